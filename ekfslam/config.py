@@ -1,0 +1,173 @@
+"""Configuration: defaults in code, overridden by a TOML file, then by flags; stored resolved with every result."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from scipy.stats import chi2
+
+from ekfslam.errors import ConfigError
+from ekfslam.sequence import Noise, Sequence
+
+Mode = Literal["dead-reckoning", "mapping-only", "full"]
+Variant = Literal["invariant", "standard"]
+Retire = Literal["auto", "unseen", "never"]
+
+MODES: tuple[Mode, ...] = get_args(Mode)
+VARIANTS: tuple[Variant, ...] = get_args(Variant)
+
+# What "auto" keeps in the state when landmarks come back: beyond this a dense covariance is no longer cheap.
+AUTO_NEVER_LIMIT = 300
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """Standard deviations per sample; None takes what the sequence states, or else the default of a clean recording.
+
+    Args:
+        sigma_v_m_s: Linear velocity, each axis (default where nothing is stated: 0.05).
+        sigma_w_rad_s: Angular velocity, each axis (0.001).
+        sigma_px: Pixels (1.0).
+    """
+
+    sigma_v_m_s: float | None = None
+    sigma_w_rad_s: float | None = None
+    sigma_px: float | None = None
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """How the filters linearise, gate, start and retire landmarks.
+
+    Args:
+        variant: Linearisation rule of the joint filter.
+        retire: ``unseen`` marginalises a landmark at the first frame that does not see it, ``never`` keeps all, ``auto``
+            is ``never`` for a sequence of at most 300 landmarks some of which come back, else ``unseen``.
+        gate_probability: Chi-square gate on each landmark's three rows; 1 accepts everything.
+        min_disparity_px: Observations with less disparity are rejected.
+        max_row_mismatch_px: Observations with larger ``|vL - vR|`` are rejected.
+        min_depth_m: Observations of a landmark predicted nearer than this (or behind) are rejected.
+        initial_position_std_m: Deviation of the first pose's translation, each axis.
+        initial_rotation_std_rad: Deviation of the first pose's rotation, each axis.
+    """
+
+    variant: Variant = "invariant"
+    retire: Retire = "auto"
+    gate_probability: float = 0.999
+    min_disparity_px: float = 2.0
+    max_row_mismatch_px: float = float("inf")
+    min_depth_m: float = 0.1
+    initial_position_std_m: float = 0.0
+    initial_rotation_std_rad: float = 0.0
+
+    @property
+    def gate(self) -> float:
+        """Chi-square threshold of the gate, 3 degrees of freedom."""
+        return float(chi2.ppf(self.gate_probability, 3))
+
+    @property
+    def initial_covariance(self) -> np.ndarray:
+        """(6, 6) covariance of the first pose's error ``xi``."""
+        return np.diag(np.repeat([self.initial_position_std_m, self.initial_rotation_std_rad], 3) ** 2)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides what a run does besides the data."""
+
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    filter: FilterConfig = field(default_factory=FilterConfig)
+
+    def __post_init__(self) -> None:
+        noise, filter_ = self.noise, self.filter
+        for name, value in dataclasses.asdict(noise).items():
+            if value is not None and not (np.isfinite(value) and value >= 0):
+                raise ConfigError(f"noise.{name} must be finite and not negative, found {value}")
+        if noise.sigma_px == 0:
+            raise ConfigError("noise.sigma_px must be positive: the innovation covariance would be singular")
+        for name, allowed in (("variant", VARIANTS), ("retire", get_args(Retire))):
+            if getattr(filter_, name) not in allowed:
+                raise ConfigError(
+                    f"filter.{name} must be one of {', '.join(allowed)}, found {getattr(filter_, name)!r}"
+                )
+        if not 0 < filter_.gate_probability <= 1:
+            raise ConfigError(f"filter.gate_probability must be in (0, 1], found {filter_.gate_probability}")
+        for name in ("max_row_mismatch_px", "min_depth_m", "initial_position_std_m", "initial_rotation_std_rad"):
+            if not getattr(filter_, name) >= 0:
+                raise ConfigError(f"filter.{name} must not be negative, found {getattr(filter_, name)}")
+        if not (np.isfinite(filter_.min_disparity_px) and filter_.min_disparity_px > 0):
+            raise ConfigError(
+                f"filter.min_disparity_px must be positive for a depth to exist, found {filter_.min_disparity_px}"
+            )
+
+    def resolved(self, sequence: Sequence) -> Config:
+        """This configuration with ``retire = "auto"`` decided for ``sequence``; noise is decided by `noise_of`."""
+        retire = self.filter.retire
+        if retire == "auto":
+            retire = "never" if _landmarks_come_back(sequence) else "unseen"
+        return dataclasses.replace(self, filter=dataclasses.replace(self.filter, retire=retire))
+
+    def with_overrides(self, overrides: Mapping[str, Mapping[str, Any]]) -> Config:
+        """This configuration with ``{table: {key: value}}`` replaced; None values are skipped.
+
+        Raises:
+            ConfigError: An unknown table or key, or a value of the wrong type or range.
+        """
+        tables = {"noise": self.noise, "filter": self.filter}
+        for table, values in overrides.items():
+            if table not in tables:
+                raise ConfigError(f"unknown table [{table}]; known: {', '.join(tables)}")
+            if not isinstance(values, Mapping):
+                raise ConfigError(f"[{table}] must be a table, found {values!r}")
+            known = {f.name: f for f in dataclasses.fields(tables[table])}
+            for key, value in values.items():
+                if key not in known:
+                    raise ConfigError(f"unknown key {table}.{key}; known: {', '.join(known)}")
+                wanted: type | tuple[type, ...] = str if key in ("variant", "retire") else (int, float)
+                if value is not None and (isinstance(value, bool) or not isinstance(value, wanted)):
+                    kind = "a string" if wanted is str else "a number"
+                    raise ConfigError(f"{table}.{key} must be {kind}, found {value!r}")
+            given = {key: value for key, value in values.items() if value is not None}
+            tables[table] = dataclasses.replace(tables[table], **given)  # type: ignore[type-var]
+        return Config(**tables)  # type: ignore[arg-type]
+
+    @staticmethod
+    def from_toml(path: str | Path) -> Config:
+        """Defaults overridden by a TOML file with tables ``[noise]`` and ``[filter]``.
+
+        Raises:
+            ConfigError: The file is missing, is not TOML, or holds something unknown.
+        """
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+            return Config().with_overrides(tomllib.loads(text))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, ConfigError) as error:
+            raise ConfigError(f"{path}: {error}") from None
+
+
+def noise_of(sequence: Sequence, config: Config) -> Noise:
+    """The noise a filter shall assume: what the configuration says, else the sequence, else a clean recording's."""
+    stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
+    twist, pixels = np.array(stated.twist_std, dtype=float), np.array(stated.pixel_std_px, dtype=float)
+    if config.noise.sigma_v_m_s is not None:
+        twist[:3] = config.noise.sigma_v_m_s
+    if config.noise.sigma_w_rad_s is not None:
+        twist[3:] = config.noise.sigma_w_rad_s
+    if config.noise.sigma_px is not None:
+        pixels[:] = config.noise.sigma_px
+    return Noise(twist, pixels)
+
+
+def _landmarks_come_back(sequence: Sequence) -> bool:
+    observations = sequence.observations
+    if len(observations.ids) > AUTO_NEVER_LIMIT:
+        return False
+    order = np.lexsort((observations.frame, observations.landmark))
+    same = np.diff(observations.landmark[order]) == 0
+    return bool((same & (np.diff(observations.frame[order]) > 1)).any())

@@ -1,0 +1,102 @@
+"""Named errors. Every message says where: the file, the field, and the index, frame or landmark id.
+
+`EkfslamError` is what the command line turns into one line and exit code 2; anything else is a bug.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as SequenceType
+
+
+class EkfslamError(Exception):
+    """Base of every error that a user's data, configuration or request can cause."""
+
+
+class ConfigError(EkfslamError):
+    """A configuration file or override names an unknown key or a value out of range."""
+
+
+class UnknownFormatError(EkfslamError):
+    """A file is missing, unreadable, truncated, or of a format that no reader knows."""
+
+
+class ArchiveError(EkfslamError):
+    """A result archive lacks what was asked of it, or has a format version this release cannot read."""
+
+
+class DataError(EkfslamError):
+    """A data set is malformed.
+
+    Args:
+        message: What is wrong.
+        source: File (or built-in world) the data came from.
+        field: Name of the offending field, as the file or `Sequence` spells it.
+        index: Position of the first offending entry within the field, if there is one.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        source: str = "",
+        field: str = "",
+        index: int | tuple[int, ...] | None = None,
+    ) -> None:
+        self.message, self.source, self.field, self.index = message, source, field, index
+        where = field
+        if index is not None:
+            where += f"[{', '.join(map(str, index)) if isinstance(index, tuple) else index}]"
+        super().__init__(": ".join(part for part in (source, where, message) if part))
+
+
+class ShapeError(DataError):
+    """A field is missing, or its shape does not fit the others."""
+
+
+class NonFiniteError(DataError):
+    """A field holds NaN or infinity."""
+
+
+class StampError(DataError):
+    """Time stamps do not increase strictly."""
+
+
+class CalibrationError(DataError):
+    """The intrinsic matrix is singular or the stereo baseline is not positive."""
+
+
+class ExtrinsicsError(DataError):
+    """A transform's rotation part is not a rotation."""
+
+
+class EmptyTracksError(DataError):
+    """There are no observations, or a track has none."""
+
+
+class DuplicateObservationError(DataError):
+    """A landmark is observed twice in one frame."""
+
+
+class TruthError(DataError):
+    """Ground truth does not fit the sequence: another length, unknown frames, or poses that are not rigid."""
+
+
+class FilterError(EkfslamError):
+    """A filter cannot go on."""
+
+
+class InnovationError(FilterError):
+    """The innovation covariance S is not positive definite.
+
+    Args:
+        frame: Frame at which the update failed.
+        ids: Landmark ids whose blocks of S are not positive definite (all observed ones if only the whole is not).
+    """
+
+    def __init__(self, frame: int, ids: SequenceType[int]) -> None:
+        self.frame, self.ids = frame, tuple(int(i) for i in ids)
+        shown = ", ".join(map(str, self.ids[:8])) + (", ..." if len(self.ids) > 8 else "")
+        super().__init__(
+            f"frame {frame}: innovation covariance is not positive definite for landmark ids [{shown}]; "
+            "check that the pixel noise is positive and the initial covariance positive semi-definite"
+        )

@@ -1,0 +1,111 @@
+"""What a run leaves behind: trajectory, map, innovation statistics and bookkeeping of one mode on one sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ekfslam.se3 import Array
+from ekfslam.sequence import IntArray, Noise
+
+ERROR_CONVENTION = (
+    "T_imu_world = exp(xi^) T_hat, xi = [rho; theta] translation first; landmark m = m_hat + d in world; "
+    "covariances are of xi and d"
+)
+
+# Why an observation was rejected; the codes of `Rejections.reason`.
+REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera")
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Every landmark a run has estimated, in the order in which it was retired (those alive at the end come last).
+
+    Args:
+        id: (M,) landmark id; an id occurs again for each time a retired landmark started afresh.
+        position_m: (M, 3) last estimate in world.
+        covariance: (M, 3, 3) of the position error d, m^2.
+        initial_position_m: (M, 3) triangulation at first sight.
+        first_frame, last_frame: (M,) frames of the first and last accepted observation.
+        observations: (M,) number of accepted observations, the first included.
+    """
+
+    id: IntArray
+    position_m: Array
+    covariance: Array
+    initial_position_m: Array
+    first_frame: IntArray
+    last_frame: IntArray
+    observations: IntArray
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @staticmethod
+    def empty() -> Landmarks:
+        none = np.empty(0, dtype=np.int64)
+        return Landmarks(none, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), none, none, none)
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """Per-frame innovation statistics.
+
+    Args:
+        nis: (T,) normalised innovation squared ``r^T S^-1 r`` of the accepted observations; 0 where there are none.
+        dof: (T,) its degrees of freedom (three a landmark).
+        accepted: (T,) observations that updated or started a landmark.
+        rejected: (T,) observations that did not.
+    """
+
+    nis: Array
+    dof: IntArray
+    accepted: IntArray
+    rejected: IntArray
+
+
+@dataclass(frozen=True)
+class Rejections:
+    """Every rejected observation: (R,) frame, landmark id, and index into `REASONS`."""
+
+    frame: IntArray
+    landmark: IntArray
+    reason: IntArray
+
+
+@dataclass(frozen=True)
+class Result:
+    """One mode run on one sequence.
+
+    Args:
+        mode: ``dead-reckoning``, ``mapping-only`` or ``full``.
+        sequence_name: Name of the sequence.
+        time_s: (T,) stamps.
+        T_world_imu: (T, 4, 4) estimated poses.
+        covariance: (T, 6, 6) of the stored error ``xi`` (see `ERROR_CONVENTION`).
+        landmarks: The map.
+        innovation: Per-frame statistics.
+        rejections: Every rejected observation.
+        ms_per_frame: (T,) wall-clock time spent on each frame.
+        counts: Totals worth knowing: accepted, rejected per reason, retired, reappeared.
+        config: The resolved configuration as nested dictionaries.
+        noise: The measurement noise that was assumed.
+        attributes: Sequence attributes, versions, seed, input checksum.
+    """
+
+    mode: str
+    sequence_name: str
+    time_s: Array
+    T_world_imu: Array
+    covariance: Array
+    landmarks: Landmarks
+    innovation: Innovation
+    rejections: Rejections
+    ms_per_frame: Array
+    counts: Mapping[str, int]
+    config: Mapping[str, Any]
+    noise: Noise
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
