@@ -50,6 +50,8 @@ class FilterConfig:
         retire: ``unseen`` marginalises a landmark at the first frame that does not see it, ``never`` keeps all, ``auto``
             is ``never`` for a sequence of at most 300 landmarks some of which come back, else ``unseen``.
         gate_probability: Chi-square gate on each landmark's three rows; 1 accepts everything.
+        split_after: A track is split, its landmark retired and a new one started, when this many observations in a row
+            fail the gate (or put it behind the camera): the tracker has jumped to another point. 0 never splits.
         min_disparity_px: Observations with less disparity are rejected.
         max_row_mismatch_px: Observations with larger ``|vL - vR|`` are rejected.
         min_depth_m: Observations of a landmark predicted nearer than this (or behind) are rejected.
@@ -60,6 +62,7 @@ class FilterConfig:
     variant: Variant = "invariant"
     retire: Retire = "auto"
     gate_probability: float = 0.999
+    split_after: int = 3
     min_disparity_px: float = 2.0
     max_row_mismatch_px: float = float("inf")
     min_depth_m: float = 0.1
@@ -98,7 +101,15 @@ class Config:
                 )
         if not 0 < filter_.gate_probability <= 1:
             raise ConfigError(f"filter.gate_probability must be in (0, 1], found {filter_.gate_probability}")
-        for name in ("max_row_mismatch_px", "min_depth_m", "initial_position_std_m", "initial_rotation_std_rad"):
+        if filter_.split_after != int(filter_.split_after):
+            raise ConfigError(f"filter.split_after must be a whole number, found {filter_.split_after}")
+        for name in (
+            "split_after",
+            "max_row_mismatch_px",
+            "min_depth_m",
+            "initial_position_std_m",
+            "initial_rotation_std_rad",
+        ):
             if not getattr(filter_, name) >= 0:
                 raise ConfigError(f"filter.{name} must not be negative, found {getattr(filter_, name)}")
         if not (np.isfinite(filter_.min_disparity_px) and filter_.min_disparity_px > 0):

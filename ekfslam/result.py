@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Sequence as SequenceType
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,11 @@ class Landmarks:
         return len(self.id)
 
     @staticmethod
+    def concatenate(parts: SequenceType[Landmarks]) -> Landmarks:
+        """All landmarks of the parts, in their order."""
+        return Landmarks(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Landmarks)))
+
+    @staticmethod
     def empty() -> Landmarks:
         none = np.empty(0, dtype=np.int64)
         return Landmarks(none, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), none, none, none)
@@ -66,6 +72,12 @@ class Innovation:
     accepted: IntArray
     rejected: IntArray
 
+    @staticmethod
+    def empty(frames: int) -> Innovation:
+        """Of a run without observations."""
+        none = np.zeros(frames, dtype=np.int64)
+        return Innovation(np.zeros(frames), none, none, none)
+
 
 @dataclass(frozen=True)
 class Rejections:
@@ -74,6 +86,11 @@ class Rejections:
     frame: IntArray
     landmark: IntArray
     reason: IntArray
+
+    @staticmethod
+    def empty() -> Rejections:
+        none = np.empty(0, dtype=np.int64)
+        return Rejections(none, none, none)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,34 @@
+"""Dead reckoning: the report's prediction (1) alone, with the covariance (2) that it carries along."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ekfslam import motion, se3
+from ekfslam.se3 import Array
+from ekfslam.sequence import Noise, Sequence
+
+
+def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> tuple[Array, Array]:
+    """Poses and covariances from the velocities alone, eq. (1) and (2).
+
+    Args:
+        sequence: The recording; starts at its `initial_T_world_imu`.
+        noise: Its velocity noise.
+        initial_covariance: (6, 6) of the first pose's error ``xi``.
+
+    Returns:
+        ``T_imu_world`` (T, 4, 4), the report's inverse poses, and the covariance (T, 6, 6) of their error ``xi``.
+    """
+    tau = np.diff(sequence.time_s)
+    E = motion.increment(sequence.twist[1:], tau)
+    F = motion.error_jacobian(E)
+    Q = motion.process_noise(sequence.twist[1:], tau, noise.twist_std)
+    T_imu_world = np.empty((len(sequence), 4, 4))
+    covariance = np.empty((len(sequence), 6, 6))
+    T_imu_world[0], covariance[0] = se3.inverse(sequence.initial_T_world_imu), initial_covariance
+    for k in range(1, len(sequence)):
+        T_imu_world[k] = E[k - 1] @ T_imu_world[k - 1]
+        P = F[k - 1] @ covariance[k - 1] @ F[k - 1].T + Q[k - 1]
+        covariance[k] = 0.5 * (P + P.T)
+    return T_imu_world, covariance

@@ -1,0 +1,282 @@
+"""The joint EKF over one pose and all active landmarks: state 6 + 3n, full cross-covariance.
+
+Nothing here is as wide as the state but P itself and the rows ``H P``: measurement Jacobians stay at 6 + 3 columns a
+landmark, the prediction touches the pose rows and columns alone, and a frame is a fixed number of NumPy calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from time import perf_counter
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import blas, lapack
+
+from ekfslam import camera as cam
+from ekfslam import motion, se3
+from ekfslam.config import FilterConfig
+from ekfslam.errors import InnovationError
+from ekfslam.filters.observing import (
+    ACCEPTED,
+    BEHIND_CAMERA,
+    GATE,
+    FrameReport,
+    Rig,
+    first_sight,
+    lookup,
+    missed,
+    normalised_squares,
+    screen,
+)
+from ekfslam.filters.variants import retract_invariant, retract_standard, transport_invariant
+from ekfslam.result import Landmarks
+from ekfslam.se3 import Array
+from ekfslam.sequence import IntArray, Sequence
+
+
+class JointEKF:
+    """Joint EKF-SLAM: call `predict`, then `update`, once a frame.
+
+    Args:
+        rig: Camera, extrinsics and noise.
+        config: Variant, gate, limits, retirement (``auto`` must have been resolved; it counts as ``unseen``).
+        T_world_imu: (4, 4) first pose.
+
+    Attributes:
+        T_imu_world: (4, 4) estimate of the report's inverse pose.
+        P: (6+3n, 6+3n) covariance of ``(xi, d_1, ..., d_n)`` with ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``.
+        ids: (n,) ids of the active landmarks, in the order of their blocks in P.
+        positions_m: (n, 3) their positions in world.
+        reappeared: Ids of retired landmarks that were seen again and started afresh.
+    """
+
+    def __init__(self, rig: Rig, config: FilterConfig, T_world_imu: Array) -> None:
+        self.rig, self.config = rig, config
+        self.T_imu_world = se3.inverse(T_world_imu)
+        self.P = config.initial_covariance
+        self.positions_m = np.empty((0, 3))
+        self.reappeared: list[int] = []
+        self._books = np.empty((0, 5), dtype=np.int64)  # id, first frame, last frame, observations, misses in a row
+        self._initial_m = np.empty((0, 3))
+        self._retired: list[Landmarks] = []
+        self._retired_ids: set[int] = set()
+
+    @property
+    def ids(self) -> IntArray:
+        return self._books[:, 0]
+
+    @property
+    def T_world_imu(self) -> Array:
+        """(4, 4) estimated pose of the IMU."""
+        return se3.inverse(self.T_imu_world)
+
+    def predict(self, twist: Array, tau_s: float) -> None:
+        """Eq. (1) and (2) over one interval: ``twist`` (6,) in m/s and rad/s, duration in s."""
+        E = motion.increment(twist, tau_s)
+        F = motion.error_jacobian(E)
+        P_xx = F @ self.P[:6, :6] @ F.T + motion.process_noise(twist, tau_s, self.rig.noise.twist_std)
+        self.T_imu_world = E @ self.T_imu_world
+        self.P[:6, 6:] = F @ self.P[:6, 6:]
+        self.P[6:, :6] = self.P[:6, 6:].T
+        self.P[:6, :6] = 0.5 * (P_xx + P_xx.T)
+
+    def update(self, frame: int, ids: IntArray, pixels_px: Array) -> FrameReport:
+        """Retire what is out of view, correct with what is known (6), start what is new (5).
+
+        Args:
+            frame: Frame index.
+            ids: (n,) landmark ids seen, distinct.
+            pixels_px: (n, 4) their pixels (uL, vL, uR, vR).
+
+        Returns:
+            What became of each observation, and the innovation statistics.
+
+        Raises:
+            InnovationError: The innovation covariance is not positive definite.
+        """
+        if self.config.retire != "never":
+            out_of_view = np.isin(self.ids, ids, invert=True)
+            self._retired_ids.update(self.ids[out_of_view].tolist())
+            self._retire(out_of_view)
+        rows = self.rig.rows(pixels_px)
+        reason = screen(pixels_px, self.config)
+        order = np.argsort(self.ids)
+        index, is_known = lookup(self.ids[order], ids)
+        known = np.flatnonzero(is_known & (reason == ACCEPTED))
+        slot = order[index[known]]
+        nis, dof, verdict = self._correct(frame, slot, rows[known])
+        reason[known] = verdict
+        updated = slot[verdict == ACCEPTED]
+        self._books[updated, 2] = frame
+        self._books[updated, 3] += 1
+        self._books[updated, 4] = 0
+        self._books[slot[missed(verdict)], 4] += 1
+        split = self._split()
+        new = (~is_known & (reason == ACCEPTED)) | np.isin(ids, split)
+        reason[new] = ACCEPTED
+        self._start(frame, ids[new], rows[new])
+        return FrameReport(frame, ids, reason, nis, dof, split)
+
+    def landmarks(self) -> Landmarks:
+        """Every landmark so far: the retired ones in the order of their retirement, then the active ones."""
+        return Landmarks.concatenate([*self._retired, self._active(np.arange(len(self.ids)))])
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Totals: landmarks retired, and retired ones that were seen again and started afresh."""
+        return {"retired": sum(len(part) for part in self._retired), "reappeared": len(self.reappeared)}
+
+    def measurement_jacobian(self, ids: IntArray) -> sp.csr_array:
+        """Full-width H (3k, 6+3n) of the rectified rows of active landmarks ``ids`` (k,), for inspection and tests.
+
+        Raises:
+            KeyError: An id is not active.
+        """
+        order = np.argsort(self.ids)
+        index, is_known = lookup(self.ids[order], np.asarray(ids))
+        if not is_known.all():
+            raise KeyError(f"landmark ids {np.asarray(ids)[~is_known].tolist()} are not active")
+        slot = order[index]
+        _, H_x, H_m = cam.landmark_jacobians(
+            self.rig.camera, self.rig.T_cam_imu, self.T_imu_world, self.positions_m[slot]
+        )
+        row = np.arange(3 * len(slot)).reshape(-1, 3, 1)
+        rows = np.broadcast_to(row, (len(slot), 3, 9))
+        pose_columns = np.broadcast_to(np.arange(6), (len(slot), 3, 6))
+        own_columns = np.broadcast_to((6 + 3 * slot)[:, None, None] + np.arange(3), (len(slot), 3, 3))
+        columns = np.concatenate([pose_columns, own_columns], axis=-1)
+        values = np.concatenate([H_x, H_m], axis=-1)
+        return sp.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * len(slot), len(self.P)))
+
+    def transition_jacobian(self, twist: Array, tau_s: float) -> sp.csr_array:
+        """Full-width F (6+3n, 6+3n) of a prediction, identity but for the pose block."""
+        F = motion.error_jacobian(motion.increment(twist, tau_s))
+        return sp.csr_array(sp.block_diag([F, sp.identity(len(self.P) - 6)]))
+
+    def _correct(self, frame: int, slot: IntArray, rows_px: Array) -> tuple[float, int, IntArray]:
+        """Eq. (6) and the variant's retraction, for the landmarks at ``slot`` seen at ``rows_px``."""
+        verdict = np.full(len(slot), ACCEPTED)
+        rig = self.rig
+        q, H_x, H_m = cam.landmark_jacobians(rig.camera, rig.T_cam_imu, self.T_imu_world, self.positions_m[slot])
+        verdict[q[:, 2] <= self.config.min_depth_m] = BEHIND_CAMERA
+        keep = np.flatnonzero(verdict == ACCEPTED)
+        if len(keep) == 0:
+            return 0.0, 0, verdict
+        q, H_x, H_m = q[keep], H_x[keep], H_m[keep]
+        residual = rows_px[keep] - cam.project(rig.camera, q)[:, :3]
+        HP, S = self._innovation(slot[keep], H_x, H_m)
+
+        blocks = np.arange(len(keep))
+        diagonal = S.reshape(len(keep), 3, len(keep), 3)[blocks, :, blocks, :]
+        inside = normalised_squares(diagonal, residual, frame, self.ids[slot[keep]]) <= self.config.gate
+        verdict[keep[~inside]] = GATE
+        if not inside.any():
+            return 0.0, 0, verdict
+        if not inside.all():
+            row = np.flatnonzero(np.repeat(inside, 3))
+            HP, S, residual = HP[row], S[row[:, None], row], residual[inside]
+
+        # LAPACK sees row-major arrays as their transposes: S is symmetric, and HP^T is what dtrsm wants.
+        L, failed = lapack.dpotrf(S.T, lower=1, overwrite_a=1)
+        if failed:
+            raise InnovationError(frame, self.ids[slot[keep[inside]]])
+        Y_transposed = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+        whitened = blas.dtrsm(1.0, L, residual.reshape(-1, 1), lower=1)[:, 0]
+        correction = Y_transposed @ whitened
+        self.P -= Y_transposed @ Y_transposed.T
+        self._retract(correction[:6], correction[6:].reshape(-1, 3))
+        return float(whitened @ whitened), len(whitened), verdict
+
+    def _innovation(self, slot: IntArray, H_x: Array, H_m: Array) -> tuple[Array, Array]:
+        """``H P`` (3k, 6+3n) and ``S = H P H^T + V`` (3k, 3k) from the two blocks of each landmark's rows."""
+        k, size = len(slot), len(self.P)
+        H_pose = H_x.reshape(3 * k, 6)
+        HP = (H_pose @ self.P[:6]).reshape(k, 3, size)
+        HP += H_m @ self.P[6:].reshape(-1, 3, size)[slot]
+        HP = HP.reshape(3 * k, size)
+        own = HP[:, 6:].reshape(3 * k, -1, 3)[:, slot].swapaxes(0, 1) @ H_m.swapaxes(1, 2)
+        S = HP[:, :6] @ H_pose.T
+        S += own.swapaxes(0, 1).reshape(3 * k, 3 * k)
+        S = 0.5 * (S + S.T)
+        S.ravel()[:: 3 * k + 1] += np.tile(self.rig.variance_px2, k)
+        return HP, S
+
+    def _retract(self, xi: Array, d: Array) -> None:
+        before, positions = self.T_imu_world, self.positions_m
+        if self.config.variant == "invariant":
+            self.T_imu_world, self.positions_m = retract_invariant(before, positions, xi, d)
+            transport_invariant(self.P, xi, before, self.positions_m - positions)
+        else:
+            self.T_imu_world, self.positions_m = retract_standard(before, positions, xi, d)
+
+    def _start(self, frame: int, ids: IntArray, rows_px: Array) -> None:
+        """Append new landmarks with their full cross-covariance, eq. (5)."""
+        if len(ids) == 0:
+            return
+        positions, G, covariance = first_sight(self.rig, self.T_imu_world, rows_px)
+        G = G.reshape(-1, 6)
+        size, grown = len(self.P), len(self.P) + len(G)
+        P = np.empty((grown, grown))
+        P[:size, :size] = self.P
+        P[size:, :size] = G @ self.P[:6]
+        P[:size, size:] = P[size:, :size].T
+        P_new = P[size:, :6] @ G.T
+        P[size:, size:] = 0.5 * (P_new + P_new.T)
+        block = np.arange(len(ids))
+        P[size:, size:].reshape(len(ids), 3, len(ids), 3)[block, :, block, :] += covariance
+        self.P = P
+        self.positions_m = np.concatenate([self.positions_m, positions])
+        self._initial_m = np.concatenate([self._initial_m, positions])
+        books = np.column_stack([ids, *np.broadcast_to([[frame], [frame], [1], [0]], (4, len(ids)))])
+        self._books = np.concatenate([self._books, books])
+        self.reappeared.extend(sorted(self._retired_ids.intersection(ids.tolist())))
+
+    def _split(self) -> IntArray:
+        """Retire the landmarks that missed too often in a row; returns their ids, which are then free to start anew."""
+        if not self.config.split_after:
+            return np.empty(0, dtype=np.int64)
+        jumped = self._books[:, 4] >= self.config.split_after
+        ids = self.ids[jumped]
+        self._retire(jumped)
+        return ids
+
+    def _retire(self, gone: np.ndarray) -> None:
+        """Marginalise landmarks: drop their rows and columns, keep their last estimate."""
+        if not gone.any():
+            return
+        self._retired.append(self._active(np.flatnonzero(gone)))
+        stay = ~gone
+        kept = np.flatnonzero(np.concatenate([np.ones(6, dtype=bool), np.repeat(stay, 3)]))
+        self.P = self.P[kept[:, None], kept]
+        self.positions_m, self._initial_m = self.positions_m[stay], self._initial_m[stay]
+        self._books = self._books[stay]
+
+    def _active(self, slot: IntArray) -> Landmarks:
+        blocks = self.P[6:, 6:].reshape(len(self.ids), 3, len(self.ids), 3)
+        identifier, first, last, count, _ = self._books[slot].T
+        return Landmarks(
+            identifier, self.positions_m[slot], blocks[slot, :, slot, :], self._initial_m[slot], first, last, count
+        )
+
+
+def run_joint(
+    sequence: Sequence, rig: Rig, config: FilterConfig, frames: Iterable[int]
+) -> tuple[JointEKF, Array, Array, list[FrameReport], Array]:
+    """`JointEKF` over the given frames of a sequence.
+
+    Returns:
+        The filter as it ended; ``T_imu_world`` (T, 4, 4) and the pose covariance (T, 6, 6) after each frame; one report
+        a frame; the wall-clock time of each frame in ms.
+    """
+    ekf = JointEKF(rig, config, sequence.initial_T_world_imu)
+    T_imu_world, covariance, reports, ms = [], [], [], []
+    for k in frames:
+        begin = perf_counter()
+        if k > 0:
+            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
+        reports.append(ekf.update(k, *sequence.observations.at(k)))
+        T_imu_world.append(ekf.T_imu_world)
+        covariance.append(ekf.P[:6, :6].copy())
+        ms.append(1e3 * (perf_counter() - begin))
+    return ekf, np.array(T_imu_world), np.array(covariance), reports, np.array(ms)

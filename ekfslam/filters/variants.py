@@ -1,0 +1,64 @@
+"""The linearisation variants of the joint filter: what happens to mean and covariance once a correction is known.
+
+All variants share the prediction (1)-(2), the measurement rows (4), new landmarks (5) and the update (6), and keep P in
+the stored coordinates ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``. They differ in the retraction.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ekfslam import se3
+from ekfslam.se3 import Array
+
+
+def retract_standard(T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array]:
+    """The textbook EKF: ``T+ = exp(xi^) T``, ``m+ = m + d``; P stays as it is.
+
+    Known weakness: it gains information along directions that no measurement observes (the choice of the world frame),
+    and so becomes overconfident, in heading first.
+    """
+    return se3.exp(xi) @ T_imu_world, positions_m + d
+
+
+def retract_invariant(T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array]:
+    """Right-invariant EKF-SLAM in stored coordinates, first two lines of eq. (7).
+
+    The correction acts as one rigid motion of the world (e_theta) on all landmarks, plus what remains of each. After
+    it, `transport_invariant` re-expresses P in the stored coordinates at the new estimate. Source: Zhang, Wu, Song,
+    Huang, Dissanayake, "Convergence and Consistency Analysis for a 3-D Invariant-EKF SLAM", RA-L 2017.
+
+    Args:
+        T_imu_world: (4, 4) pose before the correction.
+        positions_m: (n, 3) landmarks before the correction.
+        xi: (6,) correction of the pose.
+        d: (n, 3) corrections of the landmarks.
+    """
+    e_theta = -T_imu_world[:3, :3].T @ xi[3:]
+    e = d + np.cross(positions_m, e_theta)
+    rotated = positions_m @ se3.so3_exp(e_theta).T + e @ se3.so3_left_jacobian(e_theta).T
+    return se3.exp(xi) @ T_imu_world, rotated
+
+
+def transport_invariant(P: Array, xi: Array, T_imu_world: Array, moved_m: Array) -> None:
+    """Last line of eq. (7), ``P <- J P J^T`` in place: rank 3 beyond the identity.
+
+    Args:
+        P: (6+3n, 6+3n) symmetric covariance, changed in place.
+        xi: (6,) correction of the pose.
+        T_imu_world: (4, 4) pose before the correction.
+        moved_m: (n, 3) how far the correction moved each landmark, ``m+ - m``.
+    """
+    Ad = se3.adjoint(se3.exp(xi))
+    B = (se3.skew(moved_m) @ T_imu_world[:3, :3].T).reshape(-1, 3)
+    # d+ = d + B theta, xi+ = Ad xi, written block by block so that P stays symmetric to the last bit.
+    P_mx = P[6:, :6] + B @ P[3:6, :6]
+    cross = P[6:, 3:6] @ B.T
+    P[6:, 6:] += cross + cross.T + _symmetric(B @ P[3:6, 3:6] @ B.T)
+    P[6:, :6] = P_mx @ Ad.T
+    P[:6, 6:] = P[6:, :6].T
+    P[:6, :6] = _symmetric(Ad @ P[:6, :6] @ Ad.T)
+
+
+def _symmetric(A: Array) -> Array:
+    return 0.5 * (A + A.T)

@@ -1,0 +1,16 @@
+"""Progress bars: shown on a terminal for what lasts longer than a second, silent elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from typing import TypeVar
+
+from tqdm import tqdm
+
+Item = TypeVar("Item")
+
+
+def progress(items: Iterable[Item], description: str, unit: str = "frame") -> Iterable[Item]:
+    """``items``, with a progress bar on standard error."""
+    return tqdm(items, desc=description, unit=unit, delay=1.0, leave=False, disable=not sys.stderr.isatty())
