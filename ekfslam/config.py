@@ -47,8 +47,8 @@ class FilterConfig:
 
     Args:
         variant: Linearisation rule of the joint filter.
-        retire: ``unseen`` marginalises a landmark at the first frame that does not see it, ``never`` keeps all, ``auto``
-            is ``never`` for a sequence of at most 300 landmarks some of which come back, else ``unseen``.
+        retire: ``unseen`` marginalises a landmark at the first frame that does not see it, ``never`` keeps all;
+            ``auto`` is ``never`` for a sequence of at most 300 landmarks some of which come back, else ``unseen``.
         gate_probability: Chi-square gate on each landmark's three rows; 1 accepts everything.
         split_after: A track is split, its landmark retired and a new one started, when this many observations in a row
             fail the gate (or put it behind the camera): the tracker has jumped to another point. 0 never splits.

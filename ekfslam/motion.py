@@ -1,7 +1,7 @@
 """The report's SE(3) prediction from body velocities, and its covariance.
 
-A twist ``u = [v; w]`` (m/s, rad/s, IMU frame) sampled at ``t[k]`` drives the interval ``(t[k-1], t[k]]``. Its white noise
-has covariance W per sample. The state is the report's inverse pose ``T_imu_world`` with error
+A twist ``u = [v; w]`` (m/s, rad/s, IMU frame) sampled at ``t[k]`` drives the interval ``(t[k-1], t[k]]``. Its white
+noise has covariance W per sample. The state is the report's inverse pose ``T_imu_world`` with error
 ``T_imu_world = exp(xi^) T_hat``.
 """
 

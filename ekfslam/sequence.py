@@ -1,7 +1,7 @@
 """What every reader produces and every filter consumes: one validated recording.
 
-A `Sequence` cannot exist in a malformed state: its constructor checks every field and raises a `DataError` subclass that
-names source, field and index.
+A `Sequence` cannot exist in a malformed state: its constructor checks every field and raises a `DataError` subclass
+that names source, field and index.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Observations:
         pixels = np.asarray(self.pixels_px, dtype=float)
         if not len(frame) == len(landmark) == len(pixels) or pixels.shape != (len(frame), 4):
             raise ShapeError(
-                f"{len(frame)} frames, {len(landmark)} landmarks and pixels of shape {pixels.shape} do not fit together",
+                f"{len(frame)} frames, {len(landmark)} landmarks and pixels of shape {pixels.shape} do not agree",
                 field="observations",
             )
         order = np.lexsort((landmark, frame))
@@ -203,7 +203,8 @@ def require_rigid(T: Array, name: str, error: type[DataError]) -> None:
     if len(bad):
         index = tuple(int(i) for i in bad[0])
         raise error(
-            f"not a rigid transform: orthogonality defect {defect[index]:.2g}, determinant {np.linalg.det(R[index]):.6g}",
+            f"not a rigid transform: orthogonality defect {defect[index]:.2g}, "
+            f"determinant {np.linalg.det(R[index]):.6g}",
             field=name,
             index=index[0] if len(index) == 1 else index or None,
         )

@@ -45,7 +45,8 @@ def map_landmarks(
         frames: The frames to go through, ascending (wrapped in a progress bar by the caller).
 
     Returns:
-        Landmarks (pieces that were split off first, then in the order of their ids), one report a frame, and the wall-clock time of each frame in ms.
+        Landmarks (pieces that were split off, then the rest in the order of their ids), one report a frame, and the
+        wall-clock time of each frame in ms.
 
     Raises:
         InnovationError: An innovation covariance is not positive definite.

@@ -99,7 +99,7 @@ def first_sight(rig: Rig, T_imu_world: Array, rows_px: Array) -> tuple[Array, Ar
     G = -R_world_imu @ np.concatenate([np.broadcast_to(np.eye(3), (len(s), 3, 3)), -se3.skew(s)], axis=-1)
     R_world_cam = R_world_imu @ rig.T_cam_imu[:3, :3].T
     covariance = R_world_cam @ cam.triangulation_covariance(rig.camera, q, rig.variance_px2) @ R_world_cam.T
-    return se3.apply(se3.inverse(T_imu_world), s), G, covariance
+    return se3.apply(se3.inverse(T_imu_world), s), G, 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
 
 
 def missed(reason: IntArray) -> NDArray[np.bool_]:

@@ -1,0 +1,33 @@
+# make demo: everything set up, the three modes compared on the embedded data. make test: everything set up, all tests.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: demo test lint results setup clean
+
+demo: $(READY)
+	$(BIN)/ekfslam compare builtin:city --out results/local
+
+test: $(READY)
+	$(BIN)/python -m pytest
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# What is committed under results/: the demo, and the report's figures where the recordings are present.
+results: $(READY)
+	$(BIN)/python experiments/compare_modes.py
+	$(BIN)/python experiments/reproduce_report.py
+
+setup: $(READY)
+
+$(READY): pyproject.toml .ci/setup
+	PYTHON="$(PYTHON)" VENV="$(VENV)" sh .ci/setup
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build *.egg-info results/local

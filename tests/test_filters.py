@@ -1,0 +1,273 @@
+"""The filters against slow literal implementations, against each other, and at their limits."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from reference import report_mapping, run_naive, small_world
+
+from ekfslam import se3
+from ekfslam.config import Config, FilterConfig, NoiseConfig, noise_of
+from ekfslam.errors import ConfigError, InnovationError
+from ekfslam.filters.dead_reckoning import dead_reckon
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.observing import Rig
+from ekfslam.result import REASONS
+from ekfslam.runner import run
+from ekfslam.sequence import Observations
+
+OPEN = FilterConfig(gate_probability=1.0, split_after=0, min_disparity_px=1e-3)
+P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
+
+
+def settings(**changes):
+    return Config(filter=dataclasses.replace(OPEN, **changes))
+
+
+def drive(sequence, config, P0=None):
+    """`JointEKF` over a sequence with any initial covariance; poses after each frame and the filter."""
+    rig = Rig(sequence.camera, sequence.T_cam_imu, noise_of(sequence, config))
+    ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu)
+    ekf.P = np.zeros((6, 6)) if P0 is None else P0.copy()
+    poses = []
+    for k in range(len(sequence)):
+        if k > 0:
+            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
+        ekf.update(k, *sequence.observations.at(k))
+        poses.append(ekf.T_imu_world)
+    return np.array(poses), ekf
+
+
+@pytest.fixture(scope="module")
+def world():
+    return small_world()
+
+
+@pytest.mark.parametrize("variant", ["standard", "invariant"])
+@pytest.mark.parametrize("prior", [np.zeros((6, 6)), P0], ids=["certain start", "uncertain start"])
+def test_joint_filter_equals_the_naive_dense_one(world, variant, prior):
+    """60 frames; for ``invariant`` the naive one is the textbook form with process noise in every landmark."""
+    expected_poses, naive = run_naive(world, variant, prior)
+    found_poses, ekf = drive(world, settings(variant=variant, retire="never"), prior)
+    np.testing.assert_allclose(found_poses, expected_poses, atol=1e-9)
+    at = [naive.ids.index(i) for i in ekf.ids.tolist()]
+    np.testing.assert_allclose(ekf.positions_m, np.array(naive.m)[at], atol=1e-9)
+    columns = np.concatenate([np.arange(6), *(6 + 3 * i + np.arange(3) for i in at)])
+    np.testing.assert_allclose(ekf.P, naive.stored_covariance()[np.ix_(columns, columns)], atol=1e-9)
+    np.testing.assert_array_equal(ekf.P, ekf.P.T)
+    # The comparison means something only if vision moved the pose and landmarks share information.
+    assert np.abs(found_poses - dead_reckon(world, world.noise, prior)[0]).max() > 0.1
+    assert np.abs(ekf.P[6:9, 9:]).max() > 1e-6
+
+
+def test_the_variants_differ(world):
+    standard, _ = drive(world, settings(variant="standard"), P0)
+    invariant, _ = drive(world, settings(variant="invariant"), P0)
+    assert np.abs(standard - invariant).max() > 1e-4
+
+
+def test_mapping_only_equals_the_report_s_loop_over_landmarks(world):
+    result = run(world, "mapping-only", settings())
+    expected = report_mapping(world, se3.inverse(result.T_world_imu), world.noise.pixel_std_px[0])
+    assert sorted(expected) == result.landmarks.id.tolist()
+    for i, identifier in enumerate(result.landmarks.id.tolist()):
+        mean, covariance = expected[identifier]
+        np.testing.assert_allclose(result.landmarks.position_m[i], mean[:3], atol=1e-10)
+        np.testing.assert_allclose(result.landmarks.covariance[i], covariance, atol=1e-10)
+
+
+@pytest.mark.parametrize("variant", ["standard", "invariant"])
+@pytest.mark.parametrize("gated", [False, True])
+def test_mapping_only_is_the_joint_filter_without_pose_uncertainty(variant, gated):
+    """P_xx(0) = 0 and W = 0; with gate and split in force the decisions must agree as well."""
+    world = with_outliers(small_world(seed=3)) if gated else small_world(seed=3)
+    filter_config = FilterConfig(min_disparity_px=1e-3) if gated else OPEN
+    config = Config(NoiseConfig(0.0, 0.0, None), dataclasses.replace(filter_config, variant=variant, retire="never"))
+    mapping, full = run(world, "mapping-only", config), run(world, "full", config)
+    np.testing.assert_allclose(full.T_world_imu, mapping.T_world_imu, atol=1e-9)
+    order = [np.lexsort((part.landmarks.first_frame, part.landmarks.id)) for part in (full, mapping)]
+    for name in ("id", "position_m", "covariance", "initial_position_m", "first_frame", "last_frame", "observations"):
+        a, b = (getattr(p.landmarks, name)[o] for p, o in zip((full, mapping), order, strict=True))
+        np.testing.assert_allclose(a, b, atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(full.innovation.nis, mapping.innovation.nis, atol=1e-6)
+    np.testing.assert_array_equal(full.rejections.landmark, mapping.rejections.landmark)
+    if gated:
+        assert full.counts["split"] == mapping.counts["split"] > 0
+        assert full.counts["rejected: gate"] > 0
+
+
+@pytest.mark.parametrize("variant", ["standard", "invariant"])
+def test_retired_and_never_retired_filters_agree_in_every_pose(variant):
+    world = with_outliers(small_world(seed=5, frames=60, landmarks=80))
+    base = Config(filter=FilterConfig(variant=variant, retire="unseen"))
+    unseen = run(world, "full", base)
+    never = run(world, "full", base.with_overrides({"filter": {"retire": "never"}}))
+    np.testing.assert_allclose(unseen.T_world_imu, never.T_world_imu, atol=1e-9)
+    np.testing.assert_allclose(unseen.covariance, never.covariance, atol=1e-9)
+    assert unseen.counts["retired"] > never.counts["retired"]
+    assert sorted(unseen.landmarks.id) == sorted(never.landmarks.id)
+
+
+def with_outliers(world, fraction=0.03, seed=11):
+    """Single gross outliers, and one track that from its middle on follows another landmark."""
+    rng = np.random.default_rng(seed)
+    frame, landmark, pixels = (np.array(value) for value in vars(world.observations).values())
+    longest = np.bincount(landmark).argmax()
+    hit = (rng.uniform(size=len(pixels)) < fraction) & (landmark != longest)
+    pixels[hit] += rng.uniform(20, 60, (hit.sum(), 1)) * [1, 0, 1, 0]
+    frames = frame[landmark == longest]
+    after = frame >= frames[len(frames) // 2]
+    other = np.bincount(landmark[after & (landmark != longest) & ~hit]).argmax()
+    after &= frame >= frame[landmark == other].min()
+    lost = after & (landmark == longest)
+    landmark[after & (landmark == other)] = longest
+    return dataclasses.replace(world, observations=Observations(frame[~lost], landmark[~lost], pixels[~lost]))
+
+
+def test_outliers_are_rejected_listed_and_a_jumped_track_is_split():
+    world = with_outliers(small_world(seed=5))
+    result = run(world, "full", Config(filter=FilterConfig(min_disparity_px=1e-3)))
+    longest = np.bincount(world.observations.landmark).argmax()
+    pieces = np.flatnonzero(result.landmarks.id == longest)
+    assert len(pieces) == 2
+    assert result.landmarks.last_frame[pieces[0]] < result.landmarks.first_frame[pieces[1]]
+    truth = world.truth.position_m[world.truth.landmark.tolist().index(longest)]
+    assert np.linalg.norm(result.landmarks.position_m[pieces[0]] - truth) < 1.0
+    assert result.counts["split"] >= 1
+    assert len(result.rejections.frame) == result.counts["rejected"] == result.innovation.rejected.sum()
+    assert result.counts["accepted"] + result.counts["rejected"] == len(world.observations)
+    assert result.landmarks.observations.sum() == result.counts["accepted"]
+    codes = np.bincount(result.rejections.reason, minlength=len(REASONS))
+    assert codes.tolist() == [result.counts[f"rejected: {name}"] for name in REASONS]
+
+
+def test_a_landmark_that_comes_back_starts_afresh_and_is_counted():
+    world = small_world()
+    observations = world.observations
+    longest = np.bincount(observations.landmark).argmax()
+    track = np.flatnonzero(observations.landmark == longest)
+    keep = np.ones(len(observations), dtype=bool)
+    keep[track[5:8]] = False
+    gapped = dataclasses.replace(
+        world,
+        observations=Observations(observations.frame[keep], observations.landmark[keep], observations.pixels_px[keep]),
+    )
+    result = run(gapped, "full", settings(retire="unseen"))
+    assert result.counts["reappeared"] == 1
+    assert (result.landmarks.id == longest).sum() == 2
+    # Left to "auto", a small world with returning landmarks keeps them all.
+    automatic = run(gapped, "full", settings(retire="auto"))
+    assert automatic.config["filter"]["retire"] == "never"
+    assert automatic.counts["reappeared"] == 0
+
+
+def test_screening_reasons():
+    world = small_world()
+    pixels = world.observations.pixels_px.copy()
+    pixels[0, 2] = pixels[0, 0] + 1.0
+    pixels[1, 3] += 9.0
+    bad = dataclasses.replace(
+        world, observations=Observations(world.observations.frame, world.observations.landmark, pixels)
+    )
+    result = run(bad, "mapping-only", settings(min_disparity_px=2.0, max_row_mismatch_px=8.0))
+    found = {(int(f), int(i)): REASONS[r] for f, i, r in zip(*vars(result.rejections).values(), strict=True)}
+    assert found[(0, int(world.observations.landmark[0]))] == "disparity"
+    assert found[(0, int(world.observations.landmark[1]))] == "row mismatch"
+
+
+def test_a_frame_without_observations_is_a_prediction():
+    world = small_world()
+    keep = (world.observations.frame != 30) & (world.observations.frame != 0)
+    observations = Observations(
+        world.observations.frame[keep], world.observations.landmark[keep], world.observations.pixels_px[keep]
+    )
+    result = run(dataclasses.replace(world, observations=observations), "full", settings())
+    step = se3.inverse(result.T_world_imu[30]) @ result.T_world_imu[29]
+    tau = world.time_s[30] - world.time_s[29]
+    np.testing.assert_allclose(se3.log(step), -tau * world.twist[30], atol=1e-9)
+    assert result.innovation.dof[30] == 0
+
+
+def test_non_positive_innovation_covariance_names_frame_and_landmarks(world):
+    rig = Rig(world.camera, world.T_cam_imu, world.noise)
+    ekf = JointEKF(rig, OPEN, world.initial_T_world_imu)
+    ids, pixels = world.observations.at(0)
+    ekf.update(0, ids, pixels)
+    ekf.P[9:12, 9:12] = -np.eye(3)
+    with pytest.raises(InnovationError, match="frame 1") as caught:
+        ekf.update(1, ids, pixels)
+    assert caught.value.frame == 1
+    assert caught.value.ids == (ekf.ids[1],)
+
+
+def test_indefinite_as_a_whole_is_an_error_too(world):
+    rig = Rig(world.camera, world.T_cam_imu, world.noise)
+    ekf = JointEKF(rig, OPEN, world.initial_T_world_imu)
+    ids, pixels = world.observations.at(0)
+    ekf.update(0, ids, pixels)
+    ekf.P[6:9, 9:12] = ekf.P[9:12, 6:9] = 50 * np.eye(3)
+    with pytest.raises(InnovationError) as caught:
+        ekf.update(1, ids, pixels)
+    assert set(caught.value.ids) == set(ekf.ids.tolist())
+
+
+def test_measurement_jacobian_of_an_unknown_landmark(world):
+    ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), OPEN, np.eye(4))
+    with pytest.raises(KeyError, match="12345"):
+        ekf.measurement_jacobian(np.array([12345]))
+
+
+def test_dead_reckoning_covariance_is_that_of_sampled_runs(world):
+    """The spread of xi over 2000 runs with sampled velocity noise matches the covariance carried along."""
+    rng = np.random.default_rng(2)
+    short = slice(0, 15)
+    T_hat, P = dead_reckon(world, world.noise, P0)
+    start = se3.exp(rng.multivariate_normal(np.zeros(6), P0, 2000)) @ T_hat[0]
+    for k in range(1, 15):
+        noise = rng.normal(size=(2000, 6)) * world.noise.twist_std
+        tau = world.time_s[k] - world.time_s[k - 1]
+        start = se3.exp(-tau * (world.twist[short][k] - noise)) @ start
+    sampled = np.cov(se3.log(start @ se3.inverse(T_hat[14])).T)
+    scale = np.sqrt(np.diag(P[14]))
+    np.testing.assert_allclose(sampled / np.outer(scale, scale), P[14] / np.outer(scale, scale), atol=0.12)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"noise": {"sigma_px": 0.0}}, "sigma_px"),
+        ({"noise": {"sigma_v_m_s": float("nan")}}, "sigma_v_m_s"),
+        ({"noise": {"sigma_v_m_s": -1.0}}, "sigma_v_m_s"),
+        ({"noise": {"sigma": 1.0}}, r"unknown key noise\.sigma"),
+        ({"gates": {}}, "unknown table"),
+        ({"noise": 3}, "must be a table"),
+        ({"filter": {"variant": "best"}}, "variant"),
+        ({"filter": {"variant": 3}}, "must be a string"),
+        ({"filter": {"gate_probability": 0.0}}, "gate_probability"),
+        ({"filter": {"gate_probability": "high"}}, "must be a number"),
+        ({"filter": {"min_disparity_px": 0.0}}, "min_disparity_px"),
+        ({"filter": {"split_after": 1.5}}, "split_after"),
+        ({"filter": {"split_after": -1}}, "split_after"),
+    ],
+)
+def test_bad_configuration_is_named(overrides, message):
+    with pytest.raises(ConfigError, match=message):
+        Config().with_overrides(overrides)
+
+
+def test_unknown_mode(world):
+    with pytest.raises(ConfigError, match="unknown mode"):
+        run(world, "smoothing")
+
+
+def test_configuration_from_toml(tmp_path):
+    path = tmp_path / "config.toml"
+    path.write_text('[noise]\nsigma_px = 2\n[filter]\nvariant = "standard"\n')
+    config = Config.from_toml(path)
+    assert config.noise.sigma_px == 2
+    assert config.filter.variant == "standard"
+    path.write_text("[noise\n")
+    with pytest.raises(ConfigError, match=r"config\.toml"):
+        Config.from_toml(path)
+    with pytest.raises(ConfigError, match="absent"):
+        Config.from_toml(tmp_path / "absent.toml")
