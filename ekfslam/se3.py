@@ -21,28 +21,32 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _SERIES_LIMIT = 2.0  # below this theta^2 the power series is both accurate and cheap
-_SERIES_TERMS = 13  # 2^13 / (2*13+1)! < 1e-24
+_SERIES_TERMS = 13  # 2^13 / (2*13+4)! < 1e-28
+_SERIES = tuple((1.0 / factorial(2 * n + 4), 1.0 / factorial(2 * n + 5)) for n in reversed(range(_SERIES_TERMS)))
 
 
-def phi(theta_squared: Array, k: int) -> Array:
-    """``phi_k`` at ``theta^2`` (any shape), for ``k >= 0``; same shape.
+def phis(theta_squared: Array) -> tuple[Array, ...]:
+    """``(phi_0, ..., phi_5)`` at ``theta^2`` (any shape).
 
-    Power series where theta is small, the recurrence ``phi_{k+2} = (1/k! - phi_k) / theta^2`` from sine and cosine
-    elsewhere.
+    Where theta is small, from the power series of the last two by ``phi_k = 1/k! - theta^2 phi_{k+2}``; elsewhere from
+    cosine and sine by the same recurrence the other way round.
     """
     x = np.asarray(theta_squared, dtype=float)
     small = np.minimum(x, _SERIES_LIMIT)
-    series = np.zeros_like(small)
-    for n in reversed(range(_SERIES_TERMS)):
-        series = 1.0 / factorial(2 * n + k) - small * series
+    phi_4, phi_5 = np.zeros_like(small), np.zeros_like(small)
+    for coefficient_4, coefficient_5 in _SERIES:
+        phi_4 = coefficient_4 - small * phi_4
+        phi_5 = coefficient_5 - small * phi_5
+    phi_2, phi_3 = 0.5 - small * phi_4, 1.0 / 6.0 - small * phi_5
+    series = (1.0 - small * phi_2, 1.0 - small * phi_3, phi_2, phi_3, phi_4, phi_5)
     if (x <= _SERIES_LIMIT).all():
         return series
     large = np.maximum(x, _SERIES_LIMIT)
     theta = np.sqrt(large)
-    closed = np.sin(theta) / theta if k % 2 else np.cos(theta)
-    for j in range(k % 2, k, 2):
-        closed = (1.0 / factorial(j) - closed) / large
-    return np.where(x <= _SERIES_LIMIT, series, closed)
+    closed = [np.cos(theta), np.sin(theta) / theta]
+    for k in range(4):
+        closed.append((1.0 / factorial(k) - closed[k]) / large)
+    return tuple(np.where(x <= _SERIES_LIMIT, a, b) for a, b in zip(series, closed, strict=True))
 
 
 def skew(v: Array) -> Array:
@@ -54,31 +58,36 @@ def skew(v: Array) -> Array:
     return out
 
 
-def _rotation_series(theta: Array, first: int) -> Array:
-    """``I / (first-1)! + phi_first theta^ + phi_{first+1} theta^ theta^``: rotation (1) or its left Jacobian (2)."""
-    theta = np.asarray(theta, dtype=float)
-    x = np.sum(theta * theta, axis=-1)[..., None, None]
-    w = skew(theta)
-    return np.eye(3) + phi(x, first) * w + phi(x, first + 1) * (w @ w)
+def _angle_squared(theta: Array) -> Array:
+    """``|theta|^2`` of (..., 3) as (..., 1, 1), to multiply matrices with."""
+    return np.sum(theta * theta, axis=-1)[..., None, None]
 
 
 def so3_exp(theta: Array) -> Array:
     """Rotation matrix of a rotation vector (Rodrigues): (..., 3) rad to (..., 3, 3)."""
-    return _rotation_series(theta, 1)
+    return _rotation_and_jacobian(theta)[0]
 
 
 def so3_left_jacobian(theta: Array) -> Array:
     """``J_l`` with ``exp((theta + d)^) ~ exp((J_l d)^) exp(theta^)``: (..., 3) to (..., 3, 3)."""
-    return _rotation_series(theta, 2)
+    return _rotation_and_jacobian(theta)[1]
+
+
+def _rotation_and_jacobian(theta: Array) -> tuple[Array, Array]:
+    """``I + phi_1 theta^ + phi_2 theta^ theta^`` and ``I + phi_2 theta^ + phi_3 theta^ theta^``."""
+    theta = np.asarray(theta, dtype=float)
+    _, phi_1, phi_2, phi_3, _, _ = phis(_angle_squared(theta))
+    w = skew(theta)
+    ww = w @ w
+    return np.eye(3) + phi_1 * w + phi_2 * ww, np.eye(3) + phi_2 * w + phi_3 * ww
 
 
 def so3_left_jacobian_inverse(theta: Array) -> Array:
     """Inverse of `so3_left_jacobian` in closed form, finite for angles below 2 pi: (..., 3) to (..., 3, 3)."""
     theta = np.asarray(theta, dtype=float)
-    x = np.sum(theta * theta, axis=-1)[..., None, None]
+    _, _, phi_2, phi_3, phi_4, _ = phis(_angle_squared(theta))
     w = skew(theta)
-    coefficient = (phi(x, 3) - 2.0 * phi(x, 4)) / (2.0 * phi(x, 2))
-    return np.eye(3) - 0.5 * w + coefficient * (w @ w)
+    return np.eye(3) - 0.5 * w + (phi_3 - 2.0 * phi_4) / (2.0 * phi_2) * (w @ w)
 
 
 def so3_log(R: Array) -> Array:
@@ -143,8 +152,8 @@ def hat(xi: Array) -> Array:
 def exp(xi: Array) -> Array:
     """Exponential of a tangent vector ``[rho; theta]``: (..., 6) to (..., 4, 4)."""
     xi = np.asarray(xi, dtype=float)
-    rho, theta = xi[..., :3], xi[..., 3:]
-    return transform(so3_exp(theta), (so3_left_jacobian(theta) @ rho[..., None])[..., 0])
+    R, J = _rotation_and_jacobian(xi[..., 3:])
+    return transform(R, (J @ xi[..., :3, None])[..., 0])
 
 
 def log(T: Array) -> Array:
@@ -171,13 +180,12 @@ def adjoint(T: Array) -> Array:
 def _left_jacobian_corner(xi: Array) -> Array:
     """Upper right 3x3 block of the left Jacobian of SE(3) (Barfoot eq. 7.86)."""
     rho, theta = skew(xi[..., :3]), skew(xi[..., 3:])
-    x = np.sum(xi[..., 3:] ** 2, axis=-1)[..., None, None]
-    phi_4, phi_5 = phi(x, 4), phi(x, 5)
+    _, _, _, phi_3, phi_4, phi_5 = phis(_angle_squared(xi[..., 3:]))
     theta_rho, rho_theta = theta @ rho, rho @ theta
     sandwich = theta_rho @ theta
     return (
         0.5 * rho
-        + phi(x, 3) * (theta_rho + rho_theta + sandwich)
+        + phi_3 * (theta_rho + rho_theta + sandwich)
         + phi_4 * (theta @ theta_rho + rho_theta @ theta - 3.0 * sandwich)
         + 0.5 * (phi_4 - 3.0 * phi_5) * (sandwich @ theta + theta @ sandwich)
     )

@@ -177,7 +177,7 @@ def test_transport_of_the_covariance_keeps_the_invariant_error(T):
     root = RNG.normal(size=(size, size))
     P = root @ root.T
     expected = J @ P @ J.T
-    transport_invariant(P, correction[:6], T, m_plus - m)
+    transport_invariant(P, T, T_plus, m_plus - m)
     np.testing.assert_allclose(P, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
     np.testing.assert_array_equal(P, P.T)
 

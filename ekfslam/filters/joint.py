@@ -52,7 +52,7 @@ class JointEKF:
     """
 
     def __init__(self, rig: Rig, config: FilterConfig, T_world_imu: Array) -> None:
-        self.rig, self.config = rig, config
+        self.rig, self.config, self._gate = rig, config, config.gate
         self.T_imu_world = se3.inverse(T_world_imu)
         self.P = config.initial_covariance
         self.positions_m = np.empty((0, 3))
@@ -169,16 +169,16 @@ class JointEKF:
 
         blocks = np.arange(len(keep))
         diagonal = S.reshape(len(keep), 3, len(keep), 3)[blocks, :, blocks, :]
-        inside = normalised_squares(diagonal, residual, frame, self.ids[slot[keep]]) <= self.config.gate
+        inside = normalised_squares(diagonal, residual, frame, self.ids[slot[keep]]) <= self._gate
         verdict[keep[~inside]] = GATE
         if not inside.any():
             return 0.0, 0, verdict
         if not inside.all():
             row = np.flatnonzero(np.repeat(inside, 3))
-            HP, S, residual = HP[row], S[row[:, None], row], residual[inside]
+            HP, S, residual = HP[row], S[row][:, row], residual[inside]
 
-        # LAPACK sees row-major arrays as their transposes: S is symmetric, and HP^T is what dtrsm wants.
-        L, failed = lapack.dpotrf(S.T, lower=1, overwrite_a=1)
+        # LAPACK sees row-major arrays as their transposes: S is symmetric, and (H P)^T is what dtrsm wants.
+        L, failed = lapack.dpotrf(S.T, lower=1, clean=0, overwrite_a=1)
         if failed:
             raise InnovationError(frame, self.ids[slot[keep[inside]]])
         Y_transposed = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
@@ -195,10 +195,9 @@ class JointEKF:
         HP = (H_pose @ self.P[:6]).reshape(k, 3, size)
         HP += H_m @ self.P[6:].reshape(-1, 3, size)[slot]
         HP = HP.reshape(3 * k, size)
-        own = HP[:, 6:].reshape(3 * k, -1, 3)[:, slot].swapaxes(0, 1) @ H_m.swapaxes(1, 2)
-        S = HP[:, :6] @ H_pose.T
-        S += own.swapaxes(0, 1).reshape(3 * k, 3 * k)
-        S = 0.5 * (S + S.T)
+        own_columns = (6 + 3 * slot[:, None] + np.arange(3)).ravel()
+        S = (H_m @ HP.T[own_columns].reshape(k, 3, 3 * k)).reshape(3 * k, 3 * k)
+        S += H_pose @ HP[:, :6].T
         S.ravel()[:: 3 * k + 1] += np.tile(self.rig.variance_px2, k)
         return HP, S
 
@@ -206,7 +205,7 @@ class JointEKF:
         before, positions = self.T_imu_world, self.positions_m
         if self.config.variant == "invariant":
             self.T_imu_world, self.positions_m = retract_invariant(before, positions, xi, d)
-            transport_invariant(self.P, xi, before, self.positions_m - positions)
+            transport_invariant(self.P, before, self.T_imu_world, self.positions_m - positions)
         else:
             self.T_imu_world, self.positions_m = retract_standard(before, positions, xi, d)
 
@@ -248,7 +247,7 @@ class JointEKF:
         self._retired.append(self._active(np.flatnonzero(gone)))
         stay = ~gone
         kept = np.flatnonzero(np.concatenate([np.ones(6, dtype=bool), np.repeat(stay, 3)]))
-        self.P = self.P[kept[:, None], kept]
+        self.P = self.P[kept][:, kept]
         self.positions_m, self._initial_m = self.positions_m[stay], self._initial_m[stay]
         self._books = self._books[stay]
 

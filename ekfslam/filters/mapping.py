@@ -57,6 +57,7 @@ def map_landmarks(
     first, last = np.full(len(ids), -1), np.full(len(ids), -1)
     count, misses = np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.int64)
     retired: list[Landmarks] = []
+    gate, variance = config.gate, np.diag(rig.variance_px2)
 
     def estimate(which: IntArray) -> Landmarks:
         return Landmarks(*(a[which] for a in (ids, position, covariance, initial, first, last, count)))
@@ -79,9 +80,9 @@ def map_landmarks(
 
         residual = rows[known] - cam.project(rig.camera, q)[:, :3]
         HP = H @ covariance[slot[known]]
-        S = HP @ np.swapaxes(H, -1, -2) + np.diag(rig.variance_px2)
+        S = HP @ np.swapaxes(H, -1, -2) + variance
         nis = normalised_squares(S, residual, k, seen[known])
-        inside = nis <= config.gate
+        inside = nis <= gate
         reason[known[~inside]] = GATE
         update = slot[known[inside]]
         gain = np.swapaxes(np.linalg.solve(S[inside], HP[inside]), -1, -2)

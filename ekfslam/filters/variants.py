@@ -40,25 +40,21 @@ def retract_invariant(T_imu_world: Array, positions_m: Array, xi: Array, d: Arra
     return se3.exp(xi) @ T_imu_world, rotated
 
 
-def transport_invariant(P: Array, xi: Array, T_imu_world: Array, moved_m: Array) -> None:
+def transport_invariant(P: Array, T_before: Array, T_after: Array, moved_m: Array) -> None:
     """Last line of eq. (7), ``P <- J P J^T`` in place: rank 3 beyond the identity.
 
     Args:
-        P: (6+3n, 6+3n) symmetric covariance, changed in place.
-        xi: (6,) correction of the pose.
-        T_imu_world: (4, 4) pose before the correction.
+        P: (6+3n, 6+3n) symmetric covariance, changed in place and kept symmetric to the last bit.
+        T_before, T_after: (4, 4) ``T_imu_world`` before and after the correction, ``T_after = exp(xi^) T_before``.
         moved_m: (n, 3) how far the correction moved each landmark, ``m+ - m``.
     """
-    Ad = se3.adjoint(se3.exp(xi))
-    B = (se3.skew(moved_m) @ T_imu_world[:3, :3].T).reshape(-1, 3)
-    # d+ = d + B theta, xi+ = Ad xi, written block by block so that P stays symmetric to the last bit.
+    Ad = se3.adjoint(T_after @ se3.inverse(T_before))
+    # xi+ = Ad xi and d+ = d + B theta, hence P_mm+ = P_mm + B Z^T + Z B^T with Z = P_m,theta + B P_theta,theta / 2.
+    B = (se3.skew(moved_m) @ T_before[:3, :3].T).reshape(-1, 3)
     P_mx = P[6:, :6] + B @ P[3:6, :6]
-    cross = P[6:, 3:6] @ B.T
-    P[6:, 6:] += cross + cross.T + _symmetric(B @ P[3:6, 3:6] @ B.T)
+    half = B @ (P[6:, 3:6] + 0.5 * B @ P[3:6, 3:6]).T
+    P[6:, 6:] += half + half.T
     P[6:, :6] = P_mx @ Ad.T
     P[:6, 6:] = P[6:, :6].T
-    P[:6, :6] = _symmetric(Ad @ P[:6, :6] @ Ad.T)
-
-
-def _symmetric(A: Array) -> Array:
-    return 0.5 * (A + A.T)
+    P_xx = Ad @ P[:6, :6] @ Ad.T
+    P[:6, :6] = 0.5 * (P_xx + P_xx.T)
