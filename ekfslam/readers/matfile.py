@@ -1,0 +1,76 @@
+"""The numeric arrays of a MATLAB 5 file. `scipy.io.loadmat` crashes the interpreter on some damaged files; this raises.
+
+A file is 128 bytes of header and then elements: a tag (type, number of bytes) and data. A matrix is an element whose
+data are elements again: flags, dimensions, name, values. Since MATLAB 7 every matrix comes compressed by zlib.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_MATRIX, _COMPRESSED = 14, 15
+_NUMERIC_CLASSES = range(6, 16)  # double, single and the integers; others are cells, structures, text, ...
+_COMPLEX_FLAG = 0x0800
+
+
+def parse_mat(content: bytes) -> dict[str, NDArray]:
+    """Every variable of a file by name; what is not a real numeric array becomes an empty array of objects.
+
+    Raises:
+        ValueError, struct.error, zlib.error: The file is damaged.
+    """
+    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
+    if order is None:
+        raise ValueError("the header states no byte order")
+    variables = {}
+    for kind, data in _elements(content[128:], order):
+        if kind == _COMPRESSED:
+            kind, data = next(_elements(zlib.decompress(data), order), (kind, data))
+        if kind != _MATRIX:
+            raise ValueError(f"unexpected element of type {kind}")
+        name, value = _matrix(data, order)
+        variables[name] = value
+    return variables
+
+
+def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Type and data of each element."""
+    position = 0
+    while position < len(data):
+        kind, size = struct.unpack_from(order + "II", data, position)
+        if kind >> 16:  # up to four bytes of data share the eight bytes of the tag
+            kind, size, start = kind & 0xFFFF, kind >> 16, position + 4
+        else:
+            start = position + 8
+        if start + size > len(data):
+            raise ValueError(f"an element of {size} bytes runs beyond the end")
+        yield kind, data[start : start + size]
+        position = start + size
+        if kind != _COMPRESSED:
+            position += -position % 8
+
+
+def _matrix(data: bytes, order: str) -> tuple[str, NDArray]:
+    elements = list(_elements(data, order))
+    if len(elements) < 3:
+        raise ValueError("a matrix without name")
+    flags, dimensions, name = (element for _, element in elements[:3])
+    (flag,) = struct.unpack_from(order + "I", flags)
+    text = name.decode("latin-1")
+    if flag & 0xFF not in _NUMERIC_CLASSES or flag & _COMPLEX_FLAG:
+        return text, np.empty(0, dtype=object)
+    shape = [int(size) for size in np.frombuffer(dimensions, order + "i4")]
+    kind, values = elements[3] if len(elements) > 3 else (0, b"")
+    if kind not in _NUMBERS:
+        raise ValueError(f"{text} has values of unknown type {kind}")
+    array = np.frombuffer(values, order + _NUMBERS[kind])
+    if min(shape, default=-1) < 0 or math.prod(shape) != len(array):
+        raise ValueError(f"{text} has {len(array)} values for the shape {shape}")
+    return text, array.reshape(shape, order="F")

@@ -1,0 +1,24 @@
+"""Fixtures for all tests: where the recordings are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+DATA = Path(os.environ.get("EKFSLAM_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+
+
+@pytest.fixture
+def data_path() -> Callable[[str], Path]:
+    """A function from the name of a recording (``ece276a/0027.npz``) to its path; skips the test where it is absent."""
+
+    def find(name: str) -> Path:
+        path = DATA / name
+        if not path.exists():
+            pytest.skip(f"recording {path} is absent; set $EKFSLAM_DATA to the folder of the recordings")
+        return path
+
+    return find
