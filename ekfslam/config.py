@@ -49,7 +49,8 @@ class FilterConfig:
         variant: Linearisation rule of the joint filter.
         retire: ``unseen`` marginalises a landmark at the first frame that does not see it, ``never`` keeps all;
             ``auto`` is ``never`` for a sequence of at most 300 landmarks some of which come back, else ``unseen``.
-        gate_probability: Chi-square gate on each landmark's three rows; 1 accepts everything.
+        gate_probability: Chi-square gate on each landmark's three rows, once against the prediction and (joint filter)
+            once against the prediction as corrected by the frame's other landmarks; 1 accepts everything.
         split_after: A track is split, its landmark retired and a new one started, when this many observations in a row
             fail the gate (or put it behind the camera): the tracker has jumped to another point. 0 never splits.
         min_disparity_px: Observations with less disparity are rejected.

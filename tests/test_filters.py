@@ -141,6 +141,61 @@ def test_outliers_are_rejected_listed_and_a_jumped_track_is_split():
     assert codes.tolist() == [result.counts[f"rejected: {name}"] for name in REASONS]
 
 
+@pytest.mark.parametrize("variant", ["standard", "invariant"])
+def test_conditional_gate_equals_leaving_each_landmark_out(variant):
+    """Brute force: each landmark tested against the posterior of all others, dense and with explicit inverses."""
+    world = small_world(seed=10, sigma_v=1.0, sigma_w=0.15)
+    config = Config(filter=FilterConfig(variant=variant, min_disparity_px=1e-3, split_after=0))
+    rig, tau = Rig(world.camera, world.T_cam_imu, world.noise), np.diff(world.time_s, prepend=np.nan)
+    ekf, free = (JointEKF(rig, f, world.initial_T_world_imu) for f in (config.filter, settings(variant=variant).filter))
+    for filter_ in (ekf, free):
+        filter_.P = P0.copy()
+        for k in range(6):
+            if k > 0:
+                filter_.predict(world.twist[k], tau[k])
+            filter_.update(k, *world.observations.at(k))
+    np.testing.assert_array_equal(ekf.P, free.P)  # nothing was rejected so far
+    for filter_ in (ekf, free):
+        filter_.predict(world.twist[6], tau[6])
+
+    ids, pixels = world.observations.at(6)
+    known = np.isin(ids, ekf.ids)
+    ids, pixels = ids[known], pixels[known].copy()
+    assert len(ids) >= 5
+    # Too small for the marginal gate, whose S holds the pose's uncertainty; plain beside the others.
+    pixels[2] += [6.0, 4.0, 6.0, 4.0]
+    H = ekf.measurement_jacobian(ids).toarray()
+    V = np.diag(np.tile(rig.variance_px2, len(ids)))
+    at = [ekf.ids.tolist().index(i) for i in ids]
+    q = se3.apply(rig.T_cam_imu @ ekf.T_imu_world, ekf.positions_m[at])
+    u = rig.camera.fu_px * q[:, 0] / q[:, 2] + rig.camera.cu_px
+    v = rig.camera.fv_px * q[:, 1] / q[:, 2] + rig.camera.cv_px
+    predicted = np.column_stack([u, v, u - rig.camera.fu_px * rig.camera.baseline_m / q[:, 2]])
+    r = (np.column_stack([pixels[:, 0], pixels[:, [1, 3]].mean(axis=1), pixels[:, 2]]) - predicted).ravel()
+    S = H @ ekf.P @ H.T + V
+    marginal, conditional = np.zeros(len(ids)), np.zeros(len(ids))
+    for i in range(len(ids)):
+        own, rest = np.arange(3 * i, 3 * i + 3), np.setdiff1d(np.arange(len(r)), np.arange(3 * i, 3 * i + 3))
+        gain = S[np.ix_(own, rest)] @ np.linalg.inv(S[np.ix_(rest, rest)])
+        e, C = r[own] - gain @ r[rest], S[np.ix_(own, own)] - gain @ S[np.ix_(rest, own)]
+        marginal[i] = r[own] @ np.linalg.inv(S[np.ix_(own, own)]) @ r[own]
+        conditional[i] = e @ np.linalg.inv(C) @ e
+    expected = conditional <= config.filter.gate
+    assert (marginal <= config.filter.gate).all()
+    assert not expected[2]
+    assert expected.sum() >= 3
+
+    report = ekf.update(6, ids, pixels)
+    np.testing.assert_array_equal(report.reason == -1, expected)
+    reference = free.update(6, ids[expected], pixels[expected])
+    np.testing.assert_allclose(ekf.T_imu_world, free.T_imu_world, atol=1e-10)
+    kept = [ekf.ids.tolist().index(i) for i in free.ids]
+    columns = np.concatenate([np.arange(6), *(6 + 3 * i + np.arange(3) for i in kept)])
+    np.testing.assert_allclose(ekf.P[np.ix_(columns, columns)], free.P, atol=1e-10)
+    np.testing.assert_allclose(report.nis, reference.nis, rtol=1e-9)
+    assert report.dof == reference.dof
+
+
 def test_a_landmark_that_comes_back_starts_afresh_and_is_counted():
     world = small_world()
     observations = world.observations

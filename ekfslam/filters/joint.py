@@ -52,7 +52,8 @@ class JointEKF:
     """
 
     def __init__(self, rig: Rig, config: FilterConfig, T_world_imu: Array) -> None:
-        self.rig, self.config, self._gate = rig, config, config.gate
+        self.rig, self.config = rig, config
+        self._gate, self._variance = config.gate, rig.variance_px2
         self.T_imu_world = se3.inverse(T_world_imu)
         self.P = config.initial_covariance
         self.positions_m = np.empty((0, 3))
@@ -165,41 +166,70 @@ class JointEKF:
             return 0.0, 0, verdict
         q, H_x, H_m = q[keep], H_x[keep], H_m[keep]
         residual = rows_px[keep] - cam.project(rig.camera, q)[:, :3]
-        HP, S = self._innovation(slot[keep], H_x, H_m)
+        HP, S = self._project(slot[keep], H_x, H_m)
+        S.ravel()[:: len(S) + 1] += np.tile(self._variance, len(keep))
 
-        blocks = np.arange(len(keep))
-        diagonal = S.reshape(len(keep), 3, len(keep), 3)[blocks, :, blocks, :]
-        inside = normalised_squares(diagonal, residual, frame, self.ids[slot[keep]]) <= self._gate
+        k = np.arange(len(keep))
+        marginal = S.reshape(len(k), 3, len(k), 3)[k, :, k, :]
+        inside = normalised_squares(marginal, residual, frame, self.ids[slot[keep]]) <= self._gate
         verdict[keep[~inside]] = GATE
         if not inside.any():
             return 0.0, 0, verdict
         if not inside.all():
             row = np.flatnonzero(np.repeat(inside, 3))
-            HP, S, residual = HP[row], S[row][:, row], residual[inside]
+            HP, S, residual, H_x, H_m = HP[row], S[row][:, row], residual[inside], H_x[inside], H_m[inside]
+            keep = keep[inside]
 
-        # LAPACK sees row-major arrays as their transposes: S is symmetric, and (H P)^T is what dtrsm wants.
-        L, failed = lapack.dpotrf(S.T, lower=1, clean=0, overwrite_a=1)
-        if failed:
-            raise InnovationError(frame, self.ids[slot[keep[inside]]])
-        Y_transposed = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
-        whitened = blas.dtrsm(1.0, L, residual.reshape(-1, 1), lower=1)[:, 0]
-        correction = Y_transposed @ whitened
+        Y_transposed, whitened = _whiten(S, HP, residual, frame, self.ids[slot[keep]])
         self.P -= Y_transposed @ Y_transposed.T
+        correction, nis = Y_transposed @ whitened, whitened @ whitened
+        inside = self._conditional_squares(slot[keep], H_x, H_m, residual, correction, frame) <= self._gate
+        if not inside.all():
+            verdict[keep[~inside]] = GATE
+            # Taking observations out again is an update with noise -V: P + P H^T (V - H P H^T)^-1 H P.
+            out = ~inside
+            left_over = self._left_over(slot[keep[out]], H_x[out], H_m[out], residual[out], correction)
+            HP, C = self._project(slot[keep[out]], H_x[out], H_m[out])
+            C = np.diag(np.tile(self._variance, len(HP) // 3)) - C
+            Y_transposed, whitened = _whiten(C, HP, left_over, frame, self.ids[slot[keep[out]]])
+            self.P += Y_transposed @ Y_transposed.T
+            correction, nis = correction - Y_transposed @ whitened, nis - whitened @ whitened
         self._retract(correction[:6], correction[6:].reshape(-1, 3))
-        return float(whitened @ whitened), len(whitened), verdict
+        return float(nis), 3 * int(inside.sum()), verdict
 
-    def _innovation(self, slot: IntArray, H_x: Array, H_m: Array) -> tuple[Array, Array]:
-        """``H P`` (3k, 6+3n) and ``S = H P H^T + V`` (3k, 3k) from the two blocks of each landmark's rows."""
+    def _project(self, slot: IntArray, H_x: Array, H_m: Array) -> tuple[Array, Array]:
+        """``H P`` (3k, 6+3n) and ``H P H^T`` (3k, 3k) from the two blocks of each landmark's rows."""
         k, size = len(slot), len(self.P)
         H_pose = H_x.reshape(3 * k, 6)
         HP = (H_pose @ self.P[:6]).reshape(k, 3, size)
         HP += H_m @ self.P[6:].reshape(-1, 3, size)[slot]
         HP = HP.reshape(3 * k, size)
         own_columns = (6 + 3 * slot[:, None] + np.arange(3)).ravel()
-        S = (H_m @ HP.T[own_columns].reshape(k, 3, 3 * k)).reshape(3 * k, 3 * k)
-        S += H_pose @ HP[:, :6].T
-        S.ravel()[:: 3 * k + 1] += np.tile(self.rig.variance_px2, k)
-        return HP, S
+        HPH = (H_m @ HP.T[own_columns].reshape(k, 3, 3 * k)).reshape(3 * k, 3 * k)
+        HPH += H_pose @ HP[:, :6].T
+        return HP, HPH
+
+    def _left_over(self, slot: IntArray, H_x: Array, H_m: Array, residual: Array, correction: Array) -> Array:
+        """``r - H (xi, d)``, what a correction leaves of the residuals (k, 3)."""
+        d = correction[6:].reshape(-1, 3)[slot]
+        return residual - H_x @ correction[:6] - (H_m @ d[..., None])[..., 0]
+
+    def _conditional_squares(
+        self, slot: IntArray, H_x: Array, H_m: Array, residual: Array, correction: Array, frame: int
+    ) -> Array:
+        """Each landmark against the prediction as corrected by all *other* landmarks of the frame, (k,).
+
+        The marginal gate is weak while the pose itself is uncertain; this one is not. With P and the correction after
+        all of them, ``e_i = r_i - H_i (xi, d)`` and ``C_i = V - H_i P H_i^T``, it is ``e_i^T C_i^-1 e_i``.
+        """
+        if np.isinf(self._gate):
+            return np.zeros(len(slot))
+        n = len(self.ids)
+        cross = H_m @ self.P[6:, :6].reshape(n, 3, 6)[slot] @ H_x.swapaxes(1, 2)
+        own = H_m @ self.P[6:, 6:].reshape(n, 3, n, 3)[slot, :, slot, :] @ H_m.swapaxes(1, 2)
+        HPH = H_x @ self.P[:6, :6] @ H_x.swapaxes(1, 2) + cross + cross.swapaxes(1, 2) + own
+        left_over = self._left_over(slot, H_x, H_m, residual, correction)
+        return normalised_squares(np.diag(self._variance) - HPH, left_over, frame, self.ids[slot])
 
     def _retract(self, xi: Array, d: Array) -> None:
         before, positions = self.T_imu_world, self.positions_m
@@ -257,6 +287,20 @@ class JointEKF:
         return Landmarks(
             identifier, self.positions_m[slot], blocks[slot, :, slot, :], self._initial_m[slot], first, last, count
         )
+
+
+def _whiten(S: Array, HP: Array, residual: Array, frame: int, ids: IntArray) -> tuple[Array, Array]:
+    """``Y^T = (L^-1 H P)^T`` and ``L^-1 r`` of eq. (6), with ``S = L L^T``.
+
+    Raises:
+        InnovationError: S is not positive definite.
+    """
+    # LAPACK sees row-major arrays as their transposes: S is symmetric, and (H P)^T is what dtrsm wants.
+    L, failed = lapack.dpotrf(S.T, lower=1, clean=0, overwrite_a=1)
+    if failed:
+        raise InnovationError(frame, ids)
+    Y_transposed = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+    return Y_transposed, blas.dtrsm(1.0, L, residual.reshape(-1, 1), lower=1)[:, 0]
 
 
 def run_joint(
