@@ -65,7 +65,7 @@ class FilterConfig:
     gate_probability: float = 0.999
     split_after: int = 3
     min_disparity_px: float = 2.0
-    max_row_mismatch_px: float = float("inf")
+    max_row_mismatch_px: float = 20.0
     min_depth_m: float = 0.1
     initial_position_std_m: float = 0.0
     initial_rotation_std_rad: float = 0.0

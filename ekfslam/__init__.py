@@ -1,0 +1,62 @@
+"""Visual-inertial EKF-SLAM with a joint map-and-pose covariance that can be trusted.
+
+    import ekfslam
+
+    sequence = ekfslam.open_sequence("builtin:city")
+    result = ekfslam.run(sequence, mode="full")
+    result.T_world_imu, result.covariance, result.landmarks.position_m
+
+Conventions, everywhere:
+
+- ``T_a_b`` maps coordinates of frame b into frame a, ``p_a = T_a_b p_b``. Frames: ``world``, ``imu`` (x forward in a
+  car), ``cam`` (left optical frame: x right, y down, z forward). The report's inverse IMU pose is ``T_imu_world``.
+- Tangent vectors are translation first: twist ``u = [v; w]`` (m/s, rad/s, IMU frame), pose error ``xi = [rho; theta]``.
+- Errors: ``T_imu_world = exp(xi^) T_hat``, landmark ``m = m_hat + d`` (world, metres). Covariances are of ``(xi, d)``,
+  whatever variant of the filter runs.
+- ``twist[k]`` at stamp ``t[k]`` drives the interval ``(t[k-1], t[k]]``.
+- ``V`` is pixel noise, ``R`` a rotation. Units stand in names where a reader could doubt (``_s``, ``_px``, ``_m``).
+
+Equations (docstrings cite these numbers)::
+
+    E = exp(-tau u^)                      T+ = E T                                   (1) prediction
+    F = Ad_E                              Q = tau^2 J_l(-tau u) W J_l(-tau u)^T      (2) its covariance
+    q = T_cam_imu T_imu_world m           z = M pi(q) = (uL, vL, uR, vR)             (3) stereo model
+    A = M dpi/dq R_cam_imu                s = T_imu_world m
+    H = [ A [I, -s^] | A C ]              C = rotation of T_imu_world                (4) 6+3 columns a landmark
+    m_hat = T^-1 q(z),  G = -C^T [I, -s^],  P_m: = G P_x:,
+    P_mm = G P_xx G^T + C^T (A^T V^-1 A)^-1 C                                        (5) new landmark
+    S = H P H^T + V = L L^T,  Y = L^-1 H P,  (xi, d) = Y^T L^-1 r,  P -= Y^T Y       (6) update
+    e_theta = -C^T xi_theta,  e_i = d_i + m_i^ e_theta,
+    T+ = exp(xi) T,  m_i+ = exp(e_theta) m_i + J_l(e_theta) e_i,  P+ = J P J^T       (7) invariant retraction
+"""
+
+from importlib.metadata import version
+
+from ekfslam.archive import read_archive, write_archive
+from ekfslam.comparison import Comparison, compare
+from ekfslam.config import MODES, VARIANTS, Config, FilterConfig, NoiseConfig
+from ekfslam.errors import EkfslamError
+from ekfslam.readers import open_sequence, write_sequence
+from ekfslam.result import Result
+from ekfslam.runner import run
+from ekfslam.sequence import Sequence
+
+__version__ = version("ekfslam")
+
+__all__ = [
+    "MODES",
+    "VARIANTS",
+    "Comparison",
+    "Config",
+    "EkfslamError",
+    "FilterConfig",
+    "NoiseConfig",
+    "Result",
+    "Sequence",
+    "compare",
+    "open_sequence",
+    "read_archive",
+    "run",
+    "write_archive",
+    "write_sequence",
+]

@@ -1,0 +1,243 @@
+"""Result archives: one HDF5 file holds what every mode made of one sequence.
+
+    /                       attributes format, format_version, source, error_convention
+    /sequence, /truth       as in `ekfslam.readers.hdf5`, without the observations
+    /runs/<mode>            attributes config (JSON), counts (JSON), noise_twist_std, noise_pixel_std_px, sequence_name
+        attributes          seed, input checksum, versions of the software, as attributes
+        trajectory          time, T_world_imu, covariance
+        landmarks           id, position, covariance, initial_position, first_frame, last_frame, observations
+        innovation          nis, dof, accepted, rejected
+        rejections          frame, landmark, reason (index into its attribute ``names``)
+        timing              ms_per_frame
+
+Every data set has the attributes ``units`` and ``frame`` (of reference). Reading gives back every number bit for bit.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Literal
+
+import h5py
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ekfslam.camera import StereoCamera
+from ekfslam.errors import ArchiveError, DataError
+from ekfslam.readers.hdf5 import read_sequence_fields, write_sequence_group, write_truth_group
+from ekfslam.result import ERROR_CONVENTION, REASONS, Innovation, Landmarks, Rejections, Result
+from ekfslam.se3 import Array
+from ekfslam.sequence import Noise, Sequence, Truth
+
+FORMAT = "ekfslam-archive"
+FORMAT_VERSION = 1
+
+# Data set below /runs/<mode>, field of `Result`, shape (T frames, M landmarks, R rejections), units, frame.
+_LAYOUT: tuple[tuple[str, str, tuple[str | int, ...], str, str], ...] = (
+    ("trajectory/time", "time_s", ("T",), "s", "clock of the recording"),
+    ("trajectory/T_world_imu", "T_world_imu", ("T", 4, 4), "m (translation)", "world from imu"),
+    ("trajectory/covariance", "covariance", ("T", 6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu"),
+    ("landmarks/id", "landmarks.id", ("M",), "landmark id", "none"),
+    ("landmarks/position", "landmarks.position_m", ("M", 3), "m", "world"),
+    ("landmarks/covariance", "landmarks.covariance", ("M", 3, 3), "m^2", "world"),
+    ("landmarks/initial_position", "landmarks.initial_position_m", ("M", 3), "m", "world"),
+    ("landmarks/first_frame", "landmarks.first_frame", ("M",), "frame index", "none"),
+    ("landmarks/last_frame", "landmarks.last_frame", ("M",), "frame index", "none"),
+    ("landmarks/observations", "landmarks.observations", ("M",), "count", "none"),
+    ("innovation/nis", "innovation.nis", ("T",), "1", "none"),
+    ("innovation/dof", "innovation.dof", ("T",), "count", "none"),
+    ("innovation/accepted", "innovation.accepted", ("T",), "count", "none"),
+    ("innovation/rejected", "innovation.rejected", ("T",), "count", "none"),
+    ("rejections/frame", "rejections.frame", ("R",), "frame index", "none"),
+    ("rejections/landmark", "rejections.landmark", ("R",), "landmark id", "none"),
+    ("rejections/reason", "rejections.reason", ("R",), "code, see names", "none"),
+    ("timing/ms_per_frame", "ms_per_frame", ("T",), "ms", "none"),
+)
+
+
+@dataclass(frozen=True)
+class Archive:
+    """What an archive holds: the sequence without its observations, and the results of its modes.
+
+    Args:
+        name, source, time_s, twist, camera, T_cam_imu, truth, noise, notes, attributes: As in `Sequence`.
+        results: Mode to result, in the order of writing.
+    """
+
+    name: str
+    source: str
+    time_s: Array
+    twist: Array
+    camera: StereoCamera
+    T_cam_imu: Array
+    truth: Truth | None
+    noise: Noise | None
+    notes: tuple[str, ...]
+    attributes: Mapping[str, str | int | float]
+    results: Mapping[str, Result]
+
+
+def write_archive(path: str | Path, sequence: Sequence, results: Mapping[str, Result]) -> None:
+    """Write the results (mode to `Result`) of one sequence to an HDF5 file, replacing an old one.
+
+    The file appears under its name only when it is complete: a run that is killed leaves the old archive or none.
+
+    Raises:
+        ArchiveError: The file cannot be written.
+    """
+    path = Path(path)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with h5py.File(str(unfinished), "w") as h5file:
+            h5file.attrs.update(
+                format=FORMAT, format_version=FORMAT_VERSION, source=sequence.source, error_convention=ERROR_CONVENTION
+            )
+            write_sequence_group(h5file, sequence, include_observations=False)
+            if sequence.truth is not None:
+                write_truth_group(h5file, sequence.truth)
+            runs = h5file.create_group("runs", track_order=True)
+            for mode, result in results.items():
+                _write_result(runs.create_group(mode), result)
+        unfinished.replace(path)
+    except OSError as error:
+        raise ArchiveError(f"{path}: cannot be written: {error}") from None
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def read_archive(path: str | Path) -> Archive:
+    """Everything an archive holds.
+
+    Raises:
+        ArchiveError: The file is missing, truncated, no ekfslam archive or of a newer format version, or something
+            in it is missing or malformed; the message names file and item.
+    """
+    with _opened(path) as h5file:
+        fields = {"noise": None, **read_sequence_fields(h5file, str(path))}
+        fields["source"] = str(h5file.attrs["source"])
+        results = {mode: _read_result(path, h5file, mode) for mode in _modes(path, h5file)}
+        return Archive(**fields, results=results)
+
+
+def open_result(path: str | Path, mode: str) -> Result:
+    """The result of one mode, read without the rest of the archive.
+
+    Raises:
+        ArchiveError: As `read_archive`, or the archive has no such mode.
+    """
+    with _opened(path) as h5file:
+        modes = _modes(path, h5file)
+        if mode not in modes:
+            raise ArchiveError(f"{path}: runs/{mode} is missing; this archive holds {', '.join(modes) or 'no run'}")
+        return _read_result(path, h5file, mode)
+
+
+def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "kitti"]) -> None:
+    """Write the estimated poses ``T_world_imu`` as text, one line a frame, 17 significant digits.
+
+    Both formats hold the pose of the *IMU* in *world*; KITTI's own files hold the left camera in its first frame.
+
+    Args:
+        result: Run to export.
+        path: File to write.
+        format: ``tum``: ``time tx ty tz qx qy qz qw`` (s, m, unit quaternion); ``kitti``: the twelve entries of the
+            upper 3x4 part row by row.
+
+    Raises:
+        ArchiveError: The file cannot be written.
+    """
+    T = result.T_world_imu
+    if format == "tum":
+        quaternion = Rotation.from_matrix(T[:, :3, :3]).as_quat()  # scalar last, as TUM has it
+        rows = np.column_stack([result.time_s, T[:, :3, 3], quaternion])
+    else:
+        rows = T[:, :3].reshape(-1, 12)
+    try:
+        np.savetxt(path, rows, fmt="%.17g")
+    except OSError as error:
+        raise ArchiveError(f"{path}: cannot be written: {error}") from None
+
+
+def _write_result(group: h5py.Group, result: Result) -> None:
+    group.attrs.update(
+        sequence_name=result.sequence_name,
+        config=json.dumps(result.config),
+        counts=json.dumps(dict(result.counts)),
+        noise_twist_std=result.noise.twist_std,
+        noise_pixel_std_px=result.noise.pixel_std_px,
+    )
+    group.create_group("attributes").attrs.update(result.attributes)
+    for name, field, _, units, frame in _LAYOUT:
+        dataset = group.create_dataset(name, data=attrgetter(field)(result))
+        dataset.attrs["units"], dataset.attrs["frame"] = units, frame
+    group["rejections/reason"].attrs["names"] = REASONS
+
+
+def _read_result(path: str | Path, h5file: h5py.File, mode: str) -> Result:
+    group = h5file["runs"][mode]
+    sizes: dict[str | int, int] = {}
+    fields: dict[str, dict[str, Any]] = {"": {}, "landmarks": {}, "innovation": {}, "rejections": {}}
+    for name, field, shape, _, _ in _LAYOUT:
+        where = f"{path}: runs/{mode}/{name}"
+        if not isinstance(group.get(name), h5py.Dataset):
+            raise ArchiveError(f"{where} is missing")
+        value = group[name][()]
+        # The first data set along a dimension decides its length.
+        wanted = tuple(sizes.setdefault(n, value.shape[i]) if isinstance(n, str) else n for i, n in enumerate(shape))
+        if value.shape != wanted:
+            raise ArchiveError(f"{where} has shape {value.shape}, expected {wanted}")
+        part, _, leaf = field.rpartition(".")
+        fields[part][leaf] = value
+    for name in ("sequence_name", "config", "counts", "noise_twist_std", "noise_pixel_std_px"):
+        if name not in group.attrs:
+            raise ArchiveError(f"{path}: attribute {name} of runs/{mode} is missing")
+    if not isinstance(group.get("attributes"), h5py.Group):
+        raise ArchiveError(f"{path}: runs/{mode}/attributes is missing")
+    return Result(
+        mode=mode,
+        sequence_name=str(group.attrs["sequence_name"]),
+        **fields[""],
+        landmarks=Landmarks(**fields["landmarks"]),
+        innovation=Innovation(**fields["innovation"]),
+        rejections=Rejections(**fields["rejections"]),
+        counts=json.loads(group.attrs["counts"]),
+        config=json.loads(group.attrs["config"]),
+        noise=Noise(group.attrs["noise_twist_std"], group.attrs["noise_pixel_std_px"]),
+        attributes={
+            key: value.item() if isinstance(value, np.generic) else value
+            for key, value in group["attributes"].attrs.items()
+        },
+    )
+
+
+def _modes(path: str | Path, h5file: h5py.File) -> tuple[str, ...]:
+    if not isinstance(h5file.get("runs"), h5py.Group):
+        raise ArchiveError(f"{path}: the group runs is missing")
+    return tuple(h5file["runs"])
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[h5py.File]:
+    """The archive, open for reading and of a known version; whatever damage shows meanwhile is an `ArchiveError`."""
+    try:
+        with h5py.File(str(path), "r") as h5file:
+            if h5file.attrs.get("format") != FORMAT:
+                raise ArchiveError(
+                    f"{path}: no ekfslam archive: format is {h5file.attrs.get('format')!r}, expected {FORMAT!r}"
+                )
+            version = h5file.attrs.get("format_version")
+            if not isinstance(version, np.integer) or version > FORMAT_VERSION:
+                raise ArchiveError(
+                    f"{path}: has format version {version}, this release reads up to version {FORMAT_VERSION}"
+                )
+            yield h5file
+    except DataError as error:
+        raise ArchiveError(str(error)) from None
+    except (OSError, RuntimeError, KeyError, ValueError) as error:  # what h5py and json raise at damaged files
+        raise ArchiveError(f"{path}: missing, truncated or no HDF5 file ({error})") from None

@@ -1,0 +1,279 @@
+"""The command line: every subcommand is a thin call of the function of the same name in Python."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as SequenceType
+from pathlib import Path
+
+import h5py
+
+from ekfslam import __version__
+from ekfslam.archive import FORMAT as ARCHIVE_FORMAT
+from ekfslam.archive import Archive, export_trajectory, open_result, read_archive, write_archive
+from ekfslam.comparison import compare
+from ekfslam.config import MODES, VARIANTS, Config
+from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
+from ekfslam.metrics.summary import compare_table, summarise
+from ekfslam.plotting import save_figures
+from ekfslam.readers import BUILTIN, open_sequence, write_sequence
+from ekfslam.result import Result
+from ekfslam.runner import run
+from ekfslam.sequence import Sequence
+from ekfslam.simulate import builtin
+from ekfslam.tracks import inspect_tracks
+
+DEFAULT_DATA = "builtin:city"
+
+
+def main(arguments: SequenceType[str] | None = None) -> int:
+    """Entry point of ``ekfslam``; returns the exit code: 0, or 2 after one line for a user's error."""
+    options = _parser().parse_args(arguments)
+    command: Callable[[argparse.Namespace], None] = options.command
+    try:
+        command(options)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of our output (head, less) has gone; that is not an error. Keep the exit from flushing into it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (EkfslamError, OSError) as error:
+        print(f"ekfslam: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("ekfslam: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="ekfslam",
+        description="Visual-inertial EKF-SLAM: dead reckoning, independent landmark mapping, and full joint SLAM.",
+        epilog="DATA is a recording (ECE 276A .npz, UTIAS .mat, ekfslam .h5) or a simulated world: "
+        "builtin:city, builtin:loop, builtin:city?seed=3.",
+    )
+    parser.add_argument("--version", action="version", version=f"ekfslam {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def add(name: str, command: Callable[[argparse.Namespace], None], summary: str, *examples: str):  # noqa: ANN202
+        sub = commands.add_parser(
+            name,
+            help=summary,
+            description=summary[0].upper() + summary[1:] + ".",
+            epilog="examples:\n" + "\n".join(f"  ekfslam {example}" for example in examples),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        sub.set_defaults(command=command)
+        return sub
+
+    sub = add(
+        "compare",
+        _compare,
+        "run several modes on the same data and compare them",
+        "compare",
+        "compare 0027.npz --truth poses/07.txt --out results/local",
+        "compare a.mat b.mat --modes dead-reckoning full --sigma-v 0.5 --sigma-w 0.05",
+    )
+    sub.add_argument("data", nargs="*", default=[DEFAULT_DATA], metavar="DATA", help=f"default: {DEFAULT_DATA}")
+    sub.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), metavar="MODE", help=", ".join(MODES))
+    sub.add_argument("--out", type=Path, default=Path("results/local"), metavar="DIR", help="default: %(default)s")
+    _add_data_options(sub)
+    _add_filter_options(sub)
+
+    sub = add(
+        "run",
+        _run,
+        "run one mode and write its result archive",
+        "run --mode full --variant invariant --out city.h5",
+        "run drive.mat --mode mapping-only --config noise.toml --out drive.h5",
+    )
+    sub.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="DATA", help=f"default: {DEFAULT_DATA}")
+    sub.add_argument("--mode", choices=MODES, default="full", help="default: %(default)s")
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="archive to write")
+    _add_data_options(sub)
+    _add_filter_options(sub)
+
+    sub = add(
+        "simulate",
+        _simulate,
+        "write a simulated world as a recording",
+        "simulate city --out city.h5",
+        "simulate 'loop?seed=7' --out loop.h5",
+    )
+    sub.add_argument("world", nargs="?", default=DEFAULT_DATA, metavar="WORLD", help=f"default: {DEFAULT_DATA}")
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="recording to write")
+
+    sub = add(
+        "info",
+        _info,
+        "say what is in a recording or an archive, and what is wrong with it",
+        "info 0027.npz",
+        "info results/local/city/archive.h5",
+    )
+    sub.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="FILE", help=f"default: {DEFAULT_DATA}")
+    _add_data_options(sub)
+
+    sub = add("plot", _plot, "draw the figures of an archive", "plot city.h5", "plot city.h5 --out figures")
+    sub.add_argument("archive", type=Path, metavar="ARCHIVE")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="default: the folder of the archive")
+
+    sub = add(
+        "export",
+        _export,
+        "write a trajectory of an archive as text",
+        "export city.h5 --format tum",
+        "export city.h5 --format kitti --mode dead-reckoning --out poses.txt",
+    )
+    sub.add_argument("archive", type=Path, metavar="ARCHIVE")
+    sub.add_argument("--format", choices=("tum", "kitti"), required=True, help="poses of the IMU in world")
+    sub.add_argument("--mode", choices=MODES, help="default: full, or the only mode in the archive")
+    sub.add_argument("--out", type=Path, metavar="FILE", help="default: ARCHIVE with .MODE.FORMAT.txt")
+    return parser
+
+
+def _add_data_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="true poses: KITTI odometry or TUM text")
+    parser.add_argument(
+        "--extrinsics",
+        choices=("corrected", "as-stored"),
+        default="corrected",
+        help="how to read cam_T_imu of .npz recordings (default: %(default)s)",
+    )
+
+
+def _add_filter_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("settings", "flags override the file, the file overrides the defaults")
+    group.add_argument("--config", type=Path, metavar="FILE.toml", help="tables [noise] and [filter]")
+    group.add_argument("--variant", choices=VARIANTS, help="linearisation of the joint filter")
+    group.add_argument("--retire", choices=("auto", "unseen", "never"), help="when landmarks leave the state")
+    group.add_argument("--sigma-v", type=float, metavar="M_S", help="linear velocity noise per sample, m/s")
+    group.add_argument("--sigma-w", type=float, metavar="RAD_S", help="angular velocity noise per sample, rad/s")
+    group.add_argument("--sigma-px", type=float, metavar="PX", help="pixel noise")
+
+
+def _config(options: argparse.Namespace) -> Config:
+    config = Config.from_toml(options.config) if options.config else Config()
+    return config.with_overrides(
+        {
+            "noise": {
+                "sigma_v_m_s": options.sigma_v,
+                "sigma_w_rad_s": options.sigma_w,
+                "sigma_px": options.sigma_px,
+            },
+            "filter": {"variant": options.variant, "retire": options.retire},
+        }
+    )
+
+
+def _open(options: argparse.Namespace, data: str) -> Sequence:
+    return open_sequence(data, extrinsics=options.extrinsics, truth=options.truth)
+
+
+def _compare(options: argparse.Namespace) -> None:
+    config = _config(options)
+    if options.truth and len(options.data) > 1:
+        raise ConfigError("--truth belongs to one recording, but several are given; compare them one by one")
+    # Everything is read before anything is run: a mistyped last name should not cost the first hour.
+    sequences = [_open(options, data) for data in options.data]
+    for sequence, folder in zip(sequences, _folders(sequences), strict=True):
+        for note in sequence.notes:
+            print(f"{sequence.name}: {note}")
+        comparison = compare(sequence, options.modes, config)
+        paths = comparison.save(options.out / folder)
+        print(f"\n{comparison.table}\nwritten to {options.out / folder}: {', '.join(path.name for path in paths)}")
+
+
+def _folders(sequences: list[Sequence]) -> list[str]:
+    """A folder name for each sequence; recordings of the same name do not overwrite each other."""
+    folders: list[str] = []
+    for sequence in sequences:
+        same = sum(other.name == sequence.name for other in sequences[: len(folders)])
+        folders.append(f"{sequence.name}-{same + 1}" if same else sequence.name)
+    return folders
+
+
+def _run(options: argparse.Namespace) -> None:
+    sequence = _open(options, options.data)
+    result = run(sequence, options.mode, _config(options))
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    write_archive(options.out, sequence, {result.mode: result})
+    print(_table(sequence, len(sequence.observations.ids), {result.mode: result}))
+    print(", ".join(f"{name} {count}" for name, count in result.counts.items()))
+    print(f"written to {options.out}")
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    sequence = builtin(options.world.removeprefix(BUILTIN))
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    write_sequence(sequence, options.out)
+    print(f"{len(sequence)} frames, {len(sequence.observations)} observations written to {options.out}")
+
+
+def _info(options: argparse.Namespace) -> None:
+    if _is_archive(options.data):
+        archive = read_archive(options.data)
+        print(f"{options.data}: archive of {archive.name}, {len(archive.time_s)} frames, from {archive.source}")
+        print(_table(archive, None, archive.results))
+        for mode, result in archive.results.items():
+            print(f"{mode}: " + ", ".join(f"{name} {count}" for name, count in result.counts.items()))
+        return
+    sequence = _open(options, options.data)
+    camera, truth, noise = sequence.camera, sequence.truth, sequence.noise
+    tracks = inspect_tracks(sequence.observations, sequence.twist)
+    print(f"name          {sequence.name} ({sequence.source})")
+    print(f"frames        {len(sequence)} in {sequence.time_s[-1] - sequence.time_s[0]:.1f} s")
+    print(f"tracks        {tracks.tracks}, {len(sequence.observations)} observations")
+    print(
+        f"camera        fu {camera.fu_px:g} fv {camera.fv_px:g} cu {camera.cu_px:g} cv {camera.cv_px:g} px, "
+        f"baseline {camera.baseline_m:g} m"
+    )
+    if noise is None:
+        print("noise         not stated; the defaults of a clean recording will be used")
+    else:
+        print(f"noise         twist {noise.twist_std} (m/s, rad/s), pixels {noise.pixel_std_px} px")
+    known = "none" if truth is None else f"{len(truth.frame)} poses, {len(truth.landmark)} landmarks"
+    print(f"truth         {known}")
+    for key, value in sequence.attributes.items():
+        print(f"{key:13s} {value}")
+    for note in sequence.notes:
+        print(f"note          {note}")
+
+
+def _plot(options: argparse.Namespace) -> None:
+    archive = read_archive(options.archive)
+    directory = options.out or options.archive.parent
+    directory.mkdir(parents=True, exist_ok=True)
+    for path in save_figures(directory, archive.results, archive.truth):
+        print(path)
+
+
+def _export(options: argparse.Namespace) -> None:
+    modes = list(read_archive(options.archive).results)
+    mode = options.mode or ("full" if "full" in modes or not modes else modes[0])
+    result = open_result(options.archive, mode)
+    path = options.out or options.archive.with_suffix(f".{mode}.{options.format}.txt")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    export_trajectory(result, path, options.format)
+    print(f"{len(result.time_s)} poses written to {path}")
+
+
+def _is_archive(data: str) -> bool:
+    if data.startswith(BUILTIN) or not Path(data).is_file() or not h5py.is_hdf5(data):
+        return False
+    try:
+        with h5py.File(data) as h5file:
+            return h5file.attrs.get("format") == ARCHIVE_FORMAT
+    except OSError as error:
+        raise ArchiveError(f"{data}: cannot be read: {error}") from None
+
+
+def _table(data: Sequence | Archive, landmarks: int | None, results: Mapping[str, Result]) -> str:
+    modes = {mode: summarise(data, result) for mode, result in results.items()}
+    return compare_table({"sequence": data.name, "frames": len(data.time_s), "landmarks": landmarks, "modes": modes})
+
+
+if __name__ == "__main__":
+    sys.exit(main())

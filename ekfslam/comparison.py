@@ -1,0 +1,70 @@
+"""`compare`: the modes side by side on one sequence, as a table, an archive and figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ekfslam.archive import write_archive
+from ekfslam.config import MODES, Config, Mode
+from ekfslam.metrics.summary import compare_table, summarise
+from ekfslam.plotting import save_figures
+from ekfslam.result import Result
+from ekfslam.runner import run
+from ekfslam.sequence import Sequence
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What `compare` found.
+
+    Args:
+        sequence: The recording.
+        results: Mode to result, in the order asked for.
+        summary: The figures of merit as written to ``summary.json``.
+    """
+
+    sequence: Sequence
+    results: dict[str, Result]
+    summary: dict[str, Any]
+
+    @property
+    def table(self) -> str:
+        """The summary as a Markdown table."""
+        return compare_table(self.summary)
+
+    def save(self, directory: str | Path) -> list[Path]:
+        """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures; returns their paths.
+
+        Raises:
+            ArchiveError: The archive cannot be written.
+            OSError: The directory cannot be written.
+        """
+        directory = Path(directory)
+        directory.mkdir(parents=True, exist_ok=True)
+        archive, summary, table = (directory / name for name in ("archive.h5", "summary.json", "summary.md"))
+        write_archive(archive, self.sequence, self.results)
+        summary.write_text(json.dumps(self.summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        notes = "".join(f"- {note}\n" for note in self.sequence.notes)
+        table.write_text(self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""), encoding="utf-8")
+        return [archive, summary, table, *save_figures(directory, self.results, self.sequence.truth)]
+
+
+def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | None = None) -> Comparison:
+    """Run several modes with one configuration.
+
+    Raises:
+        ConfigError: Unknown mode.
+        InnovationError: An innovation covariance is not positive definite.
+    """
+    results: dict[str, Result] = {mode: run(sequence, mode, config) for mode in modes}
+    summary = {
+        "sequence": sequence.name,
+        "frames": len(sequence),
+        "landmarks": len(sequence.observations.ids),
+        "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
+    }
+    return Comparison(sequence, results, summary)

@@ -1,0 +1,91 @@
+"""The figures of merit of a run, and the table that compares modes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ekfslam.archive import Archive
+from ekfslam.metrics.consistency import pose_nees
+from ekfslam.metrics.trajectory import (
+    absolute_trajectory_error,
+    final_position_error,
+    kitti_segment_errors,
+    landmark_rmse,
+)
+from ekfslam.result import Result
+from ekfslam.sequence import Sequence
+
+# Key of a summary, heading in the table, format of the value.
+_COLUMNS = (
+    ("ate_m", "ATE [m]", ".3f"),
+    ("ate_aligned_m", "ATE aligned [m]", ".3f"),
+    ("final_error_m", "final error [m]", ".3f"),
+    ("t_rel_percent", "t_rel [%]", ".3f"),
+    ("r_rel_deg_per_100m", "r_rel [deg/100 m]", ".4f"),
+    ("pose_nees_mean", "pose NEES (6)", ".2f"),
+    ("nis_per_dof", "NIS / dof (1)", ".3f"),
+    ("landmark_rmse_m", "landmark RMSE [m]", ".3f"),
+    ("accepted", "accepted", "d"),
+    ("rejected", "rejected", "d"),
+    ("ms_per_frame_median", "ms/frame median", ".2f"),
+    ("ms_per_frame_max", "ms/frame max", ".2f"),
+    ("total_s", "total [s]", ".2f"),
+)
+
+
+def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float | int | None]:
+    """Figures of merit of one run as plain Python numbers, ready for JSON; of the sequence only the truth is used.
+
+    Trajectory errors are over the frames with known true pose, the estimate starting where the run started it; see
+    `ekfslam.metrics.trajectory` for their definitions. ``pose_nees_mean`` (6 expected) is over the frames whose
+    covariance is not singular, ``nis_per_dof`` (1 expected) is the sum of NIS over the sum of degrees of freedom,
+    ``total_s`` the sum of the time spent on the frames. None stands where truth is missing or the value is undefined.
+    """
+    summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _COLUMNS)
+    truth = sequence.truth
+    if truth is not None:
+        summary["landmark_rmse_m"] = landmark_rmse(result.landmarks, truth)
+    if truth is not None and len(truth.frame):
+        T_est, T_true = result.T_world_imu[truth.frame], truth.T_world_imu
+        summary["ate_m"] = absolute_trajectory_error(T_est, T_true, align=False)
+        summary["ate_aligned_m"] = absolute_trajectory_error(T_est, T_true, align=True)
+        summary["final_error_m"] = final_position_error(T_est, T_true)
+        segments = kitti_segment_errors(T_est, T_true)
+        if segments is not None:
+            summary["t_rel_percent"], summary["r_rel_deg_per_100m"] = segments
+        _, values = pose_nees(result, truth)
+        if np.isfinite(values).any():
+            summary["pose_nees_mean"] = float(np.nanmean(values))
+    innovation = result.innovation
+    if innovation.dof.sum() > 0:
+        summary["nis_per_dof"] = float(innovation.nis.sum() / innovation.dof.sum())
+    summary["accepted"] = int(innovation.accepted.sum())
+    summary["rejected"] = int(innovation.rejected.sum())
+    summary["ms_per_frame_median"] = float(np.median(result.ms_per_frame))
+    summary["ms_per_frame_max"] = float(result.ms_per_frame.max())
+    summary["total_s"] = float(result.ms_per_frame.sum()) / 1e3
+    return summary
+
+
+def compare_table(summary: Mapping[str, Any]) -> str:
+    """Markdown table, one row a mode, of ``{"sequence", "frames", "landmarks", "modes": {mode: summarise(...)}}``.
+
+    The number of landmarks may be None where it is not known (an archive does not hold the observations). Columns
+    without a value in any mode are left out; a value that is None is shown as a dash.
+    """
+    modes = summary["modes"]
+    columns = [column for column in _COLUMNS if any(values[column[0]] is not None for values in modes.values())]
+    landmarks = "" if summary["landmarks"] is None else f", {summary['landmarks']} landmarks"
+    lines = [
+        f"**{summary['sequence']}**: {summary['frames']} frames{landmarks}",
+        "",
+        "| mode | " + " | ".join(heading for _, heading, _ in columns) + " |",
+        "|---|" + "---:|" * len(columns),
+    ]
+    for mode, values in modes.items():
+        cells = ["-" if values[key] is None else format(values[key], spec) for key, _, spec in columns]
+        lines.append(f"| {mode} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"

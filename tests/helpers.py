@@ -1,0 +1,124 @@
+"""Synthetic recordings and results with known statistics, made without any filter.
+
+The vehicle drives a winding road among random landmarks. Dead reckoning is genuine (it integrates noisy velocities),
+the error of "full" is a scaled copy of it with equally scaled covariance: every NEES and NIS is honest by construction.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from ekfslam import camera, motion, se3
+from ekfslam.camera import StereoCamera
+from ekfslam.config import Config
+from ekfslam.result import REASONS, Innovation, Landmarks, Rejections, Result
+from ekfslam.sequence import Noise, Observations, Sequence, Truth
+
+CAMERA = StereoCamera(fu_px=700.0, fv_px=700.0, cu_px=600.0, cv_px=180.0, baseline_m=0.54)
+# IMU axes forward, left, up; camera axes right, down, forward.
+T_CAM_IMU = se3.transform(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, 0.3, -0.2]))
+NOISE = Noise.isotropic(0.3, 0.01, 1.0)
+STEP_S = 0.1
+FULL_SCALE = 0.1  # error of "full" over error of "dead-reckoning"
+
+
+def synthetic_sequence(frames: int = 200, landmarks: int = 300, seed: int = 0) -> Sequence:
+    """A recording with noisy velocities and true pixels; truth of all poses and landmarks."""
+    rng = np.random.default_rng(seed)
+    time_s = STEP_S * np.arange(frames)
+    twist = np.zeros((frames, 6))
+    twist[:, 0], twist[:, 5] = 8.0, 0.25 * np.sin(0.3 * time_s)
+    T_world_imu = np.stack(_integrate(twist))
+    frame = rng.integers(0, frames, landmarks)
+    offset = rng.uniform([5, -15, -1], [30, 15, 4], (landmarks, 3))
+    points = se3.apply(T_world_imu[frame], offset)
+    q = se3.apply(T_CAM_IMU @ se3.inverse(T_world_imu)[:, None], points)
+    seen_frame, seen_id = np.nonzero((q[..., 2] > 3) & (q[..., 2] < 40) & (np.abs(q[..., 0]) < 0.8 * q[..., 2]))
+    return Sequence(
+        name="winding road",
+        source="tests",
+        time_s=time_s,
+        twist=twist + NOISE.twist_std * rng.standard_normal((frames, 6)),
+        camera=CAMERA,
+        T_cam_imu=T_CAM_IMU,
+        observations=Observations(seen_frame, seen_id, camera.project(CAMERA, q[seen_frame, seen_id])),
+        truth=Truth(np.arange(frames), T_world_imu, np.arange(landmarks), points),
+        noise=NOISE,
+        notes=("made for a test",),
+        attributes={"seed": seed, "input_sha256": "0" * 64},
+    )
+
+
+def synthetic_result(sequence: Sequence, mode: str = "full", seed: int = 1) -> Result:
+    """A result as `mode` would leave it on a `synthetic_sequence`, its errors drawn from the covariances it states."""
+    rng = np.random.default_rng(seed)
+    frames, truth = len(sequence), sequence.truth
+    assert truth is not None
+    T_est, covariance = _integrate(sequence.twist), np.zeros((frames, 6, 6))
+    for k in range(1, frames):
+        F = motion.error_jacobian(motion.increment(sequence.twist[k], STEP_S))
+        covariance[k] = F @ covariance[k - 1] @ F.T + motion.process_noise(sequence.twist[k], STEP_S, NOISE.twist_std)
+    scale = FULL_SCALE if mode == "full" else 1.0
+    xi = scale * se3.log(se3.inverse(truth.T_world_imu) @ T_est)
+    zeros = np.zeros(frames, dtype=np.int64)
+    blank = Innovation(np.zeros(frames), zeros, zeros, zeros)
+    none = np.empty(0, dtype=np.int64)
+    result = Result(
+        mode=mode,
+        sequence_name=sequence.name,
+        time_s=sequence.time_s,
+        T_world_imu=truth.T_world_imu @ se3.exp(xi),
+        covariance=scale**2 * covariance,
+        landmarks=Landmarks.empty(),
+        innovation=blank,
+        rejections=Rejections(none, none, none),
+        ms_per_frame=rng.gamma(4.0, 0.5, frames),
+        counts={"accepted": 0},
+        config=dataclasses.asdict(Config()),
+        noise=NOISE,
+        attributes={**sequence.attributes, "version_ekfslam": "0.1.0"},
+    )
+    if mode == "dead-reckoning":
+        return result
+    accepted = np.bincount(sequence.observations.frame, minlength=frames)
+    rejected = rng.poisson(1.0, frames)
+    rejected_frame = np.repeat(np.arange(frames), rejected)
+    return dataclasses.replace(
+        result,
+        landmarks=_landmarks(sequence, truth, rng),
+        innovation=Innovation(
+            np.where(accepted > 0, rng.chisquare(np.maximum(3 * accepted, 1)), 0.0), 3 * accepted, accepted, rejected
+        ),
+        rejections=Rejections(
+            rejected_frame,
+            rng.choice(sequence.observations.ids, len(rejected_frame)),
+            rng.integers(0, len(REASONS), len(rejected_frame)),
+        ),
+        counts={"accepted": int(accepted.sum()), "rejected": int(rejected.sum())},
+    )
+
+
+def _integrate(twist: np.ndarray) -> np.ndarray:
+    poses = [np.eye(4)]
+    for u in twist[1:]:
+        poses.append(poses[-1] @ se3.exp(STEP_S * u))
+    return np.stack(poses)
+
+
+def _landmarks(sequence: Sequence, truth: Truth, rng: np.random.Generator) -> Landmarks:
+    """Landmarks scattered about their truth as stereo does it: long along the line of sight of the first view."""
+    ids, first, count = np.unique(sequence.observations.landmark, return_index=True, return_counts=True)
+    first_frame = sequence.observations.frame[first]
+    last_frame = np.array([sequence.observations.frame[sequence.observations.landmark == i].max() for i in ids])
+    T_cam_world = T_CAM_IMU @ se3.inverse(truth.T_world_imu[first_frame])
+    q = se3.apply(T_cam_world, truth.position_m[ids])
+    C = np.swapaxes(T_cam_world[:, :3, :3], 1, 2)
+    initial = C @ camera.triangulation_covariance(CAMERA, q, np.ones(3)) @ np.swapaxes(C, 1, 2)
+    covariance = initial / count[:, None, None]
+
+    def scatter(P: np.ndarray) -> np.ndarray:
+        return truth.position_m[ids] + (np.linalg.cholesky(P) @ rng.standard_normal((len(ids), 3, 1)))[..., 0]
+
+    return Landmarks(ids, scatter(covariance), covariance, scatter(initial), first_frame, last_frame, count)

@@ -1,0 +1,210 @@
+"""Result archives: exact round trip, and a named error for every way a file can be wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers import synthetic_result, synthetic_sequence
+
+from ekfslam import archive as archive_module
+from ekfslam import se3
+from ekfslam.archive import export_trajectory, open_result, read_archive, write_archive
+from ekfslam.errors import ArchiveError
+from ekfslam.result import ERROR_CONVENTION
+
+MODES = ("full", "dead-reckoning", "mapping-only")
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return synthetic_sequence(frames=40, landmarks=60)
+
+
+@pytest.fixture(scope="module")
+def results(sequence):
+    return {mode: synthetic_result(sequence, mode) for mode in MODES}
+
+
+@pytest.fixture(scope="module")
+def written(sequence, results, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("archive") / "result.h5"
+    write_archive(path, sequence, results)
+    return path
+
+
+@pytest.fixture
+def copy(written, tmp_path) -> Path:
+    return Path(shutil.copy(written, tmp_path / "copy.h5"))
+
+
+def assert_same(a, b, where: str = "") -> None:
+    """Equal bit for bit, in value and type, all through dataclasses, mappings and arrays."""
+    assert type(a) is type(b), where
+    if dataclasses.is_dataclass(a):
+        for f in dataclasses.fields(a):
+            assert_same(getattr(a, f.name), getattr(b, f.name), f"{where}.{f.name}")
+    elif isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_same(a[key], b[key], f"{where}[{key}]")
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype, where
+        np.testing.assert_array_equal(a, b, err_msg=where)
+    else:
+        assert a == b, where
+
+
+def test_results_come_back_bit_for_bit(written, results):
+    read = read_archive(written)
+    assert tuple(read.results) == MODES
+    for mode in MODES:
+        assert_same(read.results[mode], results[mode], mode)
+        assert_same(open_result(written, mode), results[mode], mode)
+
+
+def test_sequence_and_truth_come_back_bit_for_bit(written, sequence):
+    read = read_archive(written)
+    for name in ("name", "source", "time_s", "twist", "camera", "T_cam_imu", "truth", "noise", "notes", "attributes"):
+        assert_same(getattr(read, name), getattr(sequence, name), name)
+
+
+def test_sequence_without_truth_and_noise_comes_back_without(sequence, results, tmp_path):
+    bare = dataclasses.replace(sequence, truth=None, noise=None)
+    write_archive(tmp_path / "bare.h5", bare, results)
+    read = read_archive(tmp_path / "bare.h5")
+    assert read.truth is None
+    assert read.noise is None
+
+
+def test_every_data_set_states_units_and_frame(written):
+    names = []
+
+    def visit(name: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset):
+            names.append(name)
+            assert item.attrs["units"], name
+            assert item.attrs["frame"], name
+
+    with h5py.File(written) as h5file:
+        h5file.visititems(visit)
+        assert h5file.attrs["error_convention"] == ERROR_CONVENTION
+        assert h5file["runs/full/attributes"].attrs["seed"] == 0
+        assert h5file["runs/full/attributes"].attrs["version_ekfslam"] == "0.1.0"
+        assert "observations" not in h5file["sequence"]
+    assert {"truth/T_world_imu", "runs/full/trajectory/covariance", "runs/full/timing/ms_per_frame"} <= set(names)
+
+
+@pytest.mark.parametrize("item", [name for name, *_ in archive_module._LAYOUT] + ["attributes"])
+def test_missing_data_set_is_named(copy, item):
+    with h5py.File(copy, "a") as h5file:
+        del h5file[f"runs/full/{item}"]
+    with pytest.raises(ArchiveError, match=rf"copy\.h5.*runs/full/{item} is missing"):
+        read_archive(copy)
+    assert open_result(copy, "dead-reckoning").mode == "dead-reckoning", "other modes stay readable"
+
+
+@pytest.mark.parametrize("item", ["runs", "sequence/twist", "sequence/camera", "truth/T_world_imu", "sequence"])
+def test_missing_group_is_named(copy, item):
+    with h5py.File(copy, "a") as h5file:
+        del h5file[item]
+    with pytest.raises(ArchiveError, match=rf"copy\.h5.*{item}"):
+        read_archive(copy)
+
+
+@pytest.mark.parametrize("name", ["config", "counts", "noise_twist_std", "sequence_name"])
+def test_missing_attribute_is_named(copy, name):
+    with h5py.File(copy, "a") as h5file:
+        del h5file["runs/full"].attrs[name]
+    with pytest.raises(ArchiveError, match=rf"copy\.h5.*{name} of runs/full"):
+        open_result(copy, "full")
+
+
+def test_data_set_of_another_length_is_named(copy):
+    with h5py.File(copy, "a") as h5file:
+        group = h5file["runs/full/innovation"]
+        nis = group["nis"][:-1]
+        del group["nis"]
+        group["nis"] = nis
+    with pytest.raises(ArchiveError, match=r"runs/full/innovation/nis has shape \(39,\), expected \(40,\)"):
+        open_result(copy, "full")
+
+
+def test_unknown_mode_is_named_with_those_there_are(copy):
+    with h5py.File(copy, "a") as h5file:
+        del h5file["runs/full"]
+    with pytest.raises(ArchiveError, match=r"copy\.h5: runs/full is missing.*dead-reckoning, mapping-only"):
+        open_result(copy, "full")
+
+
+def test_newer_version_is_refused(copy):
+    with h5py.File(copy, "a") as h5file:
+        h5file.attrs["format_version"] = 2
+    with pytest.raises(ArchiveError, match=r"copy\.h5.*version 2.*up to version 1"):
+        read_archive(copy)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.999])
+def test_truncated_file_is_refused(copy, share):
+    content = copy.read_bytes()
+    copy.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ArchiveError, match=r"copy\.h5"):
+        read_archive(copy)
+
+
+def test_foreign_and_missing_files_are_refused(tmp_path):
+    text, hdf5 = tmp_path / "notes.h5", tmp_path / "other.h5"
+    text.write_text("not an archive")
+    h5py.File(hdf5, "w").close()
+    for path in (text, hdf5, tmp_path / "absent.h5", tmp_path):
+        with pytest.raises(ArchiveError, match=path.name):
+            read_archive(path)
+
+
+def test_interrupted_write_keeps_the_old_archive_and_leaves_no_scrap(copy, sequence, results, monkeypatch):
+    before = copy.read_bytes()
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(archive_module, "_write_result", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_archive(copy, sequence, results)
+    assert copy.read_bytes() == before
+    assert [p.name for p in copy.parent.iterdir()] == [copy.name]
+
+
+def test_rewriting_replaces_the_archive(copy, sequence, results):
+    write_archive(copy, sequence, {"full": results["full"]})
+    assert list(read_archive(copy).results) == ["full"]
+
+
+def test_writing_into_a_missing_folder_is_a_named_error(sequence, results, tmp_path):
+    with pytest.raises(ArchiveError, match=r"absent.result\.h5: cannot be written"):
+        write_archive(tmp_path / "absent" / "result.h5", sequence, results)
+    with pytest.raises(ArchiveError, match=r"absent.poses\.txt: cannot be written"):
+        export_trajectory(results["full"], tmp_path / "absent" / "poses.txt", "kitti")
+
+
+def test_tum_export_holds_stamps_positions_and_quaternions(results, tmp_path):
+    result = results["full"]
+    export_trajectory(result, tmp_path / "poses.txt", "tum")
+    rows = np.loadtxt(tmp_path / "poses.txt")
+    np.testing.assert_array_equal(rows[:, 0], result.time_s)
+    np.testing.assert_array_equal(rows[:, 1:4], result.T_world_imu[:, :3, 3])
+    # Rotation vector of a unit quaternion (x, y, z, w), by hand.
+    vector, w = rows[:, 4:7], rows[:, 7:]
+    sine = np.linalg.norm(vector, axis=1, keepdims=True)
+    theta = 2 * np.arctan2(sine, w) * vector / np.where(sine > 0, sine, 1)
+    np.testing.assert_allclose(se3.so3_exp(theta), result.T_world_imu[:, :3, :3], atol=1e-12)
+
+
+def test_kitti_export_holds_the_upper_rows_exactly(results, tmp_path):
+    result = results["full"]
+    export_trajectory(result, tmp_path / "poses.txt", "kitti")
+    rows = np.loadtxt(tmp_path / "poses.txt")
+    np.testing.assert_array_equal(rows.reshape(-1, 3, 4), result.T_world_imu[:, :3])

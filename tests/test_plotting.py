@@ -1,0 +1,228 @@
+"""Figures: geometry of ellipses, mapping of covariances into world, labels and units, files."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from helpers import synthetic_result, synthetic_sequence
+from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.figure import Figure
+
+from ekfslam import se3
+from ekfslam.plotting import (
+    ellipse_axes,
+    plot_errors,
+    plot_landmark_arrows,
+    plot_map,
+    plot_nis,
+    plot_trajectories,
+    save_figures,
+    world_error_covariance,
+)
+from ekfslam.result import Result
+
+MODES = ("dead-reckoning", "mapping-only", "full")
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return synthetic_sequence(frames=60, landmarks=80)
+
+
+@pytest.fixture(scope="module")
+def results(sequence) -> dict[str, Result]:
+    return {mode: synthetic_result(sequence, mode) for mode in MODES}
+
+
+def legend_texts(figure: Figure) -> str:
+    return " | ".join(text.get_text() for legend in figure.legends for text in legend.get_texts())
+
+
+def test_ellipse_outline_has_the_stated_mahalanobis_distance():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(50, 2, 2))
+    P = A @ np.swapaxes(A, 1, 2) + 1e-3 * np.eye(2)
+    long, short, angle = ellipse_axes(P, sigmas=2.0)
+    assert (long >= short).all()
+    for phase in np.linspace(0, 2 * np.pi, 7):
+        x, y = 0.5 * long * np.cos(phase), 0.5 * short * np.sin(phase)
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        e = np.stack([c * x - s * y, s * x + c * y], axis=-1)
+        distance = np.einsum("ni,nij,nj->n", e, np.linalg.inv(P), e)
+        np.testing.assert_allclose(distance, 4.0, rtol=1e-9)
+
+
+def test_ellipse_of_a_diagonal_covariance_lies_along_the_axes():
+    long, short, angle = ellipse_axes(np.diag([1.0, 9.0]), sigmas=2.0)
+    assert (long, short) == (pytest.approx(12.0), pytest.approx(4.0))
+    assert abs(angle) == pytest.approx(90.0)
+
+
+def test_world_error_covariance_is_that_of_sampled_errors(results):
+    result = results["full"]
+    k, rng = 50, np.random.default_rng(1)
+    P = 1e-4 * result.covariance[k]
+    R = np.linalg.cholesky(P)
+    T_imu_world = se3.inverse(result.T_world_imu[k])
+    T_world_imu = se3.inverse(se3.exp((R @ rng.standard_normal((40_000, 6, 1)))[..., 0]) @ T_imu_world)
+    position = T_world_imu[:, :3, 3] - result.T_world_imu[k, :3, 3]
+    rotation = se3.so3_log(T_world_imu[:, :3, :3] @ result.T_world_imu[k, :3, :3].T)
+    for sampled, covariance in zip((position, rotation), world_error_covariance(result), strict=True):
+        expected = 1e-4 * covariance[k]
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        np.testing.assert_allclose(np.cov(sampled.T) / scale, expected / scale, atol=0.03)
+
+
+@pytest.mark.parametrize("kind", ["map", "trajectories", "landmarks"])
+def test_views_from_above_have_equal_aspect_and_metres_on_their_axes(sequence, results, kind):
+    figure = {
+        "map": lambda: plot_map(results, sequence.truth),
+        "trajectories": lambda: plot_trajectories(results, sequence.truth),
+        "landmarks": lambda: plot_landmark_arrows(results["full"], sequence.truth),
+    }[kind]()
+    (ax,) = figure.axes
+    assert ax.get_aspect() == 1.0
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
+    assert "truth" in legend_texts(figure)
+    assert "winding road" in ax.get_title()
+
+
+def test_map_shows_every_mode_in_its_own_style_and_an_ellipse_for_what_fits(sequence, results):
+    figure = plot_map(results, sequence.truth)
+    (ax,) = figure.axes
+    styles = {
+        (line.get_color(), line.get_linestyle(), line.get_marker())
+        for line in ax.lines
+        if line.get_label() in (*MODES, "truth")
+    }
+    assert len(styles) == 4
+    assert len({style[0] for style in styles}) == 4
+    assert len({style[2] for style in styles}) == 4
+    ellipses = [c for c in ax.collections if isinstance(c, EllipseCollection)]
+    assert len(ellipses) == 1 + len(MODES)
+    landmarks = results["full"].landmarks
+    expected, _, _ = ellipse_axes(landmarks.covariance[:, :2, :2], 2.0)
+    drawn = expected <= 0.1 * np.hypot(np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()))
+    assert drawn.mean() > 0.8
+    np.testing.assert_array_equal(ellipses[0].get_offsets(), landmarks.position_m[drawn, :2])
+    np.testing.assert_allclose(ellipses[0].get_widths(), expected[drawn])
+    assert (f"{(~drawn).sum()} without ellipse" in legend_texts(figure)) == (~drawn).any()
+
+
+def test_map_works_without_truth_and_without_landmarks(results):
+    figure = plot_map({"dead-reckoning": results["dead-reckoning"]})
+    assert "truth" not in legend_texts(figure)
+    assert "landmarks" not in legend_texts(figure)
+
+
+@pytest.mark.parametrize("draw", ["map", "landmarks"])
+def test_far_outliers_do_not_decide_the_view_but_are_counted(results, draw):
+    full = results["full"]
+    position = full.landmarks.position_m.copy()
+    position[0] = [1e6, -1e6, 0]
+    result = dataclasses.replace(full, landmarks=dataclasses.replace(full.landmarks, position_m=position))
+    figure = plot_map({"full": result}) if draw == "map" else plot_landmark_arrows(result)
+    low, high = figure.axes[0].get_xlim()
+    path = full.T_world_imu[:, 0, 3]
+    assert low < path.min() < path.max() < high
+    assert high - low < 500
+    (x_low, x_high), (y_low, y_high) = figure.axes[0].get_xlim(), figure.axes[0].get_ylim()
+    x, y = position[:, :2].T
+    outside = int(((x < x_low) | (x > x_high) | (y < y_low) | (y > y_high)).sum())
+    assert outside >= 1
+    assert f"{outside} outside the view" in legend_texts(figure)
+
+
+def test_a_vehicle_that_stands_still_can_be_drawn(results):
+    full = results["full"]
+    still = dataclasses.replace(full, T_world_imu=np.tile(np.eye(4), (len(full.time_s), 1, 1)))
+    plot_trajectories({"full": still}).canvas.draw()
+
+
+def test_arrows_lead_from_first_to_final_estimate(results):
+    landmarks = results["full"].landmarks
+    (ax,) = plot_landmark_arrows(results["full"]).axes
+    (lines,) = (c for c in ax.collections if isinstance(c, LineCollection))
+    segments = {tuple(np.ravel(segment)) for segment in lines.get_segments()}
+    ends = np.hstack([landmarks.initial_position_m[:, :2], landmarks.position_m[:, :2]])
+    assert segments <= {tuple(row) for row in ends}
+    assert len(segments) > 0.8 * len(landmarks)
+
+
+def test_errors_show_estimate_minus_truth_within_three_sigma_in_world(sequence, results):
+    figure = plot_errors(results, sequence.truth)
+    axes = np.array(figure.axes).reshape(6, 2)
+    assert [ax.get_ylabel() for ax in axes[:, 0]] == [
+        *(f"position {axis} [m]" for axis in "xyz"),
+        *(f"rotation {axis} [deg]" for axis in "xyz"),
+    ]
+    assert axes[-1, 0].get_xlabel() == "time [s]"
+    assert axes[0, 0].get_title().startswith("dead-reckoning, mapping-only"), "the two share their trajectory"
+    assert axes[0, 1].get_title().startswith("full")
+    full = results["full"]
+    position_covariance, rotation_covariance = world_error_covariance(full)
+    lower, upper, error, _ = (line.get_ydata() for line in axes[1, 1].lines)
+    np.testing.assert_allclose(upper, 3 * np.sqrt(position_covariance[:, 1, 1]), rtol=1e-12)
+    np.testing.assert_allclose(lower, -upper)
+    np.testing.assert_allclose(error, full.T_world_imu[:, 1, 3] - sequence.truth.T_world_imu[:, 1, 3], atol=1e-12)
+    upper, error = (axes[5, 1].lines[i].get_ydata() for i in (1, 2))
+    np.testing.assert_allclose(upper, np.degrees(3 * np.sqrt(rotation_covariance[:, 2, 2])), rtol=1e-12)
+    # The vehicle turns about z alone, so the heading error is the rotation error about z to first order.
+    heading = [np.arctan2(T[:, 1, 0], T[:, 0, 0]) for T in (full.T_world_imu, sequence.truth.T_world_imu)]
+    np.testing.assert_allclose(error, np.degrees(heading[0] - heading[1]), atol=2e-3)
+
+
+def test_errors_take_truth_of_some_frames(sequence, results):
+    truth = dataclasses.replace(
+        sequence.truth, frame=sequence.truth.frame[::7], T_world_imu=sequence.truth.T_world_imu[::7]
+    )
+    ax = plot_errors({"full": results["full"]}, truth).axes[0]
+    np.testing.assert_allclose(ax.lines[2].get_xdata(), sequence.time_s[::7])
+
+
+def test_nis_says_how_many_frames_are_inside_their_bounds(results):
+    figure = plot_nis(results)
+    assert len(figure.axes) == 2, "dead reckoning has no innovation"
+    assert figure.axes[0].get_ylabel() == "NIS per dof [-]"
+    assert figure.axes[-1].get_xlabel() == "time [s]"
+    title = figure.axes[1].get_title()
+    assert title.startswith("full: ")
+    share = float(title.split()[1])
+    assert 85 < share <= 100
+    innovation = results["full"].innovation
+    overconfident = dataclasses.replace(
+        results["full"], innovation=dataclasses.replace(innovation, nis=9 * innovation.nis)
+    )
+    assert float(plot_nis({"full": overconfident}).axes[0].get_title().split()[1]) < 5
+    with pytest.raises(ValueError, match="no mode"):
+        plot_nis({"dead-reckoning": results["dead-reckoning"]})
+
+
+def test_files_are_written_and_small(sequence, results, tmp_path):
+    paths = save_figures(tmp_path / "new" / "folder", results, sequence.truth)
+    assert [path.name for path in paths] == [
+        "map.png",
+        "errors.png",
+        "nis.png",
+        "landmarks_mapping-only.png",
+        "landmarks_full.png",
+    ]
+    for path in paths:
+        assert path.read_bytes().startswith(b"\x89PNG")
+        assert 5_000 < path.stat().st_size < 400_000, path.name
+
+
+def test_only_figures_with_content_are_written(results, tmp_path):
+    paths = save_figures(tmp_path, {"dead-reckoning": results["dead-reckoning"]})
+    assert [path.name for path in paths] == ["map.png"]
+
+
+def test_drawing_leaves_no_global_state_behind(sequence, results):
+    before = dict(mpl.rcParams)
+    plot_map(results, sequence.truth)
+    assert dict(mpl.rcParams) == before
+    assert plt.get_fignums() == []
