@@ -131,22 +131,22 @@ class Config:
         Raises:
             ConfigError: An unknown table or key, or a value of the wrong type or range.
         """
-        tables = {"noise": self.noise, "filter": self.filter}
+        tables: dict[str, NoiseConfig | FilterConfig] = {"noise": self.noise, "filter": self.filter}
         for table, values in overrides.items():
             if table not in tables:
                 raise ConfigError(f"unknown table [{table}]; known: {', '.join(tables)}")
             if not isinstance(values, Mapping):
                 raise ConfigError(f"[{table}] must be a table, found {values!r}")
-            known = {f.name: f for f in dataclasses.fields(tables[table])}
+            known = [f.name for f in dataclasses.fields(tables[table])]
             for key, value in values.items():
                 if key not in known:
                     raise ConfigError(f"unknown key {table}.{key}; known: {', '.join(known)}")
-                wanted: type | tuple[type, ...] = str if key in ("variant", "retire") else (int, float)
-                if value is not None and (isinstance(value, bool) or not isinstance(value, wanted)):
-                    kind = "a string" if wanted is str else "a number"
-                    raise ConfigError(f"{table}.{key} must be {kind}, found {value!r}")
+                is_text = key in ("variant", "retire")
+                wanted = isinstance(value, str if is_text else (int, float)) and not isinstance(value, bool)
+                if value is not None and not wanted:
+                    raise ConfigError(f"{table}.{key} must be a {'string' if is_text else 'number'}, found {value!r}")
             given = {key: value for key, value in values.items() if value is not None}
-            tables[table] = dataclasses.replace(tables[table], **given)  # type: ignore[type-var]
+            tables[table] = dataclasses.replace(tables[table], **given)
         return Config(**tables)  # type: ignore[arg-type]
 
     @staticmethod

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as SequenceType
+from collections.abc import Iterable
 
 
 class EkfslamError(Exception):
@@ -93,7 +93,7 @@ class InnovationError(FilterError):
         ids: Landmark ids whose blocks of S are not positive definite (all observed ones if only the whole is not).
     """
 
-    def __init__(self, frame: int, ids: SequenceType[int]) -> None:
+    def __init__(self, frame: int, ids: Iterable[int]) -> None:
         self.frame, self.ids = frame, tuple(int(i) for i in ids)
         shown = ", ".join(map(str, self.ids[:8])) + (", ..." if len(self.ids) > 8 else "")
         super().__init__(

@@ -282,11 +282,11 @@ def save_figures(directory: str | Path, results: Mapping[str, Result], truth: Tr
     paths = []
     for name, figure in figures.items():
         paths.append(directory / f"{name}.png")
-        _save_png(figure, paths[-1])
+        save_figure(figure, paths[-1])
     return paths
 
 
-def _save_png(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure with a palette of 256 colours: a third of the size or less, without a visible difference."""
     # The default median cut sacrifices rare colours, here a thin trajectory; this method keeps all within 15 of 255.
     buffer = BytesIO()

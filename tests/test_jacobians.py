@@ -144,7 +144,7 @@ def test_three_rectified_rows_carry_what_four_pixels_carry():
 
 
 def test_triangulation_is_the_least_squares_point():
-    pixels = cam.project(CAMERA, np.array([[1.0, -0.5, 9.0]])) + [[0.3, 0.4, -0.2, -0.1]]
+    pixels = cam.project(CAMERA, np.array([[1.0, -0.5, 9.0]])) + np.array([0.3, 0.4, -0.2, -0.1])
     q, covariance = triangulate_least_squares(CAMERA, pixels[0], 0.9)
     z, variance = cam.rectified_rows(pixels, np.full(4, 0.9))
     found = cam.triangulate(CAMERA, z)

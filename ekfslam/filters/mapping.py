@@ -60,7 +60,9 @@ def map_landmarks(
     gate, variance = config.gate, np.diag(rig.variance_px2)
 
     def estimate(which: IntArray) -> Landmarks:
-        return Landmarks(*(a[which] for a in (ids, position, covariance, initial, first, last, count)))
+        return Landmarks(
+            ids[which], position[which], covariance[which], initial[which], first[which], last[which], count[which]
+        )
 
     reports: list[FrameReport] = []
     ms: list[float] = []

@@ -79,8 +79,8 @@ def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> 
     try:
         L = np.linalg.cholesky(S)
     except np.linalg.LinAlgError:
-        broken = ~np.isfinite(S).all(axis=(1, 2))
-        smallest = np.linalg.eigvalsh(np.where(broken[:, None, None], 0.0, S))[:, 0]
+        finite = np.isfinite(S).all(axis=(1, 2), keepdims=True)
+        smallest = np.linalg.eigvalsh(np.where(finite, S, 0.0))[:, 0]
         raise InnovationError(frame, ids[smallest <= 0]) from None
     whitened = np.linalg.solve(L, residual[..., None])[..., 0]
     return np.einsum("ni,ni->n", whitened, whitened)

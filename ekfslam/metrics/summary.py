@@ -18,8 +18,8 @@ from ekfslam.metrics.trajectory import (
 from ekfslam.result import Result
 from ekfslam.sequence import Sequence
 
-# Key of a summary, heading in the table, format of the value.
-_COLUMNS = (
+# Key of a summary, heading of its row in the table, format of the value.
+_ROWS = (
     ("ate_m", "ATE [m]", ".3f"),
     ("ate_aligned_m", "ATE aligned [m]", ".3f"),
     ("final_error_m", "final error [m]", ".3f"),
@@ -44,7 +44,7 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
     covariance is not singular, ``nis_per_dof`` (1 expected) is the sum of NIS over the sum of degrees of freedom,
     ``total_s`` the sum of the time spent on the frames. None stands where truth is missing or the value is undefined.
     """
-    summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _COLUMNS)
+    summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _ROWS)
     truth = sequence.truth
     if truth is not None:
         summary["landmark_rmse_m"] = landmark_rmse(result.landmarks, truth)
@@ -71,21 +71,23 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
 
 
 def compare_table(summary: Mapping[str, Any]) -> str:
-    """Markdown table, one row a mode, of ``{"sequence", "frames", "landmarks", "modes": {mode: summarise(...)}}``.
+    """Markdown table, one column a mode, of ``{"sequence", "frames", "landmarks", "modes": {mode: summarise(...)}}``.
 
-    The number of landmarks may be None where it is not known (an archive does not hold the observations). Columns
-    without a value in any mode are left out; a value that is None is shown as a dash.
+    Rows without a value in any mode are left out; a value that is None is shown as a dash. Cells are padded, so that
+    the table reads as well on a terminal.
     """
     modes = summary["modes"]
-    columns = [column for column in _COLUMNS if any(values[column[0]] is not None for values in modes.values())]
-    landmarks = "" if summary["landmarks"] is None else f", {summary['landmarks']} landmarks"
+    rows = [["", *modes]]
+    for key, heading, spec in _ROWS:
+        values = [mode[key] for mode in modes.values()]
+        if any(value is not None for value in values):
+            rows.append([heading, *("-" if value is None else format(value, spec) for value in values)])
+    widths = [max(4, *map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
-        f"**{summary['sequence']}**: {summary['frames']} frames{landmarks}",
-        "",
-        "| mode | " + " | ".join(heading for _, heading, _ in columns) + " |",
-        "|---|" + "---:|" * len(columns),
+        f"| {row[0]:<{widths[0]}} | " + " | ".join(f"{c:>{w}}" for c, w in zip(row[1:], widths[1:], strict=True)) + " |"
+        for row in rows
     ]
-    for mode, values in modes.items():
-        cells = ["-" if values[key] is None else format(values[key], spec) for key, _, spec in columns]
-        lines.append(f"| {mode} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    rule = f"|{'-' * (widths[0] + 2)}|" + "".join(f"{'-' * (w + 1)}:|" for w in widths[1:])
+    landmarks = "" if summary["landmarks"] is None else f", {summary['landmarks']} landmarks"
+    title = f"**{summary['sequence']}**: {summary['frames']} frames{landmarks}"
+    return "\n".join([title, "", lines[0], rule, *lines[1:]]) + "\n"

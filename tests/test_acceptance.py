@@ -1,0 +1,72 @@
+"""What the whole system promises, on the embedded worlds and on the recordings."""
+
+import numpy as np
+import pytest
+
+from ekfslam import Config, open_sequence, run
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.observing import Rig
+from ekfslam.metrics.summary import summarise
+
+# What the dense, noisy edition of the recordings had added to its velocities.
+NOISY = Config().with_overrides({"noise": {"sigma_v_m_s": 0.5, "sigma_w_rad_s": 0.05, "sigma_px": 2.0}})
+
+
+@pytest.fixture(scope="module")
+def city():
+    sequence = open_sequence("builtin:city")
+    return {mode: summarise(sequence, run(sequence, mode)) for mode in ("dead-reckoning", "mapping-only", "full")}
+
+
+def test_full_slam_beats_dead_reckoning_and_mapping_only_on_the_city(city):
+    assert city["dead-reckoning"]["ate_m"] > 5 * city["full"]["ate_m"]
+    assert city["mapping-only"]["landmark_rmse_m"] > 3 * city["full"]["landmark_rmse_m"]
+
+
+def test_innovations_on_the_city_are_white_despite_outliers(city):
+    """The mean of NIS per degree of freedom over some 5e4 of them is 1 within a few percent."""
+    assert abs(city["full"]["nis_per_dof"] - 1) < 0.03
+
+
+def test_loop_keeps_its_landmarks_and_closes_the_loop():
+    sequence = open_sequence("builtin:loop")
+    result = run(sequence, "full")
+    assert result.config["filter"]["retire"] == "never"
+    assert result.counts["reappeared"] == 0
+    assert summarise(sequence, result)["final_error_m"] < 0.2
+
+
+def test_state_stays_as_small_as_the_view():
+    """The cost of a frame depends on what is seen, not on what has been seen."""
+    sequence = open_sequence("builtin:city?frames=300")
+    config = Config().resolved(sequence).filter
+    ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, sequence.noise), config, sequence.initial_T_world_imu)
+    for k in range(len(sequence)):
+        if k:
+            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
+        ids, pixels = sequence.observations.at(k)
+        ekf.update(k, ids, pixels)
+        assert set(ekf.ids.tolist()) <= set(ids.tolist())
+    assert len(ekf.landmarks()) > 4 * len(ekf.ids)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("variant", ["invariant", "standard"])
+@pytest.mark.parametrize(("name", "frames"), [("0027", 1106), ("0020", 1104)])
+def test_retired_and_never_retired_agree_on_the_recordings(data_path, name, frames, variant):
+    sequence = open_sequence(data_path(f"ece276a/{name}.npz"))
+    assert len(sequence) == frames
+    base = Config().with_overrides({"filter": {"variant": variant}})
+    unseen, never = (
+        run(sequence, "full", base.with_overrides({"filter": {"retire": retire}})) for retire in ("unseen", "never")
+    )
+    np.testing.assert_allclose(unseen.T_world_imu, never.T_world_imu, atol=1e-9)
+    assert unseen.counts["retired"] > never.counts["retired"]
+
+
+@pytest.mark.data
+def test_dense_noisy_recording_gains_threefold_over_dead_reckoning(data_path):
+    truth = data_path("kitti_odometry_poses/07.txt")
+    sequence = open_sequence(data_path("ece276a/0027_dense_noisy.npz"), truth=truth)
+    reckoned, full = (summarise(sequence, run(sequence, mode, NOISY)) for mode in ("dead-reckoning", "full"))
+    assert reckoned["ate_m"] > 3 * full["ate_m"]

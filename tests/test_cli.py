@@ -1,0 +1,204 @@
+"""The command line as a user meets it: what it writes, and one clear line with exit code 2 for every mistake."""
+
+import json
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+from recordings import ece276a_fields, utias_fields, write_mat, write_npz
+
+from ekfslam.archive import read_archive
+from ekfslam.cli import main
+from ekfslam.readers import open_sequence
+
+CITY = "builtin:city?frames=40"
+SUMMARY_KEYS = {
+    "ate_m",
+    "ate_aligned_m",
+    "final_error_m",
+    "t_rel_percent",
+    "r_rel_deg_per_100m",
+    "ms_per_frame_median",
+    "ms_per_frame_max",
+    "total_s",
+    "accepted",
+    "rejected",
+    "nis_per_dof",
+    "pose_nees_mean",
+    "landmark_rmse_m",
+}
+
+
+def failure(capsys, *arguments):
+    """The one line that a mistaken call prints; exit code 2 and no traceback asserted."""
+    try:
+        code = main([str(a) for a in arguments])
+    except SystemExit as stop:  # argparse's own errors
+        code = stop.code
+    captured = capsys.readouterr()
+    assert code == 2
+    assert "Traceback" not in captured.err
+    return captured.err.strip().splitlines()[-1]
+
+
+def test_compare_writes_archive_summaries_and_figures(tmp_path, capsys):
+    assert main(["compare", CITY, "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "| ATE [m]" in printed
+    folder = tmp_path / "city"
+    names = {path.name for path in folder.iterdir()}
+    assert {"archive.h5", "summary.json", "summary.md", "map.png", "errors.png", "nis.png"} <= names
+    summary = json.loads((folder / "summary.json").read_text())
+    assert {"sequence", "frames", "landmarks", "modes"} == set(summary)
+    assert summary["frames"] == 40
+    assert list(summary["modes"]) == ["dead-reckoning", "mapping-only", "full"]
+    assert all(set(values) == SUMMARY_KEYS for values in summary["modes"].values())
+    assert list(read_archive(folder / "archive.h5").results) == list(summary["modes"])
+
+
+def test_recordings_of_one_name_do_not_overwrite_each_other(tmp_path):
+    assert main(["compare", CITY, CITY, "--modes", "dead-reckoning", "--out", str(tmp_path)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"city", "city-2"}
+
+
+def test_simulate_run_info_plot_export_go_hand_in_hand(tmp_path, capsys):
+    recording, archive = tmp_path / "city.h5", tmp_path / "deep" / "run.h5"
+    assert main(["simulate", CITY, "--out", str(recording)]) == 0
+    assert main(["run", str(recording), "--mode", "full", "--variant", "standard", "--out", str(archive)]) == 0
+    with h5py.File(archive) as h5file:
+        assert json.loads(h5file["runs/full"].attrs["config"])["filter"]["variant"] == "standard"
+    capsys.readouterr()
+    assert main(["info", str(recording)]) == 0
+    assert "40 in 3.9 s" in capsys.readouterr().out
+    assert main(["info", str(archive)]) == 0
+    assert "accepted" in capsys.readouterr().out
+    assert main(["plot", str(archive), "--out", str(tmp_path / "figures")]) == 0
+    assert (tmp_path / "figures" / "map.png").stat().st_size > 5000
+    assert main(["export", str(archive), "--format", "tum"]) == 0
+    tum = np.loadtxt(tmp_path / "deep" / "run.full.tum.txt")
+    assert tum.shape == (40, 8)
+    assert main(["export", str(archive), "--format", "kitti", "--out", str(tmp_path / "k.txt")]) == 0
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "k.txt")[:, 3::4], tum[:, 1:4], atol=1e-12)
+
+
+def test_the_simulated_file_gives_the_builtin_s_result_to_the_last_bit(tmp_path):
+    recording = tmp_path / "city.h5"
+    main(["simulate", CITY, "--out", str(recording)])
+    for source, out in ((str(recording), "a.h5"), (CITY, "b.h5")):
+        main(["run", source, "--out", str(tmp_path / out)])
+    a, b = (read_archive(tmp_path / name).results["full"] for name in ("a.h5", "b.h5"))
+    np.testing.assert_array_equal(a.T_world_imu, b.T_world_imu)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
+    config = tmp_path / "config.toml"
+    config.write_text('[noise]\nsigma_px = 2.0\n[filter]\nvariant = "standard"\n')
+    out = tmp_path / "run.h5"
+    assert main(["run", CITY, "--config", str(config), "--sigma-px", "3", "--out", str(out)]) == 0
+    result = read_archive(out).results["full"]
+    np.testing.assert_array_equal(result.noise.pixel_std_px, 3.0)
+    assert result.config["filter"]["variant"] == "standard"
+    assert result.config["filter"]["gate_probability"] == 0.999
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"time_stamps": lambda a: a[:, ::-1]}, ("time_stamps", "before")),
+        ({"time_stamps": lambda a: np.where(np.arange(a.size) == 3, a[0, 2], a)}, ("time_stamps[3]", "duplicates")),
+        ({"linear_velocity": lambda a: np.where(np.arange(a.shape[1]) == 2, np.nan, a)}, ("linear_velocity", "NaN")),
+        ({"features": lambda a: np.where(a > 900, np.inf, a)}, ("features", "infinite")),
+        ({"features": lambda a: a[:3]}, ("features", "shape")),
+        ({"features": lambda a: np.full_like(a, -1.0)}, ("features", "never seen")),
+        ({"K": lambda a: np.diag([0.0, 1, 1])}, ("K", "singular")),
+        ({"b": lambda a: -a}, ("b", "positive")),
+        ({"cam_T_imu": lambda a: 2 * a}, ("cam_T_imu", "rigid")),
+        ({"rotational_velocity": lambda a: a[:, :-1]}, ("rotational_velocity", "shape")),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)
+def test_malformed_recordings_are_one_line_with_file_and_field(tmp_path, capsys, change, words):
+    fields = ece276a_fields()
+    for name, alter in change.items():
+        fields[name] = alter(fields[name])
+    line = failure(capsys, "info", write_npz(tmp_path / "broken.npz", fields))
+    assert "broken.npz" in line
+    for word in words:
+        assert word in line
+
+
+def test_truth_of_another_length(tmp_path, capsys):
+    npz = write_npz(tmp_path / "a.npz", ece276a_fields())
+    poses = tmp_path / "poses.txt"
+    np.savetxt(poses, np.tile(np.eye(4)[:3].ravel(), (3, 1)))
+    line = failure(capsys, "compare", npz, "--truth", poses, "--out", tmp_path)
+    assert "poses.txt" in line
+    assert "3" in line
+    assert "7" in line
+    fields = utias_fields()
+    fields["theta_vk_i"] = fields["theta_vk_i"][:, :-2]
+    assert "theta_vk_i" in failure(capsys, "info", write_mat(tmp_path / "a.mat", fields))
+
+
+@pytest.mark.parametrize("command", ["info", "compare", "run", "plot", "export"])
+@pytest.mark.parametrize("kind", ["missing", "folder", "empty", "text", "truncated", "foreign"])
+def test_files_that_are_none_of_ours(tmp_path, capsys, command, kind):
+    path = tmp_path / "thing"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "empty":
+        path.touch()
+    elif kind == "text":
+        path.write_text("no recording\n")
+    elif kind == "truncated":
+        main(["simulate", CITY, "--out", str(path)])
+        path.write_bytes(path.read_bytes()[:2000])
+    elif kind == "foreign":
+        with h5py.File(path, "w") as h5file:
+            h5file["x"] = 1.0
+    extra = {"run": ["--out", tmp_path / "o.h5"], "compare": ["--out", tmp_path], "export": ["--format", "tum"]}
+    line = failure(capsys, command, path, *extra.get(command, []))
+    assert "thing" in line
+
+
+def test_mistakes_in_the_call(tmp_path, capsys):
+    assert "atlantis" in failure(capsys, "compare", "builtin:atlantis", "--out", tmp_path)
+    assert "no.toml" in failure(capsys, "run", CITY, "--config", tmp_path / "no.toml", "--out", tmp_path / "o.h5")
+    assert "sigma_px" in failure(capsys, "run", CITY, "--sigma-px", "0", "--out", tmp_path / "o.h5")
+    assert "invalid choice" in failure(capsys, "run", CITY, "--mode", "best", "--out", tmp_path / "o.h5")
+    assert "one by one" in failure(capsys, "compare", CITY, CITY, "--truth", tmp_path / "t.txt", "--out", tmp_path)
+    (tmp_path / "file").touch()
+    assert "file" in failure(capsys, "run", CITY, "--out", tmp_path / "file" / "o.h5")
+    main(["run", CITY, "--mode", "dead-reckoning", "--out", str(tmp_path / "o.h5")])
+    capsys.readouterr()
+    assert "full" in failure(capsys, "export", tmp_path / "o.h5", "--format", "tum", "--mode", "full")
+    # A result archive holds no observations to run on.
+    assert "ekfslam-archive" in failure(capsys, "run", tmp_path / "o.h5", "--out", tmp_path / "p.h5")
+
+
+def test_as_an_installed_command(tmp_path):
+    """A real process: exit code, silence of the progress bar off a terminal, and output that survives `head`."""
+    program = [sys.executable, "-m", "ekfslam.cli"]
+    done = subprocess.run([*program, "info", "nowhere.npz"], capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
+    done = subprocess.run([*program, "run", CITY, "--out", "o.h5"], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    helped = subprocess.run([*program, "compare", "--help"], capture_output=True, text=True, check=True).stdout
+    assert "examples:" in helped
+    piped = subprocess.run(
+        f"{sys.executable} -m ekfslam.cli info {CITY!r} | head -n 1", shell=True, capture_output=True, text=True
+    )
+    assert piped.stderr == ""
+
+
+def test_info_of_a_recording_lists_what_the_reader_noticed(tmp_path, capsys):
+    npz = write_npz(tmp_path / "a.npz", ece276a_fields())
+    assert main(["info", str(npz)]) == 0
+    printed = capsys.readouterr().out
+    for note in open_sequence(npz).notes:
+        assert note in printed
