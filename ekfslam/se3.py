@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _SERIES_LIMIT = 2.0  # below this theta^2 the power series is both accurate and cheap
-_SERIES_TERMS = 13  # 2^13 / (2*13+4)! < 1e-28
-_SERIES = tuple((1.0 / factorial(2 * n + 4), 1.0 / factorial(2 * n + 5)) for n in reversed(range(_SERIES_TERMS)))
+_SERIES_TERMS = 10  # the first one left out is 2^10 / 24! < 1e-20
+_SERIES = [np.array([1.0 / factorial(2 * n + k) for k in (4, 5)]) for n in reversed(range(_SERIES_TERMS))]
 
 
 def phis(theta_squared: Array) -> tuple[Array, ...]:
@@ -33,10 +33,10 @@ def phis(theta_squared: Array) -> tuple[Array, ...]:
     """
     x = np.asarray(theta_squared, dtype=float)
     small = np.minimum(x, _SERIES_LIMIT)
-    phi_4, phi_5 = np.zeros_like(small), np.zeros_like(small)
-    for coefficient_4, coefficient_5 in _SERIES:
-        phi_4 = coefficient_4 - small * phi_4
-        phi_5 = coefficient_5 - small * phi_5
+    both = np.zeros((*small.shape, 2))
+    for coefficients in _SERIES:
+        both = coefficients - small[..., None] * both
+    phi_4, phi_5 = both[..., 0], both[..., 1]
     phi_2, phi_3 = 0.5 - small * phi_4, 1.0 / 6.0 - small * phi_5
     series = (1.0 - small * phi_2, 1.0 - small * phi_3, phi_2, phi_3, phi_4, phi_5)
     if (x <= _SERIES_LIMIT).all():
@@ -65,16 +65,19 @@ def _angle_squared(theta: Array) -> Array:
 
 def so3_exp(theta: Array) -> Array:
     """Rotation matrix of a rotation vector (Rodrigues): (..., 3) rad to (..., 3, 3)."""
-    return _rotation_and_jacobian(theta)[0]
+    return so3_exp_and_left_jacobian(theta)[0]
 
 
 def so3_left_jacobian(theta: Array) -> Array:
     """``J_l`` with ``exp((theta + d)^) ~ exp((J_l d)^) exp(theta^)``: (..., 3) to (..., 3, 3)."""
-    return _rotation_and_jacobian(theta)[1]
+    return so3_exp_and_left_jacobian(theta)[1]
 
 
-def _rotation_and_jacobian(theta: Array) -> tuple[Array, Array]:
-    """``I + phi_1 theta^ + phi_2 theta^ theta^`` and ``I + phi_2 theta^ + phi_3 theta^ theta^``."""
+def so3_exp_and_left_jacobian(theta: Array) -> tuple[Array, Array]:
+    """`so3_exp` and `so3_left_jacobian` at the price of one: (..., 3) to (..., 3, 3) twice.
+
+    ``I + phi_1 theta^ + phi_2 theta^ theta^`` and ``I + phi_2 theta^ + phi_3 theta^ theta^``.
+    """
     theta = np.asarray(theta, dtype=float)
     _, phi_1, phi_2, phi_3, _, _ = phis(_angle_squared(theta))
     w = skew(theta)
@@ -152,7 +155,7 @@ def hat(xi: Array) -> Array:
 def exp(xi: Array) -> Array:
     """Exponential of a tangent vector ``[rho; theta]``: (..., 6) to (..., 4, 4)."""
     xi = np.asarray(xi, dtype=float)
-    R, J = _rotation_and_jacobian(xi[..., 3:])
+    R, J = so3_exp_and_left_jacobian(xi[..., 3:])
     return transform(R, (J @ xi[..., :3, None])[..., 0])
 
 

@@ -7,10 +7,12 @@ landmark, the prediction touches the pose rows and columns alone, and a frame is
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
 from ekfslam import camera as cam
@@ -29,10 +31,30 @@ from ekfslam.filters.observing import (
     normalised_squares,
     screen,
 )
+from ekfslam.filters.symmetric import add_square
 from ekfslam.filters.variants import retract_invariant, retract_standard, transport_invariant
 from ekfslam.result import Landmarks
 from ekfslam.se3 import Array
 from ekfslam.sequence import IntArray, Sequence
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Measurement rows of k landmarks: their place in the state (k,), both blocks of H, and the residuals (k, 3)."""
+
+    slot: IntArray
+    H_x: Array
+    H_m: Array
+    residual: Array
+
+    def only(self, which: NDArray[np.bool_]) -> _Rows:
+        return _Rows(self.slot[which], self.H_x[which], self.H_m[which], self.residual[which])
+
+    def corrected(self, correction: Array) -> _Rows:
+        """The rows with the residuals ``r - H (xi, d)`` that a correction (6+3n,) leaves."""
+        d = correction[6:].reshape(-1, 3)[self.slot]
+        residual = self.residual - self.H_x @ correction[:6] - (self.H_m @ d[..., None])[..., 0]
+        return replace(self, residual=residual)
 
 
 class JointEKF:
@@ -53,7 +75,7 @@ class JointEKF:
 
     def __init__(self, rig: Rig, config: FilterConfig, T_world_imu: Array) -> None:
         self.rig, self.config = rig, config
-        self._gate, self._variance = config.gate, rig.variance_px2
+        self._gate = config.gate
         self.T_imu_world = se3.inverse(T_world_imu)
         self.P = config.initial_covariance
         self.positions_m = np.empty((0, 3))
@@ -156,80 +178,71 @@ class JointEKF:
         return sp.csr_array(sp.block_diag([F, sp.identity(len(self.P) - 6)]))
 
     def _correct(self, frame: int, slot: IntArray, rows_px: Array) -> tuple[float, int, IntArray]:
-        """Eq. (6) and the variant's retraction, for the landmarks at ``slot`` seen at ``rows_px``."""
+        """Eq. (6) with its gates and the variant's retraction, for the landmarks at ``slot`` (k,) seen at ``rows_px``.
+
+        A landmark must agree with the prediction, and with the prediction as corrected by all *other* landmarks of the
+        frame: the first gate is weak while the pose itself is uncertain, the second is not. What the second rejects has
+        been used already, and is taken out again.
+
+        Returns:
+            NIS of what was accepted, its degrees of freedom, and the verdict (k,) on each landmark.
+        """
         verdict = np.full(len(slot), ACCEPTED)
-        rig = self.rig
+        rig, V = self.rig, np.diag(self.rig.variance_px2)
         q, H_x, H_m = cam.landmark_jacobians(rig.camera, rig.T_cam_imu, self.T_imu_world, self.positions_m[slot])
         verdict[q[:, 2] <= self.config.min_depth_m] = BEHIND_CAMERA
-        keep = np.flatnonzero(verdict == ACCEPTED)
-        if len(keep) == 0:
-            return 0.0, 0, verdict
-        q, H_x, H_m = q[keep], H_x[keep], H_m[keep]
-        residual = rows_px[keep] - cam.project(rig.camera, q)[:, :3]
-        HP, S = self._project(slot[keep], H_x, H_m)
-        S.ravel()[:: len(S) + 1] += np.tile(self._variance, len(keep))
+        some = np.flatnonzero(verdict == ACCEPTED)
+        rows = _Rows(slot[some], H_x[some], H_m[some], rows_px[some] - cam.project(rig.camera, q[some])[:, :3])
 
-        k = np.arange(len(keep))
-        marginal = S.reshape(len(k), 3, len(k), 3)[k, :, k, :]
-        inside = normalised_squares(marginal, residual, frame, self.ids[slot[keep]]) <= self._gate
-        verdict[keep[~inside]] = GATE
-        if not inside.any():
+        ids = self.ids[rows.slot]
+        inside = normalised_squares(self._variances(rows) + V, rows.residual, frame, ids) <= self._gate
+        verdict[some[~inside]] = GATE
+        some, rows = some[inside], rows.only(inside)
+        if len(some) == 0:
             return 0.0, 0, verdict
-        if not inside.all():
-            row = np.flatnonzero(np.repeat(inside, 3))
-            HP, S, residual, H_x, H_m = HP[row], S[row][:, row], residual[inside], H_x[inside], H_m[inside]
-            keep = keep[inside]
 
-        Y_transposed, whitened = _whiten(S, HP, residual, frame, self.ids[slot[keep]])
-        self.P -= Y_transposed @ Y_transposed.T
+        HP, S = self._project(rows)
+        S.ravel()[:: len(S) + 1] += np.tile(rig.variance_px2, len(some))
+        Y_transposed, whitened = _whiten(S, HP, rows.residual, frame, self.ids[rows.slot])
+        add_square(self.P, Y_transposed, -1.0)
         correction, nis = Y_transposed @ whitened, whitened @ whitened
-        inside = self._conditional_squares(slot[keep], H_x, H_m, residual, correction, frame) <= self._gate
-        if not inside.all():
-            verdict[keep[~inside]] = GATE
-            # Taking observations out again is an update with noise -V: P + P H^T (V - H P H^T)^-1 H P.
-            out = ~inside
-            left_over = self._left_over(slot[keep[out]], H_x[out], H_m[out], residual[out], correction)
-            HP, C = self._project(slot[keep[out]], H_x[out], H_m[out])
-            C = np.diag(np.tile(self._variance, len(HP) // 3)) - C
-            Y_transposed, whitened = _whiten(C, HP, left_over, frame, self.ids[slot[keep[out]]])
-            self.P += Y_transposed @ Y_transposed.T
-            correction, nis = correction - Y_transposed @ whitened, nis - whitened @ whitened
-        self._retract(correction[:6], correction[6:].reshape(-1, 3))
-        return float(nis), 3 * int(inside.sum()), verdict
 
-    def _project(self, slot: IntArray, H_x: Array, H_m: Array) -> tuple[Array, Array]:
-        """``H P`` (3k, 6+3n) and ``H P H^T`` (3k, 3k) from the two blocks of each landmark's rows."""
-        k, size = len(slot), len(self.P)
-        H_pose = H_x.reshape(3 * k, 6)
+        # With e_i = r_i - H_i (xi, d) and C_i = V - H_i P H_i^T after all of them, e_i^T C_i^-1 e_i is the normalised
+        # square of landmark i's innovation given all others.
+        rows = rows.corrected(correction)
+        if np.isfinite(self._gate):
+            left = V - self._variances(rows)
+            inside = normalised_squares(left, rows.residual, frame, self.ids[rows.slot]) <= self._gate
+            if not inside.all():
+                verdict[some[~inside]] = GATE
+                # Taking observations out is an update with noise -V: P + P H^T (V - H P H^T)^-1 H P.
+                rows = rows.only(~inside)
+                HP, C = self._project(rows)
+                C = np.diag(np.tile(rig.variance_px2, len(rows.slot))) - C
+                Y_transposed, whitened = _whiten(C, HP, rows.residual, frame, self.ids[rows.slot])
+                add_square(self.P, Y_transposed, 1.0)
+                correction, nis = correction - Y_transposed @ whitened, nis - whitened @ whitened
+        self._retract(correction[:6], correction[6:].reshape(-1, 3))
+        return float(nis), 3 * int((verdict == ACCEPTED).sum()), verdict
+
+    def _project(self, rows: _Rows) -> tuple[Array, Array]:
+        """``H P`` (3k, 6+3n) and ``H P H^T`` (3k, 3k)."""
+        k, size = len(rows.slot), len(self.P)
+        H_pose = rows.H_x.reshape(3 * k, 6)
         HP = (H_pose @ self.P[:6]).reshape(k, 3, size)
-        HP += H_m @ self.P[6:].reshape(-1, 3, size)[slot]
+        HP += rows.H_m @ self.P[6:].reshape(-1, 3, size)[rows.slot]
         HP = HP.reshape(3 * k, size)
-        own_columns = (6 + 3 * slot[:, None] + np.arange(3)).ravel()
-        HPH = (H_m @ HP.T[own_columns].reshape(k, 3, 3 * k)).reshape(3 * k, 3 * k)
+        own_columns = (6 + 3 * rows.slot[:, None] + np.arange(3)).ravel()
+        HPH = (rows.H_m @ HP.T[own_columns].reshape(k, 3, 3 * k)).reshape(3 * k, 3 * k)
         HPH += H_pose @ HP[:, :6].T
         return HP, HPH
 
-    def _left_over(self, slot: IntArray, H_x: Array, H_m: Array, residual: Array, correction: Array) -> Array:
-        """``r - H (xi, d)``, what a correction leaves of the residuals (k, 3)."""
-        d = correction[6:].reshape(-1, 3)[slot]
-        return residual - H_x @ correction[:6] - (H_m @ d[..., None])[..., 0]
-
-    def _conditional_squares(
-        self, slot: IntArray, H_x: Array, H_m: Array, residual: Array, correction: Array, frame: int
-    ) -> Array:
-        """Each landmark against the prediction as corrected by all *other* landmarks of the frame, (k,).
-
-        The marginal gate is weak while the pose itself is uncertain; this one is not. With P and the correction after
-        all of them, ``e_i = r_i - H_i (xi, d)`` and ``C_i = V - H_i P H_i^T``, it is ``e_i^T C_i^-1 e_i``.
-        """
-        if np.isinf(self._gate):
-            return np.zeros(len(slot))
+    def _variances(self, rows: _Rows) -> Array:
+        """``H_i P H_i^T`` (k, 3, 3) of each landmark's own rows, without what is between landmarks."""
         n = len(self.ids)
-        cross = H_m @ self.P[6:, :6].reshape(n, 3, 6)[slot] @ H_x.swapaxes(1, 2)
-        own = H_m @ self.P[6:, 6:].reshape(n, 3, n, 3)[slot, :, slot, :] @ H_m.swapaxes(1, 2)
-        HPH = H_x @ self.P[:6, :6] @ H_x.swapaxes(1, 2) + cross + cross.swapaxes(1, 2) + own
-        left_over = self._left_over(slot, H_x, H_m, residual, correction)
-        return normalised_squares(np.diag(self._variance) - HPH, left_over, frame, self.ids[slot])
+        cross = rows.H_m @ self.P[6:, :6].reshape(n, 3, 6)[rows.slot] @ rows.H_x.swapaxes(1, 2)
+        own = rows.H_m @ self.P[6:, 6:].reshape(n, 3, n, 3)[rows.slot, :, rows.slot, :] @ rows.H_m.swapaxes(1, 2)
+        return rows.H_x @ self.P[:6, :6] @ rows.H_x.swapaxes(1, 2) + cross + cross.swapaxes(1, 2) + own
 
     def _retract(self, xi: Array, d: Array) -> None:
         before, positions = self.T_imu_world, self.positions_m
@@ -270,14 +283,14 @@ class JointEKF:
         self._retire(jumped)
         return ids
 
-    def _retire(self, gone: np.ndarray) -> None:
+    def _retire(self, gone: NDArray[np.bool_]) -> None:
         """Marginalise landmarks: drop their rows and columns, keep their last estimate."""
         if not gone.any():
             return
         self._retired.append(self._active(np.flatnonzero(gone)))
         stay = ~gone
         kept = np.flatnonzero(np.concatenate([np.ones(6, dtype=bool), np.repeat(stay, 3)]))
-        self.P = self.P[kept][:, kept]
+        self.P = self.P[kept].take(kept, axis=1)
         self.positions_m, self._initial_m = self.positions_m[stay], self._initial_m[stay]
         self._books = self._books[stay]
 

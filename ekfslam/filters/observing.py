@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence as SequenceType
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +27,15 @@ GATE, DISPARITY, ROW_MISMATCH, BEHIND_CAMERA = range(len(REASONS))
 
 @dataclass(frozen=True)
 class Rig:
-    """What turns landmarks into pixels: intrinsics, extrinsics, and the variances (3,) px^2 of the rectified rows."""
+    """What turns landmarks into pixels: intrinsics, extrinsics, noise."""
 
     camera: StereoCamera
     T_cam_imu: Array
     noise: Noise
 
-    @property
+    @cached_property
     def variance_px2(self) -> Array:
+        """Variances (3,) of the rectified rows."""
         return cam.rectified_rows(np.zeros(4), self.noise.pixel_std_px)[1]
 
     def rows(self, pixels_px: Array) -> Array:

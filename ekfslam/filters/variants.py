@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ekfslam import se3
+from ekfslam.filters.symmetric import add_product
 from ekfslam.se3 import Array
 
 
@@ -35,9 +36,9 @@ def retract_invariant(T_imu_world: Array, positions_m: Array, xi: Array, d: Arra
         d: (n, 3) corrections of the landmarks.
     """
     e_theta = -T_imu_world[:3, :3].T @ xi[3:]
-    e = d + np.cross(positions_m, e_theta)
-    rotated = positions_m @ se3.so3_exp(e_theta).T + e @ se3.so3_left_jacobian(e_theta).T
-    return se3.exp(xi) @ T_imu_world, rotated
+    e = d - positions_m @ se3.skew(e_theta).T
+    R, J = se3.so3_exp_and_left_jacobian(e_theta)
+    return se3.exp(xi) @ T_imu_world, positions_m @ R.T + e @ J.T
 
 
 def transport_invariant(P: Array, T_before: Array, T_after: Array, moved_m: Array) -> None:
@@ -51,10 +52,9 @@ def transport_invariant(P: Array, T_before: Array, T_after: Array, moved_m: Arra
     Ad = se3.adjoint(T_after @ se3.inverse(T_before))
     # xi+ = Ad xi and d+ = d + B theta, hence P_mm+ = P_mm + B Z^T + Z B^T with Z = P_m,theta + B P_theta,theta / 2.
     B = (se3.skew(moved_m) @ T_before[:3, :3].T).reshape(-1, 3)
-    P_mx = P[6:, :6] + B @ P[3:6, :6]
-    half = B @ (P[6:, 3:6] + 0.5 * B @ P[3:6, 3:6]).T
-    P[6:, 6:] += half + half.T
-    P[6:, :6] = P_mx @ Ad.T
-    P[:6, 6:] = P[6:, :6].T
+    Z = P[6:, 3:6] + 0.5 * B @ P[3:6, 3:6]
+    P[6:, :6] = (P[6:, :6] + B @ P[3:6, :6]) @ Ad.T
     P_xx = Ad @ P[:6, :6] @ Ad.T
     P[:6, :6] = 0.5 * (P_xx + P_xx.T)
+    no_pose = np.zeros((6, 3))
+    add_product(P, np.vstack([no_pose, B]), np.vstack([no_pose, Z]))
