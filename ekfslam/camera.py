@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekfslam import se3
 from ekfslam.se3 import Array
 
 
@@ -77,28 +76,3 @@ def triangulate(camera: StereoCamera, rows_px: Array) -> Array:
     x = (rows_px[..., 0] - camera.cu_px) / camera.fu_px * z
     y = (rows_px[..., 1] - camera.cv_px) / camera.fv_px * z
     return np.stack([x, y, z], axis=-1)
-
-
-def triangulation_covariance(camera: StereoCamera, q: Array, variance_px2: Array) -> Array:
-    """``(A^T V^-1 A)^-1``, covariance of a triangulated point in the camera frame: (..., 3) m to (..., 3, 3) m^2.
-
-    ``variance_px2`` (3,) are the variances of the rectified rows. This is the exact limit of a diffuse prior, eq. (5).
-    """
-    A_inverse = np.linalg.inv(rectified_jacobian(camera, q))
-    return (A_inverse * variance_px2) @ np.swapaxes(A_inverse, -1, -2)
-
-
-def landmark_jacobians(
-    camera: StereoCamera, T_cam_imu: Array, T_imu_world: Array, positions_m: Array
-) -> tuple[Array, Array, Array]:
-    """Eq. (4): rectified rows of landmarks and their derivative, landmarks (n, 3) in world, metres.
-
-    Returns:
-        The points in the camera frame (n, 3) m; ``H_x`` (n, 3, 6), derivative by the pose error ``xi`` of
-        ``T_imu_world = exp(xi^) T_hat``; ``H_m`` (n, 3, 3), derivative by the landmark position.
-    """
-    s = se3.apply(T_imu_world, positions_m)
-    q = se3.apply(T_cam_imu, s)
-    A = rectified_jacobian(camera, q) @ T_cam_imu[:3, :3]
-    H_x = np.concatenate([A, -A @ se3.skew(s)], axis=-1)
-    return q, H_x, A @ T_imu_world[:3, :3]

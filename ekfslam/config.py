@@ -16,7 +16,7 @@ from ekfslam.errors import ConfigError
 from ekfslam.sequence import Noise, Sequence
 
 Mode = Literal["dead-reckoning", "mapping-only", "full"]
-Variant = Literal["invariant", "standard"]
+Variant = Literal["invariant", "fej", "standard"]
 Retire = Literal["auto", "unseen", "never"]
 
 MODES: tuple[Mode, ...] = get_args(Mode)
@@ -46,7 +46,8 @@ class FilterConfig:
     """How the filters linearise, gate, start and retire landmarks.
 
     Args:
-        variant: Linearisation rule of the joint filter.
+        variant: Linearisation rule of the joint filter, see `ekfslam.filters.variants`.
+        iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. Not for ``fej``.
         retire: ``unseen`` marginalises a landmark at the first frame that does not see it, ``never`` keeps all;
             ``auto`` is ``never`` for a sequence of at most 300 landmarks some of which come back, else ``unseen``.
         gate_probability: Chi-square gate on each landmark's three rows, once against the prediction and (joint filter)
@@ -61,6 +62,7 @@ class FilterConfig:
     """
 
     variant: Variant = "invariant"
+    iterations: int = 1
     retire: Retire = "auto"
     gate_probability: float = 0.999
     split_after: int = 3
@@ -102,10 +104,13 @@ class Config:
                 )
         if not 0 < filter_.gate_probability <= 1:
             raise ConfigError(f"filter.gate_probability must be in (0, 1], found {filter_.gate_probability}")
-        if filter_.split_after != int(filter_.split_after):
-            raise ConfigError(f"filter.split_after must be a whole number, found {filter_.split_after}")
+        for name, smallest in (("split_after", 0), ("iterations", 1)):
+            value = getattr(filter_, name)
+            if value != int(value) or value < smallest:
+                raise ConfigError(f"filter.{name} must be a whole number not below {smallest}, found {value}")
+        if filter_.variant == "fej" and filter_.iterations > 1:
+            raise ConfigError("filter.iterations > 1 contradicts first estimates: choose invariant or standard")
         for name in (
-            "split_after",
             "max_row_mismatch_px",
             "min_depth_m",
             "initial_position_std_m",

@@ -7,7 +7,7 @@ landmark, the prediction touches the pose rows and columns alone, and a frame is
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from time import perf_counter
 
 import numpy as np
@@ -15,7 +15,6 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from ekfslam import camera as cam
 from ekfslam import motion, se3
 from ekfslam.config import FilterConfig
 from ekfslam.errors import InnovationError
@@ -25,14 +24,16 @@ from ekfslam.filters.observing import (
     GATE,
     FrameReport,
     Rig,
+    Sensor,
+    diagonal,
     first_sight,
+    linearise,
     lookup,
     missed,
     normalised_squares,
-    screen,
 )
 from ekfslam.filters.symmetric import add_square
-from ekfslam.filters.variants import retract_invariant, retract_standard, transport_invariant
+from ekfslam.filters.variants import RULES
 from ekfslam.result import Landmarks
 from ekfslam.se3 import Array
 from ekfslam.sequence import IntArray, Sequence
@@ -40,15 +41,16 @@ from ekfslam.sequence import IntArray, Sequence
 
 @dataclass(frozen=True)
 class _Rows:
-    """Measurement rows of k landmarks: their place in the state (k,), both blocks of H, and the residuals (k, 3)."""
+    """Measurement rows of k landmarks: place in the state (k,), both blocks of H, residuals and variances (k, 3)."""
 
     slot: IntArray
     H_x: Array
     H_m: Array
     residual: Array
+    variance: Array
 
     def only(self, which: NDArray[np.bool_]) -> _Rows:
-        return _Rows(self.slot[which], self.H_x[which], self.H_m[which], self.residual[which])
+        return _Rows(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def corrected(self, correction: Array) -> _Rows:
         """The rows with the residuals ``r - H (xi, d)`` that a correction (6+3n,) leaves."""
@@ -61,7 +63,7 @@ class JointEKF:
     """Joint EKF-SLAM: call `predict`, then `update`, once a frame.
 
     Args:
-        rig: Camera, extrinsics and noise.
+        sensor: What observes the landmarks, with its noise: a `Rig`.
         config: Variant, gate, limits, retirement (``auto`` must have been resolved; it counts as ``unseen``).
         T_world_imu: (4, 4) first pose.
 
@@ -73,10 +75,11 @@ class JointEKF:
         reappeared: Ids of retired landmarks that were seen again and started afresh.
     """
 
-    def __init__(self, rig: Rig, config: FilterConfig, T_world_imu: Array) -> None:
-        self.rig, self.config = rig, config
+    def __init__(self, sensor: Sensor, config: FilterConfig, T_world_imu: Array) -> None:
+        self.sensor, self.config = sensor, config
+        self.rule = RULES[config.variant]
         self._gate = config.gate
-        self.T_imu_world = se3.inverse(T_world_imu)
+        self.T_imu_world = self._T_predicted = se3.inverse(T_world_imu)
         self.P = config.initial_covariance
         self.positions_m = np.empty((0, 3))
         self.reappeared: list[int] = []
@@ -90,6 +93,11 @@ class JointEKF:
         return self._books[:, 0]
 
     @property
+    def _linear_m(self) -> Array:
+        """(n, 3) positions at which H is taken, eq. (4)."""
+        return self._initial_m if self.rule.first_estimates else self.positions_m
+
+    @property
     def T_world_imu(self) -> Array:
         """(4, 4) estimated pose of the IMU."""
         return se3.inverse(self.T_imu_world)
@@ -97,20 +105,22 @@ class JointEKF:
     def predict(self, twist: Array, tau_s: float) -> None:
         """Eq. (1) and (2) over one interval: ``twist`` (6,) in m/s and rad/s, duration in s."""
         E = motion.increment(twist, tau_s)
-        F = motion.error_jacobian(E)
-        P_xx = F @ self.P[:6, :6] @ F.T + motion.process_noise(twist, tau_s, self.rig.noise.twist_std)
-        self.T_imu_world = E @ self.T_imu_world
+        T_next = E @ self.T_imu_world
+        # FEJ: from the predicted pose, where the last frame was linearised, to the next predicted pose.
+        F = motion.error_jacobian(T_next @ se3.inverse(self._T_predicted) if self.rule.first_estimates else E)
+        P_xx = F @ self.P[:6, :6] @ F.T + motion.process_noise(twist, tau_s, self.sensor.noise.twist_std)
+        self.T_imu_world = self._T_predicted = T_next
         self.P[:6, 6:] = F @ self.P[:6, 6:]
         self.P[6:, :6] = self.P[:6, 6:].T
         self.P[:6, :6] = 0.5 * (P_xx + P_xx.T)
 
-    def update(self, frame: int, ids: IntArray, pixels_px: Array) -> FrameReport:
+    def update(self, frame: int, ids: IntArray, measured: Array) -> FrameReport:
         """Retire what is out of view, correct with what is known (6), start what is new (5).
 
         Args:
             frame: Frame index.
             ids: (n,) landmark ids seen, distinct.
-            pixels_px: (n, 4) their pixels (uL, vL, uR, vR).
+            measured: (n, 4) their pixels (uL, vL, uR, vR), or what else the sensor measures.
 
         Returns:
             What became of each observation, and the innovation statistics.
@@ -122,8 +132,8 @@ class JointEKF:
             out_of_view = np.isin(self.ids, ids, invert=True)
             self._retired_ids.update(self.ids[out_of_view].tolist())
             self._retire(out_of_view)
-        rows = self.rig.rows(pixels_px)
-        reason = screen(pixels_px, self.config)
+        rows = self.sensor.rows(measured)
+        reason = self.sensor.screen(measured, self.config)
         order = np.argsort(self.ids)
         index, is_known = lookup(self.ids[order], ids)
         known = np.flatnonzero(is_known & (reason == ACCEPTED))
@@ -161,9 +171,7 @@ class JointEKF:
         if not is_known.all():
             raise KeyError(f"landmark ids {np.asarray(ids)[~is_known].tolist()} are not active")
         slot = order[index]
-        _, H_x, H_m = cam.landmark_jacobians(
-            self.rig.camera, self.rig.T_cam_imu, self.T_imu_world, self.positions_m[slot]
-        )
+        _, H_x, H_m = linearise(self.sensor, self.T_imu_world, self.positions_m[slot], self._linear_m[slot])
         row = np.arange(3 * len(slot)).reshape(-1, 3, 1)
         rows = np.broadcast_to(row, (len(slot), 3, 9))
         pose_columns = np.broadcast_to(np.arange(6), (len(slot), 3, 6))
@@ -177,8 +185,8 @@ class JointEKF:
         F = motion.error_jacobian(motion.increment(twist, tau_s))
         return sp.csr_array(sp.block_diag([F, sp.identity(len(self.P) - 6)]))
 
-    def _correct(self, frame: int, slot: IntArray, rows_px: Array) -> tuple[float, int, IntArray]:
-        """Eq. (6) with its gates and the variant's retraction, for the landmarks at ``slot`` (k,) seen at ``rows_px``.
+    def _correct(self, frame: int, slot: IntArray, measured: Array) -> tuple[float, int, IntArray]:
+        """Eq. (6) with its gates and the variant's retraction, for landmarks at ``slot`` (k,) with rows (k, 3).
 
         A landmark must agree with the prediction, and with the prediction as corrected by all *other* landmarks of the
         frame: the first gate is weak while the pose itself is uncertain, the second is not. What the second rejects has
@@ -188,42 +196,80 @@ class JointEKF:
             NIS of what was accepted, its degrees of freedom, and the verdict (k,) on each landmark.
         """
         verdict = np.full(len(slot), ACCEPTED)
-        rig, V = self.rig, np.diag(self.rig.variance_px2)
-        q, H_x, H_m = cam.landmark_jacobians(rig.camera, rig.T_cam_imu, self.T_imu_world, self.positions_m[slot])
-        verdict[q[:, 2] <= self.config.min_depth_m] = BEHIND_CAMERA
+        sensor, positions = self.sensor, self.positions_m[slot]
+        q, H_x, H_m = linearise(sensor, self.T_imu_world, positions, self._linear_m[slot])
+        verdict[~sensor.in_view(q, self.config)] = BEHIND_CAMERA
         some = np.flatnonzero(verdict == ACCEPTED)
-        rows = _Rows(slot[some], H_x[some], H_m[some], rows_px[some] - cam.project(rig.camera, q[some])[:, :3])
+        rows = _Rows(
+            slot[some], H_x[some], H_m[some], measured[some] - sensor.predict(q[some]), sensor.variance(measured[some])
+        )
 
-        ids = self.ids[rows.slot]
-        inside = normalised_squares(self._variances(rows) + V, rows.residual, frame, ids) <= self._gate
+        squares = normalised_squares(
+            self._variances(rows) + diagonal(rows.variance), rows.residual, frame, self._of(rows)
+        )
+        inside = squares <= self._gate
         verdict[some[~inside]] = GATE
         some, rows = some[inside], rows.only(inside)
         if len(some) == 0:
             return 0.0, 0, verdict
 
-        HP, S = self._project(rows)
-        S.ravel()[:: len(S) + 1] += np.tile(rig.variance_px2, len(some))
-        Y_transposed, whitened = _whiten(S, HP, rows.residual, frame, self.ids[rows.slot])
-        add_square(self.P, Y_transposed, -1.0)
-        correction, nis = Y_transposed @ whitened, whitened @ whitened
+        P_prior = self.P.copy() if self.config.iterations > 1 else None
+        correction, nis = self._condition(frame, rows)
 
         # With e_i = r_i - H_i (xi, d) and C_i = V - H_i P H_i^T after all of them, e_i^T C_i^-1 e_i is the normalised
         # square of landmark i's innovation given all others.
-        rows = rows.corrected(correction)
         if np.isfinite(self._gate):
-            left = V - self._variances(rows)
-            inside = normalised_squares(left, rows.residual, frame, self.ids[rows.slot]) <= self._gate
+            left = rows.corrected(correction)
+            squares = normalised_squares(
+                diagonal(left.variance) - self._variances(left), left.residual, frame, self._of(left)
+            )
+            inside = squares <= self._gate
             if not inside.all():
                 verdict[some[~inside]] = GATE
                 # Taking observations out is an update with noise -V: P + P H^T (V - H P H^T)^-1 H P.
-                rows = rows.only(~inside)
-                HP, C = self._project(rows)
-                C = np.diag(np.tile(rig.variance_px2, len(rows.slot))) - C
-                Y_transposed, whitened = _whiten(C, HP, rows.residual, frame, self.ids[rows.slot])
-                add_square(self.P, Y_transposed, 1.0)
-                correction, nis = correction - Y_transposed @ whitened, nis - whitened @ whitened
+                less_correction, less_nis = self._condition(frame, left.only(~inside), sign=-1.0)
+                correction, nis = correction - less_correction, nis - less_nis
+        if P_prior is not None:
+            correction = self._iterate(
+                frame, P_prior, correction, slot[verdict == ACCEPTED], measured[verdict == ACCEPTED]
+            )
         self._retract(correction[:6], correction[6:].reshape(-1, 3))
         return float(nis), 3 * int((verdict == ACCEPTED).sum()), verdict
+
+    def _iterate(self, frame: int, P_prior: Array, correction: Array, slot: IntArray, measured: Array) -> Array:
+        """Gauss-Newton on eq. (6): linearise again at the corrected state, always from the same prior.
+
+        Rows taken at the corrected state are carried back into the prior's coordinates, ``H_k J_k``, and the residual
+        becomes ``r_k + H_k J_k (xi, d)_k``. Source: Bell and Cathey, "The iterated Kalman filter update as a
+        Gauss-Newton method", IEEE TAC 1993.
+        """
+        for _ in range(self.config.iterations - 1):
+            xi, d = correction[:6], correction[6:].reshape(-1, 3)
+            T, m = self.rule.retract(self.T_imu_world, self.positions_m, xi, d)
+            q, H_x, H_m = linearise(self.sensor, T, m[slot], m[slot])
+            H_x = self.rule.carry_back(H_x, H_m, xi, self.T_imu_world, T, (m - self.positions_m)[slot])
+            residual = measured - self.sensor.predict(q)
+            rows = _Rows(slot, H_x, H_m, residual, self.sensor.variance(measured)).corrected(-correction)
+            self.P = P_prior.copy()
+            correction, _ = self._condition(frame, rows)
+        return correction
+
+    def _condition(self, frame: int, rows: _Rows, sign: float = 1.0) -> tuple[Array, float]:
+        """Eq. (6): condition P on the rows (sign 1), or take rows out that it was conditioned on (sign -1).
+
+        Returns:
+            The correction (6+3n,) to add (subtract) and the NIS that the rows contribute.
+        """
+        HP, S = self._project(rows)
+        S *= sign
+        S.ravel()[:: len(S) + 1] += rows.variance.ravel()
+        Y_transposed, whitened = _whiten(S, HP, rows.residual, frame, self._of(rows))
+        add_square(self.P, Y_transposed, -sign)
+        return Y_transposed @ whitened, float(whitened @ whitened)
+
+    def _of(self, rows: _Rows) -> IntArray:
+        """Landmark ids (k,) of measurement rows."""
+        return self.ids[rows.slot]
 
     def _project(self, rows: _Rows) -> tuple[Array, Array]:
         """``H P`` (3k, 6+3n) and ``H P H^T`` (3k, 3k)."""
@@ -246,17 +292,16 @@ class JointEKF:
 
     def _retract(self, xi: Array, d: Array) -> None:
         before, positions = self.T_imu_world, self.positions_m
-        if self.config.variant == "invariant":
-            self.T_imu_world, self.positions_m = retract_invariant(before, positions, xi, d)
-            transport_invariant(self.P, before, self.T_imu_world, self.positions_m - positions)
-        else:
-            self.T_imu_world, self.positions_m = retract_standard(before, positions, xi, d)
+        self.T_imu_world, self.positions_m = self.rule.retract(before, positions, xi, d)
+        if self.rule.transport is not None:
+            self.rule.transport(self.P, before, self.T_imu_world, self.positions_m - positions)
 
-    def _start(self, frame: int, ids: IntArray, rows_px: Array) -> None:
+    def _start(self, frame: int, ids: IntArray, rows: Array) -> None:
         """Append new landmarks with their full cross-covariance, eq. (5)."""
         if len(ids) == 0:
             return
-        positions, G, covariance = first_sight(self.rig, self.T_imu_world, rows_px)
+        T_linear = self._T_predicted if self.rule.first_estimates else self.T_imu_world
+        positions, G, covariance = first_sight(self.sensor, self.T_imu_world, rows, T_linear)
         G = G.reshape(-1, 6)
         size, grown = len(self.P), len(self.P) + len(G)
         P = np.empty((grown, grown))

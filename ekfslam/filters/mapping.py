@@ -10,18 +10,18 @@ from time import perf_counter
 
 import numpy as np
 
-from ekfslam import camera as cam
 from ekfslam.config import FilterConfig
 from ekfslam.filters.observing import (
     ACCEPTED,
     BEHIND_CAMERA,
     GATE,
     FrameReport,
-    Rig,
+    Sensor,
+    diagonal,
     first_sight,
+    linearise,
     missed,
     normalised_squares,
-    screen,
 )
 from ekfslam.result import Landmarks
 from ekfslam.se3 import Array
@@ -31,7 +31,7 @@ from ekfslam.sequence import IntArray, Observations
 def map_landmarks(
     observations: Observations,
     T_imu_world: Array,
-    rig: Rig,
+    sensor: Sensor,
     config: FilterConfig,
     frames: Iterable[int],
 ) -> tuple[Landmarks, list[FrameReport], Array]:
@@ -40,7 +40,7 @@ def map_landmarks(
     Args:
         observations: Stereo observations.
         T_imu_world: (T, 4, 4) poses, taken as exact.
-        rig: Camera and pixel noise.
+        sensor: What observes, and its noise.
         config: Gate and limits.
         frames: The frames to go through, ascending (wrapped in a progress bar by the caller).
 
@@ -57,9 +57,9 @@ def map_landmarks(
     first, last = np.full(len(ids), -1), np.full(len(ids), -1)
     count, misses = np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.int64)
     retired: list[Landmarks] = []
-    gate, variance = config.gate, np.diag(rig.variance_px2)
+    gate = config.gate
 
-    def estimate(which: IntArray) -> Landmarks:
+    def landmarks_at(which: IntArray) -> Landmarks:
         return Landmarks(
             ids[which], position[which], covariance[which], initial[which], first[which], last[which], count[which]
         )
@@ -71,18 +71,20 @@ def map_landmarks(
         begin = perf_counter()
         seen, pixels = observations.at(k)
         slot = np.searchsorted(ids, seen)
-        rows = rig.rows(pixels)
-        reason = screen(pixels, config)
+        rows = sensor.rows(pixels)
+        V = diagonal(sensor.variance(rows))
+        reason = sensor.screen(pixels, config)
 
         known = np.flatnonzero((reason == ACCEPTED) & (count[slot] > 0))
-        q, _, H = cam.landmark_jacobians(rig.camera, rig.T_cam_imu, T_imu_world[k], position[slot[known]])
-        in_front = q[:, 2] > config.min_depth_m
+        estimate = position[slot[known]]
+        q, _, H = linearise(sensor, T_imu_world[k], estimate, estimate)
+        in_front = sensor.in_view(q, config)
         reason[known[~in_front]] = BEHIND_CAMERA
         known, q, H = known[in_front], q[in_front], H[in_front]
 
-        residual = rows[known] - cam.project(rig.camera, q)[:, :3]
+        residual = rows[known] - sensor.predict(q)
         HP = H @ covariance[slot[known]]
-        S = HP @ np.swapaxes(H, -1, -2) + variance
+        S = HP @ np.swapaxes(H, -1, -2) + V[known]
         nis = normalised_squares(S, residual, k, seen[known])
         inside = nis <= gate
         reason[known[~inside]] = GATE
@@ -95,13 +97,13 @@ def map_landmarks(
         misses[slot[missed(reason)]] += 1
         misses[update] = 0
         split = slot[(misses[slot] >= config.split_after) & (config.split_after > 0)]
-        retired.append(estimate(split))
+        retired.append(landmarks_at(split))
         count[split] = misses[split] = 0
         reason[np.isin(slot, split)] = ACCEPTED
 
         new = np.flatnonzero((reason == ACCEPTED) & (count[slot] == 0))
         start = slot[new]
-        position[start], _, covariance[start] = first_sight(rig, T_imu_world[k], rows[new])
+        position[start], _, covariance[start] = first_sight(sensor, T_imu_world[k], rows[new])
         initial[start], first[start] = position[start], k
 
         accepted = slot[reason == ACCEPTED]
@@ -111,5 +113,5 @@ def map_landmarks(
         reports.append(FrameReport(k, seen, reason, float(nis_accepted.sum()), 3 * len(nis_accepted), ids[split]))
         ms.append(1e3 * (perf_counter() - begin))
 
-    landmarks = Landmarks.concatenate([*retired, estimate(np.flatnonzero(count > 0))])
+    landmarks = Landmarks.concatenate([*retired, landmarks_at(np.flatnonzero(count > 0))])
     return landmarks, reports, np.array(ms)

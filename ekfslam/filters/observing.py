@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence as SequenceType
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +26,45 @@ ACCEPTED = -1
 GATE, DISPARITY, ROW_MISMATCH, BEHIND_CAMERA = range(len(REASONS))
 
 
+class Sensor(Protocol):
+    """Anything that sees point landmarks in three rows each, regular in the point: ``z = h(q)``, ``q = T_cam_imu s``.
+
+    `Rig` is the one the library is about; experiments bring their own.
+    """
+
+    @property
+    def T_cam_imu(self) -> Array:
+        """(4, 4) extrinsics, IMU to the frame of ``q``."""
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of velocities and measurements."""
+
+    def screen(self, measured: Array, config: FilterConfig) -> IntArray:
+        """Reason codes (n,) of what can be judged from the measurements alone."""
+
+    def in_view(self, q: Array, config: FilterConfig) -> NDArray[np.bool_]:
+        """Whether (n,) points (n, 3) can be seen at all."""
+
+    def rows(self, measured: Array) -> Array:
+        """The three rows (n, 3) of each measurement."""
+
+    def variance(self, rows: Array) -> Array:
+        """Variances (n, 3) of the rows."""
+
+    def predict(self, q: Array) -> Array:
+        """``h(q)``: points (n, 3) m to rows (n, 3)."""
+
+    def jacobian(self, q: Array) -> Array:
+        """``dh/dq`` (n, 3, 3), regular."""
+
+    def invert(self, rows: Array) -> Array:
+        """The points (n, 3) m that rows (n, 3) see."""
+
+
 @dataclass(frozen=True)
 class Rig:
-    """What turns landmarks into pixels: intrinsics, extrinsics, noise."""
+    """The report's stereo rig as a `Sensor`: measurements are pixels (n, 4), rows the rectified rows (uL, v, uR)."""
 
     camera: StereoCamera
     T_cam_imu: Array
@@ -38,9 +75,29 @@ class Rig:
         """Variances (3,) of the rectified rows."""
         return cam.rectified_rows(np.zeros(4), self.noise.pixel_std_px)[1]
 
-    def rows(self, pixels_px: Array) -> Array:
-        """Rectified rows (n, 3) of pixels (n, 4)."""
-        return cam.rectified_rows(pixels_px, self.noise.pixel_std_px)[0]
+    def screen(self, measured: Array, config: FilterConfig) -> IntArray:
+        reason = np.full(len(measured), ACCEPTED)
+        reason[np.abs(measured[:, 1] - measured[:, 3]) > config.max_row_mismatch_px] = ROW_MISMATCH
+        reason[measured[:, 0] - measured[:, 2] < config.min_disparity_px] = DISPARITY
+        return reason
+
+    def in_view(self, q: Array, config: FilterConfig) -> NDArray[np.bool_]:
+        return q[:, 2] > config.min_depth_m
+
+    def rows(self, measured: Array) -> Array:
+        return cam.rectified_rows(measured, self.noise.pixel_std_px)[0]
+
+    def variance(self, rows: Array) -> Array:
+        return np.broadcast_to(self.variance_px2, rows.shape)
+
+    def predict(self, q: Array) -> Array:
+        return cam.project(self.camera, q)[:, :3]
+
+    def jacobian(self, q: Array) -> Array:
+        return cam.rectified_jacobian(self.camera, q)
+
+    def invert(self, rows: Array) -> Array:
+        return cam.triangulate(self.camera, rows)
 
 
 @dataclass(frozen=True)
@@ -64,14 +121,6 @@ class FrameReport:
     split: IntArray
 
 
-def screen(pixels_px: Array, config: FilterConfig) -> IntArray:
-    """Reason codes (n,) of what can be judged from the pixels (n, 4) alone."""
-    reason = np.full(len(pixels_px), ACCEPTED)
-    reason[np.abs(pixels_px[:, 1] - pixels_px[:, 3]) > config.max_row_mismatch_px] = ROW_MISMATCH
-    reason[pixels_px[:, 0] - pixels_px[:, 2] < config.min_disparity_px] = DISPARITY
-    return reason
-
-
 def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> Array:
     """``r_i^T S_i^-1 r_i`` of every landmark: S (n, 3, 3), residual (n, 3) to (n,).
 
@@ -88,20 +137,56 @@ def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> 
     return np.einsum("ni,ni->n", whitened, whitened)
 
 
-def first_sight(rig: Rig, T_imu_world: Array, rows_px: Array) -> tuple[Array, Array, Array]:
-    """Eq. (5): landmarks from one stereo observation each, rectified rows (n, 3).
+def linearise(
+    sensor: Sensor, T_imu_world: Array, positions_m: Array, linear_positions_m: Array
+) -> tuple[Array, Array, Array]:
+    """Eq. (4): landmarks (n, 3) in world as the sensor sees them, with their Jacobians.
+
+    Args:
+        sensor: What sees them.
+        T_imu_world: (4, 4) pose.
+        positions_m: (n, 3) estimates, at which A is taken.
+        linear_positions_m: (n, 3) positions for the rest of H: the estimates themselves, or (FEJ) the first ones.
+
+    Returns:
+        The points in the camera frame (n, 3) m; ``H_x`` (n, 3, 6), derivative by the pose error ``xi`` of
+        ``T_imu_world = exp(xi^) T_hat``; ``H_m`` (n, 3, 3), derivative by the landmark position.
+    """
+    q = se3.apply(sensor.T_cam_imu @ T_imu_world, positions_m)
+    A = sensor.jacobian(q) @ sensor.T_cam_imu[:3, :3]
+    s = se3.apply(T_imu_world, linear_positions_m)
+    return q, np.concatenate([A, -A @ se3.skew(s)], axis=-1), A @ T_imu_world[:3, :3]
+
+
+def first_sight(
+    sensor: Sensor, T_imu_world: Array, rows: Array, T_linear: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Eq. (5): landmarks from one observation each, rows (n, 3).
+
+    Args:
+        sensor: What saw them.
+        T_imu_world: (4, 4) pose.
+        rows: (n, 3) what was seen.
+        T_linear: (4, 4) pose at which G is taken, if not ``T_imu_world`` (FEJ: the predicted pose).
 
     Returns:
         Positions (n, 3) in world; ``G`` (n, 3, 6), their derivative by the pose error; the part (n, 3, 3) of their
-        covariance that the pixels cause.
+        covariance that the measurement causes, ``C^T (A^T V^-1 A)^-1 C``, the exact limit of a diffuse prior.
     """
-    q = cam.triangulate(rig.camera, rows_px)
-    s = se3.apply(se3.inverse(rig.T_cam_imu), q)
-    R_world_imu = T_imu_world[:3, :3].T
-    G = -R_world_imu @ np.concatenate([np.broadcast_to(np.eye(3), (len(s), 3, 3)), -se3.skew(s)], axis=-1)
-    R_world_cam = R_world_imu @ rig.T_cam_imu[:3, :3].T
-    covariance = R_world_cam @ cam.triangulation_covariance(rig.camera, q, rig.variance_px2) @ R_world_cam.T
-    return se3.apply(se3.inverse(T_imu_world), s), G, 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
+    q = sensor.invert(rows)
+    T_world_cam = se3.inverse(sensor.T_cam_imu @ T_imu_world)
+    positions = se3.apply(T_world_cam, q)
+    T = T_imu_world if T_linear is None else T_linear
+    s = se3.apply(T, positions)
+    G = -T[:3, :3].T @ np.concatenate([np.broadcast_to(np.eye(3), (len(s), 3, 3)), -se3.skew(s)], axis=-1)
+    A_inverse = T_world_cam[:3, :3] @ np.linalg.inv(sensor.jacobian(q))
+    covariance = (A_inverse * sensor.variance(rows)[:, None, :]) @ np.swapaxes(A_inverse, -1, -2)
+    return positions, G, 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
+
+
+def diagonal(variance: Array) -> Array:
+    """V as blocks: variances (n, 3) to diagonal matrices (n, 3, 3)."""
+    return variance[:, :, None] * np.eye(3)
 
 
 def missed(reason: IntArray) -> NDArray[np.bool_]:

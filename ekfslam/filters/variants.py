@@ -1,10 +1,27 @@
 """The linearisation variants of the joint filter: what happens to mean and covariance once a correction is known.
 
 All variants share the prediction (1)-(2), the measurement rows (4), new landmarks (5) and the update (6), and keep P in
-the stored coordinates ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``. They differ in the retraction.
+the stored coordinates ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``. They differ in where the Jacobians are taken
+and in the retraction; `RULES` says how.
+
+- ``standard``: Jacobians at the estimate, plain retraction. Every textbook's EKF. Known weakness: the directions that
+  no measurement observes (where the world's origin is, which way it is turned) are seen from ever new linearisation
+  points, and so the filter gains information about them that does not exist; its heading becomes overconfident first.
+- ``fej``: first-estimates Jacobians. Poses are linearised where they were predicted, landmarks where they were first
+  estimated, so that the unobservable directions stay the same for good. Known weakness: a poor first estimate is never
+  mended. Source: Huang, Mourikis, Roumeliotis, "Observability-based rules for designing consistent EKF SLAM
+  estimators", IJRR 2010.
+- ``invariant``: Jacobians at the estimate, but the correction acts on the group: the unobservable directions do not
+  depend on the estimate at all. Source: Zhang, Wu, Song, Huang, Dissanayake, "Convergence and Consistency Analysis for
+  a 3-D Invariant-EKF SLAM", RA-L 2017. Known weakness: a correction of the heading moves every landmark in the state.
+
+The iterated update (``iterations > 1``) goes with ``standard`` and ``invariant``.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -14,11 +31,7 @@ from ekfslam.se3 import Array
 
 
 def retract_standard(T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array]:
-    """The textbook EKF: ``T+ = exp(xi^) T``, ``m+ = m + d``; P stays as it is.
-
-    Known weakness: it gains information along directions that no measurement observes (the choice of the world frame),
-    and so becomes overconfident, in heading first.
-    """
+    """``T+ = exp(xi^) T``, ``m+ = m + d``; P stays as it is. Shapes as in `retract_invariant`."""
     return se3.exp(xi) @ T_imu_world, positions_m + d
 
 
@@ -26,8 +39,7 @@ def retract_invariant(T_imu_world: Array, positions_m: Array, xi: Array, d: Arra
     """Right-invariant EKF-SLAM in stored coordinates, first two lines of eq. (7).
 
     The correction acts as one rigid motion of the world (e_theta) on all landmarks, plus what remains of each. After
-    it, `transport_invariant` re-expresses P in the stored coordinates at the new estimate. Source: Zhang, Wu, Song,
-    Huang, Dissanayake, "Convergence and Consistency Analysis for a 3-D Invariant-EKF SLAM", RA-L 2017.
+    it, `transport_invariant` re-expresses P in the stored coordinates at the new estimate.
 
     Args:
         T_imu_world: (4, 4) pose before the correction.
@@ -58,3 +70,61 @@ def transport_invariant(P: Array, T_before: Array, T_after: Array, moved_m: Arra
     P[:6, :6] = 0.5 * (P_xx + P_xx.T)
     no_pose = np.zeros((6, 3))
     add_product(P, np.vstack([no_pose, B]), np.vstack([no_pose, Z]))
+
+
+def carry_back_standard(H_x: Array, H_m: Array, xi: Array, T_before: Array, T_after: Array, moved_m: Array) -> Array:
+    """Pose part (k, 3, 6) of rows taken at a corrected state, by the correction itself.
+
+    ``exp(xi + h) ~ exp(J_l(xi) h) exp(xi)``. Arguments as in `carry_back_invariant`.
+    """
+    return H_x @ se3.left_jacobian(xi)
+
+
+def carry_back_invariant(H_x: Array, H_m: Array, xi: Array, T_before: Array, T_after: Array, moved_m: Array) -> Array:
+    """Pose part (k, 3, 6) of rows taken at a corrected state, in the coordinates before it: H J with J of eq. (7).
+
+    Args:
+        H_x, H_m: (k, 3, 6) and (k, 3, 3) rows at the corrected state.
+        xi: (6,) correction of the pose.
+        T_before, T_after: (4, 4) ``T_imu_world`` before and after it.
+        moved_m: (k, 3) how far the correction moved the rows' landmarks.
+    """
+    H = H_x @ se3.adjoint(T_after @ se3.inverse(T_before))
+    H[..., 3:] += H_m @ (se3.skew(moved_m) @ T_before[:3, :3].T)
+    return H
+
+
+class Retract(Protocol):
+    def __call__(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array]: ...
+
+
+class Transport(Protocol):
+    def __call__(self, P: Array, T_before: Array, T_after: Array, moved_m: Array) -> None: ...
+
+
+class CarryBack(Protocol):
+    def __call__(self, H_x: Array, H_m: Array, xi: Array, T_before: Array, T_after: Array, moved_m: Array) -> Array: ...
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One variant of the joint filter.
+
+    Args:
+        retract: How a correction changes the mean.
+        transport: How P is re-expressed after it; None if it stays.
+        carry_back: Rows at a corrected state in the coordinates of the prior, for the iterated update.
+        first_estimates: Whether Jacobians are taken at first estimates.
+    """
+
+    retract: Retract
+    transport: Transport | None
+    carry_back: CarryBack
+    first_estimates: bool
+
+
+RULES: dict[str, Rule] = {
+    "invariant": Rule(retract_invariant, transport_invariant, carry_back_invariant, first_estimates=False),
+    "fej": Rule(retract_standard, None, carry_back_standard, first_estimates=True),
+    "standard": Rule(retract_standard, None, carry_back_standard, first_estimates=False),
+}
