@@ -72,26 +72,29 @@ def transport_invariant(P: Array, T_before: Array, T_after: Array, moved_m: Arra
     add_product(P, np.vstack([no_pose, B]), np.vstack([no_pose, Z]))
 
 
-def carry_back_standard(H_x: Array, H_m: Array, xi: Array, T_before: Array, T_after: Array, moved_m: Array) -> Array:
-    """Pose part (k, 3, 6) of rows taken at a corrected state, by the correction itself.
+def derivative_standard(T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array, Array]:
+    """Derivative of `retract_standard` at a correction, as in `derivative_invariant`."""
+    n = len(positions_m)
+    return se3.left_jacobian(xi), np.zeros((n, 3, 3)), np.broadcast_to(np.eye(3), (n, 3, 3))
 
-    ``exp(xi + h) ~ exp(J_l(xi) h) exp(xi)``. Arguments as in `carry_back_invariant`.
+
+def derivative_invariant(T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array, Array]:
+    """Derivative of `retract_invariant` at a correction, exact.
+
+    Arguments as there. The left Jacobian of SE(3) at ``[e_i; e_theta]`` has the blocks J and Q.
+
+    Returns:
+        (6, 6) pose error at the corrected state by xi; landmarks (n, 3, 3) by the rotation part of xi, and (n, 3, 3) by
+        their own d.
     """
-    return H_x @ se3.left_jacobian(xi)
-
-
-def carry_back_invariant(H_x: Array, H_m: Array, xi: Array, T_before: Array, T_after: Array, moved_m: Array) -> Array:
-    """Pose part (k, 3, 6) of rows taken at a corrected state, in the coordinates before it: H J with J of eq. (7).
-
-    Args:
-        H_x, H_m: (k, 3, 6) and (k, 3, 3) rows at the corrected state.
-        xi: (6,) correction of the pose.
-        T_before, T_after: (4, 4) ``T_imu_world`` before and after it.
-        moved_m: (k, 3) how far the correction moved the rows' landmarks.
-    """
-    H = H_x @ se3.adjoint(T_after @ se3.inverse(T_before))
-    H[..., 3:] += H_m @ (se3.skew(moved_m) @ T_before[:3, :3].T)
-    return H
+    C = T_imu_world[:3, :3]
+    e_theta = -C.T @ xi[3:]
+    e = d - positions_m @ se3.skew(e_theta).T
+    _, moved = retract_invariant(T_imu_world, positions_m, xi, d)
+    left = se3.left_jacobian(np.concatenate([e, np.broadcast_to(e_theta, e.shape)], axis=-1))
+    J, Q = left[:, :3, :3], left[:, :3, 3:]
+    by_e_theta = J @ se3.skew(positions_m) + Q - se3.skew(moved) @ J
+    return se3.left_jacobian(xi), -by_e_theta @ C.T, J
 
 
 class Retract(Protocol):
@@ -102,8 +105,8 @@ class Transport(Protocol):
     def __call__(self, P: Array, T_before: Array, T_after: Array, moved_m: Array) -> None: ...
 
 
-class CarryBack(Protocol):
-    def __call__(self, H_x: Array, H_m: Array, xi: Array, T_before: Array, T_after: Array, moved_m: Array) -> Array: ...
+class Derivative(Protocol):
+    def __call__(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array, Array]: ...
 
 
 @dataclass(frozen=True)
@@ -113,18 +116,18 @@ class Rule:
     Args:
         retract: How a correction changes the mean.
         transport: How P is re-expressed after it; None if it stays.
-        carry_back: Rows at a corrected state in the coordinates of the prior, for the iterated update.
+        derivative: Of the retraction, at a correction, for the iterated update.
         first_estimates: Whether Jacobians are taken at first estimates.
     """
 
     retract: Retract
     transport: Transport | None
-    carry_back: CarryBack
+    derivative: Derivative
     first_estimates: bool
 
 
 RULES: dict[str, Rule] = {
-    "invariant": Rule(retract_invariant, transport_invariant, carry_back_invariant, first_estimates=False),
-    "fej": Rule(retract_standard, None, carry_back_standard, first_estimates=True),
-    "standard": Rule(retract_standard, None, carry_back_standard, first_estimates=False),
+    "invariant": Rule(retract_invariant, transport_invariant, derivative_invariant, first_estimates=False),
+    "fej": Rule(retract_standard, None, derivative_standard, first_estimates=True),
+    "standard": Rule(retract_standard, None, derivative_standard, first_estimates=False),
 }

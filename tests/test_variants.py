@@ -1,0 +1,163 @@
+"""The linearisation variants: what each gains along the directions that nothing observes, and the iterated update."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.optimize
+from reference import small_world, stereo_matrix
+from test_jacobians import POSES, central, visible_points
+
+from ekfslam import se3
+from ekfslam.config import Config, FilterConfig
+from ekfslam.errors import ConfigError
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.observing import Rig
+from ekfslam.filters.variants import RULES
+from ekfslam.sequence import Noise
+
+P0 = np.diag([0.2, 0.1, 0.3, 0.05, 0.04, 0.08]) ** 2
+OPEN = FilterConfig(gate_probability=1.0, split_after=0, min_disparity_px=1e-3, retire="never")
+
+
+def exact_motion(sequence):
+    """The sequence as seen by a filter that takes its velocities to be exact: W = 0, though they are noisy."""
+    return dataclasses.replace(sequence, noise=Noise(np.zeros(6), sequence.noise.pixel_std_px))
+
+
+def drive(sequence, config, P0=P0, frames=None):
+    ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, sequence.noise), config, sequence.initial_T_world_imu)
+    ekf.P = P0.copy()
+    for k in range(frames or len(sequence)):
+        if k > 0:
+            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
+        ekf.update(k, *sequence.observations.at(k))
+    return ekf
+
+
+def gauge_directions(T_imu_world, positions):
+    """``N = [-Ad_T ; [I, -m_i^]]``: what moving the world by ``[rho; theta]`` does to the stored errors."""
+    landmarks = np.concatenate([np.broadcast_to(np.eye(3), (len(positions), 3, 3)), -se3.skew(positions)], axis=-1)
+    return np.vstack([-se3.adjoint(T_imu_world), landmarks.reshape(-1, 6)])
+
+
+def gauge_ratio(ekf, T_start, P0):
+    """Eigenvalues of the information along the gauge directions, over those of the prior: 1 where none was gained."""
+    first = ekf.config.variant == "fej"
+    T, m = (ekf._T_predicted, ekf._initial_m) if first else (ekf.T_imu_world, ekf.positions_m)
+    N = gauge_directions(T, m)
+    now = N.T @ np.linalg.solve(ekf.P, N)
+    prior = se3.adjoint(T_start).T @ np.linalg.solve(P0, se3.adjoint(T_start))
+    return np.sort(np.linalg.eigvals(np.linalg.solve(prior, now)).real)
+
+
+@pytest.mark.parametrize("retire", ["never", "unseen"])
+@pytest.mark.parametrize("variant", ["invariant", "fej"])
+def test_consistent_variants_gain_no_information_about_the_gauge(variant, retire):
+    world = exact_motion(small_world(seed=4, frames=60))
+    ekf = drive(world, dataclasses.replace(OPEN, variant=variant, retire=retire))
+    ratio = gauge_ratio(ekf, se3.inverse(world.initial_T_world_imu), P0)
+    np.testing.assert_allclose(ratio, 1.0, atol=1e-6)
+    if retire == "unseen":
+        assert ekf.counts["retired"] > 10
+
+
+def test_the_standard_variant_does():
+    world = exact_motion(small_world(seed=4, frames=60))
+    ekf = drive(world, dataclasses.replace(OPEN, variant="standard"))
+    assert gauge_ratio(ekf, se3.inverse(world.initial_T_world_imu), P0).max() > 1e3
+
+
+@pytest.mark.parametrize("variant", ["invariant", "fej"])
+def test_gauge_directions_are_unobserved_by_every_row(variant):
+    world = small_world(seed=4)
+    ekf = drive(world, dataclasses.replace(OPEN, variant=variant), frames=12)
+    ekf.predict(world.twist[12], 0.1)
+    m = ekf._initial_m if variant == "fej" else ekf.positions_m
+    H = ekf.measurement_jacobian(ekf.ids)
+    N = gauge_directions(ekf.T_imu_world, m)
+    assert np.abs(H @ N).max() < 1e-9 * np.abs(H.toarray()).max() * np.abs(N).max()
+
+
+def relative(ekf):
+    """What the gauge cannot change: the landmarks in the frame of the IMU."""
+    return se3.apply(ekf.T_imu_world, ekf.positions_m)
+
+
+@pytest.mark.parametrize("variant", ["invariant", "fej", "standard"])
+def test_invariance_to_the_prior_of_the_gauge(variant):
+    """How well the world's place and heading are known must not change what is estimated relative to the rig."""
+    world = small_world(seed=6, frames=40)
+    config = dataclasses.replace(OPEN, variant=variant)
+    known, vague = (drive(world, config, scale * P0) for scale in (1e-4, 1.0))
+    difference = np.abs(relative(known) - relative(vague)).max()
+    if variant == "standard":
+        assert difference > 1e-4
+    elif variant == "invariant":
+        assert difference < 1e-8
+
+
+def posterior_cost(world, ekf, frame):
+    """Negative log posterior of one update as a function of the stored correction, from scratch."""
+    rule, camera = RULES[ekf.config.variant], world.camera
+    ids, pixels = world.observations.at(frame)
+    known = np.isin(ids, ekf.ids)
+    ids, pixels = ids[known], pixels[known]
+    at = [ekf.ids.tolist().index(i) for i in ids]
+    root = np.linalg.inv(np.linalg.cholesky(ekf.P))
+    T0, m0 = ekf.T_imu_world, ekf.positions_m
+
+    def residuals(correction):
+        T, m = rule.retract(T0, m0, correction[:6], correction[6:].reshape(-1, 3))
+        q = np.column_stack([se3.apply(world.T_cam_imu @ T, m[at]), np.ones(len(at))])
+        predicted = (q / q[:, 2:3]) @ stereo_matrix(camera).T
+        return np.concatenate([root @ correction, ((pixels - predicted) / world.noise.pixel_std_px).ravel()])
+
+    return residuals, ids, pixels
+
+
+@pytest.mark.parametrize("variant", ["invariant", "standard"])
+def test_iterated_update_reaches_the_maximum_of_the_posterior(variant):
+    world = small_world(seed=12, sigma_v=2.0, sigma_w=0.4)
+    config = dataclasses.replace(OPEN, variant=variant)
+    ekf = drive(world, config, 1e-2 * P0, frames=10)
+    ekf.predict(world.twist[10], world.time_s[10] - world.time_s[9])
+    residuals, ids, pixels = posterior_cost(world, ekf, 10)
+    best = scipy.optimize.least_squares(residuals, np.zeros(len(ekf.P)), xtol=1e-14, ftol=1e-14, gtol=1e-14, jac="3-point")
+    T_best, m_best = RULES[variant].retract(ekf.T_imu_world, ekf.positions_m, best.x[:6], best.x[6:].reshape(-1, 3))
+
+    def distance(iterations):
+        again = JointEKF(ekf.sensor, dataclasses.replace(config, iterations=iterations), np.eye(4))
+        for name in ("T_imu_world", "P", "positions_m", "_books", "_initial_m"):
+            setattr(again, name, np.copy(getattr(ekf, name)))
+        again.update(10, ids, pixels)
+        return max(np.abs(again.T_imu_world - T_best).max(), np.abs(again.positions_m - m_best).max())
+
+    assert distance(1) > 1e-2
+    assert distance(20) < 1e-6
+
+
+@pytest.mark.parametrize("name", ["invariant", "standard"])
+@pytest.mark.parametrize("T", POSES.values(), ids=POSES.keys())
+def test_derivative_of_the_retraction(T, name):
+    rule, rng = RULES[name], np.random.default_rng(5)
+    m = visible_points(T, 4)
+    at = rng.normal(size=18) * 0.3
+    T_at, m_at = rule.retract(T, m, at[:6], at[6:].reshape(-1, 3))
+
+    def moved(h):
+        T_h, m_h = rule.retract(T, m, at[:6] + h[:6], (at + h)[6:].reshape(-1, 3))
+        return np.concatenate([se3.log(T_h @ se3.inverse(T_at)), (m_h - m_at).ravel()])
+
+    numeric = central(moved, 18)
+    by_pose, by_rotation, by_landmark = rule.derivative(T, m, at[:6], at[6:].reshape(-1, 3))
+    np.testing.assert_allclose(numeric[:6, :6], by_pose, rtol=1e-6, atol=1e-6)
+    for i in range(4):
+        own = slice(6 + 3 * i, 9 + 3 * i)
+        np.testing.assert_allclose(numeric[own, 3:6], by_rotation[i], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(numeric[own, own], by_landmark[i], rtol=1e-6, atol=1e-6)
+
+
+def test_iterating_first_estimates_is_refused():
+    with pytest.raises(ConfigError, match="first estimates"):
+        Config().with_overrides({"filter": {"variant": "fej", "iterations": 2}})
