@@ -8,27 +8,13 @@ import h5py
 import numpy as np
 import pytest
 from recordings import ece276a_fields, utias_fields, write_mat, write_npz
+from test_metrics import SUMMARY_KEYS
 
 from ekfslam.archive import read_archive
 from ekfslam.cli import main
 from ekfslam.readers import open_sequence
 
 CITY = "builtin:city?frames=40"
-SUMMARY_KEYS = {
-    "ate_m",
-    "ate_aligned_m",
-    "final_error_m",
-    "t_rel_percent",
-    "r_rel_deg_per_100m",
-    "ms_per_frame_median",
-    "ms_per_frame_max",
-    "total_s",
-    "accepted",
-    "rejected",
-    "nis_per_dof",
-    "pose_nees_mean",
-    "landmark_rmse_m",
-}
 
 
 def failure(capsys, *arguments):
