@@ -16,8 +16,10 @@ from ekfslam.archive import FORMAT as ARCHIVE_FORMAT
 from ekfslam.archive import Archive, export_trajectory, open_result, read_archive, write_archive
 from ekfslam.comparison import compare
 from ekfslam.config import MODES, VARIANTS, Config
+from ekfslam.consistency_report import check_consistency
 from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
 from ekfslam.metrics.summary import compare_table, summarise
+from ekfslam.montecarlo import LEVELS, STUDY_VARIANTS, Study, levels_of
 from ekfslam.plotting import save_figures
 from ekfslam.readers import BUILTIN, open_sequence, write_sequence
 from ekfslam.result import Result
@@ -97,6 +99,44 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="archive to write")
     _add_data_options(sub)
     _add_filter_options(sub)
+
+    sub = add(
+        "consistency",
+        _consistency,
+        "simulate many drives and see whether the covariances hold what they promise",
+        "consistency --runs 20",
+        "consistency --level all --variants invariant standard fej --out results/local/all",
+        "consistency --runs 1000 --executor dask://10.0.0.1:8786",
+    )
+    sub.add_argument("--runs", type=int, default=50, metavar="N", help="of each level (default: %(default)s)")
+    sub.add_argument(
+        "--level",
+        nargs="+",
+        choices=(*LEVELS, "all"),
+        default=["mid"],
+        metavar="NAME",
+        help=f"{', '.join(LEVELS)}, or all (default: mid)",
+    )
+    sub.add_argument(
+        "--variants",
+        nargs="+",
+        choices=STUDY_VARIANTS,
+        default=list(VARIANTS),
+        metavar="VARIANT",
+        help=f"{', '.join(STUDY_VARIANTS)} (default: {' '.join(VARIANTS)})",
+    )
+    sub.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
+    sub.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    sub.add_argument(
+        "--executor", default="processes", metavar="SPEC", help="processes (default), serial, dask://HOST:PORT, or mpi"
+    )
+    sub.add_argument(
+        "--out",
+        type=Path,
+        default=Path("results/local/consistency"),
+        metavar="DIR",
+        help="default: %(default)s; an interrupted study there goes on",
+    )
 
     sub = add(
         "simulate",
@@ -205,6 +245,12 @@ def _run(options: argparse.Namespace) -> None:
     print(_table(sequence, len(sequence.observations.ids), {result.mode: result}))
     print(", ".join(f"{name} {count}" for name, count in result.counts.items()))
     print(f"written to {options.out}")
+
+
+def _consistency(options: argparse.Namespace) -> None:
+    study = Study(levels_of(options.level), tuple(options.variants), options.runs, options.seed)
+    report = check_consistency(study, options.out, options.executor, options.workers)
+    print(f"{report.table}\nwritten to {options.out}: {', '.join(path.name for path in report.paths)}")
 
 
 def _simulate(options: argparse.Namespace) -> None:

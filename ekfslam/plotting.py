@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ekfslam import se3
-from ekfslam.metrics.consistency import chi2_bounds, pose_nees
+from ekfslam.metrics.consistency import chi2_bounds, pose_nees, world_axes_covariance
 from ekfslam.result import Result
 from ekfslam.se3 import Array
 from ekfslam.sequence import IntArray, Truth
@@ -65,7 +65,9 @@ _LOG_RATIO = 20.0  # largest over smallest NIS per dof from which a logarithmic 
 P = ParamSpec("P")
 
 
-def _styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Decorator: draw in this package's `STYLE`, whatever the caller's own is."""
+
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with mpl.rc_context(STYLE):
@@ -88,17 +90,11 @@ def ellipse_axes(covariance: Array, sigmas: float) -> tuple[Array, Array, Array]
 
 
 def world_error_covariance(result: Result) -> tuple[Array, Array]:
-    """Covariances (T, 3, 3) of the position error (m^2) and of the rotation error (rad^2), both along world axes.
-
-    As ``T_world_imu = T_hat exp(-xi)``, an error ``xi = [rho; theta]`` moves the IMU by ``-R rho`` to first order and
-    turns it by ``-R theta`` in world, with R the rotation of ``T_world_imu``.
-    """
-    R = result.T_world_imu[:, :3, :3]
-    R_transposed = np.swapaxes(R, 1, 2)
-    return R @ result.covariance[:, :3, :3] @ R_transposed, R @ result.covariance[:, 3:, 3:] @ R_transposed
+    """`world_axes_covariance` of a result: (T, 3, 3) m^2 and (T, 3, 3) rad^2."""
+    return world_axes_covariance(result.T_world_imu, result.covariance)
 
 
-@_styled
+@styled
 def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
     """Map from above (x, y of world, metres): trajectories of all modes, landmarks and poses with 2-sigma ellipses.
 
@@ -132,7 +128,7 @@ def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figur
     return _figure_of(ax)
 
 
-@_styled
+@styled
 def plot_trajectories(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
     """Trajectories from above (x, y of world, metres), with the direction of the IMU's x axis at start and end."""
     paths = {mode: result.T_world_imu for mode, result in results.items()}
@@ -158,7 +154,7 @@ def plot_trajectories(results: Mapping[str, Result], truth: Truth | None = None)
     return _figure_of(ax)
 
 
-@_styled
+@styled
 def plot_errors(results: Mapping[str, Result], truth: Truth) -> Figure:
     """Estimate minus truth against time, world axes: position (m) and rotation (degrees) with 3-sigma bands.
 
@@ -201,7 +197,7 @@ def plot_errors(results: Mapping[str, Result], truth: Truth) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def plot_nis(results: Mapping[str, Result]) -> Figure:
     """NIS per degree of freedom against time for each mode with updates, with each frame's 95 % chi-square bounds.
 
@@ -239,7 +235,7 @@ def plot_nis(results: Mapping[str, Result]) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
     """Landmarks from above (x, y of world, metres): from first triangulation to final estimate, over the trajectory.
 

@@ -11,6 +11,7 @@ from tqdm import tqdm
 Item = TypeVar("Item")
 
 
-def progress(items: Iterable[Item], description: str, unit: str = "frame") -> Iterable[Item]:
-    """``items``, with a progress bar on standard error."""
-    return tqdm(items, desc=description, unit=unit, delay=1.0, leave=False, disable=not sys.stderr.isatty())
+def progress(items: Iterable[Item], description: str, unit: str = "frame", total: int | None = None) -> Iterable[Item]:
+    """``items``, with a progress bar on standard error; ``total`` says how many where they cannot tell."""
+    hidden = not sys.stderr.isatty()
+    return tqdm(items, desc=description, unit=unit, total=total, delay=1.0, leave=False, disable=hidden)

@@ -79,11 +79,12 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
         counts=counts,
         config=dataclasses.asdict(config),
         noise=noise,
-        attributes={**sequence.attributes, **_versions()},
+        attributes={**sequence.attributes, **versions()},
     )
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Versions of the software whose numbers these are, as attributes ``version_<name>``."""
     return {
         "version_ekfslam": version("ekfslam"),
         "version_python": platform.python_version(),

@@ -115,7 +115,8 @@ def _landmarks(sequence: Sequence, truth: Truth, rng: np.random.Generator) -> La
     T_cam_world = T_CAM_IMU @ se3.inverse(truth.T_world_imu[first_frame])
     q = se3.apply(T_cam_world, truth.position_m[ids])
     C = np.swapaxes(T_cam_world[:, :3, :3], 1, 2)
-    initial = C @ camera.triangulation_covariance(CAMERA, q, np.ones(3)) @ np.swapaxes(C, 1, 2)
+    spread = C @ np.linalg.inv(camera.rectified_jacobian(CAMERA, q))
+    initial = spread @ np.swapaxes(spread, 1, 2)
     covariance = initial / count[:, None, None]
 
     def scatter(P: np.ndarray) -> np.ndarray:

@@ -239,17 +239,16 @@ class JointEKF:
     def _iterate(self, frame: int, P_prior: Array, correction: Array, slot: IntArray, measured: Array) -> Array:
         """Gauss-Newton on eq. (6): linearise again at the corrected state, always from the same prior.
 
-        Rows taken at the corrected state are carried back into the prior's coordinates by the derivative D of the
-        retraction, ``H_k D_k``, and the residual becomes ``r_k + H_k D_k (xi, d)_k``. Source: Bell and Cathey, "The
+        Rows taken at the corrected state are carried back into the prior's coordinates by the variant's derivative
+        D, ``H_k D_k``, and the residual becomes ``r_k + H_k D_k (xi, d)_k``. Source: Bell and Cathey, "The
         iterated Kalman filter update as a Gauss-Newton method", IEEE TAC 1993.
         """
         for _ in range(self.config.iterations - 1):
             xi, d = correction[:6], correction[6:].reshape(-1, 3)
             T, m = self.rule.retract(self.T_imu_world, self.positions_m, xi, d)
             q, H_x, H_m = linearise(self.sensor, T, m[slot], m[slot])
-            by_pose, by_rotation, by_landmark = self.rule.derivative(
-                self.T_imu_world, self.positions_m[slot], xi, d[slot]
-            )
+            moved = (m - self.positions_m)[slot]
+            by_pose, by_rotation, by_landmark = self.rule.derivative(self.T_imu_world, T, moved)
             H_x = H_x @ by_pose
             H_x[..., 3:] += H_m @ by_rotation
             H_m = H_m @ by_landmark

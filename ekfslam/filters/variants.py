@@ -58,12 +58,11 @@ def transport_invariant(P: Array, T_before: Array, T_after: Array, moved_m: Arra
 
     Args:
         P: (6+3n, 6+3n) symmetric covariance, changed in place and kept symmetric to the last bit.
-        T_before, T_after: (4, 4) ``T_imu_world`` before and after the correction, ``T_after = exp(xi^) T_before``.
-        moved_m: (n, 3) how far the correction moved each landmark, ``m+ - m``.
+        T_before, T_after, moved_m: The correction, as in `derivative_invariant`.
     """
-    Ad = se3.adjoint(T_after @ se3.inverse(T_before))
+    Ad, by_rotation, _ = derivative_invariant(T_before, T_after, moved_m)
     # xi+ = Ad xi and d+ = d + B theta, hence P_mm+ = P_mm + B Z^T + Z B^T with Z = P_m,theta + B P_theta,theta / 2.
-    B = (se3.skew(moved_m) @ T_before[:3, :3].T).reshape(-1, 3)
+    B = by_rotation.reshape(-1, 3)
     Z = P[6:, 3:6] + 0.5 * B @ P[3:6, 3:6]
     P[6:, :6] = (P[6:, :6] + B @ P[3:6, :6]) @ Ad.T
     P_xx = Ad @ P[:6, :6] @ Ad.T
@@ -72,29 +71,30 @@ def transport_invariant(P: Array, T_before: Array, T_after: Array, moved_m: Arra
     add_product(P, np.vstack([no_pose, B]), np.vstack([no_pose, Z]))
 
 
-def derivative_standard(T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array, Array]:
-    """Derivative of `retract_standard` at a correction, as in `derivative_invariant`."""
-    n = len(positions_m)
-    return se3.left_jacobian(xi), np.zeros((n, 3, 3)), np.broadcast_to(np.eye(3), (n, 3, 3))
+def derivative_invariant(T_before: Array, T_after: Array, moved_m: Array) -> tuple[Array, Array, Array]:
+    """J of eq. (7), block by block: what the stored errors before a correction are after it.
 
+    This is not the derivative of `retract_invariant` in the parameters (xi, d): it keeps the *invariant* error, which
+    is the same before and after. So ``J N(X) = N(X+)`` for the unobservable directions N, and rows carried back through
+    J still see nothing along them. The exact derivative turns them by ``J_l(e)``; an iterated update with that one
+    gains heading out of nothing.
 
-def derivative_invariant(T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array, Array]:
-    """Derivative of `retract_invariant` at a correction, exact.
-
-    Arguments as there. The left Jacobian of SE(3) at ``[e_i; e_theta]`` has the blocks J and Q.
+    Args:
+        T_before, T_after: (4, 4) ``T_imu_world`` before and after the correction, ``T_after = exp(xi^) T_before``.
+        moved_m: (n, 3) how far the correction moved each landmark, ``m+ - m``.
 
     Returns:
-        (6, 6) pose error at the corrected state by xi; landmarks (n, 3, 3) by the rotation part of xi, and (n, 3, 3) by
-        their own d.
+        (6, 6) new pose error by the old one; new landmark errors (n, 3, 3) by the old rotation error, and (n, 3, 3) by
+        the old landmark errors.
     """
-    C = T_imu_world[:3, :3]
-    e_theta = -C.T @ xi[3:]
-    e = d - positions_m @ se3.skew(e_theta).T
-    _, moved = retract_invariant(T_imu_world, positions_m, xi, d)
-    left = se3.left_jacobian(np.concatenate([e, np.broadcast_to(e_theta, e.shape)], axis=-1))
-    J, Q = left[:, :3, :3], left[:, :3, 3:]
-    by_e_theta = J @ se3.skew(positions_m) + Q - se3.skew(moved) @ J
-    return se3.left_jacobian(xi), -by_e_theta @ C.T, J
+    by_rotation = se3.skew(moved_m) @ T_before[:3, :3].T
+    return se3.adjoint(T_after @ se3.inverse(T_before)), by_rotation, np.broadcast_to(np.eye(3), by_rotation.shape)
+
+
+def derivative_standard(T_before: Array, T_after: Array, moved_m: Array) -> tuple[Array, Array, Array]:
+    """Derivative of `retract_standard` in (xi, d), exact; arguments and blocks as in `derivative_invariant`."""
+    none = np.zeros((len(moved_m), 3, 3))
+    return se3.left_jacobian(se3.log(T_after @ se3.inverse(T_before))), none, none + np.eye(3)
 
 
 class Retract(Protocol):
@@ -106,7 +106,7 @@ class Transport(Protocol):
 
 
 class Derivative(Protocol):
-    def __call__(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array, Array]: ...
+    def __call__(self, T_before: Array, T_after: Array, moved_m: Array) -> tuple[Array, Array, Array]: ...
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Rule:
     Args:
         retract: How a correction changes the mean.
         transport: How P is re-expressed after it; None if it stays.
-        derivative: Of the retraction, at a correction, for the iterated update.
+        derivative: How errors before a correction become errors after it; carries the rows of an iterated update back.
         first_estimates: Whether Jacobians are taken at first estimates.
     """
 

@@ -1,9 +1,15 @@
-"""Does the covariance tell the truth about the error? NEES of poses and landmarks, chi-square bounds.
+"""Does the covariance tell the truth about the error? NEES of poses and landmarks, averages over runs, their bounds.
 
 All errors are in the stored coordinates of `ekfslam.result.ERROR_CONVENTION`, the ones the covariances are of.
+
+NEES is correlated over some sixty frames, so that the frames of one run are nowhere near independent samples. Runs are:
+`average_over_runs` bounds an average by their scatter alone, and `chi2_bounds` is for one instant of several runs.
 """
 
 from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,6 +66,14 @@ def landmark_nees(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, Array]:
     return rows, nees(error, landmarks.covariance[rows])
 
 
+def joint_nees(xi: Array, landmark_error: Array, P: Array) -> float:
+    """NEES of pose and landmarks at once, 6 + 3n degrees of freedom; NaN where P is singular.
+
+    ``xi`` (6,) and ``landmark_error`` (n, 3) in stored coordinates, P (6+3n, 6+3n) in the same order.
+    """
+    return float(nees(np.concatenate([xi, landmark_error.ravel()]), P))
+
+
 def invariant_landmark_error(m_hat: Array, m_true: Array, T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
     """Landmark error in stored coordinates as the invariant variant defines it: (..., 3) m, shapes broadcast.
 
@@ -82,11 +96,77 @@ def invariant_landmark_error(m_hat: Array, m_true: Array, T_world_imu_est: Array
     return e_i - np.cross(m_hat, e_theta)
 
 
-def chi2_bounds(dof: ArrayLike, probability: float, runs: int = 1) -> tuple[Array, Array]:
+def world_axes_covariance(T_world_imu: Array, covariance: Array) -> tuple[Array, Array]:
+    """Covariances (T, 3, 3) of position (m^2) and rotation error (rad^2), both along world axes.
+
+    As ``T_world_imu = T_hat exp(-xi)``, an error ``xi = [rho; theta]`` moves the IMU by ``-R rho`` to first order and
+    turns it by ``-R theta`` in world, with R the rotation of ``T_world_imu`` (T, 4, 4). ``covariance`` (T, 6, 6) is of
+    ``xi``.
+    """
+    R = T_world_imu[:, :3, :3]
+    R_transposed = np.swapaxes(R, 1, 2)
+    return R @ covariance[:, :3, :3] @ R_transposed, R @ covariance[:, 3:, 3:] @ R_transposed
+
+
+@dataclass(frozen=True)
+class RunAverage:
+    """Average of independent runs, each of which counts once.
+
+    Args:
+        mean: Over runs; None if no run has a value.
+        half_width: Three standard errors, ``3 sd / sqrt(runs)``; None for fewer than two runs.
+        median: Over runs; one run that diverges spoils the mean, but not this.
+        runs: How many have a value.
+    """
+
+    mean: float | None
+    half_width: float | None
+    median: float | None
+    runs: int
+
+
+def average_over_runs(per_run: Array) -> RunAverage:
+    """The average of one value per run (runs,); NaN stands for a run without a value."""
+    values = per_run[np.isfinite(per_run)]
+    if len(values) == 0:
+        return RunAverage(None, None, None, 0)
+    half_width = float(3.0 * values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
+    return RunAverage(float(values.mean()), half_width, float(np.median(values)), len(values))
+
+
+def time_average(values: Array) -> Array:
+    """Mean over time of each run, (runs, T) to (runs,); NaN entries do not count, NaN if there are no others."""
+    return _nanmean(values, axis=1)
+
+
+def anees(values: Array, dof: int, probability: float) -> tuple[Array, Array, Array]:
+    """Average over runs at every time, and the two-sided bounds it keeps with ``probability`` if P is true.
+
+    Args:
+        values: (runs, T) NEES; NaN entries (singular P, a filter that has stopped) do not count.
+        dof: Degrees of freedom of one value.
+        probability: Of the bounds, at one time.
+
+    Returns:
+        Mean, lower and upper bound, (T,) each; NaN where no run has a value.
+    """
+    runs = np.isfinite(values).sum(axis=0)
+    low, high = chi2_bounds(np.full(len(runs), dof), probability, np.maximum(runs, 1))
+    return _nanmean(values, axis=0), np.where(runs > 0, low, np.nan), np.where(runs > 0, high, np.nan)
+
+
+def _nanmean(values: Array, axis: int) -> Array:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # NaN is the answer where there is nothing to average
+        return np.asarray(np.nanmean(values, axis=axis))
+
+
+def chi2_bounds(dof: ArrayLike, probability: float, runs: ArrayLike = 1) -> tuple[Array, Array]:
     """Two-sided bounds within which the mean of ``runs`` independent chi-square values lies with ``probability``.
 
     ``dof`` are the degrees of freedom of one value (any shape); lower and upper bound have its shape.
     """
     tails = (1.0 - probability) / 2.0
+    runs = np.asarray(runs)
     total = np.asarray(dof) * runs
     return chi2.ppf(tails, total) / runs, chi2.isf(tails, total) / runs

@@ -1,0 +1,85 @@
+"""Where a Monte Carlo study runs: processes of this machine, the calling thread, a Dask cluster, or MPI ranks."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+from ekfslam.errors import ConfigError
+
+
+class SerialExecutor(Executor):
+    """Runs everything at once, in the calling thread."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def open_executor(spec: str = "processes", workers: int | None = None) -> Iterator[Executor]:
+    """Where to run a study.
+
+    Args:
+        spec: ``processes`` on this machine; ``serial``; ``dask://HOST:PORT``, the scheduler of a Dask cluster; ``mpi``,
+            the ranks of ``mpiexec -n N python -m mpi4py.futures -m ekfslam.cli ...``.
+        workers: Number of processes, by default one per core; Dask has its own number.
+
+    Raises:
+        ConfigError: Unknown, not installed, not reachable, or no worker.
+    """
+    if workers is not None and workers < 1:
+        raise ConfigError(f"workers must be at least 1, found {workers}")
+    if spec == "serial":
+        yield SerialExecutor()
+    elif spec == "processes":
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(workers or os.cpu_count(), context, _end_with_parent) as processes:
+            yield processes
+    elif spec == "mpi":
+        try:
+            from mpi4py.futures import MPIPoolExecutor
+        except (ImportError, RuntimeError) as error:  # RuntimeError: there is no MPI library to load
+            raise _missing(spec, error) from None
+        with MPIPoolExecutor(max_workers=workers) as ranks:
+            yield ranks
+    elif spec.startswith("dask://"):
+        try:
+            from distributed import Client
+        except ImportError as error:
+            raise _missing(spec, error) from None
+        try:
+            client = Client(spec.replace("dask://", "tcp://"), timeout="10s")
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"executor {spec}: no scheduler there ({error})") from None
+        with client, client.get_executor() as cluster:
+            yield cluster
+    else:
+        raise ConfigError(f"unknown executor {spec!r}; known: processes, serial, dask://HOST:PORT, mpi")
+
+
+def _missing(spec: str, error: Exception) -> ConfigError:
+    return ConfigError(f"executor {spec} is not installed ({error}); it comes with: pip install 'ekfslam[cluster]'")
+
+
+def _end_with_parent() -> None:
+    """In a worker: leave Ctrl-C to the parent, and do not outlive it if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
