@@ -18,10 +18,13 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# What is committed under results/: the demo, and the report's figures where the recordings are present.
+# What is committed under results/, where it needs recordings only if they are present. About half an hour on two cores.
 results: $(READY)
 	$(BIN)/python experiments/compare_modes.py
 	$(BIN)/python experiments/reproduce_report.py
+	$(BIN)/python experiments/monte_carlo.py
+	$(BIN)/python experiments/published_results.py
+	$(BIN)/python experiments/starry_night.py
 
 setup: $(READY)
 

@@ -190,6 +190,7 @@ def _add_filter_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("settings", "flags override the file, the file overrides the defaults")
     group.add_argument("--config", type=Path, metavar="FILE.toml", help="tables [noise] and [filter]")
     group.add_argument("--variant", choices=VARIANTS, help="linearisation of the joint filter")
+    group.add_argument("--iterations", type=int, metavar="N", help="Gauss-Newton iterations of an update")
     group.add_argument("--retire", choices=("auto", "unseen", "never"), help="when landmarks leave the state")
     group.add_argument("--sigma-v", type=float, metavar="M_S", help="linear velocity noise per sample, m/s")
     group.add_argument("--sigma-w", type=float, metavar="RAD_S", help="angular velocity noise per sample, rad/s")
@@ -205,7 +206,7 @@ def _config(options: argparse.Namespace) -> Config:
                 "sigma_w_rad_s": options.sigma_w,
                 "sigma_px": options.sigma_px,
             },
-            "filter": {"variant": options.variant, "retire": options.retire},
+            "filter": {"variant": options.variant, "iterations": options.iterations, "retire": options.retire},
         }
     )
 
