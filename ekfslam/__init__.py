@@ -35,7 +35,9 @@ from importlib.metadata import version
 from ekfslam.archive import read_archive, write_archive
 from ekfslam.comparison import Comparison, compare
 from ekfslam.config import MODES, VARIANTS, Config, FilterConfig, NoiseConfig
+from ekfslam.consistency_report import check_consistency
 from ekfslam.errors import EkfslamError
+from ekfslam.montecarlo import LEVELS, Study
 from ekfslam.readers import open_sequence, write_sequence
 from ekfslam.result import Result
 from ekfslam.runner import run
@@ -44,6 +46,7 @@ from ekfslam.sequence import Sequence
 __version__ = version("ekfslam")
 
 __all__ = [
+    "LEVELS",
     "MODES",
     "VARIANTS",
     "Comparison",
@@ -53,6 +56,8 @@ __all__ = [
     "NoiseConfig",
     "Result",
     "Sequence",
+    "Study",
+    "check_consistency",
     "compare",
     "open_sequence",
     "read_archive",

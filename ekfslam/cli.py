@@ -106,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
         "simulate many drives and see whether the covariances hold what they promise",
         "consistency --runs 20",
         "consistency --level all --variants invariant standard fej --out results/local/all",
-        "consistency --runs 1000 --executor dask://10.0.0.1:8786",
+        "consistency --runs 1000 --executor dask://scheduler:8786",
     )
     sub.add_argument("--runs", type=int, default=50, metavar="N", help="of each level (default: %(default)s)")
     sub.add_argument(
