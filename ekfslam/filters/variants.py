@@ -8,10 +8,10 @@ and in the retraction; `RULES` says how.
   no measurement observes (where the world's origin is, which way it is turned) are seen from ever new linearisation
   points, and so the filter gains information about them that does not exist; its heading becomes overconfident first.
 - ``fej``: first-estimates Jacobians. Poses are linearised where they were predicted, landmarks where they were first
-  estimated, so that the unobservable directions stay the same for good. A of eq. (4), which does not matter for that, is
-  taken at the estimate: at first estimates too, the filter turns a little less noisy where noise is moderate and
-  diverges where it is large. Known weakness: a poor first estimate is never mended. Source: Huang, Mourikis, Roumeliotis, "Observability-based rules for designing consistent EKF SLAM
-  estimators", IJRR 2010.
+  estimated, so that the unobservable directions stay the same for good. A of eq. (4) does not matter for that and is
+  taken at the estimate: with A at first estimates too, the filter turns a little less noisy where noise is moderate
+  and diverges where it is large. Known weakness: a poor first estimate is never mended. Source: Huang, Mourikis,
+  Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators", IJRR 2010.
 - ``invariant``: Jacobians at the estimate, but the correction acts on the group: the unobservable directions do not
   depend on the estimate at all. Source: Zhang, Wu, Song, Huang, Dissanayake, "Convergence and Consistency Analysis for
   a 3-D Invariant-EKF SLAM", RA-L 2017. Known weakness: a correction of the heading moves every landmark in the state.
