@@ -196,6 +196,24 @@ def test_invariant_derivative_carries_the_gauge_directions_along(T):
     np.testing.assert_allclose(carried, after[6:].reshape(4, 3, 6), atol=1e-9)
 
 
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_a_frame_whose_every_landmark_is_rejected_changes_nothing(iterations):
+    """Landmarks that pass the gate one by one but contradict each other: all go, and P is what it was."""
+    world = small_world(seed=10, sigma_v=1.0, sigma_w=0.15)
+    config = dataclasses.replace(OPEN, gate_probability=0.999, iterations=iterations)
+    ekf = drive(world, config, 1e-2 * P0, frames=6)
+    ekf.predict(world.twist[6], world.time_s[6] - world.time_s[5])
+    before = ekf.T_imu_world.copy(), ekf.P.copy()
+    ids, pixels = world.observations.at(6)
+    some = np.flatnonzero(np.isin(ids, ekf.ids))[:6]
+    apart = pixels[some] + 8.0 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [-1, 1, -1, 1]] * 2)
+    report = ekf.update(6, ids[some], apart)
+    assert (report.reason != -1).all()
+    assert report.dof == 0
+    np.testing.assert_allclose(ekf.T_imu_world, before[0], atol=1e-9)
+    np.testing.assert_allclose(ekf.P, before[1], atol=1e-9)
+
+
 def test_iterating_first_estimates_is_refused():
     with pytest.raises(ConfigError, match="first estimates"):
         Config().with_overrides({"filter": {"variant": "fej", "iterations": 2}})

@@ -104,15 +104,21 @@ class JointEKF:
 
     def predict(self, twist: Array, tau_s: float) -> None:
         """Eq. (1) and (2) over one interval: ``twist`` (6,) in m/s and rad/s, duration in s."""
-        E = motion.increment(twist, tau_s)
-        T_next = E @ self.T_imu_world
-        # FEJ: from the predicted pose, where the last frame was linearised, to the next predicted pose.
-        F = motion.error_jacobian(T_next @ se3.inverse(self._T_predicted) if self.rule.first_estimates else E)
+        T_next, F = self._advance(twist, tau_s)
         P_xx = F @ self.P[:6, :6] @ F.T + motion.process_noise(twist, tau_s, self.sensor.noise.twist_std)
         self.T_imu_world = self._T_predicted = T_next
         self.P[:6, 6:] = F @ self.P[:6, 6:]
         self.P[6:, :6] = self.P[:6, 6:].T
         self.P[:6, :6] = 0.5 * (P_xx + P_xx.T)
+
+    def _advance(self, twist: Array, tau_s: float) -> tuple[Array, Array]:
+        """The next ``T_imu_world`` of eq. (1), and F of eq. (2)."""
+        E = motion.increment(twist, tau_s)
+        T_next = E @ self.T_imu_world
+        # FEJ: from the predicted pose, where the last frame was linearised, to the next predicted pose.
+        return T_next, motion.error_jacobian(
+            T_next @ se3.inverse(self._T_predicted) if self.rule.first_estimates else E
+        )
 
     def update(self, frame: int, ids: IntArray, measured: Array) -> FrameReport:
         """Retire what is out of view, correct with what is known (6), start what is new (5).
@@ -182,7 +188,7 @@ class JointEKF:
 
     def transition_jacobian(self, twist: Array, tau_s: float) -> sp.csr_array:
         """Full-width F (6+3n, 6+3n) of a prediction, identity but for the pose block."""
-        F = motion.error_jacobian(motion.increment(twist, tau_s))
+        _, F = self._advance(twist, tau_s)
         return sp.csr_array(sp.block_diag([F, sp.identity(len(self.P) - 6)]))
 
     def _correct(self, frame: int, slot: IntArray, measured: Array) -> tuple[float, int, IntArray]:
@@ -229,7 +235,7 @@ class JointEKF:
                 # Taking observations out is an update with noise -V: P + P H^T (V - H P H^T)^-1 H P.
                 less_correction, less_nis = self._condition(frame, left.only(~inside), sign=-1.0)
                 correction, nis = correction - less_correction, nis - less_nis
-        if P_prior is not None:
+        if P_prior is not None and (verdict == ACCEPTED).any():
             correction = self._iterate(
                 frame, P_prior, correction, slot[verdict == ACCEPTED], measured[verdict == ACCEPTED]
             )
