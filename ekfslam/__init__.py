@@ -5,6 +5,7 @@
     sequence = ekfslam.open_sequence("builtin:city")
     result = ekfslam.run(sequence, mode="full")
     result.T_world_imu, result.covariance, result.landmarks.position_m
+    everything = ekfslam.posterior(result)   # smoothed: all poses, all landmarks, any block of their covariance
 
 Conventions, everywhere:
 
@@ -34,10 +35,11 @@ from importlib.metadata import version
 
 from ekfslam.archive import read_archive, write_archive
 from ekfslam.comparison import Comparison, compare
-from ekfslam.config import MODES, VARIANTS, Config, FilterConfig, NoiseConfig
+from ekfslam.config import MODES, VARIANTS, Config, FilterConfig, NoiseConfig, PosteriorConfig
 from ekfslam.consistency_report import check_consistency
 from ekfslam.errors import EkfslamError
 from ekfslam.montecarlo import LEVELS, Study
+from ekfslam.posterior import Posterior, posterior, smooth
 from ekfslam.readers import open_sequence, write_sequence
 from ekfslam.result import Result
 from ekfslam.runner import run
@@ -54,14 +56,18 @@ __all__ = [
     "EkfslamError",
     "FilterConfig",
     "NoiseConfig",
+    "Posterior",
+    "PosteriorConfig",
     "Result",
     "Sequence",
     "Study",
     "check_consistency",
     "compare",
     "open_sequence",
+    "posterior",
     "read_archive",
     "run",
+    "smooth",
     "write_archive",
     "write_sequence",
 ]

@@ -9,6 +9,7 @@
         innovation          nis, dof, accepted, rejected
         rejections          frame, landmark, reason (index into its attribute ``names``)
         timing              ms_per_frame
+        log                 what `ekfslam.posterior` needs: see `ekfslam.log.Log` (mode full only)
 
 Every data set has the attributes ``units`` and ``frame`` (of reference). Reading gives back every number bit for bit.
 """
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,16 +32,18 @@ from scipy.spatial.transform import Rotation
 
 from ekfslam.camera import StereoCamera
 from ekfslam.errors import ArchiveError, DataError
+from ekfslam.log import Log
 from ekfslam.readers.hdf5 import read_sequence_fields, write_sequence_group, write_truth_group
 from ekfslam.result import ERROR_CONVENTION, REASONS, Innovation, Landmarks, Rejections, Result
 from ekfslam.se3 import Array
 from ekfslam.sequence import Noise, Sequence, Truth
 
 FORMAT = "ekfslam-archive"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 2 added log
 
 # Data set below /runs/<mode>, field of `Result`, shape (T frames, M landmarks, R rejections), units, frame.
-_LAYOUT: tuple[tuple[str, str, tuple[str | int, ...], str, str], ...] = (
+_Layout = tuple[tuple[str, str, tuple[str | int, ...], str, str], ...]
+_LAYOUT: _Layout = (
     ("trajectory/time", "time_s", ("T",), "s", "clock of the recording"),
     ("trajectory/T_world_imu", "T_world_imu", ("T", 4, 4), "m (translation)", "world from imu"),
     ("trajectory/covariance", "covariance", ("T", 6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu"),
@@ -58,6 +62,24 @@ _LAYOUT: tuple[tuple[str, str, tuple[str | int, ...], str, str], ...] = (
     ("rejections/landmark", "rejections.landmark", ("R",), "landmark id", "none"),
     ("rejections/reason", "rejections.reason", ("R",), "code, see names", "none"),
     ("timing/ms_per_frame", "ms_per_frame", ("T",), "ms", "none"),
+)
+
+
+# The same below /runs/<mode>/log, fields of `Log` (K observations).
+_LOG_LAYOUT: _Layout = (
+    ("initial_covariance", "initial_covariance", (6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu"),
+    ("twist", "twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "imu"),
+    ("tau", "tau_s", ("T",), "s", "none"),
+    ("T_imu_world_predicted", "T_predicted", ("T", 4, 4), "m (translation)", "imu from world"),
+    ("T_imu_world_linear", "T_linear", ("T", 4, 4), "m (translation)", "imu from world"),
+    ("T_imu_world_updated", "T_updated", ("T", 4, 4), "m (translation)", "imu from world"),
+    ("landmark_id", "id", ("M",), "landmark id", "none"),
+    ("first_position", "first_position_m", ("M", 3), "m", "world"),
+    ("frame", "frame", ("K",), "frame index", "none"),
+    ("landmark", "landmark", ("K",), "row of landmark_id", "none"),
+    ("rows", "rows", ("K", 3), "px (uL, v, uR)", "image"),
+    ("variance", "variance", ("K", 3), "px^2", "image"),
+    ("linear_position", "position_m", ("K", 3), "m", "world"),
 )
 
 
@@ -91,19 +113,42 @@ def write_archive(path: str | Path, sequence: Sequence, results: Mapping[str, Re
     Raises:
         ArchiveError: The file cannot be written.
     """
+    with _replacing(Path(path)) as unfinished, h5py.File(str(unfinished), "w") as h5file:
+        h5file.attrs.update(
+            format=FORMAT, format_version=FORMAT_VERSION, source=sequence.source, error_convention=ERROR_CONVENTION
+        )
+        write_sequence_group(h5file, sequence, include_observations=False)
+        if sequence.truth is not None:
+            write_truth_group(h5file, sequence.truth)
+        runs = h5file.create_group("runs", track_order=True)
+        for mode, result in results.items():
+            _write_result(runs.create_group(mode), result)
+
+
+def add_result(path: str | Path, result: Result) -> None:
+    """Add the result of one more mode to an archive, replacing an older one of that mode.
+
+    The archive is rewritten beside itself and then renamed: it is never seen half written.
+
+    Raises:
+        ArchiveError: The archive cannot be read or written.
+    """
     path = Path(path)
+    with _opened(path), _replacing(path) as unfinished:
+        shutil.copyfile(path, unfinished)
+        with h5py.File(str(unfinished), "r+") as h5file:
+            h5file.attrs["format_version"] = FORMAT_VERSION
+            if result.mode in h5file["runs"]:
+                del h5file["runs"][result.mode]
+            _write_result(h5file["runs"].create_group(result.mode), result)
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """A name to write a file under that takes the place of ``path`` when it is complete."""
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with h5py.File(str(unfinished), "w") as h5file:
-            h5file.attrs.update(
-                format=FORMAT, format_version=FORMAT_VERSION, source=sequence.source, error_convention=ERROR_CONVENTION
-            )
-            write_sequence_group(h5file, sequence, include_observations=False)
-            if sequence.truth is not None:
-                write_truth_group(h5file, sequence.truth)
-            runs = h5file.create_group("runs", track_order=True)
-            for mode, result in results.items():
-                _write_result(runs.create_group(mode), result)
+        yield unfinished
         unfinished.replace(path)
     except OSError as error:
         raise ArchiveError(f"{path}: cannot be written: {error}") from None
@@ -121,7 +166,8 @@ def read_archive(path: str | Path) -> Archive:
     with _opened(path) as h5file:
         fields = {"noise": None, **read_sequence_fields(h5file, str(path))}
         fields["source"] = str(h5file.attrs["source"])
-        results = {mode: _read_result(path, h5file, mode) for mode in _modes(path, h5file)}
+        calibration = fields["camera"], fields["T_cam_imu"]
+        results = {mode: _read_result(path, h5file, mode, *calibration) for mode in _modes(path, h5file)}
         return Archive(**fields, results=results)
 
 
@@ -135,7 +181,8 @@ def open_result(path: str | Path, mode: str) -> Result:
         modes = _modes(path, h5file)
         if mode not in modes:
             raise ArchiveError(f"{path}: runs/{mode} is missing; this archive holds {', '.join(modes) or 'no run'}")
-        return _read_result(path, h5file, mode)
+        fields = read_sequence_fields(h5file, str(path))
+        return _read_result(path, h5file, mode, fields["camera"], fields["T_cam_imu"])
 
 
 def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "kitti"]) -> None:
@@ -173,27 +220,52 @@ def _write_result(group: h5py.Group, result: Result) -> None:
         noise_pixel_std_px=result.noise.pixel_std_px,
     )
     group.create_group("attributes").attrs.update(result.attributes)
-    for name, field, _, units, frame in _LAYOUT:
-        dataset = group.create_dataset(name, data=attrgetter(field)(result))
-        dataset.attrs["units"], dataset.attrs["frame"] = units, frame
+    _write_fields(group, _LAYOUT, result)
     group["rejections/reason"].attrs["names"] = REASONS
+    if result.log is not None:
+        log = group.create_group("log")
+        log.attrs["first_estimates"] = result.log.first_estimates
+        _write_fields(log, _LOG_LAYOUT, result.log)
 
 
-def _read_result(path: str | Path, h5file: h5py.File, mode: str) -> Result:
-    group = h5file["runs"][mode]
-    sizes: dict[str | int, int] = {}
-    fields: dict[str, dict[str, Any]] = {"": {}, "landmarks": {}, "innovation": {}, "rejections": {}}
-    for name, field, shape, _, _ in _LAYOUT:
-        where = f"{path}: runs/{mode}/{name}"
+def _write_fields(group: h5py.Group, layout: _Layout, source: Result | Log) -> None:
+    for name, field, _, units, frame in layout:
+        dataset = group.create_dataset(name, data=attrgetter(field)(source))
+        dataset.attrs["units"], dataset.attrs["frame"] = units, frame
+
+
+def _read_fields(where: str, group: h5py.Group, layout: _Layout, sizes: dict[str, int]) -> dict[str, Any]:
+    """The data sets of a layout by field; the first one along a dimension decides its length, unless it is given."""
+    fields: dict[str, Any] = {}
+    for name, field, shape, _, _ in layout:
         if not isinstance(group.get(name), h5py.Dataset):
-            raise ArchiveError(f"{where} is missing")
+            raise ArchiveError(f"{where}/{name} is missing")
         value = group[name][()]
-        # The first data set along a dimension decides its length.
-        wanted = tuple(sizes.setdefault(n, value.shape[i]) if isinstance(n, str) else n for i, n in enumerate(shape))
+        if value.ndim == len(shape):
+            for n, length in zip(shape, value.shape, strict=True):
+                if isinstance(n, str):
+                    sizes.setdefault(n, length)
+        wanted = tuple(sizes.get(n, n) if isinstance(n, str) else n for n in shape)
         if value.shape != wanted:
-            raise ArchiveError(f"{where} has shape {value.shape}, expected {wanted}")
+            raise ArchiveError(f"{where}/{name} has shape {value.shape}, expected {wanted}")
+        fields[field] = value
+    return fields
+
+
+def _read_result(path: str | Path, h5file: h5py.File, mode: str, camera: StereoCamera, T_cam_imu: Array) -> Result:
+    group = h5file["runs"][mode]
+    sizes: dict[str, int] = {}
+    fields: dict[str, dict[str, Any]] = {"": {}, "landmarks": {}, "innovation": {}, "rejections": {}}
+    for field, value in _read_fields(f"{path}: runs/{mode}", group, _LAYOUT, sizes).items():
         part, _, leaf = field.rpartition(".")
         fields[part][leaf] = value
+    log = None
+    if isinstance(group.get("log"), h5py.Group):
+        where = f"{path}: runs/{mode}/log"
+        log_fields = _read_fields(where, group["log"], _LOG_LAYOUT, {key: sizes[key] for key in ("T", "M")})
+        if "first_estimates" not in group["log"].attrs:
+            raise ArchiveError(f"{where}: attribute first_estimates is missing")
+        log = Log(first_estimates=bool(group["log"].attrs["first_estimates"]), **log_fields)
     for name in ("sequence_name", "config", "counts", "noise_twist_std", "noise_pixel_std_px"):
         if name not in group.attrs:
             raise ArchiveError(f"{path}: attribute {name} of runs/{mode} is missing")
@@ -209,6 +281,9 @@ def _read_result(path: str | Path, h5file: h5py.File, mode: str) -> Result:
         counts=json.loads(group.attrs["counts"]),
         config=json.loads(group.attrs["config"]),
         noise=Noise(group.attrs["noise_twist_std"], group.attrs["noise_pixel_std_px"]),
+        camera=camera,
+        T_cam_imu=T_cam_imu,
+        log=log,
         attributes={
             key: value.item() if isinstance(value, np.generic) else value
             for key, value in group["attributes"].attrs.items()

@@ -8,19 +8,22 @@ import sys
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as SequenceType
 from pathlib import Path
+from typing import get_args
 
 import h5py
 
 from ekfslam import __version__
 from ekfslam.archive import FORMAT as ARCHIVE_FORMAT
-from ekfslam.archive import Archive, export_trajectory, open_result, read_archive, write_archive
+from ekfslam.archive import Archive, add_result, export_trajectory, open_result, read_archive, write_archive
 from ekfslam.comparison import compare
-from ekfslam.config import MODES, VARIANTS, Config
+from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation
 from ekfslam.consistency_report import check_consistency
 from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
 from ekfslam.metrics.summary import compare_table, summarise
 from ekfslam.montecarlo import LEVELS, STUDY_VARIANTS, Study, levels_of
 from ekfslam.plotting import save_figures
+from ekfslam.plotting_posterior import save_posterior_figures
+from ekfslam.posterior import posterior, smooth
 from ekfslam.readers import BUILTIN, open_sequence, write_sequence
 from ekfslam.result import Result
 from ekfslam.runner import run
@@ -163,6 +166,23 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--out", type=Path, metavar="DIR", help="default: the folder of the archive")
 
     sub = add(
+        "posterior",
+        _posterior,
+        "smooth a full run: write the posterior over all poses and landmarks into its archive",
+        "posterior city.h5",
+        "posterior city.h5 --linearisation filtered",
+        "posterior city.h5 --kernel cauchy",
+    )
+    sub.add_argument("archive", type=Path, metavar="ARCHIVE", help="as written by run or compare, mode full")
+    sub.add_argument(
+        "--linearisation",
+        choices=get_args(Linearisation),
+        help="map: at the maximum a posteriori; filtered: where the filter linearised (default: as configured, map)",
+    )
+    sub.add_argument("--kernel", choices=get_args(Kernel), help="robust kernel of map (default: as configured, huber)")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="for the figures; default: the folder of the archive")
+
+    sub = add(
         "export",
         _export,
         "write a trajectory of an archive as text",
@@ -297,6 +317,23 @@ def _plot(options: argparse.Namespace) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     for path in save_figures(directory, archive.results, archive.truth):
         print(path)
+
+
+def _posterior(options: argparse.Namespace) -> None:
+    full = open_result(options.archive, "full")
+    overrides = {"posterior": {"linearisation": options.linearisation, "kernel": options.kernel}}
+    config = Config().with_overrides(full.config).with_overrides(overrides).posterior
+    found = posterior(full, config)
+    smoothed = smooth(full, config, found)
+    add_result(options.archive, smoothed)
+    archive = read_archive(options.archive)
+    print(_table(archive, None, archive.results))
+    print(", ".join(f"{name} {count}" for name, count in smoothed.counts.items()))
+    directory = options.out or options.archive.parent
+    directory.mkdir(parents=True, exist_ok=True)
+    for path in save_posterior_figures(directory, full, smoothed, found.information, archive.truth):
+        print(path)
+    print(f"{smoothed.mode} written to {options.archive}")
 
 
 def _export(options: argparse.Namespace) -> None:

@@ -12,6 +12,7 @@ from ekfslam.archive import write_archive
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.metrics.summary import compare_table, summarise
 from ekfslam.plotting import save_figures
+from ekfslam.posterior import smooth
 from ekfslam.result import Result
 from ekfslam.runner import run
 from ekfslam.sequence import Sequence
@@ -59,8 +60,13 @@ def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | 
     Raises:
         ConfigError: Unknown mode.
         InnovationError: An innovation covariance is not positive definite.
+        IllPosedError: A posterior leaves something undetermined.
     """
-    results: dict[str, Result] = {mode: run(sequence, mode, config) for mode in modes}
+    results: dict[str, Result] = {}
+    for mode in modes:
+        # The filter that "smoothed" starts from need not run twice.
+        known = mode == "smoothed" and "full" in results
+        results[mode] = smooth(results["full"]) if known else run(sequence, mode, config)
     summary = {
         "sequence": sequence.name,
         "frames": len(sequence),

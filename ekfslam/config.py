@@ -15,9 +15,11 @@ from scipy.stats import chi2
 from ekfslam.errors import ConfigError
 from ekfslam.sequence import Noise, Sequence
 
-Mode = Literal["dead-reckoning", "mapping-only", "full"]
+Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
 Variant = Literal["invariant", "fej", "standard"]
 Retire = Literal["auto", "unseen", "never"]
+Linearisation = Literal["map", "filtered"]
+Kernel = Literal["huber", "cauchy", "none"]
 
 MODES: tuple[Mode, ...] = get_args(Mode)
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
@@ -48,8 +50,12 @@ class FilterConfig:
     Args:
         variant: Linearisation rule of the joint filter, see `ekfslam.filters.variants`.
         iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. Not for ``fej``.
-        retire: ``unseen`` marginalises a landmark at the first frame that does not see it, ``never`` keeps all;
-            ``auto`` is ``never`` for a sequence of at most 300 landmarks some of which come back, else ``unseen``.
+        retire: ``unseen`` marginalises a landmark when it is out of view, ``never`` keeps all; ``auto`` is ``never``
+            for a sequence of at most 300 landmarks some of which come back, else ``unseen``.
+        retire_after: Frames without a sighting after which ``unseen`` applies. By default 1, or 10 in a sequence some
+            of whose landmarks come back.
+        revive: A retired landmark that is seen again comes back with its exact mean, covariance and cross-covariance,
+            together with up to this many retired landmarks that were seen nearest to it in time. -1 starts it afresh.
         gate_probability: Chi-square gate on each landmark's three rows, once against the prediction and (joint filter)
             once against the prediction as corrected by the frame's other landmarks; 1 accepts everything.
         split_after: A track is split, its landmark retired and a new one started, when this many observations in a row
@@ -64,6 +70,8 @@ class FilterConfig:
     variant: Variant = "invariant"
     iterations: int = 1
     retire: Retire = "auto"
+    retire_after: int | None = None
+    revive: int = 100
     gate_probability: float = 0.999
     split_after: int = 3
     min_disparity_px: float = 2.0
@@ -84,28 +92,63 @@ class FilterConfig:
 
 
 @dataclass(frozen=True)
+class PosteriorConfig:
+    """How the posterior over all poses and landmarks is linearised.
+
+    Args:
+        linearisation: ``map`` linearises all rows again at the maximum a posteriori, found from the filter's estimate;
+            ``filtered`` leaves them where the filter linearised them.
+        kernel: Robust kernel on the whitened residual of each observation (``map`` only), see `ekfslam.posterior`.
+        kernel_width: Where it leaves the parabola, in standard deviations. The default is exceeded by 5 % of Gaussian
+            residuals.
+        max_iterations: Of Levenberg-Marquardt.
+        tolerance: It stops when an iteration lowers the cost by a smaller share than this.
+    """
+
+    linearisation: Linearisation = "map"
+    kernel: Kernel = "huber"
+    kernel_width: float = 2.8
+    max_iterations: int = 50
+    tolerance: float = 1e-7
+
+
+@dataclass(frozen=True)
 class Config:
     """Everything that decides what a run does besides the data."""
 
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
+    posterior: PosteriorConfig = field(default_factory=PosteriorConfig)
 
     def __post_init__(self) -> None:
-        noise, filter_ = self.noise, self.filter
+        noise, filter_, posterior = self.noise, self.filter, self.posterior
         for name, value in dataclasses.asdict(noise).items():
             if value is not None and not (np.isfinite(value) and value >= 0):
                 raise ConfigError(f"noise.{name} must be finite and not negative, found {value}")
         if noise.sigma_px == 0:
             raise ConfigError("noise.sigma_px must be positive: the innovation covariance would be singular")
-        for name, allowed in (("variant", VARIANTS), ("retire", get_args(Retire))):
-            if getattr(filter_, name) not in allowed:
-                raise ConfigError(
-                    f"filter.{name} must be one of {', '.join(allowed)}, found {getattr(filter_, name)!r}"
-                )
+        for table, name, value, allowed in (
+            ("filter", "variant", filter_.variant, VARIANTS),
+            ("filter", "retire", filter_.retire, get_args(Retire)),
+            ("posterior", "linearisation", posterior.linearisation, get_args(Linearisation)),
+            ("posterior", "kernel", posterior.kernel, get_args(Kernel)),
+        ):
+            if value not in allowed:
+                raise ConfigError(f"{table}.{name} must be one of {', '.join(allowed)}, found {value!r}")
+        if not posterior.kernel_width > 0:
+            raise ConfigError(f"posterior.kernel_width must be positive, found {posterior.kernel_width}")
+        if posterior.max_iterations != int(posterior.max_iterations) or posterior.max_iterations < 1:
+            raise ConfigError(
+                f"posterior.max_iterations must be a whole number not below 1, found {posterior.max_iterations}"
+            )
+        if not 0 < posterior.tolerance < 1:
+            raise ConfigError(f"posterior.tolerance must be between 0 and 1, found {posterior.tolerance}")
         if not 0 < filter_.gate_probability <= 1:
             raise ConfigError(f"filter.gate_probability must be in (0, 1], found {filter_.gate_probability}")
-        for name, smallest in (("split_after", 0), ("iterations", 1)):
+        for name, smallest in (("split_after", 0), ("iterations", 1), ("retire_after", 1), ("revive", -1)):
             value = getattr(filter_, name)
+            if value is None:
+                continue
             if value != int(value) or value < smallest:
                 raise ConfigError(f"filter.{name} must be a whole number not below {smallest}, found {value}")
         if filter_.variant == "fej" and filter_.iterations > 1:
@@ -124,11 +167,16 @@ class Config:
             )
 
     def resolved(self, sequence: Sequence) -> Config:
-        """This configuration with ``retire = "auto"`` decided for ``sequence``; noise is decided by `noise_of`."""
-        retire = self.filter.retire
+        """This configuration with what is automatic decided for ``sequence``; noise is decided by `noise_of`."""
+        retire, retire_after = self.filter.retire, self.filter.retire_after
+        come_back = _landmarks_come_back(sequence)
         if retire == "auto":
-            retire = "never" if _landmarks_come_back(sequence) else "unseen"
-        return dataclasses.replace(self, filter=dataclasses.replace(self.filter, retire=retire))
+            retire = "never" if come_back and len(sequence.observations.ids) <= AUTO_NEVER_LIMIT else "unseen"
+        if retire_after is None:
+            retire_after = 10 if come_back else 1
+        return dataclasses.replace(
+            self, filter=dataclasses.replace(self.filter, retire=retire, retire_after=retire_after)
+        )
 
     def with_overrides(self, overrides: Mapping[str, Mapping[str, Any]]) -> Config:
         """This configuration with ``{table: {key: value}}`` replaced; None values are skipped.
@@ -136,7 +184,11 @@ class Config:
         Raises:
             ConfigError: An unknown table or key, or a value of the wrong type or range.
         """
-        tables: dict[str, NoiseConfig | FilterConfig] = {"noise": self.noise, "filter": self.filter}
+        tables: dict[str, NoiseConfig | FilterConfig | PosteriorConfig] = {
+            "noise": self.noise,
+            "filter": self.filter,
+            "posterior": self.posterior,
+        }
         for table, values in overrides.items():
             if table not in tables:
                 raise ConfigError(f"unknown table [{table}]; known: {', '.join(tables)}")
@@ -146,7 +198,7 @@ class Config:
             for key, value in values.items():
                 if key not in known:
                     raise ConfigError(f"unknown key {table}.{key}; known: {', '.join(known)}")
-                is_text = key in ("variant", "retire")
+                is_text = key in ("variant", "retire", "linearisation", "kernel")
                 wanted = isinstance(value, str if is_text else (int, float)) and not isinstance(value, bool)
                 if value is not None and not wanted:
                     raise ConfigError(f"{table}.{key} must be a {'string' if is_text else 'number'}, found {value!r}")
@@ -156,7 +208,7 @@ class Config:
 
     @staticmethod
     def from_toml(path: str | Path) -> Config:
-        """Defaults overridden by a TOML file with tables ``[noise]`` and ``[filter]``.
+        """Defaults overridden by a TOML file with tables ``[noise]``, ``[filter]`` and ``[posterior]``.
 
         Raises:
             ConfigError: The file is missing, is not TOML, or holds something unknown.
@@ -183,8 +235,6 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
 
 def _landmarks_come_back(sequence: Sequence) -> bool:
     observations = sequence.observations
-    if len(observations.ids) > AUTO_NEVER_LIMIT:
-        return False
     order = np.lexsort((observations.frame, observations.landmark))
     same = np.diff(observations.landmark[order]) == 0
     return bool((same & (np.diff(observations.frame[order]) > 1)).any())

@@ -8,6 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 
+def _listed(ids: tuple[int, ...]) -> str:
+    """`` [3, 5, ...]``, or nothing for none."""
+    shown = ", ".join(map(str, ids[:8])) + (", ..." if len(ids) > 8 else "")
+    return f" [{shown}]" if ids else ""
+
+
 class EkfslamError(Exception):
     """Base of every error that a user's data, configuration or request can cause."""
 
@@ -95,8 +101,32 @@ class InnovationError(FilterError):
 
     def __init__(self, frame: int, ids: Iterable[int]) -> None:
         self.frame, self.ids = frame, tuple(int(i) for i in ids)
-        shown = ", ".join(map(str, self.ids[:8])) + (", ..." if len(self.ids) > 8 else "")
         super().__init__(
-            f"frame {frame}: innovation covariance is not positive definite for landmark ids [{shown}]; "
+            f"frame {frame}: innovation covariance is not positive definite for landmark ids{_listed(self.ids)}; "
             "check that the pixel noise is positive and the initial covariance positive semi-definite"
         )
+
+
+class PosteriorError(EkfslamError):
+    """A posterior is asked for what it cannot give."""
+
+
+class IllPosedError(PosteriorError):
+    """The rows of a posterior leave something undetermined.
+
+    Args:
+        what: What is undetermined.
+        ids: Ids of the landmarks, or numbers of the frames, that are.
+    """
+
+    def __init__(self, what: str, ids: Iterable[int]) -> None:
+        self.ids = tuple(int(i) for i in ids)
+        super().__init__(f"the posterior is ill-posed: {what}{_listed(self.ids)}")
+
+
+class LineError(DataError):
+    """A line of a text file holds more or fewer values than its format, or what is no number or no stamp."""
+
+
+class LostDataError(DataError):
+    """Packets or stamps of a recording are lost in a number or at a place that cannot be repaired."""

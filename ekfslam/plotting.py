@@ -51,8 +51,9 @@ MODE_STYLES: dict[str, dict[str, Any]] = {
     "full": {"color": "#0072B2", "linestyle": "-", "marker": "o"},
     "dead-reckoning": {"color": "#D55E00", "linestyle": "--", "marker": "^"},
     "mapping-only": {"color": "#009E73", "linestyle": ":", "marker": "s"},
+    "smoothed": {"color": "#CC79A7", "linestyle": "-.", "marker": "D"},
 }
-_OTHER_STYLE: dict[str, Any] = {"color": "#CC79A7", "linestyle": "-.", "marker": "D"}
+_OTHER_STYLE: dict[str, Any] = {"color": "#56B4E9", "linestyle": "-.", "marker": "v"}
 _TRUTH_STYLE: dict[str, Any] = {"color": "black", "linestyle": "-", "linewidth": 2.2}
 _LANDMARK_COLOR = "#8A5A00"
 

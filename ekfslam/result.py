@@ -8,7 +8,10 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ekfslam.camera import StereoCamera
+from ekfslam.log import Log
 from ekfslam.se3 import Array
 from ekfslam.sequence import IntArray, Noise
 
@@ -23,7 +26,7 @@ REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera"
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Every landmark a run has estimated, in the order in which it was retired (those alive at the end come last).
+    """Every landmark a run has estimated (full mode: in the order of first sight, which is that of the log).
 
     Args:
         id: (M,) landmark id; an id occurs again for each time a retired landmark started afresh.
@@ -44,6 +47,10 @@ class Landmarks:
 
     def __len__(self) -> int:
         return len(self.id)
+
+    def only(self, which: IntArray | NDArray[np.bool_]) -> Landmarks:
+        """Some of the landmarks."""
+        return Landmarks(*(getattr(self, f.name)[which] for f in fields(Landmarks)))
 
     @staticmethod
     def concatenate(parts: SequenceType[Landmarks]) -> Landmarks:
@@ -98,7 +105,7 @@ class Result:
     """One mode run on one sequence.
 
     Args:
-        mode: ``dead-reckoning``, ``mapping-only`` or ``full``.
+        mode: ``dead-reckoning``, ``mapping-only``, ``full``, or of a posterior ``smoothed`` or ``as filtered``.
         sequence_name: Name of the sequence.
         time_s: (T,) stamps.
         T_world_imu: (T, 4, 4) estimated poses.
@@ -110,6 +117,8 @@ class Result:
         counts: Totals worth knowing: accepted, rejected per reason, retired, reappeared.
         config: The resolved configuration as nested dictionaries.
         noise: The measurement noise that was assumed.
+        camera, T_cam_imu: The calibration that was assumed.
+        log: What the joint filter conditioned on; ``landmarks`` are in its order (full mode only).
         attributes: Sequence attributes, versions, seed, input checksum.
     """
 
@@ -125,4 +134,7 @@ class Result:
     counts: Mapping[str, int]
     config: Mapping[str, Any]
     noise: Noise
+    camera: StereoCamera
+    T_cam_imu: Array
+    log: Log | None = None
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)

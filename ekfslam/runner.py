@@ -19,6 +19,7 @@ from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import run_joint
 from ekfslam.filters.mapping import map_landmarks
 from ekfslam.filters.observing import Rig, collect
+from ekfslam.posterior import smooth
 from ekfslam.progress import progress
 from ekfslam.result import Innovation, Landmarks, Rejections, Result
 from ekfslam.sequence import Sequence
@@ -30,26 +31,30 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
     Args:
         sequence: The recording.
         mode: ``dead-reckoning`` (prediction only), ``mapping-only`` (the report: independent landmark EKFs on dead
-            reckoning's poses) or ``full`` (joint EKF SLAM).
+            reckoning's poses), ``full`` (joint EKF SLAM) or ``smoothed`` (the posterior of a full run).
         config: Settings; defaults where None.
 
     Raises:
         ConfigError: Unknown mode.
         InnovationError: An innovation covariance is not positive definite.
+        IllPosedError: The posterior of a smoothed run leaves something undetermined.
     """
     if mode not in MODES:
         raise ConfigError(f"unknown mode {mode!r}; known: {', '.join(MODES)}")
+    if mode == "smoothed":
+        return smooth(run(sequence, "full", config))
     config = (config or Config()).resolved(sequence)
     noise = noise_of(sequence, config)
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
     frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
     counts: dict[str, int] = {}
+    log = None
 
     # Small dense matrices: a second BLAS thread costs three times what it saves.
     with threadpool_limits(1, user_api="blas"):
         if mode == "full":
             ekf, T_imu_world, covariance, reports, ms = run_joint(sequence, rig, config.filter, frames)
-            landmarks, counts = ekf.landmarks(), ekf.counts
+            landmarks, counts, log = ekf.landmarks(), ekf.counts, ekf.log()
         else:
             begin = perf_counter()
             T_imu_world, covariance = dead_reckon(sequence, noise, config.filter.initial_covariance)
@@ -79,6 +84,9 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
         counts=counts,
         config=dataclasses.asdict(config),
         noise=noise,
+        camera=sequence.camera,
+        T_cam_imu=sequence.T_cam_imu,
+        log=log,
         attributes={**sequence.attributes, **versions()},
     )
 

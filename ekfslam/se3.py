@@ -133,6 +133,18 @@ def transform(R: Array, t: Array) -> Array:
     return T
 
 
+def nearest_rigid(T: Array) -> Array:
+    """The transform (4, 4) with its rotation part replaced by the nearest rotation; as it is if that is one already.
+
+    `inverse` takes the transpose for the inverse: with a rotation printed to five digits the two differ by 1e-5.
+    """
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() < 1e-14:
+        return T
+    U, _, Vt = np.linalg.svd(R)
+    return transform(U @ Vt, T[:3, 3])
+
+
 def inverse(T: Array) -> Array:
     """Inverse of a rigid transform, ``T_a_b`` to ``T_b_a``: (..., 4, 4) to (..., 4, 4)."""
     R_transposed = np.swapaxes(T[..., :3, :3], -1, -2)

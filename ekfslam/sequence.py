@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ekfslam import se3
 from ekfslam.camera import StereoCamera
 from ekfslam.errors import (
     CalibrationError,
@@ -30,6 +31,9 @@ from ekfslam.se3 import Array
 IntArray = NDArray[np.int64]
 
 ROTATION_TOLERANCE = 1e-4  # files print rotations with as few as five digits
+
+# Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
+WITHOUT_TRACKS = {"tracks": "none"}
 
 
 @dataclass(frozen=True)
@@ -124,8 +128,8 @@ class Sequence:
         time_s: (T,) strictly increasing stamps.
         twist: (T, 6) measured velocities ``[v; w]`` in the IMU frame; ``twist[k]`` drives ``(t[k-1], t[k]]``.
         camera: Stereo intrinsics.
-        T_cam_imu: (4, 4) extrinsics, IMU to left optical frame.
-        observations: Flat stereo observations.
+        T_cam_imu: (4, 4) extrinsics, IMU to left optical frame; made rigid to rounding, as files print few digits.
+        observations: Flat stereo observations; none only where the attributes have `WITHOUT_TRACKS`.
         truth: Ground truth, if there is any.
         noise: Noise as stated by the source, if it states any.
         notes: What the reader found and did about it, one sentence each.
@@ -153,6 +157,7 @@ class Sequence:
             if error.source:
                 raise
             raise type(error)(error.message, source=self.source, field=error.field, index=error.index) from None
+        object.__setattr__(self, "T_cam_imu", _frozen(se3.nearest_rigid(self.T_cam_imu)))
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -161,7 +166,7 @@ class Sequence:
     def initial_T_world_imu(self) -> Array:
         """(4, 4) pose that estimates start from: the true first pose where it is known, identity elsewhere."""
         if self.truth is not None and len(self.truth.frame) and self.truth.frame[0] == 0:
-            return self.truth.T_world_imu[0]
+            return se3.nearest_rigid(self.truth.T_world_imu[0])
         return np.eye(4)
 
 
@@ -243,7 +248,8 @@ def _validate(sequence: Sequence) -> None:
     require_shape(sequence.T_cam_imu, (4, 4), "T_cam_imu")
     require_finite(sequence.T_cam_imu, "T_cam_imu")
     require_rigid(sequence.T_cam_imu, "T_cam_imu", ExtrinsicsError)
-    _validate_observations(sequence.observations, frames)
+    if len(sequence.observations) or sequence.attributes.get("tracks") != WITHOUT_TRACKS["tracks"]:
+        _validate_observations(sequence.observations, frames)
     if sequence.truth is not None:
         _validate_truth(sequence.truth, frames)
     if sequence.noise is not None:

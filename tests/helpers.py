@@ -78,6 +78,8 @@ def synthetic_result(sequence: Sequence, mode: str = "full", seed: int = 1) -> R
         counts={"accepted": 0},
         config=dataclasses.asdict(Config()),
         noise=NOISE,
+        camera=sequence.camera,
+        T_cam_imu=sequence.T_cam_imu,
         attributes={**sequence.attributes, "version_ekfslam": "0.1.0"},
     )
     if mode == "dead-reckoning":

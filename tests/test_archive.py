@@ -13,7 +13,7 @@ from helpers import synthetic_result, synthetic_sequence
 
 from ekfslam import archive as archive_module
 from ekfslam import se3
-from ekfslam.archive import export_trajectory, open_result, read_archive, write_archive
+from ekfslam.archive import FORMAT_VERSION, export_trajectory, open_result, read_archive, write_archive
 from ekfslam.errors import ArchiveError
 from ekfslam.result import ERROR_CONVENTION
 
@@ -143,8 +143,8 @@ def test_unknown_mode_is_named_with_those_there_are(copy):
 
 def test_newer_version_is_refused(copy):
     with h5py.File(copy, "a") as h5file:
-        h5file.attrs["format_version"] = 2
-    with pytest.raises(ArchiveError, match=r"copy\.h5.*version 2.*up to version 1"):
+        h5file.attrs["format_version"] = FORMAT_VERSION + 1
+    with pytest.raises(ArchiveError, match=rf"copy\.h5.*version {FORMAT_VERSION + 1}.*up to version {FORMAT_VERSION}"):
         read_archive(copy)
 
 

@@ -39,7 +39,7 @@ def test_compare_writes_archive_summaries_and_figures(tmp_path, capsys):
     summary = json.loads((folder / "summary.json").read_text())
     assert {"sequence", "frames", "landmarks", "modes"} == set(summary)
     assert summary["frames"] == 40
-    assert list(summary["modes"]) == ["dead-reckoning", "mapping-only", "full"]
+    assert list(summary["modes"]) == ["dead-reckoning", "mapping-only", "full", "smoothed"]
     assert all(set(values) == SUMMARY_KEYS for values in summary["modes"].values())
     assert list(read_archive(folder / "archive.h5").results) == list(summary["modes"])
 

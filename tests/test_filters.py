@@ -27,8 +27,7 @@ def settings(**changes):
 def drive(sequence, config, P0=None):
     """`JointEKF` over a sequence with any initial covariance; poses after each frame and the filter."""
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise_of(sequence, config))
-    ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu)
-    ekf.P = np.zeros((6, 6)) if P0 is None else P0.copy()
+    ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu, P0)
     poses = []
     for k in range(len(sequence)):
         if k > 0:
@@ -196,7 +195,7 @@ def test_conditional_gate_equals_leaving_each_landmark_out(variant):
     assert report.dof == reference.dof
 
 
-def test_a_landmark_that_comes_back_starts_afresh_and_is_counted():
+def test_a_landmark_that_comes_back_is_revived_or_starts_afresh_and_is_counted():
     world = small_world()
     observations = world.observations
     longest = np.bincount(observations.landmark).argmax()
@@ -207,13 +206,20 @@ def test_a_landmark_that_comes_back_starts_afresh_and_is_counted():
         world,
         observations=Observations(observations.frame[keep], observations.landmark[keep], observations.pixels_px[keep]),
     )
-    result = run(gapped, "full", settings(retire="unseen"))
-    assert result.counts["reappeared"] == 1
-    assert (result.landmarks.id == longest).sum() == 2
+    afresh = run(gapped, "full", settings(retire="unseen", retire_after=1, revive=-1))
+    assert (afresh.counts["revived"], afresh.counts["reappeared"]) == (0, 1)
+    assert (afresh.landmarks.id == longest).sum() == 2
+    revived = run(gapped, "full", settings(retire="unseen", retire_after=1))
+    assert (revived.counts["revived"], revived.counts["reappeared"]) == (1, 0)
+    assert (revived.landmarks.id == longest).sum() == 1
+    # Kept for some frames it is still there when it comes back.
+    patient = run(gapped, "full", settings(retire="unseen"))
+    assert patient.config["filter"]["retire_after"] == 10
+    assert (patient.counts["revived"], patient.counts["reappeared"]) == (0, 0)
     # Left to "auto", a small world with returning landmarks keeps them all.
     automatic = run(gapped, "full", settings(retire="auto"))
     assert automatic.config["filter"]["retire"] == "never"
-    assert automatic.counts["reappeared"] == 0
+    assert automatic.counts["retired"] == 0
 
 
 def test_screening_reasons():

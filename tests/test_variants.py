@@ -26,8 +26,7 @@ def exact_motion(sequence):
 
 
 def drive(sequence, config, P0=P0, frames=None):
-    ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, sequence.noise), config, sequence.initial_T_world_imu)
-    ekf.P = P0.copy()
+    ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, sequence.noise), config, sequence.initial_T_world_imu, P0)
     for k in range(frames or len(sequence)):
         if k > 0:
             ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])

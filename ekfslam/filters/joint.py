@@ -18,6 +18,8 @@ from scipy.linalg import blas, lapack
 from ekfslam import motion, se3
 from ekfslam.config import FilterConfig
 from ekfslam.errors import InnovationError
+from ekfslam.filters.behind import Behind
+from ekfslam.filters.logbook import LogBook
 from ekfslam.filters.observing import (
     ACCEPTED,
     BEHIND_CAMERA,
@@ -34,9 +36,13 @@ from ekfslam.filters.observing import (
 )
 from ekfslam.filters.symmetric import add_square
 from ekfslam.filters.variants import RULES
+from ekfslam.log import Log
 from ekfslam.result import Landmarks
 from ekfslam.se3 import Array
 from ekfslam.sequence import IntArray, Sequence
+
+# Frames that a neighbour fetched with a returning landmark stays without being seen, beyond twice its distance in time.
+_PATIENCE = 30
 
 
 @dataclass(frozen=True)
@@ -66,27 +72,36 @@ class JointEKF:
         sensor: What observes the landmarks, with its noise: a `Rig`.
         config: Variant, gate, limits, retirement (``auto`` must have been resolved; it counts as ``unseen``).
         T_world_imu: (4, 4) first pose.
+        covariance: (6, 6) of its error ``xi``; by default that of the configuration.
 
     Attributes:
         T_imu_world: (4, 4) estimate of the report's inverse pose.
         P: (6+3n, 6+3n) covariance of ``(xi, d_1, ..., d_n)`` with ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``.
         ids: (n,) ids of the active landmarks, in the order of their blocks in P.
         positions_m: (n, 3) their positions in world.
+        revived: Ids of retired landmarks that were seen again and came back.
         reappeared: Ids of retired landmarks that were seen again and started afresh.
     """
 
-    def __init__(self, sensor: Sensor, config: FilterConfig, T_world_imu: Array) -> None:
+    def __init__(
+        self, sensor: Sensor, config: FilterConfig, T_world_imu: Array, covariance: Array | None = None
+    ) -> None:
         self.sensor, self.config = sensor, config
         self.rule = RULES[config.variant]
         self._gate = config.gate
         self.T_imu_world = self._T_predicted = se3.inverse(T_world_imu)
-        self.P = config.initial_covariance
+        self.P = config.initial_covariance if covariance is None else np.array(covariance, dtype=float)
         self.positions_m = np.empty((0, 3))
+        self.revived: list[int] = []
         self.reappeared: list[int] = []
-        self._books = np.empty((0, 5), dtype=np.int64)  # id, first frame, last frame, observations, misses in a row
+        # id, first frame, last frame, observations, misses in a row, row in the log, stays without being seen before
+        self._books = np.empty((0, 7), dtype=np.int64)
         self._initial_m = np.empty((0, 3))
         self._retired: list[Landmarks] = []
-        self._retired_ids: set[int] = set()
+        self._retired_rows: list[IntArray] = []
+        self._retired_row: dict[int, int] = {}  # of what can come back: its id, its row in the log
+        self._behind = Behind(sensor, config)
+        self._log = LogBook(self.rule.first_estimates, self.P.copy(), self.T_imu_world)
 
     @property
     def ids(self) -> IntArray:
@@ -110,6 +125,7 @@ class JointEKF:
         self.P[:6, 6:] = F @ self.P[:6, 6:]
         self.P[6:, :6] = self.P[:6, 6:].T
         self.P[:6, :6] = 0.5 * (P_xx + P_xx.T)
+        self._log.predicted(twist, tau_s, T_next)
 
     def _advance(self, twist: Array, tau_s: float) -> tuple[Array, Array]:
         """The next ``T_imu_world`` of eq. (1), and F of eq. (2)."""
@@ -135,9 +151,13 @@ class JointEKF:
             InnovationError: The innovation covariance is not positive definite.
         """
         if self.config.retire != "never":
-            out_of_view = np.isin(self.ids, ids, invert=True)
-            self._retired_ids.update(self.ids[out_of_view].tolist())
+            unseen_for = frame - np.maximum(self._books[:, 2], self._books[:, 6])
+            out_of_view = (unseen_for >= (self.config.retire_after or 1)) & np.isin(self.ids, ids, invert=True)
+            self._retired_row.update(self._books[out_of_view][:, [0, 5]].tolist())
             self._retire(out_of_view)
+            returning = self._retired_row.keys() & set(ids.tolist())
+            if returning and self.config.revive >= 0:
+                self._revive(frame, sorted(returning))
         rows = self.sensor.rows(measured)
         reason = self.sensor.screen(measured, self.config)
         order = np.argsort(self.ids)
@@ -154,17 +174,30 @@ class JointEKF:
         split = self._split()
         new = (~is_known & (reason == ACCEPTED)) | np.isin(ids, split)
         reason[new] = ACCEPTED
+        self._log.updated(self.T_imu_world)
         self._start(frame, ids[new], rows[new])
         return FrameReport(frame, ids, reason, nis, dof, split)
 
     def landmarks(self) -> Landmarks:
-        """Every landmark so far: the retired ones in the order of their retirement, then the active ones."""
-        return Landmarks.concatenate([*self._retired, self._active(np.arange(len(self.ids)))])
+        """Every landmark so far, in the order of first sight, which is that of the log."""
+        row = np.concatenate([*self._retired_rows, self._books[:, 5]])
+        everything = Landmarks.concatenate([*self._retired, self._active(np.arange(len(self.ids)))])
+        # A landmark that came back and was retired again is there twice; its last estimate counts.
+        _, last = np.unique(row[::-1], return_index=True)
+        return everything.only(len(row) - 1 - last)
+
+    def log(self) -> Log:
+        """What the filter has conditioned on so far, for the posterior over all poses and landmarks."""
+        return self._log.log()
 
     @property
     def counts(self) -> dict[str, int]:
-        """Totals: landmarks retired, and retired ones that were seen again and started afresh."""
-        return {"retired": sum(len(part) for part in self._retired), "reappeared": len(self.reappeared)}
+        """Totals: landmarks retired, and retired ones that were seen again and came back or started afresh."""
+        return {
+            "retired": sum(len(part) for part in self._retired),
+            "revived": len(self.revived),
+            "reappeared": len(self.reappeared),
+        }
 
     def measurement_jacobian(self, ids: IntArray) -> sp.csr_array:
         """Full-width H (3k, 6+3n) of the rectified rows of active landmarks ``ids`` (k,), for inspection and tests.
@@ -235,19 +268,26 @@ class JointEKF:
                 # Taking observations out is an update with noise -V: P + P H^T (V - H P H^T)^-1 H P.
                 less_correction, less_nis = self._condition(frame, left.only(~inside), sign=-1.0)
                 correction, nis = correction - less_correction, nis - less_nis
-        if P_prior is not None and (verdict == ACCEPTED).any():
-            correction = self._iterate(
-                frame, P_prior, correction, slot[verdict == ACCEPTED], measured[verdict == ACCEPTED]
-            )
+        taken = verdict == ACCEPTED
+        slot, measured, positions = slot[taken], measured[taken], positions[taken]
+        if P_prior is not None and taken.any():
+            correction, T_linear, positions = self._iterate(frame, P_prior, correction, slot, measured)
+            self._log.linearised(T_linear)
+        self._log.observed(self._books[slot, 5], measured, sensor.variance(measured), positions)
         self._retract(correction[:6], correction[6:].reshape(-1, 3))
-        return float(nis), 3 * int((verdict == ACCEPTED).sum()), verdict
+        return float(nis), 3 * int(taken.sum()), verdict
 
-    def _iterate(self, frame: int, P_prior: Array, correction: Array, slot: IntArray, measured: Array) -> Array:
+    def _iterate(
+        self, frame: int, P_prior: Array, correction: Array, slot: IntArray, measured: Array
+    ) -> tuple[Array, Array, Array]:
         """Gauss-Newton on eq. (6): linearise again at the corrected state, always from the same prior.
 
         Rows taken at the corrected state are carried back into the prior's coordinates by the variant's derivative
         D, ``H_k D_k``, and the residual becomes ``r_k + H_k D_k (xi, d)_k``. Source: Bell and Cathey, "The
         iterated Kalman filter update as a Gauss-Newton method", IEEE TAC 1993.
+
+        Returns:
+            The correction (6+3n,); pose (4, 4) and landmarks (k, 3) at which it was linearised last.
         """
         for _ in range(self.config.iterations - 1):
             xi, d = correction[:6], correction[6:].reshape(-1, 3)
@@ -262,7 +302,7 @@ class JointEKF:
             rows = _Rows(slot, H_x, H_m, residual, self.sensor.variance(measured)).corrected(-correction)
             self.P = P_prior.copy()
             correction, _ = self._condition(frame, rows)
-        return correction
+        return correction, T, m[slot]
 
     def _condition(self, frame: int, rows: _Rows, sign: float = 1.0) -> tuple[Array, float]:
         """Eq. (6): condition P on the rows (sign 1), or take rows out that it was conditioned on (sign -1).
@@ -325,9 +365,42 @@ class JointEKF:
         self.P = P
         self.positions_m = np.concatenate([self.positions_m, positions])
         self._initial_m = np.concatenate([self._initial_m, positions])
-        books = np.column_stack([ids, *np.broadcast_to([[frame], [frame], [1], [0]], (4, len(ids)))])
+        row = self._log.started(ids, positions)
+        self._log.observed(row, rows, self.sensor.variance(rows), positions)
+        books = np.column_stack([ids, *np.broadcast_to([[frame], [frame], [1], [0]], (4, len(ids))), row, row * 0])
         self._books = np.concatenate([self._books, books])
-        self.reappeared.extend(sorted(self._retired_ids.intersection(ids.tolist())))
+        again = sorted(self._retired_row.keys() & set(ids.tolist()))
+        self.reappeared.extend(again)
+        for i in again:
+            del self._retired_row[i]
+
+    def _revive(self, frame: int, ids: list[int]) -> None:
+        """Bring retired landmarks back, and with them the neighbours that will probably be seen next.
+
+        The state (pose, active and returning landmarks) becomes its marginal in the system behind: see
+        `ekfslam.filters.behind`.
+        """
+        log = self._log.log()
+        returning = np.array([self._retired_row[i] for i in ids])
+        retired = np.fromiter(self._retired_row.values(), dtype=np.int64, count=len(self._retired_row))
+        neighbours, distance = self._behind.neighbours(log, returning, np.setdiff1d(retired, returning))
+        back = np.concatenate([returning, neighbours])
+        known = self.landmarks()
+        came = known.only(back)
+        stay_until = frame + np.concatenate([np.zeros_like(returning), 2 * distance + _PATIENCE])
+        books = np.column_stack(
+            [came.id, came.first_frame, came.last_frame, came.observations, np.zeros_like(back), back, stay_until]
+        )
+        self._books = np.concatenate([self._books, books])
+        for i in came.id.tolist():
+            del self._retired_row[i]
+        self.revived.extend(ids)
+
+        marginal = self._behind.marginal(log, known.position_m, self._books[:, 5])
+        self.T_imu_world, self.positions_m, self.P = marginal
+        self._initial_m = log.first_position_m[self._books[:, 5]]
+        self._log.linearised(self.T_imu_world)
+        self._log.updated(self.T_imu_world)
 
     def _split(self) -> IntArray:
         """Retire the landmarks that missed too often in a row; returns their ids, which are then free to start anew."""
@@ -343,6 +416,7 @@ class JointEKF:
         if not gone.any():
             return
         self._retired.append(self._active(np.flatnonzero(gone)))
+        self._retired_rows.append(self._books[gone, 5])
         stay = ~gone
         kept = np.flatnonzero(np.concatenate([np.ones(6, dtype=bool), np.repeat(stay, 3)]))
         self.P = self.P[kept].take(kept, axis=1)
@@ -351,7 +425,7 @@ class JointEKF:
 
     def _active(self, slot: IntArray) -> Landmarks:
         blocks = self.P[6:, 6:].reshape(len(self.ids), 3, len(self.ids), 3)
-        identifier, first, last, count, _ = self._books[slot].T
+        identifier, first, last, count = self._books[slot, :4].T
         return Landmarks(
             identifier, self.positions_m[slot], blocks[slot, :, slot, :], self._initial_m[slot], first, last, count
         )

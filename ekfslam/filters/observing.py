@@ -155,7 +155,7 @@ def linearise(
     q = se3.apply(sensor.T_cam_imu @ T_imu_world, positions_m)
     A = sensor.jacobian(q) @ sensor.T_cam_imu[:3, :3]
     s = se3.apply(T_imu_world, linear_positions_m)
-    return q, np.concatenate([A, -A @ se3.skew(s)], axis=-1), A @ T_imu_world[:3, :3]
+    return q, np.concatenate([A, -A @ se3.skew(s)], axis=-1), A @ T_imu_world[..., :3, :3]
 
 
 def first_sight(
@@ -176,12 +176,20 @@ def first_sight(
     q = sensor.invert(rows)
     T_world_cam = se3.inverse(sensor.T_cam_imu @ T_imu_world)
     positions = se3.apply(T_world_cam, q)
-    T = T_imu_world if T_linear is None else T_linear
-    s = se3.apply(T, positions)
-    G = -T[:3, :3].T @ np.concatenate([np.broadcast_to(np.eye(3), (len(s), 3, 3)), -se3.skew(s)], axis=-1)
+    G = landmark_by_pose(T_imu_world if T_linear is None else T_linear, positions)
     A_inverse = T_world_cam[:3, :3] @ np.linalg.inv(sensor.jacobian(q))
     covariance = (A_inverse * sensor.variance(rows)[:, None, :]) @ np.swapaxes(A_inverse, -1, -2)
     return positions, G, 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
+
+
+def landmark_by_pose(T_imu_world: Array, positions_m: Array) -> Array:
+    """``G = -C^T [I, -s^]`` (n, 3, 6) of eq. (5): how new landmarks (n, 3) follow the error of the pose that saw them.
+
+    The pose is (4, 4) for all, or (n, 4, 4).
+    """
+    s = se3.apply(T_imu_world, positions_m)
+    minus_C_transposed = np.broadcast_to(-T_imu_world[..., :3, :3].swapaxes(-1, -2), (len(s), 3, 3))
+    return np.concatenate([minus_C_transposed, -minus_C_transposed @ se3.skew(s)], axis=-1)
 
 
 def diagonal(variance: Array) -> Array:

@@ -5,6 +5,7 @@ The file's content, not its name, decides which reader is used:
 - .npz of the report and its dense, noisy edition (`ece276a`),
 - .mat of UTIAS: KITTI drives and Starry Night (`utias`),
 - ekfslam's own HDF5 form (`hdf5`),
+- a drive folder of KITTI raw (`kitti_raw`), which has no tracks and serves dead reckoning,
 - ``builtin:NAME``, a simulated world (`ekfslam.simulate`).
 """
 
@@ -19,27 +20,32 @@ from ekfslam.errors import ConfigError, UnknownFormatError
 from ekfslam.readers.ece276a import Extrinsics, read_ece276a
 from ekfslam.readers.fields import checksum
 from ekfslam.readers.hdf5 import read_sequence, write_sequence
+from ekfslam.readers.kitti_raw import KittiRaw, is_kitti_raw, open_kitti_raw
 from ekfslam.readers.truth import attach_truth
 from ekfslam.readers.utias import read_utias
 from ekfslam.sequence import Sequence
 
-__all__ = ["open_sequence", "read_sequence", "write_sequence"]
+__all__ = ["KittiRaw", "open_kitti_raw", "open_sequence", "read_sequence", "write_sequence"]
 
 BUILTIN = "builtin:"
 
-_EXPECTED = "expected an .npz recording (ECE 276A), a .mat recording (UTIAS) or an ekfslam HDF5 file"
+_EXPECTED = (
+    "expected an .npz recording (ECE 276A), a .mat recording (UTIAS), an ekfslam HDF5 file or a drive folder of "
+    "KITTI raw"
+)
 
 
 def open_sequence(
     source: str | Path, *, extrinsics: Extrinsics = "corrected", truth: str | Path | None = None
 ) -> Sequence:
-    """The recording in a file, or the built-in world ``builtin:NAME``.
+    """The recording in a file or folder, or the built-in world ``builtin:NAME``.
 
     Args:
-        source: Path of a recording, or ``builtin:NAME``.
+        source: Path of a recording, or ``builtin:NAME``. A drive folder of KITTI raw gives a sequence without tracks;
+            `open_kitti_raw` takes tracks from elsewhere.
         extrinsics: How to take ``cam_T_imu`` of an .npz recording, see `read_ece276a`; other formats store
             ``T_cam_imu`` unambiguously and know only ``corrected``.
-        truth: File of true poses (see `attach_truth`) to use instead of the recording's own truth.
+        truth: File or folder of true poses (see `attach_truth`) to use instead of the recording's own truth.
 
     Raises:
         UnknownFormatError: The file is missing, empty, damaged or of unknown content, or there is no such world.
@@ -59,6 +65,8 @@ def _open(source: str | Path, extrinsics: Extrinsics) -> Sequence:
     if str(source).startswith(BUILTIN):
         return simulate.builtin(str(source).removeprefix(BUILTIN))
     path = Path(source)
+    if is_kitti_raw(path):
+        return open_kitti_raw(path).sequence()
     try:
         with path.open("rb") as file:
             head = file.read(128)

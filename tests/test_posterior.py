@@ -1,0 +1,438 @@
+"""The joint posterior against the dense filter, against dense algebra, and against what it must not know."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from reference import small_world
+from test_variants import gauge_directions
+
+from ekfslam import se3
+from ekfslam.archive import open_result, write_archive
+from ekfslam.config import Config, FilterConfig, PosteriorConfig, noise_of
+from ekfslam.errors import IllPosedError, PosteriorError
+from ekfslam.filters.joint import JointEKF, run_joint
+from ekfslam.filters.observing import Rig
+from ekfslam.filters.rows import Rows, State
+from ekfslam.filters.smoothing import kernel_cost, kernel_weight
+from ekfslam.information import Elimination, JointInformation, LinearSystem
+from ekfslam.posterior import posterior, posterior_of_log, smooth
+from ekfslam.readers import open_sequence
+from ekfslam.runner import run
+from ekfslam.sequence import Noise, Observations
+from ekfslam.simulate import builtin
+
+P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
+SINGULAR_P0 = np.diag([0.1, 0.2, 0.0, 0.0, 0.0, 0.03]) ** 2
+OPEN = FilterConfig(gate_probability=1.0, split_after=0, min_disparity_px=1e-3, retire="never")
+FILTERED = PosteriorConfig(linearisation="filtered")
+
+
+def rig_of(sequence):
+    return Rig(sequence.camera, sequence.T_cam_imu, noise_of(sequence, Config()))
+
+
+def drive(sequence, config, P0=None, frames=None):
+    """The filter after a sequence, and its poses after each frame."""
+    ekf, poses = JointEKF(rig_of(sequence), config, sequence.initial_T_world_imu, P0), []
+    for k in range(frames or len(sequence)):
+        if k > 0:
+            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
+        ekf.update(k, *sequence.observations.at(k))
+        poses.append(ekf.T_imu_world)
+    return ekf, np.array(poses)
+
+
+def posterior_of(sequence, ekf, config=FILTERED):
+    return posterior_of_log(ekf.log(), rig_of(sequence), ekf.landmarks().position_m, config, ekf.config)
+
+
+def assert_equal_to_dense_filter(found, ekf):
+    """Every landmark, the last pose and all of the covariance, to the tolerances of exact arithmetic done twice."""
+    active = ekf._books[:, 5]
+    np.testing.assert_allclose(found.position_m[active], ekf.positions_m, atol=1e-6)
+    np.testing.assert_allclose(found.T_world_imu[-1], ekf.T_world_imu, atol=1e-9)
+    scale = np.sqrt(np.diag(ekf.P))
+    covariance = found.joint_covariance([-1], active)
+    assert (np.abs(covariance - ekf.P) <= 1e-8 * np.outer(scale, scale)).all()
+    n = len(active)
+    own = ekf.P[6:, 6:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+    # By selected inversion, too.
+    largest = np.abs(own).max(axis=(1, 2), keepdims=True)
+    assert (np.abs(found.landmark_covariance[active] - own) <= 1e-8 * largest).all()
+    largest = np.abs(ekf.P[:6, :6]).max()
+    assert (np.abs(found.pose_covariance[-1] - ekf.P[:6, :6]) <= 1e-8 * largest).all()
+
+
+@pytest.mark.parametrize(("variant", "iterations"), [("standard", 1), ("fej", 1), ("standard", 3)])
+@pytest.mark.parametrize("prior", [None, SINGULAR_P0, P0], ids=["certain", "half certain", "uncertain"])
+def test_as_filtered_equals_the_dense_filter(variant, iterations, prior):
+    world = small_world()
+    ekf, _ = drive(world, dataclasses.replace(OPEN, variant=variant, iterations=iterations), prior)
+    assert_equal_to_dense_filter(posterior_of(world, ekf), ekf)
+
+
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_as_filtered_equals_the_dense_filter_with_gates_and_splits(variant):
+    world = builtin("loop?frames=200&outlier_fraction=0.1")
+    config = FilterConfig(variant=variant, retire="never", split_after=2)
+    ekf, _, _, reports, _ = run_joint(world, rig_of(world), config, range(len(world)))
+    assert sum(len(report.split) for report in reports) > 0
+    assert sum((report.reason != -1).sum() for report in reports) > 100
+    assert_equal_to_dense_filter(posterior_of(world, ekf), ekf)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["0027", "0020", "0042"])
+def test_as_filtered_equals_the_dense_filter_on_the_recordings(data_path, name):
+    sequence = open_sequence(data_path(f"ece276a/{name}.npz"))
+    config = Config().with_overrides({"filter": {"variant": "standard", "retire": "never"}})
+    ekf, _, _, _, _ = run_joint(sequence, rig_of(sequence), config.filter, range(len(sequence)))
+    assert_equal_to_dense_filter(posterior_of(sequence, ekf), ekf)
+
+
+def test_where_landmarks_are_eliminated_makes_no_difference():
+    world = small_world()
+    ekf, _ = drive(world, OPEN, P0)
+    log = ekf.log()
+    system = Rows(log, rig_of(world)).relinearised(Rows(log, rig_of(world)).filtered_state(ekf.positions_m))
+    found = [
+        JointInformation(Elimination(log.frames, log.landmarks, log.frame, log.landmark, log.id, up_to), system)
+        for up_to in (0, 12, 1000)
+    ]
+    kept = [len(one.elimination.kept) for one in found]
+    assert kept[0] == log.landmarks > kept[1] > kept[2] == 0
+    for one in found[1:]:
+        np.testing.assert_allclose(one.eps, found[0].eps, atol=1e-10)
+        np.testing.assert_allclose(one.d, found[0].d, atol=1e-9)
+        np.testing.assert_allclose(one.pose_covariances(), found[0].pose_covariances(), atol=1e-12)
+        np.testing.assert_allclose(one.landmark_covariances(), found[0].landmark_covariances(), atol=1e-9)
+        np.testing.assert_allclose(one.log_determinant, found[0].log_determinant, rtol=1e-12)
+
+
+def random_system(rng, frames, landmarks, share):
+    """A random system whose landmarks are seen by a random, shuffled choice of frames, loops and all."""
+    seen = rng.uniform(size=(frames, landmarks)) < share
+    seen[rng.integers(frames, size=landmarks), np.arange(landmarks)] = True
+    frame, landmark = np.nonzero(seen)
+    order = rng.permutation(len(frame))
+    frame, landmark = frame[order], landmark[order]
+    K, steps = len(frame), frames - 1
+    return LinearSystem(
+        landmarks=landmarks,
+        B=rng.normal(size=(6, 6)),
+        r_prior=rng.normal(size=6),
+        J_from=rng.normal(size=(steps, 6, 6)),
+        J_to=rng.normal(size=(steps, 6, 6)),
+        r_motion=rng.normal(size=(steps, 6)),
+        frame=frame,
+        landmark=landmark,
+        J_x=rng.normal(size=(K, 3, 6)),
+        J_m=rng.normal(size=(K, 3, 3)),
+        r=rng.normal(size=(K, 3)),
+    )
+
+
+def dense_rows(system, frames):
+    """The same rows as one dense matrix over zeta, eps_1, ..., d_0, ..., and what turns zeta into eps_0."""
+    steps, K, width = frames - 1, len(system.r), 6 * frames + 3 * system.landmarks
+    J = np.zeros((6 + 6 * steps + 3 * K, width))
+    J[:6, :6] = np.eye(6)
+    for k in range(steps):
+        J[6 + 6 * k : 12 + 6 * k, 6 * k : 6 * k + 6] = system.J_from[k]
+        J[6 + 6 * k : 12 + 6 * k, 6 * k + 6 : 6 * k + 12] = system.J_to[k]
+    for i, (k, j) in enumerate(zip(system.frame, system.landmark, strict=True)):
+        rows = slice(6 + 6 * steps + 3 * i, 9 + 6 * steps + 3 * i)
+        J[rows, 6 * k : 6 * k + 6] = system.J_x[i]
+        J[rows, 6 * frames + 3 * j : 6 * frames + 3 * j + 3] = system.J_m[i]
+    J[6:, :6] = J[6:, :6] @ system.B
+    first = np.eye(width)
+    first[:6, :6] = system.B
+    return J, np.concatenate([system.r_prior, system.r_motion.ravel(), system.r.ravel()]), first
+
+
+@pytest.mark.parametrize(("frames", "landmarks", "share"), [(1, 3, 1.0), (12, 1, 0.3), (15, 25, 0.25), (30, 40, 0.05)])
+@pytest.mark.parametrize("up_to", [0, 4, 100])
+def test_information_equals_dense_least_squares(frames, landmarks, share, up_to):
+    rng = np.random.default_rng(frames)
+    system = random_system(rng, frames, landmarks, share)
+    J, r, first = dense_rows(system, frames)
+    ids = rng.permutation(1000)[:landmarks]
+    found = JointInformation(Elimination(frames, landmarks, system.frame, system.landmark, ids, up_to), system)
+    x = np.linalg.lstsq(J, r, rcond=None)[0]
+    mean, covariance = first @ x, first @ np.linalg.inv(J.T @ J) @ first.T
+    largest = np.abs(covariance).max()
+
+    np.testing.assert_allclose(found.eps.ravel(), mean[: 6 * frames], rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(found.d.ravel(), mean[6 * frames :], rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(found.cost, 0.5 * ((J @ x - r) ** 2).sum(), rtol=1e-9, atol=1e-12 * (r @ r))
+    np.testing.assert_allclose(found.log_determinant, np.linalg.slogdet(covariance)[1], rtol=1e-9)
+    for k, block in enumerate(found.pose_covariances()):
+        np.testing.assert_allclose(block, covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6], atol=1e-9 * largest)
+    for j, block in enumerate(found.landmark_covariances()):
+        own = slice(6 * frames + 3 * j, 6 * frames + 3 * j + 3)
+        np.testing.assert_allclose(block, covariance[own, own], atol=1e-9 * largest)
+
+    # A shuffled subset, the first pose not in front.
+    some_frames = rng.permutation(frames)[: max(1, frames // 2)]
+    some = rng.permutation(landmarks)[: max(1, landmarks // 2)]
+    columns = np.concatenate(
+        [(6 * some_frames[:, None] + np.arange(6)).ravel(), (6 * frames + 3 * some[:, None] + np.arange(3)).ravel()]
+    )
+    expected = covariance[np.ix_(columns, columns)]
+    np.testing.assert_allclose(found.covariance(some_frames, some), expected, atol=1e-9 * largest)
+
+
+def test_samples_have_the_covariance_they_are_drawn_from():
+    system = random_system(np.random.default_rng(3), 4, 5, 0.6)
+    found = JointInformation(Elimination(4, 5, system.frame, system.landmark, np.arange(5), 3), system)
+    assert 0 < len(found.elimination.kept) < 5
+    eps, d = found.sample(np.random.default_rng(4), 20_000)
+    draws = np.concatenate([eps.reshape(len(eps), -1), d.reshape(len(d), -1)], axis=1)
+    expected = found.covariance(np.arange(4), np.arange(5))
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        (draws.mean(axis=0) - np.concatenate([found.eps.ravel(), found.d.ravel()])) / scale, 0, atol=0.04
+    )
+    np.testing.assert_allclose(np.cov(draws.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.05)
+
+
+def numeric_rows(rows, state, weight=None):
+    """Central differences of the residuals of `Rows` through `Rows.moved`, in the layout of `dense_rows`."""
+    T, M = len(state.T_imu_world), len(state.positions_m)
+
+    def residuals(x):
+        eps = x[: 6 * T].reshape(T, 6).copy()
+        zeta, eps[0] = eps[0].copy(), 0.0
+        moved = rows.moved(state, eps, x[6 * T :].reshape(M, 3), zeta)
+        pixels = rows.observation_residual(rows.points(moved))
+        return np.concatenate([moved.zeta, rows.motion_residual(moved).ravel(), pixels.ravel()])
+
+    step = 1e-6
+    columns = [(residuals(e) - residuals(-e)) / (2 * step) for e in step * np.eye(6 * T + 3 * M)]
+    return np.column_stack(columns), residuals(np.zeros(6 * T + 3 * M))
+
+
+@pytest.mark.parametrize("turn", [0.01, 1.0, 3.1], ids=["near identity", "random", "near pi"])
+def test_relinearised_rows_are_derivatives_of_the_residuals(turn):
+    world = small_world(frames=8, landmarks=20)
+    ekf, _ = drive(world, OPEN, P0)
+    rows = Rows(ekf.log(), rig_of(world))
+    rng = np.random.default_rng(8)
+    state = rows.filtered_state(ekf.landmarks().position_m)
+    # Turn the whole world: the same points are seen, at poses anywhere; then leave the consistent state.
+    axis = rng.normal(size=3)
+    T_world = se3.exp(np.concatenate([rng.normal(size=3), turn * axis / np.linalg.norm(axis)]))
+    state = State(
+        se3.exp(0.03 * rng.normal(size=(8, 6))) @ state.T_imu_world @ se3.inverse(T_world),
+        se3.apply(T_world, state.positions_m) + 0.1 * rng.normal(size=state.positions_m.shape),
+        0.3 * rng.normal(size=6),
+    )
+    first = se3.inverse(se3.exp(rows.B @ state.zeta) @ rows.log.T_predicted[0]) @ state.T_imu_world[0]
+    state = dataclasses.replace(
+        state,
+        T_imu_world=state.T_imu_world @ se3.inverse(first),
+        positions_m=se3.apply(first, state.positions_m),
+    )
+    system = rows.relinearised(state)
+    J, r, _ = dense_rows(system, 8)
+    expected, residual = numeric_rows(rows, state)
+    np.testing.assert_allclose(residual[:6], -r[:6], atol=1e-12)
+    # Pixel rows explain z - h, motion rows minus the error.
+    expected[6 + 6 * 7 :] *= -1
+    np.testing.assert_allclose(J, expected, atol=2e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(np.concatenate([-residual[: 6 + 42], residual[48:]]), r, atol=1e-9)
+
+
+@pytest.mark.parametrize("kernel", ["huber", "cauchy", "none"])
+def test_kernel_weight_is_the_slope_of_the_cost(kernel):
+    s = np.linspace(0.05, 9.0, 60)
+    h = 1e-6
+    slope = (kernel_cost(kernel, 2.8, s + h) - kernel_cost(kernel, 2.8, s - h)) / (2 * h)
+    np.testing.assert_allclose(kernel_weight(kernel, 2.8, s) * s, slope, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kernel", ["huber", "none"])
+def test_map_is_a_minimum_and_better_than_where_it_started(kernel):
+    world = small_world()
+    ekf, _ = drive(world, OPEN, P0)
+    found = posterior_of(world, ekf, PosteriorConfig(kernel=kernel, tolerance=1e-13))
+    assert list(found.costs) == sorted(found.costs, reverse=True)
+    assert found.cost < 0.9 * found.costs[0]
+    # At the minimum the last system has nothing left to correct.
+    assert np.abs(found.information.eps).max() < 1e-6
+    assert np.abs(found.information.d).max() < 1e-4
+    start = rig_of(world), ekf.landmarks().position_m + 0.05
+    again = posterior_of_log(ekf.log(), *start, PosteriorConfig(kernel=kernel, tolerance=1e-13), ekf.config)
+    np.testing.assert_allclose(again.cost, found.cost, rtol=1e-9)
+    np.testing.assert_allclose(again.position_m, found.position_m, atol=1e-3)
+
+
+def test_map_learns_nothing_about_where_the_world_is():
+    """Information along the gauge, of the last pose and all landmarks, is that of the prior, a little less."""
+    world = small_world(seed=4, frames=40)
+    world = dataclasses.replace(world, noise=Noise(np.full(6, 1e-3), world.noise.pixel_std_px))
+    prior = np.diag([0.2, 0.1, 0.3, 0.05, 0.04, 0.08]) ** 2
+    ekf, _ = drive(world, OPEN, prior)
+    found = posterior_of(world, ekf, PosteriorConfig(kernel="none", tolerance=1e-13))
+    N = gauge_directions(se3.inverse(found.T_world_imu[-1]), found.position_m)
+    now = N.T @ np.linalg.solve(found.dense_covariance(), N)
+    T_start = se3.inverse(found.T_world_imu[0])
+    expected = se3.adjoint(T_start).T @ np.linalg.solve(prior, se3.adjoint(T_start))
+    ratio = np.linalg.eigvals(np.linalg.solve(expected, now)).real
+    assert ratio.max() < 1 + 1e-6
+    assert ratio.min() > 0.99
+
+
+def test_robust_kernel_holds_against_outliers():
+    world = small_world(frames=50, landmarks=60, sigma_v=0.05, sigma_w=0.005)
+    rng = np.random.default_rng(0)
+    observations = world.observations
+    bad = rng.uniform(size=len(observations)) < 0.05
+    pixels = observations.pixels_px + bad[:, None] * rng.choice([-12.0, 12.0], (len(observations), 1)) * [1, 0, 1, 0]
+    spoilt = dataclasses.replace(world, observations=Observations(observations.frame, observations.landmark, pixels))
+    ekf, _ = drive(spoilt, OPEN)
+    error = {}
+    for kernel in ("none", "huber", "cauchy"):
+        found = posterior_of(spoilt, ekf, PosteriorConfig(kernel=kernel))
+        error[kernel] = np.linalg.norm(found.T_world_imu[:, :3, 3] - world.truth.T_world_imu[:, :3, 3], axis=1).mean()
+    assert error["cauchy"] < error["huber"] < error["none"]
+    assert error["cauchy"] < 0.5 * error["none"]
+
+
+@pytest.mark.slow
+def test_map_is_consistent():
+    """Mean NEES of the last pose and of landmarks over 30 drives, linearised at the maximum: 6 and 3 are expected."""
+    pose, landmark = [], []
+    for seed in range(30):
+        world = builtin(f"loop?frames=100&seed={seed}")
+        ekf, _, _, _, _ = run_joint(world, rig_of(world), FilterConfig(retire="never"), range(len(world)))
+        found = posterior_of(world, ekf, PosteriorConfig(kernel="none"))
+        xi = se3.log(se3.inverse(world.truth.T_world_imu) @ found.T_world_imu)
+        error = xi[-1]
+        pose.append(error @ np.linalg.solve(found.pose_covariance[-1], error))
+        at = np.searchsorted(world.truth.landmark, found.id)
+        d = world.truth.position_m[at] - found.position_m
+        landmark.append(np.einsum("ni,nij,nj->n", d, np.linalg.inv(found.landmark_covariance), d).mean())
+    assert 4.5 < np.mean(pose) < 8.0
+    assert 2.4 < np.mean(landmark) < 3.8
+
+
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_revival_equals_never_retiring(variant):
+    world = builtin("loop")
+    never, expected = drive(world, FilterConfig(variant=variant, retire="never"))
+    revived, poses = drive(world, FilterConfig(variant=variant, retire="unseen"))
+    assert len(revived.revived) > 5
+    assert revived.counts["retired"] > 100
+    assert len(revived.landmarks()) == len(never.landmarks())
+    np.testing.assert_allclose(poses, expected, atol=1e-6)
+    afresh, other = drive(world, FilterConfig(variant=variant, retire="unseen", revive=-1))
+    assert len(afresh.reappeared) > 50
+    assert np.abs(other - expected).max() > 0.01
+    # The log goes on through it all.
+    assert_equal_to_dense_filter(posterior_of(world, revived), never)
+
+
+def test_revival_of_the_invariant_variant_is_as_good_as_never_retiring():
+    world = builtin("loop")
+    config = FilterConfig(variant="invariant")
+    error = {}
+    for retire, revive in (("never", 0), ("unseen", 100), ("unseen", -1)):
+        _, poses = drive(world, dataclasses.replace(config, retire=retire, revive=revive))
+        position = se3.inverse(poses)[:, :3, 3] - world.truth.T_world_imu[:, :3, 3]
+        error[retire, revive] = np.sqrt((position**2).sum(axis=1).mean())
+    assert error["unseen", 100] < 1.05 * error["never", 0] < 0.5 * error["unseen", -1]
+
+
+@pytest.mark.parametrize("variant", ["invariant", "fej", "standard"])
+def test_no_information_about_the_gauge_is_gained_across_a_revival(variant):
+    """Landmarks are out of view for a while; motion is nearly exact, so that hardly any information is lost either."""
+    world = small_world(seed=4, frames=60)
+    observations = world.observations
+    keep = np.ones(len(observations), dtype=bool)
+    for landmark in np.argsort(-np.bincount(np.unique(observations.landmark, return_inverse=True)[1]))[:6]:
+        track = np.flatnonzero(observations.landmark == observations.ids[landmark])
+        keep[track[4:9]] = False
+    prior = np.diag([0.2, 0.1, 0.3, 0.05, 0.04, 0.08]) ** 2
+    world = dataclasses.replace(
+        world,
+        observations=Observations(observations.frame[keep], observations.landmark[keep], observations.pixels_px[keep]),
+        noise=Noise(np.full(6, 1e-3), world.noise.pixel_std_px),
+    )
+    config = dataclasses.replace(OPEN, variant=variant, retire="unseen", revive=5)
+    ekf = JointEKF(rig_of(world), config, world.initial_T_world_imu, prior)
+    T_start = ekf.T_imu_world
+    expected = se3.adjoint(T_start).T @ np.linalg.solve(prior, se3.adjoint(T_start))
+    largest, smallest = 0.0, 1.0
+    for k in range(len(world)):
+        if k > 0:
+            ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
+        ekf.update(k, *world.observations.at(k))
+        T, m = (ekf._T_predicted, ekf._initial_m) if variant == "fej" else (ekf.T_imu_world, ekf.positions_m)
+        N = gauge_directions(T, m)
+        ratio = np.linalg.eigvals(np.linalg.solve(expected, N.T @ np.linalg.solve(ekf.P, N))).real
+        largest, smallest = max(largest, ratio.max()), min(smallest, ratio.min())
+    assert len(ekf.revived) >= 3
+    if variant == "standard":
+        assert largest > 100
+    else:
+        assert largest < 1 + 1e-6
+        assert smallest > 0.99
+
+
+def test_archive_alone_rebuilds_the_posterior(tmp_path):
+    world = builtin("loop?frames=60")
+    result = run(world, "full")
+    write_archive(tmp_path / "a.h5", world, {"full": result})
+    for config in (PosteriorConfig(), FILTERED):
+        here, there = posterior(result, config), posterior(open_result(tmp_path / "a.h5", "full"), config)
+        np.testing.assert_array_equal(here.T_world_imu, there.T_world_imu)
+        np.testing.assert_array_equal(here.position_m, there.position_m)
+        np.testing.assert_array_equal(here.landmark_covariance, there.landmark_covariance)
+
+
+def test_smoothed_result_is_the_posterior():
+    world = builtin("loop?frames=60")
+    result = run(world, "full")
+    found, smoothed = posterior(result), smooth(result)
+    assert smoothed.mode == "smoothed"
+    np.testing.assert_array_equal(smoothed.landmarks.id, found.id)
+    np.testing.assert_array_equal(smoothed.landmarks.position_m, found.position_m)
+    np.testing.assert_allclose(smoothed.covariance, found.pose_covariance)
+    np.testing.assert_allclose(
+        found.dense_covariance([3, -1])[:6, :6],
+        smoothed.covariance[3],
+        atol=1e-10 * np.abs(smoothed.covariance[3]).max(),
+    )
+    assert smooth(result, FILTERED).mode == "as filtered"
+    poses, landmarks = found.sample(np.random.default_rng(0), 3)
+    assert poses.shape == (3, 60, 4, 4)
+    assert landmarks.shape == (3, len(found.id), 3)
+    # The first pose is certain.
+    np.testing.assert_allclose(poses[:, 0], np.broadcast_to(np.eye(4), (3, 4, 4)), atol=1e-9)
+
+
+def test_what_is_undetermined_is_named():
+    world = builtin("loop?frames=20")
+    result = run(world, "full")
+    still = dataclasses.replace(result, noise=Noise(np.repeat([0.5, 0.0], 3), result.noise.pixel_std_px))
+    with pytest.raises(IllPosedError, match=r"velocities without noise.*frames \[1, 2, 3"):
+        posterior(still)
+    log = result.log
+    blind = np.full_like(log.variance, 1.0)
+    blind[log.landmark == 4] = np.inf
+    with pytest.raises(IllPosedError, match=rf"too little information \[{log.id[4]}\]"):
+        posterior(dataclasses.replace(result, log=dataclasses.replace(log, variance=blind)), FILTERED)
+    unseen = dataclasses.replace(
+        log, id=np.append(log.id, 777), first_position_m=np.vstack([log.first_position_m, np.ones(3)])
+    )
+    with pytest.raises(IllPosedError, match=r"without an observation \[777\]"):
+        posterior(dataclasses.replace(result, log=unseen), FILTERED)
+    with pytest.raises(PosteriorError, match="no log"):
+        posterior(run(world, "mapping-only"))
+    found = posterior(result)
+    with pytest.raises(PosteriorError, match="there is no frame 20; there are 20"):
+        found.joint_covariance([20])
+    with pytest.raises(PosteriorError, match="there is no landmark"):
+        found.joint_covariance([], [10**6])
