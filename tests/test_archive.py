@@ -13,9 +13,11 @@ from helpers import synthetic_result, synthetic_sequence
 
 from ekfslam import archive as archive_module
 from ekfslam import se3
-from ekfslam.archive import FORMAT_VERSION, export_trajectory, open_result, read_archive, write_archive
+from ekfslam.archive import FORMAT_VERSION, add_result, export_trajectory, open_result, read_archive, write_archive
 from ekfslam.errors import ArchiveError
 from ekfslam.result import ERROR_CONVENTION
+from ekfslam.runner import run
+from ekfslam.simulate import builtin
 
 MODES = ("full", "dead-reckoning", "mapping-only")
 
@@ -28,6 +30,15 @@ def sequence():
 @pytest.fixture(scope="module")
 def results(sequence):
     return {mode: synthetic_result(sequence, mode) for mode in MODES}
+
+
+@pytest.fixture(scope="module")
+def with_log(tmp_path_factory) -> Path:
+    """An archive of a real run, whose full mode has a log."""
+    world = builtin("loop?frames=12")
+    path = tmp_path_factory.mktemp("log") / "log.h5"
+    write_archive(path, world, {"full": run(world, "full")})
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +76,50 @@ def test_results_come_back_bit_for_bit(written, results):
     for mode in MODES:
         assert_same(read.results[mode], results[mode], mode)
         assert_same(open_result(written, mode), results[mode], mode)
+
+
+def test_the_log_comes_back_bit_for_bit_and_in_units(with_log):
+    result = run(builtin("loop?frames=12"), "full")
+    assert_same(open_result(with_log, "full").log, result.log)
+    with h5py.File(with_log) as h5file:
+        log = h5file["runs/full/log"]
+        assert all(log[name].attrs["units"] and log[name].attrs["frame"] for name in log)
+
+
+def test_a_damaged_log_is_named(with_log, tmp_path):
+    for name in ("rows", "T_imu_world_linear", "landmark"):
+        path = Path(shutil.copy(with_log, tmp_path / "copy.h5"))
+        with h5py.File(path, "a") as h5file:
+            del h5file["runs/full/log"][name]
+        with pytest.raises(ArchiveError, match=rf"copy\.h5: runs/full/log/{name} is missing"):
+            open_result(path, "full")
+    path = Path(shutil.copy(with_log, tmp_path / "copy.h5"))
+    with h5py.File(path, "a") as h5file:
+        log = h5file["runs/full/log"]
+        short = log["landmark_id"][:-1]
+        del log["landmark_id"]
+        log["landmark_id"] = short
+    with pytest.raises(ArchiveError, match=r"log/landmark_id has shape"):
+        open_result(path, "full")
+
+
+def test_adding_a_result_keeps_the_others_and_replaces_its_own(copy, sequence, results):
+    added = dataclasses.replace(results["full"], mode="smoothed")
+    add_result(copy, added)
+    add_result(copy, dataclasses.replace(added, ms_per_frame=added.ms_per_frame + 1))
+    read = read_archive(copy).results
+    assert tuple(read) == (*MODES, "smoothed")
+    for mode in MODES:
+        assert_same(read[mode], results[mode], mode)
+    np.testing.assert_array_equal(read["smoothed"].ms_per_frame, added.ms_per_frame + 1)
+    assert list(copy.parent.iterdir()) == [copy]
+
+
+def test_adding_to_no_archive_is_a_named_error(tmp_path, results):
+    (tmp_path / "text.h5").write_text("no archive")
+    with pytest.raises(ArchiveError, match=r"text\.h5"):
+        add_result(tmp_path / "text.h5", results["full"])
+    assert (tmp_path / "text.h5").read_text() == "no archive"
 
 
 def test_sequence_and_truth_come_back_bit_for_bit(written, sequence):

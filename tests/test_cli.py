@@ -165,6 +165,39 @@ def test_mistakes_in_the_call(tmp_path, capsys):
     assert "ekfslam-archive" in failure(capsys, "run", tmp_path / "o.h5", "--out", tmp_path / "p.h5")
 
 
+def test_posterior_writes_into_the_archive_and_draws(tmp_path, capsys):
+    archive = tmp_path / "o.h5"
+    assert main(["run", CITY, "--out", str(archive)]) == 0
+    assert main(["posterior", str(archive)]) == 0
+    assert main(["posterior", str(archive), "--linearisation", "filtered", "--out", str(tmp_path / "figures")]) == 0
+    printed = capsys.readouterr().out
+    assert "| smoothed" in printed
+    assert "| as filtered" in printed
+    results = read_archive(archive).results
+    assert list(results) == ["full", "smoothed", "as filtered"]
+    assert results["full"].log is not None
+    assert np.abs(results["smoothed"].T_world_imu - results["full"].T_world_imu).max() > 1e-4
+    # Once more replaces, with another kernel.
+    assert main(["posterior", str(archive), "--kernel", "cauchy"]) == 0
+    again = read_archive(archive).results
+    assert sorted(again) == sorted(results)
+    assert again["smoothed"].config["posterior"]["kernel"] == "cauchy"
+    for folder in (tmp_path, tmp_path / "figures"):
+        assert {"map_before_and_after.png", "sparsity.png"} <= {path.name for path in folder.iterdir()}
+
+
+def test_posterior_of_what_has_none(tmp_path, capsys):
+    main(["run", CITY, "--mode", "mapping-only", "--out", str(tmp_path / "o.h5")])
+    capsys.readouterr()
+    assert "runs/full is missing" in failure(capsys, "posterior", tmp_path / "o.h5")
+    main(["run", CITY, "--out", str(tmp_path / "old.h5")])
+    with h5py.File(tmp_path / "old.h5", "a") as h5file:
+        del h5file["runs/full/log"]  # as written by the first version of the format
+        h5file.attrs["format_version"] = 1
+    capsys.readouterr()
+    assert "has no log" in failure(capsys, "posterior", tmp_path / "old.h5")
+
+
 def test_as_an_installed_command(tmp_path):
     """A real process: exit code, silence of the progress bar off a terminal, and output that survives `head`."""
     program = [sys.executable, "-m", "ekfslam.cli"]
