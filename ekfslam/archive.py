@@ -2,7 +2,7 @@
 
     /                       attributes format, format_version, source, error_convention
     /sequence, /truth       as in `ekfslam.readers.hdf5`, without the observations
-    /runs/<mode>            attributes config (JSON), counts (JSON), noise_twist_std, noise_pixel_std_px, sequence_name
+    /runs/<mode>            attributes config (JSON), counts (JSON), noise_<field of `Noise`>, sequence_name
         attributes          seed, input checksum, versions of the software, as attributes
         trajectory          time, T_world_imu, covariance
         landmarks           id, position, covariance, initial_position, first_frame, last_frame, observations
@@ -21,7 +21,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
@@ -186,7 +186,7 @@ def open_result(path: str | Path, mode: str) -> Result:
 
 
 def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "kitti"]) -> None:
-    """Write the estimated poses ``T_world_imu`` as text, one line a frame, 17 significant digits.
+    """Write the estimated poses ``T_world_imu`` as text, one line a frame, in 17 digits: every number exactly.
 
     Both formats hold the pose of the *IMU* in *world*; KITTI's own files hold the left camera in its first frame.
 
@@ -199,10 +199,36 @@ def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "
     Raises:
         ArchiveError: The file cannot be written.
     """
-    T = result.T_world_imu
+    _write_poses(path, result.time_s, result.T_world_imu, format)
+
+
+def export_truth(archive: str | Path, path: str | Path, format: Literal["tum", "kitti"]) -> int:
+    """Write the true poses that an archive holds, as `export_trajectory` does; one line a frame of known pose.
+
+    Returns:
+        The number of lines.
+
+    Raises:
+        ArchiveError: As `read_archive`; or there is no true pose, or not of every frame and the format is ``kitti``,
+            which has no stamps to say of which; or the file cannot be written.
+    """
+    found = read_archive(archive)
+    truth, frames = found.truth, len(found.time_s)
+    if truth is None or not len(truth.frame):
+        raise ArchiveError(f"{archive}: holds no true pose")
+    if format == "kitti" and len(truth.frame) < frames:
+        raise ArchiveError(
+            f"{archive}: holds the true pose of {len(truth.frame)} of {frames} frames; kitti has no stamps to say of "
+            "which, take tum"
+        )
+    _write_poses(path, found.time_s[truth.frame], truth.T_world_imu, format)
+    return len(truth.frame)
+
+
+def _write_poses(path: str | Path, time_s: Array, T: Array, format: Literal["tum", "kitti"]) -> None:
     if format == "tum":
         quaternion = Rotation.from_matrix(T[:, :3, :3]).as_quat()  # scalar last, as TUM has it
-        rows = np.column_stack([result.time_s, T[:, :3, 3], quaternion])
+        rows = np.column_stack([time_s, T[:, :3, 3], quaternion])
     else:
         rows = T[:, :3].reshape(-1, 12)
     try:
@@ -216,8 +242,7 @@ def _write_result(group: h5py.Group, result: Result) -> None:
         sequence_name=result.sequence_name,
         config=json.dumps(result.config),
         counts=json.dumps(dict(result.counts)),
-        noise_twist_std=result.noise.twist_std,
-        noise_pixel_std_px=result.noise.pixel_std_px,
+        **{f"noise_{name}": value for name, value in vars(result.noise).items() if value is not None},
     )
     group.create_group("attributes").attrs.update(result.attributes)
     _write_fields(group, _LAYOUT, result)
@@ -280,7 +305,7 @@ def _read_result(path: str | Path, h5file: h5py.File, mode: str, camera: StereoC
         rejections=Rejections(**fields["rejections"]),
         counts=json.loads(group.attrs["counts"]),
         config=json.loads(group.attrs["config"]),
-        noise=Noise(group.attrs["noise_twist_std"], group.attrs["noise_pixel_std_px"]),
+        noise=_read_noise(group),
         camera=camera,
         T_cam_imu=T_cam_imu,
         log=log,
@@ -289,6 +314,15 @@ def _read_result(path: str | Path, h5file: h5py.File, mode: str, camera: StereoC
             for key, value in group["attributes"].attrs.items()
         },
     )
+
+
+def _read_noise(group: h5py.Group) -> Noise:
+    """The noise of a run; what an older version of the format did not know yet has its default."""
+    stored = {f.name: group.attrs.get(f"noise_{f.name}") for f in fields(Noise)}
+    given: dict[str, Any] = {
+        name: float(value) if np.ndim(value) == 0 else value for name, value in stored.items() if value is not None
+    }
+    return Noise(**given)
 
 
 def _modes(path: str | Path, h5file: h5py.File) -> tuple[str, ...]:

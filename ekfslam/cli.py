@@ -14,7 +14,15 @@ import h5py
 
 from ekfslam import __version__
 from ekfslam.archive import FORMAT as ARCHIVE_FORMAT
-from ekfslam.archive import Archive, add_result, export_trajectory, open_result, read_archive, write_archive
+from ekfslam.archive import (
+    Archive,
+    add_result,
+    export_trajectory,
+    export_truth,
+    open_result,
+    read_archive,
+    write_archive,
+)
 from ekfslam.comparison import compare
 from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation
 from ekfslam.consistency_report import check_consistency
@@ -32,6 +40,7 @@ from ekfslam.simulate import builtin
 from ekfslam.tracks import inspect_tracks
 
 DEFAULT_DATA = "builtin:city"
+TRUTH = "truth"  # what `export` takes beside the modes
 
 
 def main(arguments: SequenceType[str] | None = None) -> int:
@@ -185,13 +194,16 @@ def _parser() -> argparse.ArgumentParser:
     sub = add(
         "export",
         _export,
-        "write a trajectory of an archive as text",
+        "write a trajectory of an archive, estimated or true, as text",
         "export city.h5 --format tum",
+        "export city.h5 --format tum --mode truth",
         "export city.h5 --format kitti --mode dead-reckoning --out poses.txt",
     )
     sub.add_argument("archive", type=Path, metavar="ARCHIVE")
     sub.add_argument("--format", choices=("tum", "kitti"), required=True, help="poses of the IMU in world")
-    sub.add_argument("--mode", choices=MODES, help="default: full, or the only mode in the archive")
+    sub.add_argument(
+        "--mode", help=f"any in the archive (default: full, or else its first), or {TRUTH} for the true poses"
+    )
     sub.add_argument("--out", type=Path, metavar="FILE", help="default: ARCHIVE with .MODE.FORMAT.txt")
     return parser
 
@@ -339,11 +351,15 @@ def _posterior(options: argparse.Namespace) -> None:
 def _export(options: argparse.Namespace) -> None:
     modes = list(read_archive(options.archive).results)
     mode = options.mode or ("full" if "full" in modes or not modes else modes[0])
-    result = open_result(options.archive, mode)
     path = options.out or options.archive.with_suffix(f".{mode}.{options.format}.txt")
     path.parent.mkdir(parents=True, exist_ok=True)
-    export_trajectory(result, path, options.format)
-    print(f"{len(result.time_s)} poses written to {path}")
+    if mode == TRUTH:
+        poses = export_truth(options.archive, path, options.format)
+    else:
+        result = open_result(options.archive, mode)
+        poses = len(result.time_s)
+        export_trajectory(result, path, options.format)
+    print(f"{poses} poses written to {path}")
 
 
 def _is_archive(data: str) -> bool:

@@ -13,12 +13,14 @@ import numpy as np
 from scipy.stats import chi2
 
 from ekfslam.errors import ConfigError
+from ekfslam.noise import automatic_noise
 from ekfslam.sequence import Noise, Sequence
 
 Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
 Variant = Literal["invariant", "fej", "standard"]
 Retire = Literal["auto", "unseen", "never"]
 Linearisation = Literal["map", "filtered"]
+NoiseModel = Literal["auto", "white"]
 Kernel = Literal["huber", "cauchy", "none"]
 
 MODES: tuple[Mode, ...] = get_args(Mode)
@@ -30,17 +32,21 @@ AUTO_NEVER_LIMIT = 300
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Standard deviations per sample; None takes what the sequence states, or else the default of a clean recording.
+    """Standard deviations per sample; None takes what the sequence states.
 
     Args:
-        sigma_v_m_s: Linear velocity, each axis (default where nothing is stated: 0.05).
-        sigma_w_rad_s: Angular velocity, each axis (0.001).
-        sigma_px: Pixels (1.0).
+        sigma_v_m_s: Linear velocity, each axis.
+        sigma_w_rad_s: Angular velocity, each axis.
+        sigma_px: Pixels.
+        model: ``auto``: where the sequence states no noise and none is given here, it is found from the data, see
+            `ekfslam.noise`. ``white``: what is neither stated nor given is that of a clean recording, 0.05 m/s,
+            0.001 rad/s, 1 px.
     """
 
     sigma_v_m_s: float | None = None
     sigma_w_rad_s: float | None = None
     sigma_px: float | None = None
+    model: NoiseModel = "auto"
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,9 @@ class FilterConfig:
             once against the prediction as corrected by the frame's other landmarks; 1 accepts everything.
         split_after: A track is split, its landmark retired and a new one started, when this many observations in a row
             fail the gate (or put it behind the camera): the tracker has jumped to another point. 0 never splits.
+        moving_sigma, moving_share: Where tracks may drift (`Noise.drift`), one is dropped for good when over all its
+            observations it moves along with the rig by more than this share of the way, beyond that many deviations.
+        restart_at_repeats: Where a frame repeats the pixels of the one before while the rig moves, every track is cut.
         min_disparity_px: Observations with less disparity are rejected.
         max_row_mismatch_px: Observations with larger ``|vL - vR|`` are rejected.
         min_depth_m: Observations of a landmark predicted nearer than this (or behind) are rejected.
@@ -74,6 +83,9 @@ class FilterConfig:
     revive: int = 100
     gate_probability: float = 0.999
     split_after: int = 3
+    restart_at_repeats: bool = True
+    moving_sigma: float = 3.0
+    moving_share: float = 0.1
     min_disparity_px: float = 2.0
     max_row_mismatch_px: float = 20.0
     min_depth_m: float = 0.1
@@ -123,11 +135,12 @@ class Config:
     def __post_init__(self) -> None:
         noise, filter_, posterior = self.noise, self.filter, self.posterior
         for name, value in dataclasses.asdict(noise).items():
-            if value is not None and not (np.isfinite(value) and value >= 0):
+            if name != "model" and value is not None and not (np.isfinite(value) and value >= 0):
                 raise ConfigError(f"noise.{name} must be finite and not negative, found {value}")
         if noise.sigma_px == 0:
             raise ConfigError("noise.sigma_px must be positive: the innovation covariance would be singular")
         for table, name, value, allowed in (
+            ("noise", "model", noise.model, get_args(NoiseModel)),
             ("filter", "variant", filter_.variant, VARIANTS),
             ("filter", "retire", filter_.retire, get_args(Retire)),
             ("posterior", "linearisation", posterior.linearisation, get_args(Linearisation)),
@@ -154,6 +167,8 @@ class Config:
         if filter_.variant == "fej" and filter_.iterations > 1:
             raise ConfigError("filter.iterations > 1 contradicts first estimates: choose invariant or standard")
         for name in (
+            "moving_sigma",
+            "moving_share",
             "max_row_mismatch_px",
             "min_depth_m",
             "initial_position_std_m",
@@ -198,10 +213,12 @@ class Config:
             for key, value in values.items():
                 if key not in known:
                     raise ConfigError(f"unknown key {table}.{key}; known: {', '.join(known)}")
-                is_text = key in ("variant", "retire", "linearisation", "kernel")
-                wanted = isinstance(value, str if is_text else (int, float)) and not isinstance(value, bool)
+                is_text = key in ("model", "variant", "retire", "linearisation", "kernel")
+                kind: Any = str if is_text else bool if key == "restart_at_repeats" else (int, float)
+                wanted = isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
                 if value is not None and not wanted:
-                    raise ConfigError(f"{table}.{key} must be a {'string' if is_text else 'number'}, found {value!r}")
+                    name = "string" if is_text else "truth value" if kind is bool else "number"
+                    raise ConfigError(f"{table}.{key} must be a {name}, found {value!r}")
             given = {key: value for key, value in values.items() if value is not None}
             tables[table] = dataclasses.replace(tables[table], **given)
         return Config(**tables)  # type: ignore[arg-type]
@@ -221,7 +238,10 @@ class Config:
 
 
 def noise_of(sequence: Sequence, config: Config) -> Noise:
-    """The noise a filter shall assume: what the configuration says, else the sequence, else a clean recording's."""
+    """The noise a filter shall assume: what the configuration says, else the sequence, else the data or a default."""
+    given = (config.noise.sigma_v_m_s, config.noise.sigma_w_rad_s, config.noise.sigma_px)
+    if sequence.noise is None and config.noise.model == "auto" and all(sigma is None for sigma in given):
+        return automatic_noise(sequence.twist)
     stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
     twist, pixels = np.array(stated.twist_std, dtype=float), np.array(stated.pixel_std_px, dtype=float)
     if config.noise.sigma_v_m_s is not None:

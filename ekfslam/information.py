@@ -126,7 +126,7 @@ class Elimination:
         """
         starts = np.cumsum(self.group_sizes) - self.group_sizes
         sizes, first = np.unique(self.group_sizes, return_index=True)
-        for size, begin, end in zip(sizes, first, np.append(first[1:], len(starts)), strict=True):
+        for size, begin, end in zip(sizes, first, np.append(first, len(starts))[1:], strict=True):
             step = max(1, _AT_ONCE // size)
             for group in range(begin, end, step):
                 stop = min(group + step, end)
@@ -160,8 +160,8 @@ class Elimination:
         for (block_row, _, high, wide), at in zip(
             kinds, np.split(place, np.cumsum([len(kind[0]) for kind in kinds])[:-1]), strict=True
         ):
-            target = origin[at, None, None].astype(index_type) + np.arange(high, dtype=index_type)[:, None]
-            target = target + stride[at, None, None].astype(index_type) * np.arange(wide, dtype=index_type)
+            target = origin[at, None, None] + np.arange(high)[:, None] + stride[at, None, None] * np.arange(wide)
+            target = target.astype(index_type)
             self._indices[target] = self.start[block_row, None, None] + np.arange(high)[:, None]
             self._targets.append(target)
 
@@ -204,7 +204,8 @@ class JointInformation:
     Args:
         elimination: The structure; may be shared by systems with the same observations.
         system: The rows.
-        damping: Levenberg-Marquardt: adds this share of each diagonal entry to it (0: the posterior itself).
+        damping: Levenberg-Marquardt: added to the diagonal (0: the posterior itself). Not in proportion to it: that
+            crawls along the flat directions of a trajectory.
         factor: CHOLMOD's factor of an earlier system with the same structure, whose analysis is used again.
 
     Attributes:
@@ -224,7 +225,7 @@ class JointInformation:
         damping: float = 0.0,
         factor: SparseCholesky | None = None,
     ) -> None:
-        self.elimination, self.system = elimination, system
+        self.elimination, self._B = elimination, system.B  # not the rows: they take more memory than all else kept
         e = elimination
         B, J_x, J_m, J_to = system.B, system.J_x, system.J_m, system.J_to
         J_from = system.J_from
@@ -238,8 +239,8 @@ class JointInformation:
         H_xx[1:] += J_to.swapaxes(1, 2) @ J_to
         if damping:
             for H in (H_mm, H_xx):
-                H += damping * H * np.eye(H.shape[-1])
-        self._factorise(H_mm, H_xx, J_to.swapaxes(1, 2) @ J_from, factor)
+                H += damping * np.eye(H.shape[-1])
+        self._factorise(system, H_mm, H_xx, J_to.swapaxes(1, 2) @ J_from, factor)
 
         g_x = e.sum_by_frame((J_x.swapaxes(1, 2) @ system.r[..., None])[..., 0])
         g_x[0] = system.r_prior + B.T @ g_x[0]
@@ -253,14 +254,16 @@ class JointInformation:
         squares = sum(float((r**2).sum()) for r in (system.r_prior, system.r_motion, system.r))
         self.cost = 0.5 * (squares - float((zeta_and_eps * g_x).sum() + (self.d * g_m).sum()))
 
-    def _factorise(self, H_mm: Array, H_xx: Array, H_step: Array, factor: SparseCholesky | None) -> None:
+    def _factorise(
+        self, system: LinearSystem, H_mm: Array, H_xx: Array, H_step: Array, factor: SparseCholesky | None
+    ) -> None:
         """Schur complements of the eliminated landmarks, then CHOLMOD."""
         e = self.elimination
         L = _cholesky_of_landmarks(H_mm, e.ids)
         self._L_inverse = np.linalg.inv(L)
         self._log_det_landmarks = 2.0 * float(np.log(np.diagonal(L[~e.is_kept], axis1=1, axis2=2)).sum())
         # Y_k^T Y_l is what an eliminated landmark takes from the block of the poses of its observations k and l.
-        self._Y = self._H_mx(slice(None))
+        self._Y = _H_mx(system)
         for begin in range(0, len(e.landmark), _AT_ONCE):
             part = slice(begin, begin + _AT_ONCE)
             self._Y[part] = self._L_inverse[e.landmark[part]] @ self._Y[part]
@@ -269,7 +272,7 @@ class JointInformation:
         for groups, later, earlier in e.groups():
             stacked = len(later), 3 * later.shape[1], 6
             coupling[groups] = self._Y[later].reshape(stacked).swapaxes(1, 2) @ self._Y[earlier].reshape(stacked)
-        matrix = e.assemble((H_xx, H_step, -coupling, H_mm[e.kept], self._H_mx(e.of_kept)))
+        matrix = e.assemble((H_xx, H_step, -coupling, H_mm[e.kept], _H_mx(system, e.of_kept)))
         del coupling
         try:
             factor = SparseCholesky(matrix, e.block_sizes) if factor is None else factor.with_values(matrix)
@@ -278,14 +281,6 @@ class JointInformation:
             culprit = error.block if is_pose else e.ids[e.kept[error.block - e.frames]]
             raise IllPosedError(f"{'frame' if is_pose else 'landmark'} without enough information", [culprit]) from None
         self.factor = factor
-
-    def _H_mx(self, observations: IntArray | slice) -> Array:
-        """Blocks (n, 3, 6) of the information between the landmarks and the poses of some observations."""
-        system = self.system
-        blocks = system.J_m[observations].swapaxes(1, 2) @ system.J_x[observations]
-        first = self.elimination.frame[observations] == 0
-        blocks[first] = blocks[first] @ system.B
-        return blocks
 
     def _solve(self, g_x: Array, g_m: Array) -> tuple[Array, Array]:
         """Solve the normal equations for one right side (T, 6), (M, 3)."""
@@ -306,13 +301,13 @@ class JointInformation:
 
     def _with_first_pose(self, zeta_and_eps: Array) -> Array:
         eps = zeta_and_eps.copy()
-        eps[0] = self.system.B @ zeta_and_eps[0]
+        eps[0] = self._B @ zeta_and_eps[0]
         return eps
 
     @property
     def log_determinant(self) -> float:
         """Log of the determinant of the joint covariance, without directions of the first pose known for certain."""
-        scales = np.linalg.svd(self.system.B, compute_uv=False)
+        scales = np.linalg.svd(self._B, compute_uv=False)
         known = scales > 1e-12 * max(scales[0], 1.0)
         return 2.0 * float(np.log(scales[known]).sum()) - self.factor.log_determinant - self._log_det_landmarks
 
@@ -324,7 +319,7 @@ class JointInformation:
         """Marginal covariances (T, 6, 6) of all poses, by selected inversion."""
         own = np.arange(self.elimination.frames)
         covariance = self._selected.blocks(own, own)
-        covariance[0] = self.system.B @ covariance[0] @ self.system.B.T
+        covariance[0] = self._B @ covariance[0] @ self._B.T
         return covariance
 
     def landmark_covariances(self) -> Array:
@@ -410,7 +405,7 @@ class JointInformation:
         e = self.elimination
         height = 6 * len(frames) + 3 * len(landmarks)
         pose_blocks = np.broadcast_to(np.eye(6), (len(frames), 6, 6)).copy()
-        pose_blocks[frames == 0] = self.system.B
+        pose_blocks[frames == 0] = self._B
 
         place = np.full(e.landmarks, -1)
         place[landmarks] = 6 * len(frames) + 3 * np.arange(len(landmarks))
@@ -432,6 +427,14 @@ class JointInformation:
         return sp.csr_array(
             (np.concatenate(value), (np.concatenate(row), np.concatenate(column))), shape=(height, int(e.start[-1]))
         )
+
+
+def _H_mx(system: LinearSystem, observations: IntArray | slice = slice(None)) -> Array:
+    """Blocks (n, 3, 6) of the information between the landmarks and the poses of some observations."""
+    blocks = system.J_m[observations].swapaxes(1, 2) @ system.J_x[observations]
+    first = system.frame[observations] == 0
+    blocks[first] = blocks[first] @ system.B
+    return blocks
 
 
 def _cholesky_of_landmarks(H_mm: Array, ids: IntArray) -> Array:

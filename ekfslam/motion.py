@@ -23,11 +23,24 @@ def error_jacobian(E: Array) -> Array:
     return se3.adjoint(E)
 
 
-def process_noise(twist: Array, tau_s: Array | float, twist_std: Array) -> Array:
-    """``Q = tau^2 J_l(-tau u) W J_l(-tau u)^T`` of eq. (2): (..., 6) to (..., 6, 6).
-
-    ``twist_std`` (6,) holds the standard deviations per sample, m/s and rad/s; ``W`` is the diagonal of their squares.
-    """
+def twist_jacobian(twist: Array, tau_s: Array | float) -> Array:
+    """``G = tau J_l(-tau u)``: (..., 6) to (..., 6, 6). A velocity error adds ``-G`` times itself to the pose error."""
     tau = np.asarray(tau_s)[..., None]
-    G = tau[..., None] * se3.left_jacobian(-tau * twist)
-    return (G * np.asarray(twist_std) ** 2) @ np.swapaxes(G, -1, -2)
+    return tau[..., None] * se3.left_jacobian(-tau * twist)
+
+
+def process_noise(twist: Array, tau_s: Array | float, twist_std: Array, misalignment_rad: float = 0.0) -> Array:
+    """``Q = G W G^T`` with G of `twist_jacobian`, eq. (2): (..., 6) to (..., 6, 6).
+
+    ``twist_std`` (6,) holds the standard deviations per sample, m/s and rad/s; ``W`` is the diagonal of their squares,
+    and where the frame of the velocities is turned by small angles of deviation ``misalignment_rad`` against the IMU,
+    ``B B^T misalignment_rad^2`` besides, with ``B = [v^; w^]``.
+    """
+    twist = np.asarray(twist, dtype=float)
+    G = twist_jacobian(twist, tau_s)
+    Q = (G * np.asarray(twist_std) ** 2) @ np.swapaxes(G, -1, -2)
+    if misalignment_rad:
+        B = misalignment_rad * np.concatenate([se3.skew(twist[..., :3]), se3.skew(twist[..., 3:])], axis=-2)
+        turned = G @ B
+        Q = Q + turned @ np.swapaxes(turned, -1, -2)
+    return Q

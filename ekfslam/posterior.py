@@ -163,6 +163,11 @@ def posterior_of_log(
     rows = Rows(log, sensor)
     elimination = Elimination(log.frames, log.landmarks, log.frame, log.landmark, log.id)
     if config.linearisation == "filtered":
+        if sensor.noise.twist_walk_std is not None or sensor.noise.drift:
+            raise PosteriorError(
+                f"{name}: the filter let velocities or landmarks walk, which its log does not hold; there is only the "
+                "linearisation 'map', of white velocities and landmarks that stay"
+            )
         information = JointInformation(elimination, rows.as_filtered())
         T_imu_world = se3.exp(information.eps) @ log.T_predicted
         return Posterior(

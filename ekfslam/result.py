@@ -21,7 +21,7 @@ ERROR_CONVENTION = (
 )
 
 # Why an observation was rejected; the codes of `Rejections.reason`.
-REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera")
+REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera", "moving")
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from ekfslam.posterior import smooth
 from ekfslam.progress import progress
 from ekfslam.result import Innovation, Landmarks, Rejections, Result
 from ekfslam.sequence import Sequence
+from ekfslam.tracks import restart_at_repeated_frames
 
 
 def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -> Result:
@@ -45,6 +46,11 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
         return smooth(run(sequence, "full", config))
     config = (config or Config()).resolved(sequence)
     noise = noise_of(sequence, config)
+    cut = 0
+    if config.filter.restart_at_repeats and mode != "dead-reckoning":
+        observations, restarts = restart_at_repeated_frames(sequence.observations, sequence.twist)
+        cut = len(restarts.new)
+        sequence = dataclasses.replace(sequence, observations=observations)
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
     frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
     counts: dict[str, int] = {}
@@ -70,7 +76,7 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
     innovation, rejections = Innovation.empty(len(sequence)), Rejections.empty()
     if reports:
         innovation, rejections, tallies = collect(reports)
-        counts = {**tallies, **counts}
+        counts = {**tallies, **counts, "cut at repeated frames": cut}
     return Result(
         mode=mode,
         sequence_name=sequence.name,

@@ -133,6 +133,8 @@ def selected_inverse(L: sp.csc_array) -> sp.csc_array:
             Y = inverse_JJ @ panel[:, w:]  # transposed
             Z_JR = -(Y @ Z_RR)
             Z_JJ -= Y @ Z_JR.T
+            # Fed with its own asymmetry of rounding, the recursion would amplify it without bound along a long drive.
+            Z_JJ = 0.5 * (Z_JJ + Z_JJ.T)
             front[:w, w:] = Z_JR
         front[:w, :w] = Z_JJ
         result[stored] = front[:w][in_factor[:w, :h]]

@@ -102,15 +102,29 @@ class Truth:
 
 @dataclass(frozen=True)
 class Noise:
-    """White measurement noise, standard deviations per sample.
+    """White measurement noise, standard deviations per sample, and what makes real recordings less than white.
 
     Args:
         twist_std: (6,) of the velocities, m/s and rad/s.
         pixel_std_px: (4,) of the pixels (uL, vL, uR, vR).
+        twist_walk_std: (6,) how far the true velocities change from one sample to the next; the joint filter then
+            estimates them, too. None: nothing is assumed of how they change.
+        motion_std: (6,) error of the motion beyond ``twist_std``, which no averaging of velocities removes.
+        misalignment_rad: Deviation of the angles between the frame of the velocities and the IMU frame, each axis.
+        drift: How far a track wanders on its surface (or moves with it), as a share of the distance driven.
     """
 
     twist_std: Array
     pixel_std_px: Array
+    twist_walk_std: Array | None = None
+    motion_std: Array = field(default_factory=lambda: np.zeros(6))
+    misalignment_rad: float = 0.0
+    drift: float = 0.0
+
+    @property
+    def velocity_std(self) -> Array:
+        """(6,) error of one sample as a whole: ``twist_std`` and ``motion_std`` together."""
+        return np.hypot(self.twist_std, self.motion_std)
 
     @staticmethod
     def isotropic(sigma_v_m_s: float, sigma_w_rad_s: float, sigma_px: float) -> Noise:

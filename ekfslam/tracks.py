@@ -1,4 +1,4 @@
-"""Track hygiene: what a recording's tracks look like before any filter trusts them. Looks only, changes nothing."""
+"""Track hygiene: what a recording's tracks look like before any filter trusts them, and what is done about it."""
 
 from __future__ import annotations
 
@@ -63,6 +63,52 @@ def inspect_tracks(observations: Observations, twist: Array) -> TrackReport:
         nonpositive_disparities=int((pixels[:, 0] <= pixels[:, 2]).sum()),
         max_row_mismatch_px=float(np.abs(pixels[:, 1] - pixels[:, 3]).max(initial=0.0)),
     )
+
+
+@dataclass(frozen=True)
+class Restarts:
+    """Tracks that were cut in two at repeated frames.
+
+    Args:
+        frame: (n,) first frame of the new piece.
+        old, new: (n,) id of the track up to there, and of its continuation.
+    """
+
+    frame: IntArray
+    old: IntArray
+    new: IntArray
+
+
+def restart_at_repeated_frames(observations: Observations, twist: Array) -> tuple[Observations, Restarts]:
+    """Cut every track where a frame repeats the pixels of the one before: the rest gets an id of its own.
+
+    In such a frame the tracker has been restarted at the old pixels in the new image. The pixels are right for the
+    frame that they stand in (they predict the next one as well as any), but show other points than before: no track
+    leads across. Ids of new pieces count on from the largest.
+    """
+    frames = repeated_frames(observations, twist)
+    # Which piece of its track an observation belongs to: how many repeated frames lie at or before it, from the first.
+    piece = np.searchsorted(frames, observations.frame, side="right")
+    order = np.lexsort((observations.frame, observations.landmark))
+    ids, piece = observations.landmark[order], piece[order]
+    starts = np.flatnonzero((np.diff(ids) == 0) & (np.diff(piece) > 0)) + 1
+    new = int(observations.landmark.max(initial=-1)) + 1 + np.arange(len(starts))
+    # Everything from a start to the next one, or to the end of the track, takes the new id.
+    ends = np.searchsorted(ids, ids[starts], side="right")
+    ends = np.minimum(ends, np.append(starts[1:], len(ids)))
+    landmark = ids.copy()
+    landmark[np.repeat(starts, ends - starts) + _counts(ends - starts)] = np.repeat(new, ends - starts)
+    restored = np.empty_like(landmark)
+    restored[order] = landmark
+    return (
+        Observations(observations.frame, restored, observations.pixels_px),
+        Restarts(observations.frame[order][starts], ids[starts], new),
+    )
+
+
+def _counts(lengths: IntArray) -> IntArray:
+    """``0, ..., n-1`` for every length n, one after the other."""
+    return np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
 
 def repeated_frames(observations: Observations, twist: Array) -> IntArray:

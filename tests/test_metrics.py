@@ -27,6 +27,8 @@ from ekfslam.metrics.trajectory import (
     final_position_error,
     kitti_segment_errors,
     landmark_rmse,
+    relative_pose_error_over_frames,
+    relative_pose_error_over_path,
 )
 from ekfslam.result import Landmarks
 from ekfslam.sequence import Truth
@@ -35,6 +37,10 @@ SUMMARY_KEYS = {
     "ate_m",
     "ate_aligned_m",
     "final_error_m",
+    "rpe_1_frame_m",
+    "rpe_1_frame_deg",
+    "rpe_10_m_m",
+    "rpe_10_m_deg",
     "t_rel_percent",
     "r_rel_deg_per_100m",
     "ms_per_frame_median",
@@ -97,6 +103,75 @@ def test_final_position_error_is_a_distance():
     T_est = T_true.copy()
     T_est[-1, :3, 3] += [3.0, 4.0, 12.0]
     assert final_position_error(T_est, T_true) == pytest.approx(13.0)
+
+
+def winding_drive(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Truth and an estimate of it that drifts; the vehicle stands still during a tenth of the steps."""
+    motion = np.column_stack([rng.uniform(0.3, 1.5, n - 1), np.zeros((n - 1, 4)), 0.05 * np.sin(np.arange(n - 1) / 9)])
+    motion[n // 3 : n // 3 + n // 10] = 0.0
+    steps = se3.exp(motion)
+    noisy = steps @ se3.exp(rng.normal(0, 0.01, (n - 1, 6)))
+    T_true, T_est = [np.eye(4)], [np.eye(4)]
+    for true_step, step in zip(steps, noisy, strict=True):
+        T_true.append(T_true[-1] @ true_step)
+        T_est.append(T_est[-1] @ step)
+    return np.stack(T_true), np.stack(T_est)
+
+
+def rms_of_relative_errors(T_true: np.ndarray, T_est: np.ndarray, pairs: list[tuple[int, int]]) -> tuple[float, float]:
+    """Sturm et al. as they write it; metres and degrees."""
+    lengths, angles = [], []
+    for i, j in pairs:
+        delta_true, delta_est = (np.linalg.inv(T[i]) @ T[j] for T in (T_true, T_est))
+        error = np.linalg.inv(delta_true) @ delta_est
+        lengths.append(np.linalg.norm(error[:3, 3]))
+        angles.append(np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1)))
+    return np.sqrt(np.mean(np.square(lengths))), np.degrees(np.sqrt(np.mean(np.square(angles))))
+
+
+@pytest.mark.parametrize("frames", [1, 7])
+def test_relative_error_over_frames_agrees_with_a_plain_loop(frames):
+    T_true, T_est = winding_drive(np.random.default_rng(20), 120)
+    expected = rms_of_relative_errors(T_true, T_est, [(i, i + frames) for i in range(120 - frames)])
+    assert relative_pose_error_over_frames(T_est, T_true, frames) == pytest.approx(expected, rel=1e-9)
+
+
+def test_relative_error_over_a_path_agrees_with_a_plain_loop():
+    T_true, T_est = winding_drive(np.random.default_rng(21), 300)
+    distance = [0.0]
+    for a, b in pairwise(T_true):
+        distance.append(distance[-1] + np.linalg.norm(b[:3, 3] - a[:3, 3]))
+    pairs = []
+    for i in range(300):
+        later = [(abs(distance[j] - distance[i] - 5.0), j) for j in range(i + 1, 300)]
+        if later and min(later)[0] <= 0.5:
+            pairs.append((i, min(later)[1]))
+    assert 200 < len(pairs) < 295, "some poses have no partner"
+    expected = rms_of_relative_errors(T_true, T_est, pairs)
+    assert relative_pose_error_over_path(T_est, T_true, 5.0) == pytest.approx(expected, rel=1e-9)
+
+
+def test_relative_errors_of_a_scale_and_a_heading_error_do_not_depend_on_an_alignment():
+    shift = random_poses(np.random.default_rng(22), 1)[0]
+    T_true = straight_drive(60, 2.0)
+    stretched = shift @ straight_drive(60, 2.04)
+    assert relative_pose_error_over_frames(stretched, T_true) == pytest.approx((0.04, 0.0), abs=1e-6)
+    assert relative_pose_error_over_path(stretched, T_true, 10.0) == pytest.approx((0.2, 0.0), abs=1e-6)
+    turning = T_true.copy()
+    turning[:, :3, :3] = se3.so3_exp(np.radians(0.1) * np.arange(60)[:, None] * [0, 0, 1])
+    assert relative_pose_error_over_frames(shift @ turning, T_true)[1] == pytest.approx(0.1)
+    assert relative_pose_error_over_path(shift @ turning, T_true, 10.0)[1] == pytest.approx(0.5)
+
+
+def test_relative_errors_do_not_exist_without_a_pair():
+    one = straight_drive(1)
+    assert relative_pose_error_over_frames(one, one) is None
+    assert relative_pose_error_over_path(one, one, 10.0) is None
+    short, coarse = straight_drive(9), straight_drive(20, 7.0)
+    assert relative_pose_error_over_frames(short, short, 8) == (0.0, 0.0)
+    assert relative_pose_error_over_frames(short, short, 9) is None
+    assert relative_pose_error_over_path(short, short, 10.0) is None
+    assert relative_pose_error_over_path(coarse, coarse, 10.0) is None, "7 m and 14 m are no 10 m"
 
 
 def test_kitti_errors_of_a_scale_error_are_its_percentage():
@@ -275,6 +350,10 @@ def test_summary_without_truth_leaves_errors_undefined():
         "ate_m",
         "ate_aligned_m",
         "final_error_m",
+        "rpe_1_frame_m",
+        "rpe_1_frame_deg",
+        "rpe_10_m_m",
+        "rpe_10_m_deg",
         "t_rel_percent",
         "r_rel_deg_per_100m",
         "pose_nees_mean",
@@ -308,4 +387,16 @@ def test_table_has_a_row_a_mode_a_dash_for_nothing_and_no_empty_column():
     assert len({len(line) for line in lines[2:]}) == 1
     cells = {row[0]: row[1:] for row in rows[1:]}
     assert cells["landmark RMSE [m]"][0] == "-"
-    assert cells["ATE [m]"] == [format(modes[mode]["ate_m"], ".3f") for mode in ("dead-reckoning", "full")]
+    for heading, key, spec in (
+        ("ATE [m], unaligned", "ate_m", ".3f"),
+        ("ATE [m], SE(3)-aligned", "ate_aligned_m", ".3f"),
+        ("RPE [m], 1 frame", "rpe_1_frame_m", ".4f"),
+        ("RPE [deg], 1 frame", "rpe_1_frame_deg", ".4f"),
+        ("RPE [m], 10 m", "rpe_10_m_m", ".4f"),
+        ("RPE [deg], 10 m", "rpe_10_m_deg", ".4f"),
+    ):
+        assert cells[heading] == [format(modes[mode][key], spec) for mode in ("dead-reckoning", "full")]
+    truth = Truth(sequence.truth.frame, sequence.truth.T_world_imu)
+    poses_only = {"full": summarise(dataclasses.replace(sequence, truth=truth), synthetic_result(sequence))}
+    table = compare_table({"sequence": sequence.name, "frames": 40, "landmarks": 300, "modes": poses_only})
+    assert "landmark RMSE" not in table, "no true position of a landmark is known"

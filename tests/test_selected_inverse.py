@@ -138,3 +138,22 @@ def test_blocks_of_one_request_have_one_size():
 def test_no_blocks():
     none = np.empty(0, dtype=np.int64)
     assert SelectedInverse(SparseCholesky(sp.csc_array(np.eye(9)), [6, 3])).blocks(none, none).shape == (0, 0, 0)
+
+
+@pytest.mark.parametrize("window", [8, 20])
+def test_rounding_does_not_grow_along_a_long_drive(window):
+    """An integrated random walk of 3000 blocks, known well from one to the next and badly over a window."""
+    blocks = 3000
+    bend = sp.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(blocks - 2, blocks)) * 1e3
+    apart = sp.diags_array([1.0, -1.0], offsets=[0, window], shape=(blocks - window, blocks)) * 10.0
+    start = sp.csr_array(([1e3, 1e3], ([0, 1], [0, 1])), shape=(2, blocks))
+    rows = sp.vstack([bend, apart, start]).tocsr()
+    A = sp.csc_array(sp.kron(rows.T @ rows, np.eye(6) + 0.1 * np.ones((6, 6))))
+    cholesky = SparseCholesky(A, np.full(blocks, 6))
+    some = np.linspace(0, blocks - 1, 10).astype(int)
+    unit = np.zeros((6 * blocks, 60))
+    unit[(6 * some[:, None] + np.arange(6)).ravel(), np.arange(60)] = 1.0
+    expected = (unit.T @ cholesky.solve(unit)).reshape(10, 6, 10, 6)[np.arange(10), :, np.arange(10)]
+    found = SelectedInverse(cholesky).blocks(some, some)
+    scale = np.abs(expected).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)

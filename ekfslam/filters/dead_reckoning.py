@@ -23,7 +23,7 @@ def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> 
     tau = np.diff(sequence.time_s)
     E = motion.increment(sequence.twist[1:], tau)
     F = motion.error_jacobian(E)
-    Q = motion.process_noise(sequence.twist[1:], tau, noise.twist_std)
+    Q = motion.process_noise(sequence.twist[1:], tau, noise.velocity_std, noise.misalignment_rad)
     T_imu_world = np.empty((len(sequence), 4, 4))
     covariance = np.empty((len(sequence), 6, 6))
     T_imu_world[0], covariance[0] = se3.inverse(sequence.initial_T_world_imu), initial_covariance

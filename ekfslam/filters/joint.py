@@ -24,6 +24,7 @@ from ekfslam.filters.observing import (
     ACCEPTED,
     BEHIND_CAMERA,
     GATE,
+    MOVING,
     FrameReport,
     Rig,
     Sensor,
@@ -40,6 +41,12 @@ from ekfslam.log import Log
 from ekfslam.result import Landmarks
 from ekfslam.se3 import Array
 from ekfslam.sequence import IntArray, Sequence
+
+# Observations of a landmark after which it may be found to move.
+_SEEN_TO_MOVE = 3
+
+# Smallest share of an observation's variance that must be left after the update for the second gate to mean anything.
+_LEAST_SHARE = 1e-6
 
 # Frames that a neighbour fetched with a returning landmark stays without being seen, beyond twice its distance in time.
 _PATIENCE = 30
@@ -58,10 +65,9 @@ class _Rows:
     def only(self, which: NDArray[np.bool_]) -> _Rows:
         return _Rows(*(getattr(self, field.name)[which] for field in fields(self)))
 
-    def corrected(self, correction: Array) -> _Rows:
-        """The rows with the residuals ``r - H (xi, d)`` that a correction (6+3n,) leaves."""
-        d = correction[6:].reshape(-1, 3)[self.slot]
-        residual = self.residual - self.H_x @ correction[:6] - (self.H_m @ d[..., None])[..., 0]
+    def corrected(self, xi: Array, d: Array) -> _Rows:
+        """The rows with the residuals ``r - H (xi, d)`` that corrections (6,) and (n, 3) leave."""
+        residual = self.residual - self.H_x @ xi - (self.H_m @ d[self.slot, :, None])[..., 0]
         return replace(self, residual=residual)
 
 
@@ -76,7 +82,9 @@ class JointEKF:
 
     Attributes:
         T_imu_world: (4, 4) estimate of the report's inverse pose.
-        P: (6+3n, 6+3n) covariance of ``(xi, d_1, ..., d_n)`` with ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``.
+        P: (b+3n, b+3n) covariance of ``(xi, d_1, ..., d_n)`` with ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``;
+            b is 6, or 12 where the noise states how the velocities walk: their error then stands behind ``xi``.
+        twist: (6,) estimate of the velocities, where they are in the state.
         ids: (n,) ids of the active landmarks, in the order of their blocks in P.
         positions_m: (n, 3) their positions in world.
         revived: Ids of retired landmarks that were seen again and came back.
@@ -91,6 +99,9 @@ class JointEKF:
         self._gate = config.gate
         self.T_imu_world = self._T_predicted = se3.inverse(T_world_imu)
         self.P = config.initial_covariance if covariance is None else np.array(covariance, dtype=float)
+        self._log = LogBook(self.rule.first_estimates, self.P.copy(), self.T_imu_world)
+        self._body = 6
+        self.twist: Array | None = None
         self.positions_m = np.empty((0, 3))
         self.revived: list[int] = []
         self.reappeared: list[int] = []
@@ -101,7 +112,9 @@ class JointEKF:
         self._retired_rows: list[IntArray] = []
         self._retired_row: dict[int, int] = {}  # of what can come back: its id, its row in the log
         self._behind = Behind(sensor, config)
-        self._log = LogBook(self.rule.first_estimates, self.P.copy(), self.T_imu_world)
+        self._step_m = np.zeros(3)  # last step of the rig in world
+        self._evidence = np.empty((0, 2))  # that a landmark moves along with it: see `_moving`
+        self._moving_ids: set[int] = set()
 
     @property
     def ids(self) -> IntArray:
@@ -113,19 +126,69 @@ class JointEKF:
         return self._initial_m if self.rule.first_estimates else self.positions_m
 
     @property
+    def _can_revive(self) -> bool:
+        """The system behind knows landmarks that stay and velocities that are white; others start afresh."""
+        noise = self.sensor.noise
+        return self.config.revive >= 0 and noise.twist_walk_std is None and not noise.drift
+
+    @property
     def T_world_imu(self) -> Array:
         """(4, 4) estimated pose of the IMU."""
         return se3.inverse(self.T_imu_world)
 
     def predict(self, twist: Array, tau_s: float) -> None:
         """Eq. (1) and (2) over one interval: ``twist`` (6,) in m/s and rad/s, duration in s."""
+        noise, measured = self.sensor.noise, twist
+        if noise.twist_walk_std is not None:
+            twist = self._filter_twist(measured, noise.twist_walk_std)
         T_next, F = self._advance(twist, tau_s)
-        P_xx = F @ self.P[:6, :6] @ F.T + motion.process_noise(twist, tau_s, self.sensor.noise.twist_std)
+        P_x = F @ self.P[:6]
+        std = noise.velocity_std if self.twist is None else noise.motion_std
+        if self.twist is not None:
+            G = motion.twist_jacobian(twist, tau_s)
+            P_x -= G @ self.P[6:12]
+            P_xx = P_x[:, :6] @ F.T - P_x[:, 6:12] @ G.T
+        else:
+            P_xx = P_x[:, :6] @ F.T
+        P_xx += motion.process_noise(twist, tau_s, std, noise.misalignment_rad)
         self.T_imu_world = self._T_predicted = T_next
-        self.P[:6, 6:] = F @ self.P[:6, 6:]
-        self.P[6:, :6] = self.P[:6, 6:].T
+        self.P[:6, 6:] = P_x[:, 6:]
+        self.P[6:, :6] = P_x[:, 6:].T
         self.P[:6, :6] = 0.5 * (P_xx + P_xx.T)
-        self._log.predicted(twist, tau_s, T_next)
+        self._step_m = T_next[:3, :3].T @ (twist[:3] * tau_s)
+        if noise.drift:
+            walked = noise.drift * self._step_m
+            self._landmark_blocks()[...] += np.outer(walked, walked)
+        self._log.predicted(measured, tau_s, T_next)
+
+    def _filter_twist(self, measured: Array, walk_std: Array) -> Array:
+        """The velocities as a random walk that is measured: a rank 6 update (6) of the state, then their estimate."""
+        variance = self.sensor.noise.twist_std**2
+        if self.twist is None:
+            self.twist, self._body = np.array(measured, dtype=float), 12
+            size = len(self.P) + 6
+            old = np.concatenate([np.arange(6), np.arange(12, size)])
+            P = np.zeros((size, size))
+            P[np.ix_(old, old)] = self.P
+            P[6:12, 6:12] = np.diag(variance)
+            self.P = P
+            return self.twist
+        own = np.arange(6, 12)
+        self.P[own, own] += walk_std**2
+        HP = self.P[6:12].copy()
+        S = HP[:, 6:12] + np.diag(variance)
+        Y_transposed, whitened = _whiten(S, HP, measured - self.twist, self._log.frames, self.ids)
+        add_square(self.P, Y_transposed, -1.0)
+        self._retract(Y_transposed @ whitened)
+        return self.twist
+
+    def _landmark_blocks(self) -> Array:
+        """The landmarks' own covariances (n, 3, 3), a view into P that can be written to."""
+        n, b, stride = len(self.ids), self._body, self.P.strides[0]
+        step = self.P.strides[1]
+        return np.lib.stride_tricks.as_strided(
+            self.P[b:, b:], (n, 3, 3), (3 * (stride + step), stride, step), writeable=True
+        )
 
     def _advance(self, twist: Array, tau_s: float) -> tuple[Array, Array]:
         """The next ``T_imu_world`` of eq. (1), and F of eq. (2)."""
@@ -156,10 +219,12 @@ class JointEKF:
             self._retired_row.update(self._books[out_of_view][:, [0, 5]].tolist())
             self._retire(out_of_view)
             returning = self._retired_row.keys() & set(ids.tolist())
-            if returning and self.config.revive >= 0:
+            if returning and self._can_revive:
                 self._revive(frame, sorted(returning))
         rows = self.sensor.rows(measured)
         reason = self.sensor.screen(measured, self.config)
+        if known_to_move := self._moving_ids.intersection(ids.tolist()):
+            reason[np.isin(ids, list(known_to_move))] = MOVING
         order = np.argsort(self.ids)
         index, is_known = lookup(self.ids[order], ids)
         known = np.flatnonzero(is_known & (reason == ACCEPTED))
@@ -171,7 +236,7 @@ class JointEKF:
         self._books[updated, 3] += 1
         self._books[updated, 4] = 0
         self._books[slot[missed(verdict)], 4] += 1
-        split = self._split()
+        split = self._split(slot[verdict == MOVING])
         new = (~is_known & (reason == ACCEPTED)) | np.isin(ids, split)
         reason[new] = ACCEPTED
         self._log.updated(self.T_imu_world)
@@ -192,11 +257,12 @@ class JointEKF:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Totals: landmarks retired, and retired ones that were seen again and came back or started afresh."""
+        """Totals: landmarks retired, those seen again that came back or started afresh, and tracks found to move."""
         return {
             "retired": sum(len(part) for part in self._retired),
             "revived": len(self.revived),
             "reappeared": len(self.reappeared),
+            "moving": len(self._moving_ids),
         }
 
     def measurement_jacobian(self, ids: IntArray) -> sp.csr_array:
@@ -214,15 +280,19 @@ class JointEKF:
         row = np.arange(3 * len(slot)).reshape(-1, 3, 1)
         rows = np.broadcast_to(row, (len(slot), 3, 9))
         pose_columns = np.broadcast_to(np.arange(6), (len(slot), 3, 6))
-        own_columns = np.broadcast_to((6 + 3 * slot)[:, None, None] + np.arange(3), (len(slot), 3, 3))
+        own_columns = np.broadcast_to((self._body + 3 * slot)[:, None, None] + np.arange(3), (len(slot), 3, 3))
         columns = np.concatenate([pose_columns, own_columns], axis=-1)
         values = np.concatenate([H_x, H_m], axis=-1)
         return sp.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * len(slot), len(self.P)))
 
     def transition_jacobian(self, twist: Array, tau_s: float) -> sp.csr_array:
-        """Full-width F (6+3n, 6+3n) of a prediction, identity but for the pose block."""
+        """Full-width F (b+3n, b+3n) of a prediction, identity but for the rows of the pose."""
         _, F = self._advance(twist, tau_s)
-        return sp.csr_array(sp.block_diag([F, sp.identity(len(self.P) - 6)]))
+        full = sp.lil_array(sp.identity(len(self.P)))
+        full[:6, :6] = F
+        if self.twist is not None:
+            full[:6, 6:12] = -motion.twist_jacobian(twist, tau_s)
+        return sp.csr_array(full)
 
     def _correct(self, frame: int, slot: IntArray, measured: Array) -> tuple[float, int, IntArray]:
         """Eq. (6) with its gates and the variant's retraction, for landmarks at ``slot`` (k,) with rows (k, 3).
@@ -243,11 +313,14 @@ class JointEKF:
             slot[some], H_x[some], H_m[some], measured[some] - sensor.predict(q[some]), sensor.variance(measured[some])
         )
 
-        squares = normalised_squares(
-            self._variances(rows) + diagonal(rows.variance), rows.residual, frame, self._of(rows)
-        )
+        S = self._variances(rows) + diagonal(rows.variance)
+        squares = normalised_squares(S, rows.residual, frame, self._of(rows))
         inside = squares <= self._gate
         verdict[some[~inside]] = GATE
+        if sensor.noise.drift:
+            moving = self._moving(rows, S, squares)
+            verdict[some[moving]] = MOVING
+            inside &= ~moving
         some, rows = some[inside], rows.only(inside)
         if len(some) == 0:
             return 0.0, 0, verdict
@@ -258,11 +331,16 @@ class JointEKF:
         # With e_i = r_i - H_i (xi, d) and C_i = V - H_i P H_i^T after all of them, e_i^T C_i^-1 e_i is the normalised
         # square of landmark i's innovation given all others.
         if np.isfinite(self._gate):
-            left = rows.corrected(correction)
-            squares = normalised_squares(
-                diagonal(left.variance) - self._variances(left), left.residual, frame, self._of(left)
+            left = rows.corrected(*self._parts(correction))
+            C = diagonal(left.variance) - self._variances(left)
+            # Where C is nothing but rounding, no other landmark says anything about this one: it cannot be judged.
+            deviation = np.sqrt(left.variance)
+            share = np.linalg.eigvalsh(C / (deviation[:, :, None] * deviation[:, None, :]))[:, 0]
+            judged = share > _LEAST_SHARE
+            inside = np.ones(len(C), dtype=bool)
+            inside[judged] = (
+                normalised_squares(C[judged], left.residual[judged], frame, self._of(left)[judged]) <= self._gate
             )
-            inside = squares <= self._gate
             if not inside.all():
                 verdict[some[~inside]] = GATE
                 # Taking observations out is an update with noise -V: P + P H^T (V - H P H^T)^-1 H P.
@@ -274,7 +352,7 @@ class JointEKF:
             correction, T_linear, positions = self._iterate(frame, P_prior, correction, slot, measured)
             self._log.linearised(T_linear)
         self._log.observed(self._books[slot, 5], measured, sensor.variance(measured), positions)
-        self._retract(correction[:6], correction[6:].reshape(-1, 3))
+        self._retract(correction)
         return float(nis), 3 * int(taken.sum()), verdict
 
     def _iterate(
@@ -290,7 +368,7 @@ class JointEKF:
             The correction (6+3n,); pose (4, 4) and landmarks (k, 3) at which it was linearised last.
         """
         for _ in range(self.config.iterations - 1):
-            xi, d = correction[:6], correction[6:].reshape(-1, 3)
+            xi, d = self._parts(correction)
             T, m = self.rule.retract(self.T_imu_world, self.positions_m, xi, d)
             q, H_x, H_m = linearise(self.sensor, T, m[slot], m[slot])
             moved = (m - self.positions_m)[slot]
@@ -299,7 +377,7 @@ class JointEKF:
             H_x[..., 3:] += H_m @ by_rotation
             H_m = H_m @ by_landmark
             residual = measured - self.sensor.predict(q)
-            rows = _Rows(slot, H_x, H_m, residual, self.sensor.variance(measured)).corrected(-correction)
+            rows = _Rows(slot, H_x, H_m, residual, self.sensor.variance(measured)).corrected(-xi, -d)
             self.P = P_prior.copy()
             correction, _ = self._condition(frame, rows)
         return correction, T, m[slot]
@@ -326,21 +404,28 @@ class JointEKF:
         k, size = len(rows.slot), len(self.P)
         H_pose = rows.H_x.reshape(3 * k, 6)
         HP = (H_pose @ self.P[:6]).reshape(k, 3, size)
-        HP += rows.H_m @ self.P[6:].reshape(-1, 3, size)[rows.slot]
+        HP += rows.H_m @ self.P[self._body :].reshape(-1, 3, size)[rows.slot]
         HP = HP.reshape(3 * k, size)
-        own_columns = (6 + 3 * rows.slot[:, None] + np.arange(3)).ravel()
+        own_columns = (self._body + 3 * rows.slot[:, None] + np.arange(3)).ravel()
         HPH = (rows.H_m @ HP.T[own_columns].reshape(k, 3, 3 * k)).reshape(3 * k, 3 * k)
         HPH += H_pose @ HP[:, :6].T
         return HP, HPH
 
     def _variances(self, rows: _Rows) -> Array:
         """``H_i P H_i^T`` (k, 3, 3) of each landmark's own rows, without what is between landmarks."""
-        n = len(self.ids)
-        cross = rows.H_m @ self.P[6:, :6].reshape(n, 3, 6)[rows.slot] @ rows.H_x.swapaxes(1, 2)
-        own = rows.H_m @ self.P[6:, 6:].reshape(n, 3, n, 3)[rows.slot, :, rows.slot, :] @ rows.H_m.swapaxes(1, 2)
+        cross = self.P[self._body :, :6].reshape(-1, 3, 6)[rows.slot]
+        cross = rows.H_m @ cross @ rows.H_x.swapaxes(1, 2)
+        own = rows.H_m @ self._landmark_blocks()[rows.slot] @ rows.H_m.swapaxes(1, 2)
         return rows.H_x @ self.P[:6, :6] @ rows.H_x.swapaxes(1, 2) + cross + cross.swapaxes(1, 2) + own
 
-    def _retract(self, xi: Array, d: Array) -> None:
+    def _parts(self, correction: Array) -> tuple[Array, Array]:
+        """Pose (6,) and landmark parts (n, 3) of a correction."""
+        return correction[:6], correction[self._body :].reshape(-1, 3)
+
+    def _retract(self, correction: Array) -> None:
+        xi, d = self._parts(correction)
+        if self.twist is not None:
+            self.twist = self.twist + correction[6:12]
         before, positions = self.T_imu_world, self.positions_m
         self.T_imu_world, self.positions_m = self.rule.retract(before, positions, xi, d)
         if self.rule.transport is not None:
@@ -365,6 +450,7 @@ class JointEKF:
         self.P = P
         self.positions_m = np.concatenate([self.positions_m, positions])
         self._initial_m = np.concatenate([self._initial_m, positions])
+        self._evidence = np.concatenate([self._evidence, np.zeros((len(ids), 2))])
         row = self._log.started(ids, positions)
         self._log.observed(row, rows, self.sensor.variance(rows), positions)
         books = np.column_stack([ids, *np.broadcast_to([[frame], [frame], [1], [0]], (4, len(ids))), row, row * 0])
@@ -399,16 +485,45 @@ class JointEKF:
         marginal = self._behind.marginal(log, known.position_m, self._books[:, 5])
         self.T_imu_world, self.positions_m, self.P = marginal
         self._initial_m = log.first_position_m[self._books[:, 5]]
+        self._evidence = np.concatenate([self._evidence, np.zeros((len(back), 2))])
         self._log.linearised(self.T_imu_world)
         self._log.updated(self.T_imu_world)
 
-    def _split(self) -> IntArray:
-        """Retire the landmarks that missed too often in a row; returns their ids, which are then free to start anew."""
-        if not self.config.split_after:
-            return np.empty(0, dtype=np.int64)
-        jumped = self._books[:, 4] >= self.config.split_after
-        ids = self.ids[jumped]
-        self._retire(jumped)
+    def _moving(self, rows: _Rows, S: Array, squares: Array) -> NDArray[np.bool_]:
+        """Which landmarks (k,) travel with the rig or against it, by all that their tracks have shown so far.
+
+        A landmark that moves by a share b of the rig's step dx between two frames has innovations of mean ``b h`` with
+        ``h = H_m dx``. Over a track ``N = sum h^T S^-1 r`` and ``D = sum h^T S^-1 h`` estimate b as N / D with standard
+        deviation ``D^-1/2``. Per-frame gates never see it: the pose gives way first.
+
+        Args:
+            rows: Their measurement rows.
+            S: (k, 3, 3) their innovation covariances.
+            squares: (k,) their normalised innovations squared; gross outliers count as at the gate.
+        """
+        h = rows.H_m @ self._step_m
+        weighted = np.linalg.solve(S, h[..., None])[..., 0]
+        clip = np.sqrt(self._gate / np.maximum(squares, self._gate))
+        self._evidence[rows.slot, 0] += clip * (weighted * rows.residual).sum(axis=1)
+        self._evidence[rows.slot, 1] += (weighted * h).sum(axis=1)
+        N, D = self._evidence[rows.slot].T
+        least = np.maximum(self.config.moving_sigma * np.sqrt(D), self.config.moving_share * D)
+        return (np.abs(N) > least) & (self._books[rows.slot, 3] >= _SEEN_TO_MOVE)
+
+    def _split(self, moving: IntArray) -> IntArray:
+        """Retire the landmarks at the slots that move, for good, and those that missed too often in a row.
+
+        Returns:
+            Ids of the latter, which are then free to start anew.
+        """
+        jumped = np.zeros(len(self.ids), dtype=bool)
+        if self.config.split_after:
+            jumped = self._books[:, 4] >= self.config.split_after
+        jumped[moving] = False
+        gone, ids = jumped.copy(), self.ids[jumped]
+        gone[moving] = True
+        self._moving_ids.update(self.ids[moving].tolist())
+        self._retire(gone)
         return ids
 
     def _retire(self, gone: NDArray[np.bool_]) -> None:
@@ -418,16 +533,16 @@ class JointEKF:
         self._retired.append(self._active(np.flatnonzero(gone)))
         self._retired_rows.append(self._books[gone, 5])
         stay = ~gone
-        kept = np.flatnonzero(np.concatenate([np.ones(6, dtype=bool), np.repeat(stay, 3)]))
+        kept = np.flatnonzero(np.concatenate([np.ones(self._body, dtype=bool), np.repeat(stay, 3)]))
         self.P = self.P[kept].take(kept, axis=1)
         self.positions_m, self._initial_m = self.positions_m[stay], self._initial_m[stay]
+        self._evidence = self._evidence[stay]
         self._books = self._books[stay]
 
     def _active(self, slot: IntArray) -> Landmarks:
-        blocks = self.P[6:, 6:].reshape(len(self.ids), 3, len(self.ids), 3)
         identifier, first, last, count = self._books[slot, :4].T
         return Landmarks(
-            identifier, self.positions_m[slot], blocks[slot, :, slot, :], self._initial_m[slot], first, last, count
+            identifier, self.positions_m[slot], self._landmark_blocks()[slot], self._initial_m[slot], first, last, count
         )
 
 

@@ -26,6 +26,11 @@ class LogBook:
         self._rows, self._variance, self._position = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty((0, 3))]
         self.landmarks = 0
 
+    @property
+    def frames(self) -> int:
+        """Number of frames so far."""
+        return len(self._tau_s)
+
     def predicted(self, twist: Array, tau_s: float, T_imu_world: Array) -> None:
         """A new frame, reached by a prediction."""
         self._twist.append(np.asarray(twist, dtype=float))
@@ -50,7 +55,7 @@ class LogBook:
 
     def observed(self, landmark: IntArray, rows: Array, variance: Array, position_m: Array) -> None:
         """Accepted observations of this frame."""
-        self._frame.append(np.full(len(landmark), len(self._tau_s) - 1))
+        self._frame.append(np.full(len(landmark), self.frames - 1))
         self._landmark.append(landmark)
         self._rows.append(rows)
         self._variance.append(variance)

@@ -23,7 +23,7 @@ from ekfslam.se3 import Array
 from ekfslam.sequence import IntArray, Noise
 
 ACCEPTED = -1
-GATE, DISPARITY, ROW_MISMATCH, BEHIND_CAMERA = range(len(REASONS))
+GATE, DISPARITY, ROW_MISMATCH, BEHIND_CAMERA, MOVING = range(len(REASONS))
 
 
 class Sensor(Protocol):

@@ -59,7 +59,8 @@ class Rows:
     def _weight_motion(self) -> Array:
         """``Q^-1/2`` (T-1, 6, 6) of eq. (2)."""
         log = self.log
-        Q = motion.process_noise(log.twist[1:], log.tau_s[1:], self.sensor.noise.twist_std)
+        noise = self.sensor.noise
+        Q = motion.process_noise(log.twist[1:], log.tau_s[1:], noise.velocity_std, noise.misalignment_rad)
         smallest = np.linalg.eigvalsh(Q)[:, 0] if len(Q) else np.empty(0)
         if not (smallest > 0).all():
             raise IllPosedError(

@@ -58,12 +58,14 @@ def transport_invariant(P: Array, T_before: Array, T_after: Array, moved_m: Arra
     """Last line of eq. (7), ``P <- J P J^T`` in place: rank 3 beyond the identity.
 
     Args:
-        P: (6+3n, 6+3n) symmetric covariance, changed in place and kept symmetric to the last bit.
+        P: (b+3n, b+3n) symmetric covariance, changed in place and kept symmetric to the last bit.
         T_before, T_after, moved_m: The correction, as in `derivative_invariant`.
     """
     Ad, by_rotation, _ = derivative_invariant(T_before, T_after, moved_m)
     # xi+ = Ad xi and d+ = d + B theta, hence P_mm+ = P_mm + B Z^T + Z B^T with Z = P_m,theta + B P_theta,theta / 2.
-    B = by_rotation.reshape(-1, 3)
+    # Velocities behind the pose (see `JointEKF`) are in the frame of the rig: nothing changes for them.
+    B = np.zeros((len(P) - 6, 3))
+    B[len(B) - 3 * len(moved_m) :] = by_rotation.reshape(-1, 3)
     Z = P[6:, 3:6] + 0.5 * B @ P[3:6, 3:6]
     P[6:, :6] = (P[6:, :6] + B @ P[3:6, :6]) @ Ad.T
     P_xx = Ad @ P[:6, :6] @ Ad.T

@@ -14,15 +14,23 @@ from ekfslam.metrics.trajectory import (
     final_position_error,
     kitti_segment_errors,
     landmark_rmse,
+    relative_pose_error_over_frames,
+    relative_pose_error_over_path,
 )
 from ekfslam.result import Result
 from ekfslam.sequence import Sequence
 
+RPE_PATH_M = 10.0
+
 # Key of a summary, heading of its row in the table, format of the value.
 _ROWS = (
-    ("ate_m", "ATE [m]", ".3f"),
-    ("ate_aligned_m", "ATE aligned [m]", ".3f"),
+    ("ate_m", "ATE [m], unaligned", ".3f"),
+    ("ate_aligned_m", "ATE [m], SE(3)-aligned", ".3f"),
     ("final_error_m", "final error [m]", ".3f"),
+    ("rpe_1_frame_m", "RPE [m], 1 frame", ".4f"),
+    ("rpe_1_frame_deg", "RPE [deg], 1 frame", ".4f"),
+    ("rpe_10_m_m", f"RPE [m], {RPE_PATH_M:g} m", ".4f"),
+    ("rpe_10_m_deg", f"RPE [deg], {RPE_PATH_M:g} m", ".4f"),
     ("t_rel_percent", "t_rel [%]", ".3f"),
     ("r_rel_deg_per_100m", "r_rel [deg/100 m]", ".4f"),
     ("pose_nees_mean", "pose NEES (6)", ".2f"),
@@ -40,9 +48,11 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
     """Figures of merit of one run as plain Python numbers, ready for JSON; of the sequence only the truth is used.
 
     Trajectory errors are over the frames with known true pose, the estimate starting where the run started it; see
-    `ekfslam.metrics.trajectory` for their definitions. ``pose_nees_mean`` (6 expected) is over the frames whose
-    covariance is not singular, ``nis_per_dof`` (1 expected) is the sum of NIS over the sum of degrees of freedom,
-    ``total_s`` the sum of the time spent on the frames. None stands where truth is missing or the value is undefined.
+    `ekfslam.metrics.trajectory` for their definitions. Only ``ate_aligned_m`` is aligned; ``ate_m``, ``final_error_m``
+    and ``landmark_rmse_m`` are of what stands in world. ``rpe_1_frame_*`` and ``rpe_10_m_*`` are relative errors over
+    one frame and over 10 m of true path. ``pose_nees_mean`` (6 expected) is over the frames whose covariance is not
+    singular, ``nis_per_dof`` (1 expected) is the sum of NIS over the sum of degrees of freedom, ``total_s`` the sum of
+    the time spent on the frames. None stands where truth is missing or the value is undefined.
     """
     summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _ROWS)
     truth = sequence.truth
@@ -53,6 +63,12 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
         summary["ate_m"] = absolute_trajectory_error(T_est, T_true, align=False)
         summary["ate_aligned_m"] = absolute_trajectory_error(T_est, T_true, align=True)
         summary["final_error_m"] = final_position_error(T_est, T_true)
+        step = relative_pose_error_over_frames(T_est, T_true)
+        if step is not None:
+            summary["rpe_1_frame_m"], summary["rpe_1_frame_deg"] = step
+        stretch = relative_pose_error_over_path(T_est, T_true, RPE_PATH_M)
+        if stretch is not None:
+            summary["rpe_10_m_m"], summary["rpe_10_m_deg"] = stretch
         segments = kitti_segment_errors(T_est, T_true)
         if segments is not None:
             summary["t_rel_percent"], summary["r_rel_deg_per_100m"] = segments

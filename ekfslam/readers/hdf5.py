@@ -5,7 +5,7 @@
         camera          attributes fu_px, fv_px, cu_px, cv_px, baseline_m
         attributes      the further facts, as attributes
         observations    frame (K,), landmark (K,), pixels (K, 4)
-        noise           twist_std (6,), pixel_std (4,); only if the source states noise
+        noise           twist_std (6,), pixel_std (4,), the rest of `Noise` as attributes; only if noise is stated
     /truth              frame (F,), T_world_imu (F, 4, 4); only if there is truth
         landmarks       id (M,), position (M, 3)
 
@@ -15,6 +15,7 @@ on some damaged files with text of variable length. The newer file layout carrie
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ FORMAT = "ekfslam-sequence"
 FORMAT_VERSION = 1
 
 _CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
+_FURTHER_NOISE = ("twist_walk_std", "motion_std", "misalignment_rad", "drift")
 _SPELLING = {
     "time_s": "sequence/time",
     "twist": "sequence/twist",
@@ -103,6 +105,8 @@ def write_sequence_group(h5file: h5py.Group, sequence: Sequence, include_observa
         noise = group.create_group("noise")
         _write(noise, "twist_std", sequence.noise.twist_std, "m/s (0-2), rad/s (3-5)", "imu")
         _write(noise, "pixel_std", sequence.noise.pixel_std_px, "px", "image: uL, vL, uR, vR")
+        further = {name: getattr(sequence.noise, name) for name in _FURTHER_NOISE}
+        noise.attrs.update({name: value for name, value in further.items() if value is not None})
     if include_observations:
         observations = group.create_group("observations")
         _write(observations, "frame", sequence.observations.frame, "frame index", "none")
@@ -150,6 +154,7 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
             fields["noise"] = Noise(
                 require_numbers(h5file, "sequence/noise/twist_std", (6,)),
                 require_numbers(h5file, "sequence/noise/pixel_std", (4,)),
+                **_further_noise(h5file["sequence/noise"].attrs),
             )
         if "sequence/observations" in h5file:
             fields["observations"] = Observations(
@@ -183,6 +188,11 @@ def read_truth_group(h5file: h5py.Group, source: str) -> Truth:
             require_numbers(h5file, "truth/landmarks/id", (None,), np.int64),
             require_numbers(h5file, "truth/landmarks/position", (None, 3)),
         )
+
+
+def _further_noise(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    given = {name: attributes[name] for name in _FURTHER_NOISE if name in attributes}
+    return {name: float(value) if np.ndim(value) == 0 else value for name, value in given.items()}
 
 
 def _write(group: h5py.Group, name: str, value: Any, units: str, frame: str) -> None:
