@@ -250,7 +250,7 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
         twist[3:] = config.noise.sigma_w_rad_s
     if config.noise.sigma_px is not None:
         pixels[:] = config.noise.sigma_px
-    return Noise(twist, pixels)
+    return dataclasses.replace(stated, twist_std=twist, pixel_std_px=pixels)
 
 
 def _landmarks_come_back(sequence: Sequence) -> bool:
