@@ -58,6 +58,11 @@ class LinearSystem:
     J_m: Array
     r: Array
 
+    @property
+    def half_square(self) -> float:
+        """Half the sum of squares of all right sides: the cost of leaving everything as it is."""
+        return 0.5 * sum(float((r**2).sum()) for r in (self.r_prior, self.r_motion, self.r))
+
 
 class Elimination:
     """What depends on nothing but which frame saw which landmark; computed once, used for every linearisation.
@@ -251,8 +256,7 @@ class JointInformation:
         self.zeta = zeta_and_eps[0].copy()
         self.eps = self._with_first_pose(zeta_and_eps)
         # Half the sum of squares at the mean x: |r - J x|^2 = |r|^2 - g^T x.
-        squares = sum(float((r**2).sum()) for r in (system.r_prior, system.r_motion, system.r))
-        self.cost = 0.5 * (squares - float((zeta_and_eps * g_x).sum() + (self.d * g_m).sum()))
+        self.cost = system.half_square - 0.5 * float((zeta_and_eps * g_x).sum() + (self.d * g_m).sum())
 
     def _factorise(
         self, system: LinearSystem, H_mm: Array, H_xx: Array, H_step: Array, factor: SparseCholesky | None

@@ -77,6 +77,13 @@ class Rows:
         is_first[first] = True
         return is_first
 
+    @cached_property
+    def _first_frame(self) -> IntArray:
+        """(M,) frame of each landmark's first observation."""
+        frame = np.empty(self.log.landmarks, dtype=np.int64)
+        frame[self.log.landmark[self.is_first_sight]] = self.log.frame[self.is_first_sight]
+        return frame
+
     def as_filtered(self) -> LinearSystem:
         """Rows frozen where the filter linearised them (section 3 of the design: motion, pixels, first sighting)."""
         log = self.log
@@ -163,10 +170,20 @@ class Rows:
         )
 
     def moved(self, state: State, eps: Array, d: Array, zeta: Array) -> State:
-        """A state moved by corrections ``eps`` (T, 6), ``d`` (M, 3) and that of the first pose's ``zeta`` (6,)."""
-        T = se3.exp(eps) @ state.T_imu_world
+        """A state moved by corrections ``eps`` (T, 6), ``d`` (M, 3) and that of the first pose's ``zeta`` (6,).
+
+        Landmarks move in the frame of the pose that saw them first, by what the corrections are there to first order:
+        where a long stretch of the trajectory moves and turns as a whole, its landmarks go along to all orders.
+        """
+        before = state.T_imu_world
+        T = se3.exp(eps) @ before
+        # The first pose is where its prior says, of which eps is the first order.
         T[0] = se3.exp(self.B @ (state.zeta + zeta)) @ self.log.T_predicted[0]
-        return State(T, state.positions_m + d, state.zeta + zeta)
+        eps = np.concatenate([se3.log(T[:1] @ se3.inverse(before[:1])), eps[1:]])
+        k = self._first_frame
+        s = se3.apply(before[k], state.positions_m)
+        turned = np.cross(eps[k, 3:], s) + (before[k, :3, :3] @ d[..., None])[..., 0]
+        return State(T, se3.apply(se3.inverse(T[k]), s + eps[k, :3] + turned), state.zeta + zeta)
 
     def filtered_state(self, positions_m: Array) -> State:
         """The filter's own estimates as a state: its poses after each update, and the map given."""

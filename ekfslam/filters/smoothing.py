@@ -89,7 +89,7 @@ def maximise(
         return float(pixels + 0.5 * (rows.motion_residual(state) ** 2).sum() + 0.5 * (state.zeta**2).sum()), s
 
     cost, s = evaluate(state)
-    costs, damping, factor = [cost], 1e-5, None
+    costs, damping, growth, factor = [cost], 1e-7, 2.0, None
     weight = kernel_weight(config.kernel, config.kernel_width, s)
     system = rows.relinearised(state, weight)
     for _ in iterations:
@@ -97,15 +97,18 @@ def maximise(
         factor = step.factor
         moved = rows.moved(state, step.eps, step.d, step.zeta)
         new_cost, new_s = evaluate(moved)
-        if not new_cost <= cost:
-            damping = max(10.0 * damping, 1e-5)
-            if damping > 1e8:
+        gain = cost - new_cost
+        promised = system.half_square - step.cost + 0.5 * damping * float((step.eps**2).sum() + (step.d**2).sum())
+        if not gain >= 0:
+            damping, growth = damping * growth, 2.0 * growth
+            if promised <= config.tolerance * cost:
                 break
             continue
-        gain = cost - new_cost
+        # Nielsen, "Damping parameter in Marquardt's method", 1999: by how much of what was promised has come.
+        share = gain / max(promised, np.finfo(float).tiny)
+        damping, growth = damping * max(1 / 3, 1 - (2 * min(share, 1.0) - 1) ** 3), 2.0
         state, cost, s = moved, new_cost, new_s
         costs.append(cost)
-        damping *= 0.1
         weight = kernel_weight(config.kernel, config.kernel_width, s)
         system = rows.relinearised(state, weight)
         if gain <= config.tolerance * cost:
