@@ -29,6 +29,7 @@ from ekfslam.consistency_report import check_consistency
 from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
 from ekfslam.metrics.summary import compare_table, summarise
 from ekfslam.montecarlo import LEVELS, STUDY_VARIANTS, Study, levels_of
+from ekfslam.noise import velocity_noise
 from ekfslam.plotting import save_figures
 from ekfslam.plotting_posterior import save_posterior_figures
 from ekfslam.posterior import posterior, smooth
@@ -312,7 +313,12 @@ def _info(options: argparse.Namespace) -> None:
         f"baseline {camera.baseline_m:g} m"
     )
     if noise is None:
-        print("noise         not stated; the defaults of a clean recording will be used")
+        found = velocity_noise(sequence.twist)
+        (v, w), (v_error, w_error) = found.sigma, found.sigma_error
+        print(
+            f"noise         not stated; white noise of the velocities, from the data: {v:.3g} +- {v_error:.2g} m/s, "
+            f"{w:.3g} +- {w_error:.2g} rad/s"
+        )
     else:
         print(f"noise         twist {noise.twist_std} (m/s, rad/s), pixels {noise.pixel_std_px} px")
     known = "none" if truth is None else f"{len(truth.frame)} poses, {len(truth.landmark)} landmarks"

@@ -11,7 +11,8 @@ from typing import Any
 from ekfslam.archive import write_archive
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.metrics.summary import compare_table, summarise
-from ekfslam.plotting import save_figures
+from ekfslam.plotting import save_figure, save_figures
+from ekfslam.plotting_posterior import plot_map_before_and_after
 from ekfslam.posterior import smooth
 from ekfslam.result import Result
 from ekfslam.runner import run
@@ -51,7 +52,12 @@ class Comparison:
         summary.write_text(json.dumps(self.summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         notes = "".join(f"- {note}\n" for note in self.sequence.notes)
         table.write_text(self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""), encoding="utf-8")
-        return [archive, summary, table, *save_figures(directory, self.results, self.sequence.truth)]
+        figures = save_figures(directory, self.results, self.sequence.truth)
+        if "full" in self.results and "smoothed" in self.results:
+            figures.append(directory / "map_before_and_after.png")
+            drawn = plot_map_before_and_after(self.results["full"], self.results["smoothed"], self.sequence.truth)
+            save_figure(drawn, figures[-1])
+        return [archive, summary, table, *figures]
 
 
 def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | None = None) -> Comparison:
