@@ -10,6 +10,7 @@ from typing import Any
 
 from ekfslam.archive import write_archive
 from ekfslam.config import MODES, Config, Mode
+from ekfslam.errors import IllPosedError
 from ekfslam.metrics.summary import compare_table, summarise
 from ekfslam.plotting import save_figure, save_figures
 from ekfslam.plotting_posterior import plot_map_before_and_after
@@ -27,16 +28,19 @@ class Comparison:
         sequence: The recording.
         results: Mode to result, in the order asked for.
         summary: The figures of merit as written to ``summary.json``.
+        skipped: Why there is no result of a mode asked for: an ill-posed posterior does not keep the others.
     """
 
     sequence: Sequence
     results: dict[str, Result]
     summary: dict[str, Any]
+    skipped: dict[str, str]
 
     @property
     def table(self) -> str:
-        """The summary as a Markdown table."""
-        return compare_table(self.summary)
+        """The summary as a Markdown table, and what is missing in it."""
+        missing = "".join(f"\nNo {mode}: {reason}\n" for mode, reason in self.skipped.items())
+        return compare_table(self.summary) + missing
 
     def save(self, directory: str | Path) -> list[Path]:
         """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures; returns their paths.
@@ -66,17 +70,20 @@ def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | 
     Raises:
         ConfigError: Unknown mode.
         InnovationError: An innovation covariance is not positive definite.
-        IllPosedError: A posterior leaves something undetermined.
     """
     results: dict[str, Result] = {}
+    skipped: dict[str, str] = {}
     for mode in modes:
         # The filter that "smoothed" starts from need not run twice.
         known = mode == "smoothed" and "full" in results
-        results[mode] = smooth(results["full"]) if known else run(sequence, mode, config)
+        try:
+            results[mode] = smooth(results["full"]) if known else run(sequence, mode, config)
+        except IllPosedError as error:
+            skipped[mode] = str(error)
     summary = {
         "sequence": sequence.name,
         "frames": len(sequence),
         "landmarks": len(sequence.observations.ids),
         "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
     }
-    return Comparison(sequence, results, summary)
+    return Comparison(sequence, results, summary, skipped)

@@ -221,3 +221,11 @@ def test_info_of_a_recording_lists_what_the_reader_noticed(tmp_path, capsys):
     printed = capsys.readouterr().out
     for note in open_sequence(npz).notes:
         assert note in printed
+
+
+def test_compare_goes_on_without_a_posterior_that_is_ill_posed(tmp_path, capsys):
+    """Without angular velocity noise the motion rows have no weight; the filter does not mind."""
+    assert main(["compare", CITY, "--sigma-w", "0", "--out", str(tmp_path)]) == 0
+    assert "No smoothed: the posterior is ill-posed: velocities without noise" in capsys.readouterr().out
+    assert "No smoothed" in (tmp_path / "city" / "summary.md").read_text()
+    assert list(read_archive(tmp_path / "city" / "archive.h5").results) == ["dead-reckoning", "mapping-only", "full"]

@@ -16,7 +16,6 @@ from ekfslam.errors import IllPosedError
 from ekfslam.filters.rows import Rows, State
 from ekfslam.information import Elimination, JointInformation
 from ekfslam.se3 import Array
-from ekfslam.sequence import IntArray
 
 
 def kernel_cost(kernel: Kernel, width: float, s: Array) -> Array:
@@ -69,7 +68,7 @@ def maximise(
     Args:
         rows: What is known.
         elimination: Its structure.
-        start: Where to start from; a landmark that is not in view there starts from its first triangulation instead.
+        start: Where to start from; a landmark that fits better at its first triangulation starts from there.
         config: Kernel and tolerance.
         filter_config: Says what is in view.
         iterations: Iterated over at most once (a range, wrapped in a progress bar by the caller).
@@ -77,7 +76,7 @@ def maximise(
     Raises:
         IllPosedError: Something is undetermined, or a landmark is behind a camera that saw it; names the ids.
     """
-    state = _in_front(rows, start, filter_config)
+    state = _best_start(rows, start, config, filter_config)
 
     def evaluate(state: State) -> tuple[float, Array]:
         """Cost (infinite if a landmark is behind a camera that saw it) and norms of the residuals (K,)."""
@@ -116,20 +115,23 @@ def maximise(
     return Maximum(state, weight, tuple(costs), JointInformation(elimination, system, factor=factor))
 
 
-def _in_front(rows: Rows, state: State, filter_config: FilterConfig) -> State:
-    """A state in which every landmark is in front of the cameras that saw it, as far as its first triangulation is."""
+def _best_start(rows: Rows, state: State, config: PosteriorConfig, filter_config: FilterConfig) -> State:
+    """The state with every landmark where it fits its observations better: where it is, or at its first triangulation.
+
+    Raises:
+        IllPosedError: A landmark is behind a camera that saw it in both places; names the ids.
+    """
     log = rows.log
 
-    def hidden_landmarks(state: State) -> IntArray:
-        return np.unique(log.landmark[~rows.sensor.in_view(rows.points(state), filter_config)])
+    def costs(positions_m: Array) -> Array:
+        q = rows.points(replace(state, positions_m=positions_m))
+        visible = rows.sensor.in_view(q, filter_config)
+        s = np.linalg.norm(rows.observation_residual(np.where(visible[:, None], q, 1.0)), axis=1)
+        cost = np.where(visible, kernel_cost(config.kernel, config.kernel_width, s), np.inf)
+        return np.asarray(np.bincount(log.landmark, weights=cost, minlength=log.landmarks), dtype=float)
 
-    hidden = hidden_landmarks(state)
-    if len(hidden) == 0:
-        return state
-    positions = state.positions_m.copy()
-    positions[hidden] = log.first_position_m[hidden]
-    state = replace(state, positions_m=positions)
-    hidden = hidden_landmarks(state)
-    if len(hidden):
+    here, first = costs(state.positions_m), costs(log.first_position_m)
+    hidden = np.isinf(np.minimum(here, first))
+    if hidden.any():
         raise IllPosedError("landmarks behind a camera that saw them", log.id[hidden])
-    return state
+    return replace(state, positions_m=np.where((first < here)[:, None], log.first_position_m, state.positions_m))
