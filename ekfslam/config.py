@@ -121,7 +121,7 @@ class PosteriorConfig:
     kernel: Kernel = "huber"
     kernel_width: float = 2.8
     max_iterations: int = 50
-    tolerance: float = 1e-7
+    tolerance: float = 1e-6
 
 
 @dataclass(frozen=True)
