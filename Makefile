@@ -25,6 +25,7 @@ results: $(READY)
 	$(BIN)/python experiments/monte_carlo.py
 	$(BIN)/python experiments/published_results.py
 	$(BIN)/python experiments/starry_night.py
+	$(BIN)/python experiments/real_data.py
 	$(BIN)/python experiments/scaling.py
 
 setup: $(READY)

@@ -40,7 +40,12 @@ RECORDINGS = (
 )
 
 # The report knows neither a gate nor tracks that jump.
-REPORT = ekfslam.Config().with_overrides({"filter": {"gate_probability": 1.0, "split_after": 0}})
+REPORT = ekfslam.Config().with_overrides(
+    {
+        "noise": {"model": "white"},
+        "filter": {"gate_probability": 1.0, "split_after": 0, "restart_at_repeats": False},
+    }
+)
 
 
 def main() -> int:
