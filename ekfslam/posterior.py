@@ -3,9 +3,10 @@
 The filter carries only what is in view; its log is one sparse system over all poses and all landmarks. Two
 linearisations of it are offered. *As filtered* the rows stay where the filter linearised them: for the standard and the
 first-estimates variants the solution is, to rounding, the state of a dense EKF that never retired a landmark, with
-everything smoothed besides. (The invariant variant moves the errors of all landmarks with every correction; its frozen
-rows give a posterior close to the filter's, not equal to it.) The *maximum a posteriori* linearises all rows again at
-their common solution, which makes it consistent by construction: every row sees the same unobservable directions.
+everything smoothed besides. (The invariant variant moves the errors of all landmarks with every correction, which
+frozen rows do not: they are not the filter then, and on long drives much too confident.) The *maximum a posteriori*
+linearises all rows again at their common solution, which makes it consistent by construction: every row sees the same
+unobservable directions.
 """
 
 from __future__ import annotations
