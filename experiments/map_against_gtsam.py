@@ -118,7 +118,7 @@ def factors_of(result: Result, config: PosteriorConfig) -> Factors:
     assert not log.initial_covariance.any() and (log.variance == log.variance[0]).all()
 
     measured = se3.inverse(motion.increment(log.twist, log.tau_s))
-    Q = motion.process_noise(log.twist, log.tau_s, result.noise.twist_std)
+    Q = motion.process_noise(log.twist, log.tau_s, result.noise.velocity_std, result.noise.misalignment_rad)
     Q = Q[:, ROTATION_FIRST][:, :, ROTATION_FIRST]
     # Not "smart", which would drop small covariances and with them 1e-5 of the cost.
     between = [

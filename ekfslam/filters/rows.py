@@ -85,7 +85,7 @@ class Rows:
         return frame
 
     def as_filtered(self) -> LinearSystem:
-        """Rows frozen where the filter linearised them (section 3 of the design: motion, pixels, first sighting)."""
+        """Rows frozen where the filter linearised them (motion, pixels, first sight)."""
         log = self.log
         delta = se3.log(log.T_updated @ se3.inverse(log.T_predicted))
         T_from = log.T_predicted if log.first_estimates else log.T_updated
@@ -189,9 +189,3 @@ class Rows:
         """The filter's own estimates as a state: its poses after each update, and the map given."""
         xi = se3.log(self.log.T_updated[0] @ se3.inverse(self.log.T_predicted[0]))
         return State(self.log.T_updated, positions_m, np.linalg.pinv(self.B) @ xi)
-
-
-def order_of(ids: IntArray, wanted: IntArray) -> IntArray:
-    """Place in ``ids`` of each wanted id, all of which must be there and distinct."""
-    order = np.argsort(ids)
-    return order[np.searchsorted(ids, wanted, sorter=order)]
