@@ -35,7 +35,7 @@ from importlib.metadata import version
 
 from ekfslam.archive import read_archive, write_archive
 from ekfslam.comparison import Comparison, compare
-from ekfslam.config import MODES, VARIANTS, Config, FilterConfig, NoiseConfig, PosteriorConfig
+from ekfslam.config import MODES, VARIANTS, Config, FilterConfig, HygieneConfig, NoiseConfig, PosteriorConfig
 from ekfslam.consistency_report import check_consistency
 from ekfslam.errors import EkfslamError
 from ekfslam.montecarlo import LEVELS, Study
@@ -44,6 +44,7 @@ from ekfslam.readers import open_sequence, write_sequence
 from ekfslam.result import Result
 from ekfslam.runner import run
 from ekfslam.sequence import Sequence
+from ekfslam.tune import TunedNoise, tune
 
 __version__ = version("ekfslam")
 
@@ -55,12 +56,14 @@ __all__ = [
     "Config",
     "EkfslamError",
     "FilterConfig",
+    "HygieneConfig",
     "NoiseConfig",
     "Posterior",
     "PosteriorConfig",
     "Result",
     "Sequence",
     "Study",
+    "TunedNoise",
     "check_consistency",
     "compare",
     "open_sequence",
@@ -68,6 +71,7 @@ __all__ = [
     "read_archive",
     "run",
     "smooth",
+    "tune",
     "write_archive",
     "write_sequence",
 ]

@@ -8,6 +8,9 @@
         landmarks           id, position, covariance, initial_position, first_frame, last_frame, observations
         innovation          nis, dof, accepted, rejected
         rejections          frame, landmark, reason (index into its attribute ``names``)
+        parameters          value, std, prior_std; attributes name, unit; see `ekfslam.result.Parameters`
+        hygiene             rule (index into its attribute ``names``), frame, landmark, continuation: see
+                            `ekfslam.result.HygieneReport`; attribute observations (not in dead reckoning)
         timing              ms_per_frame
         log                 what `ekfslam.posterior` needs: see `ekfslam.log.Log` (mode full only)
 
@@ -16,6 +19,7 @@ Every data set has the attributes ``units`` and ``frame`` (of reference). Readin
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -31,15 +35,26 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ekfslam.camera import StereoCamera
+from ekfslam.config import HygieneConfig
 from ekfslam.errors import ArchiveError, DataError
 from ekfslam.log import Log
 from ekfslam.readers.hdf5 import read_sequence_fields, write_sequence_group, write_truth_group
-from ekfslam.result import ERROR_CONVENTION, REASONS, Innovation, Landmarks, Rejections, Result
+from ekfslam.result import (
+    ERROR_CONVENTION,
+    REASONS,
+    RULES,
+    HygieneReport,
+    Innovation,
+    Landmarks,
+    Parameters,
+    Rejections,
+    Result,
+)
 from ekfslam.se3 import Array
-from ekfslam.sequence import Noise, Sequence, Truth
+from ekfslam.sequence import Noise, Sequence, Truth, VelocityFrame
 
 FORMAT = "ekfslam-archive"
-FORMAT_VERSION = 2  # 2 added log
+FORMAT_VERSION = 3  # 2 added log, 3 hygiene and parameters
 
 # Data set below /runs/<mode>, field of `Result`, shape (T frames, M landmarks, R rejections), units, frame.
 _Layout = tuple[tuple[str, str, tuple[str | int, ...], str, str], ...]
@@ -83,12 +98,29 @@ _LOG_LAYOUT: _Layout = (
 )
 
 
+# The same below /runs/<mode>/parameters, fields of `Parameters` (P of them).
+_PARAMETERS_LAYOUT: _Layout = (
+    ("value", "value", ("T", "P"), "see attribute unit of the group", "imu"),
+    ("std", "std", ("T", "P"), "see attribute unit of the group", "imu"),
+    ("prior_std", "prior_std", ("P",), "see attribute unit of the group", "imu"),
+)
+
+# The same below /runs/<mode>/hygiene, fields of `HygieneReport` (N findings).
+_HYGIENE_LAYOUT: _Layout = (
+    ("rule", "rule", ("N",), "code, see names", "none"),
+    ("frame", "frame", ("N",), "frame index", "none"),
+    ("landmark", "landmark", ("N",), "landmark id", "none"),
+    ("continuation", "continuation", ("N",), "landmark id, -1 where dropped", "none"),
+)
+
+
 @dataclass(frozen=True)
 class Archive:
     """What an archive holds: the sequence without its observations, and the results of its modes.
 
     Args:
-        name, source, time_s, twist, camera, T_cam_imu, truth, noise, notes, attributes: As in `Sequence`.
+        name, source, time_s, twist, camera, T_cam_imu, truth, noise, velocity_frame, notes, attributes: As in
+            `Sequence`.
         results: Mode to result, in the order of writing.
     """
 
@@ -100,6 +132,7 @@ class Archive:
     T_cam_imu: Array
     truth: Truth | None
     noise: Noise | None
+    velocity_frame: VelocityFrame
     notes: tuple[str, ...]
     attributes: Mapping[str, str | int | float]
     results: Mapping[str, Result]
@@ -247,13 +280,22 @@ def _write_result(group: h5py.Group, result: Result) -> None:
     group.create_group("attributes").attrs.update(result.attributes)
     _write_fields(group, _LAYOUT, result)
     group["rejections/reason"].attrs["names"] = REASONS
+    if result.parameters is not None:
+        parameters = group.create_group("parameters")
+        parameters.attrs.update(name=result.parameters.name, unit=result.parameters.unit)
+        _write_fields(parameters, _PARAMETERS_LAYOUT, result.parameters)
+    if result.hygiene is not None:
+        hygiene = group.create_group("hygiene")
+        hygiene.attrs["observations"] = result.hygiene.observations
+        _write_fields(hygiene, _HYGIENE_LAYOUT, result.hygiene)
+        hygiene["rule"].attrs["names"] = RULES
     if result.log is not None:
         log = group.create_group("log")
         log.attrs["first_estimates"] = result.log.first_estimates
         _write_fields(log, _LOG_LAYOUT, result.log)
 
 
-def _write_fields(group: h5py.Group, layout: _Layout, source: Result | Log) -> None:
+def _write_fields(group: h5py.Group, layout: _Layout, source: Result | Log | Parameters | HygieneReport) -> None:
     for name, field, _, units, frame in layout:
         dataset = group.create_dataset(name, data=attrgetter(field)(source))
         dataset.attrs["units"], dataset.attrs["frame"] = units, frame
@@ -291,11 +333,27 @@ def _read_result(path: str | Path, h5file: h5py.File, mode: str, camera: StereoC
         if "first_estimates" not in group["log"].attrs:
             raise ArchiveError(f"{where}: attribute first_estimates is missing")
         log = Log(first_estimates=bool(group["log"].attrs["first_estimates"]), **log_fields)
+    parameters = None
+    if isinstance(group.get("parameters"), h5py.Group):
+        where, stored = f"{path}: runs/{mode}/parameters", group["parameters"]
+        found = _read_fields(where, stored, _PARAMETERS_LAYOUT, {"T": sizes["T"]})
+        names = {key: tuple(str(text) for text in np.ravel(stored.attrs.get(key, ()))) for key in ("name", "unit")}
+        if any(len(texts) != len(found["prior_std"]) for texts in names.values()):
+            raise ArchiveError(f"{where}: the attributes name and unit do not fit {len(found['prior_std'])} parameters")
+        parameters = Parameters(names["name"], names["unit"], **found)
+    hygiene = None
+    if isinstance(group.get("hygiene"), h5py.Group):
+        where = f"{path}: runs/{mode}/hygiene"
+        findings = _read_fields(where, group["hygiene"], _HYGIENE_LAYOUT, {})
+        if "observations" not in group["hygiene"].attrs:
+            raise ArchiveError(f"{where}: attribute observations is missing")
+        hygiene = HygieneReport(observations=int(group["hygiene"].attrs["observations"]), **findings)
     for name in ("sequence_name", "config", "counts", "noise_twist_std", "noise_pixel_std_px"):
         if name not in group.attrs:
             raise ArchiveError(f"{path}: attribute {name} of runs/{mode} is missing")
     if not isinstance(group.get("attributes"), h5py.Group):
         raise ArchiveError(f"{path}: runs/{mode}/attributes is missing")
+    noise = _read_noise(group)
     return Result(
         mode=mode,
         sequence_name=str(group.attrs["sequence_name"]),
@@ -304,16 +362,33 @@ def _read_result(path: str | Path, h5file: h5py.File, mode: str, camera: StereoC
         innovation=Innovation(**fields["innovation"]),
         rejections=Rejections(**fields["rejections"]),
         counts=json.loads(group.attrs["counts"]),
-        config=json.loads(group.attrs["config"]),
-        noise=_read_noise(group),
+        config=_renamed(json.loads(group.attrs["config"]), noise),
+        noise=noise,
         camera=camera,
         T_cam_imu=T_cam_imu,
         log=log,
+        hygiene=hygiene,
+        parameters=parameters,
         attributes={
             key: value.item() if isinstance(value, np.generic) else value
             for key, value in group["attributes"].attrs.items()
         },
     )
+
+
+def _renamed(config: dict[str, Any], noise: Noise) -> dict[str, Any]:
+    """A configuration from before version 3, whose filter had the rules that hygiene has now, in today's terms."""
+    if "hygiene" in config:
+        return config
+    rest = dict(config.get("filter", {}))
+    std = noise.pixel_std_px
+    rules = {
+        "restart_at_repeats": rest.pop("restart_at_repeats", False),
+        "min_disparity_sigma": rest.pop("min_disparity_px", 0.0) / float(np.hypot(std[0], std[2])),
+        "max_row_mismatch_sigma": rest.pop("max_row_mismatch_px", 0.0) / float(np.hypot(std[1], std[3])),
+        "reused_id_sigma": 0.0,
+    }
+    return {**config, "filter": rest, "hygiene": {**dataclasses.asdict(HygieneConfig()), **rules}}
 
 
 def _read_noise(group: h5py.Group) -> Noise:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -24,9 +25,10 @@ from ekfslam.archive import (
     write_archive,
 )
 from ekfslam.comparison import compare
-from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation
+from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation, NoiseModel, noise_of
 from ekfslam.consistency_report import check_consistency
 from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
+from ekfslam.hygiene import clean_tracks
 from ekfslam.metrics.summary import compare_table, summarise
 from ekfslam.montecarlo import LEVELS, STUDY_VARIANTS, Study, levels_of
 from ekfslam.noise import velocity_noise
@@ -39,6 +41,7 @@ from ekfslam.runner import run
 from ekfslam.sequence import Sequence
 from ekfslam.simulate import builtin
 from ekfslam.tracks import inspect_tracks
+from ekfslam.tune import tune
 
 DEFAULT_DATA = "builtin:city"
 TRUTH = "truth"  # what `export` takes beside the modes
@@ -171,6 +174,26 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="FILE", help=f"default: {DEFAULT_DATA}")
     _add_data_options(sub)
 
+    sub = add(
+        "tune",
+        _tune,
+        "find the noise of a recording from its innovations, without truth",
+        "tune drive.mat",
+        "tune drive.mat --out noise.toml && ekfslam run drive.mat --config noise.toml --out drive.h5",
+    )
+    sub.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="DATA", help=f"default: {DEFAULT_DATA}")
+    sub.add_argument(
+        "--out", type=Path, metavar="FILE.toml", help="write what was found, for --config of run and compare"
+    )
+    sub.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of the filter; sigmas are ignored")
+    sub.add_argument(
+        "--model",
+        choices=[model for model in get_args(NoiseModel) if model != "tuned"],
+        help="auto: sigmas of the automatic model; white: of white noise alone (default: as configured)",
+    )
+    sub.add_argument("--drift", action="store_true", help="look for the drift of the tracks, too")
+    _add_data_options(sub)
+
     sub = add("plot", _plot, "draw the figures of an archive", "plot city.h5", "plot city.h5 --out figures")
     sub.add_argument("archive", type=Path, metavar="ARCHIVE")
     sub.add_argument("--out", type=Path, metavar="DIR", help="default: the folder of the archive")
@@ -221,7 +244,12 @@ def _add_data_options(parser: argparse.ArgumentParser) -> None:
 
 def _add_filter_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("settings", "flags override the file, the file overrides the defaults")
-    group.add_argument("--config", type=Path, metavar="FILE.toml", help="tables [noise] and [filter]")
+    group.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE.toml",
+        help="tables [noise], [hygiene], [filter], [calibration], [posterior]; what `tune` writes is one",
+    )
     group.add_argument("--variant", choices=VARIANTS, help="linearisation of the joint filter")
     group.add_argument("--iterations", type=int, metavar="N", help="Gauss-Newton iterations of an update")
     group.add_argument("--retire", choices=("auto", "unseen", "never"), help="when landmarks leave the state")
@@ -278,6 +306,8 @@ def _run(options: argparse.Namespace) -> None:
     write_archive(options.out, sequence, {result.mode: result})
     print(_table(sequence, len(sequence.observations.ids), {result.mode: result}))
     print(", ".join(f"{name} {count}" for name, count in result.counts.items()))
+    if result.parameters is not None:
+        print("\n".join(result.parameters.lines))
     print(f"written to {options.out}")
 
 
@@ -301,6 +331,12 @@ def _info(options: argparse.Namespace) -> None:
         print(_table(archive, None, archive.results))
         for mode, result in archive.results.items():
             print(f"{mode}: " + ", ".join(f"{name} {count}" for name, count in result.counts.items()))
+            if result.parameters is not None:
+                for line in result.parameters.lines:
+                    print(f"{mode}: {line}")
+            if result.hygiene is not None:
+                for line in result.hygiene.lines(result.config["hygiene"]):
+                    print(f"{mode}: hygiene: {line}")
         return
     sequence = _open(options, options.data)
     camera, truth, noise = sequence.camera, sequence.truth, sequence.noise
@@ -313,12 +349,8 @@ def _info(options: argparse.Namespace) -> None:
         f"baseline {camera.baseline_m:g} m"
     )
     if noise is None:
-        found = velocity_noise(sequence.twist)
-        (v, w), (v_error, w_error) = found.sigma, found.sigma_error
-        print(
-            f"noise         not stated; white noise of the velocities, from the data: {v:.3g} +- {v_error:.2g} m/s, "
-            f"{w:.3g} +- {w_error:.2g} rad/s"
-        )
+        v, w = velocity_noise(sequence.twist).texts
+        print(f"noise         not stated; white noise of the velocities, from the data: {v} m/s, {w} rad/s")
     else:
         print(f"noise         twist {noise.twist_std} (m/s, rad/s), pixels {noise.pixel_std_px} px")
     known = "none" if truth is None else f"{len(truth.frame)} poses, {len(truth.landmark)} landmarks"
@@ -327,6 +359,21 @@ def _info(options: argparse.Namespace) -> None:
         print(f"{key:13s} {value}")
     for note in sequence.notes:
         print(f"note          {note}")
+    config = Config()
+    _, hygiene = clean_tracks(sequence, noise_of(sequence, config), config.hygiene)
+    for line in hygiene.lines(dataclasses.asdict(config.hygiene)):
+        print(f"hygiene       {line}")
+
+
+def _tune(options: argparse.Namespace) -> None:
+    config = Config.from_toml(options.config) if options.config else Config()
+    config = config.with_overrides({"noise": {"model": options.model}})
+    tuned = tune(_open(options, options.data), config, drift=options.drift)
+    print(tuned.table)
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(tuned.toml, encoding="utf-8")
+        print(f"written to {options.out}")
 
 
 def _plot(options: argparse.Namespace) -> None:

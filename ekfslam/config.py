@@ -13,14 +13,14 @@ import numpy as np
 from scipy.stats import chi2
 
 from ekfslam.errors import ConfigError
-from ekfslam.noise import automatic_noise
+from ekfslam.noise import VelocityNoise, automatic_noise, velocity_noise
 from ekfslam.sequence import Noise, Sequence
 
 Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
 Variant = Literal["invariant", "fej", "standard"]
 Retire = Literal["auto", "unseen", "never"]
 Linearisation = Literal["map", "filtered"]
-NoiseModel = Literal["auto", "white"]
+NoiseModel = Literal["auto", "tuned", "white"]
 Kernel = Literal["huber", "cauchy", "none"]
 
 MODES: tuple[Mode, ...] = get_args(Mode)
@@ -38,15 +38,56 @@ class NoiseConfig:
         sigma_v_m_s: Linear velocity, each axis.
         sigma_w_rad_s: Angular velocity, each axis.
         sigma_px: Pixels.
-        model: ``auto``: where the sequence states no noise and none is given here, it is found from the data, see
-            `ekfslam.noise`. ``white``: what is neither stated nor given is that of a clean recording, 0.05 m/s,
-            0.001 rad/s, 1 px.
+        drift: How far a track wanders, as a share of the distance driven; None takes what the model says.
+        tilt_deg: Of velocities in a level frame: prior deviation of roll and pitch, which the joint filter estimates; 0
+            takes them as velocities of the IMU; None takes what the model says.
+        model: ``auto``: where the sequence states no noise and no sigma is given here, it is found from the data, see
+            `ekfslam.noise`; sigmas given here are those of white noise. ``tuned``: as ``auto``, but sigmas given here
+            only replace those found, and the rest of the automatic model stays (drift, misalignment, errors of the
+            motion, walk of the velocities): they were found within it, by `ekfslam.tune`, and mean nothing without.
+            ``white``: what is neither stated nor given is that of a clean recording, 0.05 m/s, 0.001 rad/s, 1 px.
     """
 
     sigma_v_m_s: float | None = None
     sigma_w_rad_s: float | None = None
     sigma_px: float | None = None
+    drift: float | None = None
+    tilt_deg: float | None = None
     model: NoiseModel = "auto"
+
+
+@dataclass(frozen=True)
+class HygieneConfig:
+    """What becomes of bad tracks before any filter sees them, see `ekfslam.hygiene`; false or 0 switches a rule off.
+
+    Deviations are those of the pixel noise that the run assumes.
+
+    Args:
+        min_disparity_sigma: Observations with less disparity, in deviations of a disparity, are dropped: they have no
+            depth. (What has no disparity at all the filters reject anyway.)
+        max_row_mismatch_sigma: So are those with larger ``|vL - vR|``, in deviations of that difference.
+        restart_at_repeats: Where a frame repeats the pixels of the one before while the rig moves, every track is cut.
+        restart_above_px: Of these, tracks that move by no more than this in the frames beside it are not cut: they show
+            another point, but one close by. Where velocities are noisy the poses gain by it, the tracks lose.
+        jump_sigma: A track is cut where its pixels jump out of its course, and out of that of the frame's other
+            tracks, by so many deviations.
+        reused_id_sigma: A track is cut where it comes back after a gap so many deviations from where the velocities
+            say that it was.
+        max_depth_error: Tracks are dropped whose depth is never known better than this, as a share of the depth.
+        min_observations: Tracks, or pieces of tracks that were cut, with fewer observations are dropped.
+
+    No rule is for an id that is seen twice in one frame: which of the two is meant nobody can know, so a `Sequence`
+    refuses it with a `DuplicateObservationError`.
+    """
+
+    min_disparity_sigma: float = 1.0
+    max_row_mismatch_sigma: float = 10.0
+    restart_at_repeats: bool = True
+    restart_above_px: float = 0.0
+    jump_sigma: float = 0.0
+    reused_id_sigma: float = 3.0
+    max_depth_error: float = 0.0
+    min_observations: int = 0
 
 
 @dataclass(frozen=True)
@@ -66,11 +107,9 @@ class FilterConfig:
             once against the prediction as corrected by the frame's other landmarks; 1 accepts everything.
         split_after: A track is split, its landmark retired and a new one started, when this many observations in a row
             fail the gate (or put it behind the camera): the tracker has jumped to another point. 0 never splits.
-        moving_sigma, moving_share: Where tracks may drift (`Noise.drift`), one is dropped for good when over all its
-            observations it moves along with the rig by more than this share of the way, beyond that many deviations.
-        restart_at_repeats: Where a frame repeats the pixels of the one before while the rig moves, every track is cut.
-        min_disparity_px: Observations with less disparity are rejected.
-        max_row_mismatch_px: Observations with larger ``|vL - vR|`` are rejected.
+        moving_sigma, moving_share: Where tracks may drift (`Noise.landmarks_walk`), one is dropped for good when over
+            all its observations it moves along with the rig by more than this share of the way, beyond that many
+            deviations (without their `Noise.margin`).
         min_depth_m: Observations of a landmark predicted nearer than this (or behind) are rejected.
         initial_position_std_m: Deviation of the first pose's translation, each axis.
         initial_rotation_std_rad: Deviation of the first pose's rotation, each axis.
@@ -83,11 +122,8 @@ class FilterConfig:
     revive: int = 100
     gate_probability: float = 0.999
     split_after: int = 3
-    restart_at_repeats: bool = True
     moving_sigma: float = 3.0
     moving_share: float = 0.1
-    min_disparity_px: float = 2.0
-    max_row_mismatch_px: float = 20.0
     min_depth_m: float = 0.1
     initial_position_std_m: float = 0.0
     initial_rotation_std_rad: float = 0.0
@@ -101,6 +137,25 @@ class FilterConfig:
     def initial_covariance(self) -> np.ndarray:
         """(6, 6) covariance of the first pose's error ``xi``."""
         return np.diag(np.repeat([self.initial_position_std_m, self.initial_rotation_std_rad], 3) ** 2)
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """What of the calibration the joint filter estimates, as prior deviations; 0 takes it as given.
+
+    Args:
+        rotation_deg: Rotation of the camera against the IMU, each axis.
+        lever_arm_m: Position of the IMU in the camera frame, each axis.
+        baseline: Length of the stereo baseline, as a share of it.
+        disparity_px: Offset of all disparities.
+        time_s: How much later than stamped the images are exposed.
+    """
+
+    rotation_deg: float = 0.0
+    lever_arm_m: float = 0.0
+    baseline: float = 0.0
+    disparity_px: float = 0.0
+    time_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -125,12 +180,49 @@ class PosteriorConfig:
 
 
 @dataclass(frozen=True)
+class TuningRecord:
+    """Where the noise of a tuned file comes from; it decides nothing, but is kept with every result.
+
+    Args:
+        sequence: Name of the recording that it was found on.
+        frames, runs: How many frames of it were filtered, and how many times.
+        log_likelihood: Of the innovations, at the maximum.
+        sigma_v_m_s, sigma_w_rad_s, sigma_px, drift: The estimates; those without ``_error`` have none.
+        found_sigma_v_m_s, found_sigma_w_rad_s: What the differences of the velocities say alone.
+        remarks: What is to be said of the maximum, such as an estimate at its bound.
+    """
+
+    sequence: str | None = None
+    frames: int | None = None
+    runs: int | None = None
+    log_likelihood: float | None = None
+    sigma_v_m_s: float | None = None
+    sigma_v_m_s_error: float | None = None
+    sigma_w_rad_s: float | None = None
+    sigma_w_rad_s_error: float | None = None
+    sigma_px: float | None = None
+    sigma_px_error: float | None = None
+    drift: float | None = None
+    drift_error: float | None = None
+    found_sigma_v_m_s: float | None = None
+    found_sigma_v_m_s_error: float | None = None
+    found_sigma_v_m_s_limit: float | None = None
+    found_sigma_w_rad_s: float | None = None
+    found_sigma_w_rad_s_error: float | None = None
+    found_sigma_w_rad_s_limit: float | None = None
+    remarks: str | None = None
+
+
+@dataclass(frozen=True)
 class Config:
-    """Everything that decides what a run does besides the data."""
+    """Everything that decides what a run does besides the data, and the record of what was tuned."""
 
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
     posterior: PosteriorConfig = field(default_factory=PosteriorConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    hygiene: HygieneConfig = field(default_factory=HygieneConfig)
+    tuning: TuningRecord = field(default_factory=TuningRecord)
 
     def __post_init__(self) -> None:
         noise, filter_, posterior = self.noise, self.filter, self.posterior
@@ -169,17 +261,20 @@ class Config:
         for name in (
             "moving_sigma",
             "moving_share",
-            "max_row_mismatch_px",
             "min_depth_m",
             "initial_position_std_m",
             "initial_rotation_std_rad",
         ):
             if not getattr(filter_, name) >= 0:
                 raise ConfigError(f"filter.{name} must not be negative, found {getattr(filter_, name)}")
-        if not (np.isfinite(filter_.min_disparity_px) and filter_.min_disparity_px > 0):
-            raise ConfigError(
-                f"filter.min_disparity_px must be positive for a depth to exist, found {filter_.min_disparity_px}"
-            )
+        for name, value in dataclasses.asdict(self.calibration).items():
+            if not (np.isfinite(value) and value >= 0):
+                raise ConfigError(f"calibration.{name} must be finite and not negative, found {value}")
+        for name, value in dataclasses.asdict(self.hygiene).items():
+            if name != "restart_at_repeats" and not (np.isfinite(value) and value >= 0):
+                raise ConfigError(f"hygiene.{name} must be finite and not negative, found {value}")
+        if self.hygiene.min_observations != int(self.hygiene.min_observations):
+            raise ConfigError(f"hygiene.min_observations must be a whole number, found {self.hygiene.min_observations}")
 
     def resolved(self, sequence: Sequence) -> Config:
         """This configuration with what is automatic decided for ``sequence``; noise is decided by `noise_of`."""
@@ -199,10 +294,13 @@ class Config:
         Raises:
             ConfigError: An unknown table or key, or a value of the wrong type or range.
         """
-        tables: dict[str, NoiseConfig | FilterConfig | PosteriorConfig] = {
+        tables: dict[str, Any] = {
             "noise": self.noise,
             "filter": self.filter,
             "posterior": self.posterior,
+            "calibration": self.calibration,
+            "hygiene": self.hygiene,
+            "tuning": self.tuning,
         }
         for table, values in overrides.items():
             if table not in tables:
@@ -213,7 +311,7 @@ class Config:
             for key, value in values.items():
                 if key not in known:
                     raise ConfigError(f"unknown key {table}.{key}; known: {', '.join(known)}")
-                is_text = key in ("model", "variant", "retire", "linearisation", "kernel")
+                is_text = key in ("model", "variant", "retire", "linearisation", "kernel", "sequence", "remarks")
                 kind: Any = str if is_text else bool if key == "restart_at_repeats" else (int, float)
                 wanted = isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
                 if value is not None and not wanted:
@@ -221,11 +319,11 @@ class Config:
                     raise ConfigError(f"{table}.{key} must be a {name}, found {value!r}")
             given = {key: value for key, value in values.items() if value is not None}
             tables[table] = dataclasses.replace(tables[table], **given)
-        return Config(**tables)  # type: ignore[arg-type]
+        return Config(**tables)
 
     @staticmethod
     def from_toml(path: str | Path) -> Config:
-        """Defaults overridden by a TOML file with tables ``[noise]``, ``[filter]`` and ``[posterior]``.
+        """Defaults overridden by a TOML file with the tables that are the fields of `Config`.
 
         Raises:
             ConfigError: The file is missing, is not TOML, or holds something unknown.
@@ -239,10 +337,10 @@ class Config:
 
 def noise_of(sequence: Sequence, config: Config) -> Noise:
     """The noise a filter shall assume: what the configuration says, else the sequence, else the data or a default."""
-    given = (config.noise.sigma_v_m_s, config.noise.sigma_w_rad_s, config.noise.sigma_px)
-    if sequence.noise is None and config.noise.model == "auto" and all(sigma is None for sigma in given):
-        return automatic_noise(sequence.twist)
-    stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
+    if is_automatic(sequence, config):
+        stated = automatic_noise(sequence.twist, sequence.velocity_frame)
+    else:
+        stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
     twist, pixels = np.array(stated.twist_std, dtype=float), np.array(stated.pixel_std_px, dtype=float)
     if config.noise.sigma_v_m_s is not None:
         twist[:3] = config.noise.sigma_v_m_s
@@ -250,7 +348,37 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
         twist[3:] = config.noise.sigma_w_rad_s
     if config.noise.sigma_px is not None:
         pixels[:] = config.noise.sigma_px
-    return dataclasses.replace(stated, twist_std=twist, pixel_std_px=pixels)
+    drift = stated.drift if config.noise.drift is None else config.noise.drift
+    tilt = stated.tilt_rad if config.noise.tilt_deg is None else float(np.deg2rad(config.noise.tilt_deg))
+    return dataclasses.replace(stated, twist_std=twist, pixel_std_px=pixels, drift=drift, tilt_rad=tilt)
+
+
+def is_automatic(sequence: Sequence, config: Config) -> bool:
+    """Whether the model of the noise is that of `ekfslam.noise`, found from the data; see `NoiseConfig`."""
+    noise = config.noise
+    given = (noise.sigma_v_m_s, noise.sigma_w_rad_s, noise.sigma_px)
+    is_asked_for = noise.model == "tuned" or (noise.model == "auto" and all(sigma is None for sigma in given))
+    return sequence.noise is None and is_asked_for
+
+
+def noise_account(sequence: Sequence, config: Config) -> dict[str, str | int | float]:
+    """Attributes for a result that say where its noise comes from.
+
+    ``found_*``: what the differences of the velocities say, with standard errors and limits, where the noise is
+    automatic; ``tuned_*``: the `TuningRecord`, where there is one.
+    """
+    account = found_attributes(velocity_noise(sequence.twist)) if is_automatic(sequence, config) else {}
+    tuned = {f"tuned_{key}": value for key, value in vars(config.tuning).items() if value is not None}
+    return {**account, **tuned}
+
+
+def found_attributes(found: VelocityNoise) -> dict[str, float]:
+    """White noise of velocities, its standard errors and 95 % limits by name, the units in the names."""
+    values: dict[str, float] = {}
+    for i, name in enumerate(("sigma_v_m_s", "sigma_w_rad_s")):
+        values[f"found_{name}"], values[f"found_{name}_error"] = float(found.sigma[i]), float(found.sigma_error[i])
+        values[f"found_{name}_limit"] = float(found.limit[i])
+    return values
 
 
 def _landmarks_come_back(sequence: Sequence) -> bool:

@@ -19,7 +19,7 @@ class Log:
     Args:
         first_estimates: Whether the filter took the landmark's place in H at its first estimate (FEJ).
         initial_covariance: (6, 6) of the first pose's error ``xi``.
-        twist: (T, 6) measured velocities, m/s and rad/s.
+        twist: (T, 6) measured velocities of the IMU, m/s and rad/s.
         tau_s: (T,) length of the interval that each twist drove; 0 for the first frame.
         T_predicted: (T, 4, 4) ``T_imu_world`` before the update of each frame.
         T_linear: (T, 4, 4) ``T_imu_world`` at which the update was linearised: the predicted one, unless it was

@@ -188,8 +188,6 @@ def filter_config(level: Loop, variant: str) -> FilterConfig:
             retire="never",
             gate_probability=1.0,
             split_after=0,
-            min_disparity_px=1e-3,
-            max_row_mismatch_px=float("inf"),
             initial_position_std_m=level.initial_position_std_m,
             initial_rotation_std_rad=level.initial_rotation_std_rad,
         )

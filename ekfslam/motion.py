@@ -40,7 +40,45 @@ def process_noise(twist: Array, tau_s: Array | float, twist_std: Array, misalign
     G = twist_jacobian(twist, tau_s)
     Q = (G * np.asarray(twist_std) ** 2) @ np.swapaxes(G, -1, -2)
     if misalignment_rad:
-        B = misalignment_rad * np.concatenate([se3.skew(twist[..., :3]), se3.skew(twist[..., 3:])], axis=-2)
-        turned = G @ B
+        turned = misalignment_rad * G @ turned_by(twist)
         Q = Q + turned @ np.swapaxes(turned, -1, -2)
     return Q
+
+
+def level_frame(up: Array) -> tuple[Array, Array]:
+    """The level frame of an IMU that knows which way is up: z up, x the horizontal part of its own x axis.
+
+    Automotive units (OXTS) give velocities in it: forward, leftward and upward over level ground, whatever the body's
+    roll and pitch are.
+
+    Args:
+        up: (3,) unit vector against gravity, in the IMU frame; not along its x axis.
+
+    Returns:
+        ``R_imu_level`` (3, 3), and Z (3, 3): where up turns by ``exp(phi^)``, the frame turns by ``exp((Z phi)^)``.
+    """
+    forward = np.array([1.0, 0.0, 0.0])
+    sine = up[0]
+    cosine = np.sqrt(1.0 - sine**2)
+    x = (forward - sine * up) / cosine
+    R_imu_level = np.column_stack([x, np.cross(up, x), up])
+    # The part of phi along up turns nothing; instead the frame turns about up as far as keeps its y axis off forward.
+    return R_imu_level, np.eye(3) - np.outer(up, up) + sine / cosine * np.outer(up, x)
+
+
+def imu_twist(level_twist: Array, up: Array) -> tuple[Array, Array, Array]:
+    """Velocities of the level frame, (6,) m/s and rad/s, in the IMU frame.
+
+    Returns:
+        The velocities (6,), their derivative (6, 6) by ``level_twist``, and (6, 3) by phi where up is ``exp(phi^) up``.
+    """
+    R, Z = level_frame(up)
+    by_level = np.zeros((6, 6))
+    by_level[:3, :3] = by_level[3:, 3:] = R
+    twist = by_level @ level_twist
+    return twist, by_level, -turned_by(twist) @ Z
+
+
+def turned_by(twist: Array) -> Array:
+    """``[v^; w^]``, velocities (..., 6) to (..., 6, 3): minus their derivative by small angles that turn them."""
+    return np.concatenate([se3.skew(twist[..., :3]), se3.skew(twist[..., 3:])], axis=-2)

@@ -16,18 +16,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.se3 import Array
-from ekfslam.sequence import Noise
+from ekfslam.sequence import Noise, VelocityFrame
 
 # Errors of automotive velocities that are there even if no noise is: of each sample, and of the angles between their
 # frame and that of the IMU.
 MOTION_STD = np.repeat([0.1, 0.0002], 3)
 MISALIGNMENT_RAD = np.deg2rad(0.07)
 
-# Of tracks of a KLT tracker: pixel noise, and how far a tracked point wanders on its surface per distance driven.
-PIXEL_STD_PX = 1.4
+# Roll and pitch of a road vehicle.
+TILT_RAD = np.deg2rad(3.0)
+
+# Of tracks of a KLT tracker: pixel noise, and how the tracked point wanders, see `Noise`. That errors of tracks agree
+# among themselves for many frames is not part of the model; to make up for it, all three are larger than what single
+# innovations show: the normalised square of these is about 0.1 a degree of freedom.
+PIXEL_STD_PX = 0.7
 DRIFT = 0.5
+BEARING_DRIFT_RAD = 0.00085
+MARGIN = 3.0
 
 _BLOCKS = 20  # of the jackknife
+_ONE_SIDED_95 = 1.645  # deviations
 _SPAN = 10  # samples over which the slow walk of the velocities is measured
 
 
@@ -37,26 +45,39 @@ class VelocityNoise:
 
     Args:
         sigma: (2,) white noise per sample of the linear (m/s) and the angular velocities (rad/s), each axis.
-        sigma_error: (2,) their standard errors (jackknife over 20 stretches).
+        sigma_error: (2,) their standard errors (jackknife over 20 stretches); 0 where no noise is seen.
+        limit: (2,) what they are below with a confidence of 95 %, also where none is seen:
+            ``s^2 + 1.645 e``, with e the standard error of ``s^2``.
         walk: (2,) how far the true velocities change per sample, root mean square.
     """
 
     sigma: Array
     sigma_error: Array
+    limit: Array
     walk: Array
+
+    @property
+    def texts(self) -> tuple[str, str]:
+        """The noise of the linear and of the angular velocities in words: with its error, or what it is below."""
+        v, w = (
+            with_error(sigma, error) if sigma > 0 else f"below {limit:.2g} (95 %)"
+            for sigma, error, limit in zip(self.sigma, self.sigma_error, self.limit, strict=True)
+        )
+        return v, w
 
 
 def velocity_noise(twist: Array) -> VelocityNoise:
     """White noise and walk of velocities (T, 6), m/s and rad/s."""
     d = np.diff(np.asarray(twist, dtype=float), axis=0)
     if len(d) < 2:
-        return VelocityNoise(np.zeros(2), np.full(2, np.inf), np.zeros(2))
+        return VelocityNoise(np.zeros(2), np.full(2, np.inf), np.full(2, np.inf), np.zeros(2))
     product, square = d[1:] * d[:-1], d**2
     sigma = _white(product.mean(axis=0))
     parts = np.array_split(product, min(_BLOCKS, len(product)))
     total = product.sum(axis=0)
-    left_out = np.array([_white((total - part.sum(axis=0)) / max(len(product) - len(part), 1)) for part in parts])
-    error = np.sqrt((len(parts) - 1) * left_out.var(axis=0))
+    left_out = np.array([(total - part.sum(axis=0)) / max(len(product) - len(part), 1) for part in parts])
+    error = _jackknife(np.array([_white(lag_1) for lag_1 in left_out]))
+    limit = _white(np.minimum(product.mean(axis=0), 0.0) - _ONE_SIDED_95 * _jackknife(left_out))
 
     # The walk is what is left of the differences, or what slow means show, whichever is more.
     lag_1 = np.minimum(product.mean(axis=0), 0.0)
@@ -69,7 +90,12 @@ def velocity_noise(twist: Array) -> VelocityNoise:
         steps = _SPAN - (_SPAN**2 - 1) / (3 * _SPAN)
         slow = np.maximum((np.diff(means, axis=0) ** 2).mean(axis=0) + 2.0 / _SPAN * lag_1, 0.0) / steps
     walk = np.maximum(*(np.sqrt(variance.reshape(2, 3).mean(axis=1)) for variance in (fast, slow)))
-    return VelocityNoise(sigma, error, walk)
+    return VelocityNoise(sigma, error, limit, walk)
+
+
+def _jackknife(left_out: Array) -> Array:
+    """Standard errors of estimates from those (n, ...) with one of n parts left out."""
+    return np.sqrt((len(left_out) - 1) * left_out.var(axis=0))
 
 
 def _white(lag_1: Array) -> Array:
@@ -77,7 +103,7 @@ def _white(lag_1: Array) -> Array:
     return np.median(np.sqrt(np.maximum(-lag_1, 0.0)).reshape(2, 3), axis=1)
 
 
-def automatic_noise(twist: Array) -> Noise:
+def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu") -> Noise:
     """The noise that a filter shall assume for a recording that states none, from its velocities (T, 6)."""
     found = velocity_noise(twist)
     sigma = np.repeat(found.sigma, 3)
@@ -90,4 +116,12 @@ def automatic_noise(twist: Array) -> Noise:
         motion_std=MOTION_STD,
         misalignment_rad=MISALIGNMENT_RAD,
         drift=DRIFT,
+        bearing_drift_rad=BEARING_DRIFT_RAD,
+        margin=MARGIN,
+        tilt_rad=TILT_RAD if velocity_frame == "level" else 0.0,
     )
+
+
+def with_error(value: float, error: float | None) -> str:
+    """A value and its standard error, if it has one, as text."""
+    return f"{value:.3g}" if error is None else f"{value:.3g} +- {error:.2g}"

@@ -22,8 +22,9 @@ from numpy.typing import ArrayLike
 from ekfslam import se3
 from ekfslam.config import Config, FilterConfig, PosteriorConfig
 from ekfslam.errors import PosteriorError
+from ekfslam.filters import calibration as cal
 from ekfslam.filters.observing import Rig, Sensor
-from ekfslam.filters.rows import Rows
+from ekfslam.filters.rows import Rows, aged
 from ekfslam.filters.smoothing import maximise
 from ekfslam.information import Elimination, JointInformation
 from ekfslam.log import Log
@@ -123,21 +124,37 @@ def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterio
         config: Linearisation and kernel; by default those that the result was configured with.
 
     Raises:
-        PosteriorError: The result has no log.
+        PosteriorError: The result has no log, or estimates what a posterior does not know.
         IllPosedError: Something is undetermined; lists landmark ids or frames.
     """
     if result.log is None:
         raise PosteriorError(f"{result.sequence_name}: a result of mode {result.mode!r} has no log; run mode 'full'")
     stored = Config().with_overrides(result.config)
     config = config or stored.posterior
+    if config.linearisation == "filtered" and result.parameters is not None:
+        raise PosteriorError(
+            f"{result.sequence_name}: the filter has also estimated {', '.join(result.parameters.name)}, which its "
+            "log does not hold; there is only the linearisation 'map'"
+        )
     return posterior_of_log(
         result.log,
-        Rig(result.camera, result.T_cam_imu, result.noise),
+        _rig(result),
         result.landmarks.position_m,
         config,
         stored.filter,
         name=result.sequence_name,
     )
+
+
+def _rig(result: Result) -> Rig:
+    """The rig of a run, with the calibration that it has found."""
+    rig, found = Rig(result.camera, result.T_cam_imu, result.noise), result.parameters
+    if found is None:
+        return rig
+    parameters = np.array([dict(zip(found.name, found.value[-1], strict=True)).get(name, 0.0) for name in cal.NAMES])
+    if cal.time_offset(parameters):
+        raise PosteriorError(f"{result.sequence_name}: there is no posterior of a run that estimates a time offset")
+    return cal.calibrated(rig, parameters)
 
 
 def posterior_of_log(
@@ -161,13 +178,13 @@ def posterior_of_log(
         IllPosedError: Something is undetermined; lists landmark ids or frames.
     """
     config = config or PosteriorConfig()
-    rows = Rows(log, sensor)
+    rows = Rows(aged(log, sensor), sensor)
     elimination = Elimination(log.frames, log.landmarks, log.frame, log.landmark, log.id)
     if config.linearisation == "filtered":
-        if sensor.noise.twist_walk_std is not None or sensor.noise.drift:
+        if sensor.noise.is_more_than_white:
             raise PosteriorError(
-                f"{name}: the filter let velocities or landmarks walk, which its log does not hold; there is only the "
-                "linearisation 'map', of white velocities and landmarks that stay"
+                f"{name}: the filter let velocities or landmarks walk or has found out its tilt, which its log does "
+                "not hold; there is only the linearisation 'map', of white velocities and landmarks that stay"
             )
         information = JointInformation(elimination, rows.as_filtered())
         T_imu_world = se3.exp(information.eps) @ log.T_predicted

@@ -13,17 +13,17 @@ import scipy
 from threadpoolctl import threadpool_limits
 
 from ekfslam import se3
-from ekfslam.config import MODES, Config, Mode, noise_of
+from ekfslam.config import MODES, Config, Mode, noise_account, noise_of
 from ekfslam.errors import ConfigError
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import run_joint
 from ekfslam.filters.mapping import map_landmarks
 from ekfslam.filters.observing import Rig, collect
+from ekfslam.hygiene import clean_tracks
 from ekfslam.posterior import smooth
 from ekfslam.progress import progress
-from ekfslam.result import Innovation, Landmarks, Rejections, Result
-from ekfslam.sequence import Sequence
-from ekfslam.tracks import restart_at_repeated_frames
+from ekfslam.result import HygieneReport, Innovation, Landmarks, Rejections, Result
+from ekfslam.sequence import WITHOUT_TRACKS, Sequence
 
 
 def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -> Result:
@@ -45,22 +45,24 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
     if mode == "smoothed":
         return smooth(run(sequence, "full", config))
     config = (config or Config()).resolved(sequence)
-    noise = noise_of(sequence, config)
-    cut = 0
-    if config.filter.restart_at_repeats and mode != "dead-reckoning":
-        observations, restarts = restart_at_repeated_frames(sequence.observations, sequence.twist)
-        cut = len(restarts.new)
-        sequence = dataclasses.replace(sequence, observations=observations)
+    noise, account = noise_of(sequence, config), noise_account(sequence, config)
+    hygiene: HygieneReport | None = None
+    if mode != "dead-reckoning":
+        observations, hygiene = clean_tracks(sequence, noise, config.hygiene)
+        attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
+        sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
     frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
     counts: dict[str, int] = {}
-    log = None
+    log = parameters = None
 
     # Small dense matrices: a second BLAS thread costs three times what it saves.
     with threadpool_limits(1, user_api="blas"):
         if mode == "full":
-            ekf, T_imu_world, covariance, reports, ms = run_joint(sequence, rig, config.filter, frames)
-            landmarks, counts, log = ekf.landmarks(), ekf.counts, ekf.log()
+            ekf, T_imu_world, covariance, reports, ms = run_joint(
+                sequence, rig, config.filter, frames, config.calibration
+            )
+            landmarks, counts, log, parameters = ekf.landmarks(), ekf.counts, ekf.log(), ekf.further()
         else:
             begin = perf_counter()
             T_imu_world, covariance = dead_reckon(sequence, noise, config.filter.initial_covariance)
@@ -76,7 +78,10 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
     innovation, rejections = Innovation.empty(len(sequence)), Rejections.empty()
     if reports:
         innovation, rejections, tallies = collect(reports)
-        counts = {**tallies, **counts, "cut at repeated frames": cut}
+        counts = {**tallies, **counts}
+        account["log_likelihood"] = float(sum(report.log_likelihood for report in reports))
+    if hygiene is not None:
+        counts |= hygiene.counts
     return Result(
         mode=mode,
         sequence_name=sequence.name,
@@ -93,7 +98,9 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
         camera=sequence.camera,
         T_cam_imu=sequence.T_cam_imu,
         log=log,
-        attributes={**sequence.attributes, **versions()},
+        hygiene=hygiene,
+        parameters=parameters,
+        attributes={**sequence.attributes, **account, **versions()},
     )
 
 

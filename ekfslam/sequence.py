@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,11 +30,18 @@ from ekfslam.errors import (
 from ekfslam.se3 import Array
 
 IntArray = NDArray[np.int64]
+VelocityFrame = Literal["imu", "level"]
 
 ROTATION_TOLERANCE = 1e-4  # files print rotations with as few as five digits
 
 # Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
+
+
+LEVEL_VELOCITIES_NOTE = (
+    "The velocities are forward, left and up over level ground, whatever the vehicle's roll and pitch: full SLAM "
+    "estimates these, dead reckoning takes them as none."
+)
 
 
 @dataclass(frozen=True)
@@ -111,7 +119,12 @@ class Noise:
             estimates them, too. None: nothing is assumed of how they change.
         motion_std: (6,) error of the motion beyond ``twist_std``, which no averaging of velocities removes.
         misalignment_rad: Deviation of the angles between the frame of the velocities and the IMU frame, each axis.
-        drift: How far a track wanders on its surface (or moves with it), as a share of the distance driven.
+        drift: How far a track wanders along the way of the rig, frame by frame, as a share of the distance driven.
+        bearing_drift_rad: How far a track wanders in the image, a random walk: rad per square root of a metre driven.
+        tilt_rad: Of velocities in a level frame: deviation of the first roll and pitch against gravity from none; the
+            joint filter then estimates them. 0: the velocities are taken as those of the IMU frame.
+        margin: How much larger all these deviations are than those of single measurements, to make up for errors that
+            agree among themselves for many frames; what judges one track by itself need not allow for that.
     """
 
     twist_std: Array
@@ -120,6 +133,19 @@ class Noise:
     motion_std: Array = field(default_factory=lambda: np.zeros(6))
     misalignment_rad: float = 0.0
     drift: float = 0.0
+    bearing_drift_rad: float = 0.0
+    tilt_rad: float = 0.0
+    margin: float = 1.0
+
+    @property
+    def landmarks_walk(self) -> bool:
+        """Whether what a track shows is taken to be another point in every frame."""
+        return bool(self.drift or self.bearing_drift_rad)
+
+    @property
+    def is_more_than_white(self) -> bool:
+        """Whether the joint filter estimates velocities or tilt, or lets landmarks walk."""
+        return self.twist_walk_std is not None or self.landmarks_walk or self.tilt_rad > 0
 
     @property
     def velocity_std(self) -> Array:
@@ -140,12 +166,13 @@ class Sequence:
         name: Short name, used for folders and titles.
         source: File or built-in world it came from, used in error messages.
         time_s: (T,) strictly increasing stamps.
-        twist: (T, 6) measured velocities ``[v; w]`` in the IMU frame; ``twist[k]`` drives ``(t[k-1], t[k]]``.
+        twist: (T, 6) measured velocities ``[v; w]`` in ``velocity_frame``; ``twist[k]`` drives ``(t[k-1], t[k]]``.
         camera: Stereo intrinsics.
         T_cam_imu: (4, 4) extrinsics, IMU to left optical frame; made rigid to rounding, as files print few digits.
         observations: Flat stereo observations; none only where the attributes have `WITHOUT_TRACKS`.
         truth: Ground truth, if there is any.
         noise: Noise as stated by the source, if it states any.
+        velocity_frame: ``imu``, or ``level``: x forward, y left, z up over level ground, see `motion.level_frame`.
         notes: What the reader found and did about it, one sentence each.
         attributes: Further facts to keep with every result (seed, checksum, simulation parameters).
     """
@@ -159,6 +186,7 @@ class Sequence:
     observations: Observations
     truth: Truth | None = None
     noise: Noise | None = None
+    velocity_frame: VelocityFrame = "imu"
     notes: tuple[str, ...] = ()
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
 
@@ -258,6 +286,11 @@ def _validate(sequence: Sequence) -> None:
         )
     require_shape(sequence.twist, (frames, 6), "twist")
     require_finite(sequence.twist, "twist")
+    if sequence.velocity_frame not in get_args(VelocityFrame):
+        raise DataError(
+            f"expected {' or '.join(get_args(VelocityFrame))}, found {sequence.velocity_frame!r}",
+            field="velocity_frame",
+        )
     validate_camera(sequence.camera)
     require_shape(sequence.T_cam_imu, (4, 4), "T_cam_imu")
     require_finite(sequence.T_cam_imu, "T_cam_imu")
@@ -314,9 +347,16 @@ def _validate_truth(truth: Truth, frames: int) -> None:
 
 
 def _validate_noise(noise: Noise) -> None:
-    for name, size in (("twist_std", 6), ("pixel_std_px", 4)):
+    for name, size in (("twist_std", 6), ("pixel_std_px", 4), ("twist_walk_std", 6), ("motion_std", 6)):
+        if name == "twist_walk_std" and noise.twist_walk_std is None:
+            continue
         value = np.asarray(getattr(noise, name), dtype=float)
         require_shape(value, (size,), f"noise.{name}")
         require_finite(value, f"noise.{name}")
         if (value < 0).any():
             raise DataError("standard deviations must not be negative", field=f"noise.{name}")
+    for name in ("misalignment_rad", "drift", "bearing_drift_rad", "tilt_rad"):
+        if not (np.isfinite(getattr(noise, name)) and getattr(noise, name) >= 0):
+            raise DataError(f"must be finite and not negative, found {getattr(noise, name)}", field=f"noise.{name}")
+    if not noise.margin >= 1:
+        raise DataError(f"must be at least 1, found {noise.margin}", field="noise.margin")

@@ -1,10 +1,11 @@
-"""Track hygiene: what a recording's tracks look like before any filter trusts them, and what is done about it."""
+"""What the tracks of a recording look like, and how to cut one: the ground that `ekfslam.hygiene` stands on."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ekfslam.se3 import Array
 from ekfslam.sequence import IntArray, Observations
@@ -52,7 +53,7 @@ class TrackReport:
 
 def inspect_tracks(observations: Observations, twist: Array) -> TrackReport:
     """Report on the tracks of a recording with velocities ``twist`` (T, 6) in m/s and rad/s, one for every frame."""
-    earlier, later = _successive(observations)
+    earlier, later = successive(observations)
     gap = observations.frame[later] - observations.frame[earlier] > 1
     pixels = observations.pixels_px
     return TrackReport(
@@ -65,50 +66,20 @@ def inspect_tracks(observations: Observations, twist: Array) -> TrackReport:
     )
 
 
-@dataclass(frozen=True)
-class Restarts:
-    """Tracks that were cut in two at repeated frames.
+def cut_tracks(observations: Observations, starts: NDArray[np.bool_], first_id: int) -> IntArray:
+    """Landmark ids (K,) after every track is cut before its observations that ``starts`` (K,) marks.
 
-    Args:
-        frame: (n,) first frame of the new piece.
-        old, new: (n,) id of the track up to there, and of its continuation.
+    New pieces are numbered from ``first_id``, by track and then by frame; the first piece of a track keeps its id.
     """
-
-    frame: IntArray
-    old: IntArray
-    new: IntArray
-
-
-def restart_at_repeated_frames(observations: Observations, twist: Array) -> tuple[Observations, Restarts]:
-    """Cut every track where a frame repeats the pixels of the one before: the rest gets an id of its own.
-
-    In such a frame the tracker has been restarted at the old pixels in the new image. The pixels are right for the
-    frame that they stand in (they predict the next one as well as any), but show other points than before: no track
-    leads across. Ids of new pieces count on from the largest.
-    """
-    frames = repeated_frames(observations, twist)
-    # Which piece of its track an observation belongs to: how many repeated frames lie at or before it, from the first.
-    piece = np.searchsorted(frames, observations.frame, side="right")
     order = np.lexsort((observations.frame, observations.landmark))
-    ids, piece = observations.landmark[order], piece[order]
-    starts = np.flatnonzero((np.diff(ids) == 0) & (np.diff(piece) > 0)) + 1
-    new = int(observations.landmark.max(initial=-1)) + 1 + np.arange(len(starts))
-    # Everything from a start to the next one, or to the end of the track, takes the new id.
-    ends = np.searchsorted(ids, ids[starts], side="right")
-    ends = np.minimum(ends, np.append(starts[1:], len(ids)))
-    landmark = ids.copy()
-    landmark[np.repeat(starts, ends - starts) + _counts(ends - starts)] = np.repeat(new, ends - starts)
-    restored = np.empty_like(landmark)
-    restored[order] = landmark
-    return (
-        Observations(observations.frame, restored, observations.pixels_px),
-        Restarts(observations.frame[order][starts], ids[starts], new),
-    )
-
-
-def _counts(lengths: IntArray) -> IntArray:
-    """``0, ..., n-1`` for every length n, one after the other."""
-    return np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    ids, marked = observations.landmark[order], starts[order]
+    first = np.diff(ids, prepend=-1) != 0
+    # The number of the piece an observation belongs to; unmarked beginnings are those of the tracks themselves.
+    piece = first_id - 1 + np.cumsum(marked)
+    begins = np.maximum.accumulate(np.where(first | marked, np.arange(len(ids)), 0))
+    landmark = np.empty_like(ids)
+    landmark[order] = np.where(marked[begins], piece, ids)
+    return landmark
 
 
 def repeated_frames(observations: Observations, twist: Array) -> IntArray:
@@ -117,8 +88,12 @@ def repeated_frames(observations: Observations, twist: Array) -> IntArray:
     One common track is enough: a subpixel tracker does not return the same four numbers from another image, and in the
     recordings no frame repeats some tracks but not others. ``twist[k]`` (T, 6) m/s and rad/s, which drives the interval
     before frame k, tells whether the rig moves; standing still, pixels may well repeat.
+
+    In such a frame the tracker has been restarted at the old pixels in the new image. The pixels are right for the
+    frame that they stand in (they predict the next one as well as any), but show other points than before: no track
+    leads across.
     """
-    earlier, later = _successive(observations)
+    earlier, later = successive(observations)
     adjacent = observations.frame[later] - observations.frame[earlier] == 1
     earlier, later = earlier[adjacent], later[adjacent]
     same = (observations.pixels_px[earlier] == observations.pixels_px[later]).all(axis=1)
@@ -128,7 +103,7 @@ def repeated_frames(observations: Observations, twist: Array) -> IntArray:
     return np.flatnonzero((common > 0) & (repeated == common) & moving)
 
 
-def _successive(observations: Observations) -> tuple[IntArray, IntArray]:
+def successive(observations: Observations) -> tuple[IntArray, IntArray]:
     """Index pairs (earlier, later) of observations that follow each other in the same track."""
     order = np.lexsort((observations.frame, observations.landmark))
     same_track = np.diff(observations.landmark[order]) == 0

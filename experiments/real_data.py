@@ -48,11 +48,18 @@ DENSE = ("ece276a/0027_dense_noisy.npz", "07")
 # Heading, mode, settings.
 ESTIMATORS: tuple[tuple[str, Any, dict[str, dict[str, Any]]], ...] = (
     ("dead reckoning", "dead-reckoning", {}),
+    ("mapping-only", "mapping-only", {}),
     ("full", "full", {}),
     ("full, standard", "full", {"filter": {"variant": "standard"}}),
     ("full, fej", "full", {"filter": {"variant": "fej"}}),
     ("smoothed", "smoothed", {}),
 )
+# Of the second table: heading, and which of the counts.
+SHARES = {
+    "dropped by hygiene": "dropped by hygiene",
+    "gate": "rejected: gate",
+    "moves": "rejected: moving",
+}
 SEEDS = range(5)
 ADDED_STD = np.repeat([0.5, 0.05], 3)
 
@@ -75,7 +82,7 @@ def main() -> None:
             except ekfslam.EkfslamError as error:
                 print(f"{name}: no {heading}: {error}", file=sys.stderr)
                 continue
-            table[name][heading] = errors(sequence, result)
+            table[name][heading] = {**errors(sequence, result), **statistics(result)}
         print(name, {key: round(value["ate_m"], 3) for key, value in table[name].items()}, flush=True)
     noisy = {}
     for path in UTIAS:
@@ -107,6 +114,22 @@ def errors(sequence: Sequence, result: Result) -> dict[str, float]:
     return {
         "ate_m": absolute_trajectory_error(estimate, truth.T_world_imu, align=False),
         "ate_aligned_m": absolute_trajectory_error(estimate, truth.T_world_imu, align=True),
+    }
+
+
+def statistics(result: Result) -> dict[str, float]:
+    """What became of the observations, in shares of all, and how large the innovations are."""
+    counts, innovation = result.counts, result.innovation
+    if "accepted" not in counts:
+        return {}
+    total = counts["accepted"] + counts["rejected"] + counts["dropped by hygiene"]
+    shares = {name: counts[key] / total for name, key in SHARES.items()}
+    cut = sum(value for key, value in counts.items() if key.startswith("hygiene: "))
+    return {
+        **shares,
+        "cuts": float(cut - counts["dropped by hygiene"]),
+        "moving tracks": float(counts.get("moving", 0)),
+        "nis_per_dof": float(innovation.nis.sum() / max(innovation.dof.sum(), 1)),
     }
 
 
@@ -142,6 +165,8 @@ def markdown(table: dict[str, dict[str, dict[str, float]]], noisy: dict[str, lis
     lines += [
         f"\nOf the {len(drives)} UTIAS drives {sum(gain > 1 for gain in drives)} gain, {np.median(drives):.2f}x in "
         "the median over all.\n",
+        "Mapping-only maps on dead reckoning's poses; its trajectory is that.\n",
+        *observations_table(table),
         "## Known noise added to the velocities\n",
         "0.5 m/s and 0.05 rad/s a sample, five seeds; ATE in metres, median (smallest to largest).\n",
         "| set | dead reckoning | full | gain |",
@@ -156,6 +181,24 @@ def markdown(table: dict[str, dict[str, dict[str, float]]], noisy: dict[str, lis
         f"\nGain over all sets and seeds: {np.median(every):.2f} in the median, {min(every):.2f} at the least."
     )
     return "\n".join(lines) + "\n"
+
+
+def observations_table(table: dict[str, dict[str, dict[str, float]]]) -> list[str]:
+    """What full SLAM did with the observations."""
+    lines = [
+        "## What became of the observations (full)\n",
+        "Shares of all observations that were dropped by hygiene, turned down by the gate, or belong to tracks found "
+        "to move; how many tracks hygiene cut and how many were found to move; normalised innovation squared a degree "
+        "of freedom, which is below 1 as the assumed noise makes up for errors that agree among themselves.\n",
+        f"| set | {' | '.join(SHARES)} | tracks cut | tracks moving | NIS/dof |",
+        "|---|" + "---:|" * (len(SHARES) + 3),
+    ]
+    for name, row in table.items():
+        full = row["full"]
+        shares = " | ".join(f"{full[key]:.1%}" for key in SHARES)
+        tracks = f"{full['cuts']:.0f} | {full['moving tracks']:.0f}"
+        lines.append(f"| {name} | {shares} | {tracks} | {full['nis_per_dof']:.2f} |")
+    return [*lines, ""]
 
 
 def plot(table: dict[str, dict[str, dict[str, float]]], noisy: dict[str, list[dict[str, float]]]) -> Figure:

@@ -7,7 +7,7 @@ import pytest
 from reference import report_mapping, run_naive, small_world
 
 from ekfslam import se3
-from ekfslam.config import Config, FilterConfig, NoiseConfig, noise_of
+from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig, noise_of
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
@@ -16,7 +16,7 @@ from ekfslam.result import REASONS
 from ekfslam.runner import run
 from ekfslam.sequence import Observations
 
-OPEN = FilterConfig(gate_probability=1.0, split_after=0, min_disparity_px=1e-3)
+OPEN = FilterConfig(gate_probability=1.0, split_after=0)
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
 
 
@@ -80,7 +80,7 @@ def test_mapping_only_equals_the_report_s_loop_over_landmarks(world):
 def test_mapping_only_is_the_joint_filter_without_pose_uncertainty(variant, gated):
     """P_xx(0) = 0 and W = 0; with gate and split in force the decisions must agree as well."""
     world = with_outliers(small_world(seed=3)) if gated else small_world(seed=3)
-    filter_config = FilterConfig(min_disparity_px=1e-3) if gated else OPEN
+    filter_config = FilterConfig() if gated else OPEN
     config = Config(NoiseConfig(0.0, 0.0, None), dataclasses.replace(filter_config, variant=variant, retire="never"))
     mapping, full = run(world, "mapping-only", config), run(world, "full", config)
     np.testing.assert_allclose(full.T_world_imu, mapping.T_world_imu, atol=1e-9)
@@ -125,7 +125,7 @@ def with_outliers(world, fraction=0.03, seed=11):
 
 def test_outliers_are_rejected_listed_and_a_jumped_track_is_split():
     world = with_outliers(small_world(seed=5))
-    result = run(world, "full", Config(filter=FilterConfig(min_disparity_px=1e-3)))
+    result = run(world, "full", Config(filter=FilterConfig()))
     longest = np.bincount(world.observations.landmark).argmax()
     pieces = np.flatnonzero(result.landmarks.id == longest)
     assert len(pieces) == 2
@@ -144,7 +144,7 @@ def test_outliers_are_rejected_listed_and_a_jumped_track_is_split():
 def test_conditional_gate_equals_leaving_each_landmark_out(variant):
     """Brute force: each landmark tested against the posterior of all others, dense and with explicit inverses."""
     world = small_world(seed=10, sigma_v=1.0, sigma_w=0.15)
-    config = Config(filter=FilterConfig(variant=variant, min_disparity_px=1e-3, split_after=0))
+    config = Config(filter=FilterConfig(variant=variant, split_after=0))
     rig, tau = Rig(world.camera, world.T_cam_imu, world.noise), np.diff(world.time_s, prepend=np.nan)
     ekf, free = (JointEKF(rig, f, world.initial_T_world_imu) for f in (config.filter, settings(variant=variant).filter))
     for filter_ in (ekf, free):
@@ -222,18 +222,19 @@ def test_a_landmark_that_comes_back_is_revived_or_starts_afresh_and_is_counted()
     assert automatic.counts["retired"] == 0
 
 
-def test_screening_reasons():
+def test_what_has_no_depth_is_rejected_whatever_hygiene_does():
     world = small_world()
     pixels = world.observations.pixels_px.copy()
     pixels[0, 2] = pixels[0, 0] + 1.0
-    pixels[1, 3] += 9.0
+    pixels[1, 2] = pixels[1, 0]
     bad = dataclasses.replace(
         world, observations=Observations(world.observations.frame, world.observations.landmark, pixels)
     )
-    result = run(bad, "mapping-only", settings(min_disparity_px=2.0, max_row_mismatch_px=8.0))
-    found = {(int(f), int(i)): REASONS[r] for f, i, r in zip(*vars(result.rejections).values(), strict=True)}
-    assert found[(0, int(world.observations.landmark[0]))] == "disparity"
-    assert found[(0, int(world.observations.landmark[1]))] == "row mismatch"
+    for mode in ("mapping-only", "full"):
+        result = run(bad, mode, Config(filter=OPEN, hygiene=HygieneConfig(min_disparity_sigma=0.0)))
+        found = {(int(f), int(i)): REASONS[r] for f, i, r in zip(*vars(result.rejections).values(), strict=True)}
+        assert found[(0, int(world.observations.landmark[0]))] == "disparity"
+        assert found[(0, int(world.observations.landmark[1]))] == "disparity"
 
 
 def test_a_frame_without_observations_is_a_prediction():
@@ -306,7 +307,11 @@ def test_dead_reckoning_covariance_is_that_of_sampled_runs(world):
         ({"filter": {"variant": 3}}, "must be a string"),
         ({"filter": {"gate_probability": 0.0}}, "gate_probability"),
         ({"filter": {"gate_probability": "high"}}, "must be a number"),
-        ({"filter": {"min_disparity_px": 0.0}}, "min_disparity_px"),
+        ({"filter": {"min_disparity_px": 2.0}}, "min_disparity_px"),
+        ({"hygiene": {"min_disparity_sigma": -1.0}}, "min_disparity_sigma"),
+        ({"hygiene": {"jump_sigma": float("inf")}}, "jump_sigma"),
+        ({"hygiene": {"min_observations": 2.5}}, "min_observations"),
+        ({"hygiene": {"restart_at_repeats": 1}}, "must be a truth value"),
         ({"filter": {"split_after": 1.5}}, "split_after"),
         ({"filter": {"split_after": -1}}, "split_after"),
     ],

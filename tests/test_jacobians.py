@@ -74,7 +74,7 @@ def test_measurement_jacobians_by_pose_and_landmark(T):
 @pytest.mark.parametrize("variant", ["invariant", "standard"])
 def test_full_width_jacobians_of_a_shuffled_non_first_subset(T, variant):
     """The sparse H and F, seen through the state's retraction, with unseen landmarks before, between and behind."""
-    ekf = JointEKF(RIG, FilterConfig(variant=variant, retire="never", min_disparity_px=0.1), se3.inverse(T))
+    ekf = JointEKF(RIG, FilterConfig(variant=variant, retire="never"), se3.inverse(T))
     m = visible_points(T, 6)
     ids = np.array([40, 3, 17, 99, 8, 21])
     pixels = cam.project(CAMERA, se3.apply(T_CAM_IMU @ T, m))

@@ -231,7 +231,6 @@ def test_a_record_is_what_an_ordinary_run_gives(variant):
         retire="never",
         gate_probability=1.0,
         split_after=0,
-        min_disparity_px=1e-3,
         initial_position_std_m=0.5,
         initial_rotation_std_rad=np.deg2rad(15.0),
     )

@@ -24,7 +24,7 @@ from ekfslam.simulate import builtin
 
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
 SINGULAR_P0 = np.diag([0.1, 0.2, 0.0, 0.0, 0.0, 0.03]) ** 2
-OPEN = FilterConfig(gate_probability=1.0, split_after=0, min_disparity_px=1e-3, retire="never")
+OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never")
 FILTERED = PosteriorConfig(linearisation="filtered")
 
 

@@ -17,7 +17,7 @@ from ekfslam.filters.variants import RULES
 from ekfslam.sequence import Noise
 
 P0 = np.diag([0.2, 0.1, 0.3, 0.05, 0.04, 0.08]) ** 2
-OPEN = FilterConfig(gate_probability=1.0, split_after=0, min_disparity_px=1e-3, retire="never")
+OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never")
 
 
 def exact_motion(sequence):

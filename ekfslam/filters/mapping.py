@@ -20,6 +20,7 @@ from ekfslam.filters.observing import (
     diagonal,
     first_sight,
     linearise,
+    log_density,
     missed,
     normalised_squares,
 )
@@ -110,7 +111,9 @@ def map_landmarks(
         last[accepted] = k
         count[accepted] += 1
         nis_accepted = nis[inside]
-        reports.append(FrameReport(k, seen, reason, float(nis_accepted.sum()), 3 * len(nis_accepted), ids[split]))
+        dof = 3 * len(nis_accepted)
+        likelihood = log_density(nis_accepted.sum(), np.linalg.slogdet(S[inside])[1].sum(), dof)
+        reports.append(FrameReport(k, seen, reason, float(nis_accepted.sum()), dof, ids[split], likelihood))
         ms.append(1e3 * (perf_counter() - begin))
 
     landmarks = Landmarks.concatenate([*retired, landmarks_at(np.flatnonzero(count > 0))])

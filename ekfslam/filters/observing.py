@@ -23,7 +23,7 @@ from ekfslam.se3 import Array
 from ekfslam.sequence import IntArray, Noise
 
 ACCEPTED = -1
-GATE, DISPARITY, ROW_MISMATCH, BEHIND_CAMERA, MOVING = range(len(REASONS))
+GATE, DISPARITY, _, BEHIND_CAMERA, MOVING = range(len(REASONS))
 
 
 class Sensor(Protocol):
@@ -64,21 +64,29 @@ class Sensor(Protocol):
 
 @dataclass(frozen=True)
 class Rig:
-    """The report's stereo rig as a `Sensor`: measurements are pixels (n, 4), rows the rectified rows (uL, v, uR)."""
+    """The report's stereo rig as a `Sensor`: measurements are pixels (n, 4), rows the rectified rows (uL, v, uR).
+
+    Disparities come out larger by ``disparity_offset_px`` than the camera's matrix says.
+    """
 
     camera: StereoCamera
     T_cam_imu: Array
     noise: Noise
+    disparity_offset_px: float = 0.0
 
     @cached_property
     def variance_px2(self) -> Array:
         """Variances (3,) of the rectified rows."""
         return cam.rectified_rows(np.zeros(4), self.noise.pixel_std_px)[1]
 
+    @property
+    def _offset(self) -> Array:
+        return np.array([0.0, 0.0, self.disparity_offset_px])
+
     def screen(self, measured: Array, config: FilterConfig) -> IntArray:
         reason = np.full(len(measured), ACCEPTED)
-        reason[np.abs(measured[:, 1] - measured[:, 3]) > config.max_row_mismatch_px] = ROW_MISMATCH
-        reason[measured[:, 0] - measured[:, 2] < config.min_disparity_px] = DISPARITY
+        # Limits tied to noise are the business of `ekfslam.hygiene`; here is only what no depth can be computed from.
+        reason[measured[:, 0] <= measured[:, 2]] = DISPARITY
         return reason
 
     def in_view(self, q: Array, config: FilterConfig) -> NDArray[np.bool_]:
@@ -91,13 +99,13 @@ class Rig:
         return np.broadcast_to(self.variance_px2, rows.shape)
 
     def predict(self, q: Array) -> Array:
-        return cam.project(self.camera, q)[:, :3]
+        return cam.project(self.camera, q)[:, :3] - self._offset
 
     def jacobian(self, q: Array) -> Array:
         return cam.rectified_jacobian(self.camera, q)
 
     def invert(self, rows: Array) -> Array:
-        return cam.triangulate(self.camera, rows)
+        return cam.triangulate(self.camera, rows + self._offset)
 
 
 @dataclass(frozen=True)
@@ -111,6 +119,8 @@ class FrameReport:
         nis: Normalised innovation squared of the accepted updates.
         dof: Its degrees of freedom.
         split: Ids of tracks that were split, their observation starting a new landmark.
+        log_likelihood: Log-density of the frame's innovations, of accepted updates and, where velocities are in the
+            state, of their measurement; see `log_density`. Landmarks that start are without prior and contribute 0.
     """
 
     frame: int
@@ -119,6 +129,16 @@ class FrameReport:
     nis: float
     dof: int
     split: IntArray
+    log_likelihood: float
+
+
+def log_density(nis: float, log_det: float, dof: int) -> float:
+    """``log N(r; 0, S) = -(r^T S^-1 r + log det S + n log 2 pi) / 2`` from the NIS, ``log det S`` and n.
+
+    Summed over a run it is the log-likelihood of the filter's parameters: the prediction error decomposition, Schweppe,
+    "Evaluation of likelihood functions for Gaussian signals", IEEE Trans. Information Theory 11, 1965.
+    """
+    return -0.5 * float(nis + log_det + dof * np.log(2 * np.pi))
 
 
 def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> Array:

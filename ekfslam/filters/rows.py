@@ -8,7 +8,7 @@ first-estimates EKF that never retires a landmark has exactly the solution of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,6 +36,28 @@ class State:
     T_imu_world: Array
     positions_m: Array
     zeta: Array
+
+
+def aged(log: Log, sensor: Sensor) -> Log:
+    """A log whose observations are worth less the further the rig has driven since their landmark was first seen.
+
+    Rows know landmarks that stay. Where tracks wander (`Noise.drift`, `Noise.bearing_drift_rad`), each observation's
+    variance grows by what its landmark may have moved since its first sight, seen at the filter's own estimates; that
+    successive observations share most of it is left out.
+    """
+    noise = sensor.noise
+    if not noise.landmarks_walk:
+        return log
+    position = se3.inverse(log.T_updated)[:, :3, 3]
+    step = np.diff(position, axis=0, prepend=position[:1])
+    way = np.cumsum(np.linalg.norm(step, axis=1))
+    along = np.cumsum(step[:, :, None] * step[:, None, :], axis=0)
+    _, first = np.unique(log.landmark, return_index=True)
+    begin, now = log.frame[first][log.landmark], log.frame
+    q, _, H_m = linearise(sensor, log.T_updated[now], log.position_m, log.position_m)
+    across = noise.bearing_drift_rad**2 * (way[now] - way[begin]) * (q**2).sum(axis=1)
+    moved = noise.drift**2 * (along[now] - along[begin]) + across[:, None, None] * np.eye(3)
+    return replace(log, variance=log.variance + np.einsum("kij,kjl,kil->ki", H_m, moved, H_m))
 
 
 class Rows:

@@ -63,7 +63,7 @@ def transport_invariant(P: Array, T_before: Array, T_after: Array, moved_m: Arra
     """
     Ad, by_rotation, _ = derivative_invariant(T_before, T_after, moved_m)
     # xi+ = Ad xi and d+ = d + B theta, hence P_mm+ = P_mm + B Z^T + Z B^T with Z = P_m,theta + B P_theta,theta / 2.
-    # Velocities behind the pose (see `JointEKF`) are in the frame of the rig: nothing changes for them.
+    # What else stands behind the pose (see `JointEKF`) is in the frame of the rig: nothing changes for it.
     B = np.zeros((len(P) - 6, 3))
     B[len(B) - 3 * len(moved_m) :] = by_rotation.reshape(-1, 3)
     Z = P[6:, 3:6] + 0.5 * B @ P[3:6, 3:6]

@@ -12,7 +12,7 @@ from ekfslam.camera import StereoCamera
 from ekfslam.errors import CalibrationError, UnknownFormatError
 from ekfslam.readers.fields import checksum, flat_observations, require_numbers, spelled_as_in
 from ekfslam.se3 import Array
-from ekfslam.sequence import Sequence, validate_camera
+from ekfslam.sequence import LEVEL_VELOCITIES_NOTE, Sequence, validate_camera
 from ekfslam.tracks import inspect_tracks
 
 Extrinsics = Literal["corrected", "as-stored"]
@@ -63,7 +63,8 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected") -> Sequence:
             camera=camera,
             T_cam_imu=stored if extrinsics == "as-stored" else _with_camera_position(stored),
             observations=observations,
-            notes=(_EXTRINSICS_NOTES[extrinsics], *inspect_tracks(observations, twist).notes),
+            velocity_frame="level",
+            notes=(_EXTRINSICS_NOTES[extrinsics], LEVEL_VELOCITIES_NOTE, *inspect_tracks(observations, twist).notes),
             attributes={"checksum_sha256": checksum(path), "reader": "ece276a", "extrinsics": extrinsics},
         )
 

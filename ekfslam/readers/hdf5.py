@@ -1,7 +1,7 @@
 """ekfslam's own HDF5 form of a `Sequence`, and its groups for others (the result archive) to embed.
 
     /                   attributes format, format_version
-    /sequence           attribute name; time (T,), twist (T, 6), T_cam_imu (4, 4), notes (n,) of text
+    /sequence           attributes name, velocity_frame; time (T,), twist (T, 6), T_cam_imu (4, 4), notes (n,) of text
         camera          attributes fu_px, fv_px, cu_px, cv_px, baseline_m
         attributes      the further facts, as attributes
         observations    frame (K,), landmark (K,), pixels (K, 4)
@@ -31,7 +31,15 @@ FORMAT = "ekfslam-sequence"
 FORMAT_VERSION = 1
 
 _CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
-_FURTHER_NOISE = ("twist_walk_std", "motion_std", "misalignment_rad", "drift")
+_FURTHER_NOISE = (
+    "twist_walk_std",
+    "motion_std",
+    "misalignment_rad",
+    "drift",
+    "bearing_drift_rad",
+    "tilt_rad",
+    "margin",
+)
 _SPELLING = {
     "time_s": "sequence/time",
     "twist": "sequence/twist",
@@ -94,6 +102,7 @@ def write_sequence_group(h5file: h5py.Group, sequence: Sequence, include_observa
     """Write ``/sequence`` below an open file or group; the truth is left to `write_truth_group`."""
     group = h5file.create_group("sequence")
     group.attrs["name"] = _text(sequence.name)
+    group.attrs["velocity_frame"] = _text(sequence.velocity_frame)
     _write(group, "time", sequence.time_s, "s", "clock of the recording")
     _write(group, "twist", sequence.twist, "m/s (columns 0-2), rad/s (columns 3-5)", "imu")
     _write(group, "T_cam_imu", sequence.T_cam_imu, "m (translation)", "cam from imu")
@@ -146,6 +155,7 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
             "twist": require_numbers(h5file, "sequence/twist", (None, 6)),
             "camera": StereoCamera(**{name: camera[name] for name in _CAMERA}),
             "T_cam_imu": require_numbers(h5file, "sequence/T_cam_imu", (4, 4)),
+            "velocity_frame": str(_attributes(h5file, "sequence").get("velocity_frame", "imu")),
             "truth": read_truth_group(h5file, source) if "truth" in h5file else None,
             "notes": tuple(str(_plain(note)) for note in np.ravel(require(h5file, "sequence/notes"))),
             "attributes": attributes,

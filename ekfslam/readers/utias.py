@@ -15,7 +15,7 @@ from ekfslam.errors import DataError, ShapeError, TruthError, UnknownFormatError
 from ekfslam.readers.fields import checksum, flat_observations, require_numbers, spelled_as_in
 from ekfslam.readers.matfile import parse_mat
 from ekfslam.se3 import Array
-from ekfslam.sequence import Noise, Sequence, Truth
+from ekfslam.sequence import LEVEL_VELOCITIES_NOTE, Noise, Sequence, Truth
 from ekfslam.tracks import inspect_tracks
 
 COLUMN_FIELDS = ("t", "v_vk_vk_i", "w_vk_vk_i", "r_i_vk_i", "theta_vk_i")
@@ -61,6 +61,9 @@ def read_utias(path: Path) -> Sequence:
         rho = require_numbers(fields, "rho_v_c_v", (3, 1))[:, 0]
         observations = flat_observations(pixels, frame_axis=1, field="y_k_j")
         notes = (f"Cut to the {frames} frames of y_k_j: {', '.join(cut)}.",) if cut else ()
+        noise = _noise(fields)  # stated by Starry Night alone, whose velocities are those of its IMU
+        if noise is None:
+            notes = (*notes, LEVEL_VELOCITIES_NOTE)
         return Sequence(
             name=path.stem,
             source=source,
@@ -70,7 +73,8 @@ def read_utias(path: Path) -> Sequence:
             T_cam_imu=se3.transform(C, -C @ rho),
             observations=observations,
             truth=_truth(fields, se3.transform(se3.so3_exp(theta), r), tracks=pixels.shape[2]),
-            noise=_noise(fields),
+            noise=noise,
+            velocity_frame="level" if noise is None else "imu",
             notes=(*notes, *inspect_tracks(observations, twist).notes),
             attributes={"checksum_sha256": checksum(path), "reader": "utias"},
         )

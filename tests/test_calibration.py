@@ -1,0 +1,245 @@
+"""Calibration in the joint filter's state: Jacobians, recovery in simulation, what no motion shows, bad input."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from reference import CAMERA, T_CAM_IMU, small_world
+from test_jacobians import POSES, TWISTS, visible_points
+from test_level import OPEN, recorded, seen_rows, sighted, stencil
+
+from ekfslam import se3
+from ekfslam.config import CalibrationConfig, Config
+from ekfslam.errors import ConfigError
+from ekfslam.filters import calibration as cal
+from ekfslam.filters.joint import JointEKF, run_joint
+from ekfslam.filters.observing import Rig, linearise
+from ekfslam.sequence import Noise, Observations
+from ekfslam.simulate import builtin
+
+RIG = Rig(CAMERA, T_CAM_IMU, Noise(np.full(6, 0.1), np.array([0.7, 0.9, 1.1, 0.9])))
+C = np.array([0.1, -0.2, 0.15, 0.05, -0.08, 0.06, 0.1, 0.7, 0.15])
+TWIST = TWISTS[3]
+poses = pytest.mark.parametrize("T", POSES.values(), ids=POSES.keys())
+parameters = pytest.mark.parametrize("c", [np.zeros(9), C, -C], ids=["none", "some", "others"])
+
+
+def seen(T, c, m):
+    rows = seen_rows(T, c, TWIST, m)
+    return rows.reshape(*rows.shape[:-2], -1)
+
+
+def points(T, c):
+    """World points in front of the camera as it is with parameters c."""
+    before = se3.exp(-c[8] * TWIST) @ T
+    return visible_points(se3.inverse(T_CAM_IMU) @ se3.exp(c[:6]) @ T_CAM_IMU @ before)
+
+
+@parameters
+@poses
+def test_measurement_jacobians_by_pose_parameters_and_landmark(T, c):
+    m = points(T, c)
+    q, H, H_m = cal.linearise_calibrated(RIG, c, TWIST, T, m, m)
+    predicted = cal.calibrated(RIG, c).predict(q)
+    np.testing.assert_allclose(predicted, seen_rows(T, c, TWIST, m), rtol=1e-11)
+    both = stencil(lambda e: seen(se3.exp(e[..., :6]) @ T, c + e[..., 6:], m), 15)
+    np.testing.assert_allclose(H.reshape(-1, 15), both, rtol=1e-7, atol=1e-6)
+    for i in range(len(m)):
+        by_landmark = stencil(lambda d, i=i: seen(T, c, m[i] + d[..., None, :]), 3)
+        np.testing.assert_allclose(H_m[i], by_landmark, rtol=1e-7, atol=1e-6)
+
+
+@poses
+def test_without_parameters_it_is_the_sensor_as_given(T):
+    m = visible_points(T)
+    q, H, H_m = cal.linearise_calibrated(RIG, np.zeros(9), TWIST, T, m, m)
+    for ours, theirs in zip((q, H[..., :6], H_m), linearise(RIG, T, m, m), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-10)
+
+
+@parameters
+@poses
+def test_new_landmarks_with_parameters(T, c):
+    z = seen_rows(T, c, TWIST, points(T, c)) + np.array([0.5, -0.2, 0.3])
+    positions, G, covariance = cal.first_sight_calibrated(RIG, c, TWIST, T, z, T)
+    np.testing.assert_allclose(positions, sighted(T, c, TWIST, z), rtol=1e-9, atol=1e-9)
+    _, H, H_m = cal.linearise_calibrated(RIG, c, TWIST, T, positions, positions)
+    V = np.diag(RIG.variance_px2)
+    root = np.random.default_rng(2).normal(size=(15, 15)) * np.repeat([0.1, 0.01, 0.1, 0.01, 0.02], [3, 3, 3, 3, 3])
+    P = root.T @ root + 1e-6 * np.eye(15)
+    for i, row in enumerate(z):
+        by_both = stencil(lambda e, row=row: sighted(se3.exp(e[..., :6]) @ T, c + e[..., 6:], TWIST, row), 15)
+        np.testing.assert_allclose(G[i], by_both, rtol=1e-6, atol=1e-5 * np.abs(by_both).max())
+        by_row = stencil(lambda d, row=row: sighted(T, c, TWIST, row + d), 3)
+        np.testing.assert_allclose(covariance[i], by_row @ V @ by_row.T, rtol=1e-6, atol=1e-9)
+        # Conditioning on the same rows a landmark of which nothing is known, in information form.
+        wide = np.hstack([H[i], H_m[i]])
+        information = wide.T @ np.linalg.solve(V, wide)
+        information[:15, :15] += np.linalg.inv(P)
+        diffuse = np.linalg.inv(information)
+        GP = G[i] @ P
+        expected = np.block([[P, GP.T], [GP, GP @ G[i].T + covariance[i]]])
+        np.testing.assert_allclose(diffuse, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+
+
+@poses
+def test_a_camera_and_its_first_estimates_moved_as_one_look_the_same(T):
+    """While the rig stands its extrinsics cannot be seen, wherever landmarks have moved since their first estimates."""
+    first = visible_points(T)
+    m = first + np.array([0.2, -0.1, 0.3])
+    _, H_first, H_m_first = cal.linearise_calibrated(RIG, np.zeros(9), TWIST, T, first, first)
+    along = -np.linalg.solve(H_m_first, H_first[..., 6:12])
+    _, H, H_m = cal.linearise_calibrated(RIG, np.zeros(9), TWIST, T, m, first)
+    np.testing.assert_allclose(H[..., 6:12] + H_m @ along, 0, atol=1e-8 * np.abs(H).max())
+
+
+def test_priors_are_in_the_order_of_the_names():
+    config = CalibrationConfig(rotation_deg=180 / np.pi, lever_arm_m=2.0, baseline=3.0, disparity_px=4.0, time_s=5.0)
+    np.testing.assert_allclose(cal.prior_std(config), [2, 2, 2, 1, 1, 1, 3, 4, 5])
+    assert len(cal.NAMES) == len(cal.UNITS) == 9
+    by_name = dict(zip(cal.NAMES, cal.prior_std(config), strict=True))
+    assert by_name["ln baseline"] == 3
+    assert by_name["disparity offset"] == 4
+    assert by_name["time offset"] == 5
+    assert not cal.prior_std(CalibrationConfig()).any()
+
+
+# --- recovery -------------------------------------------------------------------------------------------------------
+
+
+def estimated(world, calibration, variant="invariant"):
+    """Free parameters and their covariance after the last frame."""
+    config = dataclasses.replace(OPEN, variant=variant, retire="unseen", retire_after=1)
+    rig = Rig(world.camera, world.T_cam_imu, world.noise)
+    ekf = run_joint(world, rig, config, range(len(world)), calibration)[0]
+    return ekf.parameters[ekf._free], ekf.P[6 : ekf._seen, 6 : ekf._seen]
+
+
+DRIVE = "city?frames={}&outlier_fraction=0&max_tracks=12&sigma_v_m_s={}&sigma_w_rad_s={}"
+HALF_DEGREE = np.deg2rad(0.5)
+TURNED = HALF_DEGREE * np.array([1, -1, 1])
+CASES = {
+    # What is estimated, where it stands, the truth, and which of it a drive through a town must show.
+    "baseline": (CalibrationConfig(baseline=0.02), [6], [0.02], [True]),
+    "rotation": (CalibrationConfig(rotation_deg=0.5), [3, 4, 5], TURNED, [True, True, False]),
+    "lever arm": (CalibrationConfig(lever_arm_m=1.0), [0, 1, 2], [0.3, -0.3, 0.3], [True, False, True]),
+    "disparity": (CalibrationConfig(disparity_px=0.5), [7], [0.3], [True]),
+    "time": (CalibrationConfig(time_s=0.02), [8], [0.02], [True]),
+}
+
+
+@pytest.mark.parametrize(
+    ("case", "variant"), [*((case, "invariant") for case in CASES), ("rotation", "fej")], ids=lambda value: value
+)
+def test_each_error_of_the_calibration_is_found(case, variant):
+    """Velocities are precise: a time offset is seen in their changes, which noise must not hide."""
+    calibration, at, values, is_seen = CASES[case]
+    c = np.zeros(9)
+    c[at] = values
+    world = recorded(builtin(DRIVE.format(80, 0.01, 0.0005)), c, np.random.default_rng(1))
+    found, covariance = estimated(world, calibration, variant)
+    std = np.sqrt(np.diag(covariance))
+    share = std / cal.prior_std(calibration)[at]
+    assert (np.abs(found - values) < 3 * std).all()
+    assert (share[np.array(is_seen)] < 1 / 3).all()
+    assert (share <= 1 + 1e-9).all()
+
+
+@pytest.mark.slow
+def test_deviations_of_the_calibration_are_what_they_say():
+    """Normalised errors of ten drives, the truth drawn from the prior, velocities of ordinary noise."""
+    calibration = CalibrationConfig(rotation_deg=0.5, lever_arm_m=0.2, baseline=0.02, disparity_px=0.5)
+    squares = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        c = cal.prior_std(calibration) * rng.normal(size=9)
+        world = recorded(builtin(DRIVE.format(40, 0.1, 0.005) + f"&seed={seed}"), c, rng)
+        found, covariance = estimated(world, calibration)
+        error = found - c[:8]
+        squares.append([error @ np.linalg.solve(covariance, error) / 8, *(error**2 / np.diag(covariance))])
+    # 10 drives of 8 parameters: 1 +- 0.16; single parameters 1 +- 0.45.
+    assert 0.5 < np.mean(squares, axis=0)[0] < 1.6
+    assert (np.mean(squares, axis=0) < 3).all()
+
+
+@pytest.mark.slow
+def test_noise_of_the_velocities_does_not_hide_a_time_offset():
+    """With measured velocities in its Jacobian the offset comes out 14 deviations too small here."""
+    calibration, error = CalibrationConfig(time_s=0.02), []
+    for seed in range(4):
+        c = np.zeros(9)
+        c[8] = 0.02
+        world = recorded(builtin(DRIVE.format(80, 0.1, 0.005) + f"&seed={seed}"), c, np.random.default_rng(seed))
+        found, covariance = estimated(world, calibration)
+        error.append((found[0] - 0.02) / np.sqrt(covariance[0, 0]))
+    assert np.sqrt(np.mean(np.square(error))) < 2
+
+
+def test_only_a_stereo_rig_can_be_calibrated():
+    world = small_world()
+    with pytest.raises(ConfigError, match="calibration"):
+        JointEKF(object(), OPEN, world.initial_T_world_imu, calibration=CalibrationConfig(time_s=0.02))
+
+
+def test_straight_driving_shows_neither_lever_arm_nor_time_offset():
+    """The whole map moves along with either; also a camera's roll about the way is no different from the world's."""
+    world = small_world(frames=40, sigma_v=0.0, sigma_w=0.0)
+    time_s = world.time_s
+    path = np.tile(np.eye(4), (len(time_s), 1, 1))
+    path[:, 0, 3] = 6.0 * (time_s - time_s[0])
+    rng = np.random.default_rng(5)
+    place = np.column_stack([rng.uniform(8, 20, 30), rng.uniform(-5, 5, 30), rng.uniform(-2, 3, 30)])
+    frame, landmark = (part.ravel() for part in np.indices((len(time_s), len(place))))
+    truth = dataclasses.replace(world.truth, T_world_imu=path, landmark=np.arange(len(place)), position_m=place)
+    q = se3.apply((world.T_cam_imu @ se3.inverse(path))[frame], place[landmark])
+    ahead = q[:, 2] > 2
+    observations = Observations(frame[ahead], landmark[ahead], np.ones((ahead.sum(), 4)))
+    noise = Noise(np.repeat([0.1, 1e-7], 3), np.full(4, 0.8))
+    world = dataclasses.replace(world, truth=truth, observations=observations, noise=noise)
+    world = recorded(world, np.zeros(9), rng)
+    world = dataclasses.replace(world, twist=np.tile([6.0, 0, 0, 0, 0, 0], (len(time_s), 1)))
+    found, covariance = estimated(world, CalibrationConfig(lever_arm_m=0.1))
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), 0.1, rtol=1e-3)
+    assert (np.abs(found) < 1e-3).all()
+    # A time offset counts by velocities as seen, which are not even where the true ones are: that tells a little.
+    found, covariance = estimated(world, CalibrationConfig(time_s=0.02))
+    assert 0.75 * 0.02 < np.sqrt(covariance[0, 0]) <= 0.02
+    assert np.abs(found[0]) < np.sqrt(covariance[0, 0])
+    calibration = CalibrationConfig(rotation_deg=0.5)
+    _, covariance = estimated(world, calibration)
+    along = world.T_cam_imu[:3, :3] @ np.array([1.0, 0, 0])
+    assert along @ covariance @ along > 0.99 * HALF_DEGREE**2
+    assert np.sort(np.linalg.eigvalsh(covariance))[1] < 0.2 * HALF_DEGREE**2
+
+
+# --- the rest -------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_free_is_the_filter_without_calibration():
+    world = small_world(frames=20)
+    rig = Rig(world.camera, world.T_cam_imu, world.noise)
+    ekf = run_joint(world, rig, OPEN, range(20))[0]
+    assert len(ekf.P) == 6 + 3 * len(ekf.ids)
+    assert not ekf.parameters.any()
+
+
+@pytest.mark.parametrize("name", ["rotation_deg", "lever_arm_m", "baseline", "disparity_px", "time_s"])
+@pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
+def test_bad_priors_are_refused(name, value):
+    with pytest.raises(ConfigError, match=rf"calibration\.{name} must be finite and not negative"):
+        Config().with_overrides({"calibration": {name: value}})
+
+
+def test_velocities_of_the_first_frame_count_for_its_exposure():
+    """Without them landmarks of the first frame would say that there is no time offset."""
+    world = small_world(frames=2)
+    rig = Rig(world.camera, world.T_cam_imu, world.noise)
+    ekf = JointEKF(rig, OPEN, world.initial_T_world_imu, calibration=CalibrationConfig(time_s=0.02))
+    ekf.begin(world.twist[0])
+    ekf.update(0, *world.observations.at(0))
+    cross = ekf.P[7:, 6].reshape(-1, 3) / 0.02**2
+    expected = (
+        world.initial_T_world_imu[:3, :3]
+        @ (world.twist[0, :3] + np.cross(world.twist[0, 3:], se3.apply(ekf.T_imu_world, ekf.positions_m)))[..., None]
+    )
+    np.testing.assert_allclose(cross, expected[..., 0], rtol=1e-9)

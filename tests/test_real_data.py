@@ -1,0 +1,73 @@
+"""Real recordings, one configuration: noise from the data, truth for nothing but the first pose and the evaluation."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ekfslam import open_sequence, run
+from ekfslam.metrics.trajectory import absolute_trajectory_error
+
+pytestmark = [pytest.mark.data, pytest.mark.slow]
+
+UTIAS = (
+    "09_26_drive_0001",
+    "09_26_drive_0009",
+    "09_26_drive_0027",
+    "09_26_drive_0036",
+    "09_30_drive_0020",
+    "09_30_drive_0027",
+    "10_03_drive_0042",
+)
+ODOMETRY = {"0020": "06", "0027": "07", "0042": "01", "0027_dense_noisy": "07"}
+
+
+@pytest.fixture
+def opened(data_path):
+    def open_(name):
+        if name in ODOMETRY:
+            truth = data_path(f"kitti_odometry_poses/{ODOMETRY[name]}.txt")
+            return open_sequence(data_path(f"ece276a/{name}.npz"), truth=truth)
+        return open_sequence(data_path(f"utias/2011_{name}_sync_KLT.mat"))
+
+    return open_
+
+
+def error(sequence, mode, align=False):
+    result, truth = run(sequence, mode), sequence.truth
+    return absolute_trajectory_error(result.T_world_imu[truth.frame], truth.T_world_imu, align=align)
+
+
+def gain(sequence):
+    return error(sequence, "dead-reckoning") / error(sequence, "full")
+
+
+def test_full_slam_gains_on_the_drives_with_dense_tracks(opened):
+    gains = [gain(opened(name)) for name in UTIAS]
+    assert sum(g > 1 for g in gains) >= 5
+    assert np.median(gains) >= 1.25
+    assert min(gains) > 1 / 1.15
+
+
+@pytest.mark.parametrize("name", ["0020", "0027", "0042"])
+def test_full_slam_never_loses_badly_on_few_tracks(opened, name):
+    assert gain(opened(name)) > 1 / 1.15
+
+
+def test_dense_tracks_with_noisy_and_with_clean_velocities(opened):
+    noisy = opened("0027_dense_noisy")
+    assert error(noisy, "full") <= 6.0
+    assert error(noisy, "full", align=True) <= 3.5
+    clean = dataclasses.replace(noisy, twist=opened("0027").twist)
+    for align in (False, True):
+        assert error(clean, "full", align) <= error(clean, "dead-reckoning", align)
+
+
+@pytest.mark.parametrize("name", ["09_26_drive_0009", "09_26_drive_0036", "09_30_drive_0027"])
+def test_noise_added_to_the_velocities_is_filtered_out(opened, name):
+    clean = opened(name)
+    gains = []
+    for seed in range(2):
+        noise = np.repeat([0.5, 0.05], 3) * np.random.default_rng(seed).standard_normal(clean.twist.shape)
+        gains.append(gain(dataclasses.replace(clean, twist=clean.twist + noise)))
+    assert np.median(gains) >= 3.0
