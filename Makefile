@@ -26,6 +26,7 @@ results: $(READY)
 	$(BIN)/python experiments/published_results.py
 	$(BIN)/python experiments/starry_night.py
 	$(BIN)/python experiments/real_data.py
+	$(BIN)/python experiments/ablation.py
 	$(BIN)/python experiments/scaling.py
 
 setup: $(READY)

@@ -29,13 +29,24 @@ Equations (docstrings cite these numbers)::
     S = H P H^T + V = L L^T,  Y = L^-1 H P,  (xi, d) = Y^T L^-1 r,  P -= Y^T Y       (6) update
     e_theta = -C^T xi_theta,  e_i = d_i + m_i^ e_theta,
     T+ = exp(xi) T,  m_i+ = exp(e_theta) m_i + J_l(e_theta) e_i,  P+ = J P J^T       (7) invariant retraction
+    u = diag(R, R) u_level,  R = [x, up^ x, up],  x ~ forward - (forward . up) up    (8) velocities over level ground
+    q = exp(c^) T_cam_imu exp(-c_time u^) T_imu_world m                              (9) calibration in the state
 """
 
 from importlib.metadata import version
 
 from ekfslam.archive import read_archive, write_archive
 from ekfslam.comparison import Comparison, compare
-from ekfslam.config import MODES, VARIANTS, Config, FilterConfig, HygieneConfig, NoiseConfig, PosteriorConfig
+from ekfslam.config import (
+    MODES,
+    VARIANTS,
+    CalibrationConfig,
+    Config,
+    FilterConfig,
+    HygieneConfig,
+    NoiseConfig,
+    PosteriorConfig,
+)
 from ekfslam.consistency_report import check_consistency
 from ekfslam.errors import EkfslamError
 from ekfslam.montecarlo import LEVELS, Study
@@ -52,6 +63,7 @@ __all__ = [
     "LEVELS",
     "MODES",
     "VARIANTS",
+    "CalibrationConfig",
     "Comparison",
     "Config",
     "EkfslamError",

@@ -67,7 +67,7 @@ def level_frame(up: Array) -> tuple[Array, Array]:
 
 
 def imu_twist(level_twist: Array, up: Array) -> tuple[Array, Array, Array]:
-    """Velocities of the level frame, (6,) m/s and rad/s, in the IMU frame.
+    """Eq. (8): velocities of the level frame, (6,) m/s and rad/s, in the IMU frame.
 
     Returns:
         The velocities (6,), their derivative (6, 6) by ``level_twist``, and (6, 3) by phi where up is ``exp(phi^) up``.

@@ -9,15 +9,12 @@ the tracks themselves want. The recordings are looked for in ``../shared/data`` 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from real_data import DATA, ROOT, errors, recordings
+from real_data import errors, parsed, recordings
 
 import ekfslam
 from ekfslam import se3
@@ -27,6 +24,7 @@ from ekfslam.sequence import Sequence
 WITHOUT: dict[str, dict[str, dict[str, Any]]] = {
     "all of it": {},
     "no tilt": {"noise": {"tilt_deg": 0.0}},
+    "slow tracks stay at repeats": {"hygiene": {"restart_above_px": 7.0}},
     "no test for moving tracks": {"filter": {"moving_sigma": float("inf")}},
     "no drift along the way": {"noise": {"drift": 0.0}},
     "repeated frames not cut": {"hygiene": {"restart_at_repeats": False}},
@@ -36,14 +34,7 @@ CALIBRATION = {"rotation_deg": 0.5, "lever_arm_m": 0.05, "baseline": 0.02, "disp
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="default: %(default)s")
-    parser.add_argument("--out", type=Path, default=ROOT / "results" / "real_data", metavar="DIR")
-    options = parser.parse_args()
-    if not options.data.is_dir():
-        sys.exit(f"{options.data} is absent; set $EKFSLAM_DATA to the folder of the recordings")
-    options.out.mkdir(parents=True, exist_ok=True)
-
+    options = parsed(__doc__)
     ablation: dict[str, dict[str, float]] = {}
     calibration: dict[str, dict[str, dict[str, list[Any]]]] = {}
     for name, sequence in recordings(options.data):

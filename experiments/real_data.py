@@ -65,14 +65,7 @@ ADDED_STD = np.repeat([0.5, 0.05], 3)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="default: %(default)s")
-    parser.add_argument("--out", type=Path, default=ROOT / "results" / "real_data", metavar="DIR")
-    options = parser.parse_args()
-    if not options.data.is_dir():
-        sys.exit(f"{options.data} is absent; set $EKFSLAM_DATA to the folder of the recordings")
-    options.out.mkdir(parents=True, exist_ok=True)
-
+    options = parsed(__doc__)
     table: dict[str, dict[str, dict[str, float]]] = {}
     for name, sequence in recordings(options.data):
         table[name] = {}
@@ -93,6 +86,18 @@ def main() -> None:
     (options.out / "table.json").write_text(json.dumps({"clean": table, "noise added": noisy}, indent=1) + "\n")
     (options.out / "table.md").write_text(markdown(table, noisy), encoding="utf-8")
     save_figure(plot(table, noisy), options.out / "gain.png")
+
+
+def parsed(description: str | None) -> argparse.Namespace:
+    """The options ``data`` and ``out``; exits where there are no recordings."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="default: %(default)s")
+    parser.add_argument("--out", type=Path, default=ROOT / "results" / "real_data", metavar="DIR")
+    options = parser.parse_args()
+    if not options.data.is_dir():
+        sys.exit(f"{options.data} is absent; set $EKFSLAM_DATA to the folder of the recordings")
+    options.out.mkdir(parents=True, exist_ok=True)
+    return options
 
 
 def recordings(data: Path) -> Iterator[tuple[str, Sequence]]:

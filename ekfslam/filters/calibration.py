@@ -1,6 +1,6 @@
 """The stereo rig's calibration as part of the joint filter's state: which parameters there are, and their Jacobians.
 
-With nine parameters c the rig sees ``q = exp(c_0..5^) T_cam_imu exp(-c_time u^) T_imu_world m`` instead of eq. (3), its
+With nine parameters c the rig sees ``q = exp(c_0..5^) T_cam_imu exp(-c_time u^) T_imu_world m``, eq. (9), its
 baseline is ``b exp(c_baseline)``, and its disparities come out larger by ``c_disparity``. All are 0 for the calibration
 as given and change additively. ``u`` are the velocities of the IMU: images are exposed ``c_time`` later than stamped.
 """

@@ -217,7 +217,7 @@ class JointEKF:
     def _let_landmarks_walk(self) -> None:
         """What tracks do that white pixel noise does not describe: P_mm grows with the last step of the rig."""
         noise = self.sensor.noise
-        if not (noise.drift or noise.bearing_drift_rad):
+        if not noise.landmarks_walk:
             return
         along = noise.drift * self._step_m
         square_distance_m2 = (se3.apply(self.T_imu_world, self.positions_m) ** 2).sum(axis=1)
