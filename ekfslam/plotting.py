@@ -237,6 +237,44 @@ def plot_nis(results: Mapping[str, Result]) -> Figure:
 
 
 @styled
+def plot_parameters(result: Result) -> Figure:
+    """What was estimated besides poses and map (calibration, roll and pitch) against time, with bands of 3 sigma.
+
+    Dashed lines bound what was known before: where the band still fills them at the end, nothing was observed.
+
+    Raises:
+        ValueError: Nothing of the kind was estimated.
+    """
+    parameters = result.parameters
+    if parameters is None:
+        raise ValueError("there are no parameters to show")
+    count = len(parameters.name)
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(3.6 * columns, 0.6 + 2.2 * rows))
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    time_s = result.time_s - result.time_s[0]
+    for i, ax in enumerate(axes[:count]):
+        unit, factor = ("deg", np.rad2deg(1.0)) if parameters.unit[i] == "rad" else (parameters.unit[i], 1.0)
+        value, band = factor * parameters.value[:, i], factor * _BAND_SIGMAS * parameters.std[:, i]
+        color = _mode_style(result.mode)["color"]
+        ax.fill_between(time_s, value - band, value + band, color=color, alpha=0.25, linewidth=0)
+        ax.plot(time_s, value, color=color)
+        for sign in (-1.0, 1.0):
+            bound = sign * factor * _BAND_SIGMAS * parameters.prior_std[i]
+            ax.axhline(bound, color="0.3", linestyle="--", linewidth=0.8)
+        ax.set_title(parameters.name[i] + ("" if parameters.is_observed[i] else " (not observable)"))
+        ax.set_ylabel(f"[{'-' if unit == '1' else unit}]")
+        ax.margins(x=0.01)
+    for ax in axes[count:]:
+        ax.set_visible(False)
+    for ax in axes[max(count - columns, 0) : count]:
+        ax.tick_params(labelbottom=True)
+        ax.set_xlabel("time [s]")
+    return figure
+
+
+@styled
 def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
     """Landmarks from above (x, y of world, metres): from first triangulation to final estimate, over the trajectory.
 
@@ -263,8 +301,8 @@ def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
 def save_figures(directory: str | Path, results: Mapping[str, Result], truth: Truth | None = None) -> list[Path]:
     """Write the figures that the results allow as PNG into a folder, made if missing; the paths written.
 
-    ``map.png`` always, ``errors.png`` with true poses, ``nis.png`` with updates, ``landmarks_<mode>.png`` for every
-    mode with a map.
+    ``map.png`` always, ``errors.png`` with true poses, ``nis.png`` with updates, ``parameters.png`` where more than
+    poses and map was estimated, ``landmarks_<mode>.png`` for every mode with a map.
     """
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
@@ -274,6 +312,8 @@ def save_figures(directory: str | Path, results: Mapping[str, Result], truth: Tr
     if any(result.innovation.dof.any() for result in results.values()):
         figures["nis"] = plot_nis(results)
     for mode, result in results.items():
+        if mode == "full" and result.parameters is not None:
+            figures["parameters"] = plot_parameters(result)
         if len(result.landmarks):
             figures[f"landmarks_{mode}"] = plot_landmark_arrows(result, truth)
     paths = []

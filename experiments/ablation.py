@@ -19,6 +19,7 @@ from real_data import errors, parsed, recordings
 import ekfslam
 from ekfslam import se3
 from ekfslam.config import noise_of
+from ekfslam.plotting import plot_parameters, save_figure
 from ekfslam.sequence import Sequence
 
 WITHOUT: dict[str, dict[str, dict[str, Any]]] = {
@@ -30,6 +31,7 @@ WITHOUT: dict[str, dict[str, dict[str, Any]]] = {
     "repeated frames not cut": {"hygiene": {"restart_at_repeats": False}},
     "white noise": {"noise": {"model": "white"}},
 }
+SHOWN = "2011_09_30_drive_0020_sync_KLT"  # the recording whose calibration is drawn over time
 CALIBRATION = {"rotation_deg": 0.5, "lever_arm_m": 0.05, "baseline": 0.02, "disparity_px": 0.5, "time_s": 0.02}
 
 
@@ -43,8 +45,11 @@ def main() -> None:
             row[heading] = errors(sequence, full(sequence, settings))["ate_m"]
         ablation[name] = row
         print(name, {key: round(value, 2) for key, value in row.items()}, flush=True)
+        calibrated = full(sequence, {"calibration": CALIBRATION})
+        if name == SHOWN:
+            save_figure(plot_parameters(calibrated), options.out / f"calibration_{name}.png")
         calibration[name] = {
-            "measured velocities": found(full(sequence, {"calibration": CALIBRATION})),
+            "measured velocities": found(calibrated),
             "true motion": found(full(with_true_motion(sequence), {"calibration": CALIBRATION})),
         }
     (options.out / "ablation.json").write_text(json.dumps({"ate_m": ablation, "calibration": calibration}, indent=1))

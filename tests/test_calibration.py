@@ -5,15 +5,20 @@ import dataclasses
 import numpy as np
 import pytest
 from reference import CAMERA, T_CAM_IMU, small_world
+from test_archive import assert_same
 from test_jacobians import POSES, TWISTS, visible_points
 from test_level import OPEN, recorded, seen_rows, sighted, stencil
 
 from ekfslam import se3
+from ekfslam.archive import open_result, write_archive
+from ekfslam.cli import main
 from ekfslam.config import CalibrationConfig, Config
-from ekfslam.errors import ConfigError
+from ekfslam.errors import ConfigError, PosteriorError
 from ekfslam.filters import calibration as cal
 from ekfslam.filters.joint import JointEKF, run_joint
 from ekfslam.filters.observing import Rig, linearise
+from ekfslam.posterior import posterior
+from ekfslam.runner import run
 from ekfslam.sequence import Noise, Observations
 from ekfslam.simulate import builtin
 
@@ -243,3 +248,32 @@ def test_velocities_of_the_first_frame_count_for_its_exposure():
         @ (world.twist[0, :3] + np.cross(world.twist[0, 3:], se3.apply(ekf.T_imu_world, ekf.positions_m)))[..., None]
     )
     np.testing.assert_allclose(cross, expected[..., 0], rtol=1e-9)
+
+
+def test_what_was_found_is_kept_printed_and_used_by_the_posterior(tmp_path, capsys):
+    world = recorded(
+        builtin(DRIVE.format(60, 0.02, 0.001)), np.array([0, 0, 0, 0, 0, 0, 0.05, 0, 0]), np.random.default_rng(2)
+    )
+    config = Config(calibration=CalibrationConfig(baseline=0.1, disparity_px=0.3))
+    result = run(world, "full", config)
+    found = result.parameters
+    assert (found.name, found.unit) == (("ln baseline", "disparity offset"), ("1", "px"))
+    np.testing.assert_array_equal(found.prior_std, [0.1, 0.3])
+    assert found.value.shape == found.std.shape == (60, 2)
+    assert (found.std[0] <= found.prior_std).all()
+    assert found.is_observed[0]
+    write_archive(tmp_path / "a.h5", world, {"full": result})
+    assert_same(open_result(tmp_path / "a.h5", "full").parameters, found)
+    assert main(["info", str(tmp_path / "a.h5")]) == 0
+    assert (
+        f"full: ln baseline: {found.value[-1, 0]:.3g} +- {found.std[-1, 0]:.2g} 1 (before: 0 +- 0.1)"
+        in capsys.readouterr().out
+    )
+    # The posterior sees with what was found: with the calibration as given it would fit far worse.
+    cost = posterior(result).costs[-1]
+    assert cost < 0.9 * posterior(dataclasses.replace(result, parameters=None)).costs[-1]
+    with pytest.raises(PosteriorError, match="ln baseline, disparity offset"):
+        posterior(result, dataclasses.replace(config.posterior, linearisation="filtered"))
+    delayed = run(world, "full", Config(calibration=CalibrationConfig(time_s=0.02)))
+    with pytest.raises(PosteriorError, match="time offset"):
+        posterior(delayed)

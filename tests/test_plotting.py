@@ -19,11 +19,12 @@ from ekfslam.plotting import (
     plot_landmark_arrows,
     plot_map,
     plot_nis,
+    plot_parameters,
     plot_trajectories,
     save_figures,
     world_error_covariance,
 )
-from ekfslam.result import Result
+from ekfslam.result import Parameters, Result
 
 MODES = ("dead-reckoning", "mapping-only", "full")
 
@@ -226,3 +227,22 @@ def test_drawing_leaves_no_global_state_behind(sequence, results):
     plot_map(results, sequence.truth)
     assert dict(mpl.rcParams) == before
     assert plt.get_fignums() == []
+
+
+def test_parameters_have_a_panel_each_with_units_and_what_was_not_observed(results, tmp_path):
+    frames = len(results["full"].time_s)
+    value = np.linspace(0, 1, 2 * frames).reshape(frames, 2)
+    std = np.column_stack([np.linspace(0.5, 0.01, frames), np.full(frames, 0.5)])
+    parameters = Parameters(("roll", "time offset"), ("rad", "s"), np.full(2, 0.5), value, std)
+    found = dataclasses.replace(results["full"], parameters=parameters)
+    figure = plot_parameters(found)
+    roll, time = figure.axes
+    assert (roll.get_title(), roll.get_ylabel()) == ("roll", "[deg]")
+    assert (time.get_title(), time.get_ylabel()) == ("time offset (not observable)", "[s]")
+    assert "s]" in time.get_xlabel()
+    np.testing.assert_allclose(roll.lines[0].get_ydata(), np.rad2deg(value[:, 0]))
+    top = time.collections[0].get_paths()[0].vertices[:, 1].max()
+    assert top == pytest.approx(value[-1, 1] + 1.5)
+    assert tmp_path / "parameters.png" in save_figures(tmp_path, {"full": found})
+    with pytest.raises(ValueError, match="no parameters"):
+        plot_parameters(results["full"])
