@@ -221,7 +221,7 @@ def plot(table: dict[str, dict[str, dict[str, float]]], noisy: dict[str, list[di
             )
         ax.axvline(1.0, color="0.3", linewidth=0.8)
         ax.set_xscale("log")
-        ax.set_xticks([0.8, 1, 2, 3, 5, 10], ["0.8", "1", "2", "3", "5", "10"])
+        ax.set_xticks([0.5, 0.8, 1, 2, 3, 5, 10], ["0.5", "0.8", "1", "2", "3", "5", "10"])
         ax.minorticks_off()
         ax.set_yticks(range(len(names)), names)
         ax.invert_yaxis()
