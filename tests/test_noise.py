@@ -10,10 +10,12 @@ from test_variants import gauge_directions
 
 from ekfslam import motion, se3
 from ekfslam.archive import open_result, write_archive
+from ekfslam.camera import project
 from ekfslam.config import Config, FilterConfig, NoiseConfig, noise_of
 from ekfslam.errors import PosteriorError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.observing import MOVING, Rig
+from ekfslam.filters.rows import aged
 from ekfslam.noise import MOTION_STD, automatic_noise, velocity_noise
 from ekfslam.posterior import posterior, smooth
 from ekfslam.readers import open_sequence, write_sequence
@@ -320,3 +322,32 @@ def test_the_posterior_of_what_walks_is_the_map_only():
     assert smooth(result).mode == "smoothed"
     with pytest.raises(PosteriorError, match="only the linearisation 'map'"):
         posterior(result, dataclasses.replace(Config().posterior, linearisation="filtered"))
+
+
+def test_observations_are_worth_less_the_further_the_rig_has_driven_since_first_sight():
+    world = with_noise(small_world(frames=15), drift=0.1, bearing_drift_rad=2e-3)
+    rig = Rig(world.camera, world.T_cam_imu, world.noise)
+    result = run(world, "full", Config(filter=dataclasses.replace(OPEN, moving_sigma=1e9)))
+    log = result.log
+    found = aged(log, rig)
+    first = {}
+    position = se3.inverse(log.T_updated)[:, :3, 3]
+    grown = 0
+    for i, (k, j) in enumerate(zip(log.frame.tolist(), log.landmark.tolist(), strict=True)):
+        k0 = first.setdefault(j, k)
+        moved = np.zeros((3, 3))
+        for step in np.diff(position[k0 : k + 1], axis=0):
+            along = 0.1 * step
+            distance = np.linalg.norm(se3.apply(world.T_cam_imu @ log.T_updated[k], log.position_m[i]))
+            across = (2e-3 * distance) ** 2 * np.linalg.norm(step)
+            moved += np.outer(along, along) + across * np.eye(3)
+
+        def seen(m, k=k):
+            return project(world.camera, se3.apply(world.T_cam_imu @ log.T_updated[k], m))[:3]
+
+        H = central(lambda d, i=i, seen=seen: seen(log.position_m[i] + d), 3)
+        np.testing.assert_allclose(found.variance[i], log.variance[i] + np.diag(H @ moved @ H.T), rtol=1e-6)
+        grown += k > k0
+    assert grown > 50
+    stays = dataclasses.replace(rig, noise=dataclasses.replace(world.noise, drift=0.0, bearing_drift_rad=0.0))
+    assert aged(log, stays) is log
