@@ -351,3 +351,14 @@ def test_observations_are_worth_less_the_further_the_rig_has_driven_since_first_
     assert grown > 50
     stays = dataclasses.replace(rig, noise=dataclasses.replace(world.noise, drift=0.0, bearing_drift_rad=0.0))
     assert aged(log, stays) is log
+
+
+def test_a_margin_of_the_noise_is_not_allowed_to_single_tracks():
+    world, _ = moving_world()
+    plain, wide = (with_noise(world, drift=0.02, margin=margin) for margin in (1.0, 3.0))
+    found = [
+        run(part, "full", Config(filter=FilterConfig(moving_sigma=sigma))).rejections
+        for part, sigma in ((plain, 3.0), (wide, 9.0), (wide, 3.0))
+    ]
+    np.testing.assert_array_equal(found[1].landmark, found[0].landmark)
+    assert (found[2].reason == MOVING).sum() > (found[0].reason == MOVING).sum()

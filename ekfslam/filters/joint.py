@@ -231,18 +231,17 @@ class JointEKF:
             twist, by_twist, by_up = motion.imu_twist(twist, up)
         E = motion.increment(twist, tau_s)
         T_next = E @ self.T_imu_world
-        G = motion.twist_jacobian(twist, tau_s)
         std = noise.velocity_std if self.twist is None else noise.motion_std
         Phi, Q = np.eye(self._body), np.zeros((self._body, self._body))
         # FEJ: from the predicted pose, where the last frame was linearised, to the next predicted pose.
         Phi[:6, :6] = motion.error_jacobian(T_next @ se3.inverse(self._T_predicted) if self.rule.first_estimates else E)
         Q[:6, :6] = motion.process_noise(twist, tau_s, std, noise.misalignment_rad)
         if self.twist is not None:
-            Phi[:6, self._at_twist] = -G @ by_twist
+            Phi[:6, self._at_twist] = -motion.twist_jacobian(twist, tau_s) @ by_twist
         if up is not None:
             # Up turns with the IMU, by the same velocities with the same errors.
             at, R = self._at_up, E[:3, :3]
-            Phi[:6, at] = -G @ by_up
+            Phi[:6, at] = -motion.twist_jacobian(twist, tau_s) @ by_up
             Phi[at, 6:] = Phi[3:6, 6:]
             Phi[at, at] += R
             Q[at, :6], Q[:6, at], Q[at, at] = Q[3:6, :6], Q[:6, 3:6], Q[3:6, 3:6]
