@@ -30,7 +30,7 @@ TILT_RAD = np.deg2rad(3.0)
 # among themselves for many frames is not part of the model; to make up for it, all three are larger than what single
 # innovations show: the normalised square of these is about 0.1 a degree of freedom.
 PIXEL_STD_PX = 0.7
-DRIFT = 0.5
+DRIFT = 0.4
 BEARING_DRIFT_RAD = 0.00085
 MARGIN = 3.0
 
