@@ -20,7 +20,7 @@ from ekfslam.sequence import Noise, VelocityFrame
 
 # Errors of automotive velocities that are there even if no noise is: of each sample, and of the angles between their
 # frame and that of the IMU.
-MOTION_STD = np.repeat([0.1, 0.0002], 3)
+MOTION_STD = np.repeat([0.15, 0.0008], 3)
 MISALIGNMENT_RAD = np.deg2rad(0.07)
 
 # Roll and pitch of a road vehicle.
