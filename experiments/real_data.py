@@ -22,6 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import ekfslam
+from ekfslam.metrics.consistency import pose_nees
 from ekfslam.metrics.trajectory import absolute_trajectory_error
 from ekfslam.plotting import STYLE, save_figure
 from ekfslam.result import Result
@@ -75,7 +76,7 @@ def main() -> None:
             except ekfslam.EkfslamError as error:
                 print(f"{name}: no {heading}: {error}", file=sys.stderr)
                 continue
-            table[name][heading] = {**errors(sequence, result), **statistics(result)}
+            table[name][heading] = {**errors(sequence, result), **statistics(sequence, result)}
         print(name, {key: round(value["ate_m"], 3) for key, value in table[name].items()}, flush=True)
     noisy = {}
     for path in UTIAS:
@@ -122,9 +123,10 @@ def errors(sequence: Sequence, result: Result) -> dict[str, float]:
     }
 
 
-def statistics(result: Result) -> dict[str, float]:
-    """What became of the observations, in shares of all, and how large the innovations are."""
+def statistics(sequence: Sequence, result: Result) -> dict[str, float]:
+    """What became of the observations, in shares of all; how large innovations and errors are for their covariance."""
     counts, innovation = result.counts, result.innovation
+    assert sequence.truth is not None
     if "accepted" not in counts:
         return {}
     total = counts["accepted"] + counts["rejected"] + counts["dropped by hygiene"]
@@ -135,6 +137,7 @@ def statistics(result: Result) -> dict[str, float]:
         "cuts": float(cut - counts["dropped by hygiene"]),
         "moving tracks": float(counts.get("moving", 0)),
         "nis_per_dof": float(innovation.nis.sum() / max(innovation.dof.sum(), 1)),
+        "pose_nees": float(np.nanmean(pose_nees(result, sequence.truth)[1])),
     }
 
 
@@ -194,15 +197,16 @@ def observations_table(table: dict[str, dict[str, dict[str, float]]]) -> list[st
         "## What became of the observations (full)\n",
         "Shares of all observations that were dropped by hygiene, turned down by the gate, or belong to tracks found "
         "to move; how many tracks hygiene cut and how many were found to move; normalised innovation squared a degree "
-        "of freedom, which is below 1 as the assumed noise makes up for errors that agree among themselves.\n",
-        f"| set | {' | '.join(SHARES)} | tracks cut | tracks moving | NIS/dof |",
-        "|---|" + "---:|" * (len(SHARES) + 3),
+        "of freedom, which is below 1 as the assumed noise makes up for errors that agree among themselves; mean "
+        "normalised error squared of the pose, 6 for an honest covariance.\n",
+        f"| set | {' | '.join(SHARES)} | tracks cut | tracks moving | NIS/dof | pose NEES |",
+        "|---|" + "---:|" * (len(SHARES) + 4),
     ]
     for name, row in table.items():
         full = row["full"]
         shares = " | ".join(f"{full[key]:.1%}" for key in SHARES)
         tracks = f"{full['cuts']:.0f} | {full['moving tracks']:.0f}"
-        lines.append(f"| {name} | {shares} | {tracks} | {full['nis_per_dof']:.2f} |")
+        lines.append(f"| {name} | {shares} | {tracks} | {full['nis_per_dof']:.2f} | {full['pose_nees']:.0f} |")
     return [*lines, ""]
 
 
