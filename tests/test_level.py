@@ -469,3 +469,11 @@ def test_velocities_are_those_of_the_imu_unless_a_tilt_is_assumed():
 def test_unknown_velocity_frames_are_refused():
     with pytest.raises(DataError, match="expected imu or level, found 'body'"):
         dataclasses.replace(small_world(frames=5), velocity_frame="body")
+
+
+def test_the_log_holds_velocities_of_the_imu_as_turned_by_all_that_is_known_of_up():
+    world = recorded(builtin(DRIVE.format(0)), np.zeros(9), np.random.default_rng(0))
+    level = in_level_frame(world, TILT, tilt_rad=TILT_STD)
+    assert np.abs(level.twist - world.twist).max() > 0.2
+    log = end_of(level).log()
+    np.testing.assert_allclose(log.twist[1:], world.twist[1:], atol=0.03)
