@@ -373,7 +373,7 @@ class JointEKF:
         }
 
     def measurement_jacobian(self, ids: IntArray) -> sp.csr_array:
-        """Full-width H (3k, 6+3n) of the rectified rows of active landmarks ``ids`` (k,), for inspection and tests.
+        """Full-width H (3k, b+3n) of the rectified rows of active landmarks ``ids`` (k,), for inspection and tests.
 
         Raises:
             KeyError: An id is not active.
