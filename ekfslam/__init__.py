@@ -35,8 +35,6 @@ Equations (docstrings cite these numbers)::
 
 from importlib.metadata import version
 
-from ekfslam.archive import read_archive, write_archive
-from ekfslam.comparison import Comparison, compare
 from ekfslam.config import (
     MODES,
     VARIANTS,
@@ -48,14 +46,16 @@ from ekfslam.config import (
     PosteriorConfig,
 )
 from ekfslam.consistency_report import check_consistency
+from ekfslam.data.readers import open_sequence, write_sequence
+from ekfslam.data.sequence import Sequence
 from ekfslam.errors import EkfslamError
-from ekfslam.montecarlo import LEVELS, Study
-from ekfslam.posterior import Posterior, posterior, smooth
-from ekfslam.readers import open_sequence, write_sequence
-from ekfslam.result import Result
+from ekfslam.filters.result import Result
+from ekfslam.reports import Comparison, compare
 from ekfslam.runner import run
-from ekfslam.sequence import Sequence
-from ekfslam.tune import TunedNoise, tune
+from ekfslam.smoother.posterior import Posterior, posterior, smooth
+from ekfslam.storage.archive import read_archive, write_archive
+from ekfslam.studies.study import LEVELS, Study
+from ekfslam.studies.tuning import TunedNoise, tune
 
 __version__ = version("ekfslam")
 

@@ -14,8 +14,24 @@ from typing import get_args
 import h5py
 
 from ekfslam import __version__
-from ekfslam.archive import FORMAT as ARCHIVE_FORMAT
-from ekfslam.archive import (
+from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation, NoiseModel, noise_of
+from ekfslam.consistency_report import check_consistency
+from ekfslam.data.hygiene import clean_tracks
+from ekfslam.data.readers import BUILTIN, open_sequence, write_sequence
+from ekfslam.data.sequence import Sequence
+from ekfslam.data.simulate import builtin
+from ekfslam.data.tracks import inspect_tracks
+from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
+from ekfslam.evaluation.summary import compare_table, summarise
+from ekfslam.figures.posterior import save_posterior_figures
+from ekfslam.figures.run import save_figures
+from ekfslam.filters.result import Result
+from ekfslam.models.noise import velocity_noise
+from ekfslam.reports import compare
+from ekfslam.runner import run
+from ekfslam.smoother.posterior import posterior, smooth
+from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT
+from ekfslam.storage.archive import (
     Archive,
     add_result,
     export_trajectory,
@@ -24,24 +40,8 @@ from ekfslam.archive import (
     read_archive,
     write_archive,
 )
-from ekfslam.comparison import compare
-from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation, NoiseModel, noise_of
-from ekfslam.consistency_report import check_consistency
-from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
-from ekfslam.hygiene import clean_tracks
-from ekfslam.metrics.summary import compare_table, summarise
-from ekfslam.montecarlo import LEVELS, STUDY_VARIANTS, Study, levels_of
-from ekfslam.noise import velocity_noise
-from ekfslam.plotting import save_figures
-from ekfslam.plotting_posterior import save_posterior_figures
-from ekfslam.posterior import posterior, smooth
-from ekfslam.readers import BUILTIN, open_sequence, write_sequence
-from ekfslam.result import Result
-from ekfslam.runner import run
-from ekfslam.sequence import Sequence
-from ekfslam.simulate import builtin
-from ekfslam.tracks import inspect_tracks
-from ekfslam.tune import tune
+from ekfslam.studies.study import LEVELS, STUDY_VARIANTS, Study, levels_of
+from ekfslam.studies.tuning import tune
 
 DEFAULT_DATA = "builtin:city"
 TRUTH = "truth"  # what `export` takes beside the modes

@@ -12,9 +12,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.stats import chi2
 
+from ekfslam.data.sequence import Noise, Sequence
 from ekfslam.errors import ConfigError
-from ekfslam.noise import VelocityNoise, automatic_noise, velocity_noise
-from ekfslam.sequence import Noise, Sequence
+from ekfslam.models.noise import VelocityNoise, automatic_noise, velocity_noise
 
 Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
 Variant = Literal["invariant", "fej", "standard"]
@@ -42,10 +42,11 @@ class NoiseConfig:
         tilt_deg: Of velocities in a level frame: prior deviation of roll and pitch, which the joint filter estimates; 0
             takes them as velocities of the IMU; None takes what the model says.
         model: ``auto``: where the sequence states no noise and no sigma is given here, it is found from the data, see
-            `ekfslam.noise`; sigmas given here are those of white noise. ``tuned``: as ``auto``, but sigmas given here
-            only replace those found, and the rest of the automatic model stays (drift, misalignment, errors of the
-            motion, walk of the velocities): they were found within it, by `ekfslam.tune`, and mean nothing without.
-            ``white``: what is neither stated nor given is that of a clean recording, 0.05 m/s, 0.001 rad/s, 1 px.
+            `ekfslam.models.noise`; sigmas given here are those of white noise. ``tuned``: as ``auto``, but sigmas given
+            here only replace those found, and the rest of the automatic model stays (drift, misalignment, errors of the
+            motion, walk of the velocities): they were found within it, by `ekfslam.studies.tuning`, and mean nothing
+            without. ``white``: what is neither stated nor given is that of a clean recording, 0.05 m/s, 0.001 rad/s, 1
+            px.
     """
 
     sigma_v_m_s: float | None = None
@@ -58,7 +59,8 @@ class NoiseConfig:
 
 @dataclass(frozen=True)
 class HygieneConfig:
-    """What becomes of bad tracks before any filter sees them, see `ekfslam.hygiene`; false or 0 switches a rule off.
+    """What becomes of bad tracks before any filter sees them, see `ekfslam.data.hygiene`; false or 0 switches a rule
+    off.
 
     Deviations are those of the pixel noise that the run assumes.
 
@@ -165,9 +167,9 @@ class PosteriorConfig:
     Args:
         linearisation: ``map`` linearises all rows again at the maximum a posteriori, found from the filter's estimate;
             ``filtered`` leaves them where the filter linearised them.
-        kernel: Robust kernel on the whitened residual of each observation (``map`` only), see `ekfslam.posterior`.
-        kernel_width: Where it leaves the parabola, in standard deviations. The default is exceeded by 5 % of Gaussian
-            residuals.
+        kernel: Robust kernel on the whitened residual of each observation (``map`` only), see
+        `ekfslam.smoother.posterior`. kernel_width: Where it leaves the parabola, in standard deviations. The default is
+            exceeded by 5 % of Gaussian residuals.
         max_iterations: Of Levenberg-Marquardt.
         tolerance: It stops when an iteration lowers the cost by a smaller share than this.
     """
@@ -354,7 +356,7 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
 
 
 def is_automatic(sequence: Sequence, config: Config) -> bool:
-    """Whether the model of the noise is that of `ekfslam.noise`, found from the data; see `NoiseConfig`."""
+    """Whether the model of the noise is that of `ekfslam.models.noise`, found from the data; see `NoiseConfig`."""
     noise = config.noise
     given = (noise.sigma_v_m_s, noise.sigma_w_rad_s, noise.sigma_px)
     is_asked_for = noise.model == "tuned" or (noise.model == "auto" and all(sigma is None for sigma in given))

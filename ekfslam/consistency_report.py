@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ekfslam.executors import open_executor
-from ekfslam.metrics.study import study_table, summarise_study
-from ekfslam.montecarlo import Study, StudyArchive, run_study
-from ekfslam.plotting_consistency import save_study_figures
+from ekfslam.evaluation.study import study_table, summarise_study
+from ekfslam.figures.study import save_study_figures
+from ekfslam.studies.executors import open_executor
+from ekfslam.studies.study import Study, StudyArchive, run_study
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,18 @@ import numpy as np
 import scipy
 from threadpoolctl import threadpool_limits
 
-from ekfslam import se3
 from ekfslam.config import MODES, Config, Mode, noise_account, noise_of
+from ekfslam.data.hygiene import clean_tracks
+from ekfslam.data.sequence import WITHOUT_TRACKS, Sequence
 from ekfslam.errors import ConfigError
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import run_joint
 from ekfslam.filters.mapping import map_landmarks
 from ekfslam.filters.observing import Rig, collect
-from ekfslam.hygiene import clean_tracks
-from ekfslam.posterior import smooth
+from ekfslam.filters.result import HygieneReport, Innovation, Landmarks, Rejections, Result
+from ekfslam.geometry import se3
 from ekfslam.progress import progress
-from ekfslam.result import HygieneReport, Innovation, Landmarks, Rejections, Result
-from ekfslam.sequence import WITHOUT_TRACKS, Sequence
+from ekfslam.smoother.posterior import smooth
 
 
 def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -> Result:

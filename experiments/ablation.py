@@ -17,10 +17,10 @@ import numpy as np
 from real_data import errors, parsed, recordings
 
 import ekfslam
-from ekfslam import se3
 from ekfslam.config import noise_of
-from ekfslam.plotting import plot_parameters, save_figure
-from ekfslam.sequence import Sequence
+from ekfslam.data.sequence import Sequence
+from ekfslam.figures.run import plot_parameters, save_figure
+from ekfslam.geometry import se3
 
 WITHOUT: dict[str, dict[str, dict[str, Any]]] = {
     "all of it": {},

@@ -42,17 +42,17 @@ from matplotlib.ticker import FormatStrFormatter
 from threadpoolctl import threadpool_limits
 
 import ekfslam
-from ekfslam import camera, motion, se3
+from ekfslam.arrays import Array
 from ekfslam.config import PosteriorConfig
+from ekfslam.data.sequence import Sequence, Truth
+from ekfslam.evaluation.trajectory import absolute_trajectory_error
+from ekfslam.figures.run import STYLE, save_figure
 from ekfslam.filters.observing import Rig
-from ekfslam.filters.rows import Rows, State
-from ekfslam.filters.smoothing import kernel_cost
-from ekfslam.metrics.trajectory import absolute_trajectory_error
-from ekfslam.plotting import STYLE, save_figure
-from ekfslam.posterior import posterior
-from ekfslam.result import Result
-from ekfslam.se3 import Array
-from ekfslam.sequence import Sequence, Truth
+from ekfslam.filters.result import Result
+from ekfslam.geometry import camera, motion, se3
+from ekfslam.smoother.optimise import kernel_cost
+from ekfslam.smoother.posterior import posterior
+from ekfslam.smoother.problem import Rows, State
 
 try:
     import gtsam

@@ -28,7 +28,7 @@ import argparse
 from pathlib import Path
 
 from ekfslam.consistency_report import check_consistency
-from ekfslam.montecarlo import LEVELS, STUDY_VARIANTS, Study
+from ekfslam.studies.study import LEVELS, STUDY_VARIANTS, Study
 
 
 def main() -> None:

@@ -39,13 +39,13 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from ekfslam import se3
+from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig, Variant
+from ekfslam.data.sequence import Noise
+from ekfslam.evaluation.consistency import nees, pose_error
 from ekfslam.filters import JointEKF
 from ekfslam.filters.observing import ACCEPTED
-from ekfslam.metrics.consistency import nees, pose_error
-from ekfslam.se3 import Array
-from ekfslam.sequence import IntArray, Noise
+from ekfslam.geometry import se3
 
 VARIANTS: tuple[Variant, ...] = ("invariant", "fej", "standard")
 NAMES = {"invariant": "RI", "fej": "FEJ", "standard": "standard"}

@@ -22,11 +22,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import ekfslam
-from ekfslam.metrics.consistency import pose_nees
-from ekfslam.metrics.trajectory import absolute_trajectory_error
-from ekfslam.plotting import STYLE, save_figure
-from ekfslam.result import Result
-from ekfslam.sequence import Sequence
+from ekfslam.data.sequence import Sequence
+from ekfslam.evaluation.consistency import pose_nees
+from ekfslam.evaluation.trajectory import absolute_trajectory_error
+from ekfslam.figures.run import STYLE, save_figure
+from ekfslam.filters.result import Result
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("EKFSLAM_DATA") or ROOT.parent / "shared" / "data")

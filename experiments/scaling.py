@@ -1,6 +1,6 @@
 """What the size of the map costs: time and memory of a frame and of the posterior against the number of landmarks M.
 
-The world is `ekfslam.simulate.City` with short tracks: about 70 landmarks in view and 9 new ones a frame, so that
+The world is `ekfslam.data.simulate.City` with short tracks: about 70 landmarks in view and 9 new ones a frame, so that
 M = 10^5 is a drive of some 11 000 frames. Every size runs in a process of its own, whose peak memory is its own, on one
 core. Seconds are CPU time of the process, which other work on the machine disturbs least.
 
@@ -34,18 +34,18 @@ from matplotlib.ticker import NullFormatter
 from threadpoolctl import threadpool_limits
 
 from ekfslam import run
-from ekfslam.archive import write_archive
+from ekfslam.arrays import Array
 from ekfslam.config import Config, PosteriorConfig, noise_of
+from ekfslam.data.sequence import Sequence
+from ekfslam.data.simulate import City, Loop, simulate
+from ekfslam.figures.run import save_figure
 from ekfslam.filters import JointEKF, joint
 from ekfslam.filters.observing import Rig
-from ekfslam.filters.rows import Rows
-from ekfslam.information import Elimination, JointInformation, LinearSystem
-from ekfslam.plotting import save_figure
-from ekfslam.posterior import Posterior, posterior
-from ekfslam.result import Result
-from ekfslam.se3 import Array
-from ekfslam.sequence import Sequence
-from ekfslam.simulate import City, Loop, simulate
+from ekfslam.filters.result import Result
+from ekfslam.smoother.posterior import Posterior, posterior
+from ekfslam.smoother.problem import Rows
+from ekfslam.smoother.sparse.information import Elimination, JointInformation, LinearSystem
+from ekfslam.storage.archive import write_archive
 
 OUT = Path(__file__).parents[1] / "results" / "scaling"
 SIZES = (100, 300, 1000, 3000, 10_000, 30_000, 100_000)

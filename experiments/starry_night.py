@@ -33,15 +33,15 @@ from matplotlib.ticker import FormatStrFormatter
 from threadpoolctl import threadpool_limits
 
 import ekfslam
-from ekfslam import camera, se3
+from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig, Variant
+from ekfslam.data.sequence import Noise, Sequence, Truth
+from ekfslam.evaluation.consistency import chi2_bounds, invariant_landmark_error, nees, pose_error
+from ekfslam.evaluation.trajectory import match_landmarks
+from ekfslam.figures.run import STYLE, save_figure
 from ekfslam.filters import JointEKF
 from ekfslam.filters.observing import Rig
-from ekfslam.metrics.consistency import chi2_bounds, invariant_landmark_error, nees, pose_error
-from ekfslam.metrics.trajectory import match_landmarks
-from ekfslam.plotting import STYLE, save_figure
-from ekfslam.se3 import Array
-from ekfslam.sequence import IntArray, Noise, Sequence, Truth
+from ekfslam.geometry import camera, se3
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("EKFSLAM_DATA") or ROOT.parent / "shared" / "data")

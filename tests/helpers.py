@@ -10,11 +10,11 @@ import dataclasses
 
 import numpy as np
 
-from ekfslam import camera, motion, se3
-from ekfslam.camera import StereoCamera
 from ekfslam.config import Config
-from ekfslam.result import REASONS, Innovation, Landmarks, Rejections, Result
-from ekfslam.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.filters.result import REASONS, Innovation, Landmarks, Rejections, Result
+from ekfslam.geometry import camera, motion, se3
+from ekfslam.geometry.camera import StereoCamera
 
 CAMERA = StereoCamera(fu_px=700.0, fv_px=700.0, cu_px=600.0, cv_px=180.0, baseline_m=0.54)
 # IMU axes forward, left, up; camera axes right, down, forward.

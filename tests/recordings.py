@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from ekfslam import se3
+from ekfslam.geometry import se3
 
 FRAMES, TRACKS = 7, 4
 R_CAM_IMU = se3.so3_exp(np.array([0.02, -0.01, 0.03])) @ np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ekfslam import se3
-from ekfslam.camera import StereoCamera
-from ekfslam.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import StereoCamera
 
 CAMERA = StereoCamera(fu_px=700.0, fv_px=710.0, cu_px=600.0, cv_px=180.0, baseline_m=0.54)
 # Optical axes turned out of the nominal directions by some degrees about every axis, and a lever arm.

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from ekfslam import Config, PosteriorConfig, open_sequence, posterior, run
+from ekfslam.evaluation.summary import summarise
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.observing import Rig
-from ekfslam.filters.rows import Rows
-from ekfslam.information import JointInformation
-from ekfslam.metrics.summary import summarise
+from ekfslam.smoother.problem import Rows
+from ekfslam.smoother.sparse.information import JointInformation
 
 # What the dense, noisy edition of the recordings had added to its velocities.
 NOISY = Config().with_overrides({"noise": {"sigma_v_m_s": 0.5, "sigma_w_rad_s": 0.05, "sigma_px": 2.0}})

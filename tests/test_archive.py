@@ -11,13 +11,20 @@ import numpy as np
 import pytest
 from helpers import synthetic_result, synthetic_sequence
 
-from ekfslam import archive as archive_module
-from ekfslam import se3
-from ekfslam.archive import FORMAT_VERSION, add_result, export_trajectory, open_result, read_archive, write_archive
+from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError
-from ekfslam.result import ERROR_CONVENTION
+from ekfslam.filters.result import ERROR_CONVENTION
+from ekfslam.geometry import se3
 from ekfslam.runner import run
-from ekfslam.simulate import builtin
+from ekfslam.storage import archive as archive_module
+from ekfslam.storage.archive import (
+    FORMAT_VERSION,
+    add_result,
+    export_trajectory,
+    open_result,
+    read_archive,
+    write_archive,
+)
 
 MODES = ("full", "dead-reckoning", "mapping-only")
 

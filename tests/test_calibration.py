@@ -9,18 +9,18 @@ from test_archive import assert_same
 from test_jacobians import POSES, TWISTS, visible_points
 from test_level import OPEN, recorded, seen_rows, sighted, stencil
 
-from ekfslam import se3
-from ekfslam.archive import open_result, write_archive
 from ekfslam.cli import main
 from ekfslam.config import CalibrationConfig, Config
+from ekfslam.data.sequence import Noise, Observations
+from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError, PosteriorError
 from ekfslam.filters import calibration as cal
 from ekfslam.filters.joint import JointEKF, run_joint
 from ekfslam.filters.observing import Rig, linearise
-from ekfslam.posterior import posterior
+from ekfslam.geometry import se3
 from ekfslam.runner import run
-from ekfslam.sequence import Noise, Observations
-from ekfslam.simulate import builtin
+from ekfslam.smoother.posterior import posterior
+from ekfslam.storage.archive import open_result, write_archive
 
 RIG = Rig(CAMERA, T_CAM_IMU, Noise(np.full(6, 0.1), np.array([0.7, 0.9, 1.1, 0.9])))
 C = np.array([0.1, -0.2, 0.15, 0.05, -0.08, 0.06, 0.1, 0.7, 0.15])

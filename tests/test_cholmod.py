@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from ekfslam.cholmod import NotPositiveDefiniteError, PatternError, SparseCholesky
+from ekfslam.smoother.sparse.cholmod import NotPositiveDefiniteError, PatternError, SparseCholesky
 
 SIZES = np.array([6, 3, 6, 1, 3, 6, 3, 16, 6, 3])
 EDGES = [(1, 0), (2, 0), (4, 2), (5, 0), (5, 4), (7, 3), (7, 6), (8, 5), (9, 1), (9, 8)]

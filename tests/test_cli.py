@@ -10,9 +10,9 @@ import pytest
 from recordings import ece276a_fields, utias_fields, write_mat, write_npz
 from test_metrics import SUMMARY_KEYS
 
-from ekfslam.archive import read_archive
 from ekfslam.cli import main
-from ekfslam.readers import open_sequence
+from ekfslam.data.readers import open_sequence
+from ekfslam.storage.archive import read_archive
 
 CITY = "builtin:city?frames=40"
 

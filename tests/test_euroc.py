@@ -9,10 +9,10 @@ import pytest
 from recordings import FRAMES, ece276a_fields, stamps, write_npz
 from scipy.spatial.transform import Rotation
 
-from ekfslam import se3
+from ekfslam.data.readers import open_sequence
+from ekfslam.data.sequence import Sequence
 from ekfslam.errors import DataError, NonFiniteError, StampError, TruthError, UnknownFormatError
-from ekfslam.readers import open_sequence
-from ekfslam.sequence import Sequence
+from ekfslam.geometry import se3
 
 HEADER = (
     "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ekfslam.archive import export_truth, read_archive, write_archive
 from ekfslam.cli import main
+from ekfslam.data.sequence import Truth
+from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError
-from ekfslam.metrics.summary import summarise
+from ekfslam.evaluation.summary import summarise
 from ekfslam.runner import run
-from ekfslam.sequence import Truth
-from ekfslam.simulate import builtin
+from ekfslam.storage.archive import export_truth, read_archive, write_archive
 
 ATE = ("evo_ape", "--pose_relation", "trans_part")
 RPE = ("evo_rpe", "--all_pairs", "--pairs_from_reference")

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from reference import report_mapping, run_naive, small_world
 
-from ekfslam import se3
 from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig, noise_of
+from ekfslam.data.sequence import Observations
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.observing import Rig
-from ekfslam.result import REASONS
+from ekfslam.filters.result import REASONS
+from ekfslam.geometry import se3
 from ekfslam.runner import run
-from ekfslam.sequence import Observations
 
 OPEN = FilterConfig(gate_probability=1.0, split_after=0)
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2

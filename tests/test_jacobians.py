@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from reference import CAMERA, T_CAM_IMU, jacobian_of_pi, small_world, stereo_matrix, triangulate_least_squares
 
-from ekfslam import camera as cam
-from ekfslam import motion, se3
 from ekfslam.config import FilterConfig
+from ekfslam.data.sequence import Noise
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.observing import Rig, first_sight, linearise
 from ekfslam.filters.variants import retract_invariant, transport_invariant
-from ekfslam.sequence import Noise
+from ekfslam.geometry import camera as cam
+from ekfslam.geometry import motion, se3
 
 RNG = np.random.default_rng(7)
 HALF_TURNS = [(np.pi - 1e-7) * axis for axis in (*np.eye(3), np.array([0.6, -0.8, 0.0]))]

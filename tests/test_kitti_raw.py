@@ -12,9 +12,10 @@ import pytest
 from recordings import ece276a_fields, stamps, write_npz
 from scipy.spatial.transform import Rotation
 
-from ekfslam import se3
-from ekfslam.camera import project
 from ekfslam.cli import main
+from ekfslam.data.readers import open_kitti_raw, open_sequence, read_sequence, write_sequence
+from ekfslam.data.readers.kitti_raw import PACKET_FIELDS
+from ekfslam.data.sequence import Observations
 from ekfslam.errors import (
     CalibrationError,
     ConfigError,
@@ -30,10 +31,9 @@ from ekfslam.errors import (
     TruthError,
     UnknownFormatError,
 )
-from ekfslam.readers import open_kitti_raw, open_sequence, read_sequence, write_sequence
-from ekfslam.readers.kitti_raw import PACKET_FIELDS
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import project
 from ekfslam.runner import run
-from ekfslam.sequence import Observations
 
 FRAMES = 70  # so that six lost stamps in a row are too many, but not too large a share
 NAME = "2011_09_30_drive_0099_sync"

@@ -13,14 +13,14 @@ from reference import CAMERA, T_CAM_IMU, small_world
 from test_jacobians import POSES, TWISTS
 from test_variants import gauge_directions
 
-from ekfslam import motion, se3
 from ekfslam.config import CalibrationConfig, Config, FilterConfig, noise_of
+from ekfslam.data.sequence import Noise, Observations
+from ekfslam.data.simulate import builtin
 from ekfslam.errors import DataError
 from ekfslam.filters.joint import JointEKF, run_joint
 from ekfslam.filters.observing import Rig
+from ekfslam.geometry import motion, se3
 from ekfslam.runner import run
-from ekfslam.sequence import Noise, Observations
-from ekfslam.simulate import builtin
 
 OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never", moving_sigma=1e9)
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2

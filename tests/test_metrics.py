@@ -11,8 +11,8 @@ import pytest
 from helpers import FULL_SCALE, synthetic_result, synthetic_sequence
 from scipy.stats import chi2
 
-from ekfslam import se3
-from ekfslam.metrics.consistency import (
+from ekfslam.data.sequence import Truth
+from ekfslam.evaluation.consistency import (
     chi2_bounds,
     invariant_landmark_error,
     landmark_nees,
@@ -20,8 +20,8 @@ from ekfslam.metrics.consistency import (
     pose_error,
     pose_nees,
 )
-from ekfslam.metrics.summary import compare_table, summarise
-from ekfslam.metrics.trajectory import (
+from ekfslam.evaluation.summary import compare_table, summarise
+from ekfslam.evaluation.trajectory import (
     absolute_trajectory_error,
     align_se3,
     final_position_error,
@@ -30,8 +30,8 @@ from ekfslam.metrics.trajectory import (
     relative_pose_error_over_frames,
     relative_pose_error_over_path,
 )
-from ekfslam.result import Landmarks
-from ekfslam.sequence import Truth
+from ekfslam.filters.result import Landmarks
+from ekfslam.geometry import se3
 
 SUMMARY_KEYS = {
     "ate_m",

@@ -16,15 +16,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ekfslam import montecarlo, se3
 from ekfslam.cli import main
 from ekfslam.config import Config, FilterConfig
 from ekfslam.consistency_report import check_consistency
+from ekfslam.data.simulate import simulate
 from ekfslam.errors import ArchiveError, ConfigError, InnovationError
-from ekfslam.executors import SerialExecutor, open_executor
-from ekfslam.filters import JointEKF
-from ekfslam.filters.observing import Rig
-from ekfslam.metrics.consistency import (
+from ekfslam.evaluation.consistency import (
     anees,
     average_over_runs,
     chi2_bounds,
@@ -34,10 +31,14 @@ from ekfslam.metrics.consistency import (
     pose_nees,
     time_average,
 )
-from ekfslam.metrics.study import study_table, summarise_study
-from ekfslam.montecarlo import FIELDS, LEVELS, Study, levels_of, read_study, realisation, run_one, run_study
+from ekfslam.evaluation.study import study_table, summarise_study
+from ekfslam.filters import JointEKF
+from ekfslam.filters.observing import Rig
+from ekfslam.geometry import se3
 from ekfslam.runner import run
-from ekfslam.simulate import simulate
+from ekfslam.studies import study as montecarlo
+from ekfslam.studies.executors import SerialExecutor, open_executor
+from ekfslam.studies.study import FIELDS, LEVELS, Study, levels_of, read_study, realisation, run_one, run_study
 
 
 def short(level: str = "mid", frames: int = 8, **changes):
@@ -97,8 +98,8 @@ def test_threads_of_one_process_take_turns_and_give_the_same_bits(tmp_path, seri
 KILLED = """
 import sys
 from test_montecarlo import Study, short
-from ekfslam import montecarlo
-from ekfslam.executors import open_executor
+from ekfslam.studies import study as montecarlo
+from ekfslam.studies.executors import open_executor
 
 STUDY = Study(short("mid", 12), ("invariant", "standard"), runs=40, seed=2)
 if __name__ == "__main__":

@@ -8,21 +8,21 @@ from reference import small_world
 from test_jacobians import central
 from test_variants import gauge_directions
 
-from ekfslam import motion, se3
-from ekfslam.archive import open_result, write_archive
-from ekfslam.camera import project
 from ekfslam.config import Config, FilterConfig, NoiseConfig, noise_of
+from ekfslam.data.readers import open_sequence, write_sequence
+from ekfslam.data.sequence import Observations
+from ekfslam.data.simulate import builtin
 from ekfslam.errors import PosteriorError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.observing import MOVING, Rig
-from ekfslam.filters.rows import aged
-from ekfslam.noise import MOTION_STD, automatic_noise, velocity_noise
-from ekfslam.posterior import posterior, smooth
-from ekfslam.readers import open_sequence, write_sequence
-from ekfslam.result import REASONS
+from ekfslam.filters.result import REASONS
+from ekfslam.geometry import motion, se3
+from ekfslam.geometry.camera import project
+from ekfslam.models.noise import MOTION_STD, automatic_noise, velocity_noise
 from ekfslam.runner import run
-from ekfslam.sequence import Observations
-from ekfslam.simulate import builtin
+from ekfslam.smoother.posterior import posterior, smooth
+from ekfslam.smoother.problem import aged
+from ekfslam.storage.archive import open_result, write_archive
 
 OPEN = FilterConfig(gate_probability=1.0, split_after=0)
 WALK = np.repeat([0.2, 0.02], 3)

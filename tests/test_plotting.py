@@ -12,8 +12,7 @@ from helpers import synthetic_result, synthetic_sequence
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
 
-from ekfslam import se3
-from ekfslam.plotting import (
+from ekfslam.figures.run import (
     ellipse_axes,
     plot_errors,
     plot_landmark_arrows,
@@ -24,7 +23,8 @@ from ekfslam.plotting import (
     save_figures,
     world_error_covariance,
 )
-from ekfslam.result import Parameters, Result
+from ekfslam.filters.result import Parameters, Result
+from ekfslam.geometry import se3
 
 MODES = ("dead-reckoning", "mapping-only", "full")
 

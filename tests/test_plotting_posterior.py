@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
 
-from ekfslam.plotting_posterior import plot_map_before_and_after, plot_sparsity
-from ekfslam.posterior import posterior, smooth
+from ekfslam.data.simulate import builtin
+from ekfslam.figures.posterior import plot_map_before_and_after, plot_sparsity
 from ekfslam.runner import run
-from ekfslam.simulate import builtin
+from ekfslam.smoother.posterior import posterior, smooth
 
 
 @pytest.fixture(scope="module")

@@ -7,20 +7,20 @@ import pytest
 from reference import small_world
 from test_variants import gauge_directions
 
-from ekfslam import se3
-from ekfslam.archive import open_result, write_archive
 from ekfslam.config import Config, FilterConfig, NoiseConfig, PosteriorConfig, noise_of
+from ekfslam.data.readers import open_sequence
+from ekfslam.data.sequence import Noise, Observations
+from ekfslam.data.simulate import builtin
 from ekfslam.errors import IllPosedError, PosteriorError
 from ekfslam.filters.joint import JointEKF, run_joint
 from ekfslam.filters.observing import Rig
-from ekfslam.filters.rows import Rows, State
-from ekfslam.filters.smoothing import kernel_cost, kernel_weight
-from ekfslam.information import Elimination, JointInformation, LinearSystem
-from ekfslam.posterior import posterior, posterior_of_log, smooth
-from ekfslam.readers import open_sequence
+from ekfslam.geometry import se3
 from ekfslam.runner import run
-from ekfslam.sequence import Noise, Observations
-from ekfslam.simulate import builtin
+from ekfslam.smoother.optimise import kernel_cost, kernel_weight
+from ekfslam.smoother.posterior import posterior, posterior_of_log, smooth
+from ekfslam.smoother.problem import Rows, State
+from ekfslam.smoother.sparse.information import Elimination, JointInformation, LinearSystem
+from ekfslam.storage.archive import open_result, write_archive
 
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
 SINGULAR_P0 = np.diag([0.1, 0.2, 0.0, 0.0, 0.0, 0.03]) ** 2

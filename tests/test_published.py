@@ -12,9 +12,10 @@ import pytest
 from scipy.signal import lfilter
 from threadpoolctl import threadpool_limits
 
-from ekfslam import open_sequence, se3
-from ekfslam.metrics.consistency import chi2_bounds
-from ekfslam.simulate import Loop, simulate
+from ekfslam import open_sequence
+from ekfslam.data.simulate import Loop, simulate
+from ekfslam.evaluation.consistency import chi2_bounds
+from ekfslam.geometry import se3
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
 

@@ -25,8 +25,11 @@ from recordings import (
 )
 from scipy.spatial.transform import Rotation
 
-from ekfslam import motion, se3
-from ekfslam.camera import project
+from ekfslam.data.readers import open_sequence, read_sequence, write_sequence
+from ekfslam.data.readers.hdf5 import read_sequence_fields, read_sequence_group, write_sequence_group, write_truth_group
+from ekfslam.data.readers.matfile import parse_mat
+from ekfslam.data.sequence import Observations, Sequence
+from ekfslam.data.tracks import inspect_tracks, repeated_frames
 from ekfslam.errors import (
     ArchiveError,
     ConfigError,
@@ -36,11 +39,8 @@ from ekfslam.errors import (
     TruthError,
     UnknownFormatError,
 )
-from ekfslam.readers import open_sequence, read_sequence, write_sequence
-from ekfslam.readers.hdf5 import read_sequence_fields, read_sequence_group, write_sequence_group, write_truth_group
-from ekfslam.readers.matfile import parse_mat
-from ekfslam.sequence import Observations, Sequence
-from ekfslam.tracks import inspect_tracks, repeated_frames
+from ekfslam.geometry import motion, se3
+from ekfslam.geometry.camera import project
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ekfslam import open_sequence, run
-from ekfslam.metrics.trajectory import absolute_trajectory_error
+from ekfslam.evaluation.trajectory import absolute_trajectory_error
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 

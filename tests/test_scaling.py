@@ -13,11 +13,11 @@ import pytest
 
 from ekfslam import run
 from ekfslam.config import Config, FilterConfig, noise_of
+from ekfslam.data.sequence import Sequence
+from ekfslam.data.simulate import City, simulate
 from ekfslam.filters import JointEKF
 from ekfslam.filters.observing import Rig
-from ekfslam.posterior import posterior
-from ekfslam.sequence import Sequence
-from ekfslam.simulate import City, simulate
+from ekfslam.smoother.posterior import posterior
 
 EXPERIMENT = Path(__file__).parents[1] / "experiments" / "scaling.py"
 SHORT_TRACKS = City(landmarks_per_m=8.0, max_tracks=77, loss_probability=0.09)

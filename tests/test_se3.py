@@ -6,7 +6,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ekfslam import se3
+from ekfslam.geometry import se3
 
 ANGLES = st.one_of(
     st.floats(0, np.pi - 1e-3),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from ekfslam.cholmod import PatternError, SparseCholesky
-from ekfslam.selected_inverse import MissingBlockError, SelectedInverse, selected_inverse
+from ekfslam.smoother.sparse.cholmod import PatternError, SparseCholesky
+from ekfslam.smoother.sparse.selected_inverse import MissingBlockError, SelectedInverse, selected_inverse
 
 
 def band(count, width):

@@ -13,6 +13,8 @@ import pytest
 from recordings import FRAMES, TRACKS, ece276a_fields, utias_fields, write_mat, write_npz
 
 from ekfslam import errors
+from ekfslam.data.readers import open_sequence, write_sequence
+from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
 from ekfslam.errors import (
     CalibrationError,
     DataError,
@@ -24,8 +26,6 @@ from ekfslam.errors import (
     StampError,
     TruthError,
 )
-from ekfslam.readers import open_sequence, write_sequence
-from ekfslam.sequence import Noise, Observations, Sequence, Truth
 
 Change = Callable[[Any], Any]
 

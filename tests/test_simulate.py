@@ -10,11 +10,11 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial import cKDTree
 
-from ekfslam import motion, se3
-from ekfslam.camera import project
+from ekfslam.data.sequence import Sequence
+from ekfslam.data.simulate import BUILTIN, GROUND_M, IMAGE_SIZE_PX, OUTLIER_SHIFT_PX, builtin, simulate
 from ekfslam.errors import ConfigError, UnknownFormatError
-from ekfslam.sequence import Sequence
-from ekfslam.simulate import BUILTIN, GROUND_M, IMAGE_SIZE_PX, OUTLIER_SHIFT_PX, builtin, simulate
+from ekfslam.geometry import motion, se3
+from ekfslam.geometry.camera import project
 
 CITY, LOOP = BUILTIN["city"], BUILTIN["loop"]
 

@@ -7,21 +7,29 @@ import numpy as np
 import pytest
 from reference import small_world
 
-from ekfslam import motion
-from ekfslam.archive import open_result
 from ekfslam.cli import main
 from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig, noise_of
+from ekfslam.data.readers import open_sequence, write_sequence
+from ekfslam.data.sequence import Noise, Observations
+from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError, EmptyTracksError
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF, run_joint
 from ekfslam.filters.mapping import map_landmarks
 from ekfslam.filters.observing import MOVING, Rig
-from ekfslam.noise import VelocityNoise, velocity_noise
-from ekfslam.readers import open_sequence, write_sequence
+from ekfslam.geometry import motion
+from ekfslam.models.noise import VelocityNoise, velocity_noise
 from ekfslam.runner import run
-from ekfslam.sequence import Noise, Observations
-from ekfslam.simulate import builtin
-from ekfslam.tune import OUTLIER_SHARE, log_likelihoods, sandwich, stretches, tune, with_differences, without_rejected
+from ekfslam.storage.archive import open_result
+from ekfslam.studies.tuning import (
+    OUTLIER_SHARE,
+    log_likelihoods,
+    sandwich,
+    stretches,
+    tune,
+    with_differences,
+    without_rejected,
+)
 
 OPEN = FilterConfig(gate_probability=1.0, split_after=0)
 WHITE = Config(noise=NoiseConfig(model="white"))

@@ -8,13 +8,13 @@ import scipy.optimize
 from reference import small_world, stereo_matrix
 from test_jacobians import POSES, central, visible_points
 
-from ekfslam import se3
 from ekfslam.config import Config, FilterConfig
+from ekfslam.data.sequence import Noise
 from ekfslam.errors import ConfigError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.observing import Rig
 from ekfslam.filters.variants import RULES
-from ekfslam.sequence import Noise
+from ekfslam.geometry import se3
 
 P0 = np.diag([0.2, 0.1, 0.3, 0.05, 0.04, 0.08]) ** 2
 OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never")

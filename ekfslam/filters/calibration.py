@@ -11,11 +11,11 @@ import dataclasses
 
 import numpy as np
 
-from ekfslam import motion, se3
-from ekfslam.camera import StereoCamera
+from ekfslam.arrays import Array
 from ekfslam.config import CalibrationConfig
 from ekfslam.filters.observing import Rig, first_sight, linearise
-from ekfslam.se3 import Array
+from ekfslam.geometry import motion, se3
+from ekfslam.geometry.camera import StereoCamera
 
 NAMES = (
     "camera x",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ekfslam import motion, se3
-from ekfslam.se3 import Array
-from ekfslam.sequence import Noise, Sequence
+from ekfslam.arrays import Array
+from ekfslam.data.sequence import Noise, Sequence
+from ekfslam.geometry import motion, se3
 
 
 def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> tuple[Array, Array]:

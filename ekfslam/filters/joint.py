@@ -15,11 +15,12 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from ekfslam import motion, se3
+from ekfslam.arrays import Array, IntArray
 from ekfslam.config import CalibrationConfig, FilterConfig
+from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters import calibration as cal
-from ekfslam.filters.behind import Behind
+from ekfslam.filters.log import Log
 from ekfslam.filters.logbook import LogBook
 from ekfslam.filters.observing import (
     ACCEPTED,
@@ -37,12 +38,11 @@ from ekfslam.filters.observing import (
     missed,
     normalised_squares,
 )
+from ekfslam.filters.result import Landmarks, Parameters
 from ekfslam.filters.symmetric import add_product, add_square
 from ekfslam.filters.variants import RULES
-from ekfslam.log import Log
-from ekfslam.result import Landmarks, Parameters
-from ekfslam.se3 import Array
-from ekfslam.sequence import IntArray, Sequence
+from ekfslam.geometry import motion, se3
+from ekfslam.smoother.revival import Behind
 
 # Observations of a landmark after which it may be found to move.
 _SEEN_TO_MOVE = 3
@@ -640,7 +640,7 @@ class JointEKF:
         """Bring retired landmarks back, and with them the neighbours that will probably be seen next.
 
         The state (pose, active and returning landmarks) becomes its marginal in the system behind: see
-        `ekfslam.filters.behind`.
+        `ekfslam.smoother.revival`.
         """
         log = self._log.log()
         returning = np.array([self._retired_row[i] for i in ids])

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ekfslam.log import Log
-from ekfslam.se3 import Array
-from ekfslam.sequence import IntArray
+from ekfslam.arrays import Array, IntArray
+from ekfslam.filters.log import Log
 
 
 class LogBook:

@@ -10,7 +10,9 @@ from time import perf_counter
 
 import numpy as np
 
+from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
+from ekfslam.data.sequence import Observations
 from ekfslam.filters.observing import (
     ACCEPTED,
     BEHIND_CAMERA,
@@ -24,9 +26,7 @@ from ekfslam.filters.observing import (
     missed,
     normalised_squares,
 )
-from ekfslam.result import Landmarks
-from ekfslam.se3 import Array
-from ekfslam.sequence import IntArray, Observations
+from ekfslam.filters.result import Landmarks
 
 
 def map_landmarks(

@@ -13,14 +13,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ekfslam import camera as cam
-from ekfslam import se3
-from ekfslam.camera import StereoCamera
+from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
+from ekfslam.data.sequence import Noise
 from ekfslam.errors import InnovationError
-from ekfslam.result import REASONS, Innovation, Rejections
-from ekfslam.se3 import Array
-from ekfslam.sequence import IntArray, Noise
+from ekfslam.filters.result import REASONS, Innovation, Rejections
+from ekfslam.geometry import camera as cam
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import StereoCamera
 
 ACCEPTED = -1
 GATE, DISPARITY, _, BEHIND_CAMERA, MOVING = range(len(REASONS))
@@ -85,7 +85,8 @@ class Rig:
 
     def screen(self, measured: Array, config: FilterConfig) -> IntArray:
         reason = np.full(len(measured), ACCEPTED)
-        # Limits tied to noise are the business of `ekfslam.hygiene`; here is only what no depth can be computed from.
+        # Limits tied to noise are the business of `ekfslam.data.hygiene`; here is only what no depth can be computed
+        # from.
         reason[measured[:, 0] <= measured[:, 2]] = DISPARITY
         return reason
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import blas
 
-from ekfslam.se3 import Array
+from ekfslam.arrays import Array
 
 
 def add_square(P: Array, A: Array, sign: float) -> None:

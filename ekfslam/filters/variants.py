@@ -26,9 +26,9 @@ from typing import Protocol
 
 import numpy as np
 
-from ekfslam import se3
+from ekfslam.arrays import Array
 from ekfslam.filters.symmetric import add_product
-from ekfslam.se3 import Array
+from ekfslam.geometry import se3
 
 
 def retract_standard(T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array]:

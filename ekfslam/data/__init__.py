@@ -1,0 +1,1 @@
+"""Recordings: what a sequence is, its tracks, readers and simulated worlds."""

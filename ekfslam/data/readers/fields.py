@@ -1,0 +1,95 @@
+"""What the readers share: named fields of a file, checked one by one, and dense tracks made flat."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ekfslam.arrays import Array
+from ekfslam.data.sequence import Observations, require_finite, require_shape
+from ekfslam.errors import DataError, EmptyTracksError, ShapeError
+
+UNSEEN = -1.0  # what the dense formats write into all four pixels of a track that a frame does not see
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def spelled_as_in(source: str, spelling: Mapping[str, str] | None = None) -> Iterator[None]:
+    """Let data errors raised inside name the file and spell the field as the file does.
+
+    Args:
+        source: The file.
+        spelling: Field names of `Sequence` to field names of the file, where they differ.
+    """
+    try:
+        yield
+    except DataError as error:
+        name = (spelling or {}).get(error.field, error.field)
+        raise type(error)(error.message, source=source, field=name, index=error.index) from None
+
+
+def require(fields: Mapping[str, Any], name: str) -> NDArray:
+    """A field of a file as an array, whatever its type.
+
+    Raises:
+        ShapeError: The field is missing.
+    """
+    if name not in fields:
+        raise ShapeError("this field is missing", field=name)
+    return np.asarray(fields[name])
+
+
+def require_numbers(
+    fields: Mapping[str, Any], name: str, shape: tuple[int | None, ...], dtype: type = np.float64
+) -> NDArray:
+    """A field of a file as finite numbers of the wanted shape (None stands for any length) and type.
+
+    Raises:
+        ShapeError: The field is missing, is not numeric (integral where ``dtype`` is) or has another shape.
+        NonFiniteError: It holds NaN or infinity.
+    """
+    value = require(fields, name)
+    if value.dtype.kind not in ("iu" if np.issubdtype(dtype, np.integer) else "iuf"):
+        raise ShapeError(f"expected {np.dtype(dtype).name} numbers, found {value.dtype}", field=name)
+    require_shape(value, shape, name)
+    require_finite(value, name)
+    return value.astype(dtype)
+
+
+def flat_observations(dense: Array, frame_axis: int, field: str) -> Observations:
+    """Observations of a dense 4 x T x M (``frame_axis`` 1) or 4 x M x T (2) array of pixels; the column is the id.
+
+    Raises:
+        ShapeError: Only some of the four pixels are -1.
+        EmptyTracksError: A track is never seen.
+    """
+    missing = dense == UNSEEN
+    seen = ~missing.all(axis=0)
+    partly = np.argwhere(missing.any(axis=0) & seen)
+    if len(partly):
+        position = tuple(int(i) for i in partly[0])
+        row = int(np.argmax(missing[:, position[0], position[1]]))
+        raise ShapeError(
+            f"{len(partly)} observations have some but not all of their four pixels equal to -1 (unseen)",
+            field=field,
+            index=(row, *position),
+        )
+    never = np.flatnonzero(~seen.any(axis=frame_axis - 1))
+    if len(never):
+        raise EmptyTracksError(
+            f"{len(never)} tracks are never seen, the first is track {never[0]}", field=field, index=int(never[0])
+        )
+    first, second = np.nonzero(seen)
+    frame, landmark = (first, second) if frame_axis == 1 else (second, first)
+    return Observations(frame, landmark, dense[:, first, second].T)

@@ -1,0 +1,361 @@
+"""What every reader produces and every filter consumes: one validated recording.
+
+A `Sequence` cannot exist in a malformed state: its constructor checks every field and raises a `DataError` subclass
+that names source, field and index.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.errors import (
+    CalibrationError,
+    DataError,
+    DuplicateObservationError,
+    EmptyTracksError,
+    ExtrinsicsError,
+    NonFiniteError,
+    ShapeError,
+    StampError,
+    TruthError,
+)
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import StereoCamera
+
+VelocityFrame = Literal["imu", "level"]
+
+ROTATION_TOLERANCE = 1e-4  # files print rotations with as few as five digits
+
+# Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
+WITHOUT_TRACKS = {"tracks": "none"}
+
+
+LEVEL_VELOCITIES_NOTE = (
+    "The velocities are forward, left and up over level ground, whatever the vehicle's roll and pitch: full SLAM "
+    "estimates these, dead reckoning takes them as none."
+)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Stereo observations of point landmarks as flat arrays, sorted by frame and, within a frame, by landmark id.
+
+    Args:
+        frame: (K,) frame index of each observation.
+        landmark: (K,) id of the landmark; any non-negative integers.
+        pixels_px: (K, 4) rectified pixels (uL, vL, uR, vR).
+    """
+
+    frame: IntArray
+    landmark: IntArray
+    pixels_px: Array
+
+    def __post_init__(self) -> None:
+        frame = np.asarray(self.frame, dtype=np.int64).ravel()
+        landmark = np.asarray(self.landmark, dtype=np.int64).ravel()
+        pixels = np.asarray(self.pixels_px, dtype=float)
+        if not len(frame) == len(landmark) == len(pixels) or pixels.shape != (len(frame), 4):
+            raise ShapeError(
+                f"{len(frame)} frames, {len(landmark)} landmarks and pixels of shape {pixels.shape} do not agree",
+                field="observations",
+            )
+        order = np.lexsort((landmark, frame))
+        for name, value in (("frame", frame), ("landmark", landmark), ("pixels_px", pixels)):
+            object.__setattr__(self, name, _frozen(value[order]))
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @cached_property
+    def ids(self) -> IntArray:
+        """Distinct landmark ids, ascending."""
+        return np.unique(self.landmark)
+
+    def at(self, frame: int) -> tuple[IntArray, Array]:
+        """Landmark ids (n,) and pixels (n, 4) seen in one frame."""
+        start, stop = np.searchsorted(self.frame, (frame, frame + 1))
+        return self.landmark[start:stop], self.pixels_px[start:stop]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth: poses of some or all frames, and of landmarks where known.
+
+    Args:
+        frame: (F,) ascending frame indices for which the pose is known.
+        T_world_imu: (F, 4, 4) true poses.
+        landmark: (M,) ids of landmarks with known position (may be empty).
+        position_m: (M, 3) their positions in world.
+    """
+
+    frame: IntArray
+    T_world_imu: Array
+    landmark: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    position_m: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("frame", np.int64), ("landmark", np.int64)):
+            object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=dtype)))
+        for name in ("T_world_imu", "position_m"):
+            object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=float)))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White measurement noise, standard deviations per sample, and what makes real recordings less than white.
+
+    Args:
+        twist_std: (6,) of the velocities, m/s and rad/s.
+        pixel_std_px: (4,) of the pixels (uL, vL, uR, vR).
+        twist_walk_std: (6,) how far the true velocities change from one sample to the next; the joint filter then
+            estimates them, too. None: nothing is assumed of how they change.
+        motion_std: (6,) error of the motion beyond ``twist_std``, which no averaging of velocities removes.
+        misalignment_rad: Deviation of the angles between the frame of the velocities and the IMU frame, each axis.
+        drift: How far a track wanders along the way of the rig, frame by frame, as a share of the distance driven.
+        bearing_drift_rad: How far a track wanders in the image, a random walk: rad per square root of a metre driven.
+        tilt_rad: Of velocities in a level frame: deviation of the first roll and pitch against gravity from none; the
+            joint filter then estimates them. 0: the velocities are taken as those of the IMU frame.
+        margin: How much larger all these deviations are than those of single measurements, to make up for errors that
+            agree among themselves for many frames; what judges one track by itself need not allow for that.
+    """
+
+    twist_std: Array
+    pixel_std_px: Array
+    twist_walk_std: Array | None = None
+    motion_std: Array = field(default_factory=lambda: np.zeros(6))
+    misalignment_rad: float = 0.0
+    drift: float = 0.0
+    bearing_drift_rad: float = 0.0
+    tilt_rad: float = 0.0
+    margin: float = 1.0
+
+    @property
+    def landmarks_walk(self) -> bool:
+        """Whether what a track shows is taken to be another point in every frame."""
+        return bool(self.drift or self.bearing_drift_rad)
+
+    @property
+    def is_more_than_white(self) -> bool:
+        """Whether the joint filter estimates velocities or tilt, or lets landmarks walk."""
+        return self.twist_walk_std is not None or self.landmarks_walk or self.tilt_rad > 0
+
+    @property
+    def velocity_std(self) -> Array:
+        """(6,) error of one sample as a whole: ``twist_std`` and ``motion_std`` together."""
+        return np.hypot(self.twist_std, self.motion_std)
+
+    @staticmethod
+    def isotropic(sigma_v_m_s: float, sigma_w_rad_s: float, sigma_px: float) -> Noise:
+        """The same deviation for the three linear, the three angular velocities, and the four pixels."""
+        return Noise(np.repeat([sigma_v_m_s, sigma_w_rad_s], 3), np.full(4, float(sigma_px)))
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """One recording of a stereo rig with body velocities.
+
+    Args:
+        name: Short name, used for folders and titles.
+        source: File or built-in world it came from, used in error messages.
+        time_s: (T,) strictly increasing stamps.
+        twist: (T, 6) measured velocities ``[v; w]`` in ``velocity_frame``; ``twist[k]`` drives ``(t[k-1], t[k]]``.
+        camera: Stereo intrinsics.
+        T_cam_imu: (4, 4) extrinsics, IMU to left optical frame; made rigid to rounding, as files print few digits.
+        observations: Flat stereo observations; none only where the attributes have `WITHOUT_TRACKS`.
+        truth: Ground truth, if there is any.
+        noise: Noise as stated by the source, if it states any.
+        velocity_frame: ``imu``, or ``level``: x forward, y left, z up over level ground, see `motion.level_frame`.
+        notes: What the reader found and did about it, one sentence each.
+        attributes: Further facts to keep with every result (seed, checksum, simulation parameters).
+    """
+
+    name: str
+    source: str
+    time_s: Array
+    twist: Array
+    camera: StereoCamera
+    T_cam_imu: Array
+    observations: Observations
+    truth: Truth | None = None
+    noise: Noise | None = None
+    velocity_frame: VelocityFrame = "imu"
+    notes: tuple[str, ...] = ()
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "twist", "T_cam_imu"):
+            object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=float)))
+        try:
+            _validate(self)
+        except DataError as error:
+            if error.source:
+                raise
+            raise type(error)(error.message, source=self.source, field=error.field, index=error.index) from None
+        object.__setattr__(self, "T_cam_imu", _frozen(se3.nearest_rigid(self.T_cam_imu)))
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def initial_T_world_imu(self) -> Array:
+        """(4, 4) pose that estimates start from: the true first pose where it is known, identity elsewhere."""
+        if self.truth is not None and len(self.truth.frame) and self.truth.frame[0] == 0:
+            return se3.nearest_rigid(self.truth.T_world_imu[0])
+        return np.eye(4)
+
+
+def _frozen(array: NDArray) -> NDArray:
+    """The array, read-only, so that a frozen dataclass is frozen all through."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def require_shape(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> None:
+    """Raise `ShapeError` unless ``value`` has ``shape``, where None stands for any length."""
+    found = np.shape(value)
+    if len(found) != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, found, strict=True)
+    ):
+        wanted = " x ".join("n" if size is None else str(size) for size in shape)
+        raise ShapeError(f"expected shape {wanted}, found {' x '.join(map(str, found)) or 'a scalar'}", field=name)
+
+
+def require_finite(value: Array, name: str) -> None:
+    """Raise `NonFiniteError` with the index of the first NaN or infinity."""
+    bad = np.argwhere(~np.isfinite(value))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        raise NonFiniteError(
+            f"{len(bad)} values are NaN or infinite, the first is {value[index]}",
+            field=name,
+            index=index[0] if len(index) == 1 else index or None,
+        )
+
+
+def require_rigid(T: Array, name: str, error: type[DataError]) -> None:
+    """Raise ``error`` unless every (..., 4, 4) matrix is a rotation and a translation."""
+    R = T[..., :3, :3]
+    defect = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+    bottom = np.abs(T[..., 3, :] - np.array([0, 0, 0, 1])).max(axis=-1)
+    bad = np.argwhere((np.maximum(defect, bottom) > ROTATION_TOLERANCE) | (np.linalg.det(R) < 0))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        raise error(
+            f"not a rigid transform: orthogonality defect {defect[index]:.2g}, "
+            f"determinant {np.linalg.det(R[index]):.6g}",
+            field=name,
+            index=index[0] if len(index) == 1 else index or None,
+        )
+
+
+def validate_camera(camera: StereoCamera) -> None:
+    """Raise `NonFiniteError` or `CalibrationError` for unusable intrinsics or baseline."""
+    values = np.array([camera.fu_px, camera.fv_px, camera.cu_px, camera.cv_px, camera.baseline_m])
+    require_finite(values, "camera (fu, fv, cu, cv, baseline)")
+    if camera.fu_px <= 0 or camera.fv_px <= 0:
+        raise CalibrationError(
+            f"intrinsic matrix K is singular or mirrored: fu {camera.fu_px:g}, fv {camera.fv_px:g}", field="K"
+        )
+    if camera.baseline_m <= 0:
+        raise CalibrationError(f"stereo baseline must be positive, found {camera.baseline_m:g} m", field="baseline")
+
+
+def _validate(sequence: Sequence) -> None:
+    frames = len(sequence.time_s)
+    require_shape(sequence.time_s, (None,), "time_s")
+    if frames == 0:
+        raise ShapeError("the sequence has no frames", field="time_s")
+    require_finite(sequence.time_s, "time_s")
+    steps = np.diff(sequence.time_s)
+    if (steps <= 0).any():
+        index = int(np.argmax(steps <= 0)) + 1
+        kind = "duplicates" if steps[index - 1] == 0 else "is before"
+        raise StampError(
+            f"stamp {sequence.time_s[index]:.6f} s {kind} its predecessor {sequence.time_s[index - 1]:.6f} s",
+            field="time_s",
+            index=index,
+        )
+    require_shape(sequence.twist, (frames, 6), "twist")
+    require_finite(sequence.twist, "twist")
+    if sequence.velocity_frame not in get_args(VelocityFrame):
+        raise DataError(
+            f"expected {' or '.join(get_args(VelocityFrame))}, found {sequence.velocity_frame!r}",
+            field="velocity_frame",
+        )
+    validate_camera(sequence.camera)
+    require_shape(sequence.T_cam_imu, (4, 4), "T_cam_imu")
+    require_finite(sequence.T_cam_imu, "T_cam_imu")
+    require_rigid(sequence.T_cam_imu, "T_cam_imu", ExtrinsicsError)
+    if len(sequence.observations) or sequence.attributes.get("tracks") != WITHOUT_TRACKS["tracks"]:
+        _validate_observations(sequence.observations, frames)
+    if sequence.truth is not None:
+        _validate_truth(sequence.truth, frames)
+    if sequence.noise is not None:
+        _validate_noise(sequence.noise)
+
+
+def _validate_observations(observations: Observations, frames: int) -> None:
+    if len(observations) == 0:
+        raise EmptyTracksError("there is not one observation", field="observations")
+    require_finite(observations.pixels_px, "observations.pixels_px")
+    outside = (observations.frame < 0) | (observations.frame >= frames)
+    if outside.any():
+        index = int(np.argmax(outside))
+        raise ShapeError(
+            f"frame {observations.frame[index]} does not exist, there are {frames}",
+            field="observations.frame",
+            index=index,
+        )
+    if (observations.landmark < 0).any():
+        index = int(np.argmax(observations.landmark < 0))
+        raise ShapeError("landmark ids must not be negative", field="observations.landmark", index=index)
+    twice = (np.diff(observations.frame) == 0) & (np.diff(observations.landmark) == 0)
+    if twice.any():
+        index = int(np.argmax(twice)) + 1
+        raise DuplicateObservationError(
+            f"landmark {observations.landmark[index]} is observed twice in frame {observations.frame[index]}",
+            field="observations",
+            index=index,
+        )
+
+
+def _validate_truth(truth: Truth, frames: int) -> None:
+    require_shape(truth.frame, (None,), "truth.frame")
+    if np.shape(truth.T_world_imu) != (len(truth.frame), 4, 4):
+        raise TruthError(
+            f"{len(truth.frame)} frames but poses of shape {np.shape(truth.T_world_imu)}", field="truth.T_world_imu"
+        )
+    if len(truth.frame) and (truth.frame[0] < 0 or truth.frame[-1] >= frames or (np.diff(truth.frame) <= 0).any()):
+        raise TruthError(f"frames must ascend within 0..{frames - 1}", field="truth.frame")
+    require_finite(truth.T_world_imu, "truth.T_world_imu")
+    require_rigid(truth.T_world_imu, "truth.T_world_imu", TruthError)
+    if np.shape(truth.position_m) != (len(truth.landmark), 3):
+        raise TruthError(
+            f"{len(truth.landmark)} landmarks but positions of shape {np.shape(truth.position_m)}",
+            field="truth.position_m",
+        )
+    require_finite(truth.position_m, "truth.position_m")
+
+
+def _validate_noise(noise: Noise) -> None:
+    for name, size in (("twist_std", 6), ("pixel_std_px", 4), ("twist_walk_std", 6), ("motion_std", 6)):
+        if name == "twist_walk_std" and noise.twist_walk_std is None:
+            continue
+        value = np.asarray(getattr(noise, name), dtype=float)
+        require_shape(value, (size,), f"noise.{name}")
+        require_finite(value, f"noise.{name}")
+        if (value < 0).any():
+            raise DataError("standard deviations must not be negative", field=f"noise.{name}")
+    for name in ("misalignment_rad", "drift", "bearing_drift_rad", "tilt_rad"):
+        if not (np.isfinite(getattr(noise, name)) and getattr(noise, name) >= 0):
+            raise DataError(f"must be finite and not negative, found {getattr(noise, name)}", field=f"noise.{name}")
+    if not noise.margin >= 1:
+        raise DataError(f"must be at least 1, found {noise.margin}", field="noise.margin")

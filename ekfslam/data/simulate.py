@@ -1,0 +1,414 @@
+"""Simulated drives with exact truth: the embedded default data, and the raw material of Monte Carlo studies.
+
+Two worlds are built in. ``city`` is a drive through streets, seen the way a feature tracker sees it: short tracks whose
+ids never come back, and some gross outliers. ``loop`` is a ring driven several times past the same few landmarks, which
+keep their ids. ``dataclasses.replace(BUILTIN["loop"], radius_m=10.0)`` makes another world of the same kind.
+
+The truth obeys the model of the filters exactly: the velocity is constant over every interval and integrates by
+eq. (1). The world frame is the IMU frame of the first stamp, x forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+from urllib.parse import parse_qsl
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.errors import ConfigError, UnknownFormatError
+from ekfslam.geometry import motion, se3
+from ekfslam.geometry.camera import StereoCamera, project
+
+CAMERA = StereoCamera(fu_px=707.0, fv_px=707.0, cu_px=602.0, cv_px=183.0, baseline_m=0.537)
+IMAGE_SIZE_PX = (1241, 376)
+BORDER_PX = 5.0  # wide enough for the noise not to push a pixel out of the image
+
+_CAMERA_IN_IMU_M = np.array([1.1, -0.3, 0.7])
+_R_CAM_IMU = se3.so3_exp(np.deg2rad([0.8, -1.3, 0.6])) @ np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+T_CAM_IMU = se3.transform(_R_CAM_IMU, -_R_CAM_IMU @ _CAMERA_IN_IMU_M)
+
+GROUND_M = -0.95  # height of the road in the IMU frame
+ROAD_HALF_WIDTH_M = 4.0
+TURN_SPEED_M_S = 5.0
+OUTLIER_SHIFT_PX = (5.0, 40.0)
+
+# Typical size of what keeps a drive from being flat: pitch, roll (rad), sideways and vertical speed per forward speed.
+_UNEVENNESS = np.array([0.025, 0.010, 0.004, 0.008])
+_FRAMES_PER_CHUNK = 100  # a stretch of road short enough for most landmarks of a long drive to be out of range
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What every world has: sampling, noise, and the limits of the tracker.
+
+    Args:
+        name: Becomes the name of the sequence.
+        seed: Seed of the one generator that everything is drawn from.
+        frames: Number of stamps, at least 2.
+        frame_period_s: Nominal time between stamps.
+        stamp_jitter_s: Standard deviation of a stamp (cut at a third of the period).
+        sigma_v_m_s, sigma_w_rad_s: White noise of the velocities, per sample and axis.
+        sigma_px: White noise of each of the four pixels.
+        min_disparity_px, max_range_m: Landmarks with less disparity, or farther from the camera, are not tracked.
+        max_tracks: The tracker follows no more landmarks than this at a time.
+        loss_probability: Chance that the tracker misses a visible landmark in a frame.
+        outlier_fraction: Share of observations that are grossly displaced.
+        initial_position_std_m, initial_rotation_std_rad: Prior of the first pose, each axis, which the truth is drawn
+            from. Unless both are 0 the first pose is unknown: estimates start at identity, and the truth starts at
+            frame 1.
+    """
+
+    name: str
+    seed: int = 0
+    frames: int = 1000
+    frame_period_s: float = 0.1
+    stamp_jitter_s: float = 0.001
+    sigma_v_m_s: float = 0.5
+    sigma_w_rad_s: float = 0.05
+    sigma_px: float = 1.0
+    min_disparity_px: float = 6.0
+    max_range_m: float = 40.0
+    max_tracks: int = 1000
+    loss_probability: float = 0.0
+    outlier_fraction: float = 0.0
+    initial_position_std_m: float = 0.0
+    initial_rotation_std_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        for key, value in numbers_of(self).items():
+            if not 0 <= value < float("inf"):
+                raise ConfigError(f"{self.name}: {key} must be finite and not negative, found {value}")
+            if value == 0 and key in ("frame_period_s", "radius_m"):
+                raise ConfigError(f"{self.name}: {key} must be positive")
+        if self.frames < 2:
+            raise ConfigError(f"{self.name}: frames must be at least 2, found {self.frames}")
+        for key in ("loss_probability", "outlier_fraction"):
+            if getattr(self, key) > 1:
+                raise ConfigError(f"{self.name}: {key} must be in [0, 1], found {getattr(self, key)}")
+
+
+@dataclass(frozen=True)
+class City(Recording):
+    """Streets between crossings, left, left, right, right and so on, with a stop in every third.
+
+    No landmark id ever comes back: each unbroken run of observations of a physical point is a track with its own id.
+
+    Args:
+        landmarks_per_m: Physical points along each metre of street, both sides together.
+    """
+
+    name: str = "city"
+    sigma_px: float = 0.7
+    min_disparity_px: float = 4.0
+    max_range_m: float = 50.0
+    max_tracks: int = 66
+    loss_probability: float = 0.02
+    outlier_fraction: float = 0.03
+    landmarks_per_m: float = 4.0
+
+
+@dataclass(frozen=True)
+class Loop(Recording):
+    """A ring driven at constant speed; landmarks keep their ids, loop after loop (157 frames each by default).
+
+    Args:
+        radius_m, speed_m_s: Of the ring, and along it.
+        landmarks: How many there are, inside and outside of the ring.
+        landmark_offset_m: How far outside of the ring's centre line they may stand (inside: a fifth of the radius).
+        landmark_height_m: They stand between the ground and this height.
+    """
+
+    name: str = "loop"
+    frames: int = 472
+    radius_m: float = 20.0
+    speed_m_s: float = 8.0
+    landmarks: int = 100
+    landmark_offset_m: float = 16.0
+    landmark_height_m: float = 4.0
+
+
+def numbers_of(world: Recording) -> dict[str, int | float]:
+    """The numeric parameters of a world by name."""
+    return {key: value for key, value in dataclasses.asdict(world).items() if type(value) in (int, float)}
+
+
+World = City | Loop
+
+BUILTIN: Mapping[str, World] = MappingProxyType({"city": City(), "loop": Loop()})
+
+
+def builtin(name: str) -> Sequence:
+    """The sequence of a built-in world, ``city`` or ``loop``, or of a variation such as ``city?seed=3&frames=200``.
+
+    Raises:
+        UnknownFormatError: There is no such world.
+        ConfigError: A parameter is unknown or out of range.
+    """
+    base, _, query = name.partition("?")
+    if base not in BUILTIN:
+        raise UnknownFormatError(f"no built-in world {base!r}; known: {', '.join(BUILTIN)}")
+    defaults = numbers_of(BUILTIN[base])
+    changes: dict[str, Any] = {}
+    for key, text in parse_qsl(query, keep_blank_values=True):
+        if key not in defaults:
+            raise ConfigError(f"{name}: unknown parameter {key!r}; known: {', '.join(defaults)}")
+        try:
+            changes[key] = type(defaults[key])(text)
+        except ValueError:
+            raise ConfigError(f"{name}: {key} must be a number like {defaults[key]}, found {text!r}") from None
+    return simulate(dataclasses.replace(BUILTIN[base], **changes))
+
+
+def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
+    """Drive through a world once and record it; the same bits on every call.
+
+    Args:
+        world: What to simulate. Its seed decides the stamps, the drive and the landmarks.
+        rng: Draws the first pose, the noise, the losses and the outliers. By default the world's own generator goes on,
+            so that the seed decides everything; give one to record the same drive again with other noise.
+
+    Returns:
+        The recording, with the true noise, all true poses (but see `Recording` on the prior), and the true position of
+        every landmark that was observed.
+    """
+    geometry = np.random.default_rng(world.seed)
+    noise = geometry if rng is None else rng
+
+    time_s = _stamps(world, geometry)
+    distance_m, yaw_rad = _drive(world, time_s, geometry)
+    wavelength_m = 2 * np.pi * world.radius_m if isinstance(world, Loop) else 150.0
+    twist = _twists(time_s, distance_m, yaw_rad, wavelength_m, geometry)
+    T_imu_world = _integrate(twist, np.diff(time_s))
+    points_m = _landmarks(world, distance_m, yaw_rad, se3.inverse(T_imu_world)[:, :3, 3], geometry)
+
+    # The first pose is exp(xi^) instead of the identity: everything true moves along, so that no measurement changes.
+    prior_std = np.repeat([world.initial_position_std_m, world.initial_rotation_std_rad], 3)
+    T_first = se3.exp(prior_std * noise.standard_normal(6))
+    T_imu_world = T_imu_world @ T_first
+    points_m = se3.apply(se3.inverse(T_first), points_m)
+    first_known = 1 if prior_std.any() else 0  # a first pose that is drawn is one that nobody may start from
+
+    stated = Noise.isotropic(world.sigma_v_m_s, world.sigma_w_rad_s, world.sigma_px)
+    measured_twist = twist + stated.twist_std * noise.standard_normal(twist.shape)
+
+    frame, point, pixels = _visible(world, T_imu_world, points_m)
+    kept = _tracked(world, frame, point, len(points_m), noise)
+    frame, point, pixels = frame[kept], point[kept], pixels[kept]
+    pixels = pixels + _outlier_shifts(world, pixels, noise) + stated.pixel_std_px * noise.standard_normal(pixels.shape)
+    landmark = _track_ids(frame, point) if isinstance(world, City) else point
+    ids, an_observation = np.unique(landmark, return_index=True)
+
+    return Sequence(
+        name=world.name,
+        source=f"builtin:{world.name}",
+        time_s=time_s,
+        twist=measured_twist,
+        camera=CAMERA,
+        T_cam_imu=T_CAM_IMU,
+        observations=Observations(frame, landmark, pixels),
+        truth=Truth(
+            frame=np.arange(first_known, world.frames),
+            T_world_imu=se3.inverse(T_imu_world)[first_known:],
+            landmark=ids,
+            position_m=points_m[point[an_observation]],
+        ),
+        noise=stated,
+        attributes={"world": world.name, **numbers_of(world)},
+    )
+
+
+def _stamps(world: World, rng: np.random.Generator) -> Array:
+    """Stamps (T,) from 0, with a jitter too small to swap two of them."""
+    limit = world.frame_period_s / 3
+    jitter = np.clip(world.stamp_jitter_s * rng.standard_normal(world.frames), -limit, limit)
+    time_s = world.frame_period_s * np.arange(world.frames) + jitter
+    return time_s - time_s[0]
+
+
+def _drive(world: World, time_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Distance driven (T,) m and heading (T,) rad at the stamps, both 0 at the first."""
+    if isinstance(world, Loop):
+        distance = world.speed_m_s * time_s
+        return distance, distance / world.radius_m
+    return _drive_streets(time_s, rng)
+
+
+def _drive_streets(time_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """`_drive` of a city: a chain of manoeuvres, each with a duration, a speed at its end and an angle to turn by."""
+    accelerate_s, brake_s, stand_s, start_s, turn_s = 3.5, 3.5, 3.0, 3.0, 5.0
+    streets = int(time_s[-1] / (accelerate_s + brake_s + turn_s)) + 1
+    cruise_m_s = rng.uniform(9.0, 12.0, (streets, 2))
+    stops = np.arange(streets) % 3 == 1
+    angle = np.deg2rad(np.resize([90.0, 90.0, -90.0, -90.0], streets) + 3.0 * rng.standard_normal(streets))
+    brake_to = np.where(stops, 0.0, TURN_SPEED_M_S)
+
+    manoeuvres = np.zeros((streets, 6, 3))
+    manoeuvres[:, 0, 0], manoeuvres[:, 0, 1] = accelerate_s, cruise_m_s[:, 0]
+    manoeuvres[:, 1, 0], manoeuvres[:, 1, 1] = rng.uniform(1.5, 5.0, streets), cruise_m_s[:, 1]
+    manoeuvres[:, 2, 0], manoeuvres[:, 2, 1] = brake_s, brake_to
+    manoeuvres[:, 3, 0], manoeuvres[:, 3, 1] = stand_s * stops, brake_to
+    manoeuvres[:, 4, 0], manoeuvres[:, 4, 1] = start_s * stops, TURN_SPEED_M_S
+    manoeuvres[:, 5] = np.stack([np.full(streets, turn_s), np.full(streets, TURN_SPEED_M_S), angle], axis=-1)
+    duration, end_speed, turn = manoeuvres.reshape(-1, 3).T
+
+    start_speed = np.concatenate([[TURN_SPEED_M_S], end_speed[:-1]])
+    length = duration * (start_speed + end_speed) / 2
+    start_time, start_distance, start_yaw = (np.cumsum(x) - x for x in (duration, length, turn))
+    i = np.searchsorted(start_time, time_s, side="right") - 1
+    x = (time_s - start_time[i]) / duration[i]
+    # Integrals of a speed that goes over by the smooth step 3x^2 - 2x^3, and a yaw rate that swells as 1 - cos(2 pi x).
+    ramp = x**3 - x**4 / 2
+    distance = start_distance[i] + duration[i] * (start_speed[i] * x + (end_speed[i] - start_speed[i]) * ramp)
+    return distance, start_yaw[i] + turn[i] * (x - np.sin(2 * np.pi * x) / (2 * np.pi))
+
+
+def _twists(time_s: Array, distance_m: Array, yaw_rad: Array, wavelength_m: float, rng: np.random.Generator) -> Array:
+    """True velocities (T, 6): the drive on an uneven road, whose waves repeat every ``wavelength_m``.
+
+    Unevenness depends on the place, not on the time, so that a vehicle that stands stands still.
+    """
+    harmonics = np.arange(1, 4)
+    amplitude = _UNEVENNESS * rng.standard_normal((len(harmonics), 4)) / np.sqrt(len(harmonics))
+    waves = np.sin(2 * np.pi / wavelength_m * distance_m[:, None] * harmonics) @ amplitude
+    x_axis, y_axis, z_axis = np.eye(3)
+    R_world_imu = (
+        se3.so3_exp(yaw_rad[:, None] * z_axis)
+        @ se3.so3_exp(waves[:, :1] * y_axis)
+        @ se3.so3_exp(waves[:, 1:2] * x_axis)
+    )
+    tau = np.diff(time_s)[:, None]
+    speed = np.diff(distance_m)[:, None] / tau
+    v = speed * np.concatenate([np.ones_like(speed), waves[1:, 2:]], axis=-1)
+    w = se3.so3_log(np.swapaxes(R_world_imu[:-1], -1, -2) @ R_world_imu[1:]) / tau
+    twist = np.concatenate([v, w], axis=-1)
+    return np.concatenate([twist[:1], twist])  # the first sample drives an interval before the recording
+
+
+def _integrate(twist: Array, tau_s: Array) -> Array:
+    """Eq. (1) from the identity: velocities (T, 6) and intervals (T-1,) to ``T_imu_world`` (T, 4, 4)."""
+    T = np.empty((len(twist), 4, 4))
+    T[0] = np.eye(4)
+    for k, E in enumerate(motion.increment(twist[1:], tau_s), start=1):
+        T[k] = E @ T[k - 1]
+    return T
+
+
+def _landmarks(world: World, distance_m: Array, yaw_rad: Array, position_m: Array, rng: np.random.Generator) -> Array:
+    """Landmark positions (N, 3) in world, given the drive (T,), (T,), (T, 3)."""
+    if isinstance(world, Loop):
+        # The camera's field of view never reaches points nearer to the centre than 0.77 radii.
+        verge, inner, outer = ROAD_HALF_WIDTH_M / 2, 0.2 * world.radius_m, world.landmark_offset_m
+        offset = rng.uniform(verge - inner, outer - verge, world.landmarks)
+        radius = world.radius_m + offset + np.where(offset > 0, verge, -verge)
+        angle = rng.uniform(0.0, 2 * np.pi, world.landmarks)
+        height = GROUND_M + rng.uniform(0.0, world.landmark_height_m, world.landmarks)
+        return np.stack([radius * np.cos(angle), world.radius_m + radius * np.sin(angle), height], axis=-1)
+    return _line_streets(world, distance_m, yaw_rad, position_m, rng)
+
+
+def _line_streets(world: City, distance_m: Array, yaw_rad: Array, position_m: Array, rng: np.random.Generator) -> Array:
+    """`_landmarks` of a city: facades on both sides, street furniture in front of them, and kerbs."""
+    # The street goes on past the last frame, or the vehicle would end up looking into the void.
+    ahead = np.array([np.cos(yaw_rad[-1]), np.sin(yaw_rad[-1]), 0.0])
+    path_s = np.append(distance_m, distance_m[-1] + world.max_range_m)
+    path = np.concatenate([position_m, [position_m[-1] + world.max_range_m * ahead]])
+    path_yaw = np.append(yaw_rad, yaw_rad[-1])
+
+    count = rng.poisson(world.landmarks_per_m * path_s[-1])
+    s = rng.uniform(0.0, path_s[-1], count)
+    side = rng.integers(0, 2, count)
+    building = (s / 17.0).astype(int)
+    facade_m = rng.uniform(7.0, 19.5, (int(path_s[-1] / 17.0) + 1, 2))[building, side]
+    kind = rng.choice(3, count, p=[0.6, 0.2, 0.2])
+    lateral = np.choose(
+        kind,
+        [
+            facade_m + rng.uniform(0.0, 0.5, count),
+            rng.uniform(ROAD_HALF_WIDTH_M, facade_m),
+            rng.uniform(ROAD_HALF_WIDTH_M, 7.0, count),
+        ],
+    )
+    height = np.choose(kind, [rng.uniform(0.0, 8.0, count), rng.uniform(0.0, 3.0, count), rng.uniform(0, 0.15, count)])
+
+    yaw = np.interp(s, path_s, path_yaw)
+    left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1)
+    points = np.stack([np.interp(s, path_s, coordinate) for coordinate in path.T], axis=-1)
+    points[:, :2] += np.where(side, 1.0, -1.0)[:, None] * lateral[:, None] * left
+    points[:, 2] += GROUND_M + height
+    return points
+
+
+def _visible(world: World, T_imu_world: Array, points_m: Array) -> tuple[IntArray, IntArray, Array]:
+    """Frame (K,), index of the point (K,) and exact pixels (K, 4), eq. (3), of all that the tracker could see."""
+    T_cam_world = T_CAM_IMU @ T_imu_world
+    camera_m = se3.inverse(T_cam_world)[:, :3, 3]
+    found = []
+    for start in range(0, len(T_cam_world), _FRAMES_PER_CHUNK):
+        chunk = slice(start, start + _FRAMES_PER_CHUNK)
+        low, high = camera_m[chunk].min(axis=0), camera_m[chunk].max(axis=0)
+        near = np.abs(points_m - (low + high) / 2) < (high - low) / 2 + world.max_range_m
+        candidates = np.flatnonzero(near.all(axis=-1))
+        q = T_cam_world[chunk, :3, :3] @ points_m[candidates].T + T_cam_world[chunk, :3, 3:]
+        frame, candidate = np.nonzero((q[:, 2] > 0) & (np.sum(q * q, axis=1) < world.max_range_m**2))
+        pixels = project(CAMERA, q[frame, :, candidate])
+        seen = _inside(pixels) & (pixels[:, 0] - pixels[:, 2] > world.min_disparity_px)
+        found.append((start + frame[seen], candidates[candidate[seen]], pixels[seen]))
+    frames, points, all_pixels = zip(*found, strict=True)
+    return np.concatenate(frames), np.concatenate(points), np.concatenate(all_pixels)
+
+
+def _tracked(world: World, frame: IntArray, point: IntArray, points: int, rng: np.random.Generator) -> BoolArray:
+    """Mask (K,) of the visible observations that the tracker makes: the points it prefers, less what it loses."""
+    preference = rng.random(points)
+    order = np.lexsort((preference[point], frame))
+    place = np.arange(len(order)) - np.searchsorted(frame[order], frame[order])
+    kept = rng.random(len(frame)) >= world.loss_probability
+    kept[order[place >= world.max_tracks]] = False
+    return kept
+
+
+def _inside(pixels: Array) -> BoolArray:
+    """Mask (K,) of pixels (K, 4) within both images, off the border."""
+    limit = np.tile(IMAGE_SIZE_PX, 2) - 1 - BORDER_PX
+    return np.asarray(((pixels >= BORDER_PX) & (pixels <= limit)).all(axis=-1))
+
+
+def _outlier_shifts(world: World, pixels: Array, rng: np.random.Generator) -> Array:
+    """What displaces the pixels (K, 4): 0, or for an outlier a jump of the point in both images and a wrong disparity.
+
+    Rows stay matched and disparities positive, as in what a stereo matcher lets through.
+    """
+    shifts = np.zeros_like(pixels)
+    wrong = np.flatnonzero(rng.random(len(pixels)) < world.outlier_fraction)
+    z = pixels[wrong]
+    size = rng.uniform(*OUTLIER_SHIFT_PX, len(wrong))
+    direction = rng.uniform(0.0, 2 * np.pi, len(wrong))
+    du, dv = size * np.cos(direction), size * np.sin(direction)
+    stretch = rng.uniform(-0.5, 0.5, len(wrong)) * np.minimum(np.abs(du), z[:, 0] - z[:, 2])
+    # A jump out of the image goes the other way; the image is wide enough for one of the two.
+    right = z[:, 2] - stretch
+    low, high = np.minimum(z[:, 0], right) + du, np.maximum(z[:, 0], right) + du
+    du = np.where((low < BORDER_PX) | (high > IMAGE_SIZE_PX[0] - 1 - BORDER_PX), -du, du)
+    row = z[:, 1] + dv
+    dv = np.where((row < BORDER_PX) | (row > IMAGE_SIZE_PX[1] - 1 - BORDER_PX), -dv, dv)
+    shifts[wrong] = np.stack([du, dv, du - stretch, dv], axis=-1)
+    return shifts
+
+
+def _track_ids(frame: IntArray, point: IntArray) -> IntArray:
+    """An id (K,) for each unbroken run of frames of the same point, counted from 0 in order of appearance."""
+    order = np.lexsort((frame, point))
+    starts = np.ones(len(order), dtype=bool)
+    starts[1:] = (np.diff(point[order]) != 0) | (np.diff(frame[order]) != 1)
+    appearance = np.lexsort((point[order][starts], frame[order][starts]))
+    rank = np.empty(len(appearance), dtype=np.int64)
+    rank[appearance] = np.arange(len(appearance))
+    ids = np.empty(len(order), dtype=np.int64)
+    ids[order] = rank[np.cumsum(starts) - 1]
+    return ids

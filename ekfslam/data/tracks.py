@@ -1,0 +1,110 @@
+"""What the tracks of a recording look like, and how to cut one: the ground that `ekfslam.data.hygiene` stands on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.sequence import Observations
+
+# Sensors of a rig that stands still read less than this; turning faster moves the pixels by more than one a frame.
+MOVING_M_S = 0.1
+MOVING_RAD_S = 0.02
+
+
+@dataclass(frozen=True)
+class TrackReport:
+    """What `inspect_tracks` found.
+
+    Args:
+        tracks: Number of distinct landmark ids.
+        observations_per_frame: (T,) number of observations.
+        repeated_frames: Ascending frames whose pixels all repeat the previous frame's (see `repeated_frames`).
+        returning_tracks: Number of tracks that come back after frames that did not see them.
+        nonpositive_disparities: Number of observations with ``uL - uR <= 0``, which have no depth.
+        max_row_mismatch_px: Largest ``|vL - vR|``; 0 for an ideally rectified pair.
+    """
+
+    tracks: int
+    observations_per_frame: IntArray
+    repeated_frames: IntArray
+    returning_tracks: int
+    nonpositive_disparities: int
+    max_row_mismatch_px: float
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The findings, one sentence each."""
+        frames, observations = len(self.observations_per_frame), int(self.observations_per_frame.sum())
+        blind = int((self.observations_per_frame == 0).sum())
+        return (
+            f"{self.tracks} tracks, {observations} observations, {observations / frames:.1f} a frame; "
+            f"{blind} of {frames} frames see nothing.",
+            f"{len(self.repeated_frames)} of {frames} frames repeat the previous frame's pixels in every common track "
+            "although the rig moves.",
+            f"{self.returning_tracks} tracks come back after a gap.",
+            f"{self.nonpositive_disparities} of {observations} observations have a disparity <= 0.",
+            f"|vL - vR| is at most {self.max_row_mismatch_px:.2f} px.",
+        )
+
+
+def inspect_tracks(observations: Observations, twist: Array) -> TrackReport:
+    """Report on the tracks of a recording with velocities ``twist`` (T, 6) in m/s and rad/s, one for every frame."""
+    earlier, later = successive(observations)
+    gap = observations.frame[later] - observations.frame[earlier] > 1
+    pixels = observations.pixels_px
+    return TrackReport(
+        tracks=len(observations.ids),
+        observations_per_frame=np.bincount(observations.frame, minlength=len(twist)),
+        repeated_frames=repeated_frames(observations, twist),
+        returning_tracks=len(np.unique(observations.landmark[later[gap]])),
+        nonpositive_disparities=int((pixels[:, 0] <= pixels[:, 2]).sum()),
+        max_row_mismatch_px=float(np.abs(pixels[:, 1] - pixels[:, 3]).max(initial=0.0)),
+    )
+
+
+def cut_tracks(observations: Observations, starts: NDArray[np.bool_], first_id: int) -> IntArray:
+    """Landmark ids (K,) after every track is cut before its observations that ``starts`` (K,) marks.
+
+    New pieces are numbered from ``first_id``, by track and then by frame; the first piece of a track keeps its id.
+    """
+    order = np.lexsort((observations.frame, observations.landmark))
+    ids, marked = observations.landmark[order], starts[order]
+    first = np.diff(ids, prepend=-1) != 0
+    # The number of the piece an observation belongs to; unmarked beginnings are those of the tracks themselves.
+    piece = first_id - 1 + np.cumsum(marked)
+    begins = np.maximum.accumulate(np.where(first | marked, np.arange(len(ids)), 0))
+    landmark = np.empty_like(ids)
+    landmark[order] = np.where(marked[begins], piece, ids)
+    return landmark
+
+
+def repeated_frames(observations: Observations, twist: Array) -> IntArray:
+    """Ascending frames that show the previous frame's pixels again, bit for bit in every common track, while moving.
+
+    One common track is enough: a subpixel tracker does not return the same four numbers from another image, and in the
+    recordings no frame repeats some tracks but not others. ``twist[k]`` (T, 6) m/s and rad/s, which drives the interval
+    before frame k, tells whether the rig moves; standing still, pixels may well repeat.
+
+    In such a frame the tracker has been restarted at the old pixels in the new image. The pixels are right for the
+    frame that they stand in (they predict the next one as well as any), but show other points than before: no track
+    leads across.
+    """
+    earlier, later = successive(observations)
+    adjacent = observations.frame[later] - observations.frame[earlier] == 1
+    earlier, later = earlier[adjacent], later[adjacent]
+    same = (observations.pixels_px[earlier] == observations.pixels_px[later]).all(axis=1)
+    common = np.bincount(observations.frame[later], minlength=len(twist))
+    repeated = np.bincount(observations.frame[later[same]], minlength=len(twist))
+    moving = (np.linalg.norm(twist[:, :3], axis=1) > MOVING_M_S) | (np.linalg.norm(twist[:, 3:], axis=1) > MOVING_RAD_S)
+    return np.flatnonzero((common > 0) & (repeated == common) & moving)
+
+
+def successive(observations: Observations) -> tuple[IntArray, IntArray]:
+    """Index pairs (earlier, later) of observations that follow each other in the same track."""
+    order = np.lexsort((observations.frame, observations.landmark))
+    same_track = np.diff(observations.landmark[order]) == 0
+    return order[:-1][same_track], order[1:][same_track]

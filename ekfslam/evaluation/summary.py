@@ -1,0 +1,109 @@
+"""The figures of merit of a run, and the table that compares modes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ekfslam.data.sequence import Sequence
+from ekfslam.evaluation.consistency import pose_nees
+from ekfslam.evaluation.trajectory import (
+    absolute_trajectory_error,
+    final_position_error,
+    kitti_segment_errors,
+    landmark_rmse,
+    relative_pose_error_over_frames,
+    relative_pose_error_over_path,
+)
+from ekfslam.filters.result import Result
+from ekfslam.storage.archive import Archive
+
+RPE_PATH_M = 10.0
+
+# Key of a summary, heading of its row in the table, format of the value.
+_ROWS = (
+    ("ate_m", "ATE [m], unaligned", ".3f"),
+    ("ate_aligned_m", "ATE [m], SE(3)-aligned", ".3f"),
+    ("final_error_m", "final error [m]", ".3f"),
+    ("rpe_1_frame_m", "RPE [m], 1 frame", ".4f"),
+    ("rpe_1_frame_deg", "RPE [deg], 1 frame", ".4f"),
+    ("rpe_10_m_m", f"RPE [m], {RPE_PATH_M:g} m", ".4f"),
+    ("rpe_10_m_deg", f"RPE [deg], {RPE_PATH_M:g} m", ".4f"),
+    ("t_rel_percent", "t_rel [%]", ".3f"),
+    ("r_rel_deg_per_100m", "r_rel [deg/100 m]", ".4f"),
+    ("pose_nees_mean", "pose NEES (6)", ".2f"),
+    ("nis_per_dof", "NIS / dof (1)", ".3f"),
+    ("landmark_rmse_m", "landmark RMSE [m]", ".3f"),
+    ("accepted", "accepted", "d"),
+    ("rejected", "rejected", "d"),
+    ("ms_per_frame_median", "ms/frame median", ".2f"),
+    ("ms_per_frame_max", "ms/frame max", ".2f"),
+    ("total_s", "total [s]", ".2f"),
+)
+
+
+def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float | int | None]:
+    """Figures of merit of one run as plain Python numbers, ready for JSON; of the sequence only the truth is used.
+
+    Trajectory errors are over the frames with known true pose, the estimate starting where the run started it; see
+    `ekfslam.evaluation.trajectory` for their definitions. Only ``ate_aligned_m`` is aligned; ``ate_m``,
+    ``final_error_m`` and ``landmark_rmse_m`` are of what stands in world. ``rpe_1_frame_*`` and ``rpe_10_m_*`` are
+    relative errors over one frame and over 10 m of true path. ``pose_nees_mean`` (6 expected) is over the frames whose
+    covariance is not singular, ``nis_per_dof`` (1 expected) is the sum of NIS over the sum of degrees of freedom,
+    ``total_s`` the sum of the time spent on the frames. None stands where truth is missing or the value is undefined.
+    """
+    summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _ROWS)
+    truth = sequence.truth
+    if truth is not None:
+        summary["landmark_rmse_m"] = landmark_rmse(result.landmarks, truth)
+    if truth is not None and len(truth.frame):
+        T_est, T_true = result.T_world_imu[truth.frame], truth.T_world_imu
+        summary["ate_m"] = absolute_trajectory_error(T_est, T_true, align=False)
+        summary["ate_aligned_m"] = absolute_trajectory_error(T_est, T_true, align=True)
+        summary["final_error_m"] = final_position_error(T_est, T_true)
+        step = relative_pose_error_over_frames(T_est, T_true)
+        if step is not None:
+            summary["rpe_1_frame_m"], summary["rpe_1_frame_deg"] = step
+        stretch = relative_pose_error_over_path(T_est, T_true, RPE_PATH_M)
+        if stretch is not None:
+            summary["rpe_10_m_m"], summary["rpe_10_m_deg"] = stretch
+        segments = kitti_segment_errors(T_est, T_true)
+        if segments is not None:
+            summary["t_rel_percent"], summary["r_rel_deg_per_100m"] = segments
+        _, values = pose_nees(result, truth)
+        if np.isfinite(values).any():
+            summary["pose_nees_mean"] = float(np.nanmean(values))
+    innovation = result.innovation
+    if innovation.dof.sum() > 0:
+        summary["nis_per_dof"] = float(innovation.nis.sum() / innovation.dof.sum())
+    summary["accepted"] = int(innovation.accepted.sum())
+    summary["rejected"] = int(innovation.rejected.sum())
+    summary["ms_per_frame_median"] = float(np.median(result.ms_per_frame))
+    summary["ms_per_frame_max"] = float(result.ms_per_frame.max())
+    summary["total_s"] = float(result.ms_per_frame.sum()) / 1e3
+    return summary
+
+
+def compare_table(summary: Mapping[str, Any]) -> str:
+    """Markdown table, one column a mode, of ``{"sequence", "frames", "landmarks", "modes": {mode: summarise(...)}}``.
+
+    Rows without a value in any mode are left out; a value that is None is shown as a dash. Cells are padded, so that
+    the table reads as well on a terminal.
+    """
+    modes = summary["modes"]
+    rows = [["", *modes]]
+    for key, heading, spec in _ROWS:
+        values = [mode[key] for mode in modes.values()]
+        if any(value is not None for value in values):
+            rows.append([heading, *("-" if value is None else format(value, spec) for value in values)])
+    widths = [max(4, *map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        f"| {row[0]:<{widths[0]}} | " + " | ".join(f"{c:>{w}}" for c, w in zip(row[1:], widths[1:], strict=True)) + " |"
+        for row in rows
+    ]
+    rule = f"|{'-' * (widths[0] + 2)}|" + "".join(f"{'-' * (w + 1)}:|" for w in widths[1:])
+    landmarks = "" if summary["landmarks"] is None else f", {summary['landmarks']} landmarks"
+    title = f"**{summary['sequence']}**: {summary['frames']} frames{landmarks}"
+    return "\n".join([title, "", lines[0], rule, *lines[1:]]) + "\n"

@@ -1,0 +1,138 @@
+"""Errors of a trajectory and of a map against ground truth.
+
+Trajectories are stacks of poses ``T_world_imu`` (n, 4, 4), estimate and truth at the same n instants. Only
+`absolute_trajectory_error` aligns, and only when asked to; relative errors do not depend on an alignment.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.sequence import Truth
+from ekfslam.filters.result import Landmarks
+from ekfslam.geometry import se3
+
+KITTI_SEGMENT_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+KITTI_START_STEP = 10  # frames between the starts of segments
+PATH_TOLERANCE = 0.1  # of a path, by which that of a pair of poses may differ from it; the default of evo_rpe
+
+
+def align_se3(points: Array, reference: Array) -> Array:
+    """Rigid transform (4, 4) that brings points (n, 3) closest to their reference (n, 3) in the least-squares sense.
+
+    Umeyama's method without scale. Points on a line leave the rotation about it undetermined; any optimum is returned.
+    """
+    centre, reference_centre = points.mean(axis=0), reference.mean(axis=0)
+    U, _, Vt = np.linalg.svd((reference - reference_centre).T @ (points - centre))
+    # The optimal orthogonal matrix may be a reflection; flipping the weakest direction gives the optimal rotation.
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = (U * signs) @ Vt
+    return se3.transform(R, reference_centre - R @ centre)
+
+
+def absolute_trajectory_error(T_est: Array, T_true: Array, align: bool) -> float:
+    """ATE, root mean square of the position errors in metres: as they are, or after `align_se3` of the positions.
+
+    Sturm et al., *A Benchmark for the Evaluation of RGB-D SLAM Systems*, IROS 2012. Scale is never aligned.
+    """
+    estimate, truth = T_est[:, :3, 3], T_true[:, :3, 3]
+    if align:
+        estimate = se3.apply(align_se3(estimate, truth), estimate)
+    return float(np.sqrt(np.mean(np.sum((estimate - truth) ** 2, axis=1))))
+
+
+def final_position_error(T_est: Array, T_true: Array) -> float:
+    """Distance in metres between the last estimated and the last true position, no alignment."""
+    return float(np.linalg.norm(T_est[-1, :3, 3] - T_true[-1, :3, 3]))
+
+
+def relative_pose_error_over_frames(T_est: Array, T_true: Array, frames: int = 1) -> tuple[float, float] | None:
+    """RPE over a fixed number of frames: root mean squares of the translation error, m, and of the rotation angle, deg.
+
+    The error of the motion from pose i to pose j = i + frames is ``E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`` with Q the true
+    and P the estimated poses (Sturm et al. 2012). Every pair of the n poses counts, also one across a gap in the truth.
+    None if there is no pair.
+    """
+    start = np.arange(len(T_true) - frames)
+    return _rms_relative_error(T_est, T_true, start, start + frames)
+
+
+def relative_pose_error_over_path(T_est: Array, T_true: Array, path_m: float) -> tuple[float, float] | None:
+    """RPE over a length of true path: root mean squares of the translation error, m, and of the rotation angle, deg.
+
+    As `relative_pose_error_over_frames`, but each pose is paired with the later one (the first, if there are several)
+    whose distance from it along the true path comes nearest to ``path_m``, and left out where that differs by more than
+    `PATH_TOLERANCE` of it. These are the pairs of ``evo_rpe -d PATH -u m --all_pairs --pairs_from_reference``.
+    """
+    distance = _distance_along(T_true)
+    after = np.minimum(np.searchsorted(distance, distance + path_m), len(distance) - 1)
+    before = np.maximum(after - 1, 0)
+    off_after, off_before = (np.abs(distance[end] - distance - path_m) for end in (after, before))
+    # Where the vehicle stands still several poses lie at one distance; a search finds the first.
+    end = np.searchsorted(distance, distance[np.where(off_before <= off_after, before, after)])
+    fits = np.minimum(off_before, off_after) <= PATH_TOLERANCE * path_m
+    return _rms_relative_error(T_est, T_true, np.flatnonzero(fits), end[fits])
+
+
+def _distance_along(T: Array) -> Array:
+    """Distance driven in metres from the first pose to each: (n, 4, 4) to (n,)."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1))])
+
+
+def _relative_errors(T_est: Array, T_true: Array, start: IntArray, end: IntArray) -> tuple[Array, Array]:
+    """Length, m, and angle, rad, of the error of the motions from ``start`` to ``end`` (pairs,): (pairs,) each."""
+    step_est = se3.inverse(T_est[start]) @ T_est[end]
+    step_true = se3.inverse(T_true[start]) @ T_true[end]
+    error = se3.inverse(step_true) @ step_est
+    return np.linalg.norm(error[:, :3, 3], axis=1), np.linalg.norm(se3.so3_log(error[:, :3, :3]), axis=1)
+
+
+def _rms_relative_error(T_est: Array, T_true: Array, start: IntArray, end: IntArray) -> tuple[float, float] | None:
+    """Root mean squares in metres and degrees; None if there is no pair."""
+    if not len(start):
+        return None
+    length, angle = _relative_errors(T_est, T_true, start, end)
+    return float(np.sqrt(np.mean(length**2))), float(np.degrees(np.sqrt(np.mean(angle**2))))
+
+
+def kitti_segment_errors(T_est: Array, T_true: Array) -> tuple[float, float] | None:
+    """Relative errors of the KITTI odometry benchmark: ``(t_rel_percent, r_rel_deg_per_100m)``.
+
+    Mean over all segments of 100, 200, ..., 800 m of true path that start at every tenth pose, of the segment's
+    translation and rotation error divided by its nominal length (Geiger et al., *Are we ready for autonomous driving?*,
+    CVPR 2012, and its devkit). None if no segment fits, i.e. the path is not longer than 100 m.
+    """
+    distance = _distance_along(T_true)
+    start, length = np.meshgrid(np.arange(0, len(T_true), KITTI_START_STEP), KITTI_SEGMENT_LENGTHS_M, indexing="ij")
+    # The devkit ends a segment at the first pose that lies strictly further than the nominal length.
+    end = np.searchsorted(distance, distance[start] + length, side="right")
+    fits = end < len(T_true)
+    if not fits.any():
+        return None
+    start, end, length = start[fits], end[fits], length[fits]
+    translation, rotation = _relative_errors(T_est, T_true, start, end)
+    return 100.0 * float(np.mean(translation / length)), 100.0 * float(np.degrees(np.mean(rotation / length)))
+
+
+def match_landmarks(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, IntArray]:
+    """Rows of the estimated landmarks that have a known true position, and the rows of that truth: (n,), (n,).
+
+    An id that occurs several times in the estimate is matched every time.
+    """
+    order = np.argsort(truth.landmark)
+    place = np.searchsorted(truth.landmark, landmarks.id, sorter=order)
+    known = np.isin(landmarks.id, truth.landmark)
+    return np.flatnonzero(known), order[place[known]]
+
+
+def landmark_rmse(landmarks: Landmarks, truth: Truth) -> float | None:
+    """Root mean square distance in metres of estimated landmarks from their true positions, no alignment.
+
+    None if no estimated landmark has a known true position.
+    """
+    rows, truth_rows = match_landmarks(landmarks, truth)
+    if not len(rows):
+        return None
+    error = landmarks.position_m[rows] - truth.position_m[truth_rows]
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))

@@ -1,0 +1,99 @@
+"""Figures of posteriors: the map before and after smoothing, and the sparsity that makes it cheap."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ekfslam.arrays import IntArray
+from ekfslam.data.sequence import Truth
+from ekfslam.figures.run import (
+    _LANDMARK_COLOR,
+    _add_ellipses,
+    _dot_size,
+    _draw_paths,
+    save_figure,
+    styled,
+)
+from ekfslam.filters.result import Result
+from ekfslam.smoother.sparse.information import JointInformation
+
+_CELLS = 500  # across a picture of a sparsity pattern
+
+
+@styled
+def plot_map_before_and_after(before: Result, after: Result, truth: Truth | None = None) -> Figure:
+    """Two maps from above at one scale, landmarks with 2-sigma ellipses: the filter's, and the posterior's.
+
+    The view is that of the smoothed trajectory's middle half of the drive, where ellipses are large enough to see.
+    """
+    path = after.T_world_imu[:, :2, 3]
+    quarter = len(path) // 4
+    low, high = path[quarter : 3 * quarter + 1].min(axis=0), path[quarter : 3 * quarter + 1].max(axis=0)
+    margin = 0.1 * (high - low).max() + 5.0
+    low, high = low - margin, high + margin
+    aspect = float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 2.0))
+    figure = Figure(figsize=(10.0, 4.6 * aspect + 1.5))
+    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    for ax, result, title in ((axes[0], before, "filter"), (axes[1], after, "posterior")):
+        ax.set_aspect("equal", adjustable="box")
+        ax.set_xlim(low[0], high[0])
+        ax.set_ylim(low[1], high[1])
+        landmarks = result.landmarks
+        inside = ((landmarks.position_m[:, :2] > low) & (landmarks.position_m[:, :2] < high)).all(axis=1)
+        xy, covariance = landmarks.position_m[inside, :2], landmarks.covariance[inside, :2, :2]
+        _add_ellipses(ax, xy, covariance, _LANDMARK_COLOR, 0.7, 0.6, share=0.3)
+        ax.plot(*xy.T, ".", color=_LANDMARK_COLOR, markersize=_dot_size(len(xy)), label="landmark, 2 sigma")
+        _draw_paths(ax, {result.mode: result}, truth)
+        spread = np.sqrt(np.median(np.trace(covariance, axis1=1, axis2=2))) if len(xy) else np.nan
+        ax.set_title(f"{title}: median landmark deviation {spread:.3g} m")
+        ax.set_xlabel("x [m]")
+        ax.legend(loc="best")
+    axes[0].set_ylabel("y [m]")
+    return figure
+
+
+@styled
+def plot_sparsity(information: JointInformation) -> Figure:
+    """Which blocks of the information matrix and of its Cholesky factor are not zero: one cell is many blocks."""
+    figure = Figure(figsize=(10.0, 5.2))
+    e = information.elimination
+    size = e.frames + e.landmarks
+    axes = figure.subplots(1, 2)
+    for ax, (row, column), title, order in (
+        (axes[0], information.pattern(), "information matrix", "poses, then landmarks"),
+        (axes[1], information.factor_pattern(), "its Cholesky factor", "in the order of elimination"),
+    ):
+        _draw_pattern(ax, row, column, size)
+        ax.set_title(f"{title}: {len(row):,} blocks, {100 * len(row) / (size * (size + 1) / 2):.2g} % of the triangle")
+        ax.set_xlabel(f"block ({order})")
+    axes[0].set_ylabel("block")
+    return figure
+
+
+def _draw_pattern(ax: Axes, row: IntArray, column: IntArray, size: int) -> None:
+    cells = min(_CELLS, size)
+    count, _, _ = np.histogram2d(row, column, bins=cells, range=[[0, size], [0, size]])
+    # Any block at all shows, full cells are black.
+    shade = np.where(count > 0, 0.35 + 0.65 * np.minimum(count / (size / cells) ** 2, 1.0), 0.0)
+    ax.imshow(shade, cmap="Greys", vmin=0, vmax=1, extent=(0, size, size, 0), interpolation="nearest")
+    ax.grid(False)
+
+
+def save_posterior_figures(
+    directory: str | Path, before: Result, after: Result, information: JointInformation, truth: Truth | None = None
+) -> list[Path]:
+    """Write ``map_before_and_after.png`` and ``sparsity.png`` into a directory; returns their paths."""
+    figures: Mapping[str, Figure] = {
+        "map_before_and_after": plot_map_before_and_after(before, after, truth),
+        "sparsity": plot_sparsity(information),
+    }
+    paths = []
+    for name, figure in figures.items():
+        paths.append(Path(directory) / f"{name}.png")
+        save_figure(figure, paths[-1])
+    return paths

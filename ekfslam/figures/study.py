@@ -1,0 +1,172 @@
+"""Figures of a Monte Carlo study: NEES against time, errors of runs against their bounds, NEES run by run.
+
+As in `ekfslam.figures.run`, every function returns a `matplotlib.figure.Figure`, and a variant keeps its colour.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from ekfslam.arrays import Array
+from ekfslam.evaluation.consistency import anees, chi2_bounds, time_average
+from ekfslam.evaluation.study import BOUND_PROBABILITY
+from ekfslam.figures.run import save_figure, styled
+from ekfslam.studies.study import StudyArchive
+
+VARIANT_STYLES: dict[str, dict[str, Any]] = {
+    "invariant": {"color": "#0072B2", "linestyle": "-"},
+    "fej": {"color": "#009E73", "linestyle": "-."},
+    "standard": {"color": "#D55E00", "linestyle": "--"},
+    "invariant-iterated": {"color": "#56B4E9", "linestyle": (0, (4, 1, 1, 1))},
+    "standard-iterated": {"color": "#CC79A7", "linestyle": ":"},
+}
+_PROBABILITIES = (BOUND_PROBABILITY, 0.95)  # wide bounds first, the narrow ones are drawn over them
+_SHOWN_RUNS = 12  # lines of errors; more are a grey blot
+_SHOWN_PERCENT = 98.0  # of the errors are within the view; a run that diverges must not flatten the others
+
+
+@styled
+def plot_study_nees(archive: StudyArchive, level: str) -> Figure:
+    """Pose and landmark NEES against time: mean over runs of every variant, with its 95 % and 99.9 % bounds.
+
+    The landmark NEES of a frame is itself a mean over landmarks, which share the pose's error: its bounds are those of
+    a single landmark, and so err on the wide side.
+    """
+    figure = Figure(figsize=(9.0, 6.4))
+    axes = figure.subplots(2, 1, sharex=True)
+    time_s, variants = archive.time_s(level), _done(archive, level)
+    runs = int(archive.done[level].sum())
+    for ax, (field, name, dof) in zip(axes, (("pose_nees", "pose", 6), ("landmark_nees", "landmark", 3)), strict=True):
+        for probability, shade in zip(_PROBABILITIES, ("0.90", "0.80"), strict=True):
+            low, high = chi2_bounds(dof, probability, runs)
+            ax.axhspan(low, high, color=shade, linewidth=0, label=f"{100 * probability:g} % bounds", zorder=0.5)
+        ax.axhline(dof, color="black", linewidth=0.8, label="expected")
+        for variant, values in variants.items():
+            mean, _, _ = anees(values[field], dof, BOUND_PROBABILITY)
+            ax.plot(time_s, mean, **VARIANT_STYLES[variant], label=variant)
+        _log_axis(ax)
+        ax.set_ylabel(f"{name} NEES ({dof} expected) [-]")
+        ax.margins(x=0.01)
+    axes[-1].set_xlabel("time [s]")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    figure.suptitle(f"{level}: NEES, mean of {runs} runs")
+    return figure
+
+
+@styled
+def plot_study_errors(archive: StudyArchive, level: str) -> Figure:
+    """Position errors (x, y) and yaw error of the first runs against time, one column a variant, same scales.
+
+    Bounds are three sigma as the filter states them, median over runs; titles say how many errors of all runs are
+    within their own run's bounds (99.7 % expected).
+    """
+    variants = _done(archive, level)
+    time_s = archive.time_s(level)
+    rows = (("x [m]", "position_error", 0, 1.0), ("y [m]", "position_error", 1, 1.0), ("yaw [deg]", "", 2, 180 / np.pi))
+    figure = Figure(figsize=(2.9 * len(variants) + 0.5, 6.6))
+    axes = figure.subplots(3, len(variants), sharex=True, sharey="row", squeeze=False)
+    for column, (variant, values) in zip(axes.T, variants.items(), strict=True):
+        color = VARIANT_STYLES[variant]["color"]
+        inside = []
+        for ax, (label, field, axis, scale) in zip(column, rows, strict=True):
+            errors = scale * values[field or "rotation_error"][..., axis]
+            bounds = scale * values["three_sigma"][..., axis + (0 if field else 3)]
+            known = np.isfinite(errors)
+            inside.append(np.abs(errors[known]) <= bounds[known])
+            ax.plot(time_s, errors[:_SHOWN_RUNS].T, color="0.25", linewidth=0.5)
+            seen = known.any(axis=0)
+            middle = np.nanmedian(bounds[:, seen], axis=0)
+            for side in (-1, 1):
+                ax.plot(time_s[seen], side * middle, color=color, linewidth=1.6)
+            ax.margins(x=0.01)
+            if ax.get_subplotspec().is_first_col():
+                ax.set_ylabel(label)
+        column[0].set_title(f"{variant}\n{100 * np.concatenate(inside).mean():.1f} % inside own 3 sigma")
+        column[-1].set_xlabel("time [s]")
+    for row, (_, field, axis, scale) in zip(axes, rows, strict=True):
+        row[0].set_ylim(*_view(archive, level, field or "rotation_error", axis, scale))
+    figure.align_ylabels()
+    runs = int(archive.done[level].sum())
+    shown = f"{_SHOWN_RUNS} of {runs} runs" if runs > _SHOWN_RUNS else f"{runs} runs"
+    figure.suptitle(f"{level}: estimate minus truth of {shown}, world axes, with the median 3-sigma bounds")
+    return figure
+
+
+@styled
+def plot_study_boxes(archive: StudyArchive) -> Figure:
+    """Time-averaged pose NEES of every run: median, quartiles and all runs, per level and variant, on a log axis."""
+    levels = [level for level, mask in archive.done.items() if mask.any()]
+    variants = archive.study.variants
+    figure = Figure(figsize=(2.4 + 1.9 * len(levels), 4.4))
+    axes = figure.subplots(1, len(levels), sharey=True, squeeze=False)[0]
+    for ax, level in zip(axes, levels, strict=True):
+        for place, (variant, values) in enumerate(_done(archive, level).items()):
+            averages = time_average(values["pose_nees"])
+            averages = averages[np.isfinite(averages)]
+            color = VARIANT_STYLES[variant]["color"]
+            ax.boxplot(
+                averages,
+                positions=[place],
+                widths=0.6,
+                showfliers=False,
+                medianprops={"color": color, "linewidth": 1.8},
+                boxprops={"color": color},
+                whiskerprops={"color": color},
+                capprops={"color": color},
+            )
+            spread = np.linspace(-0.22, 0.22, len(averages))
+            ax.plot(place + spread, averages, ".", color=color, markersize=3.0, alpha=0.6, markeredgewidth=0)
+        ax.axhline(6.0, color="black", linewidth=0.8, zorder=0.9)
+        ax.set_xticks(range(len(variants)), variants, rotation=40, ha="right", rotation_mode="anchor")
+        ax.grid(False, axis="x")
+        ax.set_title(f"{level}, {int(archive.done[level].sum())} runs")
+    _log_axis(axes[0])
+    axes[0].set_ylabel("pose NEES, time average of a run [-]")
+    figure.suptitle("Pose NEES run by run; line: 6 expected")
+    return figure
+
+
+def save_study_figures(directory: str | Path, archive: StudyArchive) -> list[Path]:
+    """Write ``boxes.png``, and ``nees_<level>.png`` and ``errors_<level>.png`` of every level; the paths written."""
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    figures = {"boxes": plot_study_boxes(archive)}
+    for level in archive.study.levels:
+        figures[f"nees_{level}"] = plot_study_nees(archive, level)
+        figures[f"errors_{level}"] = plot_study_errors(archive, level)
+    paths = []
+    for name, figure in figures.items():
+        paths.append(directory / f"{name}.png")
+        save_figure(figure, paths[-1])
+    return paths
+
+
+def _done(archive: StudyArchive, level: str) -> dict[str, dict[str, Array]]:
+    """The values of the runs that are in, variant by variant."""
+    done = archive.done[level]
+    return {
+        variant: {field: value[done] for field, value in values.items()}
+        for variant, values in archive.data[level].items()
+    }
+
+
+def _view(archive: StudyArchive, level: str, field: str, axis: int, scale: float) -> tuple[float, float]:
+    """Symmetric limits around the bulk of the errors of all variants."""
+    errors = np.concatenate([values[field][..., axis].ravel() for values in _done(archive, level).values()])
+    errors = np.abs(scale * errors[np.isfinite(errors)])
+    limit = 1.4 * float(np.percentile(errors, _SHOWN_PERCENT)) if len(errors) else 1.0
+    return -limit, limit
+
+
+def _log_axis(ax: Axes) -> None:
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0), numticks=20))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())

@@ -1,0 +1,247 @@
+"""What a run leaves behind: trajectory, map, innovation statistics and bookkeeping of one mode on one sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Sequence as SequenceType
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.sequence import Noise
+from ekfslam.filters.log import Log
+from ekfslam.geometry.camera import StereoCamera
+
+ERROR_CONVENTION = (
+    "T_imu_world = exp(xi^) T_hat, xi = [rho; theta] translation first; landmark m = m_hat + d in world; "
+    "covariances are of xi and d"
+)
+
+# Why a filter rejected an observation; the codes of `Rejections.reason`. Archives hold the codes: "row mismatch", now
+# the business of `ekfslam.data.hygiene`, keeps its place.
+REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera", "moving")
+
+
+# The rules of `ekfslam.data.hygiene` in the order in which they are applied, with the key of ``[hygiene]`` that
+# switches each; the index is the code of `HygieneReport.rule`.
+_SWITCHES: dict[str, str] = {
+    "repeated frame": "restart_at_repeats",
+    "jump": "jump_sigma",
+    "re-used id": "reused_id_sigma",
+    "disparity": "min_disparity_sigma",
+    "row mismatch": "max_row_mismatch_sigma",
+    "depth": "max_depth_error",
+    "too short": "min_observations",
+}
+RULES: tuple[str, ...] = tuple(_SWITCHES)
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Every landmark a run has estimated (full mode: in the order of first sight, which is that of the log).
+
+    Args:
+        id: (M,) landmark id; an id occurs again for each time a retired landmark started afresh.
+        position_m: (M, 3) last estimate in world.
+        covariance: (M, 3, 3) of the position error d, m^2.
+        initial_position_m: (M, 3) triangulation at first sight.
+        first_frame, last_frame: (M,) frames of the first and last accepted observation.
+        observations: (M,) number of accepted observations, the first included.
+    """
+
+    id: IntArray
+    position_m: Array
+    covariance: Array
+    initial_position_m: Array
+    first_frame: IntArray
+    last_frame: IntArray
+    observations: IntArray
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def only(self, which: IntArray | NDArray[np.bool_]) -> Landmarks:
+        """Some of the landmarks."""
+        return Landmarks(*(getattr(self, f.name)[which] for f in fields(Landmarks)))
+
+    @staticmethod
+    def concatenate(parts: SequenceType[Landmarks]) -> Landmarks:
+        """All landmarks of the parts, in their order."""
+        return Landmarks(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Landmarks)))
+
+    @staticmethod
+    def empty() -> Landmarks:
+        none = np.empty(0, dtype=np.int64)
+        return Landmarks(none, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), none, none, none)
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """Per-frame innovation statistics.
+
+    Args:
+        nis: (T,) normalised innovation squared ``r^T S^-1 r`` of the accepted observations; 0 where there are none.
+        dof: (T,) its degrees of freedom (three a landmark).
+        accepted: (T,) observations that updated or started a landmark.
+        rejected: (T,) observations that did not.
+    """
+
+    nis: Array
+    dof: IntArray
+    accepted: IntArray
+    rejected: IntArray
+
+    @staticmethod
+    def empty(frames: int) -> Innovation:
+        """Of a run without observations."""
+        none = np.zeros(frames, dtype=np.int64)
+        return Innovation(np.zeros(frames), none, none, none)
+
+
+@dataclass(frozen=True)
+class Rejections:
+    """Every rejected observation: (R,) frame, landmark id, and index into `REASONS`."""
+
+    frame: IntArray
+    landmark: IntArray
+    reason: IntArray
+
+    @staticmethod
+    def empty() -> Rejections:
+        none = np.empty(0, dtype=np.int64)
+        return Rejections(none, none, none)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What the joint filter has estimated besides poses and landmarks, after each of T frames.
+
+    Args:
+        name, unit: Of each of the p parameters.
+        prior_std: (p,) deviations before the first frame.
+        value, std: (T, p) estimates and their deviations.
+    """
+
+    name: tuple[str, ...]
+    unit: tuple[str, ...]
+    prior_std: Array
+    value: Array
+    std: Array
+
+    @property
+    def is_observed(self) -> NDArray[np.bool_]:
+        """Whether (p,) the recording has said more about a parameter than its prior: its deviation has halved."""
+        return self.std[-1] < 0.5 * self.prior_std
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """One line a parameter: the last estimate, its deviation, and whether the recording told it."""
+        rows = zip(self.name, self.unit, self.prior_std, self.value[-1], self.std[-1], self.is_observed, strict=True)
+        return tuple(
+            f"{name}: {value:.3g} +- {std:.2g} {unit} (before: 0 +- {prior:.2g})"
+            + ("" if is_observed else ", not observable here")
+            for name, unit, prior, value, std, is_observed in rows
+        )
+
+
+@dataclass(frozen=True)
+class HygieneReport:
+    """What hygiene found and did, one row a finding, in the order of the rules and then of the frames.
+
+    Args:
+        observations: Number of observations looked at.
+        rule: (n,) index into `RULES`.
+        frame: (n,) frame of the observation that was dropped, or with which the new piece of a cut track begins.
+        landmark: (n,) id of its track in the recording.
+        continuation: (n,) id that a cut track has from there on; -1 where the observation was dropped.
+    """
+
+    observations: int
+    rule: IntArray
+    frame: IntArray
+    landmark: IntArray
+    continuation: IntArray
+
+    @property
+    def dropped(self) -> int:
+        """Number of observations dropped, each by one rule."""
+        return int((self.continuation < 0).sum())
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Findings by rule, and the observations dropped in all."""
+        found = np.bincount(self.rule, minlength=len(RULES)).tolist()
+        return {
+            "dropped by hygiene": self.dropped,
+            **{f"hygiene: {name}": count for name, count in zip(RULES, found, strict=True)},
+        }
+
+    def lines(self, config: Mapping[str, Any]) -> tuple[str, ...]:
+        """One line a rule: what was found, where, and what was done; or that ``config`` (``[hygiene]``) has it off."""
+        lines = []
+        for code, (name, switch) in enumerate(_SWITCHES.items()):
+            found = self.rule == code
+            tracks, frames = np.unique(self.landmark[found]), np.unique(self.frame[found])
+            cut = int((self.continuation[found] >= 0).sum())
+            dropped = int(found.sum()) - cut
+            line = f"{name}: " + ("nothing found" if config[switch] else "switched off")
+            if len(frames):
+                what = " and ".join([f"{dropped} observations dropped"] * bool(dropped) + [f"{cut} cuts"] * bool(cut))
+                line = f"{name}: {what}, in {len(tracks)} tracks, {len(frames)} frames from {frames[0]} to {frames[-1]}"
+            lines.append(line)
+        return (*lines, f"{self.dropped} of {self.observations} observations dropped in all")
+
+    @staticmethod
+    def empty(observations: int) -> HygieneReport:
+        """Of clean tracks."""
+        none = np.empty(0, dtype=np.int64)
+        return HygieneReport(observations, none, none, none, none)
+
+
+@dataclass(frozen=True)
+class Result:
+    """One mode run on one sequence.
+
+    Args:
+        mode: ``dead-reckoning``, ``mapping-only``, ``full``, or of a posterior ``smoothed`` or ``as filtered``.
+        sequence_name: Name of the sequence.
+        time_s: (T,) stamps.
+        T_world_imu: (T, 4, 4) estimated poses.
+        covariance: (T, 6, 6) of the stored error ``xi`` (see `ERROR_CONVENTION`).
+        landmarks: The map.
+        innovation: Per-frame statistics.
+        rejections: Every rejected observation.
+        ms_per_frame: (T,) wall-clock time spent on each frame.
+        counts: Totals worth knowing: accepted, rejected per reason, retired, reappeared, findings of hygiene. What was
+            accepted, rejected, and dropped by hygiene adds up to all observations.
+        config: The resolved configuration as nested dictionaries.
+        noise: The measurement noise that was assumed.
+        camera, T_cam_imu: The calibration that was assumed.
+        log: What the joint filter conditioned on; ``landmarks`` are in its order (full mode only).
+        hygiene: What was done to the tracks before (None: nothing, as in dead reckoning).
+        parameters: What else was estimated: calibration, roll and pitch (None: nothing).
+        attributes: Sequence attributes, versions, seed, input checksum; ``log_likelihood`` of the innovations of
+            what was accepted (runs that reject alike may be compared by it).
+    """
+
+    mode: str
+    sequence_name: str
+    time_s: Array
+    T_world_imu: Array
+    covariance: Array
+    landmarks: Landmarks
+    innovation: Innovation
+    rejections: Rejections
+    ms_per_frame: Array
+    counts: Mapping[str, int]
+    config: Mapping[str, Any]
+    noise: Noise
+    camera: StereoCamera
+    T_cam_imu: Array
+    log: Log | None = None
+    hygiene: HygieneReport | None = None
+    parameters: Parameters | None = None
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)

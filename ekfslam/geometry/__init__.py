@@ -1,0 +1,1 @@
+"""Pure maths: rigid motions, the stereo camera, motion over an interval."""

@@ -1,0 +1,84 @@
+"""The report's SE(3) prediction from body velocities, and its covariance.
+
+A twist ``u = [v; w]`` (m/s, rad/s, IMU frame) sampled at ``t[k]`` drives the interval ``(t[k-1], t[k]]``. Its white
+noise has covariance W per sample. The state is the report's inverse pose ``T_imu_world`` with error
+``T_imu_world = exp(xi^) T_hat``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.geometry import se3
+
+
+def increment(twist: Array, tau_s: Array | float) -> Array:
+    """``E = exp(-tau u^)`` of eq. (1), the prediction ``T_imu_world+ = E T_imu_world``: (..., 6) to (..., 4, 4)."""
+    return se3.exp(-np.asarray(tau_s)[..., None] * twist)
+
+
+def error_jacobian(E: Array) -> Array:
+    """``F = Ad_E`` of eq. (2): how the pose error goes through the prediction, (..., 4, 4) to (..., 6, 6)."""
+    return se3.adjoint(E)
+
+
+def twist_jacobian(twist: Array, tau_s: Array | float) -> Array:
+    """``G = tau J_l(-tau u)``: (..., 6) to (..., 6, 6). A velocity error adds ``-G`` times itself to the pose error."""
+    tau = np.asarray(tau_s)[..., None]
+    return tau[..., None] * se3.left_jacobian(-tau * twist)
+
+
+def process_noise(twist: Array, tau_s: Array | float, twist_std: Array, misalignment_rad: float = 0.0) -> Array:
+    """``Q = G W G^T`` with G of `twist_jacobian`, eq. (2): (..., 6) to (..., 6, 6).
+
+    ``twist_std`` (6,) holds the standard deviations per sample, m/s and rad/s; ``W`` is the diagonal of their squares,
+    and where the frame of the velocities is turned by small angles of deviation ``misalignment_rad`` against the IMU,
+    ``B B^T misalignment_rad^2`` besides, with ``B = [v^; w^]``.
+    """
+    twist = np.asarray(twist, dtype=float)
+    G = twist_jacobian(twist, tau_s)
+    Q = (G * np.asarray(twist_std) ** 2) @ np.swapaxes(G, -1, -2)
+    if misalignment_rad:
+        turned = misalignment_rad * G @ turned_by(twist)
+        Q = Q + turned @ np.swapaxes(turned, -1, -2)
+    return Q
+
+
+def level_frame(up: Array) -> tuple[Array, Array]:
+    """The level frame of an IMU that knows which way is up: z up, x the horizontal part of its own x axis.
+
+    Automotive units (OXTS) give velocities in it: forward, leftward and upward over level ground, whatever the body's
+    roll and pitch are.
+
+    Args:
+        up: (3,) unit vector against gravity, in the IMU frame; not along its x axis.
+
+    Returns:
+        ``R_imu_level`` (3, 3), and Z (3, 3): where up turns by ``exp(phi^)``, the frame turns by ``exp((Z phi)^)``.
+    """
+    forward = np.array([1.0, 0.0, 0.0])
+    sine = up[0]
+    cosine = np.sqrt(1.0 - sine**2)
+    x = (forward - sine * up) / cosine
+    R_imu_level = np.column_stack([x, np.cross(up, x), up])
+    # The part of phi along up turns nothing; instead the frame turns about up as far as keeps its y axis off forward.
+    return R_imu_level, np.eye(3) - np.outer(up, up) + sine / cosine * np.outer(up, x)
+
+
+def imu_twist(level_twist: Array, up: Array) -> tuple[Array, Array, Array]:
+    """Eq. (8): velocities of the level frame, (6,) m/s and rad/s, in the IMU frame.
+
+    Returns:
+        The velocities (6,), their derivative (6, 6) by ``level_twist``, and (6, 3) by phi where up is ``exp(phi^) up``.
+    """
+    R, Z = level_frame(up)
+    by_level = np.zeros((6, 6))
+    by_level[:3, :3] = by_level[3:, 3:] = R
+    twist = by_level @ level_twist
+    return twist, by_level, -turned_by(twist) @ Z
+
+
+def turned_by(twist: Array) -> Array:
+    """``[v^; w^]``, velocities (..., 6) to (..., 6, 3): minus their derivative by small angles that turn them."""
+    return np.concatenate([se3.skew(twist[..., :3]), se3.skew(twist[..., 3:])], axis=-2)

@@ -1,0 +1,127 @@
+"""Noise from the data: what a recording's velocities are worth, found without truth.
+
+Measured velocities are a slowly changing signal plus white noise. The first differences of white noise of variance s^2
+have autocovariance 2 s^2 at lag 0 and -s^2 at lag 1; those of a signal that walks or swings slowly have none below 0.
+So ``s^2 = -cov(d_k, d_k+1)`` sees the noise alone. (Second and third differences see the vehicle itself shake: on clean
+KITTI velocities they find ten times the noise there is.)
+
+What no difference can see, slow errors of scale and alignment and what a track does that no white noise describes, is
+given by the constants below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.data.sequence import Noise, VelocityFrame
+
+# Errors of automotive velocities that are there even if no noise is: of each sample, and of the angles between their
+# frame and that of the IMU.
+MOTION_STD = np.repeat([0.15, 0.0008], 3)
+MISALIGNMENT_RAD = np.deg2rad(0.07)
+
+# Roll and pitch of a road vehicle.
+TILT_RAD = np.deg2rad(3.0)
+
+# Of tracks of a KLT tracker: pixel noise, and how the tracked point wanders, see `Noise`. That errors of tracks agree
+# among themselves for many frames is not part of the model; to make up for it, all three are larger than what single
+# innovations show: the normalised square of these is about 0.1 a degree of freedom.
+PIXEL_STD_PX = 0.7
+DRIFT = 0.4
+BEARING_DRIFT_RAD = 0.00085
+MARGIN = 3.0
+
+_BLOCKS = 20  # of the jackknife
+_ONE_SIDED_95 = 1.645  # deviations
+_SPAN = 10  # samples over which the slow walk of the velocities is measured
+
+
+@dataclass(frozen=True)
+class VelocityNoise:
+    """What the differences of velocities say.
+
+    Args:
+        sigma: (2,) white noise per sample of the linear (m/s) and the angular velocities (rad/s), each axis.
+        sigma_error: (2,) their standard errors (jackknife over 20 stretches); 0 where no noise is seen.
+        limit: (2,) what they are below with a confidence of 95 %, also where none is seen:
+            ``s^2 + 1.645 e``, with e the standard error of ``s^2``.
+        walk: (2,) how far the true velocities change per sample, root mean square.
+    """
+
+    sigma: Array
+    sigma_error: Array
+    limit: Array
+    walk: Array
+
+    @property
+    def texts(self) -> tuple[str, str]:
+        """The noise of the linear and of the angular velocities in words: with its error, or what it is below."""
+        v, w = (
+            with_error(sigma, error) if sigma > 0 else f"below {limit:.2g} (95 %)"
+            for sigma, error, limit in zip(self.sigma, self.sigma_error, self.limit, strict=True)
+        )
+        return v, w
+
+
+def velocity_noise(twist: Array) -> VelocityNoise:
+    """White noise and walk of velocities (T, 6), m/s and rad/s."""
+    d = np.diff(np.asarray(twist, dtype=float), axis=0)
+    if len(d) < 2:
+        return VelocityNoise(np.zeros(2), np.full(2, np.inf), np.full(2, np.inf), np.zeros(2))
+    product, square = d[1:] * d[:-1], d**2
+    sigma = _white(product.mean(axis=0))
+    parts = np.array_split(product, min(_BLOCKS, len(product)))
+    total = product.sum(axis=0)
+    left_out = np.array([(total - part.sum(axis=0)) / max(len(product) - len(part), 1) for part in parts])
+    error = _jackknife(np.array([_white(lag_1) for lag_1 in left_out]))
+    limit = _white(np.minimum(product.mean(axis=0), 0.0) - _ONE_SIDED_95 * _jackknife(left_out))
+
+    # The walk is what is left of the differences, or what slow means show, whichever is more.
+    lag_1 = np.minimum(product.mean(axis=0), 0.0)
+    fast = np.maximum(square.mean(axis=0) + 2.0 * lag_1, 0.0)
+    whole = len(twist) // _SPAN * _SPAN
+    slow = np.zeros(6)
+    if whole >= 2 * _SPAN:
+        means = np.asarray(twist)[:whole].reshape(-1, _SPAN, 6).mean(axis=1)
+        # Means of n samples of a walk differ by n - (n^2 - 1) / (3 n) steps' variance, those of white noise by 2 / n.
+        steps = _SPAN - (_SPAN**2 - 1) / (3 * _SPAN)
+        slow = np.maximum((np.diff(means, axis=0) ** 2).mean(axis=0) + 2.0 / _SPAN * lag_1, 0.0) / steps
+    walk = np.maximum(*(np.sqrt(variance.reshape(2, 3).mean(axis=1)) for variance in (fast, slow)))
+    return VelocityNoise(sigma, error, limit, walk)
+
+
+def _jackknife(left_out: Array) -> Array:
+    """Standard errors of estimates from those (n, ...) with one of n parts left out."""
+    return np.sqrt((len(left_out) - 1) * left_out.var(axis=0))
+
+
+def _white(lag_1: Array) -> Array:
+    """(2,) noise of linear and angular velocities from the lag-1 covariances (6,): the median of three axes."""
+    return np.median(np.sqrt(np.maximum(-lag_1, 0.0)).reshape(2, 3), axis=1)
+
+
+def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu") -> Noise:
+    """The noise that a filter shall assume for a recording that states none, from its velocities (T, 6)."""
+    found = velocity_noise(twist)
+    sigma = np.repeat(found.sigma, 3)
+    # Where the white part is below what is there anyway, smoothing the velocities brings nothing.
+    is_clean = bool((sigma <= MOTION_STD).all())
+    return Noise(
+        twist_std=sigma,
+        pixel_std_px=np.full(4, PIXEL_STD_PX),
+        twist_walk_std=None if is_clean else np.repeat(found.walk, 3),
+        motion_std=MOTION_STD,
+        misalignment_rad=MISALIGNMENT_RAD,
+        drift=DRIFT,
+        bearing_drift_rad=BEARING_DRIFT_RAD,
+        margin=MARGIN,
+        tilt_rad=TILT_RAD if velocity_frame == "level" else 0.0,
+    )
+
+
+def with_error(value: float, error: float | None) -> str:
+    """A value and its standard error, if it has one, as text."""
+    return f"{value:.3g}" if error is None else f"{value:.3g} +- {error:.2g}"

@@ -1,0 +1,89 @@
+"""`compare`: the modes side by side on one sequence, as a table, an archive and figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ekfslam.config import MODES, Config, Mode
+from ekfslam.data.sequence import Sequence
+from ekfslam.errors import IllPosedError
+from ekfslam.evaluation.summary import compare_table, summarise
+from ekfslam.figures.posterior import plot_map_before_and_after
+from ekfslam.figures.run import save_figure, save_figures
+from ekfslam.filters.result import Result
+from ekfslam.runner import run
+from ekfslam.smoother.posterior import smooth
+from ekfslam.storage.archive import write_archive
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What `compare` found.
+
+    Args:
+        sequence: The recording.
+        results: Mode to result, in the order asked for.
+        summary: The figures of merit as written to ``summary.json``.
+        skipped: Why there is no result of a mode asked for: an ill-posed posterior does not keep the others.
+    """
+
+    sequence: Sequence
+    results: dict[str, Result]
+    summary: dict[str, Any]
+    skipped: dict[str, str]
+
+    @property
+    def table(self) -> str:
+        """The summary as a Markdown table, and what is missing in it."""
+        missing = "".join(f"\nNo {mode}: {reason}\n" for mode, reason in self.skipped.items())
+        return compare_table(self.summary) + missing
+
+    def save(self, directory: str | Path) -> list[Path]:
+        """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures; returns their paths.
+
+        Raises:
+            ArchiveError: The archive cannot be written.
+            OSError: The directory cannot be written.
+        """
+        directory = Path(directory)
+        directory.mkdir(parents=True, exist_ok=True)
+        archive, summary, table = (directory / name for name in ("archive.h5", "summary.json", "summary.md"))
+        write_archive(archive, self.sequence, self.results)
+        summary.write_text(json.dumps(self.summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        notes = "".join(f"- {note}\n" for note in self.sequence.notes)
+        table.write_text(self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""), encoding="utf-8")
+        figures = save_figures(directory, self.results, self.sequence.truth)
+        if "full" in self.results and "smoothed" in self.results:
+            figures.append(directory / "map_before_and_after.png")
+            drawn = plot_map_before_and_after(self.results["full"], self.results["smoothed"], self.sequence.truth)
+            save_figure(drawn, figures[-1])
+        return [archive, summary, table, *figures]
+
+
+def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | None = None) -> Comparison:
+    """Run several modes with one configuration.
+
+    Raises:
+        ConfigError: Unknown mode.
+        InnovationError: An innovation covariance is not positive definite.
+    """
+    results: dict[str, Result] = {}
+    skipped: dict[str, str] = {}
+    for mode in modes:
+        # The filter that "smoothed" starts from need not run twice.
+        known = mode == "smoothed" and "full" in results
+        try:
+            results[mode] = smooth(results["full"]) if known else run(sequence, mode, config)
+        except IllPosedError as error:
+            skipped[mode] = str(error)
+    summary = {
+        "sequence": sequence.name,
+        "frames": len(sequence),
+        "landmarks": len(sequence.observations.ids),
+        "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
+    }
+    return Comparison(sequence, results, summary, skipped)

@@ -1,0 +1,1 @@
+"""The joint posterior over all poses and landmarks."""

@@ -1,0 +1,251 @@
+"""The joint posterior over the whole trajectory and the whole map, from what the filter logged.
+
+The filter carries only what is in view; its log is one sparse system over all poses and all landmarks. Two
+linearisations of it are offered. *As filtered* the rows stay where the filter linearised them: for the standard and the
+first-estimates variants the solution is, to rounding, the state of a dense EKF that never retired a landmark, with
+everything smoothed besides. (The invariant variant moves the errors of all landmarks with every correction, which
+frozen rows do not: they are not the filter then, and on long drives much too confident.) The *maximum a posteriori*
+linearises all rows again at their common solution, which makes it consistent by construction: every row sees the same
+unobservable directions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.config import Config, FilterConfig, PosteriorConfig
+from ekfslam.errors import PosteriorError
+from ekfslam.filters import calibration as cal
+from ekfslam.filters.log import Log
+from ekfslam.filters.observing import Rig, Sensor
+from ekfslam.filters.result import Innovation, Rejections, Result
+from ekfslam.geometry import se3
+from ekfslam.progress import progress
+from ekfslam.smoother.optimise import maximise
+from ekfslam.smoother.problem import Rows, aged
+from ekfslam.smoother.sparse.information import Elimination, JointInformation
+
+DENSE_LIMIT = 20_000  # columns of a dense covariance: 3.2 GB
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """A Gaussian over all poses and all landmarks.
+
+    Landmarks go by their row in ``id``, which is the order of the filter's `Landmarks`; frames by their number,
+    negative ones from the end. Covariances are of the stored errors (see `ekfslam`).
+
+    Args:
+        linearisation: ``map`` or ``filtered``.
+        id: (M,) landmark ids; an id occurs again where a track was split.
+        T_world_imu: (T, 4, 4) smoothed poses.
+        position_m: (M, 3) the map.
+        weight: (K,) robust weight of each observation of the log.
+        costs: Cost (half the sum of squares, under the kernel) before each iteration and at the end.
+        information: The factorised system.
+    """
+
+    linearisation: str
+    id: IntArray
+    T_world_imu: Array
+    position_m: Array
+    weight: Array
+    costs: tuple[float, ...]
+    information: JointInformation
+
+    @property
+    def cost(self) -> float:
+        """Cost at the end."""
+        return self.costs[-1]
+
+    @cached_property
+    def pose_covariance(self) -> Array:
+        """(T, 6, 6) marginals of all poses."""
+        return self.information.pose_covariances()
+
+    @cached_property
+    def landmark_covariance(self) -> Array:
+        """(M, 3, 3) marginals of all landmarks."""
+        return self.information.landmark_covariances()
+
+    def joint_covariance(self, frames: ArrayLike = (), landmarks: ArrayLike = ()) -> Array:
+        """Covariance (6a+3b, 6a+3b) of a poses and b landmarks, given by frame and by row, in that order.
+
+        Raises:
+            PosteriorError: There is no such frame or landmark.
+        """
+        e = self.information.elimination
+        return self.information.covariance(
+            _checked("frame", frames, e.frames), _checked("landmark", landmarks, e.landmarks)
+        )
+
+    def dense_covariance(self, frames: ArrayLike = (-1,)) -> Array:
+        """Covariance of some poses (by default the last: the state of the EKF) and of all landmarks, in their order.
+
+        Raises:
+            PosteriorError: There is no such frame, or the matrix would be wider than 20000.
+        """
+        e = self.information.elimination
+        width = 6 * np.size(frames) + 3 * e.landmarks
+        if width > DENSE_LIMIT:
+            raise PosteriorError(
+                f"a dense covariance of {width} columns is too large (limit {DENSE_LIMIT}); "
+                "joint_covariance gives any block of it"
+            )
+        return self.joint_covariance(frames, np.arange(e.landmarks))
+
+    @property
+    def log_determinant(self) -> float:
+        """Log of the determinant of the covariance of everything but directions of the first pose known for certain."""
+        return self.information.log_determinant
+
+    def sample(self, rng: np.random.Generator, size: int = 1) -> tuple[Array, Array]:
+        """Independent draws: poses ``T_world_imu`` (size, T, 4, 4) and landmarks (size, M, 3)."""
+        eps, d = self.information.sample(rng, size)
+        return (
+            se3.inverse(se3.exp(eps - self.information.eps) @ se3.inverse(self.T_world_imu)),
+            self.position_m + d - self.information.d,
+        )
+
+
+def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterior:
+    """The joint posterior of a run of the joint filter, from its `Result` (read from an archive or not).
+
+    Args:
+        result: A result of mode ``full``.
+        config: Linearisation and kernel; by default those that the result was configured with.
+
+    Raises:
+        PosteriorError: The result has no log, or estimates what a posterior does not know.
+        IllPosedError: Something is undetermined; lists landmark ids or frames.
+    """
+    if result.log is None:
+        raise PosteriorError(f"{result.sequence_name}: a result of mode {result.mode!r} has no log; run mode 'full'")
+    stored = Config().with_overrides(result.config)
+    config = config or stored.posterior
+    if config.linearisation == "filtered" and result.parameters is not None:
+        raise PosteriorError(
+            f"{result.sequence_name}: the filter has also estimated {', '.join(result.parameters.name)}, which its "
+            "log does not hold; there is only the linearisation 'map'"
+        )
+    return posterior_of_log(
+        result.log,
+        _rig(result),
+        result.landmarks.position_m,
+        config,
+        stored.filter,
+        name=result.sequence_name,
+    )
+
+
+def _rig(result: Result) -> Rig:
+    """The rig of a run, with the calibration that it has found."""
+    rig, found = Rig(result.camera, result.T_cam_imu, result.noise), result.parameters
+    if found is None:
+        return rig
+    parameters = np.array([dict(zip(found.name, found.value[-1], strict=True)).get(name, 0.0) for name in cal.NAMES])
+    if cal.time_offset(parameters):
+        raise PosteriorError(f"{result.sequence_name}: there is no posterior of a run that estimates a time offset")
+    return cal.calibrated(rig, parameters)
+
+
+def posterior_of_log(
+    log: Log,
+    sensor: Sensor,
+    positions_m: Array,
+    config: PosteriorConfig | None = None,
+    filter_config: FilterConfig | None = None,
+    name: str = "posterior",
+) -> Posterior:
+    """`posterior` of any sensor's log.
+
+    Args:
+        log, sensor: What was observed, and by what.
+        positions_m: (M, 3) the filter's last estimates of the landmarks of the log, to start from.
+        config: Linearisation and kernel.
+        filter_config: Says what is in view.
+        name: For the progress bar.
+
+    Raises:
+        IllPosedError: Something is undetermined; lists landmark ids or frames.
+    """
+    config = config or PosteriorConfig()
+    rows = Rows(aged(log, sensor), sensor)
+    elimination = Elimination(log.frames, log.landmarks, log.frame, log.landmark, log.id)
+    if config.linearisation == "filtered":
+        if sensor.noise.is_more_than_white:
+            raise PosteriorError(
+                f"{name}: the filter let velocities or landmarks walk or has found out its tilt, which its log does "
+                "not hold; there is only the linearisation 'map', of white velocities and landmarks that stay"
+            )
+        information = JointInformation(elimination, rows.as_filtered())
+        T_imu_world = se3.exp(information.eps) @ log.T_predicted
+        return Posterior(
+            "filtered",
+            log.id,
+            se3.inverse(T_imu_world),
+            log.first_position_m + information.d,
+            np.ones(log.observations),
+            (information.cost,),
+            information,
+        )
+    iterations = progress(range(config.max_iterations), f"{name}: smoothing")
+    found = maximise(
+        rows, elimination, rows.filtered_state(positions_m), config, filter_config or FilterConfig(), iterations
+    )
+    return Posterior(
+        "map",
+        log.id,
+        se3.inverse(found.state.T_imu_world),
+        found.state.positions_m,
+        found.weight,
+        found.costs,
+        found.information,
+    )
+
+
+def smooth(result: Result, config: PosteriorConfig | None = None, found: Posterior | None = None) -> Result:
+    """The posterior of a full run as a `Result` of its own: smoothed trajectory, map, and all their marginals.
+
+    Its mode is ``smoothed`` (``as filtered`` if linearised so). Arguments and errors are those of `posterior`, whose
+    return value may be given as ``found`` if it is known already.
+    """
+    begin = perf_counter()
+    found = found or posterior(result, config)
+    T, landmarks = len(result.time_s), result.landmarks
+    covariance, landmark_covariance = found.pose_covariance, found.landmark_covariance
+    seconds = perf_counter() - begin
+    settings = dict(result.config)
+    if config is not None:
+        settings["posterior"] = dataclasses.asdict(config)
+    return dataclasses.replace(
+        result,
+        mode="smoothed" if found.linearisation == "map" else "as filtered",
+        T_world_imu=found.T_world_imu,
+        covariance=covariance,
+        landmarks=dataclasses.replace(landmarks, position_m=found.position_m, covariance=landmark_covariance),
+        innovation=Innovation.empty(T),
+        rejections=Rejections.empty(),
+        ms_per_frame=np.full(T, 1e3 * seconds / T),
+        counts={
+            "observations": len(found.weight),
+            "observations weighted below one half": int((found.weight < 0.5).sum()),
+            "iterations": len(found.costs) - 1,
+        },
+        config=settings,
+        log=None,
+    )
+
+
+def _checked(what: str, index: ArrayLike, size: int) -> IntArray:
+    index = np.atleast_1d(np.asarray(index, dtype=np.int64))
+    if len(index) and not (-size <= index.min() and index.max() < size):
+        raise PosteriorError(f"there is no {what} {index[(index < -size) | (index >= size)][0]}; there are {size}")
+    return index % size if size else index

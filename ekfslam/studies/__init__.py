@@ -1,0 +1,1 @@
+"""Many runs: Monte Carlo studies and tuning."""

@@ -1,0 +1,477 @@
+"""Monte Carlo studies of consistency: many simulated drives, several filter variants on each, one archive.
+
+    study = Study({"mid": LEVELS["mid"]}, ("invariant", "standard"), runs=50)
+    with open_executor("processes") as executor:
+        archive = run_study(study, "study.h5", executor)
+    print(study_table(summarise_study(archive)))  # of ekfslam.metrics.study
+
+A realisation is decided by the study's seed, the name of its level and its number, by nothing else: neither the
+executor, nor the number of workers, nor the order in which they finish, nor an interruption changes one bit of the data
+sets. The first pose is drawn from the prior that the filters are given, no outlier is simulated, nothing is gated: a
+consistent filter has a mean NEES equal to its degrees of freedom.
+
+The archive is one HDF5 file:
+
+    /                             attributes format, format_version, error_convention, study (JSON), seed, versions
+    /levels/<level>               attribute world (JSON)
+        time (T,)                 nominal stamps
+        done (runs,)              which runs are in
+        <variant>/<field>         (runs, T, ...) as in `FIELDS`; what is not in yet is NaN or 0
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from types import MappingProxyType
+from typing import Any
+from zlib import crc32
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from ekfslam.arrays import Array, BoolArray
+from ekfslam.config import VARIANTS, Config, FilterConfig
+from ekfslam.data.sequence import Sequence
+from ekfslam.data.simulate import Loop, simulate
+from ekfslam.errors import ArchiveError, ConfigError, FilterError
+from ekfslam.evaluation.consistency import (
+    invariant_landmark_error,
+    joint_nees,
+    nees,
+    pose_error,
+    time_average,
+    world_axes_covariance,
+)
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.observing import Rig
+from ekfslam.filters.result import ERROR_CONVENTION
+from ekfslam.geometry import se3
+from ekfslam.progress import progress as with_progress
+from ekfslam.runner import versions
+
+FORMAT = "ekfslam-study"
+FORMAT_VERSION = 1
+
+ITERATIONS = 3
+ITERATED_SUFFIX = "-iterated"
+STUDY_VARIANTS: tuple[str, ...] = (*VARIANTS, *(v + ITERATED_SUFFIX for v in VARIANTS if v != "fej"))
+
+_SMALL_PRIOR: dict[str, Any] = {"initial_position_std_m": 0.01, "initial_rotation_std_rad": 0.001}
+_LARGE_PRIOR: dict[str, Any] = {"initial_position_std_m": 0.5, "initial_rotation_std_rad": float(np.deg2rad(15.0))}
+_RING = Loop(frames=314, stamp_jitter_s=0.0, radius_m=20.0, speed_m_s=8.0, landmarks=100, min_disparity_px=6.0)
+
+# Two rounds of a ring, from a good rig to a very poor one; at ``large-heading`` the first pose is hardly known.
+LEVELS: Mapping[str, Loop] = MappingProxyType(
+    {
+        name: dataclasses.replace(
+            _RING, name=name, sigma_px=px, sigma_v_m_s=v, sigma_w_rad_s=w, max_range_m=range_m, **prior
+        )
+        for name, px, v, w, range_m, prior in (
+            ("low", 0.5, 0.1, 0.01, 25.0, _SMALL_PRIOR),
+            ("mid", 1.0, 0.5, 0.05, 40.0, _SMALL_PRIOR),
+            ("high", 2.0, 1.5, 0.2, 25.0, _SMALL_PRIOR),
+            ("large-heading", 1.0, 0.5, 0.05, 25.0, _LARGE_PRIOR),
+        )
+    }
+)
+
+# Per run: shape after (runs,), type, units, what it is. T is the number of frames, J the number of instants at which
+# the joint NEES is taken.
+FIELDS: Mapping[str, tuple[tuple[str | int, ...], type, str, str]] = MappingProxyType(
+    {
+        "pose_nees": (("T",), float, "1", "xi, 6 degrees of freedom"),
+        "orientation_nees": (("T",), float, "1", "theta of xi, 3 degrees of freedom"),
+        "position_nees": (("T",), float, "1", "rho of xi, 3 degrees of freedom"),
+        "landmark_nees": (("T",), float, "1", "mean over the landmarks in the state, 3 degrees of freedom each"),
+        "joint_nees_per_dof": (("J",), float, "1", "xi and all landmarks, divided by 6 + 3n"),
+        "nis": (("T",), float, "1", "innovations of the frame"),
+        "nis_dof": (("T",), int, "1", "degrees of freedom of nis"),
+        "position_error": (("T", 3), float, "m", "estimate minus truth, world axes"),
+        "rotation_error": (("T", 3), float, "rad", "log(R_estimate R_truth^T), world axes"),
+        "three_sigma": (("T", 6), float, "m (0-2), rad (3-5)", "bounds of position and rotation error, world axes"),
+        "diverged": ((), bool, "1", "stopped with an error, not finite, or left the ring altogether"),
+    }
+)
+
+JOINT_INSTANTS = 4  # equally spaced, the last one at the last frame
+
+IN_FLIGHT = 256
+CHECKPOINT_S = 5.0
+CHECKPOINT_SHARE = 0.05  # of the time may go into checkpoints of a large study
+
+Record = dict[str, dict[str, NDArray]]  # variant, field, value of one run
+
+# BLAS threads are limited for the process as a whole: a worker that runs several threads (Dask) takes turns.
+_ONE_RUN_AT_A_TIME = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Study:
+    """What to simulate and what to compare on it.
+
+    Args:
+        levels: Name to world; a world's own seed is not used.
+        variants: Of `STUDY_VARIANTS`: the filter's variants, ``-iterated`` with three iterations an update.
+        runs: Realisations of each level.
+        seed: Of everything.
+
+    Raises:
+        ConfigError: Nothing to do, or an unknown variant.
+    """
+
+    levels: Mapping[str, Loop] = dataclasses.field(default_factory=lambda: dict(LEVELS))
+    variants: tuple[str, ...] = VARIANTS
+    runs: int = 50
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "levels", dict(self.levels))  # a mapping proxy could not be sent to a worker
+        object.__setattr__(self, "variants", tuple(self.variants))
+        for variant in self.variants:
+            if variant not in STUDY_VARIANTS:
+                raise ConfigError(f"unknown variant {variant!r} of a study; known: {', '.join(STUDY_VARIANTS)}")
+        if len(set(self.variants)) < len(self.variants):
+            raise ConfigError(f"a variant of the study is named twice: {', '.join(self.variants)}")
+        for name, level in self.levels.items():
+            if not level.initial_position_std_m * level.initial_rotation_std_rad > 0:
+                raise ConfigError(f"level {name}: a study needs a prior of the first pose, or NEES is not defined")
+        if not self.levels or not self.variants or self.runs < 1 or self.seed < 0:
+            raise ConfigError("a study needs a level, a variant, at least one run, and a seed that is not negative")
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Everything that decides the numbers, ready for JSON."""
+        return dataclasses.asdict(self)
+
+
+def levels_of(names: Iterable[str]) -> dict[str, Loop]:
+    """`LEVELS` by name; ``all`` stands for all of them.
+
+    Raises:
+        ConfigError: There is no such level.
+    """
+    wanted = list(names)
+    if "all" in wanted:
+        return dict(LEVELS)
+    for name in wanted:
+        if name not in LEVELS:
+            raise ConfigError(f"unknown level {name!r}; known: {', '.join(LEVELS)}, all")
+    return {name: LEVELS[name] for name in wanted}
+
+
+def realisation(study: Study, level: str, run: int) -> Loop:
+    """The world of one run: the level with a seed of its own, hence with other landmarks and another road surface too.
+
+    A mean over runs is thus one over worlds as well, not a property of one lucky map. The seed depends on the study's
+    seed, the level's name and the run, whatever else the study holds.
+    """
+    source = np.random.SeedSequence(entropy=study.seed, spawn_key=(crc32(level.encode()), run))
+    return dataclasses.replace(study.levels[level], seed=int(source.generate_state(1, np.uint64)[0] >> 1))
+
+
+def filter_config(level: Loop, variant: str) -> FilterConfig:
+    """Settings of a variant in a study: the prior that the truth is drawn from, and no observation ever censored."""
+    return Config(
+        filter=FilterConfig(
+            variant=variant.removesuffix(ITERATED_SUFFIX),  # type: ignore[arg-type]
+            iterations=ITERATIONS if variant.endswith(ITERATED_SUFFIX) else 1,
+            retire="never",
+            gate_probability=1.0,
+            split_after=0,
+            initial_position_std_m=level.initial_position_std_m,
+            initial_rotation_std_rad=level.initial_rotation_std_rad,
+        )
+    ).filter
+
+
+def run_one(study: Study, level: str, run: int) -> Record:
+    """Simulate one realisation and run all variants on it: a pure function, to be called in any process.
+
+    Returns:
+        Variant to field to value, shaped as in `FIELDS`. Values are NaN at frame 0, whose true pose is drawn and not
+        part of a recording, and from the frame at which a filter stops.
+    """
+    world = realisation(study, level, run)
+    with _ONE_RUN_AT_A_TIME, threadpool_limits(1, user_api="blas"), np.errstate(all="ignore"):
+        sequence = simulate(world)
+        return {variant: _evaluate(sequence, world, filter_config(world, variant)) for variant in study.variants}
+
+
+def _blank(frames: int, runs: tuple[int, ...] = ()) -> dict[str, NDArray]:
+    """Every field of one variant without values: NaN, 0 or False."""
+    sizes = {"T": frames, "J": JOINT_INSTANTS}
+    return {
+        name: np.full(
+            (*runs, *(sizes[n] if isinstance(n, str) else n for n in shape)), np.nan if kind is float else 0, dtype=kind
+        )
+        for name, (shape, kind, _, _) in FIELDS.items()
+    }
+
+
+def _joint_frames(frames: int) -> list[int]:
+    return [(frames - 1) * (i + 1) // JOINT_INSTANTS for i in range(JOINT_INSTANTS)]
+
+
+def _evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str, NDArray]:
+    """One variant on one realisation, frame by frame."""
+    truth, noise = sequence.truth, sequence.noise
+    assert truth is not None
+    assert noise is not None
+    frames = len(sequence)
+    T_true = np.full((frames, 4, 4), np.nan)
+    T_true[truth.frame] = truth.T_world_imu
+    T_est, P_pose = np.full((frames, 4, 4), np.nan), np.full((frames, 6, 6), np.nan)
+    record = _blank(frames)
+    joint_frames = _joint_frames(frames)
+
+    ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, noise), config, sequence.initial_T_world_imu)
+    known = np.zeros(frames, dtype=bool)
+    stopped = False
+    try:
+        for k in range(frames):
+            if k > 0:
+                ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
+            report = ekf.update(k, *sequence.observations.at(k))
+            if not (np.isfinite(ekf.T_imu_world).all() and np.isfinite(ekf.P).all()):
+                stopped = True
+                break
+            record["nis"][k], record["nis_dof"][k] = report.nis, report.dof
+            T_est[k], P_pose[k] = ekf.T_world_imu, ekf.P[:6, :6]
+            known[k] = k >= truth.frame[0]
+            if not known[k] or len(ekf.ids) == 0:
+                continue
+            m_true = truth.position_m[np.searchsorted(truth.landmark, ekf.ids)]
+            if config.variant == "invariant":
+                error = invariant_landmark_error(ekf.positions_m, m_true, T_est[k], T_true[k])
+            else:
+                error = m_true - ekf.positions_m
+            n = np.arange(len(error))
+            blocks = ekf.P[6:, 6:].reshape(len(n), 3, len(n), 3)[n, :, n, :]
+            record["landmark_nees"][k] = time_average(nees(error, blocks)[None])[0]
+            if k in joint_frames:
+                value = joint_nees(pose_error(T_est[k], T_true[k]), error, ekf.P) / len(ekf.P)
+                record["joint_nees_per_dof"][joint_frames.index(k)] = value
+    except (FilterError, np.linalg.LinAlgError):
+        stopped = True
+
+    xi, P = pose_error(T_est[known], T_true[known]), P_pose[known]
+    record["pose_nees"][known] = nees(xi, P)
+    record["position_nees"][known] = nees(xi[:, :3], P[:, :3, :3])
+    record["orientation_nees"][known] = nees(xi[:, 3:], P[:, 3:, 3:])
+    record["position_error"][known] = T_est[known, :3, 3] - T_true[known, :3, 3]
+    record["rotation_error"][known] = se3.so3_log(T_est[known, :3, :3] @ np.swapaxes(T_true[known, :3, :3], 1, 2))
+    variance = np.hstack([np.diagonal(c, axis1=1, axis2=2) for c in world_axes_covariance(T_est[known], P)])
+    record["three_sigma"][known] = 3.0 * np.sqrt(np.maximum(variance, 0.0))
+    left = np.linalg.norm(record["position_error"][-1]) > 2.0 * world.radius_m
+    record["diverged"][()] = stopped or bool(left)
+    return record
+
+
+@dataclass(frozen=True)
+class StudyArchive:
+    """A study and what is there of its runs.
+
+    Args:
+        study: What was asked.
+        done: Level to mask (runs,).
+        data: Level to variant to field to values (runs, ...), see `FIELDS`.
+    """
+
+    study: Study
+    done: Mapping[str, BoolArray]
+    data: Mapping[str, Mapping[str, Mapping[str, NDArray]]]
+
+    @property
+    def complete(self) -> bool:
+        return all(mask.all() for mask in self.done.values())
+
+    def time_s(self, level: str) -> Array:
+        """(T,) nominal stamps of a level."""
+        world = self.study.levels[level]
+        return world.frame_period_s * np.arange(world.frames, dtype=float)
+
+
+def run_study(study: Study, path: str | Path, executor: Executor, progress: bool = True) -> StudyArchive:
+    """Run what the archive at ``path`` does not hold yet, and keep it up to date meanwhile.
+
+    The archive is replaced as a whole, by renaming: killed at any time, it is valid and at most some seconds old, and
+    the next call goes on from there. A study may be extended by asking for more runs.
+
+    Args:
+        study: What to run.
+        path: Archive, made if missing; its folder must exist.
+        executor: Where to run it, see `open_executor`.
+        progress: Whether to show a bar on a terminal.
+
+    Raises:
+        ArchiveError: ``path`` holds another study (the message says what differs), is no archive of a study, or cannot
+            be written.
+    """
+    path = Path(path)
+    archive = _resume(study, path)
+    missing = [(level, run) for run in range(study.runs) for level in study.levels if not archive.done[level][run]]
+    finished: Any = _completed(study, missing, executor)
+    if progress:
+        finished = with_progress(finished, "consistency", "run", total=len(missing))
+    next_checkpoint = monotonic() + CHECKPOINT_S
+    for level, run, record in finished:
+        for variant, values in record.items():
+            for field, value in values.items():
+                archive.data[level][variant][field][run] = value
+        archive.done[level][run] = True
+        if monotonic() >= next_checkpoint and not archive.complete:
+            begin = monotonic()
+            write_study(path, archive)
+            end = monotonic()
+            next_checkpoint = end + max(CHECKPOINT_S, (end - begin) / CHECKPOINT_SHARE)
+    if missing:
+        write_study(path, archive)
+    return archive
+
+
+def _completed(study: Study, tasks: list[tuple[str, int]], executor: Executor) -> Iterator[tuple[str, int, Record]]:
+    """Results as they come, with a bounded number of tasks handed to the executor at a time."""
+    remaining = iter(tasks)
+    pending: dict[Future[Record], tuple[str, int]] = {}
+    left = len(tasks)
+    try:
+        while left:
+            task = next(remaining, None) if len(pending) < IN_FLIGHT else None
+            if task is not None:
+                pending[executor.submit(run_one, study, *task)] = task
+            # While there is more to hand out, only look: an executor in this process has finished by now.
+            finished, _ = wait(pending, timeout=None if task is None else 0, return_when=FIRST_COMPLETED)
+            for future in finished:
+                left -= 1
+                yield *pending.pop(future), future.result()
+    finally:
+        for future in pending:
+            future.cancel()
+
+
+def _resume(study: Study, path: Path) -> StudyArchive:
+    """The archive to go on with: that of ``path``, with room for further runs, or an empty one."""
+    data = {
+        level: {variant: _blank(world.frames, (study.runs,)) for variant in study.variants}
+        for level, world in study.levels.items()
+    }
+    archive = StudyArchive(study, {level: np.zeros(study.runs, dtype=bool) for level in study.levels}, data)
+    if not path.exists():
+        return archive
+    old, old_versions = _read(path)
+    wanted, found = study.parameters, old.study.parameters
+    if found["runs"] <= wanted["runs"]:
+        found["runs"] = wanted["runs"]
+    # Numbers of another version of the software may differ in the last bits; that only matters where they would mix.
+    if not (old.complete and old.study.runs == study.runs):
+        wanted, found = {**wanted, **versions()}, {**found, **old_versions}
+    differences = list(_differences(wanted, found))
+    if differences:
+        more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
+        raise ArchiveError(
+            f"{path} holds another study: {'; '.join(differences[:3])}{more}; move it away or choose another folder"
+        )
+    for level, variants in old.data.items():
+        archive.done[level][: old.study.runs] = old.done[level]
+        for variant, values in variants.items():
+            for field, value in values.items():
+                archive.data[level][variant][field][: old.study.runs] = value
+    return archive
+
+
+def _differences(wanted: Any, found: Any, name: str = "") -> Iterator[str]:
+    """What differs between two nested dictionaries, in words."""
+    if isinstance(wanted, dict) and isinstance(found, dict):
+        for key in {**found, **wanted}:
+            yield from _differences(wanted.get(key), found.get(key), f"{name}.{key}" if name else key)
+    elif wanted != found:
+        spoken = [
+            "none" if v is None else "another" if isinstance(v, dict) else ", ".join(v) if isinstance(v, tuple) else v
+            for v in (found, wanted)
+        ]
+        yield f"{name} is {spoken[0]}, asked for {spoken[1]}"
+
+
+def write_study(path: str | Path, archive: StudyArchive) -> None:
+    """Write a study's archive; it replaces an old one at once and only when it is complete on disk.
+
+    Raises:
+        ArchiveError: The file cannot be written.
+    """
+    path = Path(path)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    study = archive.study
+    try:
+        with h5py.File(str(unfinished), "w") as h5file:
+            h5file.attrs.update(
+                format=FORMAT,
+                format_version=FORMAT_VERSION,
+                error_convention=ERROR_CONVENTION,
+                study=json.dumps(study.parameters),
+                seed=str(study.seed),  # as text: a seed may be larger than any integer of HDF5
+                **versions(),
+            )
+            for level, world in study.levels.items():
+                group = h5file.create_group(f"levels/{level}")
+                group.attrs["world"] = json.dumps(dataclasses.asdict(world))
+                _dataset(group, "time", archive.time_s(level), "s", "nominal stamps")
+                _dataset(group, "done", archive.done[level], "1", "runs that are in")
+                for variant, values in archive.data[level].items():
+                    for field, (_, _, units, frame) in FIELDS.items():
+                        _dataset(group, f"{variant}/{field}", values[field], units, frame)
+                    group[f"{variant}/joint_nees_per_dof"].attrs["frames"] = _joint_frames(world.frames)
+        unfinished.replace(path)
+    except OSError as error:
+        raise ArchiveError(f"{path}: cannot be written: {error}") from None
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _dataset(group: h5py.Group, name: str, value: NDArray, units: str, frame: str) -> None:
+    dataset = group.create_dataset(name, data=value)
+    dataset.attrs["units"], dataset.attrs["frame"] = units, frame
+
+
+def read_study(path: str | Path) -> StudyArchive:
+    """The archive of a study, finished or not.
+
+    Raises:
+        ArchiveError: The file is missing or damaged, or holds something else.
+    """
+    return _read(path)[0]
+
+
+def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
+    try:
+        with h5py.File(str(path), "r") as h5file:
+            attributes = h5file.attrs
+            if attributes.get("format") != FORMAT:
+                raise ArchiveError(f"{path}: no study: format is {attributes.get('format')!r}, expected {FORMAT!r}")
+            if attributes["format_version"] > FORMAT_VERSION:
+                raise ArchiveError(
+                    f"{path}: has format version {attributes['format_version']}, "
+                    f"this release reads up to version {FORMAT_VERSION}"
+                )
+            parameters = json.loads(attributes["study"])
+            parameters["levels"] = {name: Loop(**world) for name, world in parameters["levels"].items()}
+            study = Study(**parameters)
+            groups = h5file["levels"]
+            data = {
+                level: {v: {field: groups[f"{level}/{v}/{field}"][()] for field in FIELDS} for v in study.variants}
+                for level in study.levels
+            }
+            done = {level: groups[f"{level}/done"][()] for level in study.levels}
+            found_versions = {key: str(value) for key, value in attributes.items() if key.startswith("version_")}
+            return StudyArchive(study, done, data), found_versions
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # what h5py and json raise at damage
+        raise ArchiveError(f"{path}: missing, truncated or no archive of a study ({error})") from None
