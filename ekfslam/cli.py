@@ -14,9 +14,8 @@ from typing import get_args
 import h5py
 
 from ekfslam import __version__
-from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation, NoiseModel, noise_of
+from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation, NoiseModel
 from ekfslam.consistency_report import check_consistency
-from ekfslam.data.hygiene import clean_tracks
 from ekfslam.data.readers import BUILTIN, open_sequence, write_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import builtin
@@ -26,6 +25,7 @@ from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.figures.posterior import save_posterior_figures
 from ekfslam.figures.run import save_figures
 from ekfslam.filters.result import Result
+from ekfslam.models.build import build
 from ekfslam.models.noise import velocity_noise
 from ekfslam.reports import compare
 from ekfslam.runner import run
@@ -359,9 +359,11 @@ def _info(options: argparse.Namespace) -> None:
         print(f"{key:13s} {value}")
     for note in sequence.notes:
         print(f"note          {note}")
-    config = Config()
-    _, hygiene = clean_tracks(sequence, noise_of(sequence, config), config.hygiene)
-    for line in hygiene.lines(dataclasses.asdict(config.hygiene)):
+    problem = build(sequence)
+    assert problem.hygiene is not None
+    for line in problem.lines:
+        print(f"state         {line}")
+    for line in problem.hygiene.lines(dataclasses.asdict(problem.config.hygiene)):
         print(f"hygiene       {line}")
 
 

@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
-from ekfslam.data.sequence import Noise, Sequence
 from ekfslam.errors import ConfigError
-from ekfslam.models.noise import VelocityNoise, automatic_noise, velocity_noise
 
 Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
 Variant = Literal["invariant", "fej", "standard"]
@@ -26,8 +24,6 @@ Kernel = Literal["huber", "cauchy", "none"]
 MODES: tuple[Mode, ...] = get_args(Mode)
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 
-# What "auto" keeps in the state when landmarks come back: beyond this a dense covariance is no longer cheap.
-AUTO_NEVER_LIMIT = 300
 
 
 @dataclass(frozen=True)
@@ -38,7 +34,8 @@ class NoiseConfig:
         sigma_v_m_s: Linear velocity, each axis.
         sigma_w_rad_s: Angular velocity, each axis.
         sigma_px: Pixels.
-        drift: How far a track wanders, as a share of the distance driven; None takes what the model says.
+        drift: How far the error of a track walks in the image from one frame to the next, px; 0 takes pixel noise as
+            white, None takes what the model says.
         tilt_deg: Of velocities in a level frame: prior deviation of roll and pitch, which the joint filter estimates; 0
             takes them as velocities of the IMU; None takes what the model says.
         model: ``auto``: where the sequence states no noise and no sigma is given here, it is found from the data, see
@@ -133,7 +130,7 @@ class FilterConfig:
     @property
     def gate(self) -> float:
         """Chi-square threshold of the gate, 3 degrees of freedom."""
-        return float(chi2.ppf(self.gate_probability, 3))
+        return 2.0 * float(gammaincinv(1.5, self.gate_probability))
 
     @property
     def initial_covariance(self) -> np.ndarray:
@@ -225,6 +222,7 @@ class Config:
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     hygiene: HygieneConfig = field(default_factory=HygieneConfig)
     tuning: TuningRecord = field(default_factory=TuningRecord)
+    blocks: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         noise, filter_, posterior = self.noise, self.filter, self.posterior
@@ -278,18 +276,6 @@ class Config:
         if self.hygiene.min_observations != int(self.hygiene.min_observations):
             raise ConfigError(f"hygiene.min_observations must be a whole number, found {self.hygiene.min_observations}")
 
-    def resolved(self, sequence: Sequence) -> Config:
-        """This configuration with what is automatic decided for ``sequence``; noise is decided by `noise_of`."""
-        retire, retire_after = self.filter.retire, self.filter.retire_after
-        come_back = _landmarks_come_back(sequence)
-        if retire == "auto":
-            retire = "never" if come_back and len(sequence.observations.ids) <= AUTO_NEVER_LIMIT else "unseen"
-        if retire_after is None:
-            retire_after = 10 if come_back else 1
-        return dataclasses.replace(
-            self, filter=dataclasses.replace(self.filter, retire=retire, retire_after=retire_after)
-        )
-
     def with_overrides(self, overrides: Mapping[str, Mapping[str, Any]]) -> Config:
         """This configuration with ``{table: {key: value}}`` replaced; None values are skipped.
 
@@ -304,9 +290,16 @@ class Config:
             "hygiene": self.hygiene,
             "tuning": self.tuning,
         }
+        blocks = {name: dict(values) for name, values in self.blocks.items()}
         for table, values in overrides.items():
+            if table == "blocks":
+                for name, settings in values.items():
+                    if not isinstance(settings, Mapping):
+                        raise ConfigError(f"[blocks.{name}] must be a table, found {settings!r}")
+                    blocks[name] = {**blocks.get(name, {}), **settings}
+                continue
             if table not in tables:
-                raise ConfigError(f"unknown table [{table}]; known: {', '.join(tables)}")
+                raise ConfigError(f"unknown table [{table}]; known: {', '.join([*tables, 'blocks'])}")
             if not isinstance(values, Mapping):
                 raise ConfigError(f"[{table}] must be a table, found {values!r}")
             known = [f.name for f in dataclasses.fields(tables[table])]
@@ -321,7 +314,7 @@ class Config:
                     raise ConfigError(f"{table}.{key} must be a {name}, found {value!r}")
             given = {key: value for key, value in values.items() if value is not None}
             tables[table] = dataclasses.replace(tables[table], **given)
-        return Config(**tables)
+        return Config(**tables, blocks=blocks)
 
     @staticmethod
     def from_toml(path: str | Path) -> Config:
@@ -335,56 +328,3 @@ class Config:
             return Config().with_overrides(tomllib.loads(text))
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, ConfigError) as error:
             raise ConfigError(f"{path}: {error}") from None
-
-
-def noise_of(sequence: Sequence, config: Config) -> Noise:
-    """The noise a filter shall assume: what the configuration says, else the sequence, else the data or a default."""
-    if is_automatic(sequence, config):
-        stated = automatic_noise(sequence.twist, sequence.velocity_frame)
-    else:
-        stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
-    twist, pixels = np.array(stated.twist_std, dtype=float), np.array(stated.pixel_std_px, dtype=float)
-    if config.noise.sigma_v_m_s is not None:
-        twist[:3] = config.noise.sigma_v_m_s
-    if config.noise.sigma_w_rad_s is not None:
-        twist[3:] = config.noise.sigma_w_rad_s
-    if config.noise.sigma_px is not None:
-        pixels[:] = config.noise.sigma_px
-    drift = stated.drift if config.noise.drift is None else config.noise.drift
-    tilt = stated.tilt_rad if config.noise.tilt_deg is None else float(np.deg2rad(config.noise.tilt_deg))
-    return dataclasses.replace(stated, twist_std=twist, pixel_std_px=pixels, drift=drift, tilt_rad=tilt)
-
-
-def is_automatic(sequence: Sequence, config: Config) -> bool:
-    """Whether the model of the noise is that of `ekfslam.models.noise`, found from the data; see `NoiseConfig`."""
-    noise = config.noise
-    given = (noise.sigma_v_m_s, noise.sigma_w_rad_s, noise.sigma_px)
-    is_asked_for = noise.model == "tuned" or (noise.model == "auto" and all(sigma is None for sigma in given))
-    return sequence.noise is None and is_asked_for
-
-
-def noise_account(sequence: Sequence, config: Config) -> dict[str, str | int | float]:
-    """Attributes for a result that say where its noise comes from.
-
-    ``found_*``: what the differences of the velocities say, with standard errors and limits, where the noise is
-    automatic; ``tuned_*``: the `TuningRecord`, where there is one.
-    """
-    account = found_attributes(velocity_noise(sequence.twist)) if is_automatic(sequence, config) else {}
-    tuned = {f"tuned_{key}": value for key, value in vars(config.tuning).items() if value is not None}
-    return {**account, **tuned}
-
-
-def found_attributes(found: VelocityNoise) -> dict[str, float]:
-    """White noise of velocities, its standard errors and 95 % limits by name, the units in the names."""
-    values: dict[str, float] = {}
-    for i, name in enumerate(("sigma_v_m_s", "sigma_w_rad_s")):
-        values[f"found_{name}"], values[f"found_{name}_error"] = float(found.sigma[i]), float(found.sigma_error[i])
-        values[f"found_{name}_limit"] = float(found.limit[i])
-    return values
-
-
-def _landmarks_come_back(sequence: Sequence) -> bool:
-    observations = sequence.observations
-    order = np.lexsort((observations.frame, observations.landmark))
-    same = np.diff(observations.landmark[order]) == 0
-    return bool((same & (np.diff(observations.frame[order]) > 1)).any())

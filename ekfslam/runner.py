@@ -10,20 +10,21 @@ from time import perf_counter
 import h5py
 import numpy as np
 import scipy
-from threadpoolctl import threadpool_limits
 
-from ekfslam.config import MODES, Config, Mode, noise_account, noise_of
-from ekfslam.data.hygiene import clean_tracks
-from ekfslam.data.sequence import WITHOUT_TRACKS, Sequence
+from ekfslam.config import MODES, Config, Mode
+from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError
 from ekfslam.filters.dead_reckoning import dead_reckon
-from ekfslam.filters.joint import run_joint
-from ekfslam.filters.mapping import map_landmarks
-from ekfslam.filters.observing import Rig, collect
-from ekfslam.filters.result import HygieneReport, Innovation, Landmarks, Rejections, Result
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import one_thread, run_filter
+from ekfslam.filters.mapping import IndependentLandmarks
+from ekfslam.filters.reports import collect
+from ekfslam.filters.result import Innovation, Landmarks, Rejections, Result
 from ekfslam.geometry import se3
+from ekfslam.models.build import build
 from ekfslam.progress import progress
 from ekfslam.smoother.posterior import smooth
+from ekfslam.smoother.revival import MapRevival
 
 
 def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -> Result:
@@ -44,36 +45,35 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
         raise ConfigError(f"unknown mode {mode!r}; known: {', '.join(MODES)}")
     if mode == "smoothed":
         return smooth(run(sequence, "full", config))
-    config = (config or Config()).resolved(sequence)
-    noise, account = noise_of(sequence, config), noise_account(sequence, config)
-    hygiene: HygieneReport | None = None
-    if mode != "dead-reckoning":
-        observations, hygiene = clean_tracks(sequence, noise, config.hygiene)
-        attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
-        sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
-    rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
+    problem = build(sequence, config, clean=mode != "dead-reckoning")
+    sequence, config, model = problem.sequence, problem.config, problem.model
+    account, hygiene = dict(problem.account), problem.hygiene
     frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
     counts: dict[str, int] = {}
+    reports, landmarks = [], Landmarks.empty()
     log = parameters = None
 
-    # Small dense matrices: a second BLAS thread costs three times what it saves.
-    with threadpool_limits(1, user_api="blas"):
+    with one_thread():
         if mode == "full":
-            ekf, T_imu_world, covariance, reports, ms = run_joint(
-                sequence, rig, config.filter, frames, config.calibration
-            )
-            landmarks, counts, log, parameters = ekf.landmarks(), ekf.counts, ekf.log(), ekf.further()
+            revival = MapRevival(model, config.filter) if config.filter.revive >= 0 else None
+            ekf = JointEKF(model, config.filter, revival=revival)
+            T_imu_world, covariance = np.empty((len(sequence), 4, 4)), np.empty((len(sequence), 6, 6))
+            ms = np.empty(len(sequence))
+            for k, report, ms[k] in run_filter(ekf, sequence, frames):
+                T_imu_world[k], covariance[k] = ekf.T_imu_world, ekf.P[:6, :6]
+                reports.append(report)
+            landmarks, counts, log, parameters = ekf.landmarks(), ekf.counts, ekf.log(), ekf.parameters()
         else:
             begin = perf_counter()
-            T_imu_world, covariance = dead_reckon(sequence, noise, config.filter.initial_covariance)
+            T_imu_world, covariance = dead_reckon(sequence, model.noise, config.filter.initial_covariance)
             # Dead reckoning is computed for all frames at once; each frame bears its share.
             ms = np.full(len(sequence), 1e3 * (perf_counter() - begin) / len(sequence))
-            landmarks, reports = Landmarks.empty(), []
             if mode == "mapping-only":
-                landmarks, reports, ms_mapping = map_landmarks(
-                    sequence.observations, T_imu_world, rig, config.filter, frames
-                )
-                ms = ms + ms_mapping
+                mapper = IndependentLandmarks(model.rig.with_white_pixels(), config.filter, T_imu_world)
+                for k, report, taken in run_filter(mapper, sequence, frames):
+                    reports.append(report)
+                    ms[k] += taken
+                landmarks = mapper.landmarks()
 
     innovation, rejections = Innovation.empty(len(sequence)), Rejections.empty()
     if reports:
@@ -94,7 +94,7 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
         ms_per_frame=ms,
         counts=counts,
         config=dataclasses.asdict(config),
-        noise=noise,
+        noise=model.noise,
         camera=sequence.camera,
         T_cam_imu=sequence.T_cam_imu,
         log=log,

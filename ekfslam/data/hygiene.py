@@ -10,6 +10,10 @@ leaves one.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,16 +21,82 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.config import HygieneConfig
 from ekfslam.data.sequence import Noise, Observations, Sequence
 from ekfslam.data.tracks import cut_tracks, repeated_frames, successive
-from ekfslam.filters.dead_reckoning import dead_reckon
-from ekfslam.filters.result import RULES, HygieneReport
 from ekfslam.geometry import camera as cam
-from ekfslam.geometry import se3
+from ekfslam.geometry import motion, se3
+
+# The rules in the order in which they are applied, with the key of ``[hygiene]`` that
+# switches each; the index is the code of `HygieneReport.rule`.
+_SWITCHES: dict[str, str] = {
+    "repeated frame": "restart_at_repeats",
+    "jump": "jump_sigma",
+    "re-used id": "reused_id_sigma",
+    "disparity": "min_disparity_sigma",
+    "row mismatch": "max_row_mismatch_sigma",
+    "depth": "max_depth_error",
+    "too short": "min_observations",
+}
+RULES: tuple[str, ...] = tuple(_SWITCHES)
+
 
 REPEATED_FRAME, JUMP, REUSED_ID, DISPARITY, ROW_MISMATCH, DEPTH, TOO_SHORT = range(len(RULES))
 
 # Deviation that white noise of 1 px gives to what `jumps` compares.
 _JUMP_STD = 2.0
 _COMPANY = 5  # tracks of a frame that can tell how the frame as a whole moved
+
+
+@dataclass(frozen=True)
+class HygieneReport:
+    """What hygiene found and did, one row a finding, in the order of the rules and then of the frames.
+
+    Args:
+        observations: Number of observations looked at.
+        rule: (n,) index into `RULES`.
+        frame: (n,) frame of the observation that was dropped, or with which the new piece of a cut track begins.
+        landmark: (n,) id of its track in the recording.
+        continuation: (n,) id that a cut track has from there on; -1 where the observation was dropped.
+    """
+
+    observations: int
+    rule: IntArray
+    frame: IntArray
+    landmark: IntArray
+    continuation: IntArray
+
+    @property
+    def dropped(self) -> int:
+        """Number of observations dropped, each by one rule."""
+        return int((self.continuation < 0).sum())
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Findings by rule, and the observations dropped in all."""
+        found = np.bincount(self.rule, minlength=len(RULES)).tolist()
+        return {
+            "dropped by hygiene": self.dropped,
+            **{f"hygiene: {name}": count for name, count in zip(RULES, found, strict=True)},
+        }
+
+    def lines(self, config: Mapping[str, Any]) -> tuple[str, ...]:
+        """One line a rule: what was found, where, and what was done; or that ``config`` (``[hygiene]``) has it off."""
+        lines = []
+        for code, (name, switch) in enumerate(_SWITCHES.items()):
+            found = self.rule == code
+            tracks, frames = np.unique(self.landmark[found]), np.unique(self.frame[found])
+            cut = int((self.continuation[found] >= 0).sum())
+            dropped = int(found.sum()) - cut
+            line = f"{name}: " + ("nothing found" if config[switch] else "switched off")
+            if len(frames):
+                what = " and ".join([f"{dropped} observations dropped"] * bool(dropped) + [f"{cut} cuts"] * bool(cut))
+                line = f"{name}: {what}, in {len(tracks)} tracks, {len(frames)} frames from {frames[0]} to {frames[-1]}"
+            lines.append(line)
+        return (*lines, f"{self.dropped} of {self.observations} observations dropped in all")
+
+    @staticmethod
+    def empty(observations: int) -> HygieneReport:
+        """Of clean tracks."""
+        none = np.empty(0, dtype=np.int64)
+        return HygieneReport(observations, none, none, none, none)
 
 
 def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tuple[Observations, HygieneReport]:
@@ -136,7 +206,7 @@ def reused_ids(sequence: Sequence, observations: Observations, noise: Noise, sig
     if not len(later):
         return found
 
-    T_imu_world, _ = dead_reckon(sequence, noise, np.zeros((6, 6)))
+    T_imu_world = motion.integrate(np.eye(4), sequence.twist, np.diff(sequence.time_s))
     T_world_cam = se3.inverse(sequence.T_cam_imu @ T_imu_world)
 
     pixels = observations.pixels_px
@@ -158,7 +228,7 @@ def reused_ids(sequence: Sequence, observations: Observations, noise: Noise, sig
     reach = way + np.linalg.norm(cam.triangulate(sequence.camera, rows[later]), axis=1)
     drift = over(tau**2 * (velocity[:3] ** 2).sum())
     turn = over(tau**2 * (velocity[3:] ** 2).sum())
-    allowed += drift + turn * reach**2 + (noise.misalignment_rad * way) ** 2 + (noise.drift * way) ** 2
+    allowed += drift + turn * reach**2 + (noise.misalignment_rad * way) ** 2
     found[later] = np.linalg.norm(apart[1] - apart[0], axis=1) > sigma * np.sqrt(allowed)
     return found
 

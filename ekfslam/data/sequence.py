@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ekfslam.arrays import Array, IntArray
+from ekfslam.data.noise import Noise
 from ekfslam.errors import (
     CalibrationError,
     DataError,
@@ -105,56 +106,6 @@ class Truth:
             object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=dtype)))
         for name in ("T_world_imu", "position_m"):
             object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=float)))
-
-
-@dataclass(frozen=True)
-class Noise:
-    """White measurement noise, standard deviations per sample, and what makes real recordings less than white.
-
-    Args:
-        twist_std: (6,) of the velocities, m/s and rad/s.
-        pixel_std_px: (4,) of the pixels (uL, vL, uR, vR).
-        twist_walk_std: (6,) how far the true velocities change from one sample to the next; the joint filter then
-            estimates them, too. None: nothing is assumed of how they change.
-        motion_std: (6,) error of the motion beyond ``twist_std``, which no averaging of velocities removes.
-        misalignment_rad: Deviation of the angles between the frame of the velocities and the IMU frame, each axis.
-        drift: How far a track wanders along the way of the rig, frame by frame, as a share of the distance driven.
-        bearing_drift_rad: How far a track wanders in the image, a random walk: rad per square root of a metre driven.
-        tilt_rad: Of velocities in a level frame: deviation of the first roll and pitch against gravity from none; the
-            joint filter then estimates them. 0: the velocities are taken as those of the IMU frame.
-        margin: How much larger all these deviations are than those of single measurements, to make up for errors that
-            agree among themselves for many frames; what judges one track by itself need not allow for that.
-    """
-
-    twist_std: Array
-    pixel_std_px: Array
-    twist_walk_std: Array | None = None
-    motion_std: Array = field(default_factory=lambda: np.zeros(6))
-    misalignment_rad: float = 0.0
-    drift: float = 0.0
-    bearing_drift_rad: float = 0.0
-    tilt_rad: float = 0.0
-    margin: float = 1.0
-
-    @property
-    def landmarks_walk(self) -> bool:
-        """Whether what a track shows is taken to be another point in every frame."""
-        return bool(self.drift or self.bearing_drift_rad)
-
-    @property
-    def is_more_than_white(self) -> bool:
-        """Whether the joint filter estimates velocities or tilt, or lets landmarks walk."""
-        return self.twist_walk_std is not None or self.landmarks_walk or self.tilt_rad > 0
-
-    @property
-    def velocity_std(self) -> Array:
-        """(6,) error of one sample as a whole: ``twist_std`` and ``motion_std`` together."""
-        return np.hypot(self.twist_std, self.motion_std)
-
-    @staticmethod
-    def isotropic(sigma_v_m_s: float, sigma_w_rad_s: float, sigma_px: float) -> Noise:
-        """The same deviation for the three linear, the three angular velocities, and the four pixels."""
-        return Noise(np.repeat([sigma_v_m_s, sigma_w_rad_s], 3), np.full(4, float(sigma_px)))
 
 
 @dataclass(frozen=True)
@@ -346,16 +297,22 @@ def _validate_truth(truth: Truth, frames: int) -> None:
 
 
 def _validate_noise(noise: Noise) -> None:
-    for name, size in (("twist_std", 6), ("pixel_std_px", 4), ("twist_walk_std", 6), ("motion_std", 6)):
-        if name == "twist_walk_std" and noise.twist_walk_std is None:
+    sizes = {"twist_std": 6, "pixel_std_px": 4, "motion_std": 6}
+    optional = {"twist_walk_std": 6, "track_first_px": 3, "track_walk_px": 3}
+    for name, size in (sizes | optional).items():
+        if name in optional and getattr(noise, name) is None:
             continue
         value = np.asarray(getattr(noise, name), dtype=float)
         require_shape(value, (size,), f"noise.{name}")
         require_finite(value, f"noise.{name}")
         if (value < 0).any():
             raise DataError("standard deviations must not be negative", field=f"noise.{name}")
-    for name in ("misalignment_rad", "drift", "bearing_drift_rad", "tilt_rad"):
+    for name in ("misalignment_rad", "tilt_rad"):
         if not (np.isfinite(getattr(noise, name)) and getattr(noise, name) >= 0):
             raise DataError(f"must be finite and not negative, found {getattr(noise, name)}", field=f"noise.{name}")
+    if (noise.track_first_px is None) != (noise.track_walk_px is None):
+        raise DataError("track_first_px and track_walk_px belong together", field="noise.track_walk_px")
+    if not 0 < noise.track_memory <= 1:
+        raise DataError(f"must be in (0, 1], found {noise.track_memory}", field="noise.track_memory")
     if not noise.margin >= 1:
         raise DataError(f"must be at least 1, found {noise.margin}", field="noise.margin")

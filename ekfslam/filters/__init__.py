@@ -1,7 +1,5 @@
-"""The three estimators: dead reckoning, the report's independent landmark EKFs, and the joint EKF."""
+"""The estimators: the joint filter, mapping-only, dead reckoning, and what they share."""
 
-from ekfslam.filters.dead_reckoning import dead_reckon
-from ekfslam.filters.joint import JointEKF, run_joint
-from ekfslam.filters.mapping import map_landmarks
+from ekfslam.filters.joint import JointEKF
 
-__all__ = ["JointEKF", "dead_reckon", "map_landmarks", "run_joint"]
+__all__ = ["JointEKF"]

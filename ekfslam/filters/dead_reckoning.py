@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.data.sequence import Noise, Sequence
+from ekfslam.data.noise import Noise
+from ekfslam.data.sequence import Sequence
 from ekfslam.geometry import motion, se3
 
 
@@ -21,14 +22,12 @@ def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> 
         ``T_imu_world`` (T, 4, 4), the report's inverse poses, and the covariance (T, 6, 6) of their error ``xi``.
     """
     tau = np.diff(sequence.time_s)
-    E = motion.increment(sequence.twist[1:], tau)
-    F = motion.error_jacobian(E)
+    T_imu_world = motion.integrate(se3.inverse(sequence.initial_T_world_imu), sequence.twist, tau)
+    F = motion.error_jacobian(motion.increment(sequence.twist[1:], tau))
     Q = motion.process_noise(sequence.twist[1:], tau, noise.velocity_std, noise.misalignment_rad)
-    T_imu_world = np.empty((len(sequence), 4, 4))
     covariance = np.empty((len(sequence), 6, 6))
-    T_imu_world[0], covariance[0] = se3.inverse(sequence.initial_T_world_imu), initial_covariance
+    covariance[0] = initial_covariance
     for k in range(1, len(sequence)):
-        T_imu_world[k] = E[k - 1] @ T_imu_world[k - 1]
         P = F[k - 1] @ covariance[k - 1] @ F[k - 1].T + Q[k - 1]
         covariance[k] = 0.5 * (P + P.T)
     return T_imu_world, covariance

@@ -5,116 +5,99 @@ Equals the joint filter with a certain first pose and exact velocities (P_xx(0) 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from time import perf_counter
-
 import numpy as np
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import FilterConfig
-from ekfslam.data.sequence import Observations
-from ekfslam.filters.observing import (
-    ACCEPTED,
-    BEHIND_CAMERA,
-    GATE,
-    FrameReport,
-    Sensor,
-    diagonal,
-    first_sight,
-    linearise,
-    log_density,
-    missed,
-    normalised_squares,
-)
+from ekfslam.filters import gates
+from ekfslam.filters.landmarks import LandmarkTable
+from ekfslam.filters.reports import FrameReport, log_density, missed
 from ekfslam.filters.result import Landmarks
+from ekfslam.models.observation import initialise, linearise
+from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, Sensor
 
 
-def map_landmarks(
-    observations: Observations,
-    T_imu_world: Array,
-    sensor: Sensor,
-    config: FilterConfig,
-    frames: Iterable[int],
-) -> tuple[Landmarks, list[FrameReport], Array]:
-    """Independent EKF updates of all landmarks of a frame in one batch, frame by frame.
+class IndependentLandmarks:
+    """Independent EKF updates of all landmarks of a frame in one batch.
 
     Args:
-        observations: Stereo observations.
-        T_imu_world: (T, 4, 4) poses, taken as exact.
         sensor: What observes, and its noise.
         config: Gate and limits.
-        frames: The frames to go through, ascending (wrapped in a progress bar by the caller).
-
-    Returns:
-        Landmarks (pieces that were split off, then the rest in the order of their ids), one report a frame, and the
-        wall-clock time of each frame in ms.
-
-    Raises:
-        InnovationError: An innovation covariance is not positive definite.
+        T_imu_world: (T, 4, 4) poses of all frames, taken as exact.
     """
-    ids = observations.ids
-    position, initial = np.zeros((len(ids), 3)), np.zeros((len(ids), 3))
-    covariance = np.zeros((len(ids), 3, 3))
-    first, last = np.full(len(ids), -1), np.full(len(ids), -1)
-    count, misses = np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.int64)
-    retired: list[Landmarks] = []
-    gate = config.gate
 
-    def landmarks_at(which: IntArray) -> Landmarks:
-        return Landmarks(
-            ids[which], position[which], covariance[which], initial[which], first[which], last[which], count[which]
-        )
+    def __init__(self, sensor: Sensor, config: FilterConfig, T_imu_world: Array) -> None:
+        self.sensor, self.config, self._poses = sensor, config, T_imu_world
+        self.table = LandmarkTable(sensor.dimension)
+        self.covariance = np.empty((0, 3, 3))
+        self._gate = gates.threshold(config.gate_probability, sensor.dimension)
+        self._split: list[Landmarks] = []
 
-    reports: list[FrameReport] = []
-    ms: list[float] = []
+    def update(self, frame: int, ids: IntArray, measured: Array) -> FrameReport:
+        """Correct what is known, split what jumped, start what is new, eq. (4) to (6) with an exact pose.
 
-    for k in frames:
-        begin = perf_counter()
-        seen, pixels = observations.at(k)
-        slot = np.searchsorted(ids, seen)
-        rows = sensor.rows(pixels)
-        V = diagonal(sensor.variance(rows))
-        reason = sensor.screen(pixels, config)
+        Args:
+            frame: Frame index.
+            ids: (n,) landmark ids seen, distinct.
+            measured: (n, 4) pixels, or what else the sensor measures.
 
-        known = np.flatnonzero((reason == ACCEPTED) & (count[slot] > 0))
-        estimate = position[slot[known]]
-        q, _, H = linearise(sensor, T_imu_world[k], estimate, estimate)
-        in_front = sensor.in_view(q, config)
+        Raises:
+            InnovationError: An innovation covariance is not positive definite.
+        """
+        table, T = self.table, self._poses[frame]
+        rows = self.sensor.rows(measured)
+        reason = self.sensor.screen(measured, self.config.min_depth_m)
+        slot, is_known = table.lookup(ids)
+        known = np.flatnonzero(is_known & (reason == ACCEPTED))
+        position = table.position_m[slot[known]]
+        q, _, H = linearise(self.sensor, T, position, T, position)
+        in_front = self.sensor.in_view(q, self.config.min_depth_m)
         reason[known[~in_front]] = BEHIND_CAMERA
         known, q, H = known[in_front], q[in_front], H[in_front]
 
-        residual = rows[known] - sensor.predict(q)
-        HP = H @ covariance[slot[known]]
-        S = HP @ np.swapaxes(H, -1, -2) + V[known]
-        nis = normalised_squares(S, residual, k, seen[known])
-        inside = nis <= gate
+        residual = rows[known] - self.sensor.predict(q)
+        HP = H @ self.covariance[slot[known]]
+        S = HP @ np.swapaxes(H, -1, -2) + gates.diagonal(self.sensor.variance(rows[known]))
+        squares = gates.normalised_squares(S, residual, frame, ids[known])
+        inside = squares <= self._gate
         reason[known[~inside]] = GATE
-        update = slot[known[inside]]
-        gain = np.swapaxes(np.linalg.solve(S[inside], HP[inside]), -1, -2)
-        position[update] += (gain @ residual[inside, :, None])[..., 0]
-        P = covariance[update] - gain @ HP[inside]
-        covariance[update] = 0.5 * (P + np.swapaxes(P, -1, -2))
+        self._condition(slot[known[inside]], S[inside], HP[inside], residual[inside])
 
-        misses[slot[missed(reason)]] += 1
-        misses[update] = 0
-        split = slot[(misses[slot] >= config.split_after) & (config.split_after > 0)]
-        retired.append(landmarks_at(split))
-        count[split] = misses[split] = 0
-        reason[np.isin(slot, split)] = ACCEPTED
+        table.accepted(slot[known[inside]], frame)
+        table.misses[slot[is_known & missed(reason)]] += 1
+        split = self._retire((table.misses >= self.config.split_after) & (self.config.split_after > 0))
+        new = (~is_known & (reason == ACCEPTED)) | np.isin(ids, split)
+        reason[new] = ACCEPTED
+        self._start(frame, ids[new], rows[new])
+        nis, dof = float(squares[inside].sum()), int(residual[inside].size)
+        likelihood = log_density(nis, np.linalg.slogdet(S[inside])[1].sum(), dof)
+        return FrameReport(frame, ids, reason, nis, dof, split, likelihood)
 
-        new = np.flatnonzero((reason == ACCEPTED) & (count[slot] == 0))
-        start = slot[new]
-        position[start], _, covariance[start] = first_sight(sensor, T_imu_world[k], rows[new])
-        initial[start], first[start] = position[start], k
+    def _condition(self, slot: IntArray, S: Array, HP: Array, residual: Array) -> None:
+        gain = np.swapaxes(np.linalg.solve(S, HP), -1, -2)
+        self.table.position_m[slot] += (gain @ residual[..., None])[..., 0]
+        P = self.covariance[slot] - gain @ HP
+        self.covariance[slot] = 0.5 * (P + np.swapaxes(P, -1, -2))
 
-        accepted = slot[reason == ACCEPTED]
-        last[accepted] = k
-        count[accepted] += 1
-        nis_accepted = nis[inside]
-        dof = 3 * len(nis_accepted)
-        likelihood = log_density(nis_accepted.sum(), np.linalg.slogdet(S[inside])[1].sum(), dof)
-        reports.append(FrameReport(k, seen, reason, float(nis_accepted.sum()), dof, ids[split], likelihood))
-        ms.append(1e3 * (perf_counter() - begin))
+    def _start(self, frame: int, ids: IntArray, rows: Array) -> None:
+        T = self._poses[frame]
+        positions, _, covariance = initialise(self.sensor, T, rows, self.sensor.variance(rows), T)
+        at = np.full(len(ids), frame)
+        self.table.append(
+            id=ids, first_frame=at, last_frame=at, observations=at * 0 + 1, position_m=positions, initial_m=positions
+        )
+        self.covariance = np.concatenate([self.covariance, covariance])
 
-    landmarks = Landmarks.concatenate([*retired, landmarks_at(np.flatnonzero(count > 0))])
-    return landmarks, reports, np.array(ms)
+    def _retire(self, gone: BoolArray) -> IntArray:
+        """Keep what was split off; returns the ids, which are then free to start anew."""
+        slot = np.flatnonzero(gone)
+        slot = slot[np.argsort(self.table.id[slot])]
+        ids = self.table.id[slot]
+        self._split.append(self.table.snapshot(slot, self.covariance))
+        self.table.keep(~gone)
+        self.covariance = self.covariance[~gone]
+        return ids
+
+    def landmarks(self) -> Landmarks:
+        """Pieces that were split off, then the rest in the order of their ids."""
+        return Landmarks.concatenate([*self._split, self.table.snapshot(np.argsort(self.table.id), self.covariance)])

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array, IntArray
-from ekfslam.data.sequence import Noise
+from ekfslam.data.hygiene import HygieneReport
+from ekfslam.data.noise import Noise
 from ekfslam.filters.log import Log
 from ekfslam.geometry.camera import StereoCamera
 
@@ -23,20 +24,6 @@ ERROR_CONVENTION = (
 # Why a filter rejected an observation; the codes of `Rejections.reason`. Archives hold the codes: "row mismatch", now
 # the business of `ekfslam.data.hygiene`, keeps its place.
 REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera", "moving")
-
-
-# The rules of `ekfslam.data.hygiene` in the order in which they are applied, with the key of ``[hygiene]`` that
-# switches each; the index is the code of `HygieneReport.rule`.
-_SWITCHES: dict[str, str] = {
-    "repeated frame": "restart_at_repeats",
-    "jump": "jump_sigma",
-    "re-used id": "reused_id_sigma",
-    "disparity": "min_disparity_sigma",
-    "row mismatch": "max_row_mismatch_sigma",
-    "depth": "max_depth_error",
-    "too short": "min_observations",
-}
-RULES: tuple[str, ...] = tuple(_SWITCHES)
 
 
 @dataclass(frozen=True)
@@ -145,60 +132,6 @@ class Parameters:
             + ("" if is_observed else ", not observable here")
             for name, unit, prior, value, std, is_observed in rows
         )
-
-
-@dataclass(frozen=True)
-class HygieneReport:
-    """What hygiene found and did, one row a finding, in the order of the rules and then of the frames.
-
-    Args:
-        observations: Number of observations looked at.
-        rule: (n,) index into `RULES`.
-        frame: (n,) frame of the observation that was dropped, or with which the new piece of a cut track begins.
-        landmark: (n,) id of its track in the recording.
-        continuation: (n,) id that a cut track has from there on; -1 where the observation was dropped.
-    """
-
-    observations: int
-    rule: IntArray
-    frame: IntArray
-    landmark: IntArray
-    continuation: IntArray
-
-    @property
-    def dropped(self) -> int:
-        """Number of observations dropped, each by one rule."""
-        return int((self.continuation < 0).sum())
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Findings by rule, and the observations dropped in all."""
-        found = np.bincount(self.rule, minlength=len(RULES)).tolist()
-        return {
-            "dropped by hygiene": self.dropped,
-            **{f"hygiene: {name}": count for name, count in zip(RULES, found, strict=True)},
-        }
-
-    def lines(self, config: Mapping[str, Any]) -> tuple[str, ...]:
-        """One line a rule: what was found, where, and what was done; or that ``config`` (``[hygiene]``) has it off."""
-        lines = []
-        for code, (name, switch) in enumerate(_SWITCHES.items()):
-            found = self.rule == code
-            tracks, frames = np.unique(self.landmark[found]), np.unique(self.frame[found])
-            cut = int((self.continuation[found] >= 0).sum())
-            dropped = int(found.sum()) - cut
-            line = f"{name}: " + ("nothing found" if config[switch] else "switched off")
-            if len(frames):
-                what = " and ".join([f"{dropped} observations dropped"] * bool(dropped) + [f"{cut} cuts"] * bool(cut))
-                line = f"{name}: {what}, in {len(tracks)} tracks, {len(frames)} frames from {frames[0]} to {frames[-1]}"
-            lines.append(line)
-        return (*lines, f"{self.dropped} of {self.observations} observations dropped in all")
-
-    @staticmethod
-    def empty(observations: int) -> HygieneReport:
-        """Of clean tracks."""
-        none = np.empty(0, dtype=np.int64)
-        return HygieneReport(observations, none, none, none, none)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,16 @@ def increment(twist: Array, tau_s: Array | float) -> Array:
     return se3.exp(-np.asarray(tau_s)[..., None] * twist)
 
 
+def integrate(T_imu_world: Array, twist: Array, tau_s: Array) -> Array:
+    """Poses (T, 4, 4) by eq. (1) from the first one (4, 4), velocities (T, 6) and intervals (T-1,) between frames."""
+    E = increment(twist[1:], tau_s)
+    T = np.empty((len(twist), 4, 4))
+    T[0] = T_imu_world
+    for k in range(1, len(T)):
+        T[k] = E[k - 1] @ T[k - 1]
+    return T
+
+
 def error_jacobian(E: Array) -> Array:
     """``F = Ad_E`` of eq. (2): how the pose error goes through the prediction, (..., 4, 4) to (..., 6, 6)."""
     return se3.adjoint(E)
@@ -52,30 +62,34 @@ def level_frame(up: Array) -> tuple[Array, Array]:
     roll and pitch are.
 
     Args:
-        up: (3,) unit vector against gravity, in the IMU frame; not along its x axis.
+        up: (..., 3) unit vectors against gravity, in the IMU frame; not along its x axis.
 
     Returns:
-        ``R_imu_level`` (3, 3), and Z (3, 3): where up turns by ``exp(phi^)``, the frame turns by ``exp((Z phi)^)``.
+        ``R_imu_level`` (..., 3, 3), and Z (..., 3, 3): where up turns by ``exp(phi^)``, the frame turns by
+        ``exp((Z phi)^)``.
     """
-    forward = np.array([1.0, 0.0, 0.0])
-    sine = up[0]
+    sine = up[..., :1]
     cosine = np.sqrt(1.0 - sine**2)
-    x = (forward - sine * up) / cosine
-    R_imu_level = np.column_stack([x, np.cross(up, x), up])
+    x = -sine * up
+    x[..., 0] += 1.0
+    x /= cosine
+    R_imu_level = np.stack([x, np.cross(up, x), up], axis=-1)
     # The part of phi along up turns nothing; instead the frame turns about up as far as keeps its y axis off forward.
-    return R_imu_level, np.eye(3) - np.outer(up, up) + sine / cosine * np.outer(up, x)
+    about_up = (sine / cosine * x - up)[..., None, :]
+    return R_imu_level, np.eye(3) + up[..., :, None] * about_up
 
 
 def imu_twist(level_twist: Array, up: Array) -> tuple[Array, Array, Array]:
-    """Eq. (8): velocities of the level frame, (6,) m/s and rad/s, in the IMU frame.
+    """Eq. (8): velocities of the level frame, (..., 6) m/s and rad/s, in the IMU frame; ``up`` (..., 3) is of that.
 
     Returns:
-        The velocities (6,), their derivative (6, 6) by ``level_twist``, and (6, 3) by phi where up is ``exp(phi^) up``.
+        The velocities (..., 6), their derivative (..., 6, 6) by ``level_twist``, and (..., 6, 3) by phi where up is
+        ``exp(phi^) up``.
     """
     R, Z = level_frame(up)
-    by_level = np.zeros((6, 6))
-    by_level[:3, :3] = by_level[3:, 3:] = R
-    twist = by_level @ level_twist
+    by_level = np.zeros((*R.shape[:-2], 6, 6))
+    by_level[..., :3, :3] = by_level[..., 3:, 3:] = R
+    twist = (by_level @ level_twist[..., None])[..., 0]
     return twist, by_level, -turned_by(twist) @ Z
 
 

@@ -11,12 +11,14 @@ given by the constants below.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.data.sequence import Noise, VelocityFrame
+from ekfslam.data.noise import Noise
+from ekfslam.data.sequence import VelocityFrame
 
 # Errors of automotive velocities that are there even if no noise is: of each sample, and of the angles between their
 # frame and that of the IMU.
@@ -26,13 +28,12 @@ MISALIGNMENT_RAD = np.deg2rad(0.07)
 # Roll and pitch of a road vehicle.
 TILT_RAD = np.deg2rad(3.0)
 
-# Of tracks of a KLT tracker: pixel noise, and how the tracked point wanders, see `Noise`. That errors of tracks agree
-# among themselves for many frames is not part of the model; to make up for it, all three are larger than what single
-# innovations show: the normalised square of these is about 0.1 a degree of freedom.
+# Of tracks of a KLT tracker (u, v, disparity): their error at landmark initialisation and how it walks from frame to
+# frame, see `ekfslam.data.noise.TrackError`. White pixel noise only sets the limits of hygiene.
 PIXEL_STD_PX = 0.7
-DRIFT = 0.4
-BEARING_DRIFT_RAD = 0.00085
-MARGIN = 3.0
+TRACK_FIRST_PX = np.array([0.1, 0.1, 1.0])
+TRACK_WALK_PX = np.array([0.2, 0.2, 0.15])
+MARGIN = 1.0
 
 _BLOCKS = 20  # of the jackknife
 _ONE_SIDED_95 = 1.645  # deviations
@@ -115,11 +116,19 @@ def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu") -> Nois
         twist_walk_std=None if is_clean else np.repeat(found.walk, 3),
         motion_std=MOTION_STD,
         misalignment_rad=MISALIGNMENT_RAD,
-        drift=DRIFT,
-        bearing_drift_rad=BEARING_DRIFT_RAD,
+        track_first_px=TRACK_FIRST_PX,
+        track_walk_px=TRACK_WALK_PX,
         margin=MARGIN,
         tilt_rad=TILT_RAD if velocity_frame == "level" else 0.0,
     )
+
+
+def with_drift(noise: Noise, drift_px: float) -> Noise:
+    """The noise with tracks whose errors walk by ``drift_px`` a frame in u and v, in the proportions assumed else."""
+    if not drift_px:
+        return dataclasses.replace(noise, track_first_px=None, track_walk_px=None)
+    first = TRACK_FIRST_PX if noise.track_first_px is None else noise.track_first_px
+    return dataclasses.replace(noise, track_first_px=first, track_walk_px=TRACK_WALK_PX * (drift_px / TRACK_WALK_PX[0]))
 
 
 def with_error(value: float, error: float | None) -> str:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.config import FilterConfig, Kernel, PosteriorConfig
+from ekfslam.config import Kernel, PosteriorConfig
 from ekfslam.errors import IllPosedError
-from ekfslam.smoother.problem import Rows, State
+from ekfslam.smoother.problem import BatchProblem, State
 from ekfslam.smoother.sparse.information import Elimination, JointInformation
 
 
@@ -54,11 +54,11 @@ class Maximum:
 
 
 def maximise(
-    rows: Rows,
+    problem: BatchProblem,
     elimination: Elimination,
     start: State,
     config: PosteriorConfig,
-    filter_config: FilterConfig,
+    min_depth_m: float,
     iterations: Iterable[int],
 ) -> Maximum:
     """Maximum a posteriori of all rows, by Levenberg-Marquardt with iteratively reweighted rows.
@@ -66,38 +66,39 @@ def maximise(
     Source: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000, section 4.
 
     Args:
-        rows: What is known.
+        problem: What is known.
         elimination: Its structure.
         start: Where to start from; a landmark that fits better at its first triangulation starts from there.
         config: Kernel and tolerance.
-        filter_config: Says what is in view.
+        min_depth_m: What is nearer is not in view.
         iterations: Iterated over at most once (a range, wrapped in a progress bar by the caller).
 
     Raises:
         IllPosedError: Something is undetermined, or a landmark is behind a camera that saw it; names the ids.
     """
-    state = _best_start(rows, start, config, filter_config)
+    state = _best_start(problem, start, config, min_depth_m)
 
     def evaluate(state: State) -> tuple[float, Array]:
         """Cost (infinite if a landmark is behind a camera that saw it) and norms of the residuals (K,)."""
-        q = rows.points(state)
-        if not rows.sensor.in_view(q, filter_config).all():
+        q = problem.points(state)
+        if not problem.model.sensor.in_view(q, min_depth_m).all():
             return np.inf, np.empty(0)
-        s = np.linalg.norm(rows.observation_residual(q), axis=1)
+        s = np.linalg.norm(problem.observation_residual(q, state), axis=1)
         pixels = kernel_cost(config.kernel, config.kernel_width, s).sum()
-        return float(pixels + 0.5 * (rows.motion_residual(state) ** 2).sum() + 0.5 * (state.zeta**2).sum()), s
+        motion = 0.5 * (problem.motion_residual(state) ** 2).sum()
+        return float(pixels + motion + problem.block_cost(state)), s
 
     cost, s = evaluate(state)
     costs, damping, growth, factor = [cost], 1e-7, 2.0, None
     weight = kernel_weight(config.kernel, config.kernel_width, s)
-    system = rows.relinearised(state, weight)
+    system = problem.relinearised(state, weight)
     for _ in iterations:
         step = JointInformation(elimination, system, damping, factor)
         factor = step.factor
-        moved = rows.moved(state, step.eps, step.d, step.zeta)
+        moved = problem.moved(state, step)
         new_cost, new_s = evaluate(moved)
         gain = cost - new_cost
-        promised = system.half_square - step.cost + 0.5 * damping * float((step.eps**2).sum() + (step.d**2).sum())
+        promised = system.half_square - step.cost + 0.5 * damping * step.square
         if not gain >= 0:
             damping, growth = damping * growth, 2.0 * growth
             if promised <= config.tolerance * cost:
@@ -109,24 +110,24 @@ def maximise(
         state, cost, s = moved, new_cost, new_s
         costs.append(cost)
         weight = kernel_weight(config.kernel, config.kernel_width, s)
-        system = rows.relinearised(state, weight)
+        system = problem.relinearised(state, weight)
         if gain <= config.tolerance * cost:
             break
     return Maximum(state, weight, tuple(costs), JointInformation(elimination, system, factor=factor))
 
 
-def _best_start(rows: Rows, state: State, config: PosteriorConfig, filter_config: FilterConfig) -> State:
-    """The state with every landmark where it fits its observations better: where it is, or at its first triangulation.
+def _best_start(problem: BatchProblem, state: State, config: PosteriorConfig, min_depth_m: float) -> State:
+    """The state with every landmark where it fits its observations better: where it is, or at its initialisation.
 
     Raises:
         IllPosedError: A landmark is behind a camera that saw it in both places; names the ids.
     """
-    log = rows.log
+    log = problem.log
 
     def costs(positions_m: Array) -> Array:
-        q = rows.points(replace(state, positions_m=positions_m))
-        visible = rows.sensor.in_view(q, filter_config)
-        s = np.linalg.norm(rows.observation_residual(np.where(visible[:, None], q, 1.0)), axis=1)
+        q = problem.points(replace(state, positions_m=positions_m))
+        visible = problem.model.sensor.in_view(q, min_depth_m)
+        s = np.linalg.norm(problem.observation_residual(np.where(visible[:, None], q, 1.0), state), axis=1)
         cost = np.where(visible, kernel_cost(config.kernel, config.kernel_width, s), np.inf)
         return np.asarray(np.bincount(log.landmark, weights=cost, minlength=log.landmarks), dtype=float)
 

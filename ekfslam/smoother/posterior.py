@@ -12,6 +12,7 @@ unobservable directions.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from time import perf_counter
@@ -22,15 +23,16 @@ from numpy.typing import ArrayLike
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import Config, FilterConfig, PosteriorConfig
 from ekfslam.errors import PosteriorError
-from ekfslam.filters import calibration as cal
 from ekfslam.filters.log import Log
-from ekfslam.filters.observing import Rig, Sensor
 from ekfslam.filters.result import Innovation, Rejections, Result
 from ekfslam.geometry import se3
+from ekfslam.models.build import model_of, optional_blocks
+from ekfslam.models.model import Model
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
 from ekfslam.smoother.optimise import maximise
-from ekfslam.smoother.problem import Rows, aged
-from ekfslam.smoother.sparse.information import Elimination, JointInformation
+from ekfslam.smoother.problem import BatchProblem
+from ekfslam.smoother.sparse.information import JointInformation
 
 DENSE_LIMIT = 20_000  # columns of a dense covariance: 3.2 GB
 
@@ -50,6 +52,8 @@ class Posterior:
         weight: (K,) robust weight of each observation of the log.
         costs: Cost (half the sum of squares, under the kernel) before each iteration and at the end.
         information: The factorised system.
+        values: Estimates of the further state blocks by name: of each frame (T, ...), or of the drive.
+        problem: The rows.
     """
 
     linearisation: str
@@ -59,6 +63,8 @@ class Posterior:
     weight: Array
     costs: tuple[float, ...]
     information: JointInformation
+    values: Mapping[str, Array]
+    problem: BatchProblem
 
     @property
     def cost(self) -> float:
@@ -74,6 +80,24 @@ class Posterior:
     def landmark_covariance(self) -> Array:
         """(M, 3, 3) marginals of all landmarks."""
         return self.information.landmark_covariances()
+
+    def block_covariance(self, name: str) -> Array:
+        """Marginal covariance of a further state block: of each frame (T, n, n), or of the drive (n, n).
+
+        Raises:
+            PosteriorError: There is no such block.
+        """
+        for blocks, covariance in (
+            (self.problem.aux_blocks, self.information.aux_covariances),
+            (self.problem.drive_blocks, self.information.drive_covariance),
+        ):
+            start = 0
+            for block in blocks:
+                if block.name == name:
+                    at = slice(start, start + block.size)
+                    return covariance()[..., at, at]
+                start += block.size
+        raise PosteriorError(f"there is no state block {name!r}; there are {', '.join(self.values) or 'none'}")
 
     def joint_covariance(self, frames: ArrayLike = (), landmarks: ArrayLike = ()) -> Array:
         """Covariance (6a+3b, 6a+3b) of a poses and b landmarks, given by frame and by row, in that order.
@@ -123,91 +147,78 @@ def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterio
         config: Linearisation and kernel; by default those that the result was configured with.
 
     Raises:
-        PosteriorError: The result has no log, or estimates what a posterior does not know.
+        PosteriorError: The result has no log.
         IllPosedError: Something is undetermined; lists landmark ids or frames.
     """
     if result.log is None:
         raise PosteriorError(f"{result.sequence_name}: a result of mode {result.mode!r} has no log; run mode 'full'")
     stored = Config().with_overrides(result.config)
-    config = config or stored.posterior
-    if config.linearisation == "filtered" and result.parameters is not None:
-        raise PosteriorError(
-            f"{result.sequence_name}: the filter has also estimated {', '.join(result.parameters.name)}, which its "
-            "log does not hold; there is only the linearisation 'map'"
-        )
     return posterior_of_log(
         result.log,
-        _rig(result),
+        model_of_result(result),
         result.landmarks.position_m,
-        config,
-        stored.filter,
+        config or stored.posterior,
+        stored.filter.min_depth_m,
         name=result.sequence_name,
     )
 
 
-def _rig(result: Result) -> Rig:
-    """The rig of a run, with the calibration that it has found."""
-    rig, found = Rig(result.camera, result.T_cam_imu, result.noise), result.parameters
-    if found is None:
-        return rig
-    parameters = np.array([dict(zip(found.name, found.value[-1], strict=True)).get(name, 0.0) for name in cal.NAMES])
-    if cal.time_offset(parameters):
-        raise PosteriorError(f"{result.sequence_name}: there is no posterior of a run that estimates a time offset")
-    return cal.calibrated(rig, parameters)
+def model_of_result(result: Result) -> Model:
+    """The model that a full run believed in."""
+    assert result.log is not None
+    stored = Config().with_overrides(result.config)
+    return model_of(
+        Rig(result.camera, result.T_cam_imu, result.noise),
+        result.noise,
+        result.log.T_predicted[0],
+        result.log.initial_covariance,
+        stored.calibration,
+        optional_blocks(stored.blocks),
+    )
 
 
 def posterior_of_log(
     log: Log,
-    sensor: Sensor,
+    model: Model,
     positions_m: Array,
     config: PosteriorConfig | None = None,
-    filter_config: FilterConfig | None = None,
+    min_depth_m: float = FilterConfig.min_depth_m,
     name: str = "posterior",
 ) -> Posterior:
-    """`posterior` of any sensor's log.
+    """`posterior` of the log of any model.
 
     Args:
-        log, sensor: What was observed, and by what.
+        log, model: What was observed, and what was believed.
         positions_m: (M, 3) the filter's last estimates of the landmarks of the log, to start from.
         config: Linearisation and kernel.
-        filter_config: Says what is in view.
+        min_depth_m: What is nearer is not in view.
         name: For the progress bar.
 
     Raises:
         IllPosedError: Something is undetermined; lists landmark ids or frames.
     """
     config = config or PosteriorConfig()
-    rows = Rows(aged(log, sensor), sensor)
-    elimination = Elimination(log.frames, log.landmarks, log.frame, log.landmark, log.id)
+    problem = BatchProblem(log, model)
+    elimination = problem.elimination()
     if config.linearisation == "filtered":
-        if sensor.noise.is_more_than_white:
-            raise PosteriorError(
-                f"{name}: the filter let velocities or landmarks walk or has found out its tilt, which its log does "
-                "not hold; there is only the linearisation 'map', of white velocities and landmarks that stay"
-            )
-        information = JointInformation(elimination, rows.as_filtered())
-        T_imu_world = se3.exp(information.eps) @ log.T_predicted
-        return Posterior(
-            "filtered",
-            log.id,
-            se3.inverse(T_imu_world),
-            log.first_position_m + information.d,
-            np.ones(log.observations),
-            (information.cost,),
-            information,
-        )
-    iterations = progress(range(config.max_iterations), f"{name}: smoothing")
-    found = maximise(
-        rows, elimination, rows.filtered_state(positions_m), config, filter_config or FilterConfig(), iterations
-    )
+        information = JointInformation(elimination, problem.as_filtered())
+        state = problem.solved_as_filtered(information)
+        weight, costs = np.ones(log.observations), (information.cost,)
+    else:
+        iterations = progress(range(config.max_iterations), f"{name}: smoothing")
+        start = problem.filtered_state(positions_m)
+        found = maximise(problem, elimination, start, config, min_depth_m, iterations)
+        information, state, weight, costs = found.information, found.state, found.weight, found.costs
     return Posterior(
-        "map",
+        config.linearisation,
         log.id,
-        se3.inverse(found.state.T_imu_world),
-        found.state.positions_m,
-        found.weight,
-        found.costs,
-        found.information,
+        se3.inverse(state.T_imu_world),
+        state.positions_m,
+        weight,
+        costs,
+        information,
+        problem.values(state),
+        problem,
     )
 
 

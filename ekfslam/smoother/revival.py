@@ -1,8 +1,8 @@
-"""The sparse system behind the filter, from which landmarks that were retired come back.
+"""Map revival: the batch problem behind the filter, from which landmarks that were retired come back.
 
-The filter's state is the marginal, over the current pose and the landmarks in view, of one system over all poses and
-all landmarks. When retired landmarks are seen again, the marginal over the current pose, the active *and* the returning
-landmarks takes its place:
+The filter's state is the marginal, over its blocks and the landmarks in view, of one system over all frames and all
+landmarks. When retired landmarks are seen again, the marginal over the blocks, the active *and* the returning landmarks
+takes its place:
 
 - ``standard`` and ``fej``: the rows are frozen where the filter linearised them, and so the marginal is exactly the
   state of a filter that never retired anything. FEJ keeps its consistency, since a landmark comes back with its first
@@ -19,26 +19,27 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig, PosteriorConfig
+from ekfslam.filters.lifecycle import Marginal
 from ekfslam.filters.log import Log
-from ekfslam.filters.observing import Sensor
-from ekfslam.filters.variants import RULES
+from ekfslam.filters.variants import VARIANTS
+from ekfslam.models.model import Model
 from ekfslam.smoother.optimise import maximise
-from ekfslam.smoother.problem import Rows, State
-from ekfslam.smoother.sparse.information import Elimination, JointInformation
+from ekfslam.smoother.problem import BatchProblem, State
+from ekfslam.smoother.sparse.information import JointInformation
 
 # What came in has passed the gate: no kernel. The mean must be the linearisation point, so the tolerance is tight.
 _MAXIMUM = PosteriorConfig(kernel="none", tolerance=1e-12)
 
 
-class Behind:
-    """Marginals of the system behind.
+class MapRevival:
+    """Marginals of the batch problem behind a filter, for its `revival`.
 
     Args:
-        sensor, config: Those of the filter.
+        model, config: Those of the filter.
     """
 
-    def __init__(self, sensor: Sensor, config: FilterConfig) -> None:
-        self._sensor, self._config = sensor, config
+    def __init__(self, model: Model, config: FilterConfig) -> None:
+        self._model, self._config = model, config
         self._last: State | None = None
 
     def neighbours(self, log: Log, returning: IntArray, candidates: IntArray) -> tuple[IntArray, IntArray]:
@@ -66,45 +67,60 @@ class Behind:
         chosen = candidates[np.argsort(nearest[candidates], kind="stable")[: self._config.revive]]
         return chosen, nearest[chosen]
 
-    def marginal(self, log: Log, positions_m: Array, landmarks: IntArray) -> tuple[Array, Array, Array]:
-        """Mean and covariance of the last pose and some landmarks, given everything in the log.
+    def marginal(self, log: Log, positions_m: Array, landmarks: IntArray) -> Marginal:
+        """Mean and covariance of the last frame's blocks and some landmarks, given everything in the log.
 
         Args:
             log: Everything so far, the prediction to the current frame included.
             positions_m: (M, 3) the filter's last estimates of all landmarks.
             landmarks: (n,) rows of the log.
 
-        Returns:
-            ``T_imu_world`` (4, 4), positions (n, 3) and covariance (6+3n, 6+3n).
-
         Raises:
             IllPosedError: Something is undetermined; names landmark ids or frames.
         """
-        rows = Rows(log, self._sensor)
-        elimination = Elimination(log.frames, log.landmarks, log.frame, log.landmark, log.id)
-        last = np.array([log.frames - 1])
-        if RULES[self._config.variant].transport is None:
-            information = JointInformation(elimination, rows.as_filtered())
-            # The last pose has been predicted and nothing more: eps is 0 but for rounding.
-            T = log.T_predicted[-1]
+        problem = BatchProblem(log, self._model)
+        elimination = problem.elimination()
+        if VARIANTS[self._config.variant].is_frozen_exactly:
+            information = JointInformation(elimination, problem.as_filtered())
+            # The blocks' mean is the filter's already, but for rounding.
             positions = log.first_position_m[landmarks] + information.d[landmarks]
-        else:
-            start = self._start(rows, positions_m)
-            found = maximise(rows, elimination, start, _MAXIMUM, self._config, range(_MAXIMUM.max_iterations))
-            information, self._last = found.information, found.state
-            T, positions = found.state.T_imu_world[-1], found.state.positions_m[landmarks]
-        return T, positions, np.ascontiguousarray(information.covariance(last, landmarks))
+            none = np.empty(0, dtype=np.int64)
+            return Marginal({}, none, np.empty(0), positions, self._covariance(problem, information, landmarks))
+        start = self._start(problem, positions_m)
+        iterations = range(_MAXIMUM.max_iterations)
+        found = maximise(problem, elimination, start, _MAXIMUM, self._config.min_depth_m, iterations)
+        self._last = state = found.state
+        return Marginal(
+            problem.last_values(state),
+            *problem.last_coordinates(state),
+            state.positions_m[landmarks],
+            self._covariance(problem, found.information, landmarks),
+        )
 
-    def _start(self, rows: Rows, positions_m: Array) -> State:
+    def _covariance(self, problem: BatchProblem, information: JointInformation, landmarks: IntArray) -> Array:
+        """Covariance (body+3n, body+3n) in the columns of the filter."""
+        last, layout = problem.log.frames - 1, self._model.layout
+        has_clone = self._model.has_clone and last > 0
+        frames = np.array([last, last - 1] if has_clone else [last])
+        P = information.covariance(frames, landmarks, np.array([last]), drive=True)
+        names = ["pose", *(["previous_pose"] if has_clone else [])]
+        columns = np.concatenate([layout.columns(names), problem.aux_columns, problem.drive_columns])
+        order = np.concatenate([columns, layout.body + np.arange(3 * len(landmarks))])
+        wide = np.zeros((layout.body + 3 * len(landmarks),) * 2)
+        wide[np.ix_(order, order)] = P
+        return wide
+
+    def _start(self, problem: BatchProblem, positions_m: Array) -> State:
         """The last maximum, continued by the filter's estimates of what has been seen since."""
-        state, log = rows.filtered_state(positions_m), rows.log
-        if self._last is None:
+        state, log, last = problem.filtered_state(positions_m), problem.log, self._last
+        if last is None:
             return state
-        known = len(self._last.T_imu_world)
-        unseen = np.ones(len(self._last.positions_m), dtype=bool)
+        known = len(last.T_imu_world)
+        unseen = np.ones(len(last.positions_m), dtype=bool)
         since = log.landmark[log.frame >= known - 1]
         unseen[since[since < len(unseen)]] = False
         positions = state.positions_m.copy()
-        positions[: len(unseen)][unseen] = self._last.positions_m[unseen]
-        T = np.concatenate([self._last.T_imu_world, state.T_imu_world[known:]])
-        return State(T, positions, self._last.zeta)
+        positions[: len(unseen)][unseen] = last.positions_m[unseen]
+        T = np.concatenate([last.T_imu_world, state.T_imu_world[known:]])
+        aux = np.concatenate([last.aux, state.aux[known:]])
+        return State(T, positions, last.zeta, aux, last.drive, last.drive_values)

@@ -37,14 +37,13 @@ from scipy.spatial.transform import Rotation
 from ekfslam.arrays import Array
 from ekfslam.config import HygieneConfig
 from ekfslam.data.readers.hdf5 import read_sequence_fields, write_sequence_group, write_truth_group
+from ekfslam.data.hygiene import RULES, HygieneReport
 from ekfslam.data.sequence import Noise, Sequence, Truth, VelocityFrame
 from ekfslam.errors import ArchiveError, DataError
 from ekfslam.filters.log import Log
 from ekfslam.filters.result import (
     ERROR_CONVENTION,
     REASONS,
-    RULES,
-    HygieneReport,
     Innovation,
     Landmarks,
     Parameters,
@@ -54,7 +53,7 @@ from ekfslam.filters.result import (
 from ekfslam.geometry.camera import StereoCamera
 
 FORMAT = "ekfslam-archive"
-FORMAT_VERSION = 3  # 2 added log, 3 hygiene and parameters
+FORMAT_VERSION = 4  # 2 added log, 3 hygiene and parameters, 4 state blocks and track errors in the log
 
 # Data set below /runs/<mode>, field of `Result`, shape (T frames, M landmarks, R rejections), units, frame.
 _Layout = tuple[tuple[str, str, tuple[str | int, ...], str, str], ...]
@@ -80,21 +79,39 @@ _LAYOUT: _Layout = (
 )
 
 
-# The same below /runs/<mode>/log, fields of `Log` (K observations).
+# The same below /runs/<mode>/log, fields of `Log` (K observations of d rows, N velocity measurements, B body columns).
+_POSE = "m (translation)"
+_COORDINATES = "see ekfslam.filters.log"
 _LOG_LAYOUT: _Layout = (
     ("initial_covariance", "initial_covariance", (6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu"),
-    ("twist", "twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "imu"),
+    ("twist", "twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "that of the velocities"),
     ("tau", "tau_s", ("T",), "s", "none"),
-    ("T_imu_world_predicted", "T_predicted", ("T", 4, 4), "m (translation)", "imu from world"),
-    ("T_imu_world_linear", "T_linear", ("T", 4, 4), "m (translation)", "imu from world"),
-    ("T_imu_world_updated", "T_updated", ("T", 4, 4), "m (translation)", "imu from world"),
+    ("T_imu_world_predicted", "T_predicted", ("T", 4, 4), _POSE, "imu from world"),
+    ("T_imu_world_linear", "T_linear", ("T", 4, 4), _POSE, "imu from world"),
+    ("T_imu_world_updated", "T_updated", ("T", 4, 4), _POSE, "imu from world"),
     ("landmark_id", "id", ("M",), "landmark id", "none"),
     ("first_position", "first_position_m", ("M", 3), "m", "world"),
     ("frame", "frame", ("K",), "frame index", "none"),
     ("landmark", "landmark", ("K",), "row of landmark_id", "none"),
-    ("rows", "rows", ("K", 3), "px (uL, v, uR)", "image"),
-    ("variance", "variance", ("K", 3), "px^2", "image"),
+    ("rows", "rows", ("K", "d"), "px, (uL, v, uR) or (u, v, disparity)", "image"),
+    ("variance", "variance", ("K", "d"), "px^2", "image"),
     ("linear_position", "position_m", ("K", 3), "m", "world"),
+)
+_LOG_LAYOUT_4: _Layout = (
+    ("imu_twist", "imu_twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "imu"),
+    ("seen_twist", "seen_twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "imu"),
+    ("T_imu_world_departed", "T_departed", ("T", 4, 4), _POSE, "imu from world"),
+    ("T_imu_world_linear_before", "T_linear_before", ("T", 4, 4), _POSE, "imu from world"),
+    ("departed", "departed", ("T", "B"), _COORDINATES, "imu"),
+    ("linear", "linear", ("T", "B"), _COORDINATES, "imu"),
+    ("updated", "updated", ("T", "B"), _COORDINATES, "imu"),
+    ("up", "up", ("T", "U"), "1", "world"),
+    ("previous", "previous", ("K",), "observation, -1: none", "none"),
+    ("velocity_frame", "velocity_frame", ("N",), "frame index", "none"),
+    ("velocity_axis", "velocity_axis", ("N",), "axis, 0 to 5", "none"),
+    ("velocity_value", "velocity_value", ("N",), "m/s or rad/s", "that of the velocities"),
+    ("velocity_std", "velocity_std", ("N",), "m/s or rad/s", "that of the velocities"),
+    ("velocity_is_biased", "velocity_is_biased", ("N",), "truth value", "none"),
 )
 
 
@@ -292,7 +309,7 @@ def _write_result(group: h5py.Group, result: Result) -> None:
     if result.log is not None:
         log = group.create_group("log")
         log.attrs["first_estimates"] = result.log.first_estimates
-        _write_fields(log, _LOG_LAYOUT, result.log)
+        _write_fields(log, (*_LOG_LAYOUT, *_LOG_LAYOUT_4), result.log)
 
 
 def _write_fields(group: h5py.Group, layout: _Layout, source: Result | Log | Parameters | HygieneReport) -> None:
@@ -329,10 +346,13 @@ def _read_result(path: str | Path, h5file: h5py.File, mode: str, camera: StereoC
     log = None
     if isinstance(group.get("log"), h5py.Group):
         where = f"{path}: runs/{mode}/log"
-        log_fields = _read_fields(where, group["log"], _LOG_LAYOUT, {key: sizes[key] for key in ("T", "M")})
+        is_old = h5file.attrs["format_version"] < 4
+        layout = _LOG_LAYOUT if is_old else (*_LOG_LAYOUT, *_LOG_LAYOUT_4)
+        log_fields = _read_fields(where, group["log"], layout, {key: sizes[key] for key in ("T", "M")})
         if "first_estimates" not in group["log"].attrs:
             raise ArchiveError(f"{where}: attribute first_estimates is missing")
-        log = Log(first_estimates=bool(group["log"].attrs["first_estimates"]), **log_fields)
+        log_fields["first_estimates"] = bool(group["log"].attrs["first_estimates"])
+        log = Log.of_poses_alone(**log_fields) if is_old else Log(**log_fields)
     parameters = None
     if isinstance(group.get("parameters"), h5py.Group):
         where, stored = f"{path}: runs/{mode}/parameters", group["parameters"]

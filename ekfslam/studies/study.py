@@ -37,7 +37,6 @@ from zlib import crc32
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import VARIANTS, Config, FilterConfig
@@ -45,7 +44,6 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import Loop, simulate
 from ekfslam.errors import ArchiveError, ConfigError, FilterError
 from ekfslam.evaluation.consistency import (
-    invariant_landmark_error,
     joint_nees,
     nees,
     pose_error,
@@ -53,9 +51,10 @@ from ekfslam.evaluation.consistency import (
     world_axes_covariance,
 )
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.observing import Rig
+from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.filters.result import ERROR_CONVENTION
 from ekfslam.geometry import se3
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress as with_progress
 from ekfslam.runner import versions
 
@@ -202,7 +201,7 @@ def run_one(study: Study, level: str, run: int) -> Record:
         part of a recording, and from the frame at which a filter stops.
     """
     world = realisation(study, level, run)
-    with _ONE_RUN_AT_A_TIME, threadpool_limits(1, user_api="blas"), np.errstate(all="ignore"):
+    with _ONE_RUN_AT_A_TIME, one_thread(), np.errstate(all="ignore"):
         sequence = simulate(world)
         return {variant: _evaluate(sequence, world, filter_config(world, variant)) for variant in study.variants}
 
@@ -238,10 +237,7 @@ def _evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str
     known = np.zeros(frames, dtype=bool)
     stopped = False
     try:
-        for k in range(frames):
-            if k > 0:
-                ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
-            report = ekf.update(k, *sequence.observations.at(k))
+        for k, report, _ in run_filter(ekf, sequence):
             if not (np.isfinite(ekf.T_imu_world).all() and np.isfinite(ekf.P).all()):
                 stopped = True
                 break
@@ -251,10 +247,7 @@ def _evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str
             if not known[k] or len(ekf.ids) == 0:
                 continue
             m_true = truth.position_m[np.searchsorted(truth.landmark, ekf.ids)]
-            if config.variant == "invariant":
-                error = invariant_landmark_error(ekf.positions_m, m_true, T_est[k], T_true[k])
-            else:
-                error = m_true - ekf.positions_m
+            error = ekf.variant.landmark_error(ekf.positions_m, m_true, T_est[k], T_true[k])
             n = np.arange(len(error))
             blocks = ekf.P[6:, 6:].reshape(len(n), 3, len(n), 3)[n, :, n, :]
             record["landmark_nees"][k] = time_average(nees(error, blocks)[None])[0]

@@ -40,18 +40,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from ekfslam.arrays import Array
-from ekfslam.config import Config, NoiseConfig, NoiseModel, found_attributes, noise_of
+from ekfslam.config import Config, NoiseConfig, NoiseModel
 from ekfslam.data.hygiene import clean_tracks
 from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
 from ekfslam.errors import EmptyTracksError
 from ekfslam.filters.dead_reckoning import dead_reckon
-from ekfslam.filters.joint import run_joint
-from ekfslam.filters.observing import BEHIND_CAMERA, GATE, MOVING, Rig
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import one_thread, run_filter
+from ekfslam.filters.reports import FrameReport
 from ekfslam.geometry import se3
-from ekfslam.models.noise import VelocityNoise, velocity_noise, with_error
+from ekfslam.models.build import found_attributes, noise_of, resolve
+from ekfslam.models.noise import VelocityNoise, velocity_noise, with_drift, with_error
+from ekfslam.models.sensors.base import BEHIND_CAMERA, GATE, MOVING
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
 
 # Of wrong matches: how many there are, and how far off they may be.
@@ -67,7 +70,7 @@ PARAMETERS = {
     "sigma_v_m_s": ("m/s", (1e-3, 10.0)),
     "sigma_w_rad_s": ("rad/s", (1e-5, 1.0)),
     "sigma_px": ("px", (0.05, 10.0)),
-    "drift": ("1", (0.01, 3.0)),
+    "drift": ("px", (0.01, 3.0)),
 }
 
 _STRETCH = 50  # frames, of which there are as many as keep below the limit of observations
@@ -203,7 +206,7 @@ def tune(
     """
     if len(sequence.observations) == 0:
         raise EmptyTracksError("noise is tuned by observations, and there are none", source=sequence.source)
-    config = (config or Config()).resolved(sequence)
+    config = resolve(config or Config(), sequence)
     model: NoiseModel = "white" if config.noise.model == "white" else "tuned"
     base = noise_of(sequence, dataclasses.replace(config, noise=NoiseConfig(model=model, drift=config.noise.drift)))
     found = velocity_noise(sequence.twist)
@@ -217,7 +220,7 @@ def tune(
     free = [name for name, sigma, least in zip(start, found.sigma, floor, strict=False) if sigma > least or not least]
     free.append("sigma_px")
     if drift:
-        start["drift"] = base.drift or 0.1
+        start["drift"] = 0.2 if base.track_walk_px is None else float(base.track_walk_px[0])
         free.append("drift")
 
     moving, gated, ungated = _settings(config)
@@ -225,7 +228,7 @@ def tune(
     bounds = np.log([PARAMETERS[name][1] for name in free])
     x = np.clip(np.log([start[name] for name in free]), *bounds.T)
     best, step, here, converged, runs = x, np.zeros(len(x)), -np.inf, False, 0
-    with threadpool_limits(1, user_api="blas"):
+    with one_thread():
         for _ in progress(range(_MOST_ROUNDS), f"{sequence.name}: tuning", unit="round"):
             noise = _loose(_with(base, free, x))
             kept, rejected = zip(*(without_rejected(part, noise, gated) for part in parts), strict=True)
@@ -308,11 +311,17 @@ def log_likelihoods(sequence: Sequence, noise: Noise, config: Config) -> Array:
     Raises:
         InnovationError: The filter breaks down.
     """
-    rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
-    reports = run_joint(sequence, rig, config.filter, range(len(sequence)))[3]
+    reports = _reports(sequence, noise, config)
     rejected = np.array([np.isin(report.reason, _WRONG).sum() + len(report.split) for report in reports])
     accepted = np.array([report.log_likelihood + report.dof // 3 * _LOG_RIGHT for report in reports])
     return accepted + rejected * _LOG_WRONG
+
+
+def _reports(sequence: Sequence, noise: Noise, config: Config) -> list[FrameReport]:
+    """What a filter that assumes a noise did with every frame; what comes back starts afresh."""
+    rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
+    ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu)
+    return [frame.report for frame in run_filter(ekf, sequence)]
 
 
 def without_rejected(
@@ -325,8 +334,7 @@ def without_rejected(
     Raises:
         InnovationError: The filter breaks down.
     """
-    rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
-    reports = run_joint(sequence, rig, config.filter, range(len(sequence)))[3]
+    reports = _reports(sequence, noise, config)
     tracks = sequence.observations
     # Reports are in the order of the observations: by frame and, within a frame, by id.
     keep = ~np.isin(np.concatenate([report.reason for report in reports]), reasons)
@@ -435,7 +443,8 @@ def _with(base: Noise, names: list[str], x: Array) -> Noise:
     twist[:3] = value.get("sigma_v_m_s", twist[0])
     twist[3:] = value.get("sigma_w_rad_s", twist[3])
     pixels = np.full(4, value["sigma_px"])
-    return dataclasses.replace(base, twist_std=twist, pixel_std_px=pixels, drift=value.get("drift", base.drift))
+    noise = dataclasses.replace(base, twist_std=twist, pixel_std_px=pixels)
+    return with_drift(noise, value["drift"]) if "drift" in value else noise
 
 
 def _loose(noise: Noise) -> Noise:

@@ -1,10 +1,11 @@
-"""A Gaussian over poses and landmarks in information form: whitened rows, their normal equations, CHOLMOD.
+"""A Gaussian over poses, other blocks and landmarks in information form: whitened rows, normal equations, CHOLMOD.
 
-Unknowns are ``eps`` (T, 6), one vector a pose, and ``d`` (M, 3), one a landmark. Rows touch one pose and one landmark
-(observations), two consecutive poses (motion), or the first pose (prior). Landmarks know of each other only through
-poses, so those with few observations are eliminated first, all at once, by their Schur complements; what remains, the
-poses and the landmarks with many observations, goes to CHOLMOD. Both are steps of one sparse elimination: nothing is
-approximated, and no matrix as wide as the state is ever formed.
+Unknowns are ``eps`` (T, 6), one vector a pose, ``aux`` (T, a), what else has a value for each frame, ``drive`` (g,), what
+has one value for the drive, and ``d`` (M, 3), one a landmark. Observations touch a pose, perhaps the one before, the
+drive and a landmark; motion touches consecutive poses, the aux of the later one and the drive. Landmarks know of each
+other only through poses and drive, so those with few observations are eliminated first, all at once, by their Schur
+complements. What remains goes to CHOLMOD. Both are steps of one sparse elimination: nothing is approximated, and no
+matrix as wide as the state is ever formed.
 
 Sources: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000, section 6 (Schur
 complement); Takahashi, Fagan, Chen, "Formation of a sparse bus impedance matrix", 1973 (selected inverse).
@@ -32,17 +33,28 @@ _AT_ONCE = 20_000  # observations or pairs of them, so that temporary arrays sta
 
 @dataclass(frozen=True)
 class LinearSystem:
-    """Whitened rows ``J x = r`` over ``eps`` (T, 6) and ``d`` (M, 3), to be solved in the least-squares sense.
+    """Whitened rows ``J x = r`` over all unknowns, to be solved in the least-squares sense.
+
+    The first pose is ``eps_0 = B zeta`` with ``zeta ~ N(0, I)``; its columns in all Jacobians are those of zeta.
 
     Args:
         landmarks: Number of landmarks M.
-        B: (6, 6) the first pose is ``eps_0 = B zeta`` with ``zeta ~ N(0, I)``; ``B B^T`` may be singular.
+        B: (6, 6) see above; ``B B^T`` may be singular.
         r_prior: (6,) right side of the rows ``zeta = r``.
         J_from, J_to: (T-1, 6, 6) motion rows of step k over ``eps_k`` and ``eps_{k+1}``.
         r_motion: (T-1, 6) their right sides.
         frame, landmark: (K,) pose and landmark of each observation.
-        J_x, J_m: (K, 3, 6) and (K, 3, 3) rows of the observations.
-        r: (K, 3) their right sides.
+        J_x, J_m: (K, d, 6) and (K, d, 3) rows of the observations.
+        r: (K, d) their right sides.
+        previous: (K,) observation whose pose the rows touch, too; -1: none.
+        J_p: (K, d, 6) rows over that pose; None: there is no such observation.
+        J_g: (K, d, g) rows over the drive.
+        J_motion_aux, J_motion_drive: (T-1, 6, a) over ``aux_{k+1}`` and (T-1, 6, g).
+        aux_prior: (a,) weights of the rows ``weight aux_0 = r``, (a,) ``r_aux_prior``.
+        phi, aux_weight: (T-1, a) of the rows ``weight (aux_{k+1} - phi aux_k) = r_aux``, element by element.
+        r_aux: (T-1, a) their right sides.
+        at: (n,) frames of scalar rows over aux; J_at (n, a); r_at (n,).
+        drive_prior: (g,) weights of the rows ``weight drive = r_drive``, (g,).
     """
 
     landmarks: int
@@ -56,11 +68,27 @@ class LinearSystem:
     J_x: Array
     J_m: Array
     r: Array
+    previous: IntArray
+    J_p: Array | None
+    J_g: Array
+    J_motion_aux: Array
+    J_motion_drive: Array
+    aux_prior: Array
+    r_aux_prior: Array
+    phi: Array
+    aux_weight: Array
+    r_aux: Array
+    at: IntArray
+    J_at: Array
+    r_at: Array
+    drive_prior: Array
+    r_drive: Array
 
     @property
     def half_square(self) -> float:
         """Half the sum of squares of all right sides: the cost of leaving everything as it is."""
-        return 0.5 * sum(float((r**2).sum()) for r in (self.r_prior, self.r_motion, self.r))
+        right = (self.r_prior, self.r_motion, self.r, self.r_aux_prior, self.r_aux, self.r_at, self.r_drive)
+        return 0.5 * sum(float((r**2).sum()) for r in right)
 
 
 class Elimination:
@@ -71,6 +99,7 @@ class Elimination:
         landmarks: Number of landmarks M.
         frame, landmark: (K,) of each observation; no pair may occur twice.
         ids: (M,) landmark ids, for error messages.
+        aux, drive: Sizes a and g of the blocks of a frame besides its pose, and of those of the drive.
         eliminate_up_to: Landmarks with at most this many observations are eliminated before CHOLMOD's turn.
     """
 
@@ -81,25 +110,42 @@ class Elimination:
         frame: IntArray,
         landmark: IntArray,
         ids: IntArray,
+        aux: int = 0,
+        drive: int = 0,
         eliminate_up_to: int = ELIMINATE_UP_TO,
     ) -> None:
         self.frames, self.landmarks, self.ids = frames, landmarks, ids
         self.frame, self.landmark = frame, landmark
+        self.aux, self.drive = aux, drive
         seen = np.bincount(landmark, minlength=landmarks)
         if (seen == 0).any():
             raise IllPosedError("landmarks without an observation", ids[seen == 0])
         self.is_kept = seen > eliminate_up_to
         self.kept = np.flatnonzero(self.is_kept)
-        # Blocks of the reduced system: the poses, then the kept landmarks.
-        self.block_sizes = np.repeat([6, 3], [frames, len(self.kept)])
+        # Blocks of the reduced system: poses, aux of the frames, the drive, kept landmarks.
+        counts = [frames, frames if aux else 0, 1 if drive else 0, len(self.kept)]
+        self.block_sizes = np.repeat([6, aux, drive, 3], counts)
         self.start = np.concatenate([[0], np.cumsum(self.block_sizes)])
+        self.first_block = np.concatenate([[0], np.cumsum(counts)[:-1]])  # of each of the four kinds
         self.block_of_landmark = np.full(landmarks, -1)
-        self.block_of_landmark[self.kept] = frames + np.arange(len(self.kept))
+        self.block_of_landmark[self.kept] = self.first_block[3] + np.arange(len(self.kept))
 
         self.of_kept = np.flatnonzero(self.is_kept[landmark])
         self.of_eliminated = np.flatnonzero(~self.is_kept[landmark])
         self._pair_up()
         self._lay_out()
+
+    def parts(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        """Poses (T, 6, ...), aux (T, a, ...), drive (g, ...) and kept landmarks (n, 3, ...) of the reduced unknowns."""
+        ends = self.start[self.first_block[1:]]
+        poses, aux, drive, kept = np.split(x, ends)
+        rest = x.shape[1:]
+        return (
+            poses.reshape(self.frames, 6, *rest),
+            aux.reshape(self.frames, self.aux, *rest),
+            drive,
+            kept.reshape(-1, 3, *rest),
+        )
 
     def _pair_up(self) -> None:
         """Pairs of observations (later, not later) of each eliminated landmark, together if they couple the same poses.
@@ -139,13 +185,27 @@ class Elimination:
 
     def _lay_out(self) -> None:
         """Where the entries of all blocks go in the reduced matrix: its lower triangle and whole diagonal blocks."""
-        own, steps = np.arange(len(self.block_sizes)), np.arange(self.frames - 1)
+        pose, steps = np.arange(self.frames), np.arange(self.frames - 1)
+        own = np.arange(len(self.block_sizes))
+        aux = self.first_block[1] + (pose if self.aux else pose[:0])
+        drive = self.first_block[2] + np.arange(1 if self.drive else 0)
+        landmark = own[self.first_block[3] :]
+        of_drive = np.broadcast_to(drive, (len(pose),)) if self.drive else pose[:0]
+        seen = self.block_of_landmark[self.landmark[self.of_kept]]
         kinds = (  # block rows, block columns, height, width
-            (own[: self.frames], own[: self.frames], 6, 6),
+            (pose, pose, 6, 6),
             (steps + 1, steps, 6, 6),
             (self.coupled[:, 0], self.coupled[:, 1], 6, 6),
-            (own[self.frames :], own[self.frames :], 3, 3),
-            (self.block_of_landmark[self.landmark[self.of_kept]], self.frame[self.of_kept], 3, 6),
+            (landmark, landmark, 3, 3),
+            (seen, self.frame[self.of_kept], 3, 6),
+            (aux, aux, self.aux, self.aux),
+            (aux[1:], aux[:-1], self.aux, self.aux),
+            (aux, pose[: len(aux)], self.aux, 6),
+            (aux[1:], steps[: len(aux[1:])], self.aux, 6),
+            (drive, drive, self.drive, self.drive),
+            (of_drive, pose[: len(of_drive)], self.drive, 6),
+            (of_drive[: len(aux)], aux[: len(of_drive)], self.drive, self.aux),
+            (landmark[: len(of_drive) * len(landmark)], np.repeat(drive, len(landmark)), 3, self.drive),
         )
         block_row, block_column = (np.concatenate([kind[i] for kind in kinds]) for i in (0, 1))
         # Steps and diagonal blocks may be among the coupled ones: they share their place.
@@ -189,6 +249,8 @@ class Elimination:
 def _sum(index: IntArray, groups: int, values: Array) -> Array:
     """Sums (groups, ...) of the values (n, ...) of each index (n,)."""
     n = len(index)
+    if not values.size:
+        return np.zeros((groups, *values.shape[1:]))
     summation = sp.csc_array((np.ones(n), index, np.arange(n + 1)), shape=(groups, n))
     return (summation @ values.reshape(n, -1)).reshape(groups, *values.shape[1:])
 
@@ -215,6 +277,8 @@ class JointInformation:
     Attributes:
         eps: (T, 6) mean of the pose unknowns.
         zeta: (6,) mean of the first pose in units of its prior.
+        aux: (T, a) mean of what else each frame has.
+        drive: (g,) mean of what the drive has.
         d: (M, 3) mean of the landmark unknowns.
         cost: Half the sum of squares that the rows leave (of a system without damping).
 
@@ -231,42 +295,38 @@ class JointInformation:
     ) -> None:
         self.elimination, self._B = elimination, system.B  # not the rows: they take more memory than all else kept
         e = elimination
-        B, J_x, J_m, J_to = system.B, system.J_x, system.J_m, system.J_to
-        J_from = system.J_from
-        if len(J_from):
-            J_from = np.concatenate([J_from[:1] @ B, J_from[1:]])
-
-        H_mm = _sum_products(e.landmark, e.landmarks, J_m, J_m)
-        H_xx = _sum_products(e.frame, e.frames, J_x, J_x)
-        H_xx[0] = np.eye(6) + B.T @ H_xx[0] @ B
-        H_xx[:-1] += J_from.swapaxes(1, 2) @ J_from
-        H_xx[1:] += J_to.swapaxes(1, 2) @ J_to
-        if damping:
-            for H in (H_mm, H_xx):
-                H += damping * np.eye(H.shape[-1])
-        self._factorise(system, H_mm, H_xx, J_to.swapaxes(1, 2) @ J_from, factor)
-
-        g_x = e.sum_by_frame((J_x.swapaxes(1, 2) @ system.r[..., None])[..., 0])
-        g_x[0] = system.r_prior + B.T @ g_x[0]
-        g_x[:-1] += (J_from.swapaxes(1, 2) @ system.r_motion[..., None])[..., 0]
-        g_x[1:] += (J_to.swapaxes(1, 2) @ system.r_motion[..., None])[..., 0]
-        g_m = e.sum_by_landmark((J_m.swapaxes(1, 2) @ system.r[..., None])[..., 0])
-        zeta_and_eps, self.d = self._solve(g_x, g_m)
-        self.zeta = zeta_and_eps[0].copy()
-        self.eps = self._with_first_pose(zeta_and_eps)
+        self._factorise(system, damping, factor)
+        g_m, right = e.sum_by_landmark(_transposed(system.J_m, system.r)), _right_side(e, system)
+        whitened = (self._L_inverse @ g_m[..., None])[..., 0]
+        poses, _, drive, kept = e.parts(right)
+        reduced = right.copy()
+        reduced_poses, _, reduced_drive, reduced_kept = e.parts(reduced)
+        reduced_poses -= e.sum_by_frame((self._Y.swapaxes(1, 2) @ whitened[e.landmark, :, None])[..., 0])
+        reduced_drive -= (self._Y_drive.swapaxes(1, 2) @ whitened[..., None])[..., 0].sum(axis=0)
+        reduced_kept[...] = g_m[e.kept]
+        solution = self.factor.solve(reduced)
+        x, self.aux, self.drive, kept = e.parts(solution)
+        self.d = self._landmarks_given(x, self.drive, kept, whitened)
+        self.zeta = x[0].copy()
+        self.eps = self._with_first_pose(x)
         # Half the sum of squares at the mean x: |r - J x|^2 = |r|^2 - g^T x.
-        self.cost = system.half_square - 0.5 * float((zeta_and_eps * g_x).sum() + (self.d * g_m).sum())
+        without_kept = solution[: len(right) - kept.size] @ right[: len(right) - kept.size]
+        self.cost = system.half_square - 0.5 * float(without_kept + (self.d * g_m).sum())
 
-    def _factorise(
-        self, system: LinearSystem, H_mm: Array, H_xx: Array, H_step: Array, factor: SparseCholesky | None
-    ) -> None:
+    def _factorise(self, system: LinearSystem, damping: float, factor: SparseCholesky | None) -> None:
         """Schur complements of the eliminated landmarks, then CHOLMOD."""
         e = self.elimination
+        H_mm = _sum_products(e.landmark, e.landmarks, system.J_m, system.J_m)
+        blocks = _blocks(e, system)
+        if damping:
+            for H in (H_mm, blocks["pose"], blocks["aux"], blocks["drive"]):
+                H += damping * np.eye(H.shape[-1])
         L = _cholesky_of_landmarks(H_mm, e.ids)
         self._L_inverse = np.linalg.inv(L)
         self._log_det_landmarks = 2.0 * float(np.log(np.diagonal(L[~e.is_kept], axis1=1, axis2=2)).sum())
         # Y_k^T Y_l is what an eliminated landmark takes from the block of the poses of its observations k and l.
         self._Y = _H_mx(system)
+        H_mx_kept = self._Y[e.of_kept]
         for begin in range(0, len(e.landmark), _AT_ONCE):
             part = slice(begin, begin + _AT_ONCE)
             self._Y[part] = self._L_inverse[e.landmark[part]] @ self._Y[part]
@@ -275,29 +335,46 @@ class JointInformation:
         for groups, later, earlier in e.groups():
             stacked = len(later), 3 * later.shape[1], 6
             coupling[groups] = self._Y[later].reshape(stacked).swapaxes(1, 2) @ self._Y[earlier].reshape(stacked)
-        matrix = e.assemble((H_xx, H_step, -coupling, H_mm[e.kept], _H_mx(system, e.of_kept)))
+        # The drive goes through every landmark.
+        H_md = _sum_products(e.landmark, e.landmarks, system.J_m, system.J_g)
+        self._Y_drive = self._L_inverse @ H_md
+        self._Y_drive[e.kept] = 0.0
+        if e.drive:
+            blocks["drive"] -= (self._Y_drive.swapaxes(1, 2) @ self._Y_drive).sum(axis=0)
+            blocks["drive pose"] -= _sum_products(e.frame, e.frames, self._Y_drive[e.landmark], self._Y)
+        matrix = e.assemble(
+            (
+                blocks["pose"],
+                blocks["pose step"],
+                -coupling,
+                H_mm[e.kept],
+                H_mx_kept,
+                blocks["aux"],
+                blocks["aux step"],
+                blocks["aux pose"],
+                blocks["aux pose before"],
+                blocks["drive"],
+                blocks["drive pose"],
+                blocks["drive aux"],
+                H_md[e.kept if e.drive else e.kept[:0]],
+            )
+        )
         del coupling
         try:
-            factor = SparseCholesky(matrix, e.block_sizes) if factor is None else factor.with_values(matrix)
+            self.factor = SparseCholesky(matrix, e.block_sizes) if factor is None else factor.with_values(matrix)
         except NotPositiveDefiniteError as error:
-            is_pose = error.block < e.frames
-            culprit = error.block if is_pose else e.ids[e.kept[error.block - e.frames]]
-            raise IllPosedError(f"{'frame' if is_pose else 'landmark'} without enough information", [culprit]) from None
-        self.factor = factor
+            kind = int(np.searchsorted(e.first_block, error.block, side="right")) - 1
+            number = error.block - int(e.first_block[kind])
+            what = ("frame without enough information", "frame whose velocities have not enough information")
+            if kind == 2:
+                raise IllPosedError("too little information about blocks that are constant along the drive", []) from None
+            culprit = e.ids[e.kept[number]] if kind == 3 else number
+            raise IllPosedError("landmark without enough information" if kind == 3 else what[kind], [culprit]) from None
 
-    def _solve(self, g_x: Array, g_m: Array) -> tuple[Array, Array]:
-        """Solve the normal equations for one right side (T, 6), (M, 3)."""
+    def _landmarks_given(self, x: Array, drive: Array, kept: Array, whitened: Array) -> Array:
+        """Landmarks (M, 3): eliminated ones from the poses x (T, 6) and the drive (g,), the others as they are."""
         e = self.elimination
-        whitened = (self._L_inverse @ g_m[..., None])[..., 0]
-        reduced = g_x - e.sum_by_frame((self._Y.swapaxes(1, 2) @ whitened[e.landmark, :, None])[..., 0])
-        solution = self.factor.solve(np.concatenate([reduced.ravel(), g_m[e.kept].ravel()]))
-        x = solution[: 6 * e.frames].reshape(-1, 6)
-        return x, self._landmarks_given(x, solution[6 * e.frames :].reshape(-1, 3), whitened)
-
-    def _landmarks_given(self, x: Array, kept: Array, whitened: Array) -> Array:
-        """Landmarks (M, 3): eliminated ones from the poses x (T, 6), the others as they are."""
-        e = self.elimination
-        seen = e.sum_by_landmark((self._Y @ x[e.frame, :, None])[..., 0])
+        seen = e.sum_by_landmark((self._Y @ x[e.frame, :, None])[..., 0]) + self._Y_drive @ drive
         d = (self._L_inverse.swapaxes(1, 2) @ (whitened - seen)[..., None])[..., 0]
         d[e.kept] = kept
         return d
@@ -306,6 +383,12 @@ class JointInformation:
         eps = zeta_and_eps.copy()
         eps[0] = self._B @ zeta_and_eps[0]
         return eps
+
+    @property
+    def square(self) -> float:
+        """Sum of squares of the mean: what damping penalises."""
+        parts = (self.zeta, self.eps[1:], self.aux, self.drive, self.d)
+        return float(sum((part**2).sum() for part in parts))
 
     @property
     def log_determinant(self) -> float:
@@ -325,11 +408,23 @@ class JointInformation:
         covariance[0] = self._B @ covariance[0] @ self._B.T
         return covariance
 
+    def aux_covariances(self) -> Array:
+        """Marginal covariances (T, a, a) of what else each frame has, by selected inversion."""
+        e = self.elimination
+        own = e.first_block[1] + np.arange(e.frames)
+        return self._selected.blocks(own, own) if e.aux else np.empty((e.frames, 0, 0))
+
+    def drive_covariance(self) -> Array:
+        """Marginal covariance (g, g) of what the drive has."""
+        e = self.elimination
+        own = e.first_block[2:3]
+        return self._selected.blocks(own, own)[0] if e.drive else np.empty((0, 0))
+
     def landmark_covariances(self) -> Array:
         """Marginal covariances (M, 3, 3) of all landmarks, by selected inversion.
 
-        Of an eliminated landmark ``L^-T (I + sum_kl Y_k Z_kl Y_l^T) L^-1`` over its observations k and l, Z being the
-        selected inverse of the reduced matrix.
+        Of an eliminated landmark ``L^-T (I + sum_kl Y_k Z_kl Y_l^T) L^-1`` over its observations k and l and the drive,
+        Z being the selected inverse of the reduced matrix.
         """
         e = self.elimination
         half = np.zeros((e.landmarks, 3, 3))
@@ -340,26 +435,34 @@ class JointInformation:
             terms = YZ @ self._Y[earlier].swapaxes(1, 2)
             terms[later == earlier] *= 0.5
             half += _sum(e.landmark[later], e.landmarks, terms)
+        if e.drive:
+            drive = np.full(e.frames, e.first_block[2])
+            Z = self._selected.blocks(np.arange(e.frames), drive)
+            by_pose = e.sum_by_landmark(self._Y @ Z[e.frame])
+            half += (by_pose + 0.5 * self._Y_drive @ self.drive_covariance()) @ self._Y_drive.swapaxes(1, 2)
         covariance = self._L_inverse.swapaxes(1, 2) @ (np.eye(3) + half + half.swapaxes(1, 2)) @ self._L_inverse
         if len(e.kept):
             covariance[e.kept] = self._selected.blocks(e.block_of_landmark[e.kept], e.block_of_landmark[e.kept])
         return 0.5 * (covariance + covariance.swapaxes(1, 2))
 
-    def covariance(self, frames: IntArray, landmarks: IntArray) -> Array:
-        """Joint covariance of some poses (6 columns each) and some landmarks (3 each), in the order given, by solves.
+    def covariance(
+        self, frames: IntArray, landmarks: IntArray, aux: IntArray | None = None, drive: bool = False
+    ) -> Array:
+        """Joint covariance, by solves: of some poses, of the aux of some frames, of the drive, of some landmarks.
 
         Args:
-            frames: (a,) pose numbers.
-            landmarks: (b,) landmark numbers, not ids.
-
-        Returns:
-            (6a+3b, 6a+3b).
+            frames: (p,) pose numbers, six columns each.
+            landmarks: (b,) landmark numbers, not ids, three columns each; they come last.
+            aux: (q,) frames whose aux follows the poses, a columns each; None: of no frame.
+            drive: Whether the drive follows, with g columns.
         """
         e = self.elimination
-        selection = self._selection(np.asarray(frames, dtype=np.int64), np.asarray(landmarks, dtype=np.int64))
+        frames, landmarks = np.asarray(frames, dtype=np.int64), np.asarray(landmarks, dtype=np.int64)
+        aux = np.empty(0, dtype=np.int64) if aux is None else np.asarray(aux, dtype=np.int64)
+        selection = self._selection(frames, aux, drive, landmarks)
         half = self.factor.half_solve(selection.T.toarray())
         covariance = half.T @ half
-        own = 6 * len(frames) + 3 * np.arange(len(landmarks))
+        own = len(covariance) - 3 * len(landmarks) + 3 * np.arange(len(landmarks))
         given_poses = self._L_inverse[landmarks].swapaxes(1, 2) @ self._L_inverse[landmarks]
         given_poses[e.is_kept[landmarks]] = 0.0
         place = own[:, None] + np.arange(3)
@@ -397,28 +500,40 @@ class JointInformation:
         reduced = self.factor.sample_transform(rng.standard_normal((int(e.start[-1]), size)))
         eps, d = np.empty((size, e.frames, 6)), np.empty((size, e.landmarks, 3))
         for i in range(size):
-            x = reduced[: 6 * e.frames, i].reshape(-1, 6)
+            x, _, drive, kept = e.parts(reduced[:, i])
             white = rng.standard_normal((e.landmarks, 3))
-            d[i] = self.d + self._landmarks_given(x, reduced[6 * e.frames :, i].reshape(-1, 3), white)
+            d[i] = self.d + self._landmarks_given(x, drive, kept, white)
             eps[i] = self.eps + self._with_first_pose(x)
         return eps, d
 
-    def _selection(self, frames: IntArray, landmarks: IntArray) -> sp.csr_array:
-        """What picks poses and landmarks out of the reduced unknowns: an eliminated landmark follows its poses."""
+    def _selection(self, frames: IntArray, aux: IntArray, drive: bool, landmarks: IntArray) -> sp.csr_array:
+        """What picks unknowns out of the reduced ones: an eliminated landmark follows its poses and the drive."""
         e = self.elimination
-        height = 6 * len(frames) + 3 * len(landmarks)
         pose_blocks = np.broadcast_to(np.eye(6), (len(frames), 6, 6)).copy()
         pose_blocks[frames == 0] = self._B
+        before_aux = 6 * len(frames)
+        before_drive = before_aux + e.aux * len(aux)
+        before = before_drive + (e.drive if drive else 0)
+        at_drive = e.start[e.first_block[2]]
 
         place = np.full(e.landmarks, -1)
-        place[landmarks] = 6 * len(frames) + 3 * np.arange(len(landmarks))
+        place[landmarks] = before + 3 * np.arange(len(landmarks))
         chosen = np.flatnonzero((place[e.landmark] >= 0) & ~e.is_kept[e.landmark])
         follow = -self._L_inverse[e.landmark[chosen]].swapaxes(1, 2) @ self._Y[chosen]
+        follow_drive = -self._L_inverse[landmarks].swapaxes(1, 2) @ self._Y_drive[landmarks]
         kept = landmarks[e.is_kept[landmarks]]
+        drives = np.arange(1 if drive and e.drive else 0)
 
         parts = (
             (6 * np.arange(len(frames)), e.start[frames], pose_blocks),
+            (
+                before_aux + e.aux * np.arange(len(aux)),
+                e.start[e.first_block[1] + aux] if e.aux else aux,
+                np.broadcast_to(np.eye(e.aux), (len(aux), e.aux, e.aux)),
+            ),
+            (before_drive + drives, at_drive + drives, np.broadcast_to(np.eye(e.drive), (len(drives), e.drive, e.drive))),
             (place[e.landmark[chosen]], e.start[e.frame[chosen]], follow),
+            (place[landmarks], np.full(len(landmarks), at_drive), follow_drive),
             (place[kept], e.start[e.block_of_landmark[kept]], np.broadcast_to(np.eye(3), (len(kept), 3, 3))),
         )
         row, column, value = [], [], []
@@ -427,16 +542,95 @@ class JointInformation:
             row.append(np.broadcast_to(first_row[:, None, None] + np.arange(shape[1])[:, None], shape).ravel())
             column.append(np.broadcast_to(first_column[:, None, None] + np.arange(shape[2]), shape).ravel())
             value.append(block.ravel())
-        return sp.csr_array(
-            (np.concatenate(value), (np.concatenate(row), np.concatenate(column))), shape=(height, int(e.start[-1]))
-        )
+        shape = before + 3 * len(landmarks), int(e.start[-1])
+        return sp.csr_array((np.concatenate(value), (np.concatenate(row), np.concatenate(column))), shape=shape)
 
 
-def _H_mx(system: LinearSystem, observations: IntArray | slice = slice(None)) -> Array:
-    """Blocks (n, 3, 6) of the information between the landmarks and the poses of some observations."""
-    blocks = system.J_m[observations].swapaxes(1, 2) @ system.J_x[observations]
-    first = system.frame[observations] == 0
-    blocks[first] = blocks[first] @ system.B
+def _transposed(J: Array, r: Array) -> Array:
+    """``J^T r`` of many rows: (n, d, c), (n, d) to (n, c)."""
+    return (J.swapaxes(1, 2) @ r[..., None])[..., 0]
+
+
+def _blocks(e: Elimination, system: LinearSystem) -> dict[str, Array]:
+    """Blocks of the information of poses, aux and drive among themselves, before landmarks are eliminated."""
+    J_from, J_to, J_a, J_d = system.J_from, system.J_to, system.J_motion_aux, system.J_motion_drive
+    pose = _sum_products(e.frame, e.frames, system.J_x, system.J_x)
+    pose[0] += np.eye(6)
+    pose[:-1] += J_from.swapaxes(1, 2) @ J_from
+    pose[1:] += J_to.swapaxes(1, 2) @ J_to
+    step = J_to.swapaxes(1, 2) @ J_from
+    follows = np.flatnonzero(system.previous >= 0)
+    if system.J_p is not None and len(follows):
+        frame, J_p = e.frame[system.previous[follows]], system.J_p[follows]
+        pose += _sum_products(frame, e.frames, J_p, J_p)
+        step += _sum_products(frame, e.frames - 1, system.J_x[follows], J_p)
+    blocks = {"pose": pose, "pose step": step}
+
+    n_aux = e.frames if e.aux else 0
+    aux = np.zeros((n_aux, e.aux, e.aux))
+    if e.aux:
+        diagonal = np.arange(e.aux)
+        aux[0, diagonal, diagonal] += system.aux_prior**2
+        aux[:-1, diagonal, diagonal] += (system.aux_weight * system.phi) ** 2
+        aux[1:, diagonal, diagonal] += system.aux_weight**2
+        aux[1:] += J_a.swapaxes(1, 2) @ J_a
+        aux += _sum_products(system.at, e.frames, system.J_at[:, None], system.J_at[:, None])
+    blocks["aux"] = aux
+    blocks["aux step"] = -((system.aux_weight**2 * system.phi)[: max(n_aux - 1, 0), :, None] * np.eye(e.aux))
+    aux_pose = np.zeros((n_aux, e.aux, 6))
+    if e.aux:
+        aux_pose[1:] = J_a.swapaxes(1, 2) @ J_to
+    blocks["aux pose"] = aux_pose
+    blocks["aux pose before"] = (J_a.swapaxes(1, 2) @ J_from)[: max(n_aux - 1, 0)]
+
+    n_drive = 1 if e.drive else 0
+    drive, drive_pose = np.zeros((n_drive, e.drive, e.drive)), np.zeros((n_drive * e.frames, e.drive, 6))
+    drive_aux = np.zeros((n_drive * n_aux, e.drive, e.aux))
+    if e.drive:
+        flat = system.J_g.reshape(-1, e.drive)
+        drive[0] = np.diag(system.drive_prior**2) + flat.T @ flat + (J_d.swapaxes(1, 2) @ J_d).sum(axis=0)
+        drive_pose += _sum_products(e.frame, e.frames, system.J_g, system.J_x)
+        if system.J_p is not None and len(follows):
+            drive_pose += _sum_products(frame, e.frames, system.J_g[follows], J_p)
+        drive_pose[:-1] += J_d.swapaxes(1, 2) @ J_from
+        drive_pose[1:] += J_d.swapaxes(1, 2) @ J_to
+        if e.aux:
+            drive_aux[1:] = J_d.swapaxes(1, 2) @ J_a
+    blocks["drive"], blocks["drive pose"], blocks["drive aux"] = drive, drive_pose, drive_aux
+    return blocks
+
+
+def _right_side(e: Elimination, system: LinearSystem) -> Array:
+    """``J^T r`` of poses, aux and drive, in the order of the reduced unknowns; 0 for kept landmarks."""
+    right = np.zeros(int(e.start[-1]))
+    poses, aux, drive, _ = e.parts(right)
+    poses += e.sum_by_frame(_transposed(system.J_x, system.r))
+    poses[0] += system.r_prior
+    poses[:-1] += _transposed(system.J_from, system.r_motion)
+    poses[1:] += _transposed(system.J_to, system.r_motion)
+    follows = np.flatnonzero(system.previous >= 0)
+    if system.J_p is not None and len(follows):
+        poses += _sum(e.frame[system.previous[follows]], e.frames, _transposed(system.J_p[follows], system.r[follows]))
+    if e.aux:
+        weighted = system.aux_weight * system.r_aux
+        aux[0] += system.aux_prior * system.r_aux_prior
+        aux[1:] += weighted + _transposed(system.J_motion_aux, system.r_motion)
+        aux[:-1] -= system.phi * weighted
+        aux += _sum(system.at, e.frames, system.J_at * system.r_at[:, None])
+    if e.drive:
+        drive += system.drive_prior * system.r_drive
+        drive += system.J_g.reshape(-1, e.drive).T @ system.r.ravel()
+        drive += _transposed(system.J_motion_drive, system.r_motion).sum(axis=0)
+    return right
+
+
+def _H_mx(system: LinearSystem) -> Array:
+    """Blocks (K, 3, 6) of the information between landmarks and the poses that observed them, one an observation."""
+    blocks = system.J_m.swapaxes(1, 2) @ system.J_x
+    follows = np.flatnonzero(system.previous >= 0)
+    if system.J_p is not None and len(follows):
+        # No observation has two successors, so that nothing is added twice to one block.
+        blocks[system.previous[follows]] += system.J_m[follows].swapaxes(1, 2) @ system.J_p[follows]
     return blocks
 
 

@@ -1,0 +1,141 @@
+"""How landmarks leave the state and come back: retirement, map revival, and the books about both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.filters.landmarks import LandmarkTable
+from ekfslam.filters.log import Log
+from ekfslam.filters.result import Landmarks
+
+# Frames that a neighbour fetched with a returning landmark stays without being seen, beyond twice its distance in time.
+PATIENCE = 30
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """Mean and covariance of all blocks and of some landmarks, given everything in a log.
+
+    Args:
+        values: Estimates of blocks; what is not there stays.
+        columns, coordinates: (c,) columns of the body whose coordinates have changed, and what they are now.
+        position_m: (n, 3) landmarks.
+        P: (body+3n, body+3n) covariance in the order of a filter's state.
+    """
+
+    values: dict[str, Array]
+    columns: IntArray
+    coordinates: Array
+    position_m: Array
+    P: Array
+
+
+class Revival(Protocol):
+    """What brings retired landmarks back: `ekfslam.smoother.revival.MapRevival`, handed to the filter by its caller."""
+
+    def neighbours(self, log: Log, returning: IntArray, candidates: IntArray) -> tuple[IntArray, IntArray]:
+        """Rows (c,) of candidates that come along, and their distances (c,) in frames from the returning landmarks."""
+
+    def marginal(self, log: Log, positions_m: Array, landmarks: IntArray) -> Marginal:
+        """The marginal over the last frame's blocks and landmarks (n,), given as rows of the log."""
+
+
+class Retired:
+    """Landmarks that have left the state.
+
+    Attributes:
+        row_of: Rows in the log of those that may come back, by id.
+        revived: Ids of retired landmarks that were seen again and came back.
+        reappeared: Ids of retired landmarks that were seen again and started afresh.
+    """
+
+    def __init__(self) -> None:
+        self._parts: list[Landmarks] = []
+        self._rows: list[IntArray] = []
+        self.row_of: dict[int, int] = {}
+        self._misses: dict[int, int] = {}  # by row
+        self.revived: list[int] = []
+        self.reappeared: list[int] = []
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in self._parts)
+
+    def add(self, table: LandmarkTable, covariance: Array, gone: BoolArray, may_return: bool) -> None:
+        """Landmarks (n,) of a table that are gone, with the covariances (n, 3, 3) of all of them."""
+        slot = np.flatnonzero(gone)
+        ids, rows = table.id[slot].tolist(), table.log_row[slot]
+        self._parts.append(table.snapshot(slot, covariance))
+        self._rows.append(rows)
+        if may_return:
+            self.row_of.update(zip(ids, rows.tolist(), strict=True))
+            self._misses.update(zip(rows.tolist(), table.misses[slot].tolist(), strict=True))
+
+    def among(self, ids: IntArray) -> list[int]:
+        """Those of the ids that were retired and may come back, ascending."""
+        return sorted(self.row_of.keys() & set(ids.tolist())) if self.row_of else []
+
+    def start_afresh(self, ids: IntArray) -> None:
+        """Landmarks that are initialised: what was retired under their ids does not come back."""
+        again = self.among(ids)
+        self.reappeared.extend(again)
+        for i in again:
+            del self.row_of[i]
+
+    def all_landmarks(self, table: LandmarkTable, covariance: Array) -> Landmarks:
+        """Every landmark so far, in the order of the log; those in the table have covariances (n, 3, 3)."""
+        row = np.concatenate([*self._rows, table.log_row])
+        everything = Landmarks.concatenate([*self._parts, table.snapshot(np.arange(len(table)), covariance)])
+        # A landmark that came back and was retired again is there twice; its last estimate counts.
+        _, last = np.unique(row[::-1], return_index=True)
+        return everything.only(len(row) - 1 - last)
+
+    def fetch(
+        self, table: LandmarkTable, known: Landmarks, log: Log, ids: list[int], revival: Revival, frame: int
+    ) -> None:
+        """Put returning landmarks back into the table, and the neighbours that will probably be seen next.
+
+        Args:
+            table: Grows.
+            known: All landmarks, in the order of the log.
+            log: Everything so far.
+            ids: Landmarks that were seen again.
+            revival: Says which neighbours come along.
+            frame: Of the present.
+        """
+        returning = np.array([self.row_of[i] for i in ids])
+        retired = np.fromiter(self.row_of.values(), dtype=np.int64, count=len(self.row_of))
+        neighbours, distance = revival.neighbours(log, returning, np.setdiff1d(retired, returning))
+        back = np.concatenate([returning, neighbours])
+        came = known.only(back)
+        table.append(
+            id=came.id,
+            first_frame=came.first_frame,
+            last_frame=came.last_frame,
+            observations=came.observations,
+            misses=np.array([self._misses[row] for row in back.tolist()], dtype=np.int64),
+            log_row=back,
+            first_step=_first_steps(log, back),
+            last_step=np.full(len(back), -2),
+            stay_until=frame + np.concatenate([np.zeros_like(returning), 2 * distance + PATIENCE]),
+            position_m=came.position_m,
+            initial_m=log.first_position_m[back],
+        )
+        for i in came.id.tolist():
+            del self.row_of[i]
+        self.revived.extend(ids)
+
+
+def _first_steps(log: Log, rows: IntArray) -> IntArray:
+    """Frames of the log (n,) with the first observation of landmarks, given by their rows."""
+    _, first = np.unique(log.landmark, return_index=True)
+    return log.frame[first][rows]
+
+
+def out_of_view(table: LandmarkTable, ids: IntArray, frame: int, after: int) -> BoolArray:
+    """Which landmarks (n,) have not been seen for ``after`` frames, and are not now, where ``ids`` are."""
+    unseen_for = frame - np.maximum(table.last_frame, table.stay_until)
+    return (unseen_for >= after) & np.isin(table.id, ids, invert=True)

@@ -1,0 +1,67 @@
+"""The one loop over the frames of a recording, for runner, studies, tuning and experiments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
+from time import perf_counter
+from typing import NamedTuple, Protocol
+
+from threadpoolctl import threadpool_limits
+
+from ekfslam.data.sequence import Sequence
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.mapping import IndependentLandmarks
+from ekfslam.filters.reports import FrameReport
+from ekfslam.models.model import VelocityRows
+
+
+class Frame(NamedTuple):
+    """What one frame left behind: its number, the report on its observations, and the wall-clock time in ms."""
+
+    number: int
+    report: FrameReport
+    ms: float
+
+
+class FurtherVelocities(Protocol):
+    """What further sensors measured: see `ekfslam.models.sensors.velocities.VelocitySource`."""
+
+    def during(self, begin_s: float, end_s: float) -> VelocityRows | None:
+        """Measurements of the velocities of one interval."""
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """One BLAS thread: with small dense matrices a second one costs three times what it saves."""
+    return threadpool_limits(1, user_api="blas")
+
+
+def run_filter(
+    estimator: JointEKF | IndependentLandmarks,
+    sequence: Sequence,
+    frames: Iterable[int] | None = None,
+    further: FurtherVelocities | None = None,
+) -> Iterator[Frame]:
+    """Feed a recording to an estimator, frame by frame; it can be asked for its state in between.
+
+    Args:
+        estimator: As it starts: at the first of the frames.
+        sequence: The recording.
+        frames: Successive frames, all by default (or wrapped in a progress bar).
+        further: Velocity measurements of other sensors.
+    """
+    begun = False
+    for k in range(len(sequence)) if frames is None else frames:
+        begin = perf_counter()
+        if isinstance(estimator, JointEKF):
+            if begun:
+                before, now = float(sequence.time_s[k - 1]), float(sequence.time_s[k])
+                also = None if further is None else further.during(before, now)
+                estimator.predict(sequence.twist[k], now - before, also)
+            else:
+                estimator.begin(sequence.twist[k])
+        begun = True
+        report = estimator.update(k, *sequence.observations.at(k))
+        yield Frame(k, report, 1e3 * (perf_counter() - begin))
+
+

@@ -1,0 +1,70 @@
+"""What a frame's observations did, and the reports of a run as flat arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as SequenceType
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import BoolArray, IntArray
+from ekfslam.filters.result import REASONS, Innovation, Rejections
+from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """What one frame's observations did.
+
+    Args:
+        frame: Frame index.
+        ids: (n,) landmark ids seen.
+        reason: (n,) `ACCEPTED` or an index into `REASONS`.
+        nis: Normalised innovation squared of the accepted updates.
+        dof: Its degrees of freedom.
+        split: Ids of tracks that were split, their observation starting a new landmark.
+        log_likelihood: Log-density of the frame's innovations, of accepted updates and, where velocities are in the
+            state, of their measurement; see `log_density`. Landmarks that start are without prior and contribute 0.
+    """
+
+    frame: int
+    ids: IntArray
+    reason: IntArray
+    nis: float
+    dof: int
+    split: IntArray
+    log_likelihood: float
+
+
+def log_density(nis: float, log_det: float, dof: int) -> float:
+    """``log N(r; 0, S) = -(r^T S^-1 r + log det S + n log 2 pi) / 2`` from the NIS, ``log det S`` and n.
+
+    Summed over a run it is the log-likelihood of the filter's parameters: the prediction error decomposition, Schweppe,
+    "Evaluation of likelihood functions for Gaussian signals", IEEE Trans. Information Theory 11, 1965.
+    """
+    return -0.5 * float(nis + log_det + dof * np.log(2 * np.pi))
+
+
+def missed(reason: IntArray) -> BoolArray:
+    """Whether (n,) an observation speaks against its landmark, and not merely against itself."""
+    return (reason == GATE) | (reason == BEHIND_CAMERA)
+
+
+def collect(reports: SequenceType[FrameReport]) -> tuple[Innovation, Rejections, dict[str, int]]:
+    """The reports of a run as flat arrays, and the totals: accepted, rejected, and rejected per reason."""
+    ids = np.concatenate([report.ids for report in reports])
+    reason = np.concatenate([report.reason for report in reports])
+    frame = np.repeat([report.frame for report in reports], [len(report.ids) for report in reports])
+    rejected = reason != ACCEPTED
+    rejections = Rejections(frame[rejected], ids[rejected], reason[rejected])
+    innovation = Innovation(
+        nis=np.array([report.nis for report in reports]),
+        dof=np.array([report.dof for report in reports], dtype=np.int64),
+        accepted=np.array([(report.reason == ACCEPTED).sum() for report in reports], dtype=np.int64),
+        rejected=np.array([(report.reason != ACCEPTED).sum() for report in reports], dtype=np.int64),
+    )
+    split = sum(len(report.split) for report in reports)
+    counts = {"accepted": int((~rejected).sum()), "rejected": int(rejected.sum()), "split": split}
+    for code, name in enumerate(REASONS):
+        counts[f"rejected: {name}"] = int((reason == code).sum())
+    return innovation, rejections, counts

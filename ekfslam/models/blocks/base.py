@@ -1,0 +1,128 @@
+"""The interface of a state block, and the layout of blocks in a covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import ClassVar, TypeVar
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+
+# Estimates by name of their block; arrays may have leading dimensions (frames), so that a whole drive is one call.
+Values = Mapping[str, Array]
+
+
+class StateBlock:
+    """A part of the state: by default a constant vector with an additive error, of which nothing else depends.
+
+    Subclasses are frozen dataclasses that override what is different.
+
+    Attributes:
+        name: Key of its value, and of its columns in the `Layout`.
+        size: Number of columns of its error.
+        per_frame: Whether it has a value for each frame (in the batch problem: one unknown a frame), or one for the
+            whole drive.
+        is_seen: Whether observations of landmarks depend on it.
+        labels, units: Names and units of what `reported` returns; none is not reported.
+    """
+
+    name: ClassVar[str]
+    per_frame: ClassVar[bool] = False
+    is_seen: ClassVar[bool] = False
+
+    @property
+    def size(self) -> int:
+        raise NotImplementedError
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return ()
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return ()
+
+    def initial(self) -> Array:
+        """Its value before the first frame."""
+        return np.zeros(self.size)
+
+    def prior_covariance(self) -> Array:
+        """(size, size) covariance of that value."""
+        return np.zeros((self.size, self.size))
+
+    def retract(self, value: Array, correction: Array) -> Array:
+        """The value after a correction (..., size) of its error."""
+        return value + correction
+
+    def transition(self, tau_s: Array | float) -> tuple[Array, Array] | None:
+        """How value and error go from frame to frame: ``x+ = phi x + w``, element by element; None: it is constant.
+
+        Returns:
+            ``phi`` (..., size) and the standard deviation (..., size) of w over intervals ``tau_s`` (...).
+        """
+        return None
+
+    def velocity_offset(self) -> Array | None:
+        """Derivative (6, size) of the measured velocities by a block that is added to them; None: it is not."""
+        return None
+
+    def turn_velocities(
+        self, twist: Array, by: Array, values: Values, R_linear: Array, layout: Layout
+    ) -> tuple[Array, Array]:
+        """Velocities (..., 6) and their derivative (..., 6, body) by all blocks, after this block has acted on them.
+
+        Args:
+            twist, by: Before.
+            values: Estimates of all blocks, the pose being the one that the interval starts from.
+            R_linear: (..., 3, 3) rotation of that pose at which its error is linearised.
+            layout: Columns of the blocks.
+        """
+        return twist, by
+
+    def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
+        """Estimates and standard deviations (p,) of what `labels` name, given all blocks and their covariance."""
+        at = layout[self.name]
+        return values[self.name], np.sqrt(np.diag(covariance)[at])
+
+    @property
+    def reported_prior_std(self) -> Array:
+        """(p,) standard deviations of what `labels` name, before the first frame."""
+        return np.sqrt(np.diag(self.prior_covariance()))
+
+
+class Layout(dict[str, slice]):
+    """Columns of the blocks in a covariance: blocks that observations depend on come first.
+
+    Args:
+        blocks: In any order, the pose first; those that are seen move to the front.
+
+    Attributes:
+        blocks: In the order of their columns.
+        body: Number of columns of all blocks.
+        seen: Number of leading columns that observations of landmarks depend on.
+    """
+
+    def __init__(self, blocks: Iterable[StateBlock]) -> None:
+        self.blocks = tuple(sorted(blocks, key=lambda block: not block.is_seen))
+        end = np.cumsum([block.size for block in self.blocks]).tolist()
+        super().__init__(
+            (block.name, slice(stop - block.size, stop)) for block, stop in zip(self.blocks, end, strict=True)
+        )
+        self.body = end[-1]
+        self.seen = sum(block.size for block in self.blocks if block.is_seen)
+
+    def columns(self, names: Iterable[str]) -> IntArray:
+        """Columns of some blocks, in the order given."""
+        parts = [np.arange(self[name].start, self[name].stop) for name in names]
+        return np.concatenate([np.empty(0, dtype=np.int64), *parts])
+
+
+OPTIONAL_BLOCKS: dict[str, type[StateBlock]] = {}
+_Block = TypeVar("_Block", bound=type[StateBlock])
+
+
+def optional_block(block: _Block) -> _Block:
+    """Make a block available by name: the table ``[blocks.<name>]`` of a configuration puts it into the state."""
+    OPTIONAL_BLOCKS[block.name] = block
+    return block

@@ -1,0 +1,180 @@
+"""The stereo rig's calibration as a state block: which parameters there are, and their Jacobians.
+
+With nine parameters c the rig sees ``q = exp(c_0..5^) T_cam_imu exp(-c_time u^) T_imu_world m``, eq. (9), its
+baseline is ``b exp(c_baseline)``, and its disparities come out larger by ``c_disparity``. All are 0 for the calibration
+as given and change additively. ``u`` are the velocities of the IMU: images are exposed ``c_time`` later than stamped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.config import CalibrationConfig
+from ekfslam.geometry import motion, se3
+from ekfslam.models.blocks.base import Layout, StateBlock, Values
+from ekfslam.models.observation import initialise, linearise
+from ekfslam.models.sensors.stereo import Rig
+
+NAMES = (
+    "camera x",
+    "camera y",
+    "camera z",
+    "camera rotation x",
+    "camera rotation y",
+    "camera rotation z",
+    "ln baseline",
+    "disparity offset",
+    "time offset",
+)
+UNITS = ("m", "m", "m", "rad", "rad", "rad", "1", "px", "s")
+_EXTRINSIC, _BASELINE, _DISPARITY, TIME = slice(0, 6), 6, 7, 8
+_ROTATION = slice(3, 6)
+
+
+def prior_std(config: CalibrationConfig) -> Array:
+    """(9,) prior standard deviations of the parameters, in their `UNITS`; 0 where one is taken as given."""
+    return np.array(
+        [
+            *[config.lever_arm_m] * 3,
+            *[np.deg2rad(config.rotation_deg)] * 3,
+            config.baseline,
+            config.disparity_px,
+            config.time_s,
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Calibration(StateBlock):
+    """Calibration parameters of a `Rig`, one set for the drive; its value is all nine, its error the free ones.
+
+    Args:
+        std: (9,) prior standard deviations; parameters with 0 are not free.
+    """
+
+    std: Array
+
+    name = "calibration"
+    is_seen = True
+
+    @cached_property
+    def free(self) -> IntArray:
+        """Indices of the free parameters among the nine."""
+        return np.flatnonzero(self.std)
+
+    @property
+    def size(self) -> int:
+        return len(self.free)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(NAMES[i] for i in self.free)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return tuple(UNITS[i] for i in self.free)
+
+    @property
+    def has_time_offset(self) -> bool:
+        """Whether the images' time offset is free, so that velocities enter the observations."""
+        return bool(self.std[TIME])
+
+    def initial(self) -> Array:
+        return np.zeros(9)
+
+    def prior_covariance(self) -> Array:
+        return np.diag(self.std[self.free] ** 2)
+
+    def retract(self, value: Array, correction: Array) -> Array:
+        moved = value.copy()
+        moved[..., self.free] += correction
+        return moved
+
+    def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
+        return values[self.name][self.free], np.sqrt(np.diag(covariance)[layout[self.name]])
+
+    def applied(self, rig: Rig, parameters: Array) -> Rig:
+        """The rig with parameters (9,), all but the time offset."""
+        return calibrated(rig, parameters)
+
+    def delay(self, parameters: Array, twist: Array) -> Array:
+        """(..., 4, 4) motion from the stamps to the exposures, with velocities (..., 6)."""
+        return to_exposure(parameters, twist)
+
+    @cached_property
+    def turns_camera(self) -> IntArray:
+        """Columns of the block that turn the camera."""
+        return np.flatnonzero((self.free >= _ROTATION.start) & (self.free < _ROTATION.stop))
+
+    def linearise(
+        self,
+        rig: Rig,
+        parameters: Array,
+        twist: Array,
+        T_imu_world: Array,
+        positions_m: Array,
+        T_linear: Array,
+        linear_positions_m: Array,
+    ) -> tuple[Array, Array, Array, Array]:
+        """Eq. (4) with parameters (9,) at which to linearise, and velocities ``twist`` (6,) or (n, 6) of the IMU.
+
+        Returns:
+            As `ekfslam.models.observation.linearise`, with H (n, 3, size) by the free parameters before H_m.
+        """
+        now, delay = calibrated(rig, parameters), to_exposure(parameters, twist)
+        q, H_x, H_m = linearise(now, delay @ T_imu_world, positions_m, delay @ T_linear, linear_positions_m)
+        A = now.jacobian(q)
+        H = np.zeros((len(q), 3, 9))
+        # First estimates here, too: a camera and its landmarks turned about it as one must look the same for good.
+        q_linear = se3.apply(now.T_cam_imu @ delay @ T_linear, linear_positions_m)
+        moved = np.concatenate([np.broadcast_to(np.eye(3), A.shape), -se3.skew(q_linear)], axis=-1)
+        H[..., _EXTRINSIC] = A @ moved @ se3.left_jacobian(parameters[_EXTRINSIC])
+        by_disparity = now.by_disparity(q)
+        disparity_px = now.camera.fu_px * now.camera.baseline_m / q[:, 2:]
+        H[..., _BASELINE] = by_disparity * disparity_px
+        H[..., _DISPARITY] = by_disparity
+        H[..., TIME] = -(H_x @ twist[..., None])[..., 0]
+        return q, H_x @ se3.adjoint(delay), H[..., self.free], H_m
+
+    def initialise(
+        self, rig: Rig, parameters: Array, twist: Array, T_imu_world: Array, rows: Array, variance: Array, T_linear: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Eq. (5) with parameters: positions (n, 3), G (n, 3, 6) by the pose, (n, 3, size) by the block, covariance."""
+        now, delay = calibrated(rig, parameters), to_exposure(parameters, twist)
+        positions, G, covariance = initialise(now, delay @ T_imu_world, rows, variance, delay @ T_linear)
+        _, _, H, H_m = self.linearise(rig, parameters, twist, T_imu_world, positions, T_imu_world, positions)
+        # What is seen stays as it is: H (xi, c) + H_m d = 0.
+        return positions, G @ se3.adjoint(delay), -np.linalg.solve(H_m, H), covariance
+
+    def landmarks_by_rotation(self, rig: Rig, parameters: Array, T_imu_world: Array, moved_m: Array) -> Array:
+        """New landmark errors (n, 3, 3) by the camera's rotation, where a correction moves landmarks by ``moved_m``.
+
+        A rig that turns its camera and all landmarks about it sees the same: their errors count in the camera's frame,
+        as those of the invariant variant do in that of the IMU. In world they would be seen from ever new linearisation
+        points, above all while depths are poor, and the filter would learn the rotation from noise. Pose (4, 4) and
+        parameters (9,) are those before the correction.
+        """
+        R_world_cam = (se3.exp(parameters[_EXTRINSIC]) @ rig.T_cam_imu @ T_imu_world)[:3, :3].T
+        by_rotation = se3.skew(moved_m) @ R_world_cam @ se3.so3_left_jacobian(parameters[_ROTATION])
+        return by_rotation[..., self.free[self.turns_camera] - _ROTATION.start]
+
+
+def calibrated(rig: Rig, parameters: Array) -> Rig:
+    """The rig with parameters (9,) applied, all but the time offset."""
+    camera = rig.camera
+    return dataclasses.replace(
+        rig,
+        camera=dataclasses.replace(camera, baseline_m=camera.baseline_m * float(np.exp(parameters[_BASELINE]))),
+        T_cam_imu=se3.exp(parameters[_EXTRINSIC]) @ rig.T_cam_imu,
+        disparity_offset_px=rig.disparity_offset_px + float(parameters[_DISPARITY]),
+    )
+
+
+def to_exposure(parameters: Array, twist: Array) -> Array:
+    """(..., 4, 4) motion from the stamp to the exposure; ``T_imu_world`` there is it times that at the stamp."""
+    return motion.increment(twist, parameters[TIME])

@@ -1,0 +1,63 @@
+"""The pose, and the clone of the pose before it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.geometry import se3
+from ekfslam.models.blocks.base import StateBlock
+
+
+@dataclass(frozen=True)
+class Pose(StateBlock):
+    """``T_imu_world = exp(xi^) T_hat``, moved by the velocities: eq. (1) and (2).
+
+    Args:
+        T_imu_world: (4, 4) first pose.
+        covariance: (6, 6) of its error.
+    """
+
+    T_imu_world: Array
+    covariance: Array
+
+    name = "pose"
+    per_frame = True
+    is_seen = True
+
+    @property
+    def size(self) -> int:
+        return 6
+
+    def initial(self) -> Array:
+        return self.T_imu_world
+
+    def prior_covariance(self) -> Array:
+        return self.covariance
+
+    def retract(self, value: Array, correction: Array) -> Array:
+        return se3.exp(correction) @ value
+
+
+@dataclass(frozen=True)
+class PreviousPose(StateBlock):
+    """A clone of the pose of the frame before: errors of tracks are differences over two frames, eq. (10).
+
+    Source: Roumeliotis and Burdick, "Stochastic cloning", ICRA 2002. It begins as a certain identity and takes the
+    pose's place at every prediction; in the batch problem it is the pose of the frame before itself.
+    """
+
+    name = "previous_pose"
+    is_seen = True
+
+    @property
+    def size(self) -> int:
+        return 6
+
+    def initial(self) -> Array:
+        return np.eye(4)
+
+    def retract(self, value: Array, correction: Array) -> Array:
+        return se3.exp(correction) @ value

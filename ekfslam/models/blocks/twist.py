@@ -1,0 +1,32 @@
+"""The velocities as a random walk that velocity sensors measure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.models.blocks.base import StateBlock
+
+
+@dataclass(frozen=True)
+class Twist(StateBlock):
+    """True velocities (6,) of an interval, m/s and rad/s, in the frame of the measured ones; a walk from the first one.
+
+    Args:
+        walk_std: (6,) standard deviation of their change from one interval to the next.
+    """
+
+    walk_std: Array
+
+    name = "twist"
+    per_frame = True
+
+    @property
+    def size(self) -> int:
+        return 6
+
+    def transition(self, tau_s: Array | float) -> tuple[Array, Array] | None:
+        std = np.broadcast_to(self.walk_std, (*np.shape(tau_s), 6))
+        return np.ones_like(std), std

@@ -1,0 +1,71 @@
+"""Which way is up: what level velocities need to become those of the IMU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.geometry import motion, se3
+from ekfslam.models.blocks.base import Layout, StateBlock, Values
+
+
+@dataclass(frozen=True)
+class Up(StateBlock):
+    """Unit vector (3,) against gravity in world, ``up = exp(psi^) up_hat``: one for the drive.
+
+    With the pose ``T_imu_world = exp([rho; theta]^) T_hat`` of rotation R, up in the IMU frame is ``R up`` and turns by
+    ``exp(phi^)``, ``phi = theta + R psi``: nothing when the world turns as a whole.
+
+    Args:
+        direction: (3,) up as it is taken first: the first pose's z axis.
+        tilt_rad: Standard deviation of its angles.
+    """
+
+    direction: Array
+    tilt_rad: float
+
+    name = "up"
+    labels = ("roll", "pitch")
+    units = ("rad", "rad")
+
+    @property
+    def size(self) -> int:
+        return 3
+
+    def initial(self) -> Array:
+        return self.direction
+
+    def prior_covariance(self) -> Array:
+        return self.tilt_rad**2 * np.eye(3)
+
+    def retract(self, value: Array, correction: Array) -> Array:
+        return (se3.so3_exp(correction) @ value[..., None])[..., 0]
+
+    def in_imu(self, values: Values) -> Array:
+        """(..., 3) up in the IMU frame."""
+        return (values["pose"][..., :3, :3] @ values[self.name][..., None])[..., 0]
+
+    def turn_velocities(
+        self, twist: Array, by: Array, values: Values, R_linear: Array, layout: Layout
+    ) -> tuple[Array, Array]:
+        """Eq. (8)."""
+        twist, by_level, by_phi = motion.imu_twist(twist, self.in_imu(values))
+        by = by_level @ by
+        by[..., layout[self.name]] += by_phi @ R_linear
+        by[..., layout["pose"].start + 3 : layout["pose"].stop] += by_phi
+        return twist, by
+
+    def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
+        """Roll and pitch of the IMU and their standard deviations, rad."""
+        up = self.in_imu(values)
+        by = np.zeros((3, layout.body))
+        by[:, layout["pose"].start + 3 : layout["pose"].stop] = np.eye(3)
+        by[:, layout[self.name]] = values["pose"][:3, :3]
+        variance = ((by @ covariance) * by).sum(axis=1)
+        return np.array([np.arctan2(up[1], up[2]), -np.arcsin(up[0])]), np.sqrt(variance[:2])
+
+    @property
+    def reported_prior_std(self) -> Array:
+        return np.full(2, self.tilt_rad)

@@ -1,0 +1,222 @@
+"""From a recording and a configuration to the problem that the estimators solve: one place decides what is believed.
+
+`build` resolves what is automatic, cleans the tracks, and chooses noise, sensor and state blocks. `ekfslam info` prints
+what it chose.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from collections.abc import Sequence as SequenceType
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.config import CalibrationConfig, Config
+from ekfslam.data.hygiene import HygieneReport, clean_tracks
+from ekfslam.data.noise import Noise
+from ekfslam.data.sequence import WITHOUT_TRACKS, Sequence
+from ekfslam.errors import ConfigError
+from ekfslam.geometry import se3
+from ekfslam.models.blocks import OPTIONAL_BLOCKS, Calibration, Pose, PreviousPose, StateBlock, Twist, Up
+from ekfslam.models.blocks.calibration import prior_std
+from ekfslam.models.model import Model
+from ekfslam.models.noise import VelocityNoise, automatic_noise, velocity_noise, with_drift
+from ekfslam.models.sensors.base import Sensor
+from ekfslam.models.sensors.stereo import Rig
+
+# What "auto" keeps in the state when landmarks come back: beyond this a dense covariance is no longer cheap.
+AUTO_NEVER_LIMIT = 300
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that an estimator needs.
+
+    Args:
+        sequence: The recording with cleaned tracks.
+        config: Resolved configuration.
+        model: State blocks, sensor, noise.
+        hygiene: What was done to the tracks; None: they were not looked at.
+        account: Attributes for a result that say where the noise comes from.
+    """
+
+    sequence: Sequence
+    config: Config
+    model: Model
+    hygiene: HygieneReport | None
+    account: Mapping[str, str | int | float]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What is believed, one line each."""
+        model, settings = self.model, self.config.filter
+        blocks = ", ".join(f"{block.name} ({block.size})" for block in model.layout.blocks)
+        error = model.track_error
+        tracks = "pixel errors are white"
+        if error is not None:
+            first, walk = (", ".join(f"{value:.2g}" for value in std) for std in (error.first_std, error.walk_std))
+            tracks = f"errors of tracks (u, v, disparity) start with {first} px and walk by {walk} px a frame"
+        back = "no landmark leaves the state"
+        if settings.retire != "never":
+            revived = "come back exactly" if settings.revive >= 0 else "start afresh when seen again"
+            back = f"landmarks leave {settings.retire_after} frames after they were seen last, and {revived}"
+        return f"{blocks}, 3 for each landmark", tracks, back
+
+
+def build(
+    sequence: Sequence, config: Config | None = None, blocks: SequenceType[StateBlock] = (), clean: bool = True
+) -> Problem:
+    """The problem of a recording.
+
+    Args:
+        sequence: The recording.
+        config: Settings; defaults where None.
+        blocks: State blocks besides those that configuration and noise ask for.
+        clean: Whether to clean the tracks, see `ekfslam.data.hygiene`.
+
+    Raises:
+        ConfigError: An unknown block, or a setting that it does not have.
+    """
+    config = resolve(config or Config(), sequence)
+    noise, account = noise_of(sequence, config), noise_account(sequence, config)
+    hygiene = None
+    if clean:
+        observations, hygiene = clean_tracks(sequence, noise, config.hygiene)
+        attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
+        sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
+    model = model_of(
+        Rig(sequence.camera, sequence.T_cam_imu, noise),
+        noise,
+        se3.inverse(sequence.initial_T_world_imu),
+        config.filter.initial_covariance,
+        config.calibration,
+        (*optional_blocks(config.blocks), *blocks),
+    )
+    return Problem(sequence, config, model, hygiene, account)
+
+
+def model_of(
+    sensor: Sensor,
+    noise: Noise,
+    T_imu_world: Array,
+    covariance: Array,
+    calibration: CalibrationConfig | None = None,
+    blocks: SequenceType[StateBlock] = (),
+) -> Model:
+    """The state blocks that a sensor and its noise ask for: which there are, is decided here and nowhere else.
+
+    Args:
+        sensor: Of landmarks.
+        noise: Of velocities and tracks.
+        T_imu_world, covariance: (4, 4) first pose and (6, 6) of its error.
+        calibration: What of the sensor's calibration is estimated; None: nothing.
+        blocks: Further ones.
+
+    Raises:
+        ConfigError: A calibration to estimate, but no stereo rig; or a block twice.
+    """
+    chosen: list[StateBlock] = [Pose(T_imu_world, covariance)]
+    if noise.track_error is not None:
+        chosen.append(PreviousPose())
+    std = prior_std(calibration or CalibrationConfig())
+    if std.any():
+        if not isinstance(sensor, Rig):
+            raise ConfigError(f"calibration: only a stereo rig has parameters to estimate, not {type(sensor).__name__}")
+        chosen.append(Calibration(std))
+    if noise.twist_walk_std is not None:
+        chosen.append(Twist(noise.twist_walk_std))
+    if noise.tilt_rad:
+        chosen.append(Up(T_imu_world[:3, :3].T @ np.array([0.0, 0.0, 1.0]), noise.tilt_rad))
+    chosen.extend(blocks)
+    names = [block.name for block in chosen]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"a state block is there twice: {', '.join(names)}")
+    return Model(sensor, noise, tuple(chosen))
+
+
+def optional_blocks(settings: Mapping[str, Mapping[str, Any]]) -> tuple[StateBlock, ...]:
+    """Blocks that the tables ``[blocks.<name>]`` of a configuration put into the state.
+
+    Raises:
+        ConfigError: An unknown block, or a setting that it does not have.
+    """
+    chosen = []
+    for name, values in settings.items():
+        if name not in OPTIONAL_BLOCKS:
+            raise ConfigError(f"unknown block blocks.{name}; known: {', '.join(OPTIONAL_BLOCKS)}")
+        known = [field.name for field in dataclasses.fields(OPTIONAL_BLOCKS[name])]  # type: ignore[arg-type]
+        for key in values:
+            if key not in known:
+                raise ConfigError(f"unknown key blocks.{name}.{key}; known: {', '.join(known)}")
+        chosen.append(OPTIONAL_BLOCKS[name](**values))
+    return tuple(chosen)
+
+
+def resolve(config: Config, sequence: Sequence) -> Config:
+    """A configuration with what is automatic decided for a sequence; noise is decided by `noise_of`."""
+    retire, retire_after = config.filter.retire, config.filter.retire_after
+    come_back = _landmarks_come_back(sequence)
+    if retire == "auto":
+        retire = "never" if come_back and len(sequence.observations.ids) <= AUTO_NEVER_LIMIT else "unseen"
+    if retire_after is None:
+        retire_after = 10 if come_back else 1
+    settings = dataclasses.replace(config.filter, retire=retire, retire_after=retire_after)
+    return dataclasses.replace(config, filter=settings)
+
+
+def noise_of(sequence: Sequence, config: Config) -> Noise:
+    """The noise a filter shall assume: what the configuration says, else the sequence, else the data or a default."""
+    given = config.noise
+    if is_automatic(sequence, config):
+        stated = automatic_noise(sequence.twist, sequence.velocity_frame)
+    else:
+        stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
+    twist, pixels = np.array(stated.twist_std, dtype=float), np.array(stated.pixel_std_px, dtype=float)
+    if given.sigma_v_m_s is not None:
+        twist[:3] = given.sigma_v_m_s
+    if given.sigma_w_rad_s is not None:
+        twist[3:] = given.sigma_w_rad_s
+    if given.sigma_px is not None:
+        pixels[:] = given.sigma_px
+    tilt = stated.tilt_rad if given.tilt_deg is None else float(np.deg2rad(given.tilt_deg))
+    noise = dataclasses.replace(stated, twist_std=twist, pixel_std_px=pixels, tilt_rad=tilt)
+    return noise if given.drift is None else with_drift(noise, given.drift)
+
+
+def is_automatic(sequence: Sequence, config: Config) -> bool:
+    """Whether the model of the noise is that of `ekfslam.models.noise`, found from the data; see `NoiseConfig`."""
+    noise = config.noise
+    given = (noise.sigma_v_m_s, noise.sigma_w_rad_s, noise.sigma_px)
+    is_asked_for = noise.model == "tuned" or (noise.model == "auto" and all(sigma is None for sigma in given))
+    return sequence.noise is None and is_asked_for
+
+
+def noise_account(sequence: Sequence, config: Config) -> dict[str, str | int | float]:
+    """Attributes for a result that say where its noise comes from.
+
+    ``found_*``: what the differences of the velocities say, with standard errors and limits, where the noise is
+    automatic; ``tuned_*``: the `TuningRecord`, where there is one.
+    """
+    account = found_attributes(velocity_noise(sequence.twist)) if is_automatic(sequence, config) else {}
+    tuned = {f"tuned_{key}": value for key, value in vars(config.tuning).items() if value is not None}
+    return {**account, **tuned}
+
+
+def found_attributes(found: VelocityNoise) -> dict[str, float]:
+    """White noise of velocities, its standard errors and 95 % limits by name, the units in the names."""
+    values: dict[str, float] = {}
+    for i, name in enumerate(("sigma_v_m_s", "sigma_w_rad_s")):
+        values[f"found_{name}"], values[f"found_{name}_error"] = float(found.sigma[i]), float(found.sigma_error[i])
+        values[f"found_{name}_limit"] = float(found.limit[i])
+    return values
+
+
+def _landmarks_come_back(sequence: Sequence) -> bool:
+    observations = sequence.observations
+    order = np.lexsort((observations.frame, observations.landmark))
+    same = np.diff(observations.landmark[order]) == 0
+    return bool((same & (np.diff(observations.frame[order]) > 1)).any())

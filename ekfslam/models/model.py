@@ -1,0 +1,308 @@
+"""The model: state blocks, sensor and noise together, as the filter and the smoother both use it.
+
+Filter and smoother call the same functions. Arrays may have leading dimensions (frames or observations), so that the
+filter asks for one frame and the smoother for a whole drive.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.noise import Noise, TrackError
+from ekfslam.geometry import motion, se3
+from ekfslam.models.blocks import Calibration, Layout, PreviousPose, StateBlock, Twist, Values
+from ekfslam.models.observation import initialise, linearise
+from ekfslam.models.sensors.base import Sensor
+from ekfslam.models.sensors.stereo import Rig
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What observations of one frame depend on, besides landmarks.
+
+    Args:
+        T_imu_world: (..., 4, 4) pose.
+        T_linear: (..., 4, 4) pose at which its error is linearised: the same, or (FEJ) the predicted one.
+        calibration: (9,) parameters, where they are a block.
+        twist: (..., 6) velocities of the IMU, by which a time offset counts.
+    """
+
+    T_imu_world: Array
+    T_linear: Array
+    calibration: Array | None = None
+    twist: Array | None = None
+
+    def at(self, index: IntArray) -> Moment:
+        """The moments of some observations, given the frame of each, where poses are those of all frames."""
+        twist = None if self.twist is None else self.twist[index]
+        return Moment(self.T_imu_world[index], self.T_linear[index], self.calibration, twist)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Landmarks as the sensor sees them: points ``q`` (n, 3), rows ``z`` (n, d), and Jacobians of the rows.
+
+    ``H_x`` (n, d, seen) is by the leading columns of the layout, ``H_m`` (n, d, 3) by the landmark positions.
+    """
+
+    q: Array
+    z: Array
+    H_x: Array
+    H_m: Array
+
+
+@dataclass(frozen=True)
+class Step:
+    """One prediction: the next ``T_imu_world`` (4, 4), velocities of the IMU (6,), transition and noise (body, body)."""
+
+    T_imu_world: Array
+    twist: Array
+    Phi: Array
+    Q: Array
+
+
+@dataclass(frozen=True)
+class VelocityRows:
+    """Scalar measurements of true velocities, one an axis: the IMU's own, and those of further sources.
+
+    Args:
+        axis: (n,) 0 to 5: which of the six velocities.
+        value: (n,) m/s or rad/s.
+        std: (n,) standard deviations.
+        is_biased: (n,) whether biases of the IMU's velocities are in it.
+    """
+
+    axis: IntArray
+    value: Array
+    std: Array
+    is_biased: Array
+
+    @staticmethod
+    def concatenate(parts: Iterable[VelocityRows]) -> VelocityRows:
+        """All rows of the parts, in their order."""
+        parts = list(parts)
+        return VelocityRows(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(VelocityRows)))
+
+    @staticmethod
+    def of_imu(measured: Array, std: Array) -> VelocityRows:
+        """The six velocities that the IMU measures."""
+        return VelocityRows(np.arange(6), np.asarray(measured, dtype=float), std, np.ones(6, dtype=bool))
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is believed: which blocks are in the state, what observes landmarks, and how noisy everything is.
+
+    Args:
+        sensor: Of landmarks.
+        noise: Of velocities and tracks.
+        blocks: Of the state; the pose is always the first.
+    """
+
+    sensor: Sensor
+    noise: Noise
+    blocks: tuple[StateBlock, ...]
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Columns of the blocks."""
+        return Layout(self.blocks)
+
+    def block(self, name: str) -> StateBlock | None:
+        """A block by name; None where it is not in the state."""
+        return next((block for block in self.blocks if block.name == name), None)
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """The calibration, where it is in the state."""
+        return next((block for block in self.blocks if isinstance(block, Calibration)), None)
+
+    @property
+    def has_time_offset(self) -> bool:
+        """Whether observations depend on velocities."""
+        return self.calibration is not None and self.calibration.has_time_offset
+
+    @cached_property
+    def track_error(self) -> TrackError | None:
+        """The error of tracks; None where the sensor's noise is white."""
+        return self.noise.track_error
+
+    @cached_property
+    def has_clone(self) -> bool:
+        """Whether the pose of the frame before is in the state."""
+        return any(isinstance(block, PreviousPose) for block in self.blocks)
+
+    @cached_property
+    def has_twist(self) -> bool:
+        """Whether the velocities are in the state, so that velocity sensors measure them."""
+        return any(isinstance(block, Twist) for block in self.blocks)
+
+    @cached_property
+    def wandering(self) -> tuple[StateBlock, ...]:
+        """Blocks that change from frame to frame by themselves, in the order of their columns."""
+        return tuple(block for block in self.layout.blocks if block.transition(0.0) is not None)
+
+    @cached_property
+    def prior_covariance(self) -> Array:
+        """(body, body) before the first frame."""
+        P = np.zeros((self.layout.body, self.layout.body))
+        for block in self.blocks:
+            P[self.layout[block.name], self.layout[block.name]] = block.prior_covariance()
+        return P
+
+    def initial_values(self) -> dict[str, Array]:
+        """Value of every block before the first frame."""
+        return {block.name: block.initial() for block in self.blocks}
+
+    def retract(self, values: Values, correction: Array) -> dict[str, Array]:
+        """Every block after a correction (body,) of all of them."""
+        return {
+            block.name: block.retract(values[block.name], correction[self.layout[block.name]]) for block in self.blocks
+        }
+
+    # --- velocities ---------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _offsets(self) -> tuple[tuple[StateBlock, Array], ...]:
+        """Blocks that are added to the velocities that the IMU measures, with their derivatives (6, size)."""
+        pairs = ((block, block.velocity_offset()) for block in self.layout.blocks)
+        return tuple((block, J) for block, J in pairs if J is not None)
+
+    def velocity_jacobian(self, rows: VelocityRows) -> Array:
+        """H (n, body) of velocity measurements by all blocks."""
+        H = np.zeros((len(rows.axis), self.layout.body))
+        H[np.arange(len(H)), self.layout["twist"].start + rows.axis] = 1.0
+        for block, J in self._offsets:
+            H[:, self.layout[block.name]] = np.where(rows.is_biased[:, None], J[rows.axis], 0.0)
+        return H
+
+    def unbiased(self, measured: Array, values: Values) -> Array:
+        """Measured velocities (..., 6) less the biases in the state."""
+        for block, J in self._offsets:
+            measured = measured - (J @ values[block.name][..., None])[..., 0]
+        return measured
+
+    def twist_from_measurement(self, std: Array) -> tuple[Array, Array]:
+        """Phi and Q (body, body) of the step in which the first measurement (std (6,)) starts the twist."""
+        at = self.layout["twist"]
+        Phi, Q = np.eye(self.layout.body), np.zeros((self.layout.body, self.layout.body))
+        Phi[at, at], Q[at, at] = 0.0, np.diag(std**2)
+        for block, J in self._offsets:
+            Phi[at, self.layout[block.name]] = -J
+        return Phi, Q
+
+    def imu_velocities(self, values: Values, measured: Array, R_linear: Array) -> tuple[Array, Array]:
+        """Velocities of the IMU that drive an interval, and their derivative by the blocks.
+
+        Args:
+            values: Estimates; of pose (..., 4, 4) and up those before the interval, of twist and bias those during it.
+            measured: (..., 6) velocities, used where the twist is not in the state.
+            R_linear: (..., 3, 3) rotation at which the error of the pose is linearised.
+
+        Returns:
+            (..., 6) m/s and rad/s; (..., 6, body).
+        """
+        by = np.zeros((*np.shape(measured), self.layout.body))
+        if self.has_twist:
+            twist = values["twist"]
+            by[..., self.layout["twist"]] = np.eye(6)
+        else:
+            twist = self.unbiased(measured, values)
+            for block, J in self._offsets:
+                by[..., self.layout[block.name]] = -J
+        for block in self.layout.blocks:
+            twist, by = block.turn_velocities(twist, by, values, R_linear, self.layout)
+        return twist, by
+
+    def process_noise(self, twist: Array, tau_s: Array | float) -> Array:
+        """Q (..., 6, 6) of eq. (2) for the velocities (..., 6) that move the pose."""
+        process = self.noise.process
+        return motion.process_noise(twist, tau_s, process.pose_std, process.misalignment_rad)
+
+    def step(self, values: Values, measured: Array, tau_s: float, T_linear: Array, first_estimates: bool) -> Step:
+        """Eq. (1) and (2): the pose moves, its clone takes the place where it was.
+
+        Args:
+            values: Estimates before.
+            measured: (6,) velocities, used where the twist is not in the state.
+            tau_s: Duration.
+            T_linear: (4, 4) pose at which the pose's error before the step is linearised.
+            first_estimates: Whether F leads from there (FEJ) and not from the estimate.
+        """
+        at, R_linear = self.layout["pose"], T_linear[:3, :3]
+        twist, by = self.imu_velocities(values, measured, R_linear)
+        E = motion.increment(twist, tau_s)
+        T_next = E @ values["pose"]
+        Phi, Q = np.eye(self.layout.body), np.zeros((self.layout.body, self.layout.body))
+        if self.has_clone:
+            clone = self.layout["previous_pose"]
+            Phi[clone, clone], Phi[clone, at] = 0.0, np.eye(6)
+        Phi[at] = -motion.twist_jacobian(twist, tau_s) @ by
+        Phi[at, at] += motion.error_jacobian(T_next @ se3.inverse(T_linear) if first_estimates else E)
+        Q[at, at] = self.process_noise(twist, tau_s)
+        return Step(T_next, twist, Phi, Q)
+
+    # --- observations of landmarks ------------------------------------------------------------------------------------
+
+    def see(self, moment: Moment, positions_m: Array, linear_positions_m: Array, clone: bool = False) -> Seen:
+        """Eq. (3), (4) and (9): landmarks (n, 3) as the sensor sees them.
+
+        Args:
+            moment: From where.
+            positions_m, linear_positions_m: As in `ekfslam.models.observation.linearise`.
+            clone: Whether the moment is that of the clone, whose columns then take the pose's place.
+        """
+        T, T_linear, layout = moment.T_imu_world, moment.T_linear, self.layout
+        if self.calibration is None:
+            q, H_pose, H_m = linearise(self.sensor, T, positions_m, T_linear, linear_positions_m)
+            if layout.seen == 6:
+                return Seen(q, self.sensor.predict(q), H_pose, H_m)
+        else:
+            q, H_pose, H_c, H_m = self.calibration.linearise(
+                self.rig, moment.calibration, moment.twist, T, positions_m, T_linear, linear_positions_m
+            )
+        H_x = np.zeros((*H_pose.shape[:2], layout.seen))
+        H_x[..., layout["previous_pose" if clone else "pose"]] = H_pose
+        if self.calibration is not None:
+            H_x[..., layout["calibration"]] = H_c
+        return Seen(q, self.sensor_at(moment.calibration).predict(q), H_x, H_m)
+
+    def points(self, moment: Moment, positions_m: Array) -> Array:
+        """Landmarks (n, 3) in the frame of the sensor (n, 3)."""
+        T = moment.T_imu_world
+        if self.calibration is not None:
+            T = self.calibration.delay(moment.calibration, moment.twist) @ T
+        return se3.apply(self.sensor_at(moment.calibration).T_cam_imu @ T, positions_m)
+
+    def initialise(self, moment: Moment, rows: Array, variance: Array) -> tuple[Array, Array, Array]:
+        """Eq. (5): positions (n, 3) of new landmarks, G (n, 3, seen), and what the measurement adds (n, 3, 3)."""
+        T, T_linear, layout = moment.T_imu_world, moment.T_linear, self.layout
+        if self.calibration is None:
+            positions, G_pose, covariance = initialise(self.sensor, T, rows, variance, T_linear)
+            if layout.seen == 6:
+                return positions, G_pose, covariance
+        else:
+            positions, G_pose, G_c, covariance = self.calibration.initialise(
+                self.rig, moment.calibration, moment.twist, T, rows, variance, T_linear
+            )
+        G = np.zeros((len(rows), 3, layout.seen))
+        G[..., layout["pose"]] = G_pose
+        if self.calibration is not None:
+            G[..., layout["calibration"]] = G_c
+        return positions, G, covariance
+
+    def sensor_at(self, parameters: Array | None) -> Sensor:
+        """The sensor with a calibration (9,) applied."""
+        return self.sensor if self.calibration is None else self.calibration.applied(self.rig, parameters)
+
+    @property
+    def rig(self) -> Rig:
+        """The sensor, where it is a stereo rig."""
+        assert isinstance(self.sensor, Rig)
+        return self.sensor

@@ -1,0 +1,65 @@
+"""Equations (4) and (5): landmarks as a sensor sees them, and new ones from what it sees."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.geometry import se3
+from ekfslam.models.sensors.base import Sensor
+
+
+def linearise(
+    sensor: Sensor, T_imu_world: Array, positions_m: Array, T_linear: Array, linear_positions_m: Array
+) -> tuple[Array, Array, Array]:
+    """Eq. (4): landmarks (n, 3) in world as the sensor sees them, with their Jacobians.
+
+    Args:
+        sensor: What sees them.
+        T_imu_world: (4, 4) pose, or one a landmark (n, 4, 4); with ``positions_m`` the place where A is taken.
+        positions_m: (n, 3) estimates.
+        T_linear, linear_positions_m: Pose and positions for the rest of H: the estimates themselves, or (FEJ) the first
+            ones.
+
+    Returns:
+        The points in the camera frame (n, 3) m; ``H_x`` (n, d, 6), derivative by the pose error ``xi`` of
+        ``T_imu_world = exp(xi^) T_hat``; ``H_m`` (n, d, 3), derivative by the landmark position.
+    """
+    q = se3.apply(sensor.T_cam_imu @ T_imu_world, positions_m)
+    A = sensor.jacobian(q) @ sensor.T_cam_imu[:3, :3]
+    s = se3.apply(T_linear, linear_positions_m)
+    return q, np.concatenate([A, -A @ se3.skew(s)], axis=-1), A @ T_linear[..., :3, :3]
+
+
+def initialise(
+    sensor: Sensor, T_imu_world: Array, rows: Array, variance: Array, T_linear: Array
+) -> tuple[Array, Array, Array]:
+    """Eq. (5): landmark initialisation from one observation each, rows (n, 3).
+
+    Args:
+        sensor: What saw them.
+        T_imu_world: (4, 4) pose.
+        rows: (n, 3) what was seen.
+        variance: (n, 3) its variances.
+        T_linear: (4, 4) pose at which G is taken: the same, or (FEJ) the predicted one.
+
+    Returns:
+        Positions (n, 3) in world; ``G`` (n, 3, 6), their derivative by the pose error; the part (n, 3, 3) of their
+        covariance that the measurement causes, ``C^T (A^T V^-1 A)^-1 C``, the exact limit of a diffuse prior.
+    """
+    q = sensor.invert(rows)
+    T_world_cam = se3.inverse(sensor.T_cam_imu @ T_imu_world)
+    positions = se3.apply(T_world_cam, q)
+    A_inverse = T_world_cam[..., :3, :3] @ np.linalg.inv(sensor.jacobian(q))
+    covariance = (A_inverse * variance[:, None, :]) @ np.swapaxes(A_inverse, -1, -2)
+    return positions, landmark_by_pose(T_linear, positions), 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
+
+
+def landmark_by_pose(T_imu_world: Array, positions_m: Array) -> Array:
+    """``G = -C^T [I, -s^]`` (n, 3, 6) of eq. (5): how new landmarks (n, 3) follow the error of the pose that saw them.
+
+    The pose is (4, 4) for all, or (n, 4, 4).
+    """
+    s = se3.apply(T_imu_world, positions_m)
+    minus_C_transposed = np.broadcast_to(-T_imu_world[..., :3, :3].swapaxes(-1, -2), (len(s), 3, 3))
+    return np.concatenate([minus_C_transposed, -minus_C_transposed @ se3.skew(s)], axis=-1)

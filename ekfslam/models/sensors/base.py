@@ -1,0 +1,52 @@
+"""The interface of a sensor of point landmarks."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.noise import Noise
+
+# Reason codes of `Sensor.screen`; the index into `ekfslam.filters.result.REASONS` of what is rejected.
+ACCEPTED = -1
+GATE, DISPARITY, _, BEHIND_CAMERA, MOVING = range(5)
+
+
+class Sensor(Protocol):
+    """Anything that sees point landmarks in d rows each: ``z = h(q)``, ``q = T_cam_imu s``, with independent errors.
+
+    `ekfslam.models.sensors.stereo.Rig` is the one the library is about; experiments bring their own.
+    """
+
+    @property
+    def T_cam_imu(self) -> Array:
+        """(4, 4) extrinsics, IMU to the frame of ``q``."""
+
+    @property
+    def dimension(self) -> int:
+        """Rows of an observation, d."""
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of velocities and measurements."""
+
+    def screen(self, measured: Array, min_depth_m: float) -> IntArray:
+        """Reason codes (n,) of what can be judged from the measurements alone."""
+
+    def in_view(self, q: Array, min_depth_m: float) -> BoolArray:
+        """Whether (n,) points (n, 3) can be seen at all."""
+
+    def rows(self, measured: Array) -> Array:
+        """The rows (n, d) of each measurement."""
+
+    def variance(self, rows: Array) -> Array:
+        """Variances (n, d) of the rows where noise is white."""
+
+    def predict(self, q: Array) -> Array:
+        """``h(q)``: points (n, 3) m to rows (n, d)."""
+
+    def jacobian(self, q: Array) -> Array:
+        """``dh/dq`` (n, d, 3)."""
+
+    def invert(self, rows: Array) -> Array:
+        """The points (n, 3) m that rows (n, d) see; a sensor of bearings has none, see `Delayed`."""
