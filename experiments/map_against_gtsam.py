@@ -34,7 +34,6 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -46,7 +45,8 @@ from ekfslam.arrays import Array
 from ekfslam.config import PosteriorConfig
 from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.trajectory import absolute_trajectory_error
-from ekfslam.figures.run import STYLE, save_figure
+from ekfslam.figures.style import GREY, ORANGE, REFERENCE, marker_of, save_figure, styled
+from ekfslam.filters.log import Log
 from ekfslam.filters.observing import Rig
 from ekfslam.filters.result import Result
 from ekfslam.geometry import camera, motion, se3
@@ -236,7 +236,7 @@ def incremental(
 # --- Our side --------------------------------------------------------------------------------------------------------
 
 
-def log_of(result: Result) -> ekfslam.log.Log:
+def log_of(result: Result) -> Log:
     assert result.log is not None
     return result.log
 
@@ -353,11 +353,12 @@ def solve_all(sequence: Sequence, overrides: dict[str, dict[str, float]]) -> dic
 # --- Tables and figures ----------------------------------------------------------------------------------------------
 
 COMPARED = ("dead reckoning", "filter", "MAP", "GTSAM batch", "iSAM2", "iSAM2, 0.01")
+# Open marks may lie around others.
 STYLES: dict[str, dict[str, Any]] = {
-    "filter": {"color": "#0072B2", "marker": "o", "markerfacecolor": "none"},
-    "GTSAM batch": {"color": "#D55E00", "marker": "s", "markerfacecolor": "none", "markersize": 8},
-    "iSAM2": {"color": "0.5", "marker": "^"},
-    "MAP": {"color": "black", "marker": "D"},
+    "filter": {**marker_of("full"), "markerfacecolor": "none"},
+    "GTSAM batch": {"color": ORANGE, "marker": "s", "markerfacecolor": "none", "markersize": 8, "linestyle": ""},
+    "iSAM2": {"color": GREY, "marker": "^", "linestyle": ""},
+    "MAP": {**marker_of("smoothed")},
 }
 
 
@@ -448,32 +449,32 @@ def markdown(table: dict[str, dict[str, Any]], config: PosteriorConfig) -> str:
     return "\n".join(lines)
 
 
+@styled
 def plot(table: dict[str, dict[str, Any]]) -> Figure:
     """ATE over iSAM2's for every set with truth, and seconds."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.0, 0.6 + 0.33 * len(table)))
-        error_ax, time_ax = figure.subplots(1, 2, sharey=True)
-        place = np.arange(len(table))
+    figure = Figure(figsize=(9.0, 0.6 + 0.33 * len(table)))
+    error_ax, time_ax = figure.subplots(1, 2, sharey=True)
+    place = np.arange(len(table))
 
-        def dots(ax: Axes, name: str, values: list[float | None]) -> None:
-            known = [(x, y) for x, y in zip(values, place, strict=True) if x is not None]
-            ax.plot(*zip(*known, strict=True), linestyle="", label=name, **STYLES[name])
+    def dots(ax: Axes, name: str, values: list[float | None]) -> None:
+        known = [(x, y) for x, y in zip(values, place, strict=True) if x is not None]
+        ax.plot(*zip(*known, strict=True), label=name, **STYLES[name])
 
-        for name in ("filter", "GTSAM batch", "MAP"):
-            dots(error_ax, name, [ratio(row, (name, "ate_m"), ("iSAM2", "ate_m")) for row in table.values()])
-        for name in ("filter", "GTSAM batch", "iSAM2", "MAP"):
-            dots(time_ax, name, [row["estimators"][name]["seconds"] for row in table.values()])
-        error_ax.axvline(1.0, color="0.3", linewidth=0.8)
-        error_ax.axvline(1.15, color="0.3", linewidth=0.8, linestyle="--")
-        error_ax.set_xlabel("ATE over that of iSAM2 [-]; dashed: 1.15")
-        error_ax.set_yticks(place, list(table))
-        error_ax.invert_yaxis()
-        time_ax.set_xlabel("time for the whole set [s]")
-        time_ax.set_xscale("log")
-        time_ax.xaxis.set_major_formatter(FormatStrFormatter("%g"))
-        handles, labels = time_ax.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
-        figure.suptitle("The same problem solved by the posterior (MAP), by GTSAM's batch, and by iSAM2")
+    for name in ("filter", "GTSAM batch", "MAP"):
+        dots(error_ax, name, [ratio(row, (name, "ate_m"), ("iSAM2", "ate_m")) for row in table.values()])
+    for name in ("filter", "GTSAM batch", "iSAM2", "MAP"):
+        dots(time_ax, name, [row["estimators"][name]["seconds"] for row in table.values()])
+    error_ax.axvline(1.0, **REFERENCE)
+    error_ax.axvline(1.15, **{**REFERENCE, "linestyle": "--"})
+    error_ax.set_xlabel("ATE over that of iSAM2 [-]; dashed: 1.15")
+    error_ax.set_yticks(place, list(table))
+    error_ax.invert_yaxis()
+    time_ax.set_xlabel("time for the whole set [s]")
+    time_ax.set_xscale("log")
+    time_ax.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    handles, labels = time_ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    figure.suptitle("The same problem solved by the posterior (MAP), by GTSAM's batch, and by iSAM2")
     return figure
 
 

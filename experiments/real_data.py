@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -25,7 +24,7 @@ import ekfslam
 from ekfslam.data.sequence import Sequence
 from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.evaluation.trajectory import absolute_trajectory_error
-from ekfslam.figures.run import STYLE, save_figure
+from ekfslam.figures.style import ORANGE, REFERENCE, marker_of, save_figure, styled
 from ekfslam.filters.result import Result
 
 ROOT = Path(__file__).parents[1]
@@ -210,27 +209,26 @@ def observations_table(table: dict[str, dict[str, dict[str, float]]]) -> list[st
     return [*lines, ""]
 
 
+@styled
 def plot(table: dict[str, dict[str, dict[str, float]]], noisy: dict[str, list[dict[str, float]]]) -> Figure:
     """Gain over dead reckoning, set by set: as recorded, and with noise added."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(8.0, 4.2))
-        ax = figure.subplots()
-        names = list(table)
-        clean = [table[name]["dead reckoning"]["ate_m"] / table[name]["full"]["ate_m"] for name in names]
-        ax.plot(clean, range(len(names)), "o", color="#0072B2", label="as recorded")
-        for name, runs in noisy.items():
-            place = np.full(len(runs), names.index(name) + 0.25)
-            ax.plot(
-                gains(runs), place, "x", color="#D55E00", label="noise added, five seeds" if name in names[:1] else None
-            )
-        ax.axvline(1.0, color="0.3", linewidth=0.8)
-        ax.set_xscale("log")
-        ax.set_xticks([0.5, 0.8, 1, 2, 3, 5, 10], ["0.5", "0.8", "1", "2", "3", "5", "10"])
-        ax.minorticks_off()
-        ax.set_yticks(range(len(names)), names)
-        ax.invert_yaxis()
-        ax.set_xlabel("ATE of dead reckoning over that of full SLAM [-]; more is better")
-        ax.legend(loc="lower right")
+    figure = Figure(figsize=(8.0, 4.2))
+    ax = figure.subplots()
+    names = list(table)
+    clean = [table[name]["dead reckoning"]["ate_m"] / table[name]["full"]["ate_m"] for name in names]
+    ax.plot(clean, range(len(names)), **marker_of("full"), label="as recorded")
+    for name, runs in noisy.items():
+        place = np.full(len(runs), names.index(name) + 0.25)
+        label = "noise added, five seeds" if name in names[:1] else None
+        ax.plot(gains(runs), place, "x", color=ORANGE, label=label)
+    ax.axvline(1.0, **REFERENCE)
+    ax.set_xscale("log")
+    ax.set_xticks([0.5, 0.8, 1, 2, 3, 5, 10], ["0.5", "0.8", "1", "2", "3", "5", "10"])
+    ax.minorticks_off()
+    ax.set_yticks(range(len(names)), names)
+    ax.invert_yaxis()
+    ax.set_xlabel("ATE of dead reckoning over that of full SLAM [-]; more is better")
+    ax.legend(loc="lower right")
     return figure
 
 

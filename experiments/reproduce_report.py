@@ -27,7 +27,8 @@ import sys
 from pathlib import Path
 
 import ekfslam
-from ekfslam.figures.run import plot_landmark_arrows, plot_trajectories, save_figure
+from ekfslam.figures.maps import plot_landmark_arrows, plot_trajectories
+from ekfslam.figures.style import save_figure
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("EKFSLAM_DATA") or ROOT.parent / "shared" / "data")

@@ -30,7 +30,6 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy.sparse as sp
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from threadpoolctl import threadpool_limits
 
 from ekfslam import run
@@ -38,7 +37,7 @@ from ekfslam.arrays import Array
 from ekfslam.config import Config, PosteriorConfig, noise_of
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import City, Loop, simulate
-from ekfslam.figures.run import save_figure
+from ekfslam.figures.style import GREY, log_axis, save_figure, style_of, styled
 from ekfslam.filters import JointEKF, joint
 from ekfslam.filters.observing import Rig
 from ekfslam.filters.result import Result
@@ -419,33 +418,35 @@ def table(found: Row) -> str:
     return "\n".join(lines) + "\n"
 
 
+@styled
 def plot(found: Row) -> Figure:
     """Time of a frame, time of the posterior and memory against M, with the dense reference."""
     sizes, dense = found["sizes"], found["dense"]
     M, M_dense = (np.array([r["landmarks"] for r in rows], dtype=float) for rows in (sizes, dense))
-    figure = Figure(figsize=(12.0, 4.2), layout="constrained")
+    figure = Figure(figsize=(12.0, 4.2))
     axes = figure.subplots(1, 3)
+    full, smoothed, filtered = style_of("full"), style_of("smoothed"), style_of("as filtered")
+    reference = {"color": GREY, "linestyle": "--", "marker": "s"}
     curves = (
-        (0, M, [r["ms_per_frame"] for r in sizes], "o-", "0.0", "ekfslam"),
-        (0, M_dense, [r["ms_per_frame"] for r in dense], "s--", "0.5", "dense filter"),
-        (1, M, [r["map"]["total_s"] for r in sizes], "o-", "0.0", "MAP and all marginals"),
-        (1, M, [r["filtered"]["total_s"] for r in sizes], "^:", "0.3", "as filtered and all marginals"),
-        (1, M_dense, [r["posterior_s"] for r in dense], "s--", "0.5", "dense inverse"),
-        (2, M, [r["peak_mb"] for r in sizes], "o-", "0.0", "whole run with MAP"),
-        (2, M, [r["filter_mb"] for r in sizes], "^:", "0.3", "filter"),
-        (2, M_dense, [r["posterior_mb"] for r in dense], "s--", "0.5", "dense inverse"),
+        (0, M, [r["ms_per_frame"] for r in sizes], full, "ekfslam"),
+        (0, M_dense, [r["ms_per_frame"] for r in dense], reference, "dense filter"),
+        (1, M, [r["map"]["total_s"] for r in sizes], smoothed, "MAP and all marginals"),
+        (1, M, [r["filtered"]["total_s"] for r in sizes], filtered, "as filtered and all marginals"),
+        (1, M_dense, [r["posterior_s"] for r in dense], reference, "dense inverse"),
+        (2, M, [r["peak_mb"] for r in sizes], smoothed, "whole run with MAP"),
+        (2, M, [r["filter_mb"] for r in sizes], full, "filter"),
+        (2, M_dense, [r["posterior_mb"] for r in dense], reference, "dense inverse"),
     )
-    for panel, x, values, style, grey, label in curves:
+    for panel, x, values, style, label in curves:
         y = np.array(values)
         exponent = "" if panel == 2 else f" (slope {slope(x, y):.1f})"
-        axes[panel].loglog(x, y, style, color=grey, ms=5, lw=1.5, label=label + exponent)
+        axes[panel].loglog(x, y, **style, label=label + exponent)
     labels = ("CPU time of a frame, ms", "CPU time of the posterior, s", "peak memory, MB")
     for ax, label in zip(axes, labels, strict=True):
         ax.set_ylabel(label)
-        ax.yaxis.set_minor_formatter(NullFormatter())
+        log_axis(ax, (1.0,))
         ax.set_xlabel("landmarks M")
-        ax.grid(True, which="major", color="0.85")
-        ax.legend(loc="upper left", fontsize=8)
+        ax.legend(loc="upper left")
         low, high = np.log10(ax.get_ylim())
         ax.set_ylim(10.0 ** np.floor(low), 10.0 ** (high + 0.3 * (high - low)))  # room for the legend
     return figure

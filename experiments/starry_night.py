@@ -26,10 +26,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter
 from threadpoolctl import threadpool_limits
 
 import ekfslam
@@ -38,7 +36,7 @@ from ekfslam.config import FilterConfig, Variant
 from ekfslam.data.sequence import Noise, Sequence, Truth
 from ekfslam.evaluation.consistency import chi2_bounds, invariant_landmark_error, nees, pose_error
 from ekfslam.evaluation.trajectory import match_landmarks
-from ekfslam.figures.run import STYLE, save_figure
+from ekfslam.figures.style import BOUNDS, EXPECTED, SERIES, SKY_BLUE, ZERO, log_axis, marker_of, save_figure, styled
 from ekfslam.filters import JointEKF
 from ekfslam.filters.observing import Rig
 from ekfslam.geometry import camera, se3
@@ -157,11 +155,8 @@ def run_window(
 # --- Tables and figures ----------------------------------------------------------------------------------------------
 
 STYLES = {
-    "dead-reckoning": {"color": "0.55", "marker": "^"},
-    "invariant": {"color": "#0072B2", "marker": "o"},
-    "fej": {"color": "#D55E00", "marker": "s"},
-    "standard": {"color": "black", "marker": "D"},
-    "invariant, wider pixels": {"color": "#009E73", "marker": "v"},
+    **{name: marker_of(name) for name in ("dead-reckoning", *VARIANTS)},
+    "invariant, wider pixels": {**marker_of("invariant"), "color": SKY_BLUE, "marker": "v"},
 }
 
 
@@ -222,66 +217,56 @@ def consistency_table(windows: dict[str, list[Window]]) -> dict[str, dict[str, f
     return {name: {key: float(value) for key, value in row.items()} for name, row in table.items()}
 
 
+@styled
 def plot_autocorrelation(sequence: Sequence) -> Figure:
     """Autocorrelation of the pixel residuals of each landmark, and of the velocity residuals, over the lag."""
     seen = sequence.observations
     r, w = pixel_residuals(sequence), velocity_residuals(sequence)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.0, 3.8))
-        axes = figure.subplots(1, 2, sharey=True)
-        styles = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)))
-        colors = ("#0072B2", "#D55E00", "black", "#009E73", "0.5", "#CC79A7")
-        for ax, title, names, rho, count in (
-            (axes[0], "pixels, per landmark", ROWS, autocorrelation(r, LAGS, seen.landmark, seen.frame), len(r)),
-            (
-                axes[1],
-                "velocities",
-                [f"${name}$" for name in AXES],
-                autocorrelation(w, LAGS, np.zeros(len(w), dtype=np.int64), np.arange(1, len(sequence))),
-                len(w),
-            ),
-        ):
-            bound = 1.96 / np.sqrt(count)
-            ax.axhspan(-bound, bound, color="0.85", linewidth=0, label="95 % of white noise")
-            for i, name in enumerate(names):
-                ax.plot(rho[:, i], linestyle=styles[i], color=colors[i], label=name)
-            ax.axhline(0.0, color="0.4", linewidth=0.6)
-            ax.set_xlabel(f"lag [frames, {np.median(np.diff(sequence.time_s)):.3f} s each in the median]")
-            ax.set_title(title)
-            ax.legend(ncols=2)
-        axes[0].set_ylabel("autocorrelation [-]")
-        figure.suptitle("Starry Night: autocorrelation of what is left at the true poses and landmarks")
+    rho_r = autocorrelation(r, LAGS, seen.landmark, seen.frame)
+    rho_w = autocorrelation(w, LAGS, np.zeros(len(w), dtype=np.int64), np.arange(1, len(sequence)))
+    figure = Figure(figsize=(9.0, 3.8))
+    axes = figure.subplots(1, 2, sharey=True)
+    for ax, title, names, rho, count in (
+        (axes[0], "pixels, per landmark", ROWS, rho_r, len(r)),
+        (axes[1], "velocities", [f"${name}$" for name in AXES], rho_w, len(w)),
+    ):
+        bound = 1.96 / np.sqrt(count)
+        ax.axhspan(-bound, bound, **BOUNDS, label="95 % of white noise")
+        for values, name, style in zip(rho.T, names, SERIES, strict=False):
+            ax.plot(values, **style, label=name)
+        ax.axhline(0.0, **ZERO)
+        ax.set_xlabel(f"lag [frames, {np.median(np.diff(sequence.time_s)):.3f} s each in the median]")
+        ax.set_title(title)
+        ax.legend(ncols=2)
+    axes[0].set_ylabel("autocorrelation [-]")
+    figure.suptitle("Starry Night: autocorrelation of what is left at the true poses and landmarks")
     return figure
 
 
+@styled
 def plot_windows(windows: dict[str, list[Window]]) -> Figure:
     """NEES of the pose at the end of every window, and of its landmarks there, with chi-square bounds."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.0, 6.2))
-        pose_ax, landmark_ax = figure.subplots(2, 1, sharex=True)
-        pose_bounds = chi2_bounds(6, PROBABILITY)
-        bounds_label = f"{100 * PROBABILITY:g} % chi-square bounds"
-        pose_ax.axhspan(*pose_bounds, color="0.87", linewidth=0, label=bounds_label)
-        pose_ax.axhline(6.0, color="0.3", linewidth=0.8)
-        landmark_ax.axhspan(*chi2_bounds(3, PROBABILITY), color="0.87", linewidth=0)
-        landmark_ax.axhline(3.0, color="0.3", linewidth=0.8)
-        for i, (name, runs) in enumerate(windows.items()):
-            style = {**STYLES[name], "linestyle": ""}
-            # Side by side, or filters that agree would hide one another.
-            number = np.arange(1, len(runs) + 1) + 0.14 * (i - (len(windows) - 1) / 2)
-            pose_ax.plot(number, [run.pose_nees[-1] for run in runs], **style, label=name)
-            if len(runs[0].landmark_nees):
-                landmark_ax.plot(number, [run.landmark_nees.mean() for run in runs], **style)
-        for ax, label in ((pose_ax, "pose NEES [-]"), (landmark_ax, "mean landmark NEES [-]")):
-            ax.set_yscale("log")
-            ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-            ax.set_ylabel(label)
-        pose_ax.set_title("pose, 6 degrees of freedom")
-        landmark_ax.set_title("landmarks, 3 degrees of freedom")
-        landmark_ax.set_xlabel(f"window of {WINDOW_FRAMES} frames [-]")
-        landmark_ax.set_xticks(range(1, len(next(iter(windows.values()))) + 1))
-        figure.legend(loc="outside lower center", ncols=3)
-        figure.suptitle("Starry Night: NEES at the end of every window")
+    figure = Figure(figsize=(9.0, 6.2))
+    pose_ax, landmark_ax = figure.subplots(2, 1, sharex=True)
+    bounds_label = f"{100 * PROBABILITY:g} % chi-square bounds"
+    for ax, dof, label in ((pose_ax, 6, bounds_label), (landmark_ax, 3, None)):
+        ax.axhspan(*chi2_bounds(dof, PROBABILITY), **BOUNDS, label=label)
+        ax.axhline(dof, **EXPECTED)
+    for i, (name, runs) in enumerate(windows.items()):
+        # Side by side, or filters that agree would hide one another.
+        number = np.arange(1, len(runs) + 1) + 0.14 * (i - (len(windows) - 1) / 2)
+        pose_ax.plot(number, [run.pose_nees[-1] for run in runs], **STYLES[name], label=name)
+        if len(runs[0].landmark_nees):
+            landmark_ax.plot(number, [run.landmark_nees.mean() for run in runs], **STYLES[name])
+    for ax, label in ((pose_ax, "pose NEES [-]"), (landmark_ax, "mean landmark NEES [-]")):
+        log_axis(ax, (1.0,))
+        ax.set_ylabel(label)
+    pose_ax.set_title("pose, 6 degrees of freedom")
+    landmark_ax.set_title("landmarks, 3 degrees of freedom")
+    landmark_ax.set_xlabel(f"window of {WINDOW_FRAMES} frames [-]")
+    landmark_ax.set_xticks(range(1, len(next(iter(windows.values()))) + 1))
+    figure.legend(loc="outside lower center", ncols=3)
+    figure.suptitle("Starry Night: NEES at the end of every window")
     return figure
 
 

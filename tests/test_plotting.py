@@ -12,17 +12,8 @@ from helpers import synthetic_result, synthetic_sequence
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
 
-from ekfslam.figures.run import (
-    ellipse_axes,
-    plot_errors,
-    plot_landmark_arrows,
-    plot_map,
-    plot_nis,
-    plot_parameters,
-    plot_trajectories,
-    save_figures,
-    world_error_covariance,
-)
+from ekfslam.figures.maps import ellipse_axes, plot_landmark_arrows, plot_map, plot_trajectories
+from ekfslam.figures.run import plot_errors, plot_nis, plot_parameters, save_figures, world_error_covariance
 from ekfslam.filters.result import Parameters, Result
 from ekfslam.geometry import se3
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +10,8 @@ from matplotlib.figure import Figure
 
 from ekfslam.arrays import IntArray
 from ekfslam.data.sequence import Truth
-from ekfslam.figures.run import (
-    _LANDMARK_COLOR,
-    _add_ellipses,
-    _dot_size,
-    _draw_paths,
-    save_figure,
-    styled,
-)
+from ekfslam.figures.maps import SIGMAS, add_ellipses, dot_size, draw_paths
+from ekfslam.figures.style import LANDMARK_COLOR, save_all, styled
 from ekfslam.filters.result import Result
 from ekfslam.smoother.sparse.information import JointInformation
 
@@ -46,11 +39,11 @@ def plot_map_before_and_after(before: Result, after: Result, truth: Truth | None
         landmarks = result.landmarks
         inside = ((landmarks.position_m[:, :2] > low) & (landmarks.position_m[:, :2] < high)).all(axis=1)
         xy, covariance = landmarks.position_m[inside, :2], landmarks.covariance[inside, :2, :2]
-        _add_ellipses(ax, xy, covariance, _LANDMARK_COLOR, 0.7, 0.6, share=0.3)
-        ax.plot(*xy.T, ".", color=_LANDMARK_COLOR, markersize=_dot_size(len(xy)), label="landmark, 2 sigma")
-        _draw_paths(ax, {result.mode: result}, truth)
-        spread = np.sqrt(np.median(np.trace(covariance, axis1=1, axis2=2))) if len(xy) else np.nan
-        ax.set_title(f"{title}: median landmark deviation {spread:.3g} m")
+        add_ellipses(ax, xy, covariance, LANDMARK_COLOR, 0.7, 0.6, share=0.3)
+        ax.plot(*xy.T, ".", color=LANDMARK_COLOR, markersize=dot_size(len(xy)), label=f"landmark, {SIGMAS:g} sigma")
+        draw_paths(ax, {result.mode: result}, truth)
+        std_m = np.sqrt(np.median(np.trace(covariance, axis1=1, axis2=2))) if len(xy) else np.nan
+        ax.set_title(f"{title}: landmark standard deviation {std_m:.3g} m (median)")
         ax.set_xlabel("x [m]")
         ax.legend(loc="best")
     axes[0].set_ylabel("y [m]")
@@ -88,12 +81,10 @@ def save_posterior_figures(
     directory: str | Path, before: Result, after: Result, information: JointInformation, truth: Truth | None = None
 ) -> list[Path]:
     """Write ``map_before_and_after.png`` and ``sparsity.png`` into a directory; returns their paths."""
-    figures: Mapping[str, Figure] = {
-        "map_before_and_after": plot_map_before_and_after(before, after, truth),
-        "sparsity": plot_sparsity(information),
-    }
-    paths = []
-    for name, figure in figures.items():
-        paths.append(Path(directory) / f"{name}.png")
-        save_figure(figure, paths[-1])
-    return paths
+    return save_all(
+        directory,
+        {
+            "map_before_and_after": plot_map_before_and_after(before, after, truth),
+            "sparsity": plot_sparsity(information),
+        },
+    )

@@ -1,32 +1,22 @@
 """Figures of a Monte Carlo study: NEES against time, errors of runs against their bounds, NEES run by run.
 
-As in `ekfslam.figures.run`, every function returns a `matplotlib.figure.Figure`, and a variant keeps its colour.
+As in `ekfslam.figures.maps`, every function returns a `matplotlib.figure.Figure` and touches no global state.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ekfslam.arrays import Array
 from ekfslam.evaluation.consistency import anees, chi2_bounds, time_average
 from ekfslam.evaluation.study import BOUND_PROBABILITY
-from ekfslam.figures.run import save_figure, styled
+from ekfslam.figures.style import BOUNDS, EXPECTED, WIDE_BOUNDS, line_of, log_axis, save_all, style_of, styled
 from ekfslam.studies.study import StudyArchive
 
-VARIANT_STYLES: dict[str, dict[str, Any]] = {
-    "invariant": {"color": "#0072B2", "linestyle": "-"},
-    "fej": {"color": "#009E73", "linestyle": "-."},
-    "standard": {"color": "#D55E00", "linestyle": "--"},
-    "invariant-iterated": {"color": "#56B4E9", "linestyle": (0, (4, 1, 1, 1))},
-    "standard-iterated": {"color": "#CC79A7", "linestyle": ":"},
-}
-_PROBABILITIES = (BOUND_PROBABILITY, 0.95)  # wide bounds first, the narrow ones are drawn over them
+_BOUNDS = ((BOUND_PROBABILITY, WIDE_BOUNDS), (0.95, BOUNDS))  # the narrow ones are drawn over the wide ones
 _SHOWN_RUNS = 12  # lines of errors; more are a grey blot
 _SHOWN_PERCENT = 98.0  # of the errors are within the view; a run that diverges must not flatten the others
 
@@ -43,14 +33,14 @@ def plot_study_nees(archive: StudyArchive, level: str) -> Figure:
     time_s, variants = archive.time_s(level), _done(archive, level)
     runs = int(archive.done[level].sum())
     for ax, (field, name, dof) in zip(axes, (("pose_nees", "pose", 6), ("landmark_nees", "landmark", 3)), strict=True):
-        for probability, shade in zip(_PROBABILITIES, ("0.90", "0.80"), strict=True):
+        for probability, style in _BOUNDS:
             low, high = chi2_bounds(dof, probability, runs)
-            ax.axhspan(low, high, color=shade, linewidth=0, label=f"{100 * probability:g} % bounds", zorder=0.5)
-        ax.axhline(dof, color="black", linewidth=0.8, label="expected")
+            ax.axhspan(low, high, **style, label=f"{100 * probability:g} % bounds", zorder=0.5)
+        ax.axhline(dof, **EXPECTED, label="expected")
         for variant, values in variants.items():
             mean, _, _ = anees(values[field], dof, BOUND_PROBABILITY)
-            ax.plot(time_s, mean, **VARIANT_STYLES[variant], label=variant)
-        _log_axis(ax)
+            ax.plot(time_s, mean, **line_of(variant), label=variant)
+        log_axis(ax, (1.0, 3.0))
         ax.set_ylabel(f"{name} NEES ({dof} expected) [-]")
         ax.margins(x=0.01)
     axes[-1].set_xlabel("time [s]")
@@ -73,7 +63,7 @@ def plot_study_errors(archive: StudyArchive, level: str) -> Figure:
     figure = Figure(figsize=(2.9 * len(variants) + 0.5, 6.6))
     axes = figure.subplots(3, len(variants), sharex=True, sharey="row", squeeze=False)
     for column, (variant, values) in zip(axes.T, variants.items(), strict=True):
-        color = VARIANT_STYLES[variant]["color"]
+        color = style_of(variant)["color"]
         inside = []
         for ax, (label, field, axis, scale) in zip(column, rows, strict=True):
             errors = scale * values[field or "rotation_error"][..., axis]
@@ -110,7 +100,7 @@ def plot_study_boxes(archive: StudyArchive) -> Figure:
         for place, (variant, values) in enumerate(_done(archive, level).items()):
             averages = time_average(values["pose_nees"])
             averages = averages[np.isfinite(averages)]
-            color = VARIANT_STYLES[variant]["color"]
+            color = style_of(variant)["color"]
             ax.boxplot(
                 averages,
                 positions=[place],
@@ -123,11 +113,11 @@ def plot_study_boxes(archive: StudyArchive) -> Figure:
             )
             spread = np.linspace(-0.22, 0.22, len(averages))
             ax.plot(place + spread, averages, ".", color=color, markersize=3.0, alpha=0.6, markeredgewidth=0)
-        ax.axhline(6.0, color="black", linewidth=0.8, zorder=0.9)
+        ax.axhline(6.0, **EXPECTED, zorder=0.9)
         ax.set_xticks(range(len(variants)), variants, rotation=40, ha="right", rotation_mode="anchor")
         ax.grid(False, axis="x")
         ax.set_title(f"{level}, {int(archive.done[level].sum())} runs")
-    _log_axis(axes[0])
+    log_axis(axes[0], (1.0, 3.0))
     axes[0].set_ylabel("pose NEES, time average of a run [-]")
     figure.suptitle("Pose NEES run by run; line: 6 expected")
     return figure
@@ -135,17 +125,11 @@ def plot_study_boxes(archive: StudyArchive) -> Figure:
 
 def save_study_figures(directory: str | Path, archive: StudyArchive) -> list[Path]:
     """Write ``boxes.png``, and ``nees_<level>.png`` and ``errors_<level>.png`` of every level; the paths written."""
-    directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
     figures = {"boxes": plot_study_boxes(archive)}
     for level in archive.study.levels:
         figures[f"nees_{level}"] = plot_study_nees(archive, level)
         figures[f"errors_{level}"] = plot_study_errors(archive, level)
-    paths = []
-    for name, figure in figures.items():
-        paths.append(directory / f"{name}.png")
-        save_figure(figure, paths[-1])
-    return paths
+    return save_all(directory, figures)
 
 
 def _done(archive: StudyArchive, level: str) -> dict[str, dict[str, Array]]:
@@ -163,10 +147,3 @@ def _view(archive: StudyArchive, level: str, field: str, axis: int, scale: float
     errors = np.abs(scale * errors[np.isfinite(errors)])
     limit = 1.4 * float(np.percentile(errors, _SHOWN_PERCENT)) if len(errors) else 1.0
     return -limit, limit
-
-
-def _log_axis(ax: Axes) -> None:
-    ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0), numticks=20))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.yaxis.set_minor_formatter(NullFormatter())

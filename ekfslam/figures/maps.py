@@ -1,0 +1,225 @@
+"""Figures from above: maps with ellipses, trajectories, and how far landmarks moved.
+
+Every function returns a `matplotlib.figure.Figure` and touches no global state, so it works without a display and
+from any thread. Colours and lines are those of `ekfslam.figures.style`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.sequence import Truth
+from ekfslam.evaluation.consistency import world_axes_covariance
+from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, line_of, style_of, styled
+from ekfslam.filters.result import Result
+
+SIGMAS = 2.0  # of ellipses
+
+_MARKS = 10  # markers and pose ellipses along a trajectory
+
+
+def ellipse_axes(covariance: Array, sigmas: float) -> tuple[Array, Array, Array]:
+    """Ellipse ``e^T P^-1 e = sigmas^2`` of 2x2 covariances (..., 2, 2): full axes and direction of the longer one.
+
+    Returns:
+        Length of the longer axis and of the shorter one (...), in the unit of the standard deviations, and the angle
+        of the longer one from x in degrees (...).
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    lengths = 2.0 * sigmas * np.sqrt(np.maximum(values, 0.0))
+    angle = np.degrees(np.arctan2(vectors[..., 1, 1], vectors[..., 0, 1]))
+    return lengths[..., 1], lengths[..., 0], angle
+
+
+@styled
+def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
+    """Map from above (x, y of world, metres): trajectories of all modes, landmarks and poses with 2-sigma ellipses.
+
+    Landmarks are those of the full mode, or of the last mode that has any. The view follows trajectories and the bulk
+    of the landmarks; the legend says how many landmarks lie outside it. Ellipses longer than a tenth (poses:
+    half) of the view's diagonal are left out; the legend says of how many landmarks.
+    """
+    mapper = _mapper(results)
+    paths = [result.T_world_imu[:, :2, 3] for result in results.values()]
+    if truth is not None and len(truth.frame):
+        paths.append(truth.T_world_imu[:, :2, 3])
+    landmarks = mapper.landmarks
+    points = landmarks.position_m[:, :2]
+    ax, outside = _top_down_axes(np.concatenate(paths), points)
+    if len(landmarks):
+        # The more there are, the fainter, or a dense map would be one blot.
+        alpha = float(np.clip(20.0 / np.sqrt(len(landmarks)), 0.15, 0.8))
+        left_out = add_ellipses(ax, points, landmarks.covariance[:, :2, :2], LANDMARK_COLOR, alpha, 0.5, share=0.1)
+        uncertain = f", {left_out} without ellipse" if left_out else ""
+        label = f"{len(landmarks)} landmarks ({mapper.mode}{_outside_text(outside)}{uncertain})"
+        size = dot_size(len(landmarks))
+        ax.plot(*points.T, ".", color=LANDMARK_COLOR, markersize=size, markeredgewidth=0, label=label, zorder=1.5)
+    draw_paths(ax, results, truth)
+    for mode, result in results.items():
+        some = _spread(len(result.time_s), _MARKS)
+        covariance, _ = world_axes_covariance(result.T_world_imu[some], result.covariance[some])
+        color, xy = style_of(mode)["color"], result.T_world_imu[some, :2, 3]
+        add_ellipses(ax, xy, covariance[:, :2, :2], color, 1.0, 1.0, share=0.5)
+    _outside_legend(ax)
+    ax.set_title(f"{mapper.sequence_name}: map from above, {SIGMAS:g}-sigma ellipses")
+    return _figure_of(ax)
+
+
+@styled
+def plot_trajectories(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
+    """Trajectories from above (x, y of world, metres), with the direction of the IMU's x axis at start and end."""
+    paths = {mode: result.T_world_imu for mode, result in results.items()}
+    if truth is not None and len(truth.frame):
+        paths["truth"] = truth.T_world_imu
+    ax, _ = _top_down_axes(np.concatenate([T[:, :2, 3] for T in paths.values()]), np.empty((0, 2)))
+    draw_paths(ax, results, truth)
+    for name, T in paths.items():
+        ends = T[[0, -1]]
+        arrows = ax.quiver(
+            *ends[:, :2, 3].T,
+            *ends[:, :2, 0].T,
+            color=(TRUTH if name == "truth" else style_of(name))["color"],
+            angles="xy",
+            scale=18,
+            width=0.005,
+            zorder=4,
+            clip_on=False,
+        )
+        arrows.set_in_layout(False)
+    _outside_legend(ax)
+    ax.set_title(f"{_first(results).sequence_name}\ntrajectories from above, arrows along the IMU's x axis")
+    return _figure_of(ax)
+
+
+@styled
+def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
+    """Landmarks from above (x, y of world, metres): from initialisation to final estimate, over the trajectory.
+
+    The view follows trajectory and the bulk of the final landmarks; the legend says how many lie outside it.
+    """
+    landmarks = result.landmarks
+    start, end = landmarks.initial_position_m[:, :2], landmarks.position_m[:, :2]
+    path = result.T_world_imu[:, :2, 3]
+    ax, outside = _top_down_axes(path, end)
+    dot = dot_size(len(landmarks))
+    arrows = np.stack([start, end], axis=1)[~outside]
+    ax.add_collection(LineCollection(list(arrows), colors=LANDMARK_COLOR, linewidths=0.5, alpha=0.6), autolim=False)
+    ax.plot(*start.T, ".", color=FIRST_LANDMARK_COLOR, markersize=dot, markeredgewidth=0, label="initial", zorder=2.5)
+    label = f"final ({len(landmarks)} landmarks{_outside_text(outside)})"
+    ax.plot(*end.T, ".", color=LANDMARK_COLOR, markersize=dot, markeredgewidth=0, label=label, zorder=3)
+    if truth is not None and len(truth.frame):
+        ax.plot(*truth.T_world_imu[:, :2, 3].T, **TRUTH, label="truth", zorder=2.2)
+    ax.plot(*path.T, **line_of(result.mode), label="trajectory", zorder=2.3)
+    _outside_legend(ax)
+    ax.set_title(f"{result.sequence_name}, {result.mode}\nlandmarks from initialisation to final estimate")
+    return _figure_of(ax)
+
+
+def _first(results: Mapping[str, Result]) -> Result:
+    return next(iter(results.values()))
+
+
+def _mapper(results: Mapping[str, Result]) -> Result:
+    """The result whose map is shown: full, else the last one with landmarks, else any."""
+    with_map = [result for result in results.values() if len(result.landmarks)]
+    return results.get("full") or (with_map or list(results.values()))[-1]
+
+
+def _figure_of(ax: Axes) -> Figure:
+    figure = ax.get_figure()
+    assert isinstance(figure, Figure)
+    return figure
+
+
+def _spread(length: int, count: int) -> IntArray:
+    """At most ``count`` indices spread over ``length``, first and last included."""
+    return np.unique(np.linspace(0, length - 1, count).astype(int))
+
+
+def _top_down_axes(path: Array, points: Array) -> tuple[Axes, BoolArray]:
+    """Equal-aspect axes of a new figure around all of path and the bulk of points, and which points are outside."""
+    bulk = np.percentile(points, [2, 98], axis=0) if len(points) else path[:0]
+    shown = np.concatenate([path, bulk])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    # A straight or standing trajectory must not make an infinitely thin picture.
+    margin = 0.05 * (high - low) + 0.02 * (high - low).max() + 1e-3
+    low, high = low - margin, high + margin
+    outside = np.any((points < low) | (points > high), axis=1)
+    aspect = (high[1] - low[1]) / (high[0] - low[0])
+    width = min(8.0, 7.0 / aspect)
+    # Room for labels, title and legend around axes of the right shape.
+    ax = Figure(figsize=(max(width + 0.8, 6.0), max(width * aspect, 1.5) + 2.2)).subplots()
+    ax.set_aspect("equal", adjustable="box")
+    ax.set_xlim(low[0], high[0])
+    ax.set_ylim(low[1], high[1])
+    ax.set_autoscale_on(False)
+    ax.set_xlabel("x [m]")
+    ax.set_ylabel("y [m]")
+    return ax, outside
+
+
+def draw_paths(ax: Axes, results: Mapping[str, Result], truth: Truth | None) -> None:
+    """Truth and the modes' positions with marks; start as a circle, end as a cross."""
+    if truth is not None and len(truth.frame):
+        ax.plot(*truth.T_world_imu[:, :2, 3].T, **TRUTH, label="truth")
+    for i, (mode, result) in enumerate(results.items()):
+        style, xy = style_of(mode), result.T_world_imu[:, :2, 3]
+        # Shifted marks keep modes apart that lie on one another.
+        step = max(len(xy) // _MARKS, 1)
+        ax.plot(*xy.T, **style, markevery=(i * step // len(results), step), label=mode, zorder=3)
+        ax.plot(*xy[-1], "X", color=style["color"], markeredgecolor="black", markersize=8, zorder=5)
+    ax.plot(*_first(results).T_world_imu[0, :2, 3], "o", color="white", markeredgecolor="black", markersize=8, zorder=5)
+
+
+def add_ellipses(
+    ax: Axes, centres: Array, covariance: Array, color: str, alpha: float, linewidth: float, *, share: float
+) -> int:
+    """Draw covariances (n, 2, 2), not those longer than ``share`` of the view's diagonal; the number left out."""
+    long, short, angle = ellipse_axes(covariance, SIGMAS)
+    # Ellipses that hardly fit into the view are no more than lines across everything else.
+    fits = long <= share * np.hypot(np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()))
+    ellipses = EllipseCollection(
+        long[fits],
+        short[fits],
+        angle[fits],
+        units="xy",
+        offsets=centres[fits],
+        offset_transform=ax.transData,
+        facecolors="none",
+        edgecolors=color,
+        alpha=alpha,
+        linewidths=linewidth,
+    )
+    ax.add_collection(ellipses, autolim=False)
+    return int((~fits).sum())
+
+
+def dot_size(count: int) -> float:
+    """Diameter in points at which ``count`` dots still show as dots."""
+    return float(np.clip(100.0 / np.sqrt(max(count, 1)), 1.2, 4.0))
+
+
+def _outside_text(outside: BoolArray) -> str:
+    return f", {outside.sum()} outside the view" if outside.any() else ""
+
+
+def _outside_legend(ax: Axes) -> None:
+    """Legend below the axes, where it hides no data, with the marks of start and end where they are drawn."""
+    handles, _ = ax.get_legend_handles_labels()
+    if any(line.get_marker() == "X" for line in ax.lines):
+        for marker, label in (("o", "start"), ("X", "end")):
+            mark = Line2D([], [], marker=marker, color="white", markeredgecolor="black", linestyle="", label=label)
+            handles.append(mark)
+    figure = _figure_of(ax)
+    columns = 3 if figure.get_figwidth() > 7.0 else 2
+    legend = figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+    for handle in legend.legend_handles:
+        if isinstance(handle, Line2D) and handle.get_marker() == ".":
+            handle.set_markersize(8.0)  # dots small enough for a map of thousands are invisible in a legend

@@ -1,0 +1,62 @@
+"""The palette: one style for each mode and variant, told apart in colour and in grey, and no other colours anywhere."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from ekfslam import config
+from ekfslam.figures import style
+from ekfslam.studies.study import STUDY_VARIANTS
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_every_mode_and_variant_has_its_own_style():
+    assert set(style.MODES) == set(config.MODES)
+    assert set(style.VARIANTS) == {*config.VARIANTS, *STUDY_VARIANTS}
+    # The full mode is the filter, whose default variant is the invariant one.
+    assert style.MODES["full"] == style.VARIANTS["invariant"]
+    styles = [*style.MODES.values(), *(s for name, s in style.VARIANTS.items() if name != "invariant")]
+    colors = {to_rgb(s["color"]) for s in styles}
+    assert len(colors) == len(styles)
+    assert to_rgb(style.TRUTH["color"]) not in colors
+    # In grey, lines and marks tell apart what one figure shows together.
+    for together in (style.MODES, style.VARIANTS):
+        assert len({str(s["linestyle"]) for s in together.values()}) == len(together)
+        assert len({s["marker"] for s in together.values()}) == len(together)
+
+
+def test_other_names_have_a_style_too():
+    assert style.style_of("as filtered") == style.OTHER
+    assert "marker" not in style.line_of("full")
+    assert style.marker_of("fej")["linestyle"] == ""
+
+
+def test_no_other_file_has_colours_of_its_own():
+    files = [*(ROOT / "ekfslam" / "figures").glob("*.py"), *(ROOT / "experiments").glob("*.py")]
+    assert len(files) > 10
+    for path in files:
+        if path.name != "style.py":
+            found = re.findall(r"#[0-9A-Fa-f]{6}\b", path.read_text(encoding="utf-8"))
+            assert not found, f"{path.name}: {found}"
+
+
+def test_figures_are_drawn_in_this_style_whatever_the_settings_of_the_caller(tmp_path):
+    seen = {}
+
+    @style.styled
+    def draw() -> Figure:
+        seen.update(mpl.rcParams)
+        return Figure(figsize=(1.0, 1.0))
+
+    with mpl.rc_context({"font.size": 30.0}):
+        figure = draw()
+        assert mpl.rcParams["font.size"] == 30.0
+    assert {key: seen[key] for key in style.RC} == dict(style.RC)
+    (path,) = style.save_all(tmp_path / "new", {"empty": figure})
+    assert path == tmp_path / "new" / "empty.png" and path.read_bytes().startswith(b"\x89PNG")
