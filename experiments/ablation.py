@@ -17,11 +17,11 @@ import numpy as np
 from real_data import errors, parsed, recordings
 
 import ekfslam
-from ekfslam.config import noise_of
 from ekfslam.data.sequence import Sequence
 from ekfslam.figures.run import plot_parameters
 from ekfslam.figures.style import save_figure
 from ekfslam.geometry import se3
+from ekfslam.models.build import noise_of
 
 WITHOUT: dict[str, dict[str, dict[str, Any]]] = {
     "all of it": {},

@@ -34,13 +34,14 @@ from threadpoolctl import threadpool_limits
 
 from ekfslam import run
 from ekfslam.arrays import Array
-from ekfslam.config import Config, PosteriorConfig, noise_of
+from ekfslam.config import Config, PosteriorConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import City, Loop, simulate
 from ekfslam.figures.style import GREY, log_axis, save_figure, style_of, styled
 from ekfslam.filters import JointEKF, joint
 from ekfslam.filters.observing import Rig
 from ekfslam.filters.result import Result
+from ekfslam.models.build import noise_of, resolve
 from ekfslam.smoother.posterior import Posterior, posterior
 from ekfslam.smoother.problem import Rows
 from ekfslam.smoother.sparse.information import Elimination, JointInformation, LinearSystem
@@ -194,7 +195,7 @@ def position_error_m(sequence: Sequence, T_world_imu: Array) -> float:
 
 def steps(sequence: Sequence, retire: str, variant: str = "invariant") -> Iterator[tuple[JointEKF, float]]:
     """The joint filter after each frame, with the CPU milliseconds of the frame."""
-    config = Config().with_overrides({"filter": {"retire": retire, "variant": variant}}).resolved(sequence)
+    config = resolve(Config().with_overrides({"filter": {"retire": retire, "variant": variant}}), sequence)
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise_of(sequence, config))
     ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu)
     for k in range(len(sequence)):

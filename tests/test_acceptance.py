@@ -9,6 +9,7 @@ from ekfslam import Config, PosteriorConfig, open_sequence, posterior, run
 from ekfslam.evaluation.summary import summarise
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.observing import Rig
+from ekfslam.models.build import resolve
 from ekfslam.smoother.problem import Rows
 from ekfslam.smoother.sparse.information import JointInformation
 
@@ -62,7 +63,7 @@ def test_loop_keeps_its_landmarks_and_closes_the_loop():
 def test_state_stays_as_small_as_the_view():
     """The cost of a frame depends on what is seen, not on what has been seen."""
     sequence = open_sequence("builtin:city?frames=300")
-    config = Config().resolved(sequence).filter
+    config = resolve(Config(), sequence).filter
     ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, sequence.noise), config, sequence.initial_T_world_imu)
     for k in range(len(sequence)):
         if k:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from reference import report_mapping, run_naive, small_world
 
-from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig, noise_of
+from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig
 from ekfslam.data.sequence import Observations
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.dead_reckoning import dead_reckon
@@ -14,6 +14,7 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.observing import Rig
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import se3
+from ekfslam.models.build import noise_of
 from ekfslam.runner import run
 
 OPEN = FilterConfig(gate_probability=1.0, split_after=0)

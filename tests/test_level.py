@@ -13,13 +13,14 @@ from reference import CAMERA, T_CAM_IMU, small_world
 from test_jacobians import POSES, TWISTS
 from test_variants import gauge_directions
 
-from ekfslam.config import CalibrationConfig, Config, FilterConfig, noise_of
+from ekfslam.config import CalibrationConfig, Config, FilterConfig
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import DataError
 from ekfslam.filters.joint import JointEKF, run_joint
 from ekfslam.filters.observing import Rig
 from ekfslam.geometry import motion, se3
+from ekfslam.models.build import noise_of
 from ekfslam.runner import run
 
 OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never", moving_sigma=1e9)

@@ -8,7 +8,7 @@ from reference import small_world
 from test_jacobians import central
 from test_variants import gauge_directions
 
-from ekfslam.config import Config, FilterConfig, NoiseConfig, noise_of
+from ekfslam.config import Config, FilterConfig, NoiseConfig
 from ekfslam.data.readers import open_sequence, write_sequence
 from ekfslam.data.sequence import Observations
 from ekfslam.data.simulate import builtin
@@ -18,6 +18,7 @@ from ekfslam.filters.observing import MOVING, Rig
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import project
+from ekfslam.models.build import noise_of
 from ekfslam.models.noise import MOTION_STD, automatic_noise, velocity_noise
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth

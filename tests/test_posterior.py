@@ -7,7 +7,7 @@ import pytest
 from reference import small_world
 from test_variants import gauge_directions
 
-from ekfslam.config import Config, FilterConfig, NoiseConfig, PosteriorConfig, noise_of
+from ekfslam.config import Config, FilterConfig, NoiseConfig, PosteriorConfig
 from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
@@ -15,6 +15,7 @@ from ekfslam.errors import IllPosedError, PosteriorError
 from ekfslam.filters.joint import JointEKF, run_joint
 from ekfslam.filters.observing import Rig
 from ekfslam.geometry import se3
+from ekfslam.models.build import noise_of
 from ekfslam.runner import run
 from ekfslam.smoother.optimise import kernel_cost, kernel_weight
 from ekfslam.smoother.posterior import posterior, posterior_of_log, smooth

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from ekfslam import run
-from ekfslam.config import Config, FilterConfig, noise_of
+from ekfslam.config import Config, FilterConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import City, simulate
 from ekfslam.filters import JointEKF
 from ekfslam.filters.observing import Rig
+from ekfslam.models.build import noise_of, resolve
 from ekfslam.smoother.posterior import posterior
 
 EXPERIMENT = Path(__file__).parents[1] / "experiments" / "scaling.py"
@@ -24,7 +25,7 @@ SHORT_TRACKS = City(landmarks_per_m=8.0, max_tracks=77, loss_probability=0.09)
 
 
 def state_sizes(sequence: Sequence) -> list[int]:
-    config = Config(filter=FilterConfig(retire="unseen")).resolved(sequence)
+    config = resolve(Config(filter=FilterConfig(retire="unseen")), sequence)
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise_of(sequence, config))
     ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu)
     sizes = []

@@ -10,17 +10,17 @@ from reference import small_world
 from test_archive import assert_same
 
 from ekfslam.cli import main
-from ekfslam.config import Config, FilterConfig, HygieneConfig, noise_of
-from ekfslam.data.hygiene import clean_tracks, jumps
+from ekfslam.config import Config, FilterConfig, HygieneConfig
+from ekfslam.data.hygiene import RULES, clean_tracks, jumps
 from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.data.tracks import cut_tracks, inspect_tracks, repeated_frames, successive
 from ekfslam.errors import ArchiveError, DuplicateObservationError, TruthError
 from ekfslam.evaluation.reprojection import reprojection_errors
-from ekfslam.filters.result import RULES
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import project
+from ekfslam.models.build import noise_of
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior
 from ekfslam.storage.archive import open_result, write_archive

@@ -8,7 +8,7 @@ import pytest
 from reference import small_world
 
 from ekfslam.cli import main
-from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig, noise_of
+from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig
 from ekfslam.data.readers import open_sequence, write_sequence
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
@@ -18,6 +18,7 @@ from ekfslam.filters.joint import JointEKF, run_joint
 from ekfslam.filters.mapping import map_landmarks
 from ekfslam.filters.observing import MOVING, Rig
 from ekfslam.geometry import motion
+from ekfslam.models.build import noise_of, resolve
 from ekfslam.models.noise import VelocityNoise, velocity_noise
 from ekfslam.runner import run
 from ekfslam.storage.archive import open_result
@@ -113,7 +114,7 @@ def test_measured_velocities_count_where_they_are_in_the_state():
 def test_mapping_and_the_joint_filter_agree_where_nothing_but_landmarks_is_uncertain():
     world = small_world()
     noise = Noise.isotropic(0.0, 0.0, 0.8)
-    config = Config(filter=OPEN).resolved(world)
+    config = resolve(Config(filter=OPEN), world)
     reports = run_joint(world, Rig(world.camera, world.T_cam_imu, noise), config.filter, range(len(world)))[3]
     T, _ = dead_reckon(world, noise, np.zeros((6, 6)))
     rig = Rig(world.camera, world.T_cam_imu, noise)
@@ -123,7 +124,7 @@ def test_mapping_and_the_joint_filter_agree_where_nothing_but_landmarks_is_uncer
 
 def test_rejecting_everything_does_not_pay():
     world = builtin("city?frames=40")
-    config = Config().resolved(world)
+    config = resolve(Config(), world)
     right = log_likelihoods(world, world.noise, config).sum()
     for factor in (0.02, 0.2, 5.0):
         wrong = Noise.isotropic(0.5 * factor, 0.05 * factor, 0.7 * factor)
@@ -132,7 +133,7 @@ def test_rejecting_everything_does_not_pay():
 
 def test_wrong_matches_are_left_out_and_splits_go_on_as_new_tracks():
     world = builtin("city?frames=60&max_tracks=30&outlier_fraction=0.05")
-    config = Config().resolved(world)
+    config = resolve(Config(), world)
     kept, rejected = without_rejected(world, world.noise, config)
     result = run(world, "full")
     assert (
@@ -147,7 +148,7 @@ def test_wrong_matches_are_left_out_and_splits_go_on_as_new_tracks():
 
 def test_long_recordings_are_filtered_in_stretches_spread_over_them():
     world = without_noise(builtin("city?frames=700"))
-    config = Config().resolved(world)
+    config = resolve(Config(), world)
     parts = stretches(world, config, 10_000)
     assert [len(part) for part in parts] == [50] * len(parts)
     begins = [int(np.flatnonzero(world.time_s == part.time_s[0])[0]) for part in parts]
@@ -206,7 +207,7 @@ def test_velocity_noise_is_below_its_limit_also_where_none_is_seen():
 def test_a_run_keeps_the_log_likelihood_of_its_innovations():
     world = builtin("city?frames=40&outlier_fraction=0")
     config = Config(filter=OPEN)
-    expected = log_likelihoods(world, world.noise, config.resolved(world)).sum()
+    expected = log_likelihoods(world, world.noise, resolve(config, world)).sum()
     result = run(world, "full", dataclasses.replace(config, hygiene=HygieneConfig(min_disparity_sigma=0)))
     of_right = result.innovation.dof.sum() // 3 * np.log1p(-OUTLIER_SHARE)
     np.testing.assert_allclose(result.attributes["log_likelihood"], expected - of_right)
@@ -215,7 +216,7 @@ def test_a_run_keeps_the_log_likelihood_of_its_innovations():
 
 def test_moving_tracks_can_be_left_out_alone():
     world = with_outliers(small_world())
-    config = Config().resolved(world)
+    config = resolve(Config(), world)
     assert without_rejected(world, world.noise, config)[1] > 50
     split_none = dataclasses.replace(config, filter=dataclasses.replace(config.filter, split_after=0))
     same, rejected = without_rejected(world, world.noise, split_none, (MOVING,))

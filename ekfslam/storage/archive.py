@@ -36,8 +36,8 @@ from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array
 from ekfslam.config import HygieneConfig
-from ekfslam.data.readers.hdf5 import read_sequence_fields, write_sequence_group, write_truth_group
 from ekfslam.data.hygiene import RULES, HygieneReport
+from ekfslam.data.readers.hdf5 import read_sequence_fields, write_sequence_group, write_truth_group
 from ekfslam.data.sequence import Noise, Sequence, Truth, VelocityFrame
 from ekfslam.errors import ArchiveError, DataError
 from ekfslam.filters.log import Log
