@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
 from ekfslam.evaluation.consistency import average_over_runs, chi2_bounds, time_average
+from ekfslam.evaluation.tables import document, markdown_table, plus_minus, significant
 from ekfslam.studies.study import StudyArchive
 
 BOUND_PROBABILITY = 0.999
@@ -69,23 +70,16 @@ def _rms(errors: Array) -> float | None:
     return float(np.sqrt(squares.mean())) if len(squares) else None
 
 
+_HEADINGS = (
+    *("level", "variant", "pose NEES (6)", "median", "orientation (3)", "position (3)", "landmark (3)"),
+    *("joint / dof (1)", "NIS / dof (1)", "RMSE [m]", "RMSE [deg]", "diverged"),
+)
+_MEANS = ("orientation_nees", "position_nees", "landmark_nees", "joint_nees_per_dof", "nis_per_dof")
+
+
 def study_table(summary: Mapping[str, Any]) -> str:
     """Markdown table of `summarise_study`, one row a level and variant."""
-    heading = [
-        "level",
-        "variant",
-        "pose NEES (6)",
-        "median",
-        "orientation (3)",
-        "position (3)",
-        "landmark (3)",
-        "joint / dof (1)",
-        "NIS / dof (1)",
-        "RMSE [m]",
-        "RMSE [deg]",
-        "diverged",
-    ]
-    rows = [heading]
+    rows = []
     for level, variants in summary["levels"].items():
         for variant, found in variants.items():
             pose = found["pose_nees"]
@@ -93,18 +87,14 @@ def study_table(summary: Mapping[str, Any]) -> str:
                 [
                     level,
                     variant,
-                    _number(pose["mean"], pose["half_width"]),
-                    _number(pose["median"]),
-                    *(_number(found[f"{name}_nees"]["mean"]) for name in ("orientation", "position", "landmark")),
-                    *(_number(found[name]["mean"]) for name in ("joint_nees_per_dof", "nis_per_dof")),
-                    _number(found["position_rmse_m"]),
-                    _number(found["rotation_rmse_deg"]),
+                    plus_minus(significant(pose["mean"]), significant(pose["half_width"])),
+                    significant(pose["median"]),
+                    *(significant(found[name]["mean"]) for name in _MEANS),
+                    significant(found["position_rmse_m"]),
+                    significant(found["rotation_rmse_deg"]),
                     f"{found['diverged']} of {found['runs']}",
                 ]
             )
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["| " + " | ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)) + " |" for row in rows]
-    rule = "|" + "|".join("-" * (w + 2) for w in widths) + "|"
     study = summary["study"]
     low, high = chi2_bounds(6, BOUND_PROBABILITY, study["runs"])
     note = (
@@ -113,12 +103,4 @@ def study_table(summary: Mapping[str, Any]) -> str:
         f"Two-sided {100 * BOUND_PROBABILITY:g} % bounds of the mean pose NEES of as many runs at one instant: "
         f"{low:.2f} to {high:.2f}."
     )
-    return "\n".join([lines[0], rule, *lines[1:], "", note]) + "\n"
-
-
-def _number(value: float | None, half_width: float | None = None) -> str:
-    """Three significant digits, or four above 1; a dash for None."""
-    if value is None:
-        return "-"
-    text = f"{value:.0f}" if abs(value) >= 100 else f"{value:.2f}" if abs(value) >= 1 else f"{value:.3f}"
-    return text if half_width is None else f"{text} ± {_number(half_width)}"
+    return document(markdown_table(_HEADINGS, rows, left=len(_HEADINGS), padded=True), note)

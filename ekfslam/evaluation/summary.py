@@ -9,6 +9,7 @@ import numpy as np
 
 from ekfslam.data.sequence import Sequence
 from ekfslam.evaluation.consistency import pose_nees
+from ekfslam.evaluation.tables import document, markdown_table, number
 from ekfslam.evaluation.trajectory import (
     absolute_trajectory_error,
     final_position_error,
@@ -93,17 +94,11 @@ def compare_table(summary: Mapping[str, Any]) -> str:
     the table reads as well on a terminal.
     """
     modes = summary["modes"]
-    rows = [["", *modes]]
+    rows = []
     for key, heading, spec in _ROWS:
         values = [mode[key] for mode in modes.values()]
         if any(value is not None for value in values):
-            rows.append([heading, *("-" if value is None else format(value, spec) for value in values)])
-    widths = [max(4, *map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        f"| {row[0]:<{widths[0]}} | " + " | ".join(f"{c:>{w}}" for c, w in zip(row[1:], widths[1:], strict=True)) + " |"
-        for row in rows
-    ]
-    rule = f"|{'-' * (widths[0] + 2)}|" + "".join(f"{'-' * (w + 1)}:|" for w in widths[1:])
+            rows.append([heading, *(number(value, spec) for value in values)])
     landmarks = "" if summary["landmarks"] is None else f", {summary['landmarks']} landmarks"
     title = f"**{summary['sequence']}**: {summary['frames']} frames{landmarks}"
-    return "\n".join([title, "", lines[0], rule, *lines[1:]]) + "\n"
+    return document(title, markdown_table(["", *modes], rows, padded=True))

@@ -46,6 +46,7 @@ from ekfslam.config import Config, NoiseConfig, NoiseModel
 from ekfslam.data.hygiene import clean_tracks
 from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
 from ekfslam.errors import EmptyTracksError
+from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
@@ -167,16 +168,15 @@ class TunedNoise:
     def table(self) -> str:
         """Estimates, their errors and units, by differences, by likelihood and together, as a Markdown table."""
         differences = dict(zip(PARAMETERS, self.found.texts, strict=False))
-        lines = ["| parameter | unit | by differences | by likelihood | together |", "|---|---|---|---|---|"]
+        rows = []
         for estimate in self.estimates:
-            likely = "-" if estimate.likely is None else with_error(estimate.likely, estimate.likely_error)
-            found = differences.get(estimate.name, "-")
+            likely = MISSING if estimate.likely is None else with_error(estimate.likely, estimate.likely_error)
+            found = differences.get(estimate.name, MISSING)
             together = found if estimate.likely is None else with_error(estimate.value, estimate.error)
-            lines.append(f"| {estimate.name} | {PARAMETERS[estimate.name][0]} | {found} | {likely} | {together} |")
-        lines.append(
-            f"\nmodel {self.model}, log-likelihood {self.log_likelihood:.1f}, {self.runs} runs of {self.frames} frames"
-        )
-        return "\n".join([*lines, *self.remarks])
+            rows.append([estimate.name, PARAMETERS[estimate.name][0], found, likely, together])
+        headings = ("parameter", "unit", "by differences", "by likelihood", "together")
+        fit = f"model {self.model}, log-likelihood {self.log_likelihood:.1f}, {self.runs} runs of {self.frames} frames"
+        return document(markdown_table(headings, rows, left=len(headings)), "\n".join([fit, *self.remarks])).rstrip()
 
 
 _UNSEEN = "the differences see none; not refined"

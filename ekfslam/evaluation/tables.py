@@ -1,0 +1,74 @@
+"""The one writer of Markdown: tables, and the numbers in their cells.
+
+print(markdown_table(["set", "ATE [m]"], [["0027", number(3.972, ".2f")], ["0022", number(None)]]))
+
+| set | ATE [m] |
+|---|---:|
+| 0027 | 3.97 |
+| 0022 | - |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+MISSING = "-"
+
+_NARROWEST = 4  # a rule needs three dashes and a colon
+
+
+def markdown_table(
+    headings: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1, padded: bool = False
+) -> str:
+    """A table without a line end at its end.
+
+    Args:
+        headings: Of the columns.
+        rows: Cells of each row, as many as there are headings.
+        left: How many columns are text, aligned to the left; those after them are numbers, aligned to the right.
+        padded: Pad the cells, so that the table reads as well on a terminal.
+
+    Raises:
+        ValueError: A row has more or fewer cells than there are headings.
+    """
+    lines = [list(headings), *map(list, rows)]
+    if any(len(line) != len(headings) for line in lines):
+        raise ValueError(f"every row must have {len(headings)} cells")
+    widths = [max(_NARROWEST, *map(len, column)) if padded else 0 for column in zip(*lines, strict=True)]
+    texts = []
+    for line in lines:
+        cells = (
+            f"{cell:<{w}}" if i < left else f"{cell:>{w}}" for i, (cell, w) in enumerate(zip(line, widths, strict=True))
+        )
+        texts.append(f"| {' | '.join(cells)} |")
+    return "\n".join([texts[0], _rule(widths, left, padded), *texts[1:]])
+
+
+def _rule(widths: Sequence[int], left: int, padded: bool) -> str:
+    """What separates the headings from the rows, and says how columns are aligned."""
+    dashes = ["-" * (width + 2) if padded else "---" for width in widths]
+    # In a padded table the colon takes the place of a dash.
+    right = [(text[:-1] if padded else text) + ":" for text in dashes]
+    return f"|{'|'.join([*dashes[:left], *right[left:]])}|"
+
+
+def number(value: float | None, spec: str = "") -> str:
+    """A number in a format such as ``.2f``; a dash for None."""
+    return MISSING if value is None else format(value, spec)
+
+
+def significant(value: float | None) -> str:
+    """A number with three significant digits or so, whatever its size; a dash for None."""
+    if value is None:
+        return MISSING
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2f}" if abs(value) >= 1 else f"{value:.3f}"
+
+
+def plus_minus(value: str, error: str) -> str:
+    """A value and its error (standard errors, a standard deviation), as the text around the table says."""
+    return value if MISSING in (value, error) else f"{value} ± {error}"
+
+
+def document(*blocks: str) -> str:
+    """Headings, paragraphs and tables as the text of a file, a blank line between any two."""
+    return "\n\n".join(block.strip("\n") for block in blocks) + "\n"
