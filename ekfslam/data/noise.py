@@ -41,18 +41,26 @@ class TrackError:
     """The error of a track in the image, eq. (10): it starts anew where the track does, and then walks.
 
     An observation is ``z(k) = h(k) + e(k)`` with ``e ~ N(0, first^2)`` at landmark initialisation and
-    ``e(k) = memory e(k-1) + N(0, walk^2)`` while the track goes on. With memory 1 it is a random walk about a constant
-    error, with less an AR(1) process.
+    ``e(k) = memory e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2))`` while the track goes on: the further pixels move from
+    one frame to the next, the worse they are followed. With memory 1 it is a random walk about a constant error, with
+    less an AR(1) process.
 
     Args:
         first_std: (3,) standard deviation at landmark initialisation, in the sensor's rows, px.
         walk_std: (3,) of the innovation from one frame to the next, px.
         memory: Share of the error that stays from one frame to the next, in (0, 1].
+        flow_px: Motion in the image at which the variance of the walk has doubled; infinite: it never grows.
     """
 
     first_std: Array
     walk_std: Array
     memory: float
+    flow_px: float
+
+    def step_variance(self, motion_px: Array) -> Array:
+        """Variances (n, 3) of differences from the frame before, whose rows have moved by ``motion_px`` (n, 3)."""
+        square_flow = (motion_px[:, :2] ** 2).sum(axis=1, keepdims=True)
+        return self.walk_std**2 * (1.0 + square_flow / self.flow_px**2)
 
     def absolute_variance(self, age: Array) -> Array:
         """Variances (n, 3) of observations without a predecessor in the frame before, ``age`` (n,) frames old.
@@ -82,6 +90,7 @@ class Noise:
             pixel noise is white.
         track_walk_px: (3,) how far that error walks from frame to frame (u, v, disparity).
         track_memory: Share of that error that stays from frame to frame.
+        track_flow_px: Motion in the image at which the variance of the walk has doubled.
         margin: How much larger the errors of tracks are taken than those of single measurements, to make up for errors
             that agree among tracks; what judges one track by itself need not allow for that.
     """
@@ -95,6 +104,7 @@ class Noise:
     track_first_px: Array | None = None
     track_walk_px: Array | None = None
     track_memory: float = 1.0
+    track_flow_px: float = np.inf
     margin: float = 1.0
 
     @property
@@ -107,7 +117,7 @@ class Noise:
         """The part that belongs to tracks; None where pixel noise is white."""
         if self.track_first_px is None or self.track_walk_px is None:
             return None
-        return TrackError(np.asarray(self.track_first_px), np.asarray(self.track_walk_px), self.track_memory)
+        return TrackError(np.asarray(self.track_first_px), np.asarray(self.track_walk_px), self.track_memory, self.track_flow_px)
 
     @property
     def velocity_std(self) -> Array:

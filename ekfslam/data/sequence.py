@@ -314,5 +314,7 @@ def _validate_noise(noise: Noise) -> None:
         raise DataError("track_first_px and track_walk_px belong together", field="noise.track_walk_px")
     if not 0 < noise.track_memory <= 1:
         raise DataError(f"must be in (0, 1], found {noise.track_memory}", field="noise.track_memory")
+    if not noise.track_flow_px > 0:
+        raise DataError(f"must be positive, found {noise.track_flow_px}", field="noise.track_flow_px")
     if not noise.margin >= 1:
         raise DataError(f"must be at least 1, found {noise.margin}", field="noise.margin")

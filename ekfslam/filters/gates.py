@@ -43,9 +43,7 @@ def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> 
     return np.einsum("ni,ni->n", whitened, whitened)
 
 
-def agrees_with_others(
-    gaussian: Gaussian, left: Rows, gate: float, frame: int, ids: IntArray
-) -> BoolArray:
+def agrees_with_others(gaussian: Gaussian, left: Rows, gate: float) -> BoolArray:
     """Whether (k,) each landmark agrees with the prediction as corrected by all *other* landmarks of the frame.
 
     With ``e_i = r_i - H_i (xi, d)`` and ``C_i = V - H_i P H_i^T`` after conditioning on all of them, ``e_i^T C_i^-1 e_i``
@@ -55,16 +53,15 @@ def agrees_with_others(
         gaussian: Conditioned on all of the rows.
         left: The rows with the residuals that the correction leaves.
         gate: Chi-square threshold.
-        frame, ids: For error messages.
     """
-    C = diagonal(left.variance) - gaussian.variances(left)
-    # Where C is nothing but rounding, no other landmark says anything about this one: it cannot be judged.
     std = np.sqrt(left.variance)
-    share = np.linalg.eigvalsh(C / (std[:, :, None] * std[:, None, :]))[:, 0]
-    judged = share > _LEAST_SHARE
-    inside = np.ones(len(C), dtype=bool)
-    inside[judged] = normalised_squares(C[judged], left.residual[judged], frame, ids[judged]) <= gate
-    return inside
+    C = np.eye(std.shape[1]) - gaussian.variances(left) / (std[:, :, None] * std[:, None, :])
+    share, axes = np.linalg.eigh(C)
+    # Where C is nothing but rounding, no other landmark says anything about this one: it cannot be judged.
+    judged = share[:, 0] > _LEAST_SHARE
+    along = np.einsum("nji,nj->ni", axes, left.residual / std)
+    squares = np.divide(along**2, share, out=np.zeros_like(along), where=judged[:, None]).sum(axis=1)
+    return ~judged | (squares <= gate)
 
 
 def moves_along(

@@ -32,7 +32,7 @@ class Rows:
     residual: Array
     variance: Array
 
-    def only(self, which: BoolArray) -> Rows:
+    def only(self, which: BoolArray | IntArray) -> Rows:
         """The rows of some of the landmarks."""
         return Rows(*(getattr(self, field.name)[which] for field in fields(self)))
 

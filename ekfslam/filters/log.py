@@ -9,14 +9,13 @@ from where it was predicted; those of blocks that are vectors are their values.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.geometry import se3
-from ekfslam.models.model import VelocityRows
 
 
 @dataclass(frozen=True)
@@ -126,142 +125,3 @@ class Log:
     def observations(self) -> int:
         """Number of accepted observations K."""
         return len(self.frame)
-
-
-_PER_FRAME = (
-    "twist",
-    "tau_s",
-    "imu_twist",
-    "seen_twist",
-    "T_departed",
-    "T_predicted",
-    "T_linear",
-    "T_linear_before",
-    "T_updated",
-    "departed",
-    "linear",
-    "updated",
-    "up",
-)
-
-
-class LogBook:
-    """Grows a `Log` frame by frame; arrays are joined when the log is asked for.
-
-    Args:
-        first_estimates, initial_covariance: As in `Log`.
-        T_imu_world: (4, 4) estimate of the first pose.
-        coordinates: (body,) of all blocks before the first frame.
-        up: (3,) direction against gravity, or (0,).
-        dimension: Rows of an observation.
-    """
-
-    def __init__(
-        self,
-        first_estimates: bool,
-        initial_covariance: Array,
-        T_imu_world: Array,
-        coordinates: Array,
-        up: Array,
-        dimension: int = 3,
-    ) -> None:
-        self._first_estimates, self._initial_covariance = first_estimates, initial_covariance
-        self._frames: dict[str, list] = {name: [] for name in _PER_FRAME}
-        no_index, none = np.empty(0, dtype=np.int64), np.empty(0)
-        self._lists: dict[str, list] = {
-            "id": [no_index],
-            "first_position_m": [np.empty((0, 3))],
-            "frame": [no_index],
-            "landmark": [no_index],
-            "previous": [no_index],
-            "rows": [np.empty((0, dimension))],
-            "variance": [np.empty((0, dimension))],
-            "position_m": [np.empty((0, 3))],
-            "velocity_frame": [no_index],
-            "velocity_axis": [no_index],
-            "velocity_value": [none],
-            "velocity_std": [none],
-            "velocity_is_biased": [np.empty(0, dtype=bool)],
-        }
-        self.landmarks = self.observations = 0
-        zero = np.zeros(6)
-        self.predicted(zero, 0.0, zero, T_imu_world, T_imu_world, coordinates, coordinates, up)
-
-    @property
-    def step(self) -> int:
-        """Number of the frame that is being written."""
-        return len(self._frames["tau_s"]) - 1
-
-    def predicted(
-        self,
-        twist: Array,
-        tau_s: float,
-        imu_twist: Array,
-        T_departed: Array,
-        T_imu_world: Array,
-        departed: Array,
-        coordinates: Array,
-        up: Array,
-    ) -> None:
-        """A new frame, reached by a prediction; fields as in `Log`."""
-        values = {
-            "twist": np.asarray(twist, dtype=float),
-            "tau_s": tau_s,
-            "imu_twist": imu_twist,
-            "seen_twist": imu_twist,
-            "T_departed": T_departed,
-            "T_predicted": T_imu_world,
-            "T_linear": T_imu_world,
-            "T_linear_before": T_departed,
-            "T_updated": T_imu_world,
-            "departed": departed,
-            "linear": coordinates,
-            "updated": coordinates,
-            "up": up,
-        }
-        for name, value in values.items():
-            self._frames[name].append(value)
-
-    def amend(self, **values: Array) -> None:
-        """Replace fields of the frame that is being written, by their names in `Log`."""
-        for name, value in values.items():
-            self._frames[name][-1] = value
-
-    def measured(self, rows: VelocityRows) -> None:
-        """Measurements of the velocities that lead to the next frame."""
-        self._lists["velocity_frame"].append(np.full(len(rows.axis), self.step + 1))
-        for field in fields(rows):
-            self._lists[f"velocity_{field.name}"].append(getattr(rows, field.name))
-
-    def started(self, ids: IntArray, positions_m: Array) -> IntArray:
-        """New landmarks; returns their rows in the log."""
-        self._lists["id"].append(ids)
-        self._lists["first_position_m"].append(positions_m)
-        self.landmarks += len(ids)
-        return np.arange(self.landmarks - len(ids), self.landmarks)
-
-    def observed(
-        self, landmark: IntArray, rows: Array, variance: Array, position_m: Array, previous: IntArray
-    ) -> IntArray:
-        """Accepted observations of this frame; returns their places in the log."""
-        values = {
-            "frame": np.full(len(landmark), self.step),
-            "landmark": landmark,
-            "previous": previous,
-            "rows": rows,
-            "variance": variance,
-            "position_m": position_m,
-        }
-        for name, value in values.items():
-            self._lists[name].append(value)
-        self.observations += len(landmark)
-        return np.arange(self.observations - len(landmark), self.observations)
-
-    def log(self) -> Log:
-        """The log so far."""
-        return Log(
-            first_estimates=self._first_estimates,
-            initial_covariance=self._initial_covariance,
-            **{name: np.array(values) for name, values in self._frames.items()},
-            **{name: np.concatenate(values) for name, values in self._lists.items()},
-        )

@@ -41,8 +41,8 @@ class Standard:
         """Where the Jacobian of a pose or of landmarks is taken, of the estimate and the first estimate."""
         return first if self.first_estimates else estimate
 
-    def retract(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array]:
-        """``T+ = exp(xi^) T``, ``m+ = m + d``.
+    def retract_landmarks(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> Array:
+        """``m+ = m + d`` (n, 3), where ``T+ = exp(xi^) T``.
 
         Args:
             T_imu_world: (4, 4) pose before the correction.
@@ -50,7 +50,7 @@ class Standard:
             xi: (6,) correction of the pose.
             d: (n, 3) corrections of the landmarks.
         """
-        return se3.exp(xi) @ T_imu_world, positions_m + d
+        return positions_m + d
 
     def transport(self, gaussian: Gaussian, model: Model, before: Values, after: Values, moved_m: Array) -> None:
         """Re-express the covariance after a correction that moved landmarks by ``moved_m`` (n, 3); here it stays."""
@@ -101,15 +101,15 @@ class Invariant(Standard):
     name = "invariant"
     is_frozen_exactly = False
 
-    def retract(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> tuple[Array, Array]:
-        """First two lines of eq. (7); arguments as in `Standard.retract`.
+    def retract_landmarks(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> Array:
+        """Second line of eq. (7); arguments as in `Standard.retract_landmarks`.
 
         The correction acts as one rigid motion of the world (e_theta) on all landmarks, plus what remains of each.
         """
         e_theta = -T_imu_world[:3, :3].T @ xi[3:]
         e = d - positions_m @ se3.skew(e_theta).T
         R, J = se3.so3_exp_and_left_jacobian(e_theta)
-        return se3.exp(xi) @ T_imu_world, positions_m @ R.T + e @ J.T
+        return positions_m @ R.T + e @ J.T
 
     def transport(self, gaussian: Gaussian, model: Model, before: Values, after: Values, moved_m: Array) -> None:
         """Last line of eq. (7), ``P <- J P J^T``: rank 3 beyond the identity and the adjoints of the poses.

@@ -166,6 +166,22 @@ class Model:
             block.name: block.retract(values[block.name], correction[self.layout[block.name]]) for block in self.blocks
         }
 
+    @cached_property
+    def labels(self) -> tuple[tuple[str, ...], tuple[str, ...], Array]:
+        """Names, units and prior standard deviations (p,) of what the blocks report."""
+        blocks = [block for block in self.layout.blocks if block.labels]
+        return (
+            tuple(label for block in blocks for label in block.labels),
+            tuple(unit for block in blocks for unit in block.units),
+            np.concatenate([np.empty(0), *(block.reported_prior_std for block in blocks)]),
+        )
+
+    def reported(self, values: Values, covariance: Array) -> Array:
+        """Estimates and standard deviations (2, p) of what has labels, from the covariance (body, body)."""
+        blocks = [block for block in self.layout.blocks if block.labels]
+        found = [np.array(block.reported(values, covariance, self.layout)) for block in blocks]
+        return np.hstack([np.empty((2, 0)), *found])
+
     # --- velocities ---------------------------------------------------------------------------------------------------
 
     @cached_property

@@ -33,7 +33,8 @@ TILT_RAD = np.deg2rad(3.0)
 PIXEL_STD_PX = 0.7
 TRACK_FIRST_PX = np.array([0.1, 0.1, 1.0])
 TRACK_WALK_PX = np.array([0.2, 0.2, 0.15])
-MARGIN = 1.0
+TRACK_FLOW_PX = 1.5
+MARGIN = 3.0
 
 _BLOCKS = 20  # of the jackknife
 _ONE_SIDED_95 = 1.645  # deviations
@@ -118,6 +119,7 @@ def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu") -> Nois
         misalignment_rad=MISALIGNMENT_RAD,
         track_first_px=TRACK_FIRST_PX,
         track_walk_px=TRACK_WALK_PX,
+        track_flow_px=TRACK_FLOW_PX,
         margin=MARGIN,
         tilt_rad=TILT_RAD if velocity_frame == "level" else 0.0,
     )

@@ -4,18 +4,16 @@ stereo tracks, without ground truth."""
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.data.readers.fields import checksum, flat_observations, require_numbers, spelled_as_in
+from ekfslam.data.readers.registry import Extrinsics, Reader
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, validate_camera
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import CalibrationError, UnknownFormatError
 from ekfslam.geometry.camera import StereoCamera
-
-Extrinsics = Literal["corrected", "as-stored"]
 
 FIELDS = ("features", "time_stamps", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
 
@@ -65,7 +63,7 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected") -> Sequence:
             observations=observations,
             velocity_frame="level",
             notes=(_EXTRINSICS_NOTES[extrinsics], LEVEL_VELOCITIES_NOTE, *inspect_tracks(observations, twist).notes),
-            attributes={"checksum_sha256": checksum(path), "reader": "ece276a", "extrinsics": extrinsics},
+            attributes={"checksum_sha256": checksum(path), "reader": READER.name, "extrinsics": extrinsics},
         )
 
 
@@ -104,3 +102,11 @@ def _with_camera_position(stored: Array) -> Array:
     corrected = stored.copy()
     corrected[:3, 3] = -stored[:3, :3] @ stored[:3, 3]
     return corrected
+
+
+READER = Reader(
+    "ece276a",
+    "an .npz recording (ECE 276A)",
+    lambda source: source.head.startswith(b"PK\x03\x04"),
+    lambda source: read_ece276a(source.path, source.extrinsics),
+)

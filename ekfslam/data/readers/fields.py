@@ -18,10 +18,12 @@ from ekfslam.errors import DataError, EmptyTracksError, ShapeError
 UNSEEN = -1.0  # what the dense formats write into all four pixels of a track that a frame does not see
 
 
-def checksum(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def checksum(*paths: Path) -> str:
+    """SHA-256 of the contents of files in their order, hexadecimal."""
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 @contextmanager

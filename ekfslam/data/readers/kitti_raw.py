@@ -14,19 +14,18 @@ development kit. A drive is laid out as::
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ekfslam.arrays import Array
-from ekfslam.data.readers.fields import spelled_as_in
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.readers.fields import checksum, spelled_as_in
+from ekfslam.data.readers.registry import Poses, Reader, TruthReader
+from ekfslam.data.readers.text import line_of, parse_numbers, parse_table, read_lines
 from ekfslam.data.sequence import WITHOUT_TRACKS, Observations, Sequence, Truth, require_rigid, validate_camera
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import (
@@ -35,7 +34,6 @@ from ekfslam.errors import (
     ExtrinsicsError,
     LineError,
     LostDataError,
-    NonFiniteError,
     ShapeError,
     StampError,
     UnknownFormatError,
@@ -168,8 +166,8 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray") -> KittiRaw:
         T_cam_imu=T_cam_imu,
         notes=(*oxts.notes, *_image_notes(folder / f"image_{CAMERAS[pair][0]}" / "timestamps.txt", oxts.time_s)),
         attributes={
-            "checksum_sha256": checksum_of((*oxts.files, *files)),
-            "reader": "kitti_raw",
+            "checksum_sha256": checksum(*oxts.files, *files),
+            "reader": READER.name,
             "stereo_pair": pair,
         },
     )
@@ -274,50 +272,20 @@ def read_calibration(folder: Path, pair: Pair = "gray") -> tuple[StereoCamera, A
     return camera, se3.transform(np.eye(3), t_left) @ rectify @ T_cam00_velo @ T_velo_imu, files
 
 
-def checksum_of(files: Iterable[Path]) -> str:
-    """SHA-256 of the contents of files in their order, hexadecimal."""
-    digest = hashlib.sha256()
-    for path in files:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UnknownFormatError(f"{path}: not a readable text file ({error}); {_EXPECTED}") from None
-
-
-def _numbers(text: str, count: int, path: Path, line: int) -> Array:
-    """Exactly ``count`` finite numbers out of one line."""
-    where: dict[str, Any] = {"source": str(path), "field": "line", "index": line}
-    words = text.split()
-    if len(words) != count:
-        raise LineError(f"{len(words)} values, expected {count}", **where)
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError as error:
-        raise LineError(str(error), **where) from None
-    if not np.isfinite(values).all():
-        raise NonFiniteError("NaN or infinite value", **where)
-    return values
-
-
 def _check_format(path: Path) -> tuple[Path, ...]:
     """The optional description of the packets, if it is there and agrees on the fields that are used."""
     if not path.exists():
         return ()
-    names = [line.split(":")[0].strip() for line in _read_lines(path)]
+    names = [line.split(":")[0].strip() for line in read_lines(path, _EXPECTED)]
     for number, name in enumerate(PACKET_FIELDS, start=1):
         if name in _POSE + _TWIST and names[number - 1 : number] != [name]:
-            raise LineError(f"field {name} is not described here", source=str(path), field="line", index=number)
+            raise LineError(f"field {name} is not described here", **line_of(path, number))
     return (path,)
 
 
-def _read_stamps(path: Path) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _read_stamps(path: Path) -> tuple[IntArray, BoolArray]:
     """Stamps (ns since 1970, 0 where the line is empty) and which lines have one."""
-    lines = _read_lines(path)
+    lines = read_lines(path, _EXPECTED)
     stamp_ns = np.zeros(len(lines), dtype=np.int64)
     stamped = np.array([bool(line.strip()) for line in lines], dtype=bool)
     for k in np.flatnonzero(stamped):
@@ -328,27 +296,19 @@ def _read_stamps(path: Path) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         except ValueError:
             valid = False
         if not valid:
-            raise LineError(
-                f"{lines[k]!r} is no stamp like 2011-09-30 12:00:00.123456789",
-                source=str(path),
-                field="line",
-                index=int(k) + 1,
-            )
+            message = f"{lines[k]!r} is no stamp like 2011-09-30 12:00:00.123456789"
+            raise LineError(message, **line_of(path, int(k) + 1))
     return stamp_ns, stamped
 
 
-def _require_repairable(stamped: NDArray[np.bool_], path: Path) -> None:
+def _require_repairable(stamped: BoolArray, path: Path) -> None:
     """Raise `LostDataError` unless stamps are lost only here and there within the recording."""
     if stamped.all():
         return
     for k in (0, len(stamped) - 1):
         if not stamped[k]:
-            raise LostDataError(
-                "the line is empty, and a stamp at either end cannot be interpolated",
-                source=str(path),
-                field="line",
-                index=k + 1,
-            )
+            message = "the line is empty, and a stamp at either end cannot be interpolated"
+            raise LostDataError(message, **line_of(path, k + 1))
     known = np.flatnonzero(stamped)
     longest = int(np.argmax(np.diff(known)))
     run, empty = int(known[longest + 1] - known[longest] - 1), int((~stamped).sum())
@@ -356,13 +316,11 @@ def _require_repairable(stamped: NDArray[np.bool_], path: Path) -> None:
         raise LostDataError(
             f"{empty} of {len(stamped)} lines are empty, {run} in a row from here; at most {MAX_EMPTY_RUN} in a row "
             f"and {MAX_EMPTY_SHARE:.0%} of all can be interpolated",
-            source=str(path),
-            field="line",
-            index=int(known[longest]) + 2,
+            **line_of(path, int(known[longest]) + 2),
         )
 
 
-def _interpolated(values: Array, known: NDArray[np.bool_]) -> Array:
+def _interpolated(values: Array, known: BoolArray) -> Array:
     """The columns of (T, n) values, linear over the rows that are not known."""
     if known.all():
         return values
@@ -370,7 +328,7 @@ def _interpolated(values: Array, known: NDArray[np.bool_]) -> Array:
     return np.column_stack([np.interp(row, row[known], column[known]) for column in values.T])
 
 
-def _check_steps(time_s: Array, stamp_ns: NDArray[np.int64], stamped: NDArray[np.bool_], path: Path) -> tuple[str, ...]:
+def _check_steps(time_s: Array, stamp_ns: IntArray, stamped: BoolArray, path: Path) -> tuple[str, ...]:
     """A note on gaps between stamps, if there are any; raises `StampError` where they are too long or negative."""
     known = np.flatnonzero(stamped)
     step_s = np.diff(stamp_ns[known]) / 1e9
@@ -379,9 +337,7 @@ def _check_steps(time_s: Array, stamp_ns: NDArray[np.int64], stamped: NDArray[np
             first = int(np.argmax(bad))
             raise StampError(
                 f"the stamp {what}: {step_s[first]:.6f} s after the one before",
-                source=str(path),
-                field="line",
-                index=int(known[first + 1]) + 1,
+                **line_of(path, int(known[first + 1]) + 1),
             )
     step_s = np.diff(time_s)
     gaps = np.flatnonzero(step_s > _NOTED_GAP * np.median(step_s)) if len(step_s) else np.empty(0, np.int64)
@@ -393,7 +349,7 @@ def _check_steps(time_s: Array, stamp_ns: NDArray[np.int64], stamped: NDArray[np
     )
 
 
-def _repair_notes(stamped: NDArray[np.bool_], present: NDArray[np.bool_]) -> tuple[str, ...]:
+def _repair_notes(stamped: BoolArray, present: BoolArray) -> tuple[str, ...]:
     notes = []
     empty, lost = np.flatnonzero(~stamped), np.flatnonzero(~present)
     if len(empty):
@@ -421,20 +377,15 @@ def _image_notes(path: Path, time_s: Array) -> tuple[str, ...]:
 
 
 def _read_packet(path: Path) -> Array:
-    lines = _read_lines(path)
-    written = [k for k, line in enumerate(lines) if line.strip()] or [0]
-    if len(written) > 1:
-        raise LineError("a packet is one line", source=str(path), field="line", index=written[1] + 1)
-    packet = _numbers(lines[written[0]] if lines else "", len(PACKET_FIELDS), path, written[0] + 1)
-    lat, lon = packet[:2]
+    table = parse_table(read_lines(path, _EXPECTED), path, columns=len(PACKET_FIELDS), comment=None)
+    if len(table.values) == 0:
+        raise LineError("the packet is missing", **line_of(path, 1))
+    if len(table.values) > 1:
+        raise LineError("a packet is one line", **table.where(1))
+    lat, lon = table.values[0, :2]
     if abs(lat) >= 90 or abs(lon) > 180:
-        raise LineError(
-            f"no place has latitude {lat:g} and longitude {lon:g} deg",
-            source=str(path),
-            field="line",
-            index=written[0] + 1,
-        )
-    return packet
+        raise LineError(f"no place has latitude {lat:g} and longitude {lon:g} deg", **table.where(0))
+    return table.values[0]
 
 
 def _columns(packets: Array, names: tuple[str, ...]) -> Array:
@@ -470,10 +421,11 @@ def _find_calibration(folder: Path, name: str) -> Path:
 def _read_calibration_file(path: Path, counts: dict[str, int]) -> dict[str, Array]:
     """The wanted ones of the lines ``KEY: numbers``; the others hold dates and unrectified cameras."""
     values: dict[str, Array] = {}
-    for number, line in enumerate(_read_lines(path), start=1):
+    for number, line in enumerate(read_lines(path, _EXPECTED), start=1):
         key, _, rest = line.partition(":")
         if key.strip() in counts:
-            values[key.strip()] = _numbers(rest, counts[key.strip()], path, number)
+            count = counts[key.strip()]
+            values[key.strip()] = np.array(parse_numbers(rest.split(), count, line_of(path, number)))
     for key in counts:
         if key not in values:
             raise CalibrationError("this key is missing", source=str(path), field=key)
@@ -495,3 +447,17 @@ def _split_projection(values: Array, name: str) -> tuple[Array, Array]:
     if (pinhole != K).any() or K[0, 0] * K[1, 1] == 0:
         raise CalibrationError("not of the form [fu 0 cu . ; 0 fv cv . ; 0 0 1 .]", field=name)
     return K, (np.linalg.inv(K) @ P[:, 3]).astype(float)
+
+
+def _poses_of_drive(folder: Path, sequence: Sequence) -> Poses:
+    oxts = read_oxts(folder)
+    return Poses(oxts.truth.T_world_imu, oxts.time_s[oxts.truth.frame], oxts.files)
+
+
+READER = Reader(
+    "kitti_raw",
+    "a drive folder of KITTI raw",
+    lambda source: is_kitti_raw(source.path),
+    lambda source: open_kitti_raw(source.path).sequence(),
+)
+TRUTH_READER = TruthReader("KITTI raw", READER.expected, is_kitti_raw, _poses_of_drive)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ekfslam.arrays import Array
 from ekfslam.data.readers.fields import checksum, flat_observations, require_numbers, spelled_as_in
 from ekfslam.data.readers.matfile import parse_mat
+from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Noise, Sequence, Truth
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import DataError, ShapeError, TruthError, UnknownFormatError
@@ -76,7 +77,7 @@ def read_utias(path: Path) -> Sequence:
             noise=noise,
             velocity_frame="level" if noise is None else "imu",
             notes=(*notes, *inspect_tracks(observations, twist).notes),
-            attributes={"checksum_sha256": checksum(path), "reader": "utias"},
+            attributes={"checksum_sha256": checksum(path), "reader": READER.name},
         )
 
 
@@ -110,3 +111,17 @@ def _noise(fields: dict[str, NDArray]) -> Noise | None:
         variances.append(variance)
     v, w, y = variances
     return Noise(np.sqrt(np.concatenate([v, w])), np.sqrt(y))
+
+
+def _open(source: Source) -> Sequence:
+    if source.head.startswith(b"MATLAB 7.3"):
+        raise UnknownFormatError(f"{source.place}: a MATLAB 7.3 file, save it with -v7; expected {READER.expected}")
+    return read_utias(source.path)
+
+
+READER = Reader(
+    "utias",
+    "a .mat recording (UTIAS)",
+    lambda source: source.head.startswith((b"MATLAB 5.0", b"MATLAB 7.3")),
+    _open,
+)

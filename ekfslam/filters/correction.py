@@ -1,0 +1,138 @@
+"""The correction of one frame: gates, eq. (6), and the iterated update."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.filters import gates
+from ekfslam.filters.estimate import Estimate
+from ekfslam.filters.gaussian import Conditioned, Rows
+from ekfslam.geometry import se3
+from ekfslam.models.model import Seen
+from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, MOVING
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What a frame's known landmarks say.
+
+    Args:
+        done: Correction of the mean, NIS and ``log det S`` of what was accepted.
+        dof: Its degrees of freedom.
+        verdict: (k,) on each landmark: `ACCEPTED` or a reason code.
+        slot, measured, variance: (j,), (j, d), (j, d) of the accepted ones.
+        position_m: (j, 3) where they were linearised.
+        linear: (body,) coordinates at which the update was linearised.
+        T_linear, T_linear_before: (4, 4) poses there, of this frame and of the one before.
+    """
+
+    done: Conditioned
+    dof: int
+    verdict: IntArray
+    slot: IntArray
+    measured: Array
+    variance: Array
+    position_m: Array
+    linear: Array
+    T_linear: Array
+    T_linear_before: Array
+
+
+def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correction:
+    """Eq. (6) with its gates, for landmarks at ``slot`` (k,) with rows (k, d). The covariance is conditioned.
+
+    A landmark must agree with the prediction, and with the prediction as corrected by all *other* landmarks of the
+    frame: the first gate is weak while the pose itself is uncertain, the second is not. What the second rejects has
+    been used already, and is taken out again. The mean is left to the caller.
+
+    Raises:
+        InnovationError: The innovation covariance is not positive definite.
+    """
+    gate = gates.threshold(e.config.gate_probability, e.sensor.dimension)
+    verdict = np.full(len(slot), ACCEPTED)
+    seen, rows = e.observe(slot, measured)
+    verdict[~e.sensor.in_view(seen.q, e.config.min_depth_m)] = BEHIND_CAMERA
+    some = _gate_alone(e, frame, rows, seen, verdict, gate)
+    done = Conditioned(np.zeros(len(e.P)), 0.0, 0.0)
+    P_prior = e.P.copy() if e.config.iterations > 1 and len(some) else None
+    if len(some):
+        if e.model.has_time_offset and e.tau_s:
+            e.imu_twist = _seen_twist(e, frame, rows.only(some))
+            _, rows = e.observe(slot, measured)
+        tried = rows.only(some)
+        done = e.gaussian.condition(tried, frame, e.ids[tried.slot])
+        if np.isfinite(gate):
+            left = tried.corrected(*e.parts(done.correction))
+            inside = gates.agrees_with_others(e.gaussian, left, gate)
+            if not inside.all():
+                verdict[some[~inside]] = GATE
+                out = left.only(~inside)
+                done = done - e.gaussian.condition(out, frame, e.ids[out.slot], sign=-1.0)
+    taken = verdict == ACCEPTED
+    rows, measured = rows.only(taken), measured[taken]
+    clone = e.values.get("previous_pose", e.T_departed)
+    linear = e.coordinates, e.T_imu_world, clone
+    position = e.table.position_m[rows.slot]
+    if P_prior is not None and taken.any():
+        done, position, linear = _iterate(e, frame, P_prior, done, rows.slot, measured)
+    return Correction(done, rows.residual.size, verdict, rows.slot, measured, rows.variance, position, *linear)
+
+
+def _gate_alone(e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArray, gate: float) -> IntArray:
+    """Which landmarks (j,) of the rows pass the gate by themselves; the verdict (k,) on the others is written."""
+    some = np.flatnonzero(verdict == ACCEPTED)
+    rows = rows.only(some)
+    S = e.gaussian.variances(rows) + gates.diagonal(rows.variance)
+    squares = gates.normalised_squares(S, rows.residual, frame, e.ids[rows.slot])
+    inside = squares <= gate
+    verdict[some[~inside]] = GATE
+    if e.model.track_error is not None and e.tau_s:
+        h = seen.H_m[some] @ (e.T_imu_world[:3, :3].T @ (e.imu_twist[:3] * e.tau_s))
+        sigma = e.config.moving_sigma / e.model.noise.margin
+        moving = gates.moves_along(e.table, rows, h, S, squares, gate, sigma, e.config.moving_share)
+        verdict[some[moving]] = MOVING
+        inside &= ~moving
+    return some[inside]
+
+
+def _seen_twist(e: Estimate, frame: int, rows: Rows) -> Array:
+    """The velocities (6,) that led to this frame, as corrected by its observations.
+
+    A time offset counts in proportion to them. With the measured ones, whose noise the innovations show, too, it would
+    come out far too small.
+    """
+    xi = e.gaussian.correction(rows, frame, e.ids[rows.slot])[:6]
+    return -se3.log(se3.exp(xi) @ e.T_imu_world @ se3.inverse(e.T_departed)) / e.tau_s
+
+
+def _iterate(
+    e: Estimate, frame: int, P_prior: Array, done: Conditioned, slot: IntArray, measured: Array
+) -> tuple[Conditioned, Array, tuple[Array, Array, Array]]:
+    """Gauss-Newton on eq. (6): linearise again at the corrected state, always from the same prior.
+
+    Rows taken at the corrected state are carried back into the prior's coordinates by the variant's derivative D,
+    ``H_k D_k``, and the residual becomes ``r_k + H_k D_k (xi, d)_k``. Source: Bell and Cathey, "The iterated Kalman
+    filter update as a Gauss-Newton method", IEEE TAC 1993.
+
+    Returns:
+        The last correction; the landmarks (j, 3), coordinates and poses at which it was linearised.
+    """
+    values, positions, first = e.values, e.table.position_m, done
+    for _ in range(e.config.iterations - 1):
+        x, d = e.parts(done.correction)
+        after, m = e.retracted(done.correction)
+        linear = (
+            e.coordinates + done.correction[: e.gaussian.body],
+            after["pose"],
+            after.get("previous_pose", e.T_departed),
+        )
+        e.values, e.table.position_m = after, m
+        _, rows = e.observe(slot, measured)
+        e.values, e.table.position_m = values, positions
+        rows = e.variant.carry_back(rows, e.model, values, after, (m - positions)[slot])
+        e.P = P_prior.copy()
+        done = e.gaussian.condition(rows.corrected(-x, -d), frame, e.ids[slot])
+    return Conditioned(done.correction, first.nis, first.log_det), m[slot], linear

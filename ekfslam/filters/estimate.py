@@ -1,0 +1,192 @@
+"""What the joint filter knows at one moment: the blocks, the landmarks, and their joint covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.config import FilterConfig
+from ekfslam.filters.gaussian import Gaussian, Rows
+from ekfslam.filters.landmarks import LandmarkTable
+from ekfslam.filters.variants import VARIANTS
+from ekfslam.geometry import se3
+from ekfslam.models.model import Model, Moment, Seen
+from ekfslam.models.sensors.base import Sensor
+
+
+class Estimate:
+    """Mean and covariance of all state blocks and active landmarks.
+
+    Args:
+        model: Blocks, sensor and noise.
+        config: Variant, gate and limits.
+
+    Attributes:
+        model, config: As given.
+        variant: What is the variant's own.
+        values: Estimate of every state block by name.
+        coordinates: (body,) of the blocks, as in the log.
+        table: The active landmarks, in the order of their blocks in P.
+        gaussian: The covariance.
+        T_predicted, T_predicted_before: (4, 4) ``T_imu_world`` before the last update, and before the one before.
+        T_departed: (4, 4) pose from which the last prediction led.
+        imu_twist, imu_twist_before: (6,) velocities of the IMU that led to the last frame, and to the one before.
+        tau_s: How long the last prediction took; 0 before the first one.
+        step: Number of predictions so far.
+    """
+
+    def __init__(self, model: Model, config: FilterConfig) -> None:
+        self.model, self.config = model, config
+        self.variant = VARIANTS[config.variant]
+        self.values = model.initial_values()
+        self.coordinates = np.zeros(model.layout.body)
+        self.table = LandmarkTable(model.sensor.dimension)
+        self.gaussian = Gaussian(model.prior_covariance, model.layout.seen)
+        self.T_predicted = self.T_predicted_before = self.T_departed = self.values["pose"]
+        self.imu_twist = self.imu_twist_before = np.zeros(6)
+        self.tau_s, self.step = 0.0, 0
+
+    @property
+    def P(self) -> Array:
+        """(b+3n, b+3n) covariance of the blocks, in the columns of ``model.layout``, and of ``(d_1, ..., d_n)``.
+
+        ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``. The pose has the first six columns.
+        """
+        return self.gaussian.P
+
+    @P.setter
+    def P(self, P: Array) -> None:
+        self.gaussian.replace(np.ascontiguousarray(P, dtype=float))
+
+    @property
+    def sensor(self) -> Sensor:
+        """What observes the landmarks, with the calibration as given."""
+        return self.model.sensor
+
+    @property
+    def T_imu_world(self) -> Array:
+        """(4, 4) estimate of the report's inverse pose."""
+        return self.values["pose"]
+
+    @property
+    def T_world_imu(self) -> Array:
+        """(4, 4) estimated pose of the IMU."""
+        return se3.inverse(self.T_imu_world)
+
+    @property
+    def ids(self) -> IntArray:
+        """(n,) ids of the active landmarks, in the order of their blocks in P."""
+        return self.table.id
+
+    @property
+    def positions_m(self) -> Array:
+        """(n, 3) their positions in world."""
+        return self.table.position_m
+
+    @property
+    def linear_positions_m(self) -> Array:
+        """(n, 3) positions at which H is taken, eq. (4)."""
+        return self.variant.linear(self.table.position_m, self.table.initial_m)
+
+    @property
+    def linear_T_imu_world(self) -> Array:
+        """(4, 4) pose at which H is taken."""
+        return self.variant.linear(self.T_imu_world, self.T_predicted)
+
+    @property
+    def up_world(self) -> Array:
+        """(3,) direction against gravity where it is estimated, else (0,)."""
+        return self.values.get("up", np.empty(0))
+
+    def covariance_of(self, ids: IntArray) -> Array:
+        """Joint covariance (b+3k, b+3k) of the blocks and of some active landmarks.
+
+        Raises:
+            KeyError: An id is not active.
+        """
+        slot, body = self._slots(ids), np.arange(self.gaussian.body)
+        columns = np.concatenate([body, (len(body) + 3 * slot[:, None] + np.arange(3)).ravel()])
+        return self.P[np.ix_(columns, columns)]
+
+    def measurement_jacobian(self, ids: IntArray) -> sp.csr_array:
+        """Full-width H (3k, b+3n) of the sensor's rows of active landmarks ``ids`` (k,), for inspection and tests.
+
+        Raises:
+            KeyError: An id is not active.
+        """
+        slot = self._slots(ids)
+        seen = self.model.see(self.moment(), self.positions_m[slot], self.linear_positions_m[slot])
+        k, d, width = seen.H_x.shape
+        row = np.broadcast_to(np.arange(k * d).reshape(k, d, 1), (k, d, width + 3))
+        body = np.broadcast_to(np.arange(width), (k, d, width))
+        own = np.broadcast_to((self.gaussian.body + 3 * slot)[:, None, None] + np.arange(3), (k, d, 3))
+        columns = np.concatenate([body, own], axis=-1)
+        values = np.concatenate([seen.H_x, seen.H_m], axis=-1)
+        return sp.csr_array((values.ravel(), (row.ravel(), columns.ravel())), shape=(k * d, len(self.P)))
+
+    def transition_jacobian(self, twist: Array, tau_s: float) -> sp.csr_array:
+        """Full-width F (b+3n, b+3n) of a prediction by velocities (6,), identity but for the rows of the body."""
+        step = self.model.step(self.values, twist, tau_s, self.linear_T_imu_world, self.variant.first_estimates)
+        full = sp.lil_array(sp.identity(len(self.P)))
+        full[: self.gaussian.body, : self.gaussian.body] = step.Phi
+        return sp.csr_array(full)
+
+    def _slots(self, ids: IntArray) -> IntArray:
+        slot, is_known = self.table.lookup(np.asarray(ids))
+        if not is_known.all():
+            raise KeyError(f"landmark ids {np.asarray(ids)[~is_known].tolist()} are not active")
+        return slot
+
+    # --- what is seen from here ---------------------------------------------------------------------------------------
+
+    def moment(self) -> Moment:
+        """From where landmarks are seen now."""
+        return Moment(self.T_imu_world, self.linear_T_imu_world, self.values.get("calibration"), self.imu_twist)
+
+    def moment_before(self) -> Moment:
+        """From where they were seen in the frame before, as far as the clone knows."""
+        T = self.values["previous_pose"]
+        T_linear = self.variant.linear(T, self.T_predicted_before)
+        return Moment(T, T_linear, self.values.get("calibration"), self.imu_twist_before)
+
+    def observe(self, slot: IntArray, measured: Array) -> tuple[Seen, Rows]:
+        """Landmarks at the slots (k,) as they are seen now, and the measurement rows of what was ``measured`` (k, d).
+
+        Where tracks err, eq. (10), an observation that follows another one is the difference from it.
+        """
+        positions, linear = self.table.position_m[slot], self.linear_positions_m[slot]
+        seen = self.model.see(self.moment(), positions, linear)
+        error, H_x, H_m, residual = self.model.track_error, seen.H_x, seen.H_m, measured - seen.z
+        if error is None:
+            return seen, Rows(slot, H_x, H_m, residual, self.sensor.variance(measured))
+        variance = error.absolute_variance(self.step - self.table.first_step[slot])
+        follows = np.flatnonzero(self.table.last_step[slot] == self.step - 1)
+        if len(follows):
+            before = self.model.see(self.moment_before(), positions[follows], linear[follows], clone=True)
+            rows_before = self.table.seen_rows[slot[follows]]
+            H_x, H_m = H_x.copy(), H_m.copy()
+            residual[follows] -= error.memory * (rows_before - before.z)
+            H_x[follows] -= error.memory * before.H_x
+            H_m[follows] -= error.memory * before.H_m
+            variance[follows] = error.step_variance(measured[follows] - rows_before)
+        return seen, Rows(slot, H_x, H_m, residual, variance)
+
+    # --- how a correction changes it ----------------------------------------------------------------------------------
+
+    def parts(self, correction: Array) -> tuple[Array, Array]:
+        """What observations depend on (seen,), and the landmarks' part (n, 3) of a correction."""
+        return correction[: self.gaussian.seen], correction[self.gaussian.body :].reshape(-1, 3)
+
+    def retracted(self, correction: Array) -> tuple[dict[str, Array], Array]:
+        """Blocks and landmarks (n, 3) after a correction (b+3n,); the estimate stays."""
+        _, d = self.parts(correction)
+        m = self.variant.retract_landmarks(self.T_imu_world, self.table.position_m, correction[:6], d)
+        return self.model.retract(self.values, correction), m
+
+    def retract(self, correction: Array) -> None:
+        """Move the mean, and re-express the covariance where the variant does."""
+        before, positions = self.values, self.table.position_m
+        self.values, self.table.position_m = self.retracted(correction)
+        self.coordinates = self.coordinates + correction[: self.gaussian.body]
+        self.variant.transport(self.gaussian, self.model, before, self.values, self.table.position_m - positions)

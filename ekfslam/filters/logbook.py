@@ -1,0 +1,142 @@
+"""How the joint filter keeps its `Log`: frame by frame, from its estimate and its corrections."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.filters.correction import Correction
+from ekfslam.filters.estimate import Estimate
+from ekfslam.filters.log import Log
+from ekfslam.models.model import VelocityRows
+
+_PER_FRAME = (
+    "twist",
+    "tau_s",
+    "imu_twist",
+    "seen_twist",
+    "T_departed",
+    "T_predicted",
+    "T_linear",
+    "T_linear_before",
+    "T_updated",
+    "departed",
+    "linear",
+    "updated",
+    "up",
+)
+
+
+class LogBook:
+    """Grows a `Log` frame by frame; arrays are joined when the log is asked for.
+
+    Args:
+        start: What the filter knows before the first frame.
+    """
+
+    def __init__(self, start: Estimate) -> None:
+        self._first_estimates = start.variant.first_estimates
+        self._initial_covariance = start.P[:6, :6].copy()
+        self._frames: dict[str, list] = {name: [] for name in _PER_FRAME}
+        no_index, none, rows = np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, start.sensor.dimension))
+        self._lists: dict[str, list] = {
+            "id": [no_index],
+            "first_position_m": [np.empty((0, 3))],
+            "frame": [no_index],
+            "landmark": [no_index],
+            "previous": [no_index],
+            "rows": [rows],
+            "variance": [rows],
+            "position_m": [np.empty((0, 3))],
+            "velocity_frame": [no_index],
+            "velocity_axis": [no_index],
+            "velocity_value": [none],
+            "velocity_std": [none],
+            "velocity_is_biased": [np.empty(0, dtype=bool)],
+        }
+        self._landmarks = self._observations = 0
+        self.predicted(start, np.zeros(6), start.coordinates)
+
+    def predicted(self, now: Estimate, twist: Array, departed: Array) -> None:
+        """A new frame, reached by a prediction with measured velocities (6,) from coordinates (body,)."""
+        T, coordinates = now.T_imu_world, now.coordinates.copy()
+        values = {
+            "twist": np.asarray(twist, dtype=float),
+            "tau_s": now.tau_s,
+            "imu_twist": now.imu_twist,
+            "seen_twist": now.imu_twist,
+            "T_departed": now.T_departed,
+            "T_predicted": T,
+            "T_linear": T,
+            "T_linear_before": now.T_departed,
+            "T_updated": T,
+            "departed": departed,
+            "linear": coordinates,
+            "updated": coordinates,
+            "up": now.up_world,
+        }
+        for name, value in values.items():
+            self._frames[name].append(value)
+
+    def amend(self, **values: Array) -> None:
+        """Replace fields of the frame that is being written, by their names in `Log`."""
+        for name, value in values.items():
+            self._frames[name][-1] = value
+
+    def measured(self, rows: VelocityRows) -> None:
+        """Measurements of the velocities that lead to the next frame."""
+        self._lists["velocity_frame"].append(np.full(len(rows.axis), len(self._frames["tau_s"])))
+        for field in fields(rows):
+            self._lists[f"velocity_{field.name}"].append(getattr(rows, field.name))
+
+    def corrected(self, now: Estimate, found: Correction) -> None:
+        """The correction of this frame, before the estimate takes it."""
+        table, slot = now.table, found.slot
+        follows = (table.last_step[slot] == now.step - 1) & (now.model.track_error is not None)
+        previous = np.where(follows, table.last_observation[slot], -1)
+        self._observed(table.log_row[slot], found.measured, found.variance, found.position_m, previous)
+        self.amend(
+            seen_twist=now.imu_twist,
+            linear=found.linear.copy(),
+            T_linear=found.T_linear,
+            T_linear_before=found.T_linear_before,
+        )
+
+    def started(self, ids: IntArray, positions_m: Array, rows: Array, variance: Array) -> IntArray:
+        """New landmarks and what initialised them; returns their rows in the log."""
+        self._lists["id"].append(ids)
+        self._lists["first_position_m"].append(positions_m)
+        at = np.arange(self._landmarks, self._landmarks + len(ids))
+        self._landmarks += len(ids)
+        self._observed(at, rows, variance, positions_m, np.full(len(ids), -1))
+        return at
+
+    def last(self, count: int) -> IntArray:
+        """Places of the last observations."""
+        return np.arange(self._observations - count, self._observations)
+
+    def _observed(
+        self, landmark: IntArray, rows: Array, variance: Array, position_m: Array, previous: IntArray
+    ) -> None:
+        values = {
+            "frame": np.full(len(landmark), len(self._frames["tau_s"]) - 1),
+            "landmark": landmark,
+            "previous": previous,
+            "rows": rows,
+            "variance": variance,
+            "position_m": position_m,
+        }
+        for name, value in values.items():
+            self._lists[name].append(value)
+        self._observations += len(landmark)
+
+    def log(self) -> Log:
+        """The log so far."""
+        return Log(
+            first_estimates=self._first_estimates,
+            initial_covariance=self._initial_covariance,
+            **{name: np.array(values) for name, values in self._frames.items()},
+            **{name: np.concatenate(values) for name, values in self._lists.items()},
+        )
