@@ -1,10 +1,14 @@
-"""Configuration: defaults in code, overridden by a TOML file, then by flags; stored resolved with every result."""
+"""Configuration: defaults in code, overridden by a TOML file, then by flags; stored resolved with every result.
+
+Every setting carries its `Rule` in the metadata of its field: what kind of value it is and what must hold for it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -20,10 +24,70 @@ Retire = Literal["auto", "unseen", "never"]
 Linearisation = Literal["map", "filtered"]
 NoiseModel = Literal["auto", "tuned", "white"]
 Kernel = Literal["huber", "cauchy", "none"]
+BlockSetting = float | int | str | bool
 
 MODES: tuple[Mode, ...] = get_args(Mode)
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 
+_KINDS: dict[type, str] = {float: "number", int: "whole number", str: "string", bool: "truth value"}
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a setting may be.
+
+    Args:
+        kind: ``float`` (any number), ``int``, ``str`` or ``bool``.
+        words: What else must hold, as it follows "must".
+        holds: Whether it holds for a value of the kind.
+    """
+
+    kind: type
+    words: str = ""
+    holds: Callable[[Any], bool] = lambda _: True
+
+    def is_kind(self, value: object) -> bool:
+        """Whether a value is of the kind; a whole number is a number, a truth value is none."""
+        kinds = (float, int) if self.kind is float else self.kind
+        return isinstance(value, kinds) and isinstance(value, bool) == (self.kind is bool)
+
+    def plain(self, value: Any) -> Any:
+        """A value as the kind has it: a file may write the whole number 2 as 2.0."""
+        return int(value) if self.kind is int and isinstance(value, float) and value.is_integer() else value
+
+    def check(self, name: str, value: object) -> None:
+        """Raise a `ConfigError` that names the setting, the rule and the value, where the rule does not hold."""
+        if not self.is_kind(value):
+            raise ConfigError(f"{name} must be a {_KINDS[self.kind]}, found {value!r}")
+        if not self.holds(value):
+            raise ConfigError(f"{name} must {self.words}, found {value!r}")
+
+
+def _rule(kind: type, words: str = "", holds: Callable[[Any], bool] = lambda _: True) -> dict[str, Rule]:
+    """Metadata of a field."""
+    return {"rule": Rule(kind, words, holds)}
+
+
+def _whole(least: int) -> dict[str, Rule]:
+    return _rule(int, f"be a whole number not below {least}", lambda value: value >= least)
+
+
+def _one_of(literal: Any) -> dict[str, Rule]:
+    names = get_args(literal)
+    return _rule(str, f"be one of {', '.join(names)}", lambda value: value in names)
+
+
+# No comparison holds for NaN, so the rules refuse it.
+_TEXT, _SWITCH = _rule(str), _rule(bool)
+_NUMBER = _rule(float, "not be NaN", lambda value: not math.isnan(value))
+_POSITIVE = _rule(float, "be positive", lambda value: value > 0)
+_NOT_NEGATIVE = _rule(float, "not be negative", lambda value: value >= 0)
+_FINITE = _rule(float, "be finite and not negative", lambda value: 0 <= value < math.inf)
+_PIXELS = _rule(
+    float, "be finite and positive, or the innovation covariance is singular", lambda value: 0 < value < math.inf
+)
+_PROBABILITY = _rule(float, "be in (0, 1]", lambda value: 0 < value <= 1)
+_BETWEEN_0_AND_1 = _rule(float, "be between 0 and 1", lambda value: 0 < value < 1)
 
 
 @dataclass(frozen=True)
@@ -36,57 +100,55 @@ class NoiseConfig:
         sigma_px: Pixels.
         drift: How far the error of a track walks in the image from one frame to the next, px; 0 takes pixel noise as
             white, None takes what the model says.
-        tilt_deg: Of velocities in a level frame: prior deviation of roll and pitch, which the joint filter estimates; 0
-            takes them as velocities of the IMU; None takes what the model says.
-        model: ``auto``: where the sequence states no noise and no sigma is given here, it is found from the data, see
-            `ekfslam.models.noise`; sigmas given here are those of white noise. ``tuned``: as ``auto``, but sigmas given
-            here only replace those found, and the rest of the automatic model stays (drift, misalignment, errors of the
-            motion, walk of the velocities): they were found within it, by `ekfslam.studies.tuning`, and mean nothing
-            without. ``white``: what is neither stated nor given is that of a clean recording, 0.05 m/s, 0.001 rad/s, 1
-            px.
+        tilt_deg: Of velocities in a level frame: prior standard deviation of roll and pitch, which the joint filter
+            estimates; 0 takes them as velocities of the IMU; None takes what the model says.
+        model: ``auto`` finds the noise from the data (`ekfslam.models.noise`) where the sequence states none and no
+            sigma is given here; sigmas given here are those of white noise. ``tuned`` is the same, but sigmas given
+            here only replace those found: they were found by `ekfslam.studies.tuning` within the automatic model and
+            mean nothing without the rest of it. ``white`` takes what is neither stated nor given from a clean
+            recording: 0.05 m/s, 0.001 rad/s, 1 px.
     """
 
-    sigma_v_m_s: float | None = None
-    sigma_w_rad_s: float | None = None
-    sigma_px: float | None = None
-    drift: float | None = None
-    tilt_deg: float | None = None
-    model: NoiseModel = "auto"
+    sigma_v_m_s: float | None = field(default=None, metadata=_FINITE)
+    sigma_w_rad_s: float | None = field(default=None, metadata=_FINITE)
+    sigma_px: float | None = field(default=None, metadata=_PIXELS)
+    drift: float | None = field(default=None, metadata=_FINITE)
+    tilt_deg: float | None = field(default=None, metadata=_FINITE)
+    model: NoiseModel = field(default="auto", metadata=_one_of(NoiseModel))
 
 
 @dataclass(frozen=True)
 class HygieneConfig:
-    """What becomes of bad tracks before any filter sees them, see `ekfslam.data.hygiene`; false or 0 switches a rule
-    off.
+    """What becomes of bad tracks before any filter sees them, see `ekfslam.data.hygiene`.
 
-    Deviations are those of the pixel noise that the run assumes.
+    False or 0 switches a rule off. Sigmas are standard deviations by the pixel noise that the run assumes.
 
     Args:
-        min_disparity_sigma: Observations with less disparity, in deviations of a disparity, are dropped: they have no
-            depth. (What has no disparity at all the filters reject anyway.)
-        max_row_mismatch_sigma: So are those with larger ``|vL - vR|``, in deviations of that difference.
+        min_disparity_sigma: Observations with less disparity, in sigmas of a disparity, are dropped: they have no
+            depth. (The filters reject observations without disparity.)
+        max_row_mismatch_sigma: So are those with larger ``|vL - vR|``, in sigmas of that difference.
         restart_at_repeats: Where a frame repeats the pixels of the one before while the rig moves, every track is cut.
         restart_above_px: Of these, tracks that move by no more than this in the frames beside it are not cut: they show
             another point, but one close by. Where velocities are noisy the poses gain by it, the tracks lose.
-        jump_sigma: A track is cut where its pixels jump out of its course, and out of that of the frame's other
-            tracks, by so many deviations.
-        reused_id_sigma: A track is cut where it comes back after a gap so many deviations from where the velocities
-            say that it was.
+        jump_sigma: A track is cut where its pixels jump so many sigmas out of its course, and out of that of the
+            frame's other tracks.
+        reused_id_sigma: A track is cut where it comes back after a gap so many sigmas from where the velocities say
+            that it was.
         max_depth_error: Tracks are dropped whose depth is never known better than this, as a share of the depth.
         min_observations: Tracks, or pieces of tracks that were cut, with fewer observations are dropped.
 
-    No rule is for an id that is seen twice in one frame: which of the two is meant nobody can know, so a `Sequence`
-    refuses it with a `DuplicateObservationError`.
+    There is no rule for an id that is seen twice in one frame. Nobody can know which of the two is meant, so a
+    `Sequence` refuses it with a `DuplicateObservationError`.
     """
 
-    min_disparity_sigma: float = 1.0
-    max_row_mismatch_sigma: float = 10.0
-    restart_at_repeats: bool = True
-    restart_above_px: float = 0.0
-    jump_sigma: float = 0.0
-    reused_id_sigma: float = 3.0
-    max_depth_error: float = 0.0
-    min_observations: int = 0
+    min_disparity_sigma: float = field(default=1.0, metadata=_FINITE)
+    max_row_mismatch_sigma: float = field(default=10.0, metadata=_FINITE)
+    restart_at_repeats: bool = field(default=True, metadata=_SWITCH)
+    restart_above_px: float = field(default=0.0, metadata=_FINITE)
+    jump_sigma: float = field(default=0.0, metadata=_FINITE)
+    reused_id_sigma: float = field(default=3.0, metadata=_FINITE)
+    max_depth_error: float = field(default=0.0, metadata=_FINITE)
+    min_observations: int = field(default=0, metadata=_whole(0))
 
 
 @dataclass(frozen=True)
@@ -102,30 +164,30 @@ class FilterConfig:
             of whose landmarks come back.
         revive: A retired landmark that is seen again comes back with its exact mean, covariance and cross-covariance,
             together with up to this many retired landmarks that were seen nearest to it in time. -1 starts it afresh.
-        gate_probability: Chi-square gate on each landmark's three rows, once against the prediction and (joint filter)
-            once against the prediction as corrected by the frame's other landmarks; 1 accepts everything.
+        gate_probability: Chi-square gate on each observation, once against the prediction and (joint filter) once
+            against the prediction as corrected by the frame's other landmarks; 1 accepts everything.
         split_after: A track is split, its landmark retired and a new one started, when this many observations in a row
             fail the gate (or put it behind the camera): the tracker has jumped to another point. 0 never splits.
-        moving_sigma, moving_share: Where tracks may drift (`Noise.landmarks_walk`), one is dropped for good when over
-            all its observations it moves along with the rig by more than this share of the way, beyond that many
-            deviations (without their `Noise.margin`).
+        moving_sigma, moving_share: Where the errors of tracks walk (`Noise.track_error`), a track is dropped for good
+            when it moves along with the rig. Over all its observations it must do so by more than this share of the
+            way, and by more than this many standard deviations (without their `Noise.margin`).
         min_depth_m: Observations of a landmark predicted nearer than this (or behind) are rejected.
-        initial_position_std_m: Deviation of the first pose's translation, each axis.
-        initial_rotation_std_rad: Deviation of the first pose's rotation, each axis.
+        initial_position_std_m: Standard deviation of the first pose's translation, each axis.
+        initial_rotation_std_rad: Standard deviation of the first pose's rotation, each axis.
     """
 
-    variant: Variant = "invariant"
-    iterations: int = 1
-    retire: Retire = "auto"
-    retire_after: int | None = None
-    revive: int = 100
-    gate_probability: float = 0.999
-    split_after: int = 3
-    moving_sigma: float = 3.0
-    moving_share: float = 0.1
-    min_depth_m: float = 0.1
-    initial_position_std_m: float = 0.0
-    initial_rotation_std_rad: float = 0.0
+    variant: Variant = field(default="invariant", metadata=_one_of(Variant))
+    iterations: int = field(default=1, metadata=_whole(1))
+    retire: Retire = field(default="auto", metadata=_one_of(Retire))
+    retire_after: int | None = field(default=None, metadata=_whole(1))
+    revive: int = field(default=100, metadata=_whole(-1))
+    gate_probability: float = field(default=0.999, metadata=_PROBABILITY)
+    split_after: int = field(default=3, metadata=_whole(0))
+    moving_sigma: float = field(default=3.0, metadata=_NOT_NEGATIVE)
+    moving_share: float = field(default=0.1, metadata=_NOT_NEGATIVE)
+    min_depth_m: float = field(default=0.1, metadata=_NOT_NEGATIVE)
+    initial_position_std_m: float = field(default=0.0, metadata=_FINITE)
+    initial_rotation_std_rad: float = field(default=0.0, metadata=_FINITE)
 
     @property
     def gate(self) -> float:
@@ -140,7 +202,7 @@ class FilterConfig:
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """What of the calibration the joint filter estimates, as prior deviations; 0 takes it as given.
+    """What of the calibration the joint filter estimates, as prior standard deviations; 0 takes it as given.
 
     Args:
         rotation_deg: Rotation of the camera against the IMU, each axis.
@@ -150,11 +212,11 @@ class CalibrationConfig:
         time_s: How much later than stamped the images are exposed.
     """
 
-    rotation_deg: float = 0.0
-    lever_arm_m: float = 0.0
-    baseline: float = 0.0
-    disparity_px: float = 0.0
-    time_s: float = 0.0
+    rotation_deg: float = field(default=0.0, metadata=_FINITE)
+    lever_arm_m: float = field(default=0.0, metadata=_FINITE)
+    baseline: float = field(default=0.0, metadata=_FINITE)
+    disparity_px: float = field(default=0.0, metadata=_FINITE)
+    time_s: float = field(default=0.0, metadata=_FINITE)
 
 
 @dataclass(frozen=True)
@@ -165,17 +227,18 @@ class PosteriorConfig:
         linearisation: ``map`` linearises all rows again at the maximum a posteriori, found from the filter's estimate;
             ``filtered`` leaves them where the filter linearised them.
         kernel: Robust kernel on the whitened residual of each observation (``map`` only), see
-        `ekfslam.smoother.posterior`. kernel_width: Where it leaves the parabola, in standard deviations. The default is
-            exceeded by 5 % of Gaussian residuals.
+            `ekfslam.smoother.posterior`.
+        kernel_width: Where it leaves the parabola, in standard deviations. 5 % of Gaussian residuals exceed the
+            default.
         max_iterations: Of Levenberg-Marquardt.
         tolerance: It stops when an iteration lowers the cost by a smaller share than this.
     """
 
-    linearisation: Linearisation = "map"
-    kernel: Kernel = "huber"
-    kernel_width: float = 2.8
-    max_iterations: int = 50
-    tolerance: float = 1e-6
+    linearisation: Linearisation = field(default="map", metadata=_one_of(Linearisation))
+    kernel: Kernel = field(default="huber", metadata=_one_of(Kernel))
+    kernel_width: float = field(default=2.8, metadata=_POSITIVE)
+    max_iterations: int = field(default=50, metadata=_whole(1))
+    tolerance: float = field(default=1e-6, metadata=_BETWEEN_0_AND_1)
 
 
 @dataclass(frozen=True)
@@ -191,30 +254,39 @@ class TuningRecord:
         remarks: What is to be said of the maximum, such as an estimate at its bound.
     """
 
-    sequence: str | None = None
-    frames: int | None = None
-    runs: int | None = None
-    log_likelihood: float | None = None
-    sigma_v_m_s: float | None = None
-    sigma_v_m_s_error: float | None = None
-    sigma_w_rad_s: float | None = None
-    sigma_w_rad_s_error: float | None = None
-    sigma_px: float | None = None
-    sigma_px_error: float | None = None
-    drift: float | None = None
-    drift_error: float | None = None
-    found_sigma_v_m_s: float | None = None
-    found_sigma_v_m_s_error: float | None = None
-    found_sigma_v_m_s_limit: float | None = None
-    found_sigma_w_rad_s: float | None = None
-    found_sigma_w_rad_s_error: float | None = None
-    found_sigma_w_rad_s_limit: float | None = None
-    remarks: str | None = None
+    sequence: str | None = field(default=None, metadata=_TEXT)
+    frames: int | None = field(default=None, metadata=_whole(0))
+    runs: int | None = field(default=None, metadata=_whole(0))
+    log_likelihood: float | None = field(default=None, metadata=_NUMBER)
+    sigma_v_m_s: float | None = field(default=None, metadata=_NUMBER)
+    sigma_v_m_s_error: float | None = field(default=None, metadata=_NUMBER)
+    sigma_w_rad_s: float | None = field(default=None, metadata=_NUMBER)
+    sigma_w_rad_s_error: float | None = field(default=None, metadata=_NUMBER)
+    sigma_px: float | None = field(default=None, metadata=_NUMBER)
+    sigma_px_error: float | None = field(default=None, metadata=_NUMBER)
+    drift: float | None = field(default=None, metadata=_NUMBER)
+    drift_error: float | None = field(default=None, metadata=_NUMBER)
+    found_sigma_v_m_s: float | None = field(default=None, metadata=_NUMBER)
+    found_sigma_v_m_s_error: float | None = field(default=None, metadata=_NUMBER)
+    found_sigma_v_m_s_limit: float | None = field(default=None, metadata=_NUMBER)
+    found_sigma_w_rad_s: float | None = field(default=None, metadata=_NUMBER)
+    found_sigma_w_rad_s_error: float | None = field(default=None, metadata=_NUMBER)
+    found_sigma_w_rad_s_limit: float | None = field(default=None, metadata=_NUMBER)
+    remarks: str | None = field(default=None, metadata=_TEXT)
 
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that decides what a run does besides the data, and the record of what was tuned."""
+    """Everything that decides what a run does besides the data, and the record of what was tuned.
+
+    Args:
+        noise, filter, posterior, calibration, hygiene, tuning: The tables of a file.
+        blocks: Name of an optional state block to its settings, ``[blocks.<name>]`` in a file. Here they are only
+            plain values; `ekfslam.models.build` knows the blocks and what can be set of them.
+
+    Raises:
+        ConfigError: A value breaks its rule; the message names table and key, the rule, and the value.
+    """
 
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
@@ -222,99 +294,35 @@ class Config:
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     hygiene: HygieneConfig = field(default_factory=HygieneConfig)
     tuning: TuningRecord = field(default_factory=TuningRecord)
-    blocks: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    blocks: Mapping[str, Mapping[str, BlockSetting]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        noise, filter_, posterior = self.noise, self.filter, self.posterior
-        for name, value in dataclasses.asdict(noise).items():
-            if name != "model" and value is not None and not (np.isfinite(value) and value >= 0):
-                raise ConfigError(f"noise.{name} must be finite and not negative, found {value}")
-        if noise.sigma_px == 0:
-            raise ConfigError("noise.sigma_px must be positive: the innovation covariance would be singular")
-        for table, name, value, allowed in (
-            ("noise", "model", noise.model, get_args(NoiseModel)),
-            ("filter", "variant", filter_.variant, VARIANTS),
-            ("filter", "retire", filter_.retire, get_args(Retire)),
-            ("posterior", "linearisation", posterior.linearisation, get_args(Linearisation)),
-            ("posterior", "kernel", posterior.kernel, get_args(Kernel)),
-        ):
-            if value not in allowed:
-                raise ConfigError(f"{table}.{name} must be one of {', '.join(allowed)}, found {value!r}")
-        if not posterior.kernel_width > 0:
-            raise ConfigError(f"posterior.kernel_width must be positive, found {posterior.kernel_width}")
-        if posterior.max_iterations != int(posterior.max_iterations) or posterior.max_iterations < 1:
-            raise ConfigError(
-                f"posterior.max_iterations must be a whole number not below 1, found {posterior.max_iterations}"
-            )
-        if not 0 < posterior.tolerance < 1:
-            raise ConfigError(f"posterior.tolerance must be between 0 and 1, found {posterior.tolerance}")
-        if not 0 < filter_.gate_probability <= 1:
-            raise ConfigError(f"filter.gate_probability must be in (0, 1], found {filter_.gate_probability}")
-        for name, smallest in (("split_after", 0), ("iterations", 1), ("retire_after", 1), ("revive", -1)):
-            value = getattr(filter_, name)
-            if value is None:
-                continue
-            if value != int(value) or value < smallest:
-                raise ConfigError(f"filter.{name} must be a whole number not below {smallest}, found {value}")
-        if filter_.variant == "fej" and filter_.iterations > 1:
+        for table, settings in vars(self).items():
+            if table != "blocks":
+                _check_table(table, settings)
+        _check_blocks(self.blocks)
+        object.__setattr__(self, "blocks", {name: dict(settings) for name, settings in self.blocks.items()})
+        if self.filter.variant == "fej" and self.filter.iterations > 1:
             raise ConfigError("filter.iterations > 1 contradicts first estimates: choose invariant or standard")
-        for name in (
-            "moving_sigma",
-            "moving_share",
-            "min_depth_m",
-            "initial_position_std_m",
-            "initial_rotation_std_rad",
-        ):
-            if not getattr(filter_, name) >= 0:
-                raise ConfigError(f"filter.{name} must not be negative, found {getattr(filter_, name)}")
-        for name, value in dataclasses.asdict(self.calibration).items():
-            if not (np.isfinite(value) and value >= 0):
-                raise ConfigError(f"calibration.{name} must be finite and not negative, found {value}")
-        for name, value in dataclasses.asdict(self.hygiene).items():
-            if name != "restart_at_repeats" and not (np.isfinite(value) and value >= 0):
-                raise ConfigError(f"hygiene.{name} must be finite and not negative, found {value}")
-        if self.hygiene.min_observations != int(self.hygiene.min_observations):
-            raise ConfigError(f"hygiene.min_observations must be a whole number, found {self.hygiene.min_observations}")
 
     def with_overrides(self, overrides: Mapping[str, Mapping[str, Any]]) -> Config:
         """This configuration with ``{table: {key: value}}`` replaced; None values are skipped.
 
+        Settings of a state block replace those of the same block and leave its others and all other blocks.
+
         Raises:
-            ConfigError: An unknown table or key, or a value of the wrong type or range.
+            ConfigError: An unknown table or key, or a value of the wrong kind or range.
         """
-        tables: dict[str, Any] = {
-            "noise": self.noise,
-            "filter": self.filter,
-            "posterior": self.posterior,
-            "calibration": self.calibration,
-            "hygiene": self.hygiene,
-            "tuning": self.tuning,
-        }
-        blocks = {name: dict(values) for name, values in self.blocks.items()}
+        tables = dict(vars(self))
         for table, values in overrides.items():
-            if table == "blocks":
-                for name, settings in values.items():
-                    if not isinstance(settings, Mapping):
-                        raise ConfigError(f"[blocks.{name}] must be a table, found {settings!r}")
-                    blocks[name] = {**blocks.get(name, {}), **settings}
-                continue
             if table not in tables:
-                raise ConfigError(f"unknown table [{table}]; known: {', '.join([*tables, 'blocks'])}")
-            if not isinstance(values, Mapping):
-                raise ConfigError(f"[{table}] must be a table, found {values!r}")
-            known = [f.name for f in dataclasses.fields(tables[table])]
-            for key, value in values.items():
-                if key not in known:
-                    raise ConfigError(f"unknown key {table}.{key}; known: {', '.join(known)}")
-                is_text = key in ("model", "variant", "retire", "linearisation", "kernel", "sequence", "remarks")
-                kind: Any = str if is_text else bool if key == "restart_at_repeats" else (int, float)
-                wanted = isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
-                if value is not None and not wanted:
-                    name = "string" if is_text else "truth value" if kind is bool else "number"
-                    raise ConfigError(f"{table}.{key} must be a {name}, found {value!r}")
-            given = {key: value for key, value in values.items() if value is not None}
-            tables[table] = dataclasses.replace(tables[table], **given)
-        return Config(**tables, blocks=blocks)
+                raise ConfigError(f"unknown table [{table}]; known: {', '.join(tables)}")
+            _require_table(table, values)
+            if table == "blocks":
+                tables[table] = _replaced_blocks(self.blocks, values)
+            else:
+                tables[table] = _replaced(table, tables[table], values)
+        return Config(**tables)
 
     @staticmethod
     def from_toml(path: str | Path) -> Config:
@@ -328,3 +336,46 @@ class Config:
             return Config().with_overrides(tomllib.loads(text))
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, ConfigError) as error:
             raise ConfigError(f"{path}: {error}") from None
+
+
+def _require_table(name: str, value: object) -> None:
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"[{name}] must be a table, found {value!r}")
+
+
+def _check_table(table: str, settings: Any) -> None:
+    """Raise a `ConfigError` where a setting breaks its rule; None is allowed where it is the default."""
+    for setting in dataclasses.fields(settings):
+        value = getattr(settings, setting.name)
+        if value is not None or setting.default is not None:
+            setting.metadata["rule"].check(f"{table}.{setting.name}", value)
+
+
+def _check_blocks(blocks: Mapping[str, Any]) -> None:
+    """Raise a `ConfigError` where this is no table of tables of plain values."""
+    _require_table("blocks", blocks)
+    for name, settings in blocks.items():
+        _require_table(f"blocks.{name}", settings)
+        for key, value in settings.items():
+            if not isinstance(value, BlockSetting) or value != value:  # NaN alone differs from itself
+                raise ConfigError(f"blocks.{name}.{key} must be a number, a string or a truth value, found {value!r}")
+
+
+def _replaced(table: str, settings: Any, values: Mapping[str, Any]) -> Any:
+    """The settings of a table with the given values, those that are None left out."""
+    rules = {setting.name: setting.metadata["rule"] for setting in dataclasses.fields(settings)}
+    for key in values:
+        if key not in rules:
+            raise ConfigError(f"unknown key {table}.{key}; known: {', '.join(rules)}")
+    given = {key: rules[key].plain(value) for key, value in values.items() if value is not None}
+    return dataclasses.replace(settings, **given)
+
+
+def _replaced_blocks(blocks: Mapping[str, Any], values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The same for state blocks, one by one."""
+    merged = dict(blocks)
+    for name, settings in values.items():
+        _require_table(f"blocks.{name}", settings)
+        given = {key: value for key, value in settings.items() if value is not None}
+        merged[name] = {**blocks.get(name, {}), **given}
+    return merged

@@ -1,0 +1,73 @@
+"""Settings: every one has a rule, state blocks have tables of their own, and everything survives its archive."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import pytest
+
+from ekfslam.config import Config, FilterConfig
+from ekfslam.errors import ConfigError
+
+SETTINGS = [
+    (table.name, setting)
+    for table in dataclasses.fields(Config)
+    if table.name != "blocks"
+    for setting in dataclasses.fields(getattr(Config(), table.name))
+]
+BLOCKS = {"twist_bias": {"sigma_v_m_s": 0.03, "steps": 2, "is_on": True}, "clone": {"kind": "pose"}}
+
+
+@pytest.mark.parametrize(("table", "setting"), SETTINGS, ids=[f"{table}.{s.name}" for table, s in SETTINGS])
+def test_every_setting_refuses_another_kind_and_nan(table, setting):
+    wrong = [math.nan, [1.0]] + ([] if setting.metadata["rule"].kind is str else ["word"])
+    for value in wrong:
+        with pytest.raises(ConfigError, match=rf"{table}\.{setting.name} must .*, found "):
+            Config().with_overrides({table: {setting.name: value}})
+
+
+@pytest.mark.parametrize("name", ["iterations", "retire_after", "revive", "split_after"])
+def test_whole_numbers(name):
+    with pytest.raises(ConfigError, match=rf"filter\.{name} must be a whole number, found 2\.5"):
+        Config().with_overrides({"filter": {name: 2.5}})
+    with pytest.raises(ConfigError, match=rf"filter\.{name} must be a whole number not below -?\d, found -7"):
+        Config().with_overrides({"filter": {name: -7}})
+    assert type(getattr(Config().with_overrides({"filter": {name: 2.0}}).filter, name)) is int
+
+
+def test_none_is_skipped_in_overrides_and_refused_where_it_means_nothing():
+    assert Config().with_overrides({"filter": {"iterations": None}}) == Config()
+    with pytest.raises(ConfigError, match=r"filter\.iterations must be a whole number, found None"):
+        Config(filter=FilterConfig(iterations=None))  # type: ignore[arg-type]
+
+
+def test_settings_of_state_blocks_from_a_file_and_through_an_archive(tmp_path):
+    path = tmp_path / "config.toml"
+    path.write_text("[blocks.twist_bias]\nsigma_v_m_s = 0.03\nsteps = 2\nis_on = true\n[blocks.clone]\nkind = 'pose'\n")
+    config = Config.from_toml(path)
+    assert config.blocks == BLOCKS
+    assert Config().with_overrides(json.loads(json.dumps(dataclasses.asdict(config)))) == config
+
+
+def test_overrides_of_state_blocks_merge_block_by_block():
+    config = Config(blocks=BLOCKS).with_overrides({"blocks": {"twist_bias": {"steps": 3, "is_on": None}, "new": {}}})
+    assert config.blocks == {"twist_bias": {**BLOCKS["twist_bias"], "steps": 3}, "clone": {"kind": "pose"}, "new": {}}
+    assert Config(blocks=BLOCKS).with_overrides({"noise": {"sigma_px": 2.0}}).blocks == BLOCKS
+
+
+@pytest.mark.parametrize(
+    ("blocks", "message"),
+    [
+        (3, r"\[blocks\] must be a table"),
+        ({"twist_bias": 0.03}, r"\[blocks\.twist_bias\] must be a table, found 0\.03"),
+        ({"twist_bias": {"sigma": [1.0]}}, r"blocks\.twist_bias\.sigma must be a number, a string or a truth value"),
+        ({"twist_bias": {"sigma": math.nan}}, r"blocks\.twist_bias\.sigma must .*, found nan"),
+    ],
+)
+def test_bad_tables_of_state_blocks_are_named(blocks, message):
+    with pytest.raises(ConfigError, match=message):
+        Config().with_overrides({"blocks": blocks})
+    with pytest.raises(ConfigError, match=message):
+        Config(blocks=blocks)
