@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import struct
+import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -25,15 +27,19 @@ from recordings import (
 )
 from scipy.spatial.transform import Rotation
 
+from ekfslam.data import readers
 from ekfslam.data.readers import open_sequence, read_sequence, write_sequence
 from ekfslam.data.readers.hdf5 import read_sequence_fields, read_sequence_group, write_sequence_group, write_truth_group
 from ekfslam.data.readers.matfile import parse_mat
+from ekfslam.data.readers.text import parse_table
 from ekfslam.data.sequence import Observations, Sequence
 from ekfslam.data.tracks import inspect_tracks, repeated_frames
 from ekfslam.errors import (
     ArchiveError,
     ConfigError,
+    DataError,
     EkfslamError,
+    LineError,
     NonFiniteError,
     StampError,
     TruthError,
@@ -249,6 +255,69 @@ def test_mat_files_of_either_byte_order_and_every_number_type_are_parsed():
             np.testing.assert_array_equal(value, [[0, 2, 4], [1, 3, 5]])
 
 
+# Adding a format, and the parser of text
+
+FORMAT = """
+from ekfslam.data.readers.registry import Poses, Reader, TruthReader
+from ekfslam.data.readers.text import first_row, parse_table, read_lines
+from ekfslam.data.simulate import builtin
+
+READER = Reader("mine", "a .mine file", lambda source: source.head.startswith(b"MINE"), lambda source: builtin("loop"))
+
+
+def read(path, sequence):
+    table = parse_table(read_lines(path, ""), path, columns=2)
+    return Poses(sequence.truth.T_world_imu[: len(table.values)], table.values[:, 0], (path,))
+
+
+TRUTH_READER = TruthReader("mine", "2 numbers a line (mine)", lambda path: len(first_row(path).split()) == 2, read)
+"""
+
+
+def test_a_format_is_added_by_one_file_alone(tmp_path, monkeypatch):
+    recording, truth = tmp_path / "recording", tmp_path / "truth"
+    recording.write_text("MINE")
+    sequence = open_sequence("builtin:loop")
+    truth.write_text("".join(f"{time!r} 0\n" for time in sequence.time_s.tolist()))
+    for arguments in ({"source": recording}, {"source": "builtin:loop", "truth": truth}):
+        with pytest.raises(UnknownFormatError, match="expected"):
+            open_sequence(**arguments)
+
+    folder = tmp_path / "more"
+    folder.mkdir()
+    (folder / "mine.py").write_text(FORMAT)
+    monkeypatch.setattr(readers, "__path__", [*readers.__path__, str(folder)])
+    monkeypatch.delitem(sys.modules, "ekfslam.data.readers.mine", raising=False)
+    assert_same(open_sequence(recording), sequence)
+    assert open_sequence("builtin:loop", truth=truth).notes[-1] == "Truth of 472 of 472 frames from truth."
+    (tmp_path / "other").write_text("other")
+    with pytest.raises(UnknownFormatError, match=r"a \.mine file"):
+        open_sequence(tmp_path / "other")
+    monkeypatch.delitem(sys.modules, "ekfslam.data.readers.mine")
+    monkeypatch.delattr(readers, "mine")
+
+
+def test_rows_of_text_skip_comments_and_keep_their_line_numbers():
+    path = Path("a.txt")
+    table = parse_table(["# head", "", "1, 2,x", "  # more", "3,4 , # and"], path, columns=3, used=2, separator=",")
+    np.testing.assert_array_equal(table.values, [[1, 2], [3, 4]])
+    np.testing.assert_array_equal(table.line, [3, 5])
+    assert table.where(1) == {"source": "a.txt", "field": "line", "index": 5}
+    assert parse_table(["#"], path, columns=4).values.shape == (0, 4)
+
+
+@pytest.mark.parametrize(
+    ("line", "error"), [("1 2", LineError), ("1 2 3 4", LineError), ("1 2 x", LineError), ("1 inf 3", NonFiniteError)]
+)
+def test_malformed_rows_of_text_name_file_and_line(line, error):
+    with pytest.raises(DataError) as caught:
+        parse_table(["0 0 0", "", line], Path("a.txt"))
+    assert type(caught.value) is error
+    assert (caught.value.source, caught.value.field, caught.value.index) == ("a.txt", "line", 3)
+    with pytest.raises(TruthError if error is LineError else NonFiniteError):
+        parse_table([line], Path("a.txt"), columns=3, error=TruthError)
+
+
 # Own HDF5 form
 
 
@@ -392,7 +461,7 @@ def test_files_that_hold_no_truth_are_refused(npz, tmp_path, content):
     path = tmp_path / "truth.txt"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(UnknownFormatError, match=r"truth\.txt: .*expected 12 numbers a line"):
+    with pytest.raises(UnknownFormatError, match=r"truth\.txt: .*expected .*12 numbers a line"):
         open_sequence(npz, truth=path)
 
 

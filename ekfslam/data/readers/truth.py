@@ -1,4 +1,4 @@
-"""Ground truth from elsewhere: poses of any format that a file of this folder reads, given to the frames they are of."""
+"""Ground truth from elsewhere: poses of any format that a file of this folder reads, given to their frames."""
 
 from __future__ import annotations
 

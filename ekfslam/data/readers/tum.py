@@ -15,7 +15,7 @@ from ekfslam.geometry import se3
 
 COLUMNS = ("time", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _QUATERNION_TOLERANCE = 1e-3
-_EXPECTED = f"{len(COLUMNS)} (TUM: {' '.join(COLUMNS)})"
+_EXPECTED = f"{len(COLUMNS)} numbers a line (TUM: {' '.join(COLUMNS)})"
 
 
 def stamped_poses(table: Table) -> Poses:
