@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from helpers import synthetic_result, synthetic_sequence
 
+from ekfslam.data.readers import read_sequence, write_sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError
 from ekfslam.filters.result import ERROR_CONVENTION
@@ -270,3 +272,40 @@ def test_kitti_export_holds_the_upper_rows_exactly(results, tmp_path):
     export_trajectory(result, tmp_path / "poses.txt", "kitti")
     rows = np.loadtxt(tmp_path / "poses.txt")
     np.testing.assert_array_equal(rows.reshape(-1, 3, 4), result.T_world_imu[:, :3])
+
+
+# Files of earlier releases
+
+
+def test_adding_to_an_archive_of_an_earlier_version_keeps_its_runs_readable(with_log, results, tmp_path):
+    path = Path(shutil.copy(with_log, tmp_path / "old.h5"))
+    with h5py.File(path, "a") as h5file:
+        h5file.attrs["format_version"] = 3
+        for name, *_ in archive_module._LOG_LAYOUT_4:
+            del h5file["runs/full/log"][name]
+    before = open_result(path, "full")
+    for name in ("first", "second"):
+        add_result(path, dataclasses.replace(results["dead-reckoning"], mode=name))
+        assert_same(open_result(path, "full"), before)
+    with h5py.File(path) as h5file:
+        assert h5file.attrs["format_version"] == FORMAT_VERSION
+        assert h5file["runs/full"].attrs["format_version"] == 3
+
+
+def test_drift_of_an_earlier_version_is_not_taken_for_pixels(copy):
+    with h5py.File(copy, "a") as h5file:
+        h5file.attrs["format_version"] = 3
+        attributes = h5file["runs/full"].attrs
+        config = json.loads(attributes["config"])
+        config["noise"]["drift"] = 0.4  # of the distance driven
+        attributes["config"], attributes["noise_drift"] = json.dumps(config), 0.4
+    assert open_result(copy, "full").config["noise"]["drift"] is None
+
+
+def test_noise_that_no_model_uses_any_more_is_noted(sequence, tmp_path):
+    write_sequence(sequence, tmp_path / "old.h5")
+    with h5py.File(tmp_path / "old.h5", "a") as h5file:
+        h5file["sequence/noise"].attrs.update(drift=0.4, bearing_drift_rad=0.0)
+    again = read_sequence(tmp_path / "old.h5")
+    assert_same(again.noise, sequence.noise)
+    assert again.notes == (*sequence.notes, "The noise states drift 0.4, which no model uses any more.")

@@ -1,1 +1,1 @@
-"""HDF5 archives."""
+"""HDF5: the dialect of all files, and result archives."""

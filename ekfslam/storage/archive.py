@@ -2,7 +2,8 @@
 
     /                       attributes format, format_version, source, error_convention
     /sequence, /truth       as in `ekfslam.data.readers.hdf5`, without the observations
-    /runs/<mode>            attributes config (JSON), counts (JSON), noise_<field of `Noise`>, sequence_name
+    /runs/<mode>            attributes config (JSON), counts (JSON), noise_<field of `Noise`>, sequence_name; and
+                            format_version if an older release wrote it
         attributes          seed, input checksum, versions of the software, as attributes
         trajectory          time, T_world_imu, covariance
         landmarks           id, position, covariance, initial_position, first_frame, last_frame, observations
@@ -14,19 +15,16 @@
         timing              ms_per_frame
         log                 what `ekfslam.smoother.posterior` needs: see `ekfslam.filters.log.Log` (mode full only)
 
-Every data set has the attributes ``units`` and ``frame`` (of reference). Reading gives back every number bit for bit.
+Reading gives back every number bit for bit. See `ekfslam.storage.hdf5` for what all files have in common.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
-from operator import attrgetter
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,7 +35,13 @@ from scipy.spatial.transform import Rotation
 from ekfslam.arrays import Array
 from ekfslam.config import HygieneConfig
 from ekfslam.data.hygiene import RULES, HygieneReport
-from ekfslam.data.readers.hdf5 import read_sequence_fields, write_sequence_group, write_truth_group
+from ekfslam.data.readers.hdf5 import (
+    noise_attributes,
+    noise_of_attributes,
+    read_sequence_fields,
+    write_sequence_group,
+    write_truth_group,
+)
 from ekfslam.data.sequence import Noise, Sequence, Truth, VelocityFrame
 from ekfslam.errors import ArchiveError, DataError
 from ekfslam.filters.log import Log
@@ -51,13 +55,13 @@ from ekfslam.filters.result import (
     Result,
 )
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.storage import hdf5
 
 FORMAT = "ekfslam-archive"
 FORMAT_VERSION = 4  # 2 added log, 3 hygiene and parameters, 4 state blocks and track errors in the log
 
-# Data set below /runs/<mode>, field of `Result`, shape (T frames, M landmarks, R rejections), units, frame.
-_Layout = tuple[tuple[str, str, tuple[str | int, ...], str, str], ...]
-_LAYOUT: _Layout = (
+# Data sets below /runs/<mode>, fields of `Result` (T frames, M landmarks, R rejections).
+_LAYOUT: hdf5.Layout = (
     ("trajectory/time", "time_s", ("T",), "s", "clock of the recording"),
     ("trajectory/T_world_imu", "T_world_imu", ("T", 4, 4), "m (translation)", "world from imu"),
     ("trajectory/covariance", "covariance", ("T", 6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu"),
@@ -82,7 +86,7 @@ _LAYOUT: _Layout = (
 # The same below /runs/<mode>/log, fields of `Log` (K observations of d rows, N velocity measurements, B body columns).
 _POSE = "m (translation)"
 _COORDINATES = "see ekfslam.filters.log"
-_LOG_LAYOUT: _Layout = (
+_LOG_LAYOUT: hdf5.Layout = (
     ("initial_covariance", "initial_covariance", (6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu"),
     ("twist", "twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "that of the velocities"),
     ("tau", "tau_s", ("T",), "s", "none"),
@@ -97,7 +101,7 @@ _LOG_LAYOUT: _Layout = (
     ("variance", "variance", ("K", "d"), "px^2", "image"),
     ("linear_position", "position_m", ("K", 3), "m", "world"),
 )
-_LOG_LAYOUT_4: _Layout = (
+_LOG_LAYOUT_4: hdf5.Layout = (
     ("imu_twist", "imu_twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "imu"),
     ("seen_twist", "seen_twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "imu"),
     ("T_imu_world_departed", "T_departed", ("T", 4, 4), _POSE, "imu from world"),
@@ -116,14 +120,14 @@ _LOG_LAYOUT_4: _Layout = (
 
 
 # The same below /runs/<mode>/parameters, fields of `Parameters` (P of them).
-_PARAMETERS_LAYOUT: _Layout = (
+_PARAMETERS_LAYOUT: hdf5.Layout = (
     ("value", "value", ("T", "P"), "see attribute unit of the group", "imu"),
     ("std", "std", ("T", "P"), "see attribute unit of the group", "imu"),
     ("prior_std", "prior_std", ("P",), "see attribute unit of the group", "imu"),
 )
 
 # The same below /runs/<mode>/hygiene, fields of `HygieneReport` (N findings).
-_HYGIENE_LAYOUT: _Layout = (
+_HYGIENE_LAYOUT: hdf5.Layout = (
     ("rule", "rule", ("N",), "code, see names", "none"),
     ("frame", "frame", ("N",), "frame index", "none"),
     ("landmark", "landmark", ("N",), "landmark id", "none"),
@@ -163,10 +167,8 @@ def write_archive(path: str | Path, sequence: Sequence, results: Mapping[str, Re
     Raises:
         ArchiveError: The file cannot be written.
     """
-    with _replacing(Path(path)) as unfinished, h5py.File(str(unfinished), "w") as h5file:
-        h5file.attrs.update(
-            format=FORMAT, format_version=FORMAT_VERSION, source=sequence.source, error_convention=ERROR_CONVENTION
-        )
+    with hdf5.creating(path, FORMAT, FORMAT_VERSION) as h5file:
+        hdf5.write_attributes(h5file, {"source": sequence.source, "error_convention": ERROR_CONVENTION})
         write_sequence_group(h5file, sequence, include_observations=False)
         if sequence.truth is not None:
             write_truth_group(h5file, sequence.truth)
@@ -183,27 +185,18 @@ def add_result(path: str | Path, result: Result) -> None:
     Raises:
         ArchiveError: The archive cannot be read or written.
     """
-    path = Path(path)
-    with _opened(path), _replacing(path) as unfinished:
+    with hdf5.opened(path, FORMAT, FORMAT_VERSION):
+        pass
+    with hdf5.replacing(path) as unfinished:
         shutil.copyfile(path, unfinished)
         with h5py.File(str(unfinished), "r+") as h5file:
+            runs, version = h5file["runs"], h5file.attrs["format_version"]
+            if result.mode in runs:
+                del runs[result.mode]
+            for older in runs.values():
+                hdf5.write_attributes(older, {"format_version": older.attrs.get("format_version", version)})
             h5file.attrs["format_version"] = FORMAT_VERSION
-            if result.mode in h5file["runs"]:
-                del h5file["runs"][result.mode]
-            _write_result(h5file["runs"].create_group(result.mode), result)
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A name to write a file under that takes the place of ``path`` when it is complete."""
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield unfinished
-        unfinished.replace(path)
-    except OSError as error:
-        raise ArchiveError(f"{path}: cannot be written: {error}") from None
-    finally:
-        unfinished.unlink(missing_ok=True)
+            _write_result(runs.create_group(result.mode), result)
 
 
 def read_archive(path: str | Path) -> Archive:
@@ -213,12 +206,11 @@ def read_archive(path: str | Path) -> Archive:
         ArchiveError: The file is missing, truncated, no ekfslam archive or of a newer format version, or something
             in it is missing or malformed; the message names file and item.
     """
-    with _opened(path) as h5file:
-        fields = {"noise": None, **read_sequence_fields(h5file, str(path))}
-        fields["source"] = str(h5file.attrs["source"])
-        calibration = fields["camera"], fields["T_cam_imu"]
-        results = {mode: _read_result(path, h5file, mode, *calibration) for mode in _modes(path, h5file)}
-        return Archive(**fields, results=results)
+    with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
+        sequence = {"noise": None, **_sequence_fields(h5file), "source": str(hdf5.attribute(h5file, "source"))}
+        calibration = sequence["camera"], sequence["T_cam_imu"]
+        modes = hdf5.subgroup(h5file, "runs")
+        return Archive(**sequence, results={mode: _read_result(h5file, mode, *calibration) for mode in modes})
 
 
 def open_result(path: str | Path, mode: str) -> Result:
@@ -227,12 +219,12 @@ def open_result(path: str | Path, mode: str) -> Result:
     Raises:
         ArchiveError: As `read_archive`, or the archive has no such mode.
     """
-    with _opened(path) as h5file:
-        modes = _modes(path, h5file)
+    with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
+        modes = tuple(hdf5.subgroup(h5file, "runs"))
         if mode not in modes:
             raise ArchiveError(f"{path}: runs/{mode} is missing; this archive holds {', '.join(modes) or 'no run'}")
-        fields = read_sequence_fields(h5file, str(path))
-        return _read_result(path, h5file, mode, fields["camera"], fields["T_cam_imu"])
+        sequence = _sequence_fields(h5file)
+        return _read_result(h5file, mode, sequence["camera"], sequence["T_cam_imu"])
 
 
 def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "kitti"]) -> None:
@@ -288,116 +280,103 @@ def _write_poses(path: str | Path, time_s: Array, T: Array, format: Literal["tum
 
 
 def _write_result(group: h5py.Group, result: Result) -> None:
-    group.attrs.update(
-        sequence_name=result.sequence_name,
-        config=json.dumps(result.config),
-        counts=json.dumps(dict(result.counts)),
-        **{f"noise_{name}": value for name, value in vars(result.noise).items() if value is not None},
+    hdf5.write_attributes(
+        group,
+        {
+            "sequence_name": result.sequence_name,
+            "config": json.dumps(result.config),
+            "counts": json.dumps(dict(result.counts)),
+            **noise_attributes(result.noise, "noise_"),
+        },
     )
-    group.create_group("attributes").attrs.update(result.attributes)
-    _write_fields(group, _LAYOUT, result)
+    hdf5.write_attributes(group.create_group("attributes"), result.attributes)
+    hdf5.write_fields(group, _LAYOUT, result)
     group["rejections/reason"].attrs["names"] = REASONS
     if result.parameters is not None:
         parameters = group.create_group("parameters")
-        parameters.attrs.update(name=result.parameters.name, unit=result.parameters.unit)
-        _write_fields(parameters, _PARAMETERS_LAYOUT, result.parameters)
+        hdf5.write_attributes(parameters, {"name": result.parameters.name, "unit": result.parameters.unit})
+        hdf5.write_fields(parameters, _PARAMETERS_LAYOUT, result.parameters)
     if result.hygiene is not None:
         hygiene = group.create_group("hygiene")
-        hygiene.attrs["observations"] = result.hygiene.observations
-        _write_fields(hygiene, _HYGIENE_LAYOUT, result.hygiene)
+        hdf5.write_attributes(hygiene, {"observations": result.hygiene.observations})
+        hdf5.write_fields(hygiene, _HYGIENE_LAYOUT, result.hygiene)
         hygiene["rule"].attrs["names"] = RULES
     if result.log is not None:
         log = group.create_group("log")
-        log.attrs["first_estimates"] = result.log.first_estimates
-        _write_fields(log, (*_LOG_LAYOUT, *_LOG_LAYOUT_4), result.log)
+        hdf5.write_attributes(log, {"first_estimates": result.log.first_estimates})
+        hdf5.write_fields(log, (*_LOG_LAYOUT, *_LOG_LAYOUT_4), result.log)
 
 
-def _write_fields(group: h5py.Group, layout: _Layout, source: Result | Log | Parameters | HygieneReport) -> None:
-    for name, field, _, units, frame in layout:
-        dataset = group.create_dataset(name, data=attrgetter(field)(source))
-        dataset.attrs["units"], dataset.attrs["frame"] = units, frame
+def _sequence_fields(h5file: h5py.File) -> dict[str, Any]:
+    """Arguments of `Archive` but the results; what is wrong with them is wrong with the archive."""
+    try:
+        return read_sequence_fields(h5file, h5file.filename)
+    except DataError as error:
+        raise ArchiveError(str(error)) from None
 
 
-def _read_fields(where: str, group: h5py.Group, layout: _Layout, sizes: dict[str, int]) -> dict[str, Any]:
-    """The data sets of a layout by field; the first one along a dimension decides its length, unless it is given."""
-    fields: dict[str, Any] = {}
-    for name, field, shape, _, _ in layout:
-        if not isinstance(group.get(name), h5py.Dataset):
-            raise ArchiveError(f"{where}/{name} is missing")
-        value = group[name][()]
-        if value.ndim == len(shape):
-            for n, length in zip(shape, value.shape, strict=True):
-                if isinstance(n, str):
-                    sizes.setdefault(n, length)
-        wanted = tuple(sizes.get(n, n) if isinstance(n, str) else n for n in shape)
-        if value.shape != wanted:
-            raise ArchiveError(f"{where}/{name} has shape {value.shape}, expected {wanted}")
-        fields[field] = value
-    return fields
-
-
-def _read_result(path: str | Path, h5file: h5py.File, mode: str, camera: StereoCamera, T_cam_imu: Array) -> Result:
-    group = h5file["runs"][mode]
-    sizes: dict[str, int] = {}
+def _read_result(h5file: h5py.File, mode: str, camera: StereoCamera, T_cam_imu: Array) -> Result:
+    group = hdf5.subgroup(h5file, f"runs/{mode}")
+    version = group.attrs.get("format_version", h5file.attrs["format_version"])
     fields: dict[str, dict[str, Any]] = {"": {}, "landmarks": {}, "innovation": {}, "rejections": {}}
-    for field, value in _read_fields(f"{path}: runs/{mode}", group, _LAYOUT, sizes).items():
+    for field, value in hdf5.read_fields(group, _LAYOUT).items():
         part, _, leaf = field.rpartition(".")
         fields[part][leaf] = value
-    log = None
-    if isinstance(group.get("log"), h5py.Group):
-        where = f"{path}: runs/{mode}/log"
-        is_old = h5file.attrs["format_version"] < 4
-        layout = _LOG_LAYOUT if is_old else (*_LOG_LAYOUT, *_LOG_LAYOUT_4)
-        log_fields = _read_fields(where, group["log"], layout, {key: sizes[key] for key in ("T", "M")})
-        if "first_estimates" not in group["log"].attrs:
-            raise ArchiveError(f"{where}: attribute first_estimates is missing")
-        log_fields["first_estimates"] = bool(group["log"].attrs["first_estimates"])
-        log = Log.of_poses_alone(**log_fields) if is_old else Log(**log_fields)
-    parameters = None
-    if isinstance(group.get("parameters"), h5py.Group):
-        where, stored = f"{path}: runs/{mode}/parameters", group["parameters"]
-        found = _read_fields(where, stored, _PARAMETERS_LAYOUT, {"T": sizes["T"]})
-        names = {key: tuple(str(text) for text in np.ravel(stored.attrs.get(key, ()))) for key in ("name", "unit")}
-        if any(len(texts) != len(found["prior_std"]) for texts in names.values()):
-            raise ArchiveError(f"{where}: the attributes name and unit do not fit {len(found['prior_std'])} parameters")
-        parameters = Parameters(names["name"], names["unit"], **found)
-    hygiene = None
-    if isinstance(group.get("hygiene"), h5py.Group):
-        where = f"{path}: runs/{mode}/hygiene"
-        findings = _read_fields(where, group["hygiene"], _HYGIENE_LAYOUT, {})
-        if "observations" not in group["hygiene"].attrs:
-            raise ArchiveError(f"{where}: attribute observations is missing")
-        hygiene = HygieneReport(observations=int(group["hygiene"].attrs["observations"]), **findings)
-    for name in ("sequence_name", "config", "counts", "noise_twist_std", "noise_pixel_std_px"):
-        if name not in group.attrs:
-            raise ArchiveError(f"{path}: attribute {name} of runs/{mode} is missing")
-    if not isinstance(group.get("attributes"), h5py.Group):
-        raise ArchiveError(f"{path}: runs/{mode}/attributes is missing")
-    noise = _read_noise(group)
+    sizes = {"T": len(fields[""]["time_s"]), "M": len(fields["landmarks"]["id"])}
+    # These two have no default, and no result is without.
+    for name in ("noise_twist_std", "noise_pixel_std_px"):
+        hdf5.attribute(group, name)
+    noise = Noise(**noise_of_attributes(group.attrs, "noise_"))
     return Result(
         mode=mode,
-        sequence_name=str(group.attrs["sequence_name"]),
+        sequence_name=str(hdf5.attribute(group, "sequence_name")),
         **fields[""],
         landmarks=Landmarks(**fields["landmarks"]),
         innovation=Innovation(**fields["innovation"]),
         rejections=Rejections(**fields["rejections"]),
-        counts=json.loads(group.attrs["counts"]),
-        config=_renamed(json.loads(group.attrs["config"]), noise),
+        counts=json.loads(hdf5.attribute(group, "counts")),
+        config=_in_todays_terms(json.loads(hdf5.attribute(group, "config")), noise, version),
         noise=noise,
         camera=camera,
         T_cam_imu=T_cam_imu,
-        log=log,
-        hygiene=hygiene,
-        parameters=parameters,
-        attributes={
-            key: value.item() if isinstance(value, np.generic) else value
-            for key, value in group["attributes"].attrs.items()
-        },
+        log=_read_log(hdf5.subgroup(group, "log"), sizes, version) if "log" in group else None,
+        hygiene=_read_hygiene(hdf5.subgroup(group, "hygiene")) if "hygiene" in group else None,
+        parameters=_read_parameters(hdf5.subgroup(group, "parameters"), sizes) if "parameters" in group else None,
+        attributes=hdf5.attributes(hdf5.subgroup(group, "attributes")),
     )
 
 
-def _renamed(config: dict[str, Any], noise: Noise) -> dict[str, Any]:
-    """A configuration from before version 3, whose filter had the rules that hygiene has now, in today's terms."""
+def _read_log(group: h5py.Group, sizes: Mapping[str, int], version: int) -> Log:
+    is_old = version < 4
+    found = hdf5.read_fields(group, _LOG_LAYOUT if is_old else (*_LOG_LAYOUT, *_LOG_LAYOUT_4), sizes)
+    found["first_estimates"] = bool(hdf5.attribute(group, "first_estimates"))
+    return Log.of_poses_alone(**found) if is_old else Log(**found)
+
+
+def _read_parameters(group: h5py.Group, sizes: Mapping[str, int]) -> Parameters:
+    found = hdf5.read_fields(group, _PARAMETERS_LAYOUT, {"T": sizes["T"]})
+    names, units = (hdf5.texts(group.attrs.get(key, ())) for key in ("name", "unit"))
+    if not len(names) == len(units) == len(found["prior_std"]):
+        raise ArchiveError(
+            f"{group.file.filename}: the attributes name and unit of {group.name.strip('/')} do not fit "
+            f"{len(found['prior_std'])} parameters"
+        )
+    return Parameters(names, units, **found)
+
+
+def _read_hygiene(group: h5py.Group) -> HygieneReport:
+    findings = hdf5.read_fields(group, _HYGIENE_LAYOUT)
+    return HygieneReport(observations=int(hdf5.attribute(group, "observations")), **findings)
+
+
+def _in_todays_terms(config: dict[str, Any], noise: Noise, version: int) -> dict[str, Any]:
+    """A configuration of an older version.
+
+    Before version 4, drift was a share of the distance driven: today's drift, in px, says nothing of it. Before version
+    3, the filter had the rules that hygiene has now.
+    """
+    if version < 4 and "noise" in config:
+        config = {**config, "noise": {**config["noise"], "drift": None}}
     if "hygiene" in config:
         return config
     rest = dict(config.get("filter", {}))
@@ -409,39 +388,3 @@ def _renamed(config: dict[str, Any], noise: Noise) -> dict[str, Any]:
         "reused_id_sigma": 0.0,
     }
     return {**config, "filter": rest, "hygiene": {**dataclasses.asdict(HygieneConfig()), **rules}}
-
-
-def _read_noise(group: h5py.Group) -> Noise:
-    """The noise of a run; what an older version of the format did not know yet has its default."""
-    stored = {f.name: group.attrs.get(f"noise_{f.name}") for f in fields(Noise)}
-    given: dict[str, Any] = {
-        name: float(value) if np.ndim(value) == 0 else value for name, value in stored.items() if value is not None
-    }
-    return Noise(**given)
-
-
-def _modes(path: str | Path, h5file: h5py.File) -> tuple[str, ...]:
-    if not isinstance(h5file.get("runs"), h5py.Group):
-        raise ArchiveError(f"{path}: the group runs is missing")
-    return tuple(h5file["runs"])
-
-
-@contextmanager
-def _opened(path: str | Path) -> Iterator[h5py.File]:
-    """The archive, open for reading and of a known version; whatever damage shows meanwhile is an `ArchiveError`."""
-    try:
-        with h5py.File(str(path), "r") as h5file:
-            if h5file.attrs.get("format") != FORMAT:
-                raise ArchiveError(
-                    f"{path}: no ekfslam archive: format is {h5file.attrs.get('format')!r}, expected {FORMAT!r}"
-                )
-            version = h5file.attrs.get("format_version")
-            if not isinstance(version, np.integer) or version > FORMAT_VERSION:
-                raise ArchiveError(
-                    f"{path}: has format version {version}, this release reads up to version {FORMAT_VERSION}"
-                )
-            yield h5file
-    except DataError as error:
-        raise ArchiveError(str(error)) from None
-    except (OSError, RuntimeError, KeyError, ValueError) as error:  # what h5py and json raise at damaged files
-        raise ArchiveError(f"{path}: missing, truncated or no HDF5 file ({error})") from None

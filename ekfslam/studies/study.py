@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
@@ -34,7 +33,6 @@ from types import MappingProxyType
 from typing import Any
 from zlib import crc32
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,6 +55,7 @@ from ekfslam.geometry import se3
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress as with_progress
 from ekfslam.runner import versions
+from ekfslam.storage import hdf5
 
 FORMAT = "ekfslam-study"
 FORMAT_VERSION = 1
@@ -107,6 +106,15 @@ JOINT_INSTANTS = 4  # equally spaced, the last one at the last frame
 IN_FLIGHT = 256
 CHECKPOINT_S = 5.0
 CHECKPOINT_SHARE = 0.05  # of the time may go into checkpoints of a large study
+
+# Data sets below a level, and below a variant of it.
+_LEVEL: hdf5.Layout = (
+    ("time", "time", ("T",), "s", "nominal stamps"),
+    ("done", "done", ("runs",), "1", "runs that are in"),
+)
+_VARIANT: hdf5.Layout = tuple(
+    (name, name, ("runs", *shape), units, frame) for name, (shape, _, units, frame) in FIELDS.items()
+)
 
 Record = dict[str, dict[str, NDArray]]  # variant, field, value of one run
 
@@ -401,38 +409,24 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
     Raises:
         ArchiveError: The file cannot be written.
     """
-    path = Path(path)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     study = archive.study
-    try:
-        with h5py.File(str(unfinished), "w") as h5file:
-            h5file.attrs.update(
-                format=FORMAT,
-                format_version=FORMAT_VERSION,
-                error_convention=ERROR_CONVENTION,
-                study=json.dumps(study.parameters),
-                seed=str(study.seed),  # as text: a seed may be larger than any integer of HDF5
+    with hdf5.creating(path, FORMAT, FORMAT_VERSION) as h5file:
+        hdf5.write_attributes(
+            h5file,
+            {
+                "error_convention": ERROR_CONVENTION,
+                "study": json.dumps(study.parameters),
+                "seed": str(study.seed),  # as text: a seed may be larger than any integer of HDF5
                 **versions(),
-            )
-            for level, world in study.levels.items():
-                group = h5file.create_group(f"levels/{level}")
-                group.attrs["world"] = json.dumps(dataclasses.asdict(world))
-                _dataset(group, "time", archive.time_s(level), "s", "nominal stamps")
-                _dataset(group, "done", archive.done[level], "1", "runs that are in")
-                for variant, values in archive.data[level].items():
-                    for field, (_, _, units, frame) in FIELDS.items():
-                        _dataset(group, f"{variant}/{field}", values[field], units, frame)
-                    group[f"{variant}/joint_nees_per_dof"].attrs["frames"] = _joint_frames(world.frames)
-        unfinished.replace(path)
-    except OSError as error:
-        raise ArchiveError(f"{path}: cannot be written: {error}") from None
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
-def _dataset(group: h5py.Group, name: str, value: NDArray, units: str, frame: str) -> None:
-    dataset = group.create_dataset(name, data=value)
-    dataset.attrs["units"], dataset.attrs["frame"] = units, frame
+            },
+        )
+        for level, world in study.levels.items():
+            group = h5file.create_group(f"levels/{level}")
+            hdf5.write_attributes(group, {"world": json.dumps(dataclasses.asdict(world))})
+            hdf5.write_fields(group, _LEVEL, {"time": archive.time_s(level), "done": archive.done[level]})
+            for variant, values in archive.data[level].items():
+                hdf5.write_fields(group.create_group(variant), _VARIANT, values)
+                group[f"{variant}/joint_nees_per_dof"].attrs["frames"] = _joint_frames(world.frames)
 
 
 def read_study(path: str | Path) -> StudyArchive:
@@ -445,26 +439,17 @@ def read_study(path: str | Path) -> StudyArchive:
 
 
 def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
-    try:
-        with h5py.File(str(path), "r") as h5file:
-            attributes = h5file.attrs
-            if attributes.get("format") != FORMAT:
-                raise ArchiveError(f"{path}: no study: format is {attributes.get('format')!r}, expected {FORMAT!r}")
-            if attributes["format_version"] > FORMAT_VERSION:
-                raise ArchiveError(
-                    f"{path}: has format version {attributes['format_version']}, "
-                    f"this release reads up to version {FORMAT_VERSION}"
-                )
-            parameters = json.loads(attributes["study"])
-            parameters["levels"] = {name: Loop(**world) for name, world in parameters["levels"].items()}
-            study = Study(**parameters)
-            groups = h5file["levels"]
-            data = {
-                level: {v: {field: groups[f"{level}/{v}/{field}"][()] for field in FIELDS} for v in study.variants}
-                for level in study.levels
-            }
-            done = {level: groups[f"{level}/done"][()] for level in study.levels}
-            found_versions = {key: str(value) for key, value in attributes.items() if key.startswith("version_")}
-            return StudyArchive(study, done, data), found_versions
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # what h5py and json raise at damage
-        raise ArchiveError(f"{path}: missing, truncated or no archive of a study ({error})") from None
+    with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
+        parameters = json.loads(hdf5.attribute(h5file, "study"))
+        parameters["levels"] = {name: Loop(**world) for name, world in parameters["levels"].items()}
+        study = Study(**parameters)
+        done, data = {}, {}
+        for level, world in study.levels.items():
+            group = hdf5.subgroup(h5file, f"levels/{level}")
+            sizes = {"runs": study.runs, "T": world.frames, "J": JOINT_INSTANTS}
+            done[level] = hdf5.read_fields(group, _LEVEL, sizes)["done"]
+            data[level] = {v: hdf5.read_fields(hdf5.subgroup(group, v), _VARIANT, sizes) for v in study.variants}
+        found_versions = {
+            key: str(value) for key, value in hdf5.attributes(h5file).items() if key.startswith("version_")
+        }
+        return StudyArchive(study, done, data), found_versions

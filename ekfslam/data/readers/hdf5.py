@@ -9,51 +9,62 @@
     /truth              frame (F,), T_world_imu (F, 4, 4); only if there is truth
         landmarks       id (M,), position (M, 3)
 
-Every dataset has the attributes ``units`` and ``frame`` (of reference). Text is stored with fixed length: libhdf5 hangs
-on some damaged files with text of variable length. The newer file layout carries checksums of all but the arrays.
+See `ekfslam.storage.hdf5` for what all files have in common.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
+from ekfslam.data.noise import Noise
 from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
-from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.data.sequence import Observations, Sequence, Truth
 from ekfslam.errors import ArchiveError, ShapeError, UnknownFormatError
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.storage import hdf5
 
 FORMAT = "ekfslam-sequence"
 FORMAT_VERSION = 1
 
-_CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
-_FURTHER_NOISE = (
-    "twist_walk_std",
-    "motion_std",
-    "misalignment_rad",
-    "drift",
-    "bearing_drift_rad",
-    "tilt_rad",
-    "margin",
+_INDICES = ("frame index", "landmark id")  # units of whole numbers
+
+# Part of a `Sequence` to data sets below /, fields of the part, shape, units, frame.
+_SEQUENCE: hdf5.Layout = (
+    ("sequence/time", "time_s", ("T",), "s", "clock of the recording"),
+    ("sequence/twist", "twist", ("T", 6), "m/s (columns 0-2), rad/s (columns 3-5)", "imu"),
+    ("sequence/T_cam_imu", "T_cam_imu", (4, 4), "m (translation)", "cam from imu"),
 )
-_SPELLING = {
-    "time_s": "sequence/time",
-    "twist": "sequence/twist",
-    "T_cam_imu": "sequence/T_cam_imu",
+_OBSERVATIONS: hdf5.Layout = (
+    ("sequence/observations/frame", "frame", ("K",), "frame index", "none"),
+    ("sequence/observations/landmark", "landmark", ("K",), "landmark id", "none"),
+    ("sequence/observations/pixels", "pixels_px", ("K", 4), "px", "image: uL, vL, uR, vR"),
+)
+_NOISE: hdf5.Layout = (
+    ("sequence/noise/twist_std", "twist_std", (6,), "m/s (0-2), rad/s (3-5)", "imu"),
+    ("sequence/noise/pixel_std", "pixel_std_px", (4,), "px", "image: uL, vL, uR, vR"),
+)
+_TRUTH: hdf5.Layout = (
+    ("truth/frame", "frame", ("F",), "frame index", "none"),
+    ("truth/T_world_imu", "T_world_imu", ("F", 4, 4), "m (translation)", "world from imu"),
+    ("truth/landmarks/id", "landmark", ("M",), "landmark id", "none"),
+    ("truth/landmarks/position", "position_m", ("M", 3), "m", "world"),
+)
+_NOTES: hdf5.Layout = (("sequence/notes", "notes", ("n",), "text", "none"),)
+_CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
+_OLD_NOISE = ("drift", "bearing_drift_rad")  # walks of landmarks, before errors of tracks walked in the image
+_NOISE_FIELDS = tuple(field for _, field, *_ in _NOISE)
+
+_PARTS = {"": _SEQUENCE, "observations.": _OBSERVATIONS, "noise.": _NOISE, "truth.": _TRUTH}
+_SPELLING = {part + field: name for part, layout in _PARTS.items() for name, field, *_ in layout} | {
     "K": "sequence/camera@fu_px, fv_px",
     "baseline": "sequence/camera@baseline_m",
     "observations": "sequence/observations",
-    "observations.frame": "sequence/observations/frame",
-    "observations.landmark": "sequence/observations/landmark",
-    "noise.twist_std": "sequence/noise/twist_std",
-    "noise.pixel_std_px": "sequence/noise/pixel_std",
-    "truth.frame": "truth/frame",
-    "truth.T_world_imu": "truth/T_world_imu",
-    "truth.position_m": "truth/landmarks/position",
 }
 
 
@@ -63,15 +74,10 @@ def write_sequence(sequence: Sequence, path: str | Path) -> None:
     Raises:
         ArchiveError: The file cannot be written.
     """
-    try:
-        with h5py.File(path, "w", libver="v110") as h5file:
-            h5file.attrs["format"] = _text(FORMAT)
-            h5file.attrs["format_version"] = FORMAT_VERSION
-            write_sequence_group(h5file, sequence, include_observations=True)
-            if sequence.truth is not None:
-                write_truth_group(h5file, sequence.truth)
-    except OSError as error:
-        raise ArchiveError(f"{path}: cannot be written: {error}") from None
+    with hdf5.creating(path, FORMAT, FORMAT_VERSION, compact=True) as h5file:
+        write_sequence_group(h5file, sequence, include_observations=True)
+        if sequence.truth is not None:
+            write_truth_group(h5file, sequence.truth)
 
 
 def read_sequence(path: str | Path) -> Sequence:
@@ -82,45 +88,26 @@ def read_sequence(path: str | Path) -> Sequence:
         ArchiveError: A newer release wrote the file.
         DataError: A field is missing or malformed; the subclass says how.
     """
-    try:
-        with h5py.File(path, "r") as h5file:
-            found, version = _plain(h5file.attrs.get("format")), h5file.attrs.get("format_version")
-            if found != FORMAT:
-                raise UnknownFormatError(
-                    f"{path}: an HDF5 file of format {found!r} with [{', '.join(h5file)}]; expected format {FORMAT!r}"
-                )
-            if not isinstance(version, np.integer) or version > FORMAT_VERSION:
-                raise ArchiveError(
-                    f"{path}: has format version {version}, this release reads up to version {FORMAT_VERSION}"
-                )
-            return read_sequence_group(h5file, str(path))
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # what h5py raises at damaged files
-        raise UnknownFormatError(f"{path}: damaged HDF5 file ({error}); expected format {FORMAT!r}") from None
+    with hdf5.opened(path, FORMAT, FORMAT_VERSION, error=UnknownFormatError) as h5file:
+        return read_sequence_group(h5file, str(path))
 
 
 def write_sequence_group(h5file: h5py.Group, sequence: Sequence, include_observations: bool) -> None:
     """Write ``/sequence`` below an open file or group; the truth is left to `write_truth_group`."""
-    group = h5file.create_group("sequence")
-    group.attrs["name"] = _text(sequence.name)
-    group.attrs["velocity_frame"] = _text(sequence.velocity_frame)
-    _write(group, "time", sequence.time_s, "s", "clock of the recording")
-    _write(group, "twist", sequence.twist, "m/s (columns 0-2), rad/s (columns 3-5)", "imu")
-    _write(group, "T_cam_imu", sequence.T_cam_imu, "m (translation)", "cam from imu")
-    _write(group, "notes", np.array([_text(note) for note in sequence.notes], dtype=np.bytes_), "text", "none")
-    group.create_group("camera").attrs.update({name: getattr(sequence.camera, name) for name in _CAMERA})
-    facts = {key: _text(value) if isinstance(value, str) else value for key, value in sequence.attributes.items()}
-    group.create_group("attributes").attrs.update(facts)
+    hdf5.write_fields(h5file, _SEQUENCE, sequence, compact=True)
+    notes = np.array([hdf5.fixed_text(note) for note in sequence.notes], dtype=np.bytes_)
+    hdf5.write_fields(h5file, _NOTES, {"notes": notes}, compact=True)
+    group = h5file["sequence"]
+    names = {"name": sequence.name, "velocity_frame": sequence.velocity_frame}
+    hdf5.write_attributes(group, names, compact=True)
+    hdf5.write_attributes(group.create_group("camera"), {name: getattr(sequence.camera, name) for name in _CAMERA})
+    hdf5.write_attributes(group.create_group("attributes"), sequence.attributes, compact=True)
     if sequence.noise is not None:
-        noise = group.create_group("noise")
-        _write(noise, "twist_std", sequence.noise.twist_std, "m/s (0-2), rad/s (3-5)", "imu")
-        _write(noise, "pixel_std", sequence.noise.pixel_std_px, "px", "image: uL, vL, uR, vR")
-        further = {name: getattr(sequence.noise, name) for name in _FURTHER_NOISE}
-        noise.attrs.update({name: value for name, value in further.items() if value is not None})
+        hdf5.write_fields(h5file, _NOISE, sequence.noise, compact=True)
+        further = noise_attributes(sequence.noise)
+        hdf5.write_attributes(group["noise"], {key: further[key] for key in further if key not in _NOISE_FIELDS})
     if include_observations:
-        observations = group.create_group("observations")
-        _write(observations, "frame", sequence.observations.frame, "frame index", "none")
-        _write(observations, "landmark", sequence.observations.landmark, "landmark id", "none")
-        _write(observations, "pixels", sequence.observations.pixels_px, "px", "image: uL, vL, uR, vR")
+        hdf5.write_fields(h5file, _OBSERVATIONS, sequence.observations, compact=True)
 
 
 def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
@@ -130,11 +117,11 @@ def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
         ArchiveError: The group was written without observations; `read_sequence_fields` reads what there is.
         DataError: A field is missing or malformed; the subclass says how.
     """
-    fields = read_sequence_fields(h5file, source)
-    if "observations" not in fields:
+    found = read_sequence_fields(h5file, source)
+    if "observations" not in found:
         raise ArchiveError(f"{source}: holds a sequence without its observations")
     with spelled_as_in(source, _SPELLING):
-        return Sequence(**fields)
+        return Sequence(**found)
 
 
 def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
@@ -148,41 +135,33 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
         for name in _CAMERA:
             if not isinstance(camera.get(name), int | float):
                 raise ShapeError("this attribute is missing or no number", field=f"sequence/camera@{name}")
-        fields: dict[str, Any] = {
-            "name": str(_attributes(h5file, "sequence").get("name", "")),
+        names = _attributes(h5file, "sequence")
+        found: dict[str, Any] = {
+            "name": str(names.get("name", "")),
             "source": source,
-            "time_s": require_numbers(h5file, "sequence/time", (None,)),
-            "twist": require_numbers(h5file, "sequence/twist", (None, 6)),
+            **_read(h5file, _SEQUENCE),
             "camera": StereoCamera(**{name: camera[name] for name in _CAMERA}),
-            "T_cam_imu": require_numbers(h5file, "sequence/T_cam_imu", (4, 4)),
-            "velocity_frame": str(_attributes(h5file, "sequence").get("velocity_frame", "imu")),
+            "velocity_frame": str(names.get("velocity_frame", "imu")),
             "truth": read_truth_group(h5file, source) if "truth" in h5file else None,
-            "notes": tuple(str(_plain(note)) for note in np.ravel(require(h5file, "sequence/notes"))),
+            "notes": hdf5.texts(require(h5file, "sequence/notes")),
             "attributes": attributes,
         }
         if "sequence/noise" in h5file:
-            fields["noise"] = Noise(
-                require_numbers(h5file, "sequence/noise/twist_std", (6,)),
-                require_numbers(h5file, "sequence/noise/pixel_std", (4,)),
-                **_further_noise(h5file["sequence/noise"].attrs),
+            further = _attributes(h5file, "sequence/noise")
+            found["noise"] = Noise(**{**noise_of_attributes(further), **_read(h5file, _NOISE)})
+            found["notes"] += tuple(
+                f"The noise states {name} {further[name]}, which no model uses any more."
+                for name in _OLD_NOISE
+                if further.get(name)
             )
         if "sequence/observations" in h5file:
-            fields["observations"] = Observations(
-                require_numbers(h5file, "sequence/observations/frame", (None,), np.int64),
-                require_numbers(h5file, "sequence/observations/landmark", (None,), np.int64),
-                require_numbers(h5file, "sequence/observations/pixels", (None, 4)),
-            )
-        return fields
+            found["observations"] = Observations(**_read(h5file, _OBSERVATIONS))
+        return found
 
 
 def write_truth_group(h5file: h5py.Group, truth: Truth) -> None:
     """Write ``/truth`` below an open file or group."""
-    group = h5file.create_group("truth")
-    _write(group, "frame", truth.frame, "frame index", "none")
-    _write(group, "T_world_imu", truth.T_world_imu, "m (translation)", "world from imu")
-    landmarks = group.create_group("landmarks")
-    _write(landmarks, "id", truth.landmark, "landmark id", "none")
-    _write(landmarks, "position", truth.position_m, "m", "world")
+    hdf5.write_fields(h5file, _TRUTH, truth, compact=True)
 
 
 def read_truth_group(h5file: h5py.Group, source: str) -> Truth:
@@ -192,39 +171,35 @@ def read_truth_group(h5file: h5py.Group, source: str) -> Truth:
         DataError: A field is missing or malformed; the subclass says how.
     """
     with spelled_as_in(source):
-        return Truth(
-            require_numbers(h5file, "truth/frame", (None,), np.int64),
-            require_numbers(h5file, "truth/T_world_imu", (None, 4, 4)),
-            require_numbers(h5file, "truth/landmarks/id", (None,), np.int64),
-            require_numbers(h5file, "truth/landmarks/position", (None, 3)),
+        return Truth(**_read(h5file, _TRUTH))
+
+
+def noise_attributes(noise: Noise, prefix: str = "") -> dict[str, Any]:
+    """Noise as attributes, ``<prefix><field>``."""
+    return {prefix + name: value for name, value in vars(noise).items() if value is not None}
+
+
+def noise_of_attributes(attributes: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Arguments of `Noise` among attributes; what an older file does not state has its default."""
+    stored = {f.name: attributes.get(prefix + f.name) for f in fields(Noise)}
+    return {name: float(value) if np.ndim(value) == 0 else value for name, value in stored.items() if value is not None}
+
+
+def _read(h5file: h5py.Group, layout: hdf5.Layout) -> dict[str, Any]:
+    """The data sets of a layout by field, as finite numbers; that lengths agree, the record checks that takes them."""
+    return {
+        field: require_numbers(
+            h5file,
+            name,
+            tuple(None if isinstance(n, str) else n for n in shape),
+            np.int64 if units in _INDICES else np.float64,
         )
-
-
-def _further_noise(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    given = {name: attributes[name] for name in _FURTHER_NOISE if name in attributes}
-    return {name: float(value) if np.ndim(value) == 0 else value for name, value in given.items()}
-
-
-def _write(group: h5py.Group, name: str, value: Any, units: str, frame: str) -> None:
-    # Only long arrays are worth compressing; HDF5 cannot chunk an empty one.
-    compression = "gzip" if np.size(value) > 10_000 else None
-    dataset = group.create_dataset(name, data=value, compression=compression)
-    dataset.attrs["units"], dataset.attrs["frame"] = _text(units), _text(frame)
+        for name, field, shape, units, _ in layout
+    }
 
 
 def _attributes(h5file: h5py.Group, name: str) -> dict[str, Any]:
-    """HDF5 attributes of a group as plain Python values."""
+    """Attributes of a group that must be there."""
     if not isinstance(h5file.get(name), h5py.Group):
         raise ShapeError("this group is missing", field=name)
-    return {key: _plain(value) for key, value in h5file[name].attrs.items()}
-
-
-def _text(text: str) -> np.bytes_:
-    """Text in HDF5's fixed-length form."""
-    return np.bytes_(text.encode())
-
-
-def _plain(value: Any) -> Any:
-    """A stored scalar as a plain Python value."""
-    value = value.item() if isinstance(value, np.generic) else value
-    return value.decode(errors="replace") if isinstance(value, bytes) else value
+    return hdf5.attributes(h5file[name])
