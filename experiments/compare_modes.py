@@ -21,8 +21,7 @@ filter keeps them all.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from common import argument_parser
 
 import ekfslam
 
@@ -30,9 +29,7 @@ WORLDS = ("builtin:city", "builtin:loop")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "results" / "demo", metavar="DIR")
-    out = parser.parse_args().out
+    out = argument_parser(__doc__, "demo").parse_args().out
     for world in WORLDS:
         comparison = ekfslam.compare(ekfslam.open_sequence(world))
         comparison.save(out / comparison.sequence.name)

@@ -22,10 +22,8 @@ Seconds are wall-clock within the solvers: building GTSAM's factors from Python 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
-import os
 import sys
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -35,6 +33,17 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from common import (
+    DENSE,
+    STARRY_NIGHT,
+    UTIAS,
+    argument_parser,
+    has_recordings,
+    open_recording,
+    trajectory_errors,
+    with_aligned,
+    write,
+)
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter
@@ -44,8 +53,8 @@ import ekfslam
 from ekfslam.arrays import Array
 from ekfslam.config import PosteriorConfig
 from ekfslam.data.sequence import Sequence, Truth
-from ekfslam.evaluation.trajectory import absolute_trajectory_error
-from ekfslam.figures.style import GREY, ORANGE, REFERENCE, marker_of, save_figure, styled
+from ekfslam.evaluation.tables import MISSING, document, markdown_table, number
+from ekfslam.figures.style import GREY, ORANGE, REFERENCE, marker_of, styled
 from ekfslam.filters.log import Log
 from ekfslam.filters.observing import Rig
 from ekfslam.filters.result import Result
@@ -60,27 +69,17 @@ try:
 except ModuleNotFoundError:
     sys.exit("GTSAM is missing: pip install 'ekfslam[bench]'")
 
-ROOT = Path(__file__).parents[1]
-DATA = Path(os.environ.get("EKFSLAM_DATA") or ROOT.parent / "shared" / "data")
-
 # Noise was added to the velocities of the later edition; its tracks are rougher too.
 NOISY = {"noise": {"sigma_v_m_s": 0.5, "sigma_w_rad_s": 0.05, "sigma_px": 2.0}}
-# File, KITTI odometry poses, settings.
-SETS: tuple[tuple[str, str | None, dict[str, dict[str, float]]], ...] = (
-    ("ece276a/0027.npz", "07", {}),
-    ("ece276a/0020.npz", "06", {}),
-    ("ece276a/0042.npz", "01", {}),
-    ("ece276a/0027_dense_noisy.npz", "07", NOISY),
-    ("ece276a/0022_dense_noisy.npz", None, NOISY),
-    ("utias/2011_09_26_drive_0001_sync_KLT.mat", None, {}),
-    ("utias/2011_09_26_drive_0009_sync_KLT.mat", None, {}),
-    ("utias/2011_09_26_drive_0027_sync_KLT.mat", None, {}),
-    ("utias/2011_09_26_drive_0036_sync_KLT.mat", None, {}),
-    ("utias/2011_09_30_drive_0020_sync_KLT.mat", None, {}),
-    ("utias/2011_09_30_drive_0027_sync_KLT.mat", None, {}),
-    ("utias/2011_10_03_drive_0042_sync_KLT.mat", None, {}),
-    ("utias/dataset3.mat", None, {}),
-)
+# Recordings and their settings.
+SETS: dict[str, dict[str, dict[str, float]]] = {
+    "ece276a/0027.npz": {},
+    "ece276a/0020.npz": {},
+    "ece276a/0042.npz": {},
+    DENSE: NOISY,
+    "ece276a/0022_dense_noisy.npz": NOISY,
+    **{file: {} for file in (*UTIAS, STARRY_NIGHT)},
+}
 
 # GTSAM's own default is 0.1 (metres and radians alike) at every tenth update; here it may relinearise at every one.
 RELINEARISE = 0.1
@@ -267,14 +266,13 @@ def orthonormal(T: Array) -> Array:
     return se3.transform(U @ Vt, T[..., :3, 3])
 
 
-def open_set(data: Path, file: str, poses: str | None) -> Sequence:
+def open_set(data: Path, file: str) -> Sequence:
     """A recording with rotations that are rotations to rounding.
 
     As printed they are off by 1e-7. Inverses by transposition and by GTSAM's product then differ by that, at positions
     some hundred metres from the origin enough to change the cost by 1e-4.
     """
-    truth = None if poses is None else data / "kitti_odometry_poses" / f"{poses}.txt"
-    sequence = ekfslam.open_sequence(data / file, truth=truth) if truth else ekfslam.open_sequence(data / file)
+    sequence = open_recording(data, file)
     known = sequence.truth
     if known is not None:
         known = Truth(known.frame, orthonormal(known.T_world_imu), known.landmark, known.position_m)
@@ -304,10 +302,8 @@ def solve_all(sequence: Sequence, overrides: dict[str, dict[str, float]]) -> dic
     def entry(T_world_imu: Array, positions_m: Array | None = None, **more: float | int) -> dict[str, Any]:
         """One estimator: errors, and the cost in both functions."""
         values: dict[str, Any] = {"ate_m": None, "ate_aligned_m": None, **more}
-        truth = sequence.truth
-        if truth is not None and len(truth.frame):
-            for key, align in (("ate_m", False), ("ate_aligned_m", True)):
-                values[key] = absolute_trajectory_error(T_world_imu[truth.frame], truth.T_world_imu, align)
+        if sequence.truth is not None and len(sequence.truth.frame):
+            values |= trajectory_errors(sequence, T_world_imu)
         if positions_m is not None:
             values["cost"], values["behind"] = cost_of(rows, config, T_world_imu, positions_m)
             values["gtsam_cost"] = graph.error(to_gtsam(T_world_imu, positions_m))
@@ -376,77 +372,74 @@ def medians(table: dict[str, dict[str, Any]], above: tuple[str, str], below: tup
 
 def markdown(table: dict[str, dict[str, Any]], config: PosteriorConfig) -> str:
     """The report of the experiment."""
-
-    def cells(heading: str, values: list[str]) -> str:
-        return f"| {heading} | " + " | ".join(values) + " |"
-
-    def errors(row: dict[str, Any], name: str) -> str:
-        found = row["estimators"][name]
-        mark = " *" if found.get("weak_priors") else ""
-        value = "-" if found["ate_m"] is None else f"{found['ate_m']:.3f} ({found['ate_aligned_m']:.3f})"
-        return value + mark
-
-    def quotient(row: dict[str, Any], key: str) -> str:
-        value = ratio(row, ("MAP", key), ("iSAM2", key))
-        return "-" if value is None else f"{value:.3f}"
-
     kernel = config.kernel if config.kernel == "none" else f"{config.kernel}, width {config.kernel_width:g}"
-    lines = [
-        "# Maximum a posteriori, next to GTSAM\n",
+    middle, largest = medians(table, ("MAP", "gtsam_cost"), ("GTSAM converged", "gtsam_cost"))
+    return document(
+        "# Maximum a posteriori, next to GTSAM",
         f"GTSAM {version('gtsam')}; kernel {kernel}; iSAM2 relinearises beyond {RELINEARISE:g} (its "
         f"default), in the last column beyond {RELINEARISE_OFTEN:g}, at every update. "
         "GTSAM and the posterior use the same observations, noise and kernel. Where iSAM2 has a star its system became "
-        f"singular; the figures are with a prior of {LANDMARK_STD_M:g} m on every landmark.\n",
-        "## Absolute trajectory error in metres (in brackets: aligned)\n",
-        "| set | frames | landmarks | observations | " + " | ".join(COMPARED) + " | MAP / iSAM2 (aligned) |",
-        "|---|" + "---:|" * (len(COMPARED) + 4),
-    ]
-    for name, row in table.items():
-        sizes = [str(row[key]) for key in ("frames", "landmarks", "observations")]
-        found = [errors(row, estimator) for estimator in COMPARED]
-        lines.append(cells(name, [*sizes, *found, f"{quotient(row, 'ate_m')} ({quotient(row, 'ate_aligned_m')})"]))
-    for key, what in (("ate_m", "ATE"), ("ate_aligned_m", "aligned ATE")):
-        middle, largest = medians(table, ("MAP", key), ("iSAM2", key))
-        lines.append(f"\n{what}, MAP / iSAM2: {middle:.3f} in the median over the sets, {largest:.3f} at the most;")
-        middle, largest = medians(table, ("MAP", key), ("iSAM2, 0.01", key))
-        lines.append(f"MAP / iSAM2 that relinearises beyond {RELINEARISE_OFTEN:g}: {middle:.4f}, {largest:.3f}.")
-    lines += [
-        "\n## Cost at the solution, and time\n",
+        f"singular; the figures are with a prior of {LANDMARK_STD_M:g} m on every landmark.",
+        "## Absolute trajectory error in metres (in brackets: aligned)",
+        markdown_table(
+            ["set", "frames", "landmarks", "observations", *COMPARED, "MAP / iSAM2 (aligned)"],
+            ([name, *error_cells(row)] for name, row in table.items()),
+        ),
+        *(error_summary(table, key, what) for key, what in (("ate_m", "ATE"), ("ate_aligned_m", "aligned ATE"))),
+        "## Cost at the solution, and time",
         "Costs are of GTSAM's function; *both* is how far the posterior's is from it at the posterior's solution. "
         "*Excess* is over GTSAM's batch driven on until nothing decreases any more. *Behind* counts the observations "
         "whose landmark is behind the camera at the solution: GTSAM then sees a constant, the posterior never gets "
         "there. The batch solvers stop where an iteration lowers the cost by less than "
-        f"{config.tolerance:g} of it.\n",
-        "| set | start | MAP | excess of MAP | of GTSAM batch | of iSAM2 | both | behind GTSAM, iSAM2 "
-        "| iterations MAP, GTSAM | s filter | MAP | GTSAM batch | iSAM2 |",
-        "|---|" + "---:|" * 12,
-    ]
-    for name, row in table.items():
-        e = row["estimators"]
-
-        def excess(estimator: str, row: dict[str, Any] = row) -> str:
-            value = ratio(row, (estimator, "gtsam_cost"), ("GTSAM converged", "gtsam_cost"))
-            return "-" if value is None else f"{100 * (value - 1):.4f} %"
-
-        lines.append(
-            cells(
-                name,
-                [
-                    f"{e['start']['gtsam_cost']:.1f}",
-                    f"{e['MAP']['gtsam_cost']:.2f}",
-                    *map(excess, ("MAP", "GTSAM batch", "iSAM2")),
-                    f"{e['MAP']['cost'] / e['MAP']['gtsam_cost'] - 1:.0e}",
-                    f"{e['GTSAM converged']['behind']}, {e['iSAM2']['behind']}",
-                    f"{e['MAP']['iterations']}, {e['GTSAM batch']['iterations']}",
-                    *(f"{e[name]['seconds']:.2f}" for name in ("filter", "MAP", "GTSAM batch", "iSAM2")),
-                ],
-            )
-        )
-    middle, largest = medians(table, ("MAP", "gtsam_cost"), ("GTSAM converged", "gtsam_cost"))
-    lines.append(
-        f"\nCost, MAP / GTSAM: 1{middle - 1:+.1e} in the median over the sets, 1{largest - 1:+.1e} at the most.\n"
+        f"{config.tolerance:g} of it.",
+        markdown_table(
+            [
+                *("set", "start", "MAP", "excess of MAP", "of GTSAM batch", "of iSAM2", "both", "behind GTSAM, iSAM2"),
+                *("iterations MAP, GTSAM", "s filter", "MAP", "GTSAM batch", "iSAM2"),
+            ],
+            ([name, *cost_cells(row)] for name, row in table.items()),
+        ),
+        f"Cost, MAP / GTSAM: 1{middle - 1:+.1e} in the median over the sets, 1{largest - 1:+.1e} at the most.",
     )
-    return "\n".join(lines)
+
+
+def error_cells(row: dict[str, Any]) -> list[str]:
+    """Sizes and errors of one set."""
+    found = row["estimators"]
+    stars = {name: " *" if found[name].get("weak_priors") else "" for name in COMPARED}
+    quotients = (number(ratio(row, ("MAP", key), ("iSAM2", key)), ".3f") for key in ("ate_m", "ate_aligned_m"))
+    return [
+        *(str(row[key]) for key in ("frames", "landmarks", "observations")),
+        *(with_aligned(found[name], ".3f") + stars[name] for name in COMPARED),
+        "{} ({})".format(*quotients),
+    ]
+
+
+def error_summary(table: dict[str, dict[str, Any]], key: str, what: str) -> str:
+    """How one kind of error compares with iSAM2's, over all sets."""
+    middle, largest = medians(table, ("MAP", key), ("iSAM2", key))
+    text = f"{what}, MAP / iSAM2: {middle:.3f} in the median over the sets, {largest:.3f} at the most;\n"
+    middle, largest = medians(table, ("MAP", key), ("iSAM2, 0.01", key))
+    return f"{text}MAP / iSAM2 that relinearises beyond {RELINEARISE_OFTEN:g}: {middle:.4f}, {largest:.3f}."
+
+
+def cost_cells(row: dict[str, Any]) -> list[str]:
+    """Costs, iterations and seconds of one set."""
+    e = row["estimators"]
+
+    def excess(estimator: str) -> str:
+        value = ratio(row, (estimator, "gtsam_cost"), ("GTSAM converged", "gtsam_cost"))
+        return MISSING if value is None else f"{100 * (value - 1):.4f} %"
+
+    return [
+        f"{e['start']['gtsam_cost']:.1f}",
+        f"{e['MAP']['gtsam_cost']:.2f}",
+        *map(excess, ("MAP", "GTSAM batch", "iSAM2")),
+        f"{e['MAP']['cost'] / e['MAP']['gtsam_cost'] - 1:.0e}",
+        f"{e['GTSAM converged']['behind']}, {e['iSAM2']['behind']}",
+        f"{e['MAP']['iterations']}, {e['GTSAM batch']['iterations']}",
+        *(f"{e[name]['seconds']:.2f}" for name in ("filter", "MAP", "GTSAM batch", "iSAM2")),
+    ]
 
 
 @styled
@@ -479,38 +472,32 @@ def plot(table: dict[str, dict[str, Any]]) -> Figure:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="folder that holds ece276a and utias")
-    parser.add_argument("--out", type=Path, default=ROOT / "results" / "map", metavar="DIR")
+    parser = argument_parser(__doc__, "map", data=True)
     parser.add_argument("sets", nargs="*", metavar="SET", help="names of sets, e.g. 0027; all by default")
-    options = parser.parse_args()
-    if not (options.data / "utias").is_dir():
-        print(f"no recordings in {options.data}; give --data or set EKFSLAM_DATA", file=sys.stderr)
+    parsed = parser.parse_args()
+    names = {Path(file).stem.replace("_drive", "").replace("_sync_KLT", ""): file for file in SETS}
+    wanted = {name: file for name, file in names.items() if not parsed.sets or name in parsed.sets}
+    if not wanted:
+        parser.error(f"no such set: {' '.join(parsed.sets)}")
+    if not has_recordings(parsed.data, *wanted.values()):
         return 0
 
     table: dict[str, dict[str, Any]] = {}
     # One thread for the filter's and the posterior's BLAS, as the library has it by itself.
     with threadpool_limits(1, user_api="blas"):
-        for file, poses, overrides in SETS:
-            name = Path(file).stem.replace("_drive", "").replace("_sync_KLT", "")
-            if not options.sets or name in options.sets:
-                table[name] = solve_all(open_set(options.data, file, poses), overrides)
-                print(name, json.dumps(table[name]["estimators"]))
-    if not table:
-        parser.error(f"no such set: {' '.join(options.sets)}")
+        for name, file in wanted.items():
+            table[name] = solve_all(open_set(parsed.data, file), SETS[file])
+            print(name, json.dumps(table[name]["estimators"]))
 
-    options.out.mkdir(parents=True, exist_ok=True)
     config = PosteriorConfig()
     text = markdown(table, config)
-    (options.out / "table.md").write_text(text, encoding="utf-8")
     summary = {
         "gtsam": version("gtsam"),
         "posterior": dataclasses.asdict(config),
         "relinearise": {"threshold": RELINEARISE, "skip": RELINEARISE_SKIP},
         "sets": table,
     }
-    (options.out / "table.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    save_figure(plot(table), options.out / "against_gtsam.png")
+    write(parsed.out, "table", summary, text, {"against_gtsam": plot(table)})
     print(text)
     return 0
 

@@ -24,22 +24,18 @@ A study that was interrupted goes on where it was.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from common import argument_parser
 
 from ekfslam.consistency_report import check_consistency
 from ekfslam.studies.study import LEVELS, STUDY_VARIANTS, Study
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__, "consistency")
     parser.add_argument("--runs", type=int, default=50, metavar="N", help="of each level (default: %(default)s)")
-    parser.add_argument(
-        "--out", type=Path, default=Path(__file__).parents[1] / "results" / "consistency", metavar="DIR"
-    )
-    options = parser.parse_args()
-    study = Study(LEVELS, STUDY_VARIANTS, options.runs)
-    print(check_consistency(study, options.out).table)
+    parsed = parser.parse_args()
+    study = Study(LEVELS, STUDY_VARIANTS, parsed.runs)
+    print(check_consistency(study, parsed.out).table)
 
 
 if __name__ == "__main__":  # the worker processes import this file

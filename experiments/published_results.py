@@ -27,15 +27,13 @@ closely, so that runs are the samples: tables give mean +- 3 standard errors ove
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
+from common import argument_parser, write
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -43,6 +41,7 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig, Variant
 from ekfslam.data.sequence import Noise
 from ekfslam.evaluation.consistency import nees, pose_error
+from ekfslam.evaluation.tables import document, markdown_table, plus_minus
 from ekfslam.filters import JointEKF
 from ekfslam.filters.observing import ACCEPTED
 from ekfslam.geometry import se3
@@ -60,14 +59,14 @@ SIGMAS = 3.0  # of the stated uncertainty of a mean
 class PositionSensor:
     """A sensor that measures where a landmark is in the vehicle's own frame, ``h(q) = q``, for one frame.
 
-    Its noise grows with the true z, which only the experiment knows: every measurement comes with its own deviations.
-    Were they taken from the noisy z instead, then too small a z would weigh more than too large a one, and the pull
-    towards the vehicle (2 sigma^2 |z|, however many measurements) would in time exceed every stated deviation.
+    Its noise grows with the true z, which only the experiment knows: every measurement comes with its own standard
+    deviations. Were they taken from the noisy z instead, too small a z would weigh more than too large a one. The pull
+    towards the vehicle (2 sigma^2 |z|, however many measurements) would in time exceed every stated standard deviation.
 
     Args:
         noise: Of the odometry that leads to this frame; its pixel part is not used.
         measured_m: (n, 3) the frame's measurements.
-        std_m: (n, 3) the deviations of their noise.
+        std_m: (n, 3) the standard deviations of their noise.
     """
 
     noise: Noise
@@ -113,10 +112,10 @@ class World:
     Args:
         T_world_imu: (T, 4, 4) true poses.
         odometry: (T, 6) true velocities, ``odometry[k]`` leads from pose k-1 to pose k.
-        odometry_std: (T, 6) deviations of their noise.
+        odometry_std: (T, 6) standard deviations of their noise.
         landmarks_m: (N, 3) landmarks in world.
         sees: Which points (n, 3) in the vehicle's frame are seen.
-        position_std: Deviations (n, 3) with which points (n, 3) in the vehicle's frame are measured.
+        position_std: Standard deviations (n, 3) with which points (n, 3) in the vehicle's frame are measured.
         planar: Whether everything happens in the plane; errors are then taken of x, y and heading alone.
     """
 
@@ -334,16 +333,19 @@ than ours by a factor that we cannot explain.
 
 def markdown(experiment: str, summary: dict[str, dict[str, list[float]]], runs: int) -> str:
     """Table of our variants and of what was published."""
-    lines = [
-        f"## {experiment}, {runs} runs\n",
-        "| | " + " | ".join(heading for heading, _ in FIGURES.values()) + " |",
-        "|---|" + "---:|" * len(FIGURES),
-    ]
-    for variant, table in summary.items():
-        cells = (f"{table[key][0]:{spec}} ± {table[key][1]:{spec.lstrip('+')}}" for key, (_, spec) in FIGURES.items())
-        lines.append(f"| {NAMES[variant]} | " + " | ".join(cells) + " |")
-    lines += [f"| *{name}, published* | " + " | ".join(cells) + " |" for name, *cells in PUBLISHED[experiment]]
-    return "\n".join([*lines, "", ordering(summary), ""])
+    ours = (
+        [NAMES[variant], *(mean_cell(table[key], spec) for key, (_, spec) in FIGURES.items())]
+        for variant, table in summary.items()
+    )
+    theirs = ([f"*{name}, published*", *cells] for name, *cells in PUBLISHED[experiment])
+    headings = ["", *(heading for heading, _ in FIGURES.values())]
+    return document(f"## {experiment}, {runs} runs", markdown_table(headings, [*ours, *theirs]), ordering(summary))
+
+
+def mean_cell(figure: list[float], spec: str) -> str:
+    """A mean and its three standard errors; only the mean shows its sign."""
+    mean, bound = figure
+    return plus_minus(f"{mean:{spec}}", f"{bound:{spec.lstrip('+')}}")
 
 
 def ordering(summary: dict[str, dict[str, list[float]]]) -> str:
@@ -357,27 +359,23 @@ def ordering(summary: dict[str, dict[str, list[float]]]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__, "published")
     parser.add_argument("--runs", type=int, default=20, metavar="N", help="runs of each experiment, at least 2")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the first run; runs count up from it")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "results" / "published", metavar="DIR")
-    options = parser.parse_args()
-    if options.runs < 2:
+    parsed = parser.parse_args()
+    if parsed.runs < 2:
         parser.error("--runs must be at least 2")
 
-    seeds = range(options.seed, options.seed + options.runs)
-    texts, summaries = ["# Published consistency experiments, repeated\n", REMARKS], {}
+    seeds = range(parsed.seed, parsed.seed + parsed.runs)
+    texts, summaries = ["# Published consistency experiments, repeated", REMARKS], {}
     with ProcessPoolExecutor(WORKERS) as pool:
         for experiment in EXPERIMENTS:
             summary = summarise(list(pool.map(partial(one_run, experiment), seeds)))
             summaries[experiment] = summary
-            texts.append(markdown(experiment, summary, options.runs))
+            texts.append(markdown(experiment, summary, parsed.runs))
             print(texts[-1], flush=True)
-
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "summary.md").write_text("\n".join(texts), encoding="utf-8")
-    report = {"runs": options.runs, "seed": options.seed, "mean_and_3_standard_errors": summaries}
-    (options.out / "summary.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    report = {"runs": parsed.runs, "seed": parsed.seed, "mean_and_3_standard_errors": summaries}
+    write(parsed.out, "summary", report, document(*texts))
 
 
 if __name__ == "__main__":

@@ -21,27 +21,24 @@ rigid transform; it is corrected here, and the table shows what it costs to take
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
-from pathlib import Path
+
+from common import REPORT, argument_parser, has_recordings, open_recording, with_aligned
 
 import ekfslam
+from ekfslam.evaluation.tables import document, markdown_table
 from ekfslam.figures.maps import plot_landmark_arrows, plot_trajectories
-from ekfslam.figures.style import save_figure
+from ekfslam.figures.style import save_all
 
-ROOT = Path(__file__).parents[1]
-DATA = Path(os.environ.get("EKFSLAM_DATA") or ROOT.parent / "shared" / "data")
-
-# Recording, KITTI odometry poses, the report's figures of its trajectory and of its landmarks.
-RECORDINGS = (
-    ("0027", "07", "figure_1_trajectory_0027", "figure_2_landmarks_0027"),
-    ("0042", "01", "figure_1_trajectory_0042", "figure_3_landmarks_0042"),
-    ("0020", "06", "figure_4_trajectory_0020", "figure_5_landmarks_0020"),
+# Recording, and the report's figures of its trajectory and of its landmarks.
+FIGURES = (
+    ("0027", "figure_1_trajectory_0027", "figure_2_landmarks_0027"),
+    ("0042", "figure_1_trajectory_0042", "figure_3_landmarks_0042"),
+    ("0020", "figure_4_trajectory_0020", "figure_5_landmarks_0020"),
 )
 
 # The report knows neither a gate nor tracks that jump; disparities below 2 px (of 1 px noise) are left out.
-REPORT = ekfslam.Config().with_overrides(
+AS_REPORTED = ekfslam.Config().with_overrides(
     {
         "noise": {"model": "white"},
         "hygiene": {"restart_at_repeats": False, "min_disparity_sigma": 2.0**0.5},
@@ -51,41 +48,36 @@ REPORT = ekfslam.Config().with_overrides(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="folder that holds ece276a")
-    parser.add_argument("--out", type=Path, default=ROOT / "results" / "report", metavar="DIR")
-    options = parser.parse_args()
-    if not (options.data / "ece276a").is_dir():
-        print(f"no recordings in {options.data}; give --data or set EKFSLAM_DATA", file=sys.stderr)
+    parsed = argument_parser(__doc__, "report", data=True).parse_args()
+    if not has_recordings(parsed.data, *REPORT):
         return 0
-
-    table = [
-        "| recording | dead reckoning | as stored | full SLAM |",
-        "|---|---:|---:|---:|",
-    ]
-    for name, poses, trajectory_figure, landmark_figure in RECORDINGS:
-        recording = options.data / "ece276a" / f"{name}.npz"
-        truth = options.data / "kitti_odometry_poses" / f"{poses}.txt"
-        comparison = ekfslam.compare(ekfslam.open_sequence(recording, truth=truth))
-        comparison.save(options.out / name)
+    rows = []
+    for name, trajectory_figure, landmark_figure in FIGURES:
+        file = f"ece276a/{name}.npz"
+        comparison = ekfslam.compare(open_recording(parsed.data, file))
+        comparison.save(parsed.out / name)
         print(comparison.table)
 
-        results, known = comparison.results, comparison.sequence.truth
-        as_reported = ekfslam.run(comparison.sequence, "mapping-only", REPORT)
+        results, truth = comparison.results, comparison.sequence.truth
+        as_reported = ekfslam.run(comparison.sequence, "mapping-only", AS_REPORTED)
         paths = {mode: results[mode] for mode in ("dead-reckoning", "full")}
-        save_figure(plot_trajectories(paths, known), options.out / f"{trajectory_figure}.png")
-        save_figure(plot_landmark_arrows(as_reported, known), options.out / f"{landmark_figure}.png")
-        save_figure(plot_landmark_arrows(results["full"], known), options.out / f"{landmark_figure}_full.png")
+        figures = {
+            trajectory_figure: plot_trajectories(paths, truth),
+            landmark_figure: plot_landmark_arrows(as_reported, truth),
+            f"{landmark_figure}_full": plot_landmark_arrows(results["full"], truth),
+        }
+        save_all(parsed.out, figures)
 
-        as_stored = ekfslam.open_sequence(recording, truth=truth, extrinsics="as-stored")
+        as_stored = open_recording(parsed.data, file, extrinsics="as-stored")
         stored = ekfslam.compare(as_stored, ["dead-reckoning"]).summary["modes"]["dead-reckoning"]
         modes = comparison.summary["modes"]
-        row = (modes["dead-reckoning"], stored, modes["full"])
-        cells = (f"{values['ate_m']:.2f} ({values['ate_aligned_m']:.2f})" for values in row)
-        table.append(f"| {name} | " + " | ".join(cells) + " |")
+        rows.append([name, *map(with_aligned, (modes["dead-reckoning"], stored, modes["full"]))])
 
-    text = "ATE in metres (in brackets: aligned), against KITTI odometry:\n\n" + "\n".join(table) + "\n"
-    (options.out / "summary.md").write_text(text, encoding="utf-8")
+    text = document(
+        "ATE in metres (in brackets: aligned), against KITTI odometry:",
+        markdown_table(["recording", "dead reckoning", "as stored", "full SLAM"], rows),
+    )
+    (parsed.out / "summary.md").write_text(text, encoding="utf-8")
     print(text)
     return 0
 

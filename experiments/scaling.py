@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
+from common import argument_parser, truth_of, write
 from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
 
@@ -37,7 +38,8 @@ from ekfslam.arrays import Array
 from ekfslam.config import Config, PosteriorConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import City, Loop, simulate
-from ekfslam.figures.style import GREY, log_axis, save_figure, style_of, styled
+from ekfslam.evaluation.tables import document, markdown_table
+from ekfslam.figures.style import GREY, log_axis, style_of, styled
 from ekfslam.filters import JointEKF, joint
 from ekfslam.filters.observing import Rig
 from ekfslam.filters.result import Result
@@ -47,7 +49,6 @@ from ekfslam.smoother.problem import Rows
 from ekfslam.smoother.sparse.information import Elimination, JointInformation, LinearSystem
 from ekfslam.storage.archive import write_archive
 
-OUT = Path(__file__).parents[1] / "results" / "scaling"
 SIZES = (100, 300, 1000, 3000, 10_000, 30_000, 100_000)
 DENSE_SIZES = (100, 300, 1000, 2000)
 QUICK = 1000  # the largest size of --quick
@@ -188,8 +189,8 @@ def against_solves(found: Posterior) -> float:
 
 def position_error_m(sequence: Sequence, T_world_imu: Array) -> float:
     """Root mean square position error, without alignment: the first pose is known."""
-    assert sequence.truth is not None
-    difference = T_world_imu[sequence.truth.frame, :3, 3] - sequence.truth.T_world_imu[:, :3, 3]
+    truth = truth_of(sequence)
+    difference = T_world_imu[truth.frame, :3, 3] - truth.T_world_imu[:, :3, 3]
     return float(np.sqrt((difference**2).sum(axis=1).mean()))
 
 
@@ -294,7 +295,6 @@ def measure_loop(landmarks: int) -> Row:
             solves.append(len(ekf.revived) > revived)
             active.append(len(ekf.ids))
             revived, position = len(ekf.revived), ekf.T_world_imu[:3, 3]
-        assert sequence.truth is not None
         row["filters"].append(
             {
                 "variant": variant,
@@ -303,7 +303,7 @@ def measure_loop(landmarks: int) -> Row:
                 "solving_s": float(np.sum(np.array(ms)[solves])) / 1e3,
                 "solves": [int(np.sum(lap)) for lap in np.split(np.array(solves), 3)],
                 "active": [float(np.mean(lap)) for lap in np.split(np.array(active), 3)],
-                "last_error_m": float(np.linalg.norm(position - sequence.truth.T_world_imu[-1, :3, 3])),
+                "last_error_m": float(np.linalg.norm(position - truth_of(sequence).T_world_imu[-1, :3, 3])),
             }
         )
     return row
@@ -336,87 +336,97 @@ def slope(sizes: Array, values: Array) -> float:
 
 def table(found: Row) -> str:
     """The results as Markdown."""
-    sizes, dense, in_turn = found["sizes"], found["dense"], found["in_turn"]
-    lines = [
+    sizes, in_turn, loop = found["sizes"], found["in_turn"], found["loop"]
+    return document(
         "# Cost against the size of the map",
-        "",
         "Made by `experiments/scaling.py`; the world is `City` with short tracks, invariant variant. "
         f"{found['machine']}, one core; times are CPU times of the process. A frame in ms, median over "
         "frames of the second half with "
         f"{IN_VIEW[0]} to {IN_VIEW[1]} landmarks in view. Memory is the peak of the process in that stage, 10^6 bytes.",
-        "",
-        "| M | frames | observations | ms a frame | filter s | filter MB | MAP s | (iterations) | MAP MB "
-        "| as filtered s | as filtered MB | archive MB |",
-        "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
-    ]
-    for r in sizes:
-        f, m = r["filtered"], r["map"]
-        lines.append(
-            f"| {r['landmarks']} | {r['frames']} | {r['observations']} | {r['ms_per_frame']:.1f} | {r['filter_s']:.1f} "
-            f"| {r['filter_mb']:.0f} | {m['total_s']:.2f} | {m['iterations']} | {m['mb']:.0f} | {f['total_s']:.2f} "
-            f"| {f['mb']:.0f} | {r['archive_mb']:.1f} |"
-        )
-    lines += [
-        "",
+        markdown_table(
+            [
+                *("M", "frames", "observations", "ms a frame", "filter s", "filter MB", "MAP s", "(iterations)"),
+                *("MAP MB", "as filtered s", "as filtered MB", "archive MB"),
+            ],
+            map(size_cells, sizes),
+            left=0,
+        ),
         f"Peak memory of the whole run at M = {sizes[-1]['landmarks']}: {sizes[-1]['peak_mb']:.0f} MB.",
-        "",
         f"A frame at the end of a drive with M = {sizes[-1]['landmarks']} against one with M = {IN_TURN_WITH}, in turn "
         f"in one process (CPU): {in_turn['large_ms']:.2f} ms against {in_turn['small_ms']:.2f} ms, "
         f"ratio **{in_turn['ratio']:.2f}**.",
-        "",
         "## Where the posterior's seconds go",
-        "",
         "Structure: which poses are coupled by which landmarks, once. Rows: linearisation. Solution: Schur "
         "complements, CHOLMOD and mean; the first one with its symbolic analysis. Difference: largest "
         "between marginals and solves, relative to the block. Error: root mean square "
         "position error of the trajectory.",
-        "",
-        "| M | structure | rows | first solution | next solution | pose marginals | landmark marginals "
-        "| factor entries | difference | error filter m | error MAP m |",
-        "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
-    ]
-    for r in sizes:
-        s, m = r["stages"], r["map"]
-        lines.append(
-            f"| {r['landmarks']} | {s['structure_s']:.2f} | {s['rows_s']:.2f} | {s['first_solution_s']:.2f} "
-            f"| {s['next_solution_s']:.2f} | {m['pose_marginals_s']:.2f} | {m['landmark_marginals_s']:.2f} "
-            f"| {s['factor_entries']:.1e} | {m['against_solves']:.0e} "
-            f"| {r['filter_error_m']:.2f} | {m['error_m']:.2f} |"
-        )
-    lines += [
-        "",
+        markdown_table(
+            [
+                *("M", "structure", "rows", "first solution", "next solution", "pose marginals"),
+                *("landmark marginals", "factor entries", "difference", "error filter m", "error MAP m"),
+            ],
+            map(stage_cells, sizes),
+            left=0,
+        ),
         "## Dense reference",
-        "",
         "A filter that never retires a landmark (a frame at the end, median of the last ten), and the inverse of the "
         "dense information matrix of all poses and landmarks.",
-        "",
-        "| M | ms a frame | filter MB | posterior s | posterior MB |",
-        "|--:|--:|--:|--:|--:|",
-    ]
-    for r in dense:
-        lines.append(
-            f"| {r['landmarks']} | {r['ms_per_frame']:.1f} | {r['filter_mb']:.0f} | {r['posterior_s']:.2f} "
-            f"| {r['posterior_mb']:.0f} |"
-        )
-    loop = found["loop"]
-    lines += [
-        "",
+        markdown_table(
+            ["M", "ms a frame", "filter MB", "posterior s", "posterior MB"], map(dense_cells, found["dense"]), left=0
+        ),
         "## Landmarks that come back",
-        "",
         f"Three laps of a ring of {LOOP_RADIUS_M:.0f} m radius with {loop['landmarks']} landmarks. A solve is a "
         "frame in which retired landmarks came back.",
-        "",
-        "| variant | retire | lap 1 s | lap 2 s | lap 3 s | of which in solves s | solves | mean active "
-        "| last error m |",
-        "|---|---|--:|--:|--:|--:|--:|--:|--:|",
+        markdown_table(
+            [
+                *("variant", "retire", "lap 1 s", "lap 2 s", "lap 3 s", "of which in solves s", "solves"),
+                *("mean active", "last error m"),
+            ],
+            map(loop_cells, loop["filters"]),
+            left=2,
+        ),
+    )
+
+
+def size_cells(r: Row) -> list[str]:
+    """Time and memory of one size."""
+    f, m = r["filtered"], r["map"]
+    return [
+        *(f"{r[key]}" for key in ("landmarks", "frames", "observations")),
+        *(f"{r['ms_per_frame']:.1f}", f"{r['filter_s']:.1f}", f"{r['filter_mb']:.0f}"),
+        *(f"{m['total_s']:.2f}", f"{m['iterations']}", f"{m['mb']:.0f}", f"{f['total_s']:.2f}", f"{f['mb']:.0f}"),
+        f"{r['archive_mb']:.1f}",
     ]
-    for r in loop["filters"]:
-        seconds = " | ".join(f"{lap:.1f}" for lap in r["lap_s"])
-        lines.append(
-            f"| {r['variant']} | {r['retire']} | {seconds} | {r['solving_s']:.1f} | {', '.join(map(str, r['solves']))} "
-            f"| {', '.join(f'{n:.0f}' for n in r['active'])} | {r['last_error_m']:.4f} |"
-        )
-    return "\n".join(lines) + "\n"
+
+
+def stage_cells(r: Row) -> list[str]:
+    """Steps of the posterior of one size, and how exact it is."""
+    s, m = r["stages"], r["map"]
+    return [
+        f"{r['landmarks']}",
+        *(f"{s[f'{stage}_s']:.2f}" for stage in ("structure", "rows", "first_solution", "next_solution")),
+        *(f"{m[f'{kind}_marginals_s']:.2f}" for kind in ("pose", "landmark")),
+        *(f"{s['factor_entries']:.1e}", f"{m['against_solves']:.0e}"),
+        *(f"{r['filter_error_m']:.2f}", f"{m['error_m']:.2f}"),
+    ]
+
+
+def dense_cells(r: Row) -> list[str]:
+    """The dense reference of one size."""
+    return [
+        *(f"{r['landmarks']}", f"{r['ms_per_frame']:.1f}", f"{r['filter_mb']:.0f}"),
+        *(f"{r['posterior_s']:.2f}", f"{r['posterior_mb']:.0f}"),
+    ]
+
+
+def loop_cells(r: Row) -> list[str]:
+    """One filter on the ring."""
+    return [
+        *(r["variant"], r["retire"]),
+        *(f"{lap:.1f}" for lap in r["lap_s"]),
+        *(f"{r['solving_s']:.1f}", ", ".join(map(str, r["solves"]))),
+        *(", ".join(f"{n:.0f}" for n in r["active"]), f"{r['last_error_m']:.4f}"),
+    ]
 
 
 @styled
@@ -454,32 +464,28 @@ def plot(found: Row) -> Figure:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=OUT)
+    parser = argument_parser(__doc__, "scaling")
     parser.add_argument("--quick", action="store_true", help=f"sizes up to {QUICK} only")
     parser.add_argument("--worker", nargs=2, metavar=("WHAT", "M"), help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.worker:
-        what, landmarks = arguments.worker
+    parsed = parser.parse_args()
+    if parsed.worker:
+        what, landmarks = parsed.worker
         # `run` times frames by the wall clock, which other work on the machine disturbs several times over.
         joint.perf_counter = process_time
         with threadpool_limits(1):
             print(json.dumps(WORKERS[what](int(landmarks))))
         return
 
-    limit = QUICK if arguments.quick else SIZES[-1]
+    limit = QUICK if parsed.quick else SIZES[-1]
     found: Row = {"machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}"}
-    arguments.out.mkdir(parents=True, exist_ok=True)
     for key, worker, sizes in (("sizes", "size", SIZES), ("dense", "dense", DENSE_SIZES)):
         found[key] = []
         for landmarks in (size for size in sizes if size <= limit):
             found[key].append(in_own_process(worker, landmarks))
             print(f"{worker} {landmarks}: {json.dumps(found[key][-1])}", flush=True)
-    found["loop"] = in_own_process("loop", 100 if arguments.quick else LOOP_LANDMARKS)
+    found["loop"] = in_own_process("loop", 100 if parsed.quick else LOOP_LANDMARKS)
     found["in_turn"] = in_own_process("in-turn", max(limit, 3 * IN_TURN_WITH + 1))
-    (arguments.out / "scaling.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    (arguments.out / "scaling.md").write_text(table(found), encoding="utf-8")
-    save_figure(plot(found), arguments.out / "scaling.png")
+    write(parsed.out, "scaling", found, table(found), {"scaling": plot(found)}, indent=1)
 
 
 if __name__ == "__main__":

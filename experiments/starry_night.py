@@ -19,36 +19,30 @@ stated is worth, and nothing shall be hidden.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+from common import STARRY_NIGHT, argument_parser, has_recordings, truth_of, write
 from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
 
 import ekfslam
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig, Variant
-from ekfslam.data.sequence import Noise, Sequence, Truth
+from ekfslam.data.sequence import Noise, Sequence
 from ekfslam.evaluation.consistency import chi2_bounds, invariant_landmark_error, nees, pose_error
+from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.evaluation.trajectory import match_landmarks
-from ekfslam.figures.style import BOUNDS, EXPECTED, SERIES, SKY_BLUE, ZERO, log_axis, marker_of, save_figure, styled
+from ekfslam.figures.style import BOUNDS, EXPECTED, SERIES, SKY_BLUE, ZERO, log_axis, marker_of, styled
 from ekfslam.filters import JointEKF
 from ekfslam.filters.observing import Rig
 from ekfslam.geometry import camera, se3
 
-ROOT = Path(__file__).parents[1]
-DATA = Path(os.environ.get("EKFSLAM_DATA") or ROOT.parent / "shared" / "data")
-RECORDING = Path("utias") / "dataset3.mat"
-
 VARIANTS: tuple[Variant, ...] = ("invariant", "fej", "standard")
 WINDOW_FRAMES = 100
 PRIOR_POSITION_M, PRIOR_ROTATION_RAD = 0.01, 0.01
-LAGS = 40  # frames
+LAGS, SHOWN_LAGS = 40, (1, 2, 5, 10, 20)  # frames
 PROBABILITY = 0.95
 ROWS = ("uL", "vL", "uR", "vR")
 AXES = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
@@ -71,11 +65,6 @@ def velocity_residuals(sequence: Sequence) -> Array:
     T = se3.inverse(truth_of(sequence).T_world_imu)
     tau = np.diff(sequence.time_s)[:, None]
     return sequence.twist[1:] + se3.log(T[1:] @ se3.inverse(T[:-1])) / tau
-
-
-def truth_of(sequence: Sequence) -> Truth:
-    assert sequence.truth is not None
-    return sequence.truth
 
 
 def autocorrelation(values: Array, lags: int, group: IntArray, index: IntArray) -> Array:
@@ -101,7 +90,7 @@ def autocorrelation(values: Array, lags: int, group: IntArray, index: IntArray) 
 
 
 def robust_std(values: Array) -> Array:
-    """Deviation (n,) of values (K, n) from their median absolute deviation, which a few gross errors leave alone."""
+    """Standard deviation (n,) of values (K, n), found from the median absolute deviation, which spares gross errors."""
     return np.median(np.abs(values - np.median(values, axis=0)), axis=0) / 0.6745
 
 
@@ -179,7 +168,7 @@ def noise_table(sequence: Sequence) -> dict[str, dict[str, dict[str, float]]]:
             "robust_std": robust_std(values),
             "mean": values.mean(axis=0),
             "largest": np.abs(values).max(axis=0),
-            **{f"autocorrelation_{lag}": rho[lag] for lag in (1, 2, 5, 10, 20)},
+            **{f"autocorrelation_{lag}": rho[lag] for lag in SHOWN_LAGS},
             "inflation": inflation(rho),
         }
         tables[kind] = {name: {c: float(v[i]) for c, v in columns.items()} for i, name in enumerate(names)}
@@ -187,7 +176,7 @@ def noise_table(sequence: Sequence) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def inflation(rho: Array) -> Array:
-    """By how much (n,) a deviation must grow for the mean of many correlated samples to be as uncertain as it is.
+    """The factor (n,) on a standard deviation that makes the mean of correlated samples as uncertain as it is.
 
     ``sqrt(1 + 2 sum rho)`` over the lags (lags+1, n) before the correlation first vanishes; white noise has 1.
     """
@@ -272,54 +261,66 @@ def plot_windows(windows: dict[str, list[Window]]) -> Figure:
 
 def markdown(noise: dict[str, dict[str, dict[str, float]]], table: dict[str, dict[str, float]], count: int) -> str:
     """The report of the experiment."""
-    lines = [f"# Starry Night\n\n{count} windows of {WINDOW_FRAMES} frames, noise as the file states it.\n"]
     low, high = chi2_bounds(6, PROBABILITY, count)
     landmark_low, landmark_high = chi2_bounds(3, PROBABILITY, count)
-    lines += [
-        "| filter | pose NEES, all frames | pose NEES, last frame (median) | landmark NEES (median) | m | rad |",
-        "|---|---:|---:|---:|---:|---:|",
-    ]
-    for name, row in table.items():
-        landmark = "-"
-        if "landmark_nees_mean" in row:
-            landmark = f"{row['landmark_nees_mean']:.2f} ({row['landmark_nees_median_window']:.2f})"
-        lines.append(
-            f"| {name} | {row['pose_nees_mean']:.2f} | {row['pose_nees_end_mean']:.2f} "
-            f"({row['pose_nees_end_median']:.2f}) | {landmark} | {row['position_rms_end_m']:.3f} "
-            f"| {row['rotation_rms_end_rad']:.4f} |"
-        )
-    lines.append(
-        f"\nExpected 6 and 3; {100 * PROBABILITY:g} % of means of {count} windows lie in {low:.2f}-{high:.2f} for the "
+    return document(
+        f"# Starry Night\n\n{count} windows of {WINDOW_FRAMES} frames, noise as the file states it.",
+        markdown_table(
+            [
+                *("filter", "pose NEES, all frames", "pose NEES, last frame (median)", "landmark NEES (median)"),
+                *("m", "rad"),
+            ],
+            ([name, *consistency_cells(row)] for name, row in table.items()),
+        ),
+        f"Expected 6 and 3; {100 * PROBABILITY:g} % of means of {count} windows lie in {low:.2f}-{high:.2f} for the "
         f"last frame's pose and, were a window's landmarks one sample, in {landmark_low:.2f}-{landmark_high:.2f}. "
         "m and rad: root mean square errors of the pose at the last frame, in stored coordinates. *Wider pixels* have "
-        "the stated deviations times the inflation below, by which correlation in time makes the mean of many pixels "
-        "more uncertain than that of white ones, `sqrt(1 + 2 sum rho)`.\n"
+        "the stated standard deviations times the inflation below, by which correlation in time makes the mean of many "
+        "pixels more uncertain than that of white ones, `sqrt(1 + 2 sum rho)`.",
+        *(
+            block
+            for kind, unit, digits in (("pixels", "px", 2), ("velocities", "m/s, rad/s", 4))
+            for block in (
+                f"## {kind.capitalize()} [{unit}]: residuals at the truth",
+                markdown_table(
+                    [
+                        *("", "stated std", "std", "robust std", "mean", "largest"),
+                        *("lag 1", "2", "5", "10", "20", "inflation"),
+                    ],
+                    ([name, *noise_cells(row, digits)] for name, row in noise[kind].items()),
+                ),
+            )
+        ),
     )
-    for kind, unit in (("pixels", "px"), ("velocities", "m/s, rad/s")):
-        lines += [
-            f"## {kind.capitalize()} [{unit}]: residuals at the truth\n",
-            "| | stated std | std | robust std | mean | largest | lag 1 | 2 | 5 | 10 | 20 | inflation |",
-            "|---|" + "---:|" * 11,
-        ]
-        for name, row in noise[kind].items():
-            digits = 2 if kind == "pixels" else 4
-            cells = [f"{row[key]:.{digits}f}" for key in ("stated_std", "std", "robust_std", "mean", "largest")]
-            cells += [f"{row[f'autocorrelation_{lag}']:.2f}" for lag in (1, 2, 5, 10, 20)]
-            lines.append(f"| {name} | " + " | ".join(cells) + f" | {row['inflation']:.2f} |")
-        lines.append("")
-    return "\n".join(lines)
+
+
+def consistency_cells(row: dict[str, float]) -> list[str]:
+    """One filter of `consistency_table`."""
+
+    def with_median(mean: str, median: str) -> str:
+        return f"{row[mean]:.2f} ({row[median]:.2f})" if mean in row else MISSING
+
+    return [
+        f"{row['pose_nees_mean']:.2f}",
+        with_median("pose_nees_end_mean", "pose_nees_end_median"),
+        with_median("landmark_nees_mean", "landmark_nees_median_window"),
+        f"{row['position_rms_end_m']:.3f}",
+        f"{row['rotation_rms_end_rad']:.4f}",
+    ]
+
+
+def noise_cells(row: dict[str, float], digits: int) -> list[str]:
+    """One row or axis of `noise_table`."""
+    sizes = [f"{row[key]:.{digits}f}" for key in ("stated_std", "std", "robust_std", "mean", "largest")]
+    return [*sizes, *(f"{row[f'autocorrelation_{lag}']:.2f}" for lag in SHOWN_LAGS), f"{row['inflation']:.2f}"]
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="folder that holds utias")
-    parser.add_argument("--out", type=Path, default=ROOT / "results" / "starry_night", metavar="DIR")
-    options = parser.parse_args()
-    if not (options.data / RECORDING).is_file():
-        print(f"no {RECORDING} in {options.data}; give --data or set EKFSLAM_DATA", file=sys.stderr)
+    parsed = argument_parser(__doc__, "starry_night", data=True).parse_args()
+    if not has_recordings(parsed.data, STARRY_NIGHT):
         return 0
 
-    sequence = ekfslam.open_sequence(options.data / RECORDING)
+    sequence = ekfslam.open_sequence(parsed.data / STARRY_NIGHT)
     stated = sequence.noise
     assert stated is not None
     noise = noise_table(sequence)
@@ -339,14 +340,11 @@ def main() -> int:
             for name, (variant, assumed) in filters.items()
         }
 
-    options.out.mkdir(parents=True, exist_ok=True)
     table = consistency_table(windows)
     text = markdown(noise, table, len(starts))
-    (options.out / "summary.md").write_text(text, encoding="utf-8")
     summary = {"windows": len(starts), "frames": WINDOW_FRAMES, "consistency": table, "noise": noise}
-    (options.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    save_figure(plot_autocorrelation(sequence), options.out / "autocorrelation.png")
-    save_figure(plot_windows(windows), options.out / "nees.png")
+    figures = {"autocorrelation": plot_autocorrelation(sequence), "nees": plot_windows(windows)}
+    write(parsed.out, "summary", summary, text, figures)
     print(text)
     return 0
 

@@ -16,7 +16,7 @@ RESULTS = Path(__file__).parents[1] / "results"
 
 def test_plain_table_aligns_numbers_to_the_right():
     table = markdown_table(["set", "ATE [m]", "frames"], [["0027", number(3.972, ".2f"), "1106"], ["", "-", "0"]])
-    assert table == "| set | ATE [m] | frames |\n|---|---:|---:|\n| 0027 | 3.97 | 1106 |\n|  | - | 0 |"
+    assert table == "| set | ATE [m] | frames |\n|---|---:|---:|\n| 0027 | 3.97 | 1106 |\n| | - | 0 |"
     assert markdown_table(["a", "b"], [], left=2) == "| a | b |\n|---|---|"
     assert markdown_table(["a"], [], left=0) == "| a |\n|---:|"
 

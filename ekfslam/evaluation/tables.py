@@ -40,7 +40,7 @@ def markdown_table(
         cells = (
             f"{cell:<{w}}" if i < left else f"{cell:>{w}}" for i, (cell, w) in enumerate(zip(line, widths, strict=True))
         )
-        texts.append(f"| {' | '.join(cells)} |")
+        texts.append(f"|{'|'.join(f' {cell} ' if cell else ' ' for cell in cells)}|")
     return "\n".join([texts[0], _rule(widths, left, padded), *texts[1:]])
 
 
