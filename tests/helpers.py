@@ -12,9 +12,12 @@ import numpy as np
 
 from ekfslam.config import Config
 from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
 from ekfslam.filters.result import REASONS, Innovation, Landmarks, Rejections, Result
 from ekfslam.geometry import camera, motion, se3
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.smoother.revival import MapRevival
 
 CAMERA = StereoCamera(fu_px=700.0, fv_px=700.0, cu_px=600.0, cv_px=180.0, baseline_m=0.54)
 # IMU axes forward, left, up; camera axes right, down, forward.
@@ -125,3 +128,19 @@ def _landmarks(sequence: Sequence, truth: Truth, rng: np.random.Generator) -> La
         return truth.position_m[ids] + (np.linalg.cholesky(P) @ rng.standard_normal((len(ids), 3, 1)))[..., 0]
 
     return Landmarks(ids, scatter(covariance), covariance, scatter(initial), first_frame, last_frame, count)
+
+
+def run_joint(sequence, rig, config, calibration=None, revives=False, **options):
+    """The joint filter over a sequence as one call.
+
+    Returns:
+        The filter as it ended; ``T_imu_world`` (T, 4, 4) after each frame; the report of each frame.
+    """
+    ekf = JointEKF(rig, config, sequence.initial_T_world_imu, calibration=calibration, **options)
+    if revives:
+        ekf.revival = MapRevival(ekf.model, config)
+    poses, reports = [], []
+    for frame in run_filter(ekf, sequence):
+        poses.append(ekf.T_imu_world)
+        reports.append(frame.report)
+    return ekf, np.array(poses), reports

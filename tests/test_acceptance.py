@@ -8,9 +8,8 @@ import pytest
 from ekfslam import Config, PosteriorConfig, open_sequence, posterior, run
 from ekfslam.evaluation.summary import summarise
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.observing import Rig
 from ekfslam.models.build import resolve
-from ekfslam.smoother.problem import Rows
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.smoother.sparse.information import JointInformation
 
 # What the dense, noisy edition of the recordings had added to its velocities.
@@ -42,7 +41,7 @@ def test_posterior_of_the_dense_recording_is_fast(data_path):
     found = posterior(result, PosteriorConfig(linearisation="filtered"))
     elimination = found.information.elimination
     assert elimination.landmarks > 3000
-    system = Rows(result.log, Rig(result.camera, result.T_cam_imu, result.noise)).as_filtered()
+    system = found.problem.as_filtered()
     begin = perf_counter()
     JointInformation(elimination, system, factor=found.information.factor)
     factorised = perf_counter()

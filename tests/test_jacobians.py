@@ -9,11 +9,14 @@ from reference import CAMERA, T_CAM_IMU, jacobian_of_pi, small_world, stereo_mat
 
 from ekfslam.config import FilterConfig
 from ekfslam.data.sequence import Noise
+from ekfslam.filters.gaussian import Gaussian
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.observing import Rig, first_sight, linearise
-from ekfslam.filters.variants import retract_invariant, transport_invariant
+from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
+from ekfslam.models.build import model_of
+from ekfslam.models.observation import initialise, linearise
+from ekfslam.models.sensors.stereo import Rig
 
 RNG = np.random.default_rng(7)
 HALF_TURNS = [(np.pi - 1e-7) * axis for axis in (*np.eye(3), np.array([0.6, -0.8, 0.0]))]
@@ -41,6 +44,23 @@ def visible_points(T_imu_world, n=5):
     return se3.apply(se3.inverse(T_CAM_IMU @ T_imu_world), q)
 
 
+def from_one_sight(rig, T, z):
+    return initialise(rig, T, z, rig.variance(z), T)
+
+
+def retract_invariant(T, m, xi, d):
+    return se3.exp(xi) @ T, VARIANTS["invariant"].retract_landmarks(T, m, xi, d)
+
+
+def transport_invariant(P, T, T_after, moved):
+    """P (b+3n, b+3n) carried along by a correction that moves landmarks by ``moved`` (n, 3)."""
+    model = model_of(RIG, RIG.noise, T, np.eye(6))
+    gaussian = Gaussian(np.eye(6), 6)
+    gaussian.replace(P.copy())
+    VARIANTS["invariant"].transport(gaussian, model, {"pose": T}, {"pose": T_after}, moved)
+    return gaussian.P
+
+
 def rows(T_imu_world, m):
     return cam.project(CAMERA, se3.apply(T_CAM_IMU @ T_imu_world, m))[:, :3].ravel()
 
@@ -62,7 +82,7 @@ def test_projection_jacobian():
 @poses
 def test_measurement_jacobians_by_pose_and_landmark(T):
     m = visible_points(T)
-    _, H_x, H_m = linearise(RIG, T, m, m)
+    _, H_x, H_m = linearise(RIG, T, m, T, m)
     by_pose = central(lambda xi: rows(se3.exp(xi) @ T, m), 6)
     np.testing.assert_allclose(H_x.reshape(-1, 6), by_pose, rtol=1e-5, atol=1e-4)
     for i in range(len(m)):
@@ -122,11 +142,11 @@ def test_new_landmarks(T):
     m = visible_points(T)
     pixels = cam.project(CAMERA, se3.apply(T_CAM_IMU @ T, m)) + RNG.normal(size=(len(m), 4)) * [0.5, 0.1, 0.5, 0.1]
     z = RIG.rows(pixels)
-    position, G, covariance = first_sight(RIG, T, z)
-    by_pose = central(lambda xi: first_sight(RIG, se3.exp(xi) @ T, z)[0].ravel(), 6)
+    position, G, covariance = from_one_sight(RIG, T, z)
+    by_pose = central(lambda xi: from_one_sight(RIG, se3.exp(xi) @ T, z)[0].ravel(), 6)
     np.testing.assert_allclose(G.reshape(-1, 6), by_pose, rtol=1e-6, atol=1e-6)
     for i in range(len(m)):
-        by_pixel = central(lambda d, i=i: first_sight(RIG, T, z[i : i + 1] + d)[0][0], 3)
+        by_pixel = central(lambda d, i=i: from_one_sight(RIG, T, z[i : i + 1] + d)[0][0], 3)
         expected = by_pixel @ np.diag(RIG.variance_px2) @ by_pixel.T
         np.testing.assert_allclose(covariance[i], expected, rtol=1e-5, atol=1e-9)
     reprojected = cam.project(CAMERA, se3.apply(T_CAM_IMU @ T, position))[:, :3]
@@ -150,7 +170,7 @@ def test_triangulation_is_the_least_squares_point():
     found = cam.triangulate(CAMERA, z)
     np.testing.assert_allclose(found[0], q, rtol=1e-12)
     rig = Rig(CAMERA, np.eye(4), Noise(np.zeros(6), np.full(4, 0.9)))
-    np.testing.assert_allclose(first_sight(rig, np.eye(4), z)[2][0], covariance, rtol=1e-10)
+    np.testing.assert_allclose(from_one_sight(rig, np.eye(4), z)[2][0], covariance, rtol=1e-10)
 
 
 def invariant_retraction(T_imu_world, m, e):
@@ -178,7 +198,7 @@ def test_transport_of_the_covariance_keeps_the_invariant_error(T):
     root = RNG.normal(size=(size, size))
     P = root @ root.T
     expected = J @ P @ J.T
-    transport_invariant(P, T, T_plus, m_plus - m)
+    P = transport_invariant(P, T, T_plus, m_plus - m)
     np.testing.assert_allclose(P, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
     np.testing.assert_array_equal(P, P.T)
 
