@@ -45,12 +45,11 @@ from ekfslam.config import (
     NoiseConfig,
     PosteriorConfig,
 )
-from ekfslam.consistency_report import check_consistency
 from ekfslam.data.readers import open_sequence, write_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import EkfslamError
 from ekfslam.filters.result import Result
-from ekfslam.reports import Comparison, compare
+from ekfslam.reports import Comparison, check_consistency, compare
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import Posterior, posterior, smooth
 from ekfslam.storage.archive import read_archive, write_archive

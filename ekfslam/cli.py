@@ -15,7 +15,6 @@ import h5py
 
 from ekfslam import __version__
 from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation, NoiseModel
-from ekfslam.consistency_report import check_consistency
 from ekfslam.data.readers import BUILTIN, open_sequence, write_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import builtin
@@ -27,7 +26,7 @@ from ekfslam.figures.run import save_figures
 from ekfslam.filters.result import Result
 from ekfslam.models.build import build
 from ekfslam.models.noise import velocity_noise
-from ekfslam.reports import compare
+from ekfslam.reports import check_consistency, compare
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT

@@ -1,4 +1,7 @@
-"""`compare`: the modes side by side on one sequence, as a table, an archive and figures."""
+"""Reports: a call runs, writes an archive, and says what it found in a table and figures.
+
+`compare`: the modes side by side on one sequence. `check_consistency`: whether covariances hold what they promise.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,17 @@ from typing import Any
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import IllPosedError
+from ekfslam.evaluation.study import study_table, summarise_study
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.figures.posterior import plot_map_before_and_after
 from ekfslam.figures.run import save_figure, save_figures
+from ekfslam.figures.study import save_study_figures
 from ekfslam.filters.result import Result
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import smooth
 from ekfslam.storage.archive import write_archive
+from ekfslam.studies.executors import open_executor
+from ekfslam.studies.study import Study, StudyArchive, run_study
 
 
 @dataclass(frozen=True)
@@ -53,7 +60,7 @@ class Comparison:
         directory.mkdir(parents=True, exist_ok=True)
         archive, summary, table = (directory / name for name in ("archive.h5", "summary.json", "summary.md"))
         write_archive(archive, self.sequence, self.results)
-        summary.write_text(json.dumps(self.summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        _write_json(summary, self.summary)
         notes = "".join(f"- {note}\n" for note in self.sequence.notes)
         table.write_text(self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""), encoding="utf-8")
         figures = save_figures(directory, self.results, self.sequence.truth)
@@ -87,3 +94,53 @@ def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | 
         "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
     }
     return Comparison(sequence, results, summary, skipped)
+
+
+@dataclass(frozen=True)
+class ConsistencyReport:
+    """What `check_consistency` found.
+
+    Args:
+        archive: All values of all runs.
+        summary: Averages and their bounds, as written to ``summary.json``.
+        paths: The files written.
+    """
+
+    archive: StudyArchive
+    summary: dict[str, Any]
+    paths: list[Path]
+
+    @property
+    def table(self) -> str:
+        """The summary as a Markdown table."""
+        return study_table(self.summary)
+
+
+def check_consistency(
+    study: Study, directory: str | Path, executor: str = "processes", workers: int | None = None
+) -> ConsistencyReport:
+    """Run a study, or what is missing of it, and write ``study.h5``, ``summary.json``, ``table.md`` and figures.
+
+    Args:
+        study: What to run.
+        directory: Where to; made if missing. A study that was interrupted there goes on.
+        executor, workers: See `open_executor`.
+
+    Raises:
+        ArchiveError: The directory holds another study, or cannot be written.
+        ConfigError: The executor is unknown, not installed or not reachable.
+    """
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    archive_path, summary_path, table_path = (directory / name for name in ("study.h5", "summary.json", "table.md"))
+    with open_executor(executor, workers) as opened:
+        archive = run_study(study, archive_path, opened)
+    summary = summarise_study(archive)
+    _write_json(summary_path, summary)
+    table_path.write_text(study_table(summary), encoding="utf-8")
+    paths = [archive_path, summary_path, table_path, *save_study_figures(directory, archive)]
+    return ConsistencyReport(archive, summary, paths)
+
+
+def _write_json(path: Path, summary: dict[str, Any]) -> None:
+    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")

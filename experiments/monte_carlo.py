@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from common import argument_parser
 
-from ekfslam.consistency_report import check_consistency
+from ekfslam.reports import check_consistency
 from ekfslam.studies.study import LEVELS, STUDY_VARIANTS, Study
 
 

@@ -18,7 +18,6 @@ from PIL import Image
 
 from ekfslam.cli import main
 from ekfslam.config import Config, FilterConfig
-from ekfslam.consistency_report import check_consistency
 from ekfslam.data.simulate import simulate
 from ekfslam.errors import ArchiveError, ConfigError, InnovationError
 from ekfslam.evaluation.consistency import (
@@ -35,6 +34,7 @@ from ekfslam.evaluation.study import study_table, summarise_study
 from ekfslam.filters import JointEKF
 from ekfslam.filters.observing import Rig
 from ekfslam.geometry import se3
+from ekfslam.reports import check_consistency
 from ekfslam.runner import run
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import SerialExecutor, open_executor
