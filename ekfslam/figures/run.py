@@ -1,4 +1,4 @@
-"""Figures of runs against time: errors, innovation consistency, further parameters; and the files of a whole run.
+"""Figures of runs against time: errors, innovation consistency, estimated parameters; and the files of a whole run.
 
 As in `ekfslam.figures.maps`, every function returns a `matplotlib.figure.Figure` and touches no global state.
 """

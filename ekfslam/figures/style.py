@@ -138,8 +138,8 @@ def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
 
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure with a palette of 256 colours: a third of the size or less, without a visible difference."""
-    # The default median cut sacrifices rare colours, here a thin trajectory; this method keeps all within 20 of 255. Its
-    # means (kmeans) then give large areas their exact colour: the grey of bounds must not turn blue.
+    # The default median cut sacrifices rare colours, here a thin trajectory; this method keeps all within 20 of 255.
+    # Means (kmeans) then give large areas their exact colour: the grey of bounds must not turn blue.
     buffer = BytesIO()
     figure.savefig(buffer, dpi=DPI)
     picture = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
