@@ -183,7 +183,7 @@ class FilterConfig:
     revive: int = field(default=100, metadata=_whole(-1))
     gate_probability: float = field(default=0.999, metadata=_PROBABILITY)
     split_after: int = field(default=3, metadata=_whole(0))
-    moving_sigma: float = field(default=3.0, metadata=_NOT_NEGATIVE)
+    moving_sigma: float = field(default=1.5, metadata=_NOT_NEGATIVE)
     moving_share: float = field(default=0.1, metadata=_NOT_NEGATIVE)
     min_depth_m: float = field(default=0.1, metadata=_NOT_NEGATIVE)
     initial_position_std_m: float = field(default=0.0, metadata=_FINITE)

@@ -25,7 +25,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
@@ -56,12 +56,11 @@ from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.tables import MISSING, document, markdown_table, number
 from ekfslam.figures.style import GREY, ORANGE, REFERENCE, marker_of, styled
 from ekfslam.filters.log import Log
-from ekfslam.filters.observing import Rig
 from ekfslam.filters.result import Result
 from ekfslam.geometry import camera, motion, se3
 from ekfslam.smoother.optimise import kernel_cost
 from ekfslam.smoother.posterior import posterior
-from ekfslam.smoother.problem import Rows, State
+from ekfslam.smoother.problem import BatchProblem
 
 try:
     import gtsam
@@ -240,7 +239,7 @@ def log_of(result: Result) -> Log:
     return result.log
 
 
-def start_of(result: Result, rows: Rows) -> tuple[Array, Array]:
+def start_of(result: Result, rows: BatchProblem) -> tuple[Array, Array]:
     """Where the posterior starts: the filter's poses and map, but landmarks left behind a camera as triangulated."""
     log = log_of(result)
     q = rows.points(rows.filtered_state(result.landmarks.position_m))
@@ -248,14 +247,17 @@ def start_of(result: Result, rows: Rows) -> tuple[Array, Array]:
     return se3.inverse(log.T_updated), np.where(hidden[:, None], log.first_position_m, result.landmarks.position_m)
 
 
-def cost_of(rows: Rows, config: PosteriorConfig, T_world_imu: Array, positions_m: Array) -> tuple[float | None, int]:
+def cost_of(
+    rows: BatchProblem, config: PosteriorConfig, T_world_imu: Array, positions_m: Array
+) -> tuple[float | None, int]:
     """The posterior's cost function anywhere, None where it is infinite, and the number of observations from behind."""
-    state = State(se3.inverse(T_world_imu), positions_m, np.zeros(6))
+    # White noise and a certain first pose: poses and landmarks are all there is.
+    state = replace(rows.filtered_state(positions_m), T_imu_world=se3.inverse(T_world_imu), zeta=np.zeros(6))
     q = rows.points(state)
     behind = int((q[:, 2] <= 0.0).sum())
     if behind:
         return None, behind
-    s = np.linalg.norm(rows.observation_residual(q), axis=1)
+    s = np.linalg.norm(rows.observation_residual(q, state), axis=1)
     pixels = kernel_cost(config.kernel, config.kernel_width, s).sum()
     return float(pixels + 0.5 * (rows.motion_residual(state) ** 2).sum()), 0
 
@@ -290,11 +292,10 @@ def solve_all(sequence: Sequence, overrides: dict[str, dict[str, float]]) -> dic
     dead_reckoning = ekfslam.run(sequence, "dead-reckoning", settings)
     result = ekfslam.run(sequence, "full", settings)
     log = log_of(result)
-    rows = Rows(log, Rig(result.camera, result.T_cam_imu, result.noise))
-
     begin = perf_counter()
     found = posterior(result)
     seconds = perf_counter() - begin
+    rows = found.problem
 
     factors = factors_of(result, config)
     graph, start = factors.graph(), to_gtsam(*start_of(result, rows))

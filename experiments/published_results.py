@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -43,8 +43,8 @@ from ekfslam.data.sequence import Noise
 from ekfslam.evaluation.consistency import nees, pose_error
 from ekfslam.evaluation.tables import document, markdown_table, plus_minus
 from ekfslam.filters import JointEKF
-from ekfslam.filters.observing import ACCEPTED
 from ekfslam.geometry import se3
+from ekfslam.models.sensors.base import ACCEPTED
 
 VARIANTS: tuple[Variant, ...] = ("invariant", "fej", "standard")
 NAMES = {"invariant": "RI", "fej": "FEJ", "standard": "standard"}
@@ -77,10 +77,12 @@ class PositionSensor:
     def T_cam_imu(self) -> Array:
         return np.eye(4)
 
-    def screen(self, measured: Array, config: FilterConfig) -> IntArray:
+    dimension = 3
+
+    def screen(self, measured: Array, min_depth_m: float) -> IntArray:
         return np.full(len(measured), ACCEPTED)
 
-    def in_view(self, q: Array, config: FilterConfig) -> NDArray[np.bool_]:
+    def in_view(self, q: Array, min_depth_m: float) -> NDArray[np.bool_]:
         return np.ones(len(q), dtype=bool)
 
     def rows(self, measured: Array) -> Array:
@@ -239,7 +241,8 @@ def drive(world: World, rng: np.random.Generator, variants: Iterable[Variant] = 
         ekf = JointEKF(frames[0][1], config, world.T_world_imu[0])
         T_imu_world, covariance = np.empty((steps, 4, 4)), np.empty((steps, 6, 6))
         for k, (ids, sensor) in enumerate(frames):
-            ekf.sensor = sensor
+            # Odometry and sensor both have a noise of their own in every frame.
+            ekf.model = replace(ekf.model, sensor=sensor, noise=sensor.noise)
             if k > 0:
                 ekf.predict(odometry[k], 1.0)
             ekf.update(k, ids, sensor.measured_m)

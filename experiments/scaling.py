@@ -40,13 +40,13 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import City, Loop, simulate
 from ekfslam.evaluation.tables import document, markdown_table
 from ekfslam.figures.style import GREY, log_axis, style_of, styled
-from ekfslam.filters import JointEKF, joint
-from ekfslam.filters.observing import Rig
+from ekfslam.filters import JointEKF, loop
 from ekfslam.filters.result import Result
-from ekfslam.models.build import noise_of, resolve
-from ekfslam.smoother.posterior import Posterior, posterior
-from ekfslam.smoother.problem import Rows
-from ekfslam.smoother.sparse.information import Elimination, JointInformation, LinearSystem
+from ekfslam.models.build import build, resolve
+from ekfslam.smoother.posterior import Posterior, model_of_result, posterior
+from ekfslam.smoother.problem import BatchProblem
+from ekfslam.smoother.revival import MapRevival
+from ekfslam.smoother.sparse.information import JointInformation, LinearSystem
 from ekfslam.storage.archive import write_archive
 
 SIZES = (100, 300, 1000, 3000, 10_000, 30_000, 100_000)
@@ -154,8 +154,8 @@ def measure_stages(result: Result) -> Row:
     """Seconds of the steps of one linearisation (as filtered)."""
     log = result.log
     assert log is not None
-    rows = Rows(log, Rig(result.camera, result.T_cam_imu, result.noise))
-    elimination, structure_s = timed(lambda: Elimination(log.frames, log.landmarks, log.frame, log.landmark, log.id))
+    rows = BatchProblem(log, model_of_result(result))
+    elimination, structure_s = timed(rows.elimination)
     state = rows.filtered_state(result.landmarks.position_m)
     system, rows_s = timed(lambda: rows.relinearised(state))
     information, first_s = timed(lambda: JointInformation(elimination, system))
@@ -197,14 +197,10 @@ def position_error_m(sequence: Sequence, T_world_imu: Array) -> float:
 def steps(sequence: Sequence, retire: str, variant: str = "invariant") -> Iterator[tuple[JointEKF, float]]:
     """The joint filter after each frame, with the CPU milliseconds of the frame."""
     config = resolve(Config().with_overrides({"filter": {"retire": retire, "variant": variant}}), sequence)
-    rig = Rig(sequence.camera, sequence.T_cam_imu, noise_of(sequence, config))
-    ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu)
-    for k in range(len(sequence)):
-        begin = process_time()
-        if k > 0:
-            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
-        ekf.update(k, *sequence.observations.at(k))
-        yield ekf, 1e3 * (process_time() - begin)
+    model = build(sequence, config, clean=False).model
+    ekf = JointEKF(model, config.filter, revival=MapRevival(model, config.filter))
+    for frame in loop.run_filter(ekf, sequence, clock=process_time):
+        yield ekf, frame.ms
 
 
 def measure_in_turn(landmarks: int) -> Row:
@@ -246,8 +242,7 @@ def measure_dense(landmarks: int) -> Row:
     row: Row = {"landmarks": len(ekf.ids), "ms_per_frame": float(np.median(ms[-10:])), "filter_mb": memory()}
 
     log = ekf.log()
-    assert isinstance(ekf.sensor, Rig)
-    system = Rows(log, ekf.sensor).as_filtered()
+    system = BatchProblem(log, ekf.model).as_filtered()
     row["posterior_s"] = timed(lambda: dense_inverse(system, log.frames))[1]
     row["posterior_mb"] = memory()
     return row
@@ -255,9 +250,7 @@ def measure_dense(landmarks: int) -> Row:
 
 def dense_inverse(system: LinearSystem, frames: int) -> Array:
     """Covariance of all poses and landmarks, (6T+3M, 6T+3M), with the first pose in units of its prior."""
-    J_from, J_x = system.J_from.copy(), system.J_x.copy()
-    J_from[0] = J_from[0] @ system.B
-    J_x[system.frame == 0] = J_x[system.frame == 0] @ system.B
+    J_from, J_x = system.J_from, system.J_x
     step, observation = np.arange(frames - 1), np.arange(len(system.r))
     width = 6 * frames + 3 * system.landmarks
     information = np.zeros((width, width))
@@ -292,9 +285,9 @@ def measure_loop(landmarks: int) -> Row:
         position = np.zeros(3)
         for ekf, frame_ms in steps(sequence, retire, variant):
             ms.append(frame_ms)
-            solves.append(len(ekf.revived) > revived)
+            solves.append(len(ekf.retired.revived) > revived)
             active.append(len(ekf.ids))
-            revived, position = len(ekf.revived), ekf.T_world_imu[:3, 3]
+            revived, position = len(ekf.retired.revived), ekf.T_world_imu[:3, 3]
         row["filters"].append(
             {
                 "variant": variant,
@@ -471,7 +464,7 @@ def main() -> None:
     if parsed.worker:
         what, landmarks = parsed.worker
         # `run` times frames by the wall clock, which other work on the machine disturbs several times over.
-        joint.perf_counter = process_time
+        loop.perf_counter = process_time
         with threadpool_limits(1):
             print(json.dumps(WORKERS[what](int(landmarks))))
         return

@@ -19,6 +19,7 @@ stated is worth, and nothing shall be hidden.
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from dataclasses import dataclass
 
@@ -30,14 +31,15 @@ from threadpoolctl import threadpool_limits
 import ekfslam
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig, Variant
-from ekfslam.data.sequence import Noise, Sequence
+from ekfslam.data.sequence import Noise, Observations, Sequence
 from ekfslam.evaluation.consistency import chi2_bounds, invariant_landmark_error, nees, pose_error
 from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.evaluation.trajectory import match_landmarks
 from ekfslam.figures.style import BOUNDS, EXPECTED, SERIES, SKY_BLUE, ZERO, log_axis, marker_of, styled
 from ekfslam.filters import JointEKF
-from ekfslam.filters.observing import Rig
+from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import camera, se3
+from ekfslam.models.sensors.stereo import Rig
 
 VARIANTS: tuple[Variant, ...] = ("invariant", "fej", "standard")
 WINDOW_FRAMES = 100
@@ -97,6 +99,9 @@ def robust_std(values: Array) -> Array:
 # --- Windows ---------------------------------------------------------------------------------------------------------
 
 
+NOTHING_SEEN = Observations(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 4)))
+
+
 @dataclass(frozen=True)
 class Window:
     """One variant on one window: pose NEES (n,) after each frame, landmark NEES (m,) and pose error (6,) at the end."""
@@ -123,11 +128,8 @@ def run_window(
     # T_imu_world = exp(xi^) T_hat, hence T_hat^-1 = T_world_imu exp(xi^).
     ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, noise), config, truth.T_world_imu[start] @ se3.exp(xi))
     T_world_imu, covariance = np.empty((stop - start, 4, 4)), np.empty((stop - start, 6, 6))
-    for i, k in enumerate(range(start, stop)):
-        if i > 0:
-            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
-        if variant is not None:
-            ekf.update(k, *sequence.observations.at(k))
+    frames = dataclasses.replace(sequence, observations=NOTHING_SEEN) if variant is None else sequence
+    for i, _ in enumerate(run_filter(ekf, frames, range(start, stop))):
         T_world_imu[i], covariance[i] = ekf.T_world_imu, ekf.P[:6, :6]
 
     error = pose_error(T_world_imu, truth.T_world_imu[start:stop])

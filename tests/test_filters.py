@@ -11,10 +11,10 @@ from ekfslam.data.sequence import Observations
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.observing import Rig
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import se3
 from ekfslam.models.build import noise_of
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
 
 OPEN = FilterConfig(gate_probability=1.0, split_after=0)

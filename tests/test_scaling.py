@@ -16,8 +16,8 @@ from ekfslam.config import Config, FilterConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import City, simulate
 from ekfslam.filters import JointEKF
-from ekfslam.filters.observing import Rig
 from ekfslam.models.build import noise_of, resolve
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.smoother.posterior import posterior
 
 EXPERIMENT = Path(__file__).parents[1] / "experiments" / "scaling.py"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, IntArray
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class TrackError:
     """The error of a track in the image, eq. (10): it starts anew where the track does, and then walks.
 
     An observation is ``z(k) = h(k) + e(k)`` with ``e ~ N(0, first^2)`` at landmark initialisation and
-    ``e(k) = memory e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2))`` while the track goes on: the further pixels move from
-    one frame to the next, the worse they are followed. With memory 1 it is a random walk about a constant error, with
-    less an AR(1) process.
+    ``e(k) = memory e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2))`` while the track goes on: the further pixels move
+    from one frame to the next, the worse they are followed. With memory 1 it is a random walk about a constant error,
+    with less an AR(1) process.
 
     Args:
         first_std: (3,) standard deviation at landmark initialisation, in the sensor's rows, px.
@@ -62,7 +62,7 @@ class TrackError:
         square_flow = (motion_px[:, :2] ** 2).sum(axis=1, keepdims=True)
         return self.walk_std**2 * (1.0 + square_flow / self.flow_px**2)
 
-    def absolute_variance(self, age: Array) -> Array:
+    def absolute_variance(self, age: IntArray) -> Array:
         """Variances (n, 3) of observations without a predecessor in the frame before, ``age`` (n,) frames old.
 
         At age 0 that of landmark initialisation. A track that missed a frame is matched anew: its error is drawn again,
@@ -117,7 +117,9 @@ class Noise:
         """The part that belongs to tracks; None where pixel noise is white."""
         if self.track_first_px is None or self.track_walk_px is None:
             return None
-        return TrackError(np.asarray(self.track_first_px), np.asarray(self.track_walk_px), self.track_memory, self.track_flow_px)
+        return TrackError(
+            np.asarray(self.track_first_px), np.asarray(self.track_walk_px), self.track_memory, self.track_flow_px
+        )
 
     @property
     def velocity_std(self) -> Array:

@@ -14,6 +14,9 @@ from ekfslam.geometry import se3
 from ekfslam.models.model import Seen
 from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, MOVING
 
+# Largest variance of an innovation, in those of the measurement, at which linearising still means anything.
+_MOST_BLURRED = 1e8
+
 
 @dataclass(frozen=True)
 class Correction:
@@ -86,6 +89,10 @@ def _gate_alone(e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArr
     some = np.flatnonzero(verdict == ACCEPTED)
     rows = rows.only(some)
     S = e.gaussian.variances(rows) + gates.diagonal(rows.variance)
+    # So near to the camera plane that its image may be anywhere: linearised, it would spoil the whole frame.
+    blurred = np.any(np.diagonal(S, axis1=1, axis2=2) > _MOST_BLURRED * rows.variance, axis=1)
+    verdict[some[blurred]] = BEHIND_CAMERA
+    some, S, rows = some[~blurred], S[~blurred], rows.only(~blurred)
     squares = gates.normalised_squares(S, rows.residual, frame, e.ids[rows.slot])
     inside = squares <= gate
     verdict[some[~inside]] = GATE

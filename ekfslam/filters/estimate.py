@@ -14,6 +14,9 @@ from ekfslam.geometry import se3
 from ekfslam.models.model import Model, Moment, Seen
 from ekfslam.models.sensors.base import Sensor
 
+# Calibration parameters where they are as given.
+GIVEN = np.zeros(9)
+
 
 class Estimate:
     """Mean and covariance of all state blocks and active landmarks.
@@ -142,13 +145,13 @@ class Estimate:
 
     def moment(self) -> Moment:
         """From where landmarks are seen now."""
-        return Moment(self.T_imu_world, self.linear_T_imu_world, self.values.get("calibration"), self.imu_twist)
+        return Moment(self.T_imu_world, self.linear_T_imu_world, self.values.get("calibration", GIVEN), self.imu_twist)
 
     def moment_before(self) -> Moment:
         """From where they were seen in the frame before, as far as the clone knows."""
         T = self.values["previous_pose"]
         T_linear = self.variant.linear(T, self.T_predicted_before)
-        return Moment(T, T_linear, self.values.get("calibration"), self.imu_twist_before)
+        return Moment(T, T_linear, self.values.get("calibration", GIVEN), self.imu_twist_before)
 
     def observe(self, slot: IntArray, measured: Array) -> tuple[Seen, Rows]:
         """Landmarks at the slots (k,) as they are seen now, and the measurement rows of what was ``measured`` (k, d).

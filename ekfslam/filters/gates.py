@@ -46,8 +46,8 @@ def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> 
 def agrees_with_others(gaussian: Gaussian, left: Rows, gate: float) -> BoolArray:
     """Whether (k,) each landmark agrees with the prediction as corrected by all *other* landmarks of the frame.
 
-    With ``e_i = r_i - H_i (xi, d)`` and ``C_i = V - H_i P H_i^T`` after conditioning on all of them, ``e_i^T C_i^-1 e_i``
-    is the normalised square of landmark i's innovation given all others.
+    With ``e_i = r_i - H_i (xi, d)`` and ``C_i = V - H_i P H_i^T`` after conditioning on all of them,
+    ``e_i^T C_i^-1 e_i`` is the normalised square of landmark i's innovation given all others.
 
     Args:
         gaussian: Conditioned on all of the rows.
@@ -69,9 +69,9 @@ def moves_along(
 ) -> BoolArray:
     """Which landmarks (k,) travel with the rig or against it, by all that their tracks have shown so far.
 
-    A landmark that moves by a share b of the rig's step between two frames has innovations of mean ``b h``. Over a track
-    ``N = sum h^T S^-1 r`` and ``D = sum h^T S^-1 h`` estimate b as N / D with standard deviation ``D^-1/2``. Per-frame
-    gates never see it: the pose gives way first.
+    A landmark that moves by a share b of the rig's step between two frames has innovations of mean ``b h``. Over a
+    track ``N = sum h^T S^-1 r`` and ``D = sum h^T S^-1 h`` estimate b as N / D with standard deviation ``D^-1/2``.
+    Per-frame gates never see it: the pose gives way first.
 
     Args:
         table: Keeps the evidence, which grows.

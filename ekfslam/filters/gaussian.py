@@ -1,7 +1,7 @@
 """The covariance of body and landmarks, and the verbs that change it: nothing else writes it (a transport excepted).
 
-Body columns come first (see `ekfslam.models.blocks.Layout`), then three columns a landmark. Every verb works in place on
-half of the symmetric matrix, and equals its naive form ``F P F^T + Q``, ``P - K S K^T`` and so on to rounding.
+Body columns come first (see `ekfslam.models.blocks.Layout`), then three columns a landmark. Every verb works in place
+on half of the symmetric matrix, and equals its naive form ``F P F^T + Q``, ``P - K S K^T`` and so on to rounding.
 """
 
 from __future__ import annotations
@@ -148,9 +148,7 @@ class Gaussian:
         Y_transposed, whitened, _ = _whiten(S, HP, rows.residual.ravel(), frame, ids)
         return Y_transposed @ whitened
 
-    def _condition(
-        self, HP: Array, S: Array, residual: Array, sign: float, frame: int, ids: IntArray
-    ) -> Conditioned:
+    def _condition(self, HP: Array, S: Array, residual: Array, sign: float, frame: int, ids: IntArray) -> Conditioned:
         Y_transposed, whitened, log_det = _whiten(S, HP, residual, frame, ids)
         add_square(self.P, Y_transposed, -sign)
         return Conditioned(Y_transposed @ whitened, float(whitened @ whitened), log_det)

@@ -206,7 +206,8 @@ class JointEKF(Estimate):
             position_m=positions,
             initial_m=positions,
         )
-        self.table.observed(np.arange(len(self.ids) - len(ids), len(self.ids)), self.step, rows, self._log.last(len(ids)))
+        slot = np.arange(len(self.ids) - len(ids), len(self.ids))
+        self.table.observed(slot, self.step, rows, self._log.last(len(ids)))
         self.retired.start_afresh(ids)
 
     def _retire(self, gone: BoolArray, may_return: bool = False) -> None:

@@ -62,7 +62,7 @@ class LandmarkTable:
         return (order[index] if len(order) else index), is_known
 
     def observed(self, slot: IntArray, step: int, rows: Array, places: IntArray) -> None:
-        """Remember what was seen of landmarks (k,) for the next frame: rows (k, d), and their places (k,) in the log."""
+        """Remember what was seen of landmarks (k,) for the next frame: rows (k, d), and places (k,) in the log."""
         self.last_step[slot], self.seen_rows[slot], self.last_observation[slot] = step, rows, places
 
     def accepted(self, slot: IntArray, frame: int) -> None:

@@ -116,7 +116,7 @@ class Invariant(Standard):
 
         J is not the derivative of `retract`: it keeps the *invariant* error, which is the same before and after. So
         ``J N(X) = N(X+)`` for the unobservable directions N, and rows carried back through J still see nothing along
-        them. The exact derivative turns them by ``J_l(e)``; an iterated update with that one gains heading from nothing.
+        them. The exact derivative turns them by ``J_l(e)``; an iterated update with it gains heading from nothing.
         """
         P = gaussian.P
         columns, by = self._landmarks_by_rotations(model, before, moved_m)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -35,13 +35,12 @@ class Moment:
 
     T_imu_world: Array
     T_linear: Array
-    calibration: Array | None = None
-    twist: Array | None = None
+    calibration: Array = field(default_factory=lambda: np.zeros(9))
+    twist: Array = field(default_factory=lambda: np.zeros(6))
 
     def at(self, index: IntArray) -> Moment:
-        """The moments of some observations, given the frame of each, where poses are those of all frames."""
-        twist = None if self.twist is None else self.twist[index]
-        return Moment(self.T_imu_world[index], self.T_linear[index], self.calibration, twist)
+        """The moments of some observations, given the frame of each, where poses and velocities are of all frames."""
+        return Moment(self.T_imu_world[index], self.T_linear[index], self.calibration, self.twist[index])
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Step:
-    """One prediction: the next ``T_imu_world`` (4, 4), velocities of the IMU (6,), transition and noise (body, body)."""
+    """One prediction: next ``T_imu_world`` (4, 4), velocities of the IMU (6,), transition and noise (body, body)."""
 
     T_imu_world: Array
     twist: Array
@@ -87,7 +86,8 @@ class VelocityRows:
     def concatenate(parts: Iterable[VelocityRows]) -> VelocityRows:
         """All rows of the parts, in their order."""
         parts = list(parts)
-        return VelocityRows(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(VelocityRows)))
+        names = [field.name for field in dataclasses.fields(VelocityRows)]
+        return VelocityRows(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     @staticmethod
     def of_imu(measured: Array, std: Array) -> VelocityRows:
@@ -313,7 +313,7 @@ class Model:
             G[..., layout["calibration"]] = G_c
         return positions, G, covariance
 
-    def sensor_at(self, parameters: Array | None) -> Sensor:
+    def sensor_at(self, parameters: Array) -> Sensor:
         """The sensor with a calibration (9,) applied."""
         return self.sensor if self.calibration is None else self.calibration.applied(self.rig, parameters)
 

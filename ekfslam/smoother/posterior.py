@@ -166,15 +166,17 @@ def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterio
 def model_of_result(result: Result) -> Model:
     """The model that a full run believed in."""
     assert result.log is not None
-    stored = Config().with_overrides(result.config)
-    return model_of(
-        Rig(result.camera, result.T_cam_imu, result.noise),
-        result.noise,
-        result.log.T_predicted[0],
-        result.log.initial_covariance,
-        stored.calibration,
-        optional_blocks(stored.blocks),
+    stored, log = Config().with_overrides(result.config), result.log
+    start = log.T_predicted[0], log.initial_covariance
+    rig = Rig(result.camera, result.T_cam_imu, result.noise)
+    model = model_of(rig, result.noise, *start, stored.calibration, optional_blocks(stored.blocks))
+    if model.layout.body == log.departed.shape[1]:
+        return model
+    # Archives before format version 4 know of poses alone: velocities are white there, and so are pixels.
+    noise = dataclasses.replace(
+        result.noise, twist_walk_std=None, tilt_rad=0.0, track_first_px=None, track_walk_px=None
     )
+    return model_of(dataclasses.replace(rig, noise=noise), noise, *start)
 
 
 def posterior_of_log(
@@ -200,10 +202,11 @@ def posterior_of_log(
     config = config or PosteriorConfig()
     problem = BatchProblem(log, model)
     elimination = problem.elimination()
+    weight, costs = np.ones(log.observations), tuple[float, ...]()
     if config.linearisation == "filtered":
         information = JointInformation(elimination, problem.as_filtered())
         state = problem.solved_as_filtered(information)
-        weight, costs = np.ones(log.observations), (information.cost,)
+        costs = (information.cost,)
     else:
         iterations = progress(range(config.max_iterations), f"{name}: smoothing")
         start = problem.filtered_state(positions_m)

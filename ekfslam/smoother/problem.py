@@ -9,7 +9,7 @@ first-estimates EKF that never retires a landmark has exactly the solution of th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import IllPosedError
+from ekfslam.filters.estimate import GIVEN
 from ekfslam.filters.log import Log
 from ekfslam.geometry import motion, se3
 from ekfslam.models.model import Model, Moment, Seen, VelocityRows
@@ -63,9 +64,7 @@ class BatchProblem:
         eigenvalues, vectors = np.linalg.eigh(log.initial_covariance)
         self.B = (vectors * np.sqrt(np.maximum(eigenvalues, 0.0))) @ vectors.T
         self.aux_blocks = [block for block in layout.blocks if block.per_frame and block.name != "pose"]
-        self.drive_blocks = [
-            block for block in layout.blocks if not block.per_frame and block.name != "previous_pose"
-        ]
+        self.drive_blocks = [block for block in layout.blocks if not block.per_frame and block.name != "previous_pose"]
         self.aux_columns = layout.columns(block.name for block in self.aux_blocks)
         self.drive_columns = layout.columns(block.name for block in self.drive_blocks)
         self._pose, self._clone = layout["pose"], layout.get("previous_pose")
@@ -161,7 +160,7 @@ class BatchProblem:
             "r_drive": -drive_prior * drive,
         }
 
-    def _motion_rows(self, Phi: Array, by_last: Array, by_next: Array, B: Array) -> dict[str, Array]:
+    def _motion_rows(self, Phi: Array, by_last: Array, by_next: Array, B: Array) -> dict[str, Any]:
         """Rows of the steps from Phi (T-1, 6, body), scaled by derivatives (T-1, 6, 6) of the residual."""
         W = self._weight_motion
         WPhi = -W @ by_last @ Phi
@@ -263,7 +262,8 @@ class BatchProblem:
                 clone=True,
             )
             B_x = self._carried_back(before.H_x, self._clone, log.T_linear_before, log.T_departed, frame, None)
-            r[follows] -= memory * (log.rows[log.previous[follows]] - before.z + (B_x @ x[follows, :width, None])[..., 0])
+            shifted = (B_x @ x[follows, :width, None])[..., 0]
+            r[follows] -= memory * (log.rows[log.previous[follows]] - before.z + shifted)
             H_x[follows] -= memory * B_x
             H_m[follows] -= memory * before.H_m
             J_p = H_x[..., self._clone]
@@ -288,8 +288,8 @@ class BatchProblem:
         linear_positions_m: Array,
         clone: bool = False,
     ) -> Seen:
-        """Landmarks (K, 3) from poses (K, 4, 4), calibrated as coordinates (K, body) say, which a group has in common."""
-        model, calibration = self.model, self.model.calibration
+        """Landmarks (K, 3) from poses (K, 4, 4), calibrated as coordinates (K, body) say; those of a group are
+        equal.""" model, calibration = self.model, self.model.calibration
         if calibration is None:
             return model.see(Moment(T, T_linear), positions_m, linear_positions_m, clone)
         parts, order = [], np.argsort(group, kind="stable")
@@ -305,7 +305,8 @@ class BatchProblem:
         calibration = self.model.calibration
         if calibration is None or not calibration.has_time_offset:
             return T, np.broadcast_to(np.eye(6), (len(T), 6, 6))
-        found = np.array([calibration.retract(calibration.initial(), x) for x in coordinates[:, self.model.layout["calibration"]]])
+        start, at = calibration.initial(), self.model.layout["calibration"]
+        found = np.array([calibration.retract(start, x[at]) for x in coordinates])
         delay = np.array([calibration.delay(c, u) for c, u in zip(found, twist, strict=True)])
         return delay @ T, se3.adjoint(delay)
 
@@ -324,7 +325,7 @@ class BatchProblem:
     # --- at any state -------------------------------------------------------------------------------------------------
 
     def _values_before(self, state: State) -> dict[str, Array]:
-        """Values of all blocks as the steps (T-1,) need them: poses of the frame before, all else of the frame after."""
+        """Values of all blocks as steps (T-1,) need them: poses of the frame before, all else of the frame after."""
         values: dict[str, Array] = {"pose": state.T_imu_world[:-1]}
         start = 0
         for block in self.aux_blocks:
@@ -353,14 +354,12 @@ class BatchProblem:
 
     def _moments(self, state: State) -> Moment:
         """From where every frame sees."""
-        T, twist = state.T_imu_world, None
+        T, twist = state.T_imu_world, np.zeros((len(state.T_imu_world), 6))
         if self.model.has_time_offset:
             # Velocities as the trajectory has them; that they change with it is of second order.
             tau = np.where(self.log.tau_s > 0, self.log.tau_s, 1.0)[1:, None]
             twist = np.concatenate([self.log.seen_twist[:1], -se3.log(T[1:] @ se3.inverse(T[:-1])) / tau])
-        elif self.model.calibration is not None:
-            twist = np.zeros((len(T), 6))
-        return Moment(T, T, state.drive_values.get("calibration"), twist)
+        return Moment(T, T, state.drive_values.get("calibration", GIVEN), twist)
 
     def points(self, state: State) -> Array:
         """Every observed landmark (K, 3) m as the sensor has it."""
@@ -370,7 +369,7 @@ class BatchProblem:
     def observation_residual(self, q: Array, state: State) -> Array:
         """Whitened right sides (K, d) of the observations at the points of `points`."""
         log, follows = self.log, self._follows
-        r = log.rows - self.model.sensor_at(state.drive_values.get("calibration")).predict(q)
+        r = log.rows - self.model.sensor_at(state.drive_values.get("calibration", GIVEN)).predict(q)
         if len(follows):
             # Seen from the frame before is what the observation before has seen: the same landmark.
             r[follows] -= self._memory * r[log.previous[follows]]
@@ -429,14 +428,20 @@ class BatchProblem:
         s = se3.apply(before[k], state.positions_m)
         turned = np.cross(eps[k, 3:], s) + (before[k, :3, :3] @ d[..., None])[..., 0]
         positions = se3.apply(se3.inverse(T[k]), s + eps[k, :3] + turned)
-        return State(T, positions, zeta, state.aux + step.aux, state.drive + step.drive, self._drive(state, step.drive))
+        drive = self._drive(state.drive_values, step.drive)
+        return State(T, positions, zeta, state.aux + step.aux, state.drive + step.drive, drive)
 
-    def _drive(self, state: State, correction: Array) -> dict[str, Array]:
+    @property
+    def _initial_drive(self) -> dict[str, Array]:
+        """Values of the drive's blocks before the first frame."""
+        return {block.name: block.initial() for block in self.drive_blocks}
+
+    def _drive(self, before: Mapping[str, Array], correction: Array) -> dict[str, Array]:
         """Values of the drive's blocks after a correction (g,)."""
         values, start = {}, 0
         for block in self.drive_blocks:
             part = correction[start : start + block.size]
-            values[block.name] = block.retract(state.drive_values[block.name], part)
+            values[block.name] = block.retract(before[block.name], part)
             start += block.size
         return values
 
@@ -445,18 +450,16 @@ class BatchProblem:
         log = self.log
         xi = se3.log(log.T_updated[0] @ se3.inverse(log.T_predicted[0]))
         drive = log.updated[-1, self.drive_columns]
-        start = State(log.T_updated, positions_m, np.linalg.pinv(self.B) @ xi, log.updated[:, self.aux_columns], drive, {})
-        initial = replace(start, drive_values={block.name: block.initial() for block in self.drive_blocks})
-        return replace(initial, drive_values=self._drive(initial, drive))
+        zeta, aux = np.linalg.pinv(self.B) @ xi, log.updated[:, self.aux_columns]
+        return State(log.T_updated, positions_m, zeta, aux, drive, self._drive(self._initial_drive, drive))
 
     def solved_as_filtered(self, information: JointInformation) -> State:
         """The state that the solution of `as_filtered` stands for; corrections of it add up as those of the filter."""
         log = self.log
         T = se3.exp(information.eps) @ log.T_predicted
         positions = log.first_position_m + information.d
-        state = State(T, positions, information.zeta, information.aux, information.drive, {})
-        initial = replace(state, drive_values={block.name: block.initial() for block in self.drive_blocks})
-        return replace(initial, drive_values=self._drive(initial, information.drive))
+        drive = self._drive(self._initial_drive, information.drive)
+        return State(T, positions, information.zeta, information.aux, information.drive, drive)
 
     def values(self, state: State) -> dict[str, Array]:
         """Values of the blocks besides the poses: of each frame (T, ...), or of the drive."""

@@ -1,9 +1,9 @@
 """A Gaussian over poses, other blocks and landmarks in information form: whitened rows, normal equations, CHOLMOD.
 
-Unknowns are ``eps`` (T, 6), one vector a pose, ``aux`` (T, a), what else has a value for each frame, ``drive`` (g,), what
-has one value for the drive, and ``d`` (M, 3), one a landmark. Observations touch a pose, perhaps the one before, the
-drive and a landmark; motion touches consecutive poses, the aux of the later one and the drive. Landmarks know of each
-other only through poses and drive, so those with few observations are eliminated first, all at once, by their Schur
+Unknowns are ``eps`` (T, 6), one vector a pose; ``aux`` (T, a), what else has a value for each frame; ``drive`` (g,),
+what has one value for the drive; and ``d`` (M, 3), one a landmark. Observations touch a pose, perhaps the one before,
+the drive and a landmark; motion touches consecutive poses, the aux of the later one and the drive. Landmarks know of
+each other only through poses and drive, so those with few observations are eliminated first, all at once, by their Schur
 complements. What remains goes to CHOLMOD. Both are steps of one sparse elimination: nothing is approximated, and no
 matrix as wide as the state is ever formed.
 
@@ -298,7 +298,6 @@ class JointInformation:
         self._factorise(system, damping, factor)
         g_m, right = e.sum_by_landmark(_transposed(system.J_m, system.r)), _right_side(e, system)
         whitened = (self._L_inverse @ g_m[..., None])[..., 0]
-        poses, _, drive, kept = e.parts(right)
         reduced = right.copy()
         reduced_poses, _, reduced_drive, reduced_kept = e.parts(reduced)
         reduced_poses -= e.sum_by_frame((self._Y.swapaxes(1, 2) @ whitened[e.landmark, :, None])[..., 0])
@@ -367,7 +366,7 @@ class JointInformation:
             number = error.block - int(e.first_block[kind])
             what = ("frame without enough information", "frame whose velocities have not enough information")
             if kind == 2:
-                raise IllPosedError("too little information about blocks that are constant along the drive", []) from None
+                raise IllPosedError("too little information about blocks of the whole drive", []) from None
             culprit = e.ids[e.kept[number]] if kind == 3 else number
             raise IllPosedError("landmark without enough information" if kind == 3 else what[kind], [culprit]) from None
 
@@ -531,7 +530,11 @@ class JointInformation:
                 e.start[e.first_block[1] + aux] if e.aux else aux,
                 np.broadcast_to(np.eye(e.aux), (len(aux), e.aux, e.aux)),
             ),
-            (before_drive + drives, at_drive + drives, np.broadcast_to(np.eye(e.drive), (len(drives), e.drive, e.drive))),
+            (
+                before_drive + drives,
+                at_drive + drives,
+                np.broadcast_to(np.eye(e.drive), (len(drives), *(e.drive,) * 2)),
+            ),
             (place[e.landmark[chosen]], e.start[e.frame[chosen]], follow),
             (place[landmarks], np.full(len(landmarks), at_drive), follow_drive),
             (place[kept], e.start[e.block_of_landmark[kept]], np.broadcast_to(np.eye(3), (len(kept), 3, 3))),
