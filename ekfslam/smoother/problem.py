@@ -288,8 +288,8 @@ class BatchProblem:
         linear_positions_m: Array,
         clone: bool = False,
     ) -> Seen:
-        """Landmarks (K, 3) from poses (K, 4, 4), calibrated as coordinates (K, body) say; those of a group are
-        equal.""" model, calibration = self.model, self.model.calibration
+        """Landmarks (K, 3) from poses (K, 4, 4), calibrated as coordinates (K, body) say, alike within a group."""
+        model, calibration = self.model, self.model.calibration
         if calibration is None:
             return model.see(Moment(T, T_linear), positions_m, linear_positions_m, clone)
         parts, order = [], np.argsort(group, kind="stable")
