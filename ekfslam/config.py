@@ -185,7 +185,7 @@ class FilterConfig:
     split_after: int = field(default=3, metadata=_whole(0))
     moving_sigma: float = field(default=1.5, metadata=_NOT_NEGATIVE)
     moving_share: float = field(default=0.1, metadata=_NOT_NEGATIVE)
-    min_depth_m: float = field(default=0.1, metadata=_NOT_NEGATIVE)
+    min_depth_m: float = field(default=0.1, metadata=_FINITE)
     initial_position_std_m: float = field(default=0.0, metadata=_FINITE)
     initial_rotation_std_rad: float = field(default=0.0, metadata=_FINITE)
 

@@ -137,6 +137,15 @@ def test_sequence_and_truth_come_back_bit_for_bit(written, sequence):
         assert_same(getattr(read, name), getattr(sequence, name), name)
 
 
+@pytest.mark.parametrize("name", ["config", "counts"])
+@pytest.mark.parametrize("text", ["[]", "3", "not JSON"])
+def test_what_is_no_table_is_named(copy, name, text):
+    with h5py.File(copy, "a") as h5file:
+        h5file["runs/full"].attrs[name] = text
+    with pytest.raises(ArchiveError, match=rf"copy\.h5: attribute {name} of runs/full is no JSON object"):
+        open_result(copy, "full")
+
+
 def test_sequence_without_truth_and_noise_comes_back_without(sequence, results, tmp_path):
     bare = dataclasses.replace(sequence, truth=None, noise=None)
     write_archive(tmp_path / "bare.h5", bare, results)

@@ -182,7 +182,9 @@ def test_runs_of_another_version_are_not_mixed_in(tmp_path, serial):
         run_study(dataclasses.replace(SMALL, runs=4), path, SerialExecutor())
 
 
-@pytest.mark.parametrize("kind", ["missing", "text", "truncated", "foreign", "newer"])
+@pytest.mark.parametrize(
+    "kind", ["missing", "text", "truncated", "foreign", "newer", "other JSON", "no levels", "no runs"]
+)
 def test_what_is_no_archive_of_a_study(tmp_path, serial, kind):
     path = tmp_path / "thing.h5"
     if kind == "text":
@@ -195,6 +197,11 @@ def test_what_is_no_archive_of_a_study(tmp_path, serial, kind):
         path.write_bytes(serial.read_bytes())
         with h5py.File(path, "r+") as h5file:
             h5file.attrs["format_version"] = 99
+    elif kind != "missing":
+        path.write_bytes(serial.read_bytes())
+        changed = {**SMALL.parameters, **{"no levels": {"levels": []}, "no runs": {"runs": 0}}.get(kind, {})}
+        with h5py.File(path, "r+") as h5file:
+            h5file.attrs["study"] = "[]" if kind == "other JSON" else json.dumps(changed)
     with pytest.raises(ArchiveError, match=r"thing\.h5.*"):
         read_study(path)
 

@@ -24,8 +24,8 @@ from ekfslam.data.tracks import cut_tracks, repeated_frames, successive
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
 
-# The rules in the order in which they are applied, with the key of ``[hygiene]`` that
-# switches each; the index is the code of `HygieneReport.rule`.
+# The rules in the order in which they are applied, with the key of ``[hygiene]`` that switches each. The index of a
+# rule is its code in `HygieneReport.rule`.
 _SWITCHES: dict[str, str] = {
     "repeated frame": "restart_at_repeats",
     "jump": "jump_sigma",
@@ -36,11 +36,9 @@ _SWITCHES: dict[str, str] = {
     "too short": "min_observations",
 }
 RULES: tuple[str, ...] = tuple(_SWITCHES)
-
-
 REPEATED_FRAME, JUMP, REUSED_ID, DISPARITY, ROW_MISMATCH, DEPTH, TOO_SHORT = range(len(RULES))
 
-# Deviation that white noise of 1 px gives to what `jumps` compares.
+# Standard deviation that white noise of 1 px gives to what `jumps` compares.
 _JUMP_STD = 2.0
 _COMPANY = 5  # tracks of a frame that can tell how the frame as a whole moved
 
@@ -130,8 +128,8 @@ def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tup
         order = np.lexsort((landmark, kept.frame))  # that of `Observations`
         kept, own = Observations(kept.frame, landmark, kept.pixels_px), own[order]
 
-    deviation = np.asarray(noise.pixel_std_px)
-    disparity_std, row_std = np.hypot(deviation[0], deviation[2]), np.hypot(deviation[1], deviation[3])
+    std = noise.pixel_std_px
+    disparity_std, row_std = np.hypot(std[0], std[2]), np.hypot(std[1], std[3])
     if config.restart_at_repeats:
         starts = _first_at_or_after(kept, repeated_frames(kept, sequence.twist))
         cut(REPEATED_FRAME, starts & ~_is_slow(kept, config.restart_above_px))
@@ -167,8 +165,8 @@ def jumps(observations: Observations, noise: Noise, sigma: float) -> NDArray[np.
     Three observations before and three from there on (in successive frames) decide. The track's course is the median of
     the two motions before and the two after; what the pixels have moved beyond it is taken over one, three and five
     frames about the jump, and the median of the three is not moved by one bad observation. A jump exceeds the
-    differences within the course, and, less what the frame's tracks have in common, ``sigma`` deviations of pixel noise
-    and of the scatter of the frame's tracks together.
+    differences within the course. Less what the frame's tracks have in common, it also exceeds ``sigma`` standard
+    deviations of pixel noise and of the scatter of the frame's tracks together.
     """
     order = np.lexsort((observations.frame, observations.landmark))
     frame, landmark = observations.frame[order], observations.landmark[order]
@@ -192,9 +190,10 @@ def jumps(observations: Observations, noise: Noise, sigma: float) -> NDArray[np.
 def reused_ids(sequence: Sequence, observations: Observations, noise: Noise, sigma: float) -> NDArray[np.bool_]:
     """Whether (K,) an observation after a gap in its track shows a point that cannot be the one from before the gap.
 
-    Both points are put into the world by the velocities alone. They may be apart by ``sigma`` deviations: of both
-    triangulations, and of what the velocities' noise adds up to during the gap, in position and (over the way and the
-    distance to the point) in heading. After a long drive that forbids little: a landmark that comes back is not cut.
+    Both points are put into the world by the velocities alone. They may be apart by ``sigma`` standard deviations: of
+    both triangulations, and of what the velocities' noise adds up to during the gap, in position and (over the way and
+    the distance to the point) in heading. After a long drive that forbids little, so a landmark that comes back is not
+    cut.
     """
     found = np.zeros(len(observations), dtype=bool)
     earlier, later = successive(observations)

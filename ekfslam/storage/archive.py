@@ -11,7 +11,7 @@
         rejections          frame, landmark, reason (index into its attribute ``names``)
         parameters          value, std, prior_std; attributes name, unit; see `ekfslam.filters.result.Parameters`
         hygiene             rule (index into its attribute ``names``), frame, landmark, continuation: see
-                            `ekfslam.filters.result.HygieneReport`; attribute observations (not in dead reckoning)
+                            `ekfslam.data.hygiene.HygieneReport`; attribute observations (not in dead reckoning)
         timing              ms_per_frame
         log                 what `ekfslam.smoother.posterior` needs: see `ekfslam.filters.log.Log` (mode full only)
 
@@ -334,8 +334,8 @@ def _read_result(h5file: h5py.File, mode: str, camera: StereoCamera, T_cam_imu: 
         landmarks=Landmarks(**fields["landmarks"]),
         innovation=Innovation(**fields["innovation"]),
         rejections=Rejections(**fields["rejections"]),
-        counts=json.loads(hdf5.attribute(group, "counts")),
-        config=_in_todays_terms(json.loads(hdf5.attribute(group, "config")), noise, version),
+        counts=hdf5.json_table(group, "counts"),
+        config=_in_todays_terms(hdf5.json_table(group, "config"), noise, version),
         noise=noise,
         camera=camera,
         T_cam_imu=T_cam_imu,

@@ -14,6 +14,7 @@ A leaf: readers of data use it as well as archives do, so it imports nothing of 
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -155,8 +156,24 @@ def attribute(item: h5py.Group | h5py.Dataset, name: str) -> Any:
         ArchiveError: It is missing.
     """
     if name not in item.attrs:
-        raise ArchiveError(f"{item.file.filename}: attribute {name} of {item.name.strip('/')} is missing")
+        raise ArchiveError(f"{item.file.filename}: {_spoken(item, name)} is missing")
     return plain(item.attrs[name])
+
+
+def json_table(item: h5py.Group | h5py.Dataset, name: str) -> dict[str, Any]:
+    """One attribute that holds a JSON object.
+
+    Raises:
+        ArchiveError: It is missing, or holds something else.
+    """
+    text = attribute(item, name)
+    try:
+        table = json.loads(text)
+    except (ValueError, TypeError):
+        table = None
+    if not isinstance(table, dict):
+        raise ArchiveError(f"{item.file.filename}: {_spoken(item, name)} is no JSON object: {str(text)[:40]!r}")
+    return table
 
 
 def fixed_text(text: str) -> np.bytes_:
@@ -173,6 +190,10 @@ def plain(value: Any) -> Any:
 def texts(values: Any) -> tuple[str, ...]:
     """Stored texts as plain ones."""
     return tuple(str(plain(text)) for text in np.ravel(values))
+
+
+def _spoken(item: h5py.Group | h5py.Dataset, name: str) -> str:
+    return f"attribute {name} of {item.name.strip('/') or 'the file'}"
 
 
 def _place(group: h5py.Group, name: str = "") -> str:

@@ -3,7 +3,7 @@
     study = Study({"mid": LEVELS["mid"]}, ("invariant", "standard"), runs=50)
     with open_executor("processes") as executor:
         archive = run_study(study, "study.h5", executor)
-    print(study_table(summarise_study(archive)))  # of ekfslam.metrics.study
+    print(study_table(summarise_study(archive)))  # of ekfslam.evaluation.study
 
 A realisation is decided by the study's seed, the name of its level and its number, by nothing else: neither the
 executor, nor the number of workers, nor the order in which they finish, nor an interruption changes one bit of the data
@@ -440,9 +440,12 @@ def read_study(path: str | Path) -> StudyArchive:
 
 def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
-        parameters = json.loads(hdf5.attribute(h5file, "study"))
-        parameters["levels"] = {name: Loop(**world) for name, world in parameters["levels"].items()}
-        study = Study(**parameters)
+        parameters = hdf5.json_table(h5file, "study")
+        try:
+            levels = {name: Loop(**world) for name, world in dict(parameters["levels"]).items()}
+            study = Study(**{**parameters, "levels": levels})
+        except ConfigError as error:
+            raise ArchiveError(f"{path}: {error}") from None
         done, data = {}, {}
         for level, world in study.levels.items():
             group = hdf5.subgroup(h5file, f"levels/{level}")
