@@ -16,7 +16,7 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.loop import one_thread, run_filter
+from ekfslam.filters.loop import FurtherVelocities, one_thread, run_filter
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.reports import collect
 from ekfslam.filters.result import Innovation, Landmarks, Rejections, Result
@@ -27,7 +27,9 @@ from ekfslam.smoother.posterior import smooth
 from ekfslam.smoother.revival import MapRevival
 
 
-def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -> Result:
+def run(
+    sequence: Sequence, mode: Mode = "full", config: Config | None = None, further: FurtherVelocities | None = None
+) -> Result:
     """Estimate trajectory and map of a sequence.
 
     Args:
@@ -35,6 +37,7 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
         mode: ``dead-reckoning`` (prediction only), ``mapping-only`` (the report: independent landmark EKFs on dead
             reckoning's poses), ``full`` (joint EKF SLAM) or ``smoothed`` (the posterior of a full run).
         config: Settings; defaults where None.
+        further: Velocity measurements of other sensors, for the joint filter (`ekfslam.models.sensors.velocities`).
 
     Raises:
         ConfigError: Unknown mode.
@@ -44,7 +47,7 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
     if mode not in MODES:
         raise ConfigError(f"unknown mode {mode!r}; known: {', '.join(MODES)}")
     if mode == "smoothed":
-        return smooth(run(sequence, "full", config))
+        return smooth(run(sequence, "full", config, further))
     problem = build(sequence, config, clean=mode != "dead-reckoning")
     sequence, config, model = problem.sequence, problem.config, problem.model
     account, hygiene = dict(problem.account), problem.hygiene
@@ -59,7 +62,7 @@ def run(sequence: Sequence, mode: Mode = "full", config: Config | None = None) -
             ekf = JointEKF(model, config.filter, revival=revival)
             T_imu_world, covariance = np.empty((len(sequence), 4, 4)), np.empty((len(sequence), 6, 6))
             ms = np.empty(len(sequence))
-            for k, report, ms[k] in run_filter(ekf, sequence, frames):
+            for k, report, ms[k] in run_filter(ekf, sequence, frames, further):
                 T_imu_world[k], covariance[k] = ekf.T_imu_world, ekf.P[:6, :6]
                 reports.append(report)
             landmarks, counts, log, parameters = ekf.landmarks(), ekf.counts, ekf.log(), ekf.parameters()

@@ -144,3 +144,9 @@ def run_joint(sequence, rig, config, calibration=None, revives=False, **options)
         poses.append(ekf.T_imu_world)
         reports.append(frame.report)
     return ekf, np.array(poses), reports
+
+
+def truth_error(sequence, result):
+    """Distance (T,) of the estimated positions from the true ones, m."""
+    truth = sequence.truth
+    return np.linalg.norm(result.T_world_imu[truth.frame, :3, 3] - truth.T_world_imu[:, :3, 3], axis=1)

@@ -166,7 +166,7 @@ class Estimate:
         variance = error.absolute_variance(self.step - self.table.first_step[slot])
         follows = np.flatnonzero(self.table.last_step[slot] == self.step - 1)
         if len(follows):
-            before = self.model.see(self.moment_before(), positions[follows], linear[follows], clone=True)
+            before = self.model.see(self.moment_before(), positions[follows], linear[follows], "previous_pose")
             rows_before = self.table.seen_rows[slot[follows]]
             H_x, H_m = H_x.copy(), H_m.copy()
             residual[follows] -= error.memory * (rows_before - before.z)

@@ -21,11 +21,12 @@ from ekfslam.filters.log import Log
 from ekfslam.filters.logbook import LogBook
 from ekfslam.filters.reports import FrameReport, log_density, missed
 from ekfslam.filters.result import Landmarks, Parameters
+from ekfslam.filters.waiting import Waiting
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import StateBlock
 from ekfslam.models.build import model_of
 from ekfslam.models.model import Model, Moment, VelocityRows
-from ekfslam.models.sensors.base import ACCEPTED, MOVING, Sensor
+from ekfslam.models.sensors.base import ACCEPTED, MOVING, WAITING, DelayedSensor, Sensor
 
 
 class JointEKF(Estimate):
@@ -73,6 +74,8 @@ class JointEKF(Estimate):
         self._reported: list[Array] = []  # estimates and standard deviations (2, p) after each frame
         self._is_twist_known = False
         self._moving_ids: set[int] = set()
+        delayed = model.sensor if isinstance(model.sensor, DelayedSensor) else None
+        self._waiting = None if delayed is None else Waiting(delayed, config.gate_probability)
         self._log_likelihood = 0.0  # of the velocities measured since the last frame
 
     # --- prediction ---------------------------------------------------------------------------------------------------
@@ -96,6 +99,8 @@ class JointEKF(Estimate):
             self._wander(block, tau_s)
         if model.has_twist:
             self._measure_velocities(twist, also)
+        elif also is not None:
+            raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
         step = model.step(self.values, twist, tau_s, self.linear_T_imu_world, self.variant.first_estimates)
         self.gaussian.propagate(step.Phi, step.Q)
         departed = self.coordinates
@@ -179,29 +184,52 @@ class JointEKF(Estimate):
         new = (~is_known & (reason == ACCEPTED)) | np.isin(ids, split)
         reason[new] = ACCEPTED
         self._log.amend(T_updated=self.T_imu_world, updated=self.coordinates)
-        # 5. Start new landmarks, eq. (5).
-        self._start(frame, ids[new], rows[new])
+        # 5. Start new landmarks, eq. (5), or let them wait.
+        reason[np.flatnonzero(new)[~self._start(frame, ids[new], rows[new])]] = WAITING
         self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
         likelihood = self._log_likelihood + log_density(found.done.nis, found.done.log_det, found.dof)
         self._log_likelihood = 0.0
         return FrameReport(frame, ids, reason, found.done.nis, found.dof, split, likelihood)
 
-    def _start(self, frame: int, ids: IntArray, rows: Array) -> None:
-        """Append new landmarks with their full cross-covariance, eq. (5)."""
-        if len(ids) == 0:
-            return
-        error, fresh, now = self.model.track_error, np.zeros(len(ids), dtype=np.int64), self.moment()
-        variance = self.sensor.variance(rows) if error is None else error.absolute_variance(fresh)
-        T_linear = self.variant.linear(now.T_imu_world, self.T_predicted)
-        moment = Moment(now.T_imu_world, T_linear, now.calibration, now.twist)
-        positions, G, covariance = self.model.initialise(moment, rows, variance)
-        self.gaussian.augment(G, covariance)
+    def _start(self, frame: int, ids: IntArray, rows: Array) -> BoolArray:
+        """Append new landmarks with their full cross-covariance, eq. (5); returns which (n,) need not wait."""
+        if self._waiting is not None:
+            return self._start_after_waiting(self._waiting, frame, ids, rows)
+        if len(ids):
+            error, now = self.model.track_error, self.moment()
+            none = np.zeros(len(ids), dtype=np.int64)
+            variance = self.sensor.variance(rows) if error is None else error.absolute_variance(none)
+            T_linear = self.variant.linear(now.T_imu_world, self.T_predicted)
+            moment = Moment(now.T_imu_world, T_linear, now.calibration, now.twist)
+            positions, G, covariance = self.model.initialise(moment, rows, variance)
+            self.gaussian.augment(G, covariance)
+            self._append(frame, ids, positions, rows, (self.step, rows, variance))
+        return np.ones(len(ids), dtype=bool)
+
+    def _start_after_waiting(self, waiting: Waiting, frame: int, ids: IntArray, rows: Array) -> BoolArray:
+        """The same for a sensor that needs two views: what these leave over is a measurement of the blocks."""
+        found = waiting.start(self, ids, rows)
+        if found.which.any():
+            now, variance = rows[found.which], self.sensor.variance(rows[found.which])
+            self.gaussian.augment(found.G, found.covariance)
+            views = (found.step, found.rows, variance), (self.step, now, variance)
+            self._append(frame, ids[found.which], found.position_m, now, *views)
+            done = self.gaussian.condition_body(found.H, found.residual, np.ones(len(found.residual)), self.step)
+            self.retract(done.correction)
+        waiting.move_on(self, ids[~found.which], rows[~found.which])
+        return found.which
+
+    def _append(
+        self, frame: int, ids: IntArray, positions: Array, rows: Array, *views: tuple[int, Array, Array]
+    ) -> None:
+        """Write new landmarks into the books."""
+        fresh = np.zeros(len(ids), dtype=np.int64)
         self.table.append(
             id=ids,
             first_frame=fresh + frame,
             last_frame=fresh + frame,
-            observations=fresh + 1,
-            log_row=self._log.started(ids, positions, rows, variance),
+            observations=fresh + len(views),
+            log_row=self._log.started(ids, positions, *views),
             first_step=fresh + self.step,
             position_m=positions,
             initial_m=positions,

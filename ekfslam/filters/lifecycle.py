@@ -57,7 +57,7 @@ class Retired:
         self._parts: list[Landmarks] = []
         self._rows: list[IntArray] = []
         self.row_of: dict[int, int] = {}
-        self._misses: dict[int, int] = {}  # by row
+        self._verdicts: dict[int, tuple[int, Array]] = {}  # misses and evidence of moving, by row
         self.revived: list[int] = []
         self.reappeared: list[int] = []
 
@@ -72,7 +72,8 @@ class Retired:
         self._rows.append(rows)
         if may_return:
             self.row_of.update(zip(ids, rows.tolist(), strict=True))
-            self._misses.update(zip(rows.tolist(), table.misses[slot].tolist(), strict=True))
+            verdicts = zip(table.misses[slot].tolist(), table.evidence[slot], strict=True)
+            self._verdicts.update(zip(rows.tolist(), verdicts, strict=True))
 
     def among(self, ids: IntArray) -> list[int]:
         """Those of the ids that were retired and may come back, ascending."""
@@ -111,12 +112,14 @@ class Retired:
         neighbours, distance = revival.neighbours(log, returning, np.setdiff1d(retired, returning))
         back = np.concatenate([returning, neighbours])
         came = known.only(back)
+        misses, evidence = zip(*(self._verdicts[row] for row in back.tolist()), strict=True)
         table.append(
             id=came.id,
             first_frame=came.first_frame,
             last_frame=came.last_frame,
             observations=came.observations,
-            misses=np.array([self._misses[row] for row in back.tolist()], dtype=np.int64),
+            misses=np.array(misses),
+            evidence=np.array(evidence),
             log_row=back,
             first_step=_first_steps(log, back),
             last_step=np.full(len(back), -2),

@@ -42,7 +42,7 @@ class Log:
         up: (T, 3) direction against gravity in world, where it is estimated, at the prediction; else (T, 0).
         id: (M,) landmark ids in the order of landmark initialisation; an id occurs again where a track was split.
         first_position_m: (M, 3) position at landmark initialisation, in world.
-        frame: (K,) frame of each accepted observation, ascending.
+        frame: (K,) frame of each accepted observation; ascending but for views that waited for a second one.
         landmark: (K,) row of the landmark in ``id``. Its first observation is the one that initialised it.
         previous: (K,) observation of the same landmark in the frame before, from which this one is a difference; -1
             where it stands alone.

@@ -96,7 +96,7 @@ class LogBook:
         table, slot = now.table, found.slot
         follows = (table.last_step[slot] == now.step - 1) & (now.model.track_error is not None)
         previous = np.where(follows, table.last_observation[slot], -1)
-        self._observed(table.log_row[slot], found.measured, found.variance, found.position_m, previous)
+        self._observed(now.step, table.log_row[slot], found.measured, found.variance, found.position_m, previous)
         self.amend(
             seen_twist=now.imu_twist,
             linear=found.linear.copy(),
@@ -104,13 +104,18 @@ class LogBook:
             T_linear_before=found.T_linear_before,
         )
 
-    def started(self, ids: IntArray, positions_m: Array, rows: Array, variance: Array) -> IntArray:
-        """New landmarks and what initialised them; returns their rows in the log."""
+    def started(self, ids: IntArray, positions_m: Array, *views: tuple[int, Array, Array]) -> IntArray:
+        """New landmarks (n,) and the views that initialised them: frame, rows (n, d), variances (n, d).
+
+        Returns:
+            Their rows in the log.
+        """
         self._lists["id"].append(ids)
         self._lists["first_position_m"].append(positions_m)
         at = np.arange(self._landmarks, self._landmarks + len(ids))
         self._landmarks += len(ids)
-        self._observed(at, rows, variance, positions_m, np.full(len(ids), -1))
+        for step, rows, variance in views:
+            self._observed(step, at, rows, variance, positions_m, np.full(len(ids), -1))
         return at
 
     def last(self, count: int) -> IntArray:
@@ -118,10 +123,10 @@ class LogBook:
         return np.arange(self._observations - count, self._observations)
 
     def _observed(
-        self, landmark: IntArray, rows: Array, variance: Array, position_m: Array, previous: IntArray
+        self, step: int, landmark: IntArray, rows: Array, variance: Array, position_m: Array, previous: IntArray
     ) -> None:
         values = {
-            "frame": np.full(len(landmark), len(self._frames["tau_s"]) - 1),
+            "frame": np.full(len(landmark), step),
             "landmark": landmark,
             "previous": previous,
             "rows": rows,

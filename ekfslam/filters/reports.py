@@ -9,7 +9,7 @@ import numpy as np
 
 from ekfslam.arrays import BoolArray, IntArray
 from ekfslam.filters.result import REASONS, Innovation, Rejections
-from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE
+from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, WAITING
 
 
 @dataclass(frozen=True)
@@ -66,5 +66,7 @@ def collect(reports: SequenceType[FrameReport]) -> tuple[Innovation, Rejections,
     split = sum(len(report.split) for report in reports)
     counts = {"accepted": int((~rejected).sum()), "rejected": int(rejected.sum()), "split": split}
     for code, name in enumerate(REASONS):
-        counts[f"rejected: {name}"] = int((reason == code).sum())
+        count = int((reason == code).sum())
+        if code != WAITING or count:
+            counts[f"rejected: {name}"] = count
     return innovation, rejections, counts

@@ -23,7 +23,7 @@ ERROR_CONVENTION = (
 
 # Why a filter rejected an observation; the codes of `Rejections.reason`. Archives hold the codes: "row mismatch", now
 # the business of `ekfslam.data.hygiene`, keeps its place.
-REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera", "moving")
+REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera", "moving", "waiting")
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,6 @@ from ekfslam.geometry import se3
 from ekfslam.models.blocks import Values
 from ekfslam.models.model import Model
 
-_POSES = ("pose", "previous_pose")
-
 
 class Standard:
     """Jacobians at the estimate, plain retraction: every textbook's EKF.
@@ -61,10 +59,9 @@ class Standard:
         The chain rule with the derivative of the retraction; ``moved_m`` (k, 3) is of the landmarks of the rows.
         """
         H_x = rows.H_x.copy()
-        for name in _POSES:
-            if name in model.layout:
-                at = model.layout[name]
-                H_x[..., at] = H_x[..., at] @ se3.left_jacobian(se3.log(after[name] @ se3.inverse(before[name])))
+        for name in model.layout.poses:
+            at = model.layout[name]
+            H_x[..., at] = H_x[..., at] @ se3.left_jacobian(se3.log(after[name] @ se3.inverse(before[name])))
         return Rows(rows.slot, H_x, rows.H_m, rows.residual, rows.variance)
 
     def landmark_error(self, m_hat: Array, m_true: Array, T_world_imu_hat: Array, T_world_imu_true: Array) -> Array:
@@ -124,21 +121,19 @@ class Invariant(Standard):
         B = np.zeros((len(P), by.shape[-1]))
         B[gaussian.body :] = by.reshape(-1, by.shape[-1])
         add_product(P, B, P[:, columns] + 0.5 * B @ P[np.ix_(columns, columns)])
-        for name in _POSES:
-            if name in model.layout:
-                at, Ad = model.layout[name], se3.adjoint(after[name] @ se3.inverse(before[name]))
-                P[at] = Ad @ P[at]
-                P[:, at] = P[at].T
-                P_xx = Ad @ P[at, at]
-                P[at, at] = 0.5 * (P_xx + P_xx.T)
+        for name in model.layout.poses:
+            at, Ad = model.layout[name], se3.adjoint(after[name] @ se3.inverse(before[name]))
+            P[at] = Ad @ P[at]
+            P[:, at] = P[at].T
+            P_xx = Ad @ P[at, at]
+            P[at, at] = 0.5 * (P_xx + P_xx.T)
 
     def carry_back(self, rows: Rows, model: Model, before: Values, after: Values, moved_m: Array) -> Rows:
         """The chain rule with J of eq. (7)."""
         H_x = rows.H_x.copy()
-        for name in _POSES:
-            if name in model.layout:
-                at = model.layout[name]
-                H_x[..., at] = H_x[..., at] @ se3.adjoint(after[name] @ se3.inverse(before[name]))
+        for name in model.layout.poses:
+            at = model.layout[name]
+            H_x[..., at] = H_x[..., at] @ se3.adjoint(after[name] @ se3.inverse(before[name]))
         columns, by = self._landmarks_by_rotations(model, before, moved_m)
         H_x[..., columns] += rows.H_m @ by
         return Rows(rows.slot, H_x, rows.H_m, rows.residual, rows.variance)

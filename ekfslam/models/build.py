@@ -21,11 +21,11 @@ from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import WITHOUT_TRACKS, Sequence
 from ekfslam.errors import ConfigError
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import OPTIONAL_BLOCKS, Calibration, Pose, PreviousPose, StateBlock, Twist, Up
+from ekfslam.models.blocks import OPTIONAL_BLOCKS, Anchor, Calibration, Pose, PreviousPose, StateBlock, Twist, Up
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.model import Model
 from ekfslam.models.noise import VelocityNoise, automatic_noise, velocity_noise, with_drift
-from ekfslam.models.sensors.base import Sensor
+from ekfslam.models.sensors.base import DelayedSensor, Sensor
 from ekfslam.models.sensors.stereo import Rig
 
 # What "auto" keeps in the state when landmarks come back: beyond this a dense covariance is no longer cheap.
@@ -131,6 +131,8 @@ def model_of(
         chosen.append(Twist(noise.twist_walk_std))
     if noise.tilt_rad:
         chosen.append(Up(T_imu_world[:3, :3].T @ np.array([0.0, 0.0, 1.0]), noise.tilt_rad))
+    if isinstance(sensor, DelayedSensor):
+        chosen.append(Anchor())
     chosen.extend(blocks)
     names = [block.name for block in chosen]
     if len(set(names)) < len(names):

@@ -266,13 +266,13 @@ class Model:
 
     # --- observations of landmarks ------------------------------------------------------------------------------------
 
-    def see(self, moment: Moment, positions_m: Array, linear_positions_m: Array, clone: bool = False) -> Seen:
+    def see(self, moment: Moment, positions_m: Array, linear_positions_m: Array, pose: str = "pose") -> Seen:
         """Eq. (3), (4) and (9): landmarks (n, 3) as the sensor sees them.
 
         Args:
             moment: From where.
             positions_m, linear_positions_m: As in `ekfslam.models.observation.linearise`.
-            clone: Whether the moment is that of the clone, whose columns then take the pose's place.
+            pose: Whose columns the pose of the moment has: those of the pose, or of a clone.
         """
         T, T_linear, layout = moment.T_imu_world, moment.T_linear, self.layout
         if self.calibration is None:
@@ -284,7 +284,7 @@ class Model:
                 self.rig, moment.calibration, moment.twist, T, positions_m, T_linear, linear_positions_m
             )
         H_x = np.zeros((*H_pose.shape[:2], layout.seen))
-        H_x[..., layout["previous_pose" if clone else "pose"]] = H_pose
+        H_x[..., layout[pose]] = H_pose
         if self.calibration is not None:
             H_x[..., layout["calibration"]] = H_c
         return Seen(q, self.sensor_at(moment.calibration).predict(q), H_x, H_m)

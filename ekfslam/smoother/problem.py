@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.errors import IllPosedError
+from ekfslam.errors import IllPosedError, PosteriorError
 from ekfslam.filters.estimate import GIVEN
 from ekfslam.filters.log import Log
 from ekfslam.geometry import motion, se3
 from ekfslam.models.model import Model, Moment, Seen, VelocityRows
 from ekfslam.models.observation import landmark_by_pose
+from ekfslam.models.sensors.base import DelayedSensor
 from ekfslam.smoother.sparse.information import Elimination, JointInformation, LinearSystem
 
 
@@ -64,7 +65,7 @@ class BatchProblem:
         eigenvalues, vectors = np.linalg.eigh(log.initial_covariance)
         self.B = (vectors * np.sqrt(np.maximum(eigenvalues, 0.0))) @ vectors.T
         self.aux_blocks = [block for block in layout.blocks if block.per_frame and block.name != "pose"]
-        self.drive_blocks = [block for block in layout.blocks if not block.per_frame and block.name != "previous_pose"]
+        self.drive_blocks = [block for block in layout.blocks if not block.per_frame and not block.is_pose]
         self.aux_columns = layout.columns(block.name for block in self.aux_blocks)
         self.drive_columns = layout.columns(block.name for block in self.drive_blocks)
         self._pose, self._clone = layout["pose"], layout.get("previous_pose")
@@ -202,6 +203,10 @@ class BatchProblem:
 
     def as_filtered(self) -> LinearSystem:
         """Rows frozen where the filter linearised them (motion, velocities, observations, initialisations)."""
+        if isinstance(self.model.sensor, DelayedSensor):
+            raise PosteriorError(
+                "landmarks that waited for a second view have no rows as filtered; there is only 'map'"
+            )
         log, W = self.log, self._weight_motion
         Phi = self._frozen_transition()
         identity = np.broadcast_to(np.eye(6), W.shape)
@@ -259,7 +264,7 @@ class BatchProblem:
                 log.seen_twist[frame - 1],
                 position[follows],
                 linear_position[follows],
-                clone=True,
+                "previous_pose",
             )
             B_x = self._carried_back(before.H_x, self._clone, log.T_linear_before, log.T_departed, frame, None)
             shifted = (B_x @ x[follows, :width, None])[..., 0]
@@ -286,17 +291,17 @@ class BatchProblem:
         twist: Array,
         positions_m: Array,
         linear_positions_m: Array,
-        clone: bool = False,
+        pose: str = "pose",
     ) -> Seen:
         """Landmarks (K, 3) from poses (K, 4, 4), calibrated as coordinates (K, body) say, alike within a group."""
         model, calibration = self.model, self.model.calibration
         if calibration is None:
-            return model.see(Moment(T, T_linear), positions_m, linear_positions_m, clone)
+            return model.see(Moment(T, T_linear), positions_m, linear_positions_m, pose)
         parts, order = [], np.argsort(group, kind="stable")
         for some in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
             found = calibration.retract(calibration.initial(), coordinates[some[0], model.layout["calibration"]])
             moment = Moment(T[some], T_linear[some], found, twist[some])
-            parts.append(model.see(moment, positions_m[some], linear_positions_m[some], clone))
+            parts.append(model.see(moment, positions_m[some], linear_positions_m[some], pose))
         back = np.argsort(order, kind="stable")
         return Seen(*(np.concatenate([getattr(part, field.name) for part in parts])[back] for field in fields(Seen)))
 
@@ -404,7 +409,9 @@ class BatchProblem:
         if len(follows):
             # Seen from the frame before is what the observation before has seen: the same landmark.
             previous, memory = log.previous[follows], self._memory
-            before = self.model.see(moments.at(log.frame[previous]), positions[follows], positions[follows], clone=True)
+            before = self.model.see(
+                moments.at(log.frame[previous]), positions[follows], positions[follows], "previous_pose"
+            )
             r[follows] -= memory * (log.rows[previous] - before.z)
             H_x[follows] -= memory * before.H_x
             H_m[follows] -= memory * before.H_m

@@ -85,7 +85,7 @@ class MapRevival:
             # The blocks' mean is the filter's already, but for rounding.
             positions = log.first_position_m[landmarks] + information.d[landmarks]
             none = np.empty(0, dtype=np.int64)
-            return Marginal({}, none, np.empty(0), positions, self._covariance(problem, information, landmarks))
+            return Marginal({}, none, np.empty(0), positions, self.covariance(problem, information, landmarks))
         start = self._start(problem, positions_m)
         iterations = range(_MAXIMUM.max_iterations)
         found = maximise(problem, elimination, start, _MAXIMUM, self._config.min_depth_m, iterations)
@@ -94,10 +94,10 @@ class MapRevival:
             problem.last_values(state),
             *problem.last_coordinates(state),
             state.positions_m[landmarks],
-            self._covariance(problem, found.information, landmarks),
+            self.covariance(problem, found.information, landmarks),
         )
 
-    def _covariance(self, problem: BatchProblem, information: JointInformation, landmarks: IntArray) -> Array:
+    def covariance(self, problem: BatchProblem, information: JointInformation, landmarks: IntArray) -> Array:
         """Covariance (body+3n, body+3n) in the columns of the filter."""
         last, layout = problem.log.frames - 1, self._model.layout
         has_clone = self._model.has_clone and last > 0

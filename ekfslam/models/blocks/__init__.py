@@ -6,13 +6,14 @@ The filter and the smoother know blocks only by this interface: a new one is a n
 
 from ekfslam.models.blocks.base import OPTIONAL_BLOCKS, Layout, StateBlock, Values, optional_block
 from ekfslam.models.blocks.calibration import Calibration
-from ekfslam.models.blocks.pose import Pose, PreviousPose
+from ekfslam.models.blocks.pose import Anchor, Pose, PreviousPose
 from ekfslam.models.blocks.twist import Twist
 from ekfslam.models.blocks.twist_bias import TwistBias
 from ekfslam.models.blocks.up import Up
 
 __all__ = [
     "OPTIONAL_BLOCKS",
+    "Anchor",
     "Calibration",
     "Layout",
     "Pose",

@@ -24,12 +24,14 @@ class StateBlock:
         per_frame: Whether it has a value for each frame (in the batch problem: one unknown a frame), or one for the
             whole drive.
         is_seen: Whether observations of landmarks depend on it.
+        is_pose: Whether it is a pose ``T_imu_world`` with the error of one: the pose itself, or a clone of it.
         labels, units: Names and units of what `reported` returns; none is not reported.
     """
 
     name: ClassVar[str]
     per_frame: ClassVar[bool] = False
     is_seen: ClassVar[bool] = False
+    is_pose: ClassVar[bool] = False
 
     @property
     def size(self) -> int:
@@ -101,6 +103,7 @@ class Layout(dict[str, slice]):
         blocks: In the order of their columns.
         body: Number of columns of all blocks.
         seen: Number of leading columns that observations of landmarks depend on.
+        poses: Names of the pose and of its clones.
     """
 
     def __init__(self, blocks: Iterable[StateBlock]) -> None:
@@ -110,6 +113,7 @@ class Layout(dict[str, slice]):
             (block.name, slice(stop - block.size, stop)) for block, stop in zip(self.blocks, end, strict=True)
         )
         self.body = end[-1]
+        self.poses = tuple(block.name for block in self.blocks if block.is_pose)
         self.seen = sum(block.size for block in self.blocks if block.is_seen)
 
     def columns(self, names: Iterable[str]) -> IntArray:

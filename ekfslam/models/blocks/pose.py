@@ -26,6 +26,7 @@ class Pose(StateBlock):
     name = "pose"
     per_frame = True
     is_seen = True
+    is_pose = True
 
     @property
     def size(self) -> int:
@@ -42,15 +43,11 @@ class Pose(StateBlock):
 
 
 @dataclass(frozen=True)
-class PreviousPose(StateBlock):
-    """A clone of the pose of the frame before: errors of tracks are differences over two frames, eq. (10).
+class Clone(StateBlock):
+    """What clones of the pose have in common: they begin as a certain identity, until they take the pose's place."""
 
-    Source: Roumeliotis and Burdick, "Stochastic cloning", ICRA 2002. It begins as a certain identity and takes the
-    pose's place at every prediction; in the batch problem it is the pose of the frame before itself.
-    """
-
-    name = "previous_pose"
     is_seen = True
+    is_pose = True
 
     @property
     def size(self) -> int:
@@ -61,3 +58,21 @@ class PreviousPose(StateBlock):
 
     def retract(self, value: Array, correction: Array) -> Array:
         return se3.exp(correction) @ value
+
+
+@dataclass(frozen=True)
+class PreviousPose(Clone):
+    """A clone of the pose of the frame before: errors of tracks are differences over two frames, eq. (10).
+
+    Source: Roumeliotis and Burdick, "Stochastic cloning", ICRA 2002. It takes the pose's place at every prediction; in
+    the batch problem it is the pose of the frame before itself.
+    """
+
+    name = "previous_pose"
+
+
+@dataclass(frozen=True)
+class Anchor(Clone):
+    """A clone of the pose from which tracks wait for parallax, see `ekfslam.filters.waiting`."""
+
+    name = "anchor"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.noise import Noise
 
 # Reason codes of `Sensor.screen`; the index into `ekfslam.filters.result.REASONS` of what is rejected.
 ACCEPTED = -1
-GATE, DISPARITY, _, BEHIND_CAMERA, MOVING = range(5)
+GATE, DISPARITY, _, BEHIND_CAMERA, MOVING, WAITING = range(6)
 
 
 class Sensor(Protocol):
@@ -49,4 +49,23 @@ class Sensor(Protocol):
         """``dh/dq`` (n, d, 3)."""
 
     def invert(self, rows: Array) -> Array:
-        """The points (n, 3) m that rows (n, d) see; a sensor of bearings has none, see `Delayed`."""
+        """The points (n, 3) m that rows (n, d) see; a `DelayedSensor` never is asked."""
+
+
+@runtime_checkable
+class DelayedSensor(Protocol):
+    """A `Sensor` one view of which does not say where a landmark is, such as one camera alone.
+
+    Its model has the block `ekfslam.models.blocks.pose.Anchor`. New tracks wait from the anchor on, until
+    `triangulate` has an answer; see `ekfslam.filters.waiting`.
+    """
+
+    @property
+    def patience(self) -> int:
+        """Frames after which the anchor moves on, whoever still waits."""
+
+    def triangulate(self, rows_anchor: Array, rows: Array, T_now_anchor: Array) -> tuple[Array, BoolArray]:
+        """Points (n, 3) in the sensor's frame from two views (n, d), and whether (n,) these say where they are.
+
+        ``T_now_anchor`` (4, 4) maps the sensor's frame at the anchor into that of now.
+        """

@@ -4,8 +4,8 @@ Unknowns are ``eps`` (T, 6), one vector a pose; ``aux`` (T, a), what else has a 
 what has one value for the drive; and ``d`` (M, 3), one a landmark. Observations touch a pose, perhaps the one before,
 the drive and a landmark; motion touches consecutive poses, the aux of the later one and the drive. Landmarks know of
 each other only through poses and drive, so those with few observations are eliminated first, all at once, by their
-Schur complements. What remains goes to CHOLMOD. Both are steps of one sparse elimination: nothing is approximated, and no
-matrix as wide as the state is ever formed.
+Schur complements. What remains goes to CHOLMOD. Both are steps of one sparse elimination: nothing is approximated, and
+no matrix as wide as the state is ever formed.
 
 Sources: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000, section 6 (Schur
 complement); Takahashi, Fagan, Chen, "Formation of a sparse bus impedance matrix", 1973 (selected inverse).

@@ -1,0 +1,76 @@
+"""One camera: bearings alone, so that landmarks wait for parallax."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.noise import Noise
+from ekfslam.geometry import camera as cam
+from ekfslam.geometry.camera import StereoCamera
+from ekfslam.models.sensors.base import ACCEPTED
+
+
+@dataclass(frozen=True)
+class Monocular:
+    """The left camera of a rig as a `DelayedSensor`: of pixels (n, 4) or (n, 2) it takes (uL, vL).
+
+    Scale comes from the velocities alone.
+
+    Args:
+        camera: Intrinsics; the baseline is not used.
+        T_cam_imu: (4, 4) extrinsics.
+        noise: Of pixels (white) and velocities.
+        parallax_rad: Angle between two rays beyond which their landmark is initialised.
+        patience: Frames after which the anchor moves on.
+    """
+
+    camera: StereoCamera
+    T_cam_imu: Array
+    noise: Noise
+    parallax_rad: float = 0.2
+    patience: int = 40
+
+    dimension = 2
+
+    def screen(self, measured: Array, min_depth_m: float) -> IntArray:
+        return np.full(len(measured), ACCEPTED)
+
+    def in_view(self, q: Array, min_depth_m: float) -> BoolArray:
+        return q[..., 2] > min_depth_m
+
+    def rows(self, measured: Array) -> Array:
+        return np.array(measured[:, :2], dtype=float)
+
+    def variance(self, rows: Array) -> Array:
+        return np.broadcast_to(np.asarray(self.noise.pixel_std_px[:2]) ** 2, rows.shape)
+
+    def predict(self, q: Array) -> Array:
+        return cam.project(self.camera, q)[..., :2]
+
+    def jacobian(self, q: Array) -> Array:
+        return cam.projection_jacobian(self.camera, q)[..., :2, :]
+
+    def invert(self, rows: Array) -> Array:
+        raise NotImplementedError("one view of one camera has no depth")
+
+    def rays(self, rows: Array) -> Array:
+        """Unit vectors (n, 3) along which pixels (n, 2) lie, in the camera frame."""
+        x = (rows[:, 0] - self.camera.cu_px) / self.camera.fu_px
+        y = (rows[:, 1] - self.camera.cv_px) / self.camera.fv_px
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+    def triangulate(self, rows_anchor: Array, rows: Array, T_now_anchor: Array) -> tuple[Array, BoolArray]:
+        """The middle of the shortest line between both rays: points (n, 3) now, and whether (n,) parallax suffices."""
+        a, b = self.rays(rows_anchor) @ T_now_anchor[:3, :3].T, self.rays(rows)
+        origin = T_now_anchor[:3, 3]
+        cosine = (a * b).sum(axis=1)
+        sine_square = np.maximum(1.0 - cosine**2, np.finfo(float).tiny)
+        # Depths s along a (from the anchor) and t along b of the two nearest points.
+        s = (cosine * (b @ origin) - a @ origin) / sine_square
+        t = (b @ origin - cosine * (a @ origin)) / sine_square
+        q = 0.5 * (origin + s[:, None] * a + t[:, None] * b)
+        return q, (sine_square > np.sin(self.parallax_rad) ** 2) & (s > 0) & (t > 0)

@@ -1,0 +1,59 @@
+"""A second source of velocities, such as wheels beside an IMU: other rate, other noise, some axes only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.errors import ConfigError
+from ekfslam.models.model import VelocityRows
+
+AXES = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
+
+
+@dataclass(frozen=True)
+class VelocitySource:
+    """Measurements of the block `Twist`: ``z = twist[axes] + noise``, at stamps of their own.
+
+    Each measures the velocities of the interval between frames that its stamp lies in, ``(t[k-1], t[k]]``. Biases of
+    the IMU's velocities are not in it.
+
+    Args:
+        time_s: (n,) ascending stamps, on the clock of the recording.
+        axes: Which of `AXES` are measured, a of them.
+        value: (n, a) measurements, m/s or rad/s, in the frame of the recording's velocities.
+        std: (a,) their standard deviations.
+
+    Raises:
+        ConfigError: An unknown axis, stamps that do not ascend, or sizes that do not fit.
+    """
+
+    time_s: Array
+    axes: tuple[str, ...]
+    value: Array
+    std: Array
+
+    def __post_init__(self) -> None:
+        unknown = [axis for axis in self.axes if axis not in AXES]
+        if unknown or not self.axes:
+            raise ConfigError(f"axes of a velocity source must be among {', '.join(AXES)}, found {self.axes}")
+        n, a = len(self.time_s), len(self.axes)
+        if np.shape(self.value) != (n, a) or np.shape(self.std) != (a,):
+            raise ConfigError(
+                f"{n} stamps, {a} axes, but values of shape {np.shape(self.value)}, std of {np.shape(self.std)}"
+            )
+        if not np.isfinite(self.value).all() or not (np.diff(self.time_s) > 0).all():
+            raise ConfigError("a velocity source needs finite values and ascending stamps")
+        if not (np.asarray(self.std) > 0).all():
+            raise ConfigError(f"standard deviations of a velocity source must be positive, found {self.std}")
+
+    def during(self, begin_s: float, end_s: float) -> VelocityRows | None:
+        """Its measurements with stamps in ``(begin_s, end_s]``; None where there are none."""
+        first, last = np.searchsorted(self.time_s, (begin_s, end_s), side="right")
+        if first == last:
+            return None
+        axis = np.tile([AXES.index(name) for name in self.axes], last - first)
+        std = np.tile(np.asarray(self.std, dtype=float), last - first)
+        return VelocityRows(axis, np.ravel(self.value[first:last]), std, np.zeros(len(axis), dtype=bool))

@@ -1,0 +1,149 @@
+"""Filter and smoother believe the same: rows frozen where the filter linearised them have its state as solution."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers import truth_error
+from test_posterior import EVERYTHING, with_everything
+
+from ekfslam.config import Config
+from ekfslam.data.readers import open_sequence
+from ekfslam.data.sequence import Truth
+from ekfslam.data.simulate import builtin
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
+from ekfslam.models.build import build
+from ekfslam.runner import run
+from ekfslam.smoother.posterior import posterior, smooth
+from ekfslam.smoother.problem import BatchProblem
+from ekfslam.smoother.revival import MapRevival
+from ekfslam.smoother.sparse.information import JointInformation
+
+PRIOR = {"moving_sigma": 20.0, "initial_position_std_m": 0.1, "initial_rotation_std_rad": 0.05}
+CALIBRATION = {"rotation_deg": 0.3, "lever_arm_m": 0.05, "baseline": 0.01, "disparity_px": 0.3, "time_s": 0.01}
+ALL_BLOCKS = ["pose", "previous_pose", "calibration", "twist", "up", "twist_bias"]
+
+
+def drive(sequence, settings, blocks=ALL_BLOCKS):
+    """The filter after a recording whose model has the blocks."""
+    problem = build(sequence, Config().with_overrides(settings))
+    assert [block.name for block in problem.model.layout.blocks] == blocks
+    ekf = JointEKF(problem.model, problem.config.filter)
+    ekf.revival = MapRevival(ekf.model, ekf.config) if problem.config.filter.retire == "unseen" else None
+    for _ in run_filter(ekf, problem.sequence):
+        pass
+    return ekf
+
+
+def assert_equal_to_frozen_rows(ekf):
+    """Blocks, landmarks and the whole covariance, to 1e-8 of their standard deviations or better."""
+    problem = BatchProblem(ekf.log(), ekf.model)
+    information = JointInformation(problem.elimination(), problem.as_filtered())
+    landmarks, layout = ekf.table.log_row, ekf.model.layout
+    found = np.zeros(layout.body)
+    found[layout["pose"]] = information.eps[-1]
+    if "previous_pose" in layout:
+        found[layout["previous_pose"]] = information.eps[-2]
+    found[problem.aux_columns], found[problem.drive_columns] = information.aux[-1], information.drive
+    np.testing.assert_allclose(found, ekf.coordinates, atol=1e-8)
+    np.testing.assert_allclose(
+        problem.log.first_position_m[landmarks] + information.d[landmarks], ekf.positions_m, atol=1e-8
+    )
+    P = MapRevival(ekf.model, ekf.config).covariance(problem, information, landmarks)
+    std = np.sqrt(np.diag(ekf.P))
+    assert (np.abs(P - ekf.P) <= 1e-8 * np.outer(std, std)).all()
+    assert (std > 0).all()
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_every_block_and_errors_of_tracks_in_the_city(variant, iterations):
+    if variant == "fej" and iterations > 1:
+        pytest.skip("first estimates are not iterated")
+    settings = {"filter": {"variant": variant, "retire": "never", "iterations": iterations, **PRIOR}}
+    ekf = drive(
+        with_everything(builtin("city?frames=60")),
+        {**settings, "calibration": CALIBRATION, "blocks": {"twist_bias": {}}},
+    )
+    assert (ekf.log().previous >= 0).sum() > 500
+    assert_equal_to_frozen_rows(ekf)
+
+
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_every_block_and_errors_of_tracks_on_a_loop_with_revival(variant):
+    settings = {"filter": {"variant": variant, "retire": "unseen", "retire_after": 3, **PRIOR}}
+    world = with_everything(builtin("loop?frames=330"))
+    ekf = drive(world, {**settings, "calibration": CALIBRATION, "blocks": {"twist_bias": {}}})
+    assert len(ekf.retired.revived) > 0
+    assert_equal_to_frozen_rows(ekf)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_every_block_and_errors_of_tracks_on_a_recording(data_path, variant):
+    """The first 100 frames; with an uncertain first pose the filter's own rounding would exceed the tolerance."""
+    frames = 100
+    sequence = open_sequence(data_path("utias/2011_09_26_drive_0001_sync_KLT.mat"))
+    seen = sequence.observations.frame < frames
+    observations = dataclasses.replace(
+        sequence.observations,
+        **{name: getattr(sequence.observations, name)[seen] for name in ("frame", "landmark", "pixels_px")},
+    )
+    truth = Truth(sequence.truth.frame[:1], sequence.truth.T_world_imu[:1])
+    short = dataclasses.replace(
+        sequence,
+        time_s=sequence.time_s[:frames],
+        twist=sequence.twist[:frames],
+        observations=observations,
+        truth=truth,
+    )
+    found = build(short).model.noise
+    noise = dataclasses.replace(found, twist_walk_std=EVERYTHING["twist_walk_std"], twist_std=np.full(6, 0.05))
+    settings = {"filter": {"variant": variant}, "calibration": CALIBRATION, "blocks": {"twist_bias": {}}}
+    assert_equal_to_frozen_rows(drive(dataclasses.replace(short, noise=noise), settings))
+
+
+@pytest.mark.parametrize("part", ["twist", "up", "track", "calibration", "twist_bias"])
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_every_block_by_itself(variant, part):
+    keys = {
+        "twist": ("twist_walk_std", "motion_std"),
+        "up": ("tilt_rad",),
+        "track": ("track_first_px", "track_walk_px"),
+    }
+    world = builtin("city?frames=40")
+    chosen = {key: EVERYTHING[key] for key in keys.get(part, ())}
+    world = dataclasses.replace(world, noise=dataclasses.replace(world.noise, **chosen))
+    settings = {"filter": {"variant": variant, **PRIOR}}
+    settings |= {"calibration": CALIBRATION} if part == "calibration" else {}
+    settings |= {"blocks": {"twist_bias": {}}} if part == "twist_bias" else {}
+    assert_equal_to_frozen_rows(drive(world, settings, ["pose", "previous_pose" if part == "track" else part]))
+
+
+def test_a_loop_closes_under_automatic_noise():
+    """A loop whose file states no noise: landmarks come back, and it ends as well as if they had never left."""
+    world = dataclasses.replace(builtin("loop"), noise=None)
+    error = {}
+    for retire in ("never", "unseen"):
+        result = run(world, "full", Config().with_overrides({"filter": {"retire": retire}}))
+        error[retire] = truth_error(world, result)[-1]
+        assert (result.counts["revived"] > 0) == (retire == "unseen")
+        assert result.counts["reappeared"] == 0
+    assert error["unseen"] < 1.2 * error["never"]
+
+
+def test_as_filtered_of_a_run_with_every_block_is_the_filter():
+    world = with_everything(builtin("city?frames=60"))
+    settings = {"filter": {"variant": "standard"}, "calibration": CALIBRATION, "blocks": {"twist_bias": {}}}
+    settings["posterior"] = {"linearisation": "filtered"}
+    result = run(world, "full", Config().with_overrides(settings))
+    found = posterior(result)
+    np.testing.assert_allclose(found.T_world_imu[-1], result.T_world_imu[-1], atol=1e-8)
+    np.testing.assert_allclose(found.pose_covariance[-1], result.covariance[-1], atol=1e-9)
+    bias = found.block_covariance("twist_bias")
+    at = [result.parameters.name.index(f"bias of {axis}") for axis in ("v_x", "w_z")]
+    np.testing.assert_allclose(found.values["twist_bias"][-1, [0, 5]], result.parameters.value[-1, at], atol=1e-8)
+    np.testing.assert_allclose(np.sqrt(np.diag(bias[-1])[[0, 5]]), result.parameters.std[-1, at], rtol=1e-6)
+    assert found.block_covariance("up").shape == (3, 3)
+    assert smooth(result).mode == "as filtered"
