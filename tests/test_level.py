@@ -9,6 +9,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers import run_joint
 from reference import CAMERA, T_CAM_IMU, small_world
 from test_jacobians import POSES, TWISTS
 from test_variants import gauge_directions
@@ -17,10 +18,11 @@ from ekfslam.config import CalibrationConfig, Config, FilterConfig
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import DataError
-from ekfslam.filters.joint import JointEKF, run_joint
-from ekfslam.filters.observing import Rig
+from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import motion, se3
-from ekfslam.models.build import noise_of
+from ekfslam.models.blocks import TwistBias
+from ekfslam.models.build import model_of, noise_of
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
 
 OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never", moving_sigma=1e9)
@@ -28,6 +30,13 @@ P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
 EVERYTHING = CalibrationConfig(rotation_deg=0.5, lever_arm_m=0.1, baseline=0.02, disparity_px=0.5, time_s=0.02)
 SOME = CalibrationConfig(rotation_deg=0.5, disparity_px=0.5, time_s=0.02)
 WALK = np.repeat([0.2, 0.02], 3)
+TRACKS = {
+    "track_first_px": np.array([0.3, 0.4, 0.8]),
+    "track_walk_px": np.array([0.2, 0.25, 0.3]),
+    "track_memory": 0.9,
+    "track_flow_px": 15.0,
+}
+BIAS = TwistBias(sigma_v_m_s=0.1, sigma_w_rad_s=0.01, time_v_s=3.0, time_w_s=7.0)
 RNG = np.random.default_rng(11)
 X, Y, Z = np.eye(3)
 UPS = {
@@ -69,20 +78,19 @@ def in_imu(level_twist, up):
 
 
 def moved(T, W, twist, tau, errors=None):
-    """Pose, attitude W against gravity (up is its z axis) and IMU velocities after one step at level velocities.
+    """Pose and IMU velocities after one step at level velocities; up is the z axis of W, in world.
 
     ``errors`` (9,) are those of the velocities, and the small angles that turn them.
     """
-    u = in_imu(twist, W[..., 2])
+    u = in_imu(twist, (T[..., :3, :3] @ W)[..., 2])
     if errors is not None:
         u = rotated(se3.so3_exp(errors[..., 6:]), u) + errors[..., :6]
-    E = se3.exp(-tau * u)
-    return E @ T, E[..., :3, :3] @ W, u
+    return se3.exp(-tau * u) @ T, u
 
 
-def difference(T, W, T_hat, W_hat):
-    """Errors (9,) of pose and attitude."""
-    return np.concatenate([se3.log(T @ np.linalg.inv(T_hat)), se3.so3_log(W @ W_hat.T)], axis=-1)
+def difference(T, T_hat):
+    """Error (6,) of a pose."""
+    return se3.log(T @ np.linalg.inv(T_hat))
 
 
 def camera_pose(T, c, u, T_cam_imu):
@@ -105,106 +113,198 @@ def sighted(T, c, u, rows, camera=CAMERA, T_cam_imu=T_CAM_IMU):
     return se3.apply(np.linalg.inv(camera_pose(T, c, u, T_cam_imu)), np.stack([x, y, z], axis=-1))
 
 
+# From (uL, v, uR) to (u, v, disparity), and back.
+BY_DISPARITY = np.array([[1.0, 0, 0], [0, 1, 0], [1, 0, -1]])
+
+
 class Literal:
     """Textbook EKF: full-width numeric F, H and G, S^-1, Joseph's form. Nothing is gated or retired.
 
-    The state is pose, free calibration parameters, velocities, attitude against gravity, landmarks, as in `JointEKF`.
+    The state is pose, pose before, free calibration parameters, velocities, up, bias, landmarks, as in `JointEKF`;
+    where the noise knows no tracks, velocities or bias, these have no columns.
     """
 
-    def __init__(self, sequence, variant, free, std, W=None, P=P0):
+    def __init__(self, sequence, variant, free, std, up=Z, bias=None, P=P0):
         self.sequence, self.noise, self.variant, self.free = sequence, sequence.noise, variant, free
-        self.T, self.c, self.twist, self.u = np.linalg.inv(sequence.initial_T_world_imu), np.zeros(9), None, np.zeros(6)
-        self.updated = [self.T]
-        self.W, self.m, self.ids = np.eye(3) if W is None else W, np.empty((0, 3)), []
-        f = len(free)
-        self.walks = self.noise.twist_walk_std is not None
-        self.at_twist = 6 + f
-        self.at_up = 6 + f + 6 * self.walks
-        self.body = self.at_up + 3
+        self.T = self.departed = np.linalg.inv(sequence.initial_T_world_imu)
+        self.before, self.c, self.twist, self.b = np.eye(4), np.zeros(9), None, np.zeros(6)
+        self.u = self.u_before = np.zeros(6)
+        self.W = self.T[:3, :3].T @ level_axes(up)
+        self.m, self.ids, self.first, self.last, self.rows = np.empty((0, 3)), [], {}, {}, {}
+        self.walks, self.bias, self.tracks = self.noise.twist_walk_std is not None, bias, self.noise.track_error
+        self.k, self.body, self.at = 0, 0, {}
+        of_bias = np.zeros(0) if bias is None else np.repeat([bias.sigma_v_m_s, bias.sigma_w_rad_s], 3)
+        prior = {
+            "pose": P,
+            "before": np.zeros((6 * (self.tracks is not None),) * 2),
+            "c": np.diag(std**2),
+            "twist": np.zeros((6 * self.walks,) * 2),
+            "up": self.noise.tilt_rad**2 * np.eye(3),
+            "bias": np.diag(of_bias**2),
+        }
+        for name, block in prior.items():
+            self.at[name] = slice(self.body, self.body + len(block))
+            self.body += len(block)
         self.P = np.zeros((self.body, self.body))
-        self.P[:6, :6] = P
-        self.P[6 : 6 + f, 6 : 6 + f] = np.diag(std**2)
-        self.P[self.at_up :, self.at_up :] = self.noise.tilt_rad**2 * np.eye(3)
+        for name, block in prior.items():
+            self.P[self.at[name], self.at[name]] = block
 
     def moved_by(self, e):
-        """The body with errors e: T, c, twist, W."""
-        f = len(self.free)
-        c = self.c + e[..., 6 : 6 + f] @ np.eye(9)[self.free]
-        twist = self.twist if self.twist is None else self.twist + e[..., self.at_twist : self.at_up]
-        W = se3.so3_exp(e[..., self.at_up : self.body]) @ self.W
-        return se3.exp(e[..., :6]) @ self.T, c, twist, W
+        """The blocks with errors e."""
+        found = {
+            "T": se3.exp(e[..., self.at["pose"]]) @ self.T,
+            "before": self.before,
+            "c": self.c + e[..., self.at["c"]] @ np.eye(9)[self.free],
+            "twist": self.twist,
+            "W": se3.so3_exp(e[..., self.at["up"]]) @ self.W,
+            "b": self.b,
+        }
+        if self.tracks is not None:
+            found["before"] = se3.exp(e[..., self.at["before"]]) @ self.before
+        if self.twist is not None:
+            found["twist"] = self.twist + e[..., self.at["twist"]]
+        if self.bias is not None:
+            found["b"] = self.b + e[..., self.at["bias"]]
+        return found
+
+    def begin(self, measured):
+        self.u = moved(self.T, self.W, measured, 0.0)[1]
 
     def predict(self, measured, tau):
-        own = np.arange(self.at_twist, self.at_up)
-        if self.walks and self.twist is None:
-            self.twist = measured.copy()
-            self.P[own, own] = self.noise.twist_std**2
-        elif self.walks:
-            self.P[own, own] += self.noise.twist_walk_std**2
-            self.condition(np.eye(len(self.P))[own], measured - self.twist, np.diag(self.noise.twist_std**2))
-        twist = self.twist if self.walks else measured
-        T, W, u = moved(self.T, self.W, twist, tau)
+        self.wander(tau)
+        if self.walks:
+            self.measure(measured)
+
+        def driven(x):
+            return x["twist"] if self.walks else measured - x["b"]
+
+        nothing = np.zeros(len(self.P))
+        twist = driven(self.moved_by(nothing))
+        T, u = moved(self.T, self.W, twist, tau)
 
         def after(e):
-            T_e, _, twist_e, W_e = self.moved_by(e)
-            return difference(*moved(T_e, W_e, twist_e if self.walks else measured, tau)[:2], T, W)
+            x = self.moved_by(e)
+            return difference(moved(x["T"], x["W"], driven(x), tau)[0], T)
 
-        rows = np.concatenate([np.arange(6), np.arange(self.at_up, self.body)])
         F, G = np.eye(len(self.P)), np.zeros((len(self.P), 9))
-        F[rows, : self.body] = stencil(after, self.body)
-        G[rows] = stencil(lambda errors: difference(*moved(self.T, self.W, twist, tau, errors)[:2], T, W), 9)
+        F[:6] = stencil(after, len(self.P))
+        G[:6] = stencil(lambda errors: difference(moved(self.T, self.W, twist, tau, errors)[0], T), 9)
+        if self.tracks is not None:
+            F[self.at["before"]] = np.eye(len(self.P))[:6]
         std = self.noise.motion_std if self.walks else np.hypot(self.noise.twist_std, self.noise.motion_std)
         variance = np.concatenate([std**2, np.full(3, self.noise.misalignment_rad**2)])
         self.P = F @ self.P @ F.T + G @ np.diag(variance) @ G.T
-        self.T, self.W, self.u, self.tau = T, W, u, tau
-        step = T[:3, :3].T @ u[:3] * tau
-        for j, m in enumerate(self.m):
-            own = slice(self.body + 3 * j, self.body + 3 * j + 3)
-            distance = np.linalg.norm(T[:3, :3] @ m + T[:3, 3])
-            self.P[own, own] += self.noise.drift**2 * np.outer(step, step)
-            self.P[own, own] += self.noise.bearing_drift_rad**2 * np.linalg.norm(step) * distance**2 * np.eye(3)
+        self.before = self.departed = self.T
+        self.T, self.u, self.u_before, self.tau, self.k = T, u, self.u, tau, self.k + 1
+
+    def wander(self, tau):
+        """Velocities walk once they are known, the bias forgets."""
+        own = np.arange(len(self.P))
+        if self.twist is not None:
+            at = own[self.at["twist"]]
+            self.P[at, at] += self.noise.twist_walk_std**2
+        if self.bias is not None:
+            sigma = np.repeat([self.bias.sigma_v_m_s, self.bias.sigma_w_rad_s], 3)
+            kept = np.exp(-tau / np.repeat([self.bias.time_v_s, self.bias.time_w_s], 3))
+            F, at = np.eye(len(self.P)), own[self.at["bias"]]
+            F[at, at] = kept
+            self.P = F @ self.P @ F.T
+            self.P[at, at] += sigma**2 - (sigma * kept) ** 2
+            self.b = kept * self.b
+
+    def measure(self, measured):
+        """The velocities, whose first measurement is the first that is known of them."""
+        variance, none = np.diag(self.noise.twist_std**2), np.zeros((6, len(self.P)))
+        by_bias = none.copy()
+        by_bias[:, self.at["bias"]] = np.eye(6) if self.bias is not None else 0.0
+        if self.twist is None:
+            F = np.eye(len(self.P))
+            F[self.at["twist"]] = -by_bias
+            self.P = F @ self.P @ F.T
+            self.P[self.at["twist"], self.at["twist"]] += variance
+            self.twist = measured - self.b
+        else:
+            H = none + by_bias
+            H[:, self.at["twist"]] = np.eye(6)
+            self.condition(H, measured - self.twist - self.b, variance)
 
     def update(self, ids, pixels):
         rows = np.column_stack([pixels[:, 0], (pixels[:, 1] + pixels[:, 3]) / 2, pixels[:, 2]])
-        variance = self.noise.pixel_std_px[0] ** 2 * np.array([1, 0.5, 1])
-        known = np.isin(ids, self.ids)
-        if known.any():
-            at = [self.ids.index(i) for i in ids[known]]
-
-            def predicted(e):
-                m = self.m + e[..., self.body :].reshape(*e.shape[:-1], -1, 3)
-                found = seen_rows(*self.moved_by(e)[:2], self.u, m[..., at, :])
-                return found.reshape(*e.shape[:-1], -1)
-
-            def corrected():
-                residual = rows[known].ravel() - predicted(np.zeros(len(self.P)))
-                self.condition(stencil(predicted, len(self.P)), residual, np.diag(np.tile(variance, len(at))))
-
+        if self.tracks is not None:
+            rows = np.column_stack([rows[:, :2], pixels[:, 0] - pixels[:, 2]])
+        seen = [(i, z, self.ids.index(i)) for i, z in zip(ids.tolist(), rows, strict=True) if i in self.ids]
+        if seen:
             # The velocities that a time offset counts by are those that the frame itself corrects.
             trial = copy.deepcopy(vars(self))
-            corrected()
-            u = -se3.log(self.T @ np.linalg.inv(self.updated[-1])) / self.tau
+            self.correct(seen)
+            u = -difference(self.T, self.departed) / self.tau
             vars(self).update(trial)
             self.u = u
-            corrected()
-        for i, z in zip(ids[~known], rows[~known], strict=True):
-            self.start(i, z, variance)
-        self.updated.append(self.T)
+            self.correct(seen)
+        for i, z in zip(ids.tolist(), rows, strict=True):
+            if i not in self.ids:
+                self.start(i, z)
+            self.last[i], self.rows[i] = self.k, z
 
-    def start(self, i, z, variance):
-        n = len(self.P)
-        G = stencil(lambda e: sighted(*self.moved_by(e)[:2], self.u, z), n)
-        by_row = stencil(lambda d: sighted(self.T, self.c, self.u, z + d), 3)
+    def look(self, T, c, u, m):
+        """Rows of points (..., n, 3), with disparities where tracks err."""
+        rows = seen_rows(T, c, u, m)
+        return rows if self.tracks is None else rows @ BY_DISPARITY.T
+
+    def correct(self, seen):
+        variance = []
+        for i, z, _ in seen:
+            if self.tracks is None:
+                variance.append(self.noise.pixel_std_px[0] ** 2 * np.array([1, 0.5, 1]))
+            elif self.last[i] == self.k - 1:
+                flow = np.linalg.norm((z - self.rows[i])[:2])
+                variance.append(self.noise.track_walk_px**2 * (1 + (flow / self.noise.track_flow_px) ** 2))
+            else:
+                spread = self.noise.track_first_px**2
+                for _ in range(self.first[i], self.k):
+                    spread = self.noise.track_memory**2 * spread + self.noise.track_walk_px**2
+                variance.append(spread)
+
+        def left(e):
+            x, parts = self.moved_by(e), []
+            m = self.m + e[..., self.body :].reshape(*e.shape[:-1], -1, 3)
+            for i, z, place in seen:
+                own = m[..., place : place + 1, :]
+                residual = z - self.look(x["T"], x["c"], self.u, own)
+                if self.tracks is not None and self.last[i] == self.k - 1:
+                    before = self.rows[i] - self.look(x["before"], x["c"], self.u_before, own)
+                    residual = residual - self.noise.track_memory * before
+                parts.append(residual[..., 0, :])
+            return np.concatenate(parts, axis=-1)
+
+        H = -stencil(left, len(self.P))
+        self.condition(H, left(np.zeros(len(self.P))), np.diag(np.concatenate(variance)))
+
+    def start(self, i, z):
+        n, back = len(self.P), np.eye(3) if self.tracks is None else BY_DISPARITY
+
+        def point(x, row):
+            return sighted(x["T"], x["c"], self.u, row @ back.T)
+
+        here = self.moved_by(np.zeros(n))
+        G = stencil(lambda e: point(self.moved_by(e), z), n)
+        by_row = stencil(lambda d: point(here, z + d), 3)
+        variance = self.noise.pixel_std_px[0] ** 2 * np.array([1, 0.5, 1])
+        if self.tracks is not None:
+            variance = self.noise.track_first_px**2
         wide = np.vstack([np.eye(n), G])
         self.P = wide @ self.P @ wide.T
         self.P[n:, n:] += by_row @ np.diag(variance) @ by_row.T
-        self.m = np.vstack([self.m, sighted(self.T, self.c, self.u, z)])
+        self.m = np.vstack([self.m, point(here, z)])
         self.ids.append(i)
+        self.first[i] = self.k
 
     def to_stored(self):
-        """L, stored errors of pose and landmarks by the right-invariant ones; identity in between."""
+        """L, stored errors of poses and landmarks by the right-invariant ones; identity in between."""
         L = np.eye(len(self.P))
         L[:6, :6] = -se3.adjoint(self.T)
+        if self.tracks is not None:
+            L[self.at["before"], self.at["before"]] = -se3.adjoint(self.before)
         for j, m in enumerate(self.m):
             L[self.body + 3 * j : self.body + 3 * j + 3, 3:6] = -se3.skew(m)
         return L
@@ -213,22 +313,24 @@ class Literal:
         K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + V)
         x, rest = K @ residual, np.eye(len(self.P)) - K @ H
         self.P = rest @ self.P @ rest.T + K @ V @ K.T
-        T, self.c, self.twist, self.W = self.moved_by(x)
+        stored, T_before, m_before, c_before = self.to_stored(), self.T, self.m, self.c
+        after = self.moved_by(x)
+        self.c, self.twist, self.W, self.b = (after[name] for name in ("c", "twist", "W", "b"))
         if self.variant == "standard":
-            self.T, self.m = T, self.m + x[self.body :].reshape(-1, 3)
+            self.T, self.before, self.m = after["T"], after["before"], self.m + x[self.body :].reshape(-1, 3)
             return
-        before = self.to_stored()
-        e = np.linalg.inv(before) @ x
-        T_before, m_before, c_before = self.T, self.m, self.c - x[6 : 6 + len(self.free)] @ np.eye(9)[self.free]
+        e = np.linalg.inv(stored) @ x
         self.T = self.T @ se3.exp(-e[:6])
+        if self.tracks is not None:
+            self.before = self.before @ se3.exp(-e[self.at["before"]])
         R, J = se3.so3_exp(e[3:6]), se3.so3_left_jacobian(e[3:6])
         self.m = self.m @ R.T + e[self.body :].reshape(-1, 3) @ J.T
-        transport = self.to_stored() @ np.linalg.inv(before)
+        transport = self.to_stored() @ np.linalg.inv(stored)
         R_cam_world = (se3.exp(c_before[:6]) @ T_CAM_IMU @ T_before)[:3, :3]
         for i, place in enumerate(self.free):
             if place in (3, 4, 5):
                 axis = R_cam_world.T @ se3.so3_left_jacobian(c_before[3:6])[:, place - 3]
-                transport[self.body :, 6 + i] += np.cross(self.m - m_before, axis).ravel()
+                transport[self.body :, self.at["c"].start + i] += np.cross(self.m - m_before, axis).ravel()
         self.P = transport @ self.P @ transport.T
 
 
@@ -260,9 +362,13 @@ def recorded(world, c, rng):
     return dataclasses.replace(world, twist=twist, observations=Observations(k, observations.landmark, pixels))
 
 
-def filter_of(world, config, calibration=None, P=P0):
+def filter_of(world, config, calibration=None, P=P0, up=None, blocks=()):
+    """The filter of a world, where ``up`` (3,) is what it takes as up in the first frame of the IMU."""
     rig = Rig(world.camera, world.T_cam_imu, world.noise)
-    return JointEKF(rig, config, world.initial_T_world_imu, P, calibration)
+    ekf = JointEKF(rig, config, world.initial_T_world_imu, P, calibration, blocks=blocks)
+    if up is not None:
+        ekf.values["up"] = ekf.T_world_imu[:3, :3] @ up
+    return ekf
 
 
 @ups
@@ -294,7 +400,7 @@ def test_turned_velocities():
 @pytest.mark.parametrize("walks", [True, False])
 @pytest.mark.parametrize(("name", "T"), POSES.items(), ids=POSES.keys())
 def test_transition_and_noise_of_everything(name, T, walks):
-    """Phi and Q of pose, calibration, velocities and up, from the one model of a step."""
+    """Phi and Q of pose, pose before, calibration, velocities, up and bias, from the one model of a step."""
     noise = Noise(
         np.repeat([0.3, 0.05], 3),
         np.ones(4),
@@ -302,110 +408,131 @@ def test_transition_and_noise_of_everything(name, T, walks):
         motion_std=np.array([0.1, 0.2, 0.3, 0.04, 0.05, 0.06]) if walks else np.zeros(6),
         misalignment_rad=0.02,
         tilt_rad=0.1,
+        **TRACKS,
     )
     number = list(POSES).index(name)
     up, twist, tau = list(UPS.values())[number % len(UPS)], TWISTS[2 + number % 3], 0.13
-    ekf = JointEKF(Rig(CAMERA, T_CAM_IMU, noise), FilterConfig(), se3.inverse(T), P0, EVERYTHING)
-    ekf.up, ekf.twist = up, twist if walks else None
-    W = level_axes(up)
-    step = ekf._step(twist, tau)
-    T_next, W_next, u = moved(T, W, twist, tau)
+    model = model_of(Rig(CAMERA, T_CAM_IMU, noise), noise, T, P0, EVERYTHING, [BIAS])
+    b, W = 0.1 * TWISTS[3], T[:3, :3].T @ level_axes(up)
+    values = {**model.initial_values(), "twist_bias": b, "up": W @ Z}
+    if walks:
+        values["twist"] = twist
+    step = model.step(values, twist + b, tau, T, False)
+    T_next, u = moved(T, W, twist, tau)
     np.testing.assert_allclose(step.T_imu_world, T_next, atol=1e-12)
-    np.testing.assert_allclose(step.up, W_next @ Z, atol=1e-13)
     np.testing.assert_allclose(step.twist, u, atol=1e-13)
+    names = ["pose", "previous_pose", "calibration", *(["twist"] if walks else []), "up", "twist_bias"]
+    ends = np.cumsum([block.size for block in model.layout.blocks])
+    assert list(model.layout) == names
+    assert [at.stop for at in model.layout.values()] == ends.tolist()
 
     def after(e):
-        v = twist + e[..., 15:21] if walks else twist
-        T_e, W_e, _ = moved(se3.exp(e[..., :6]) @ T, se3.so3_exp(e[..., -3:]) @ W, v, tau)
-        return difference(T_e, W_e, T_next, W_next)
+        v = twist + e[..., 21:27] if walks else twist - e[..., -6:]
+        W_e = se3.so3_exp(e[..., -9:-6]) @ W
+        return difference(moved(se3.exp(e[..., :6]) @ T, W_e, v, tau)[0], T_next)
 
-    size = 24 if walks else 18
-    rows = [*range(6), *range(size - 3, size)]
+    size = 36 if walks else 30
     Phi, G = np.eye(size), np.zeros((size, 9))
-    Phi[rows] = stencil(after, size)
-    G[rows] = stencil(lambda errors: difference(*moved(T, W, twist, tau, errors)[:2], T_next, W_next), 9)
+    Phi[:6] = stencil(after, size)
+    Phi[6:12] = np.eye(size)[:6]
+    G[:6] = stencil(lambda errors: difference(moved(T, W, twist, tau, errors)[0], T_next), 9)
     np.testing.assert_allclose(step.Phi, Phi, atol=1e-9)
     std = np.concatenate([noise.motion_std if walks else noise.twist_std, np.full(3, noise.misalignment_rad)])
     np.testing.assert_allclose(step.Q, G @ np.diag(std**2) @ G.T, atol=1e-11)
-    assert np.abs(step.Q[-3:, :6]).max() > 1e-6
+    assert np.abs(step.Phi[:6, -9:-6]).max() > 1e-3
 
 
 TILTED = se3.so3_exp(np.array([0.3, -0.2, 0.0]))
 
 
+@pytest.mark.parametrize("tracks", [TRACKS, {**TRACKS, "track_memory": 1.0}, {}], ids=["ar", "walk", "white"])
 @pytest.mark.parametrize("walks", [True, False])
 @pytest.mark.parametrize("calibration", [EVERYTHING, SOME], ids=["all", "some"])
 @pytest.mark.parametrize("variant", ["standard", "invariant"])
-def test_filter_of_everything_equals_the_literal_one(variant, calibration, walks):
+def test_filter_of_everything_equals_the_literal_one(variant, calibration, walks, tracks):
     world = in_level_frame(
         small_world(frames=12, landmarks=20),
         TILTED,
         twist_walk_std=WALK if walks else None,
         motion_std=np.repeat([0.05, 0.01], 3),
         misalignment_rad=0.02,
-        drift=0.1,
-        bearing_drift_rad=1e-3,
         tilt_rad=0.05,
+        **tracks,
     )
-    ekf = filter_of(world, dataclasses.replace(OPEN, variant=variant), calibration)
+    bias = BIAS if calibration is EVERYTHING else None
+    blocks = [] if bias is None else [bias]
+    ekf = filter_of(world, dataclasses.replace(OPEN, variant=variant), calibration, up=TILTED @ Z, blocks=blocks)
     std = np.array([0.1] * 3 + [np.deg2rad(0.5)] * 3 + [0.02, 0.5, 0.02])
     free = np.arange(9) if calibration is EVERYTHING else np.array([3, 4, 5, 7, 8])
-    literal = Literal(world, variant, free, std[free], TILTED)
-    ekf.up = TILTED @ Z
+    literal = Literal(world, variant, free, std[free], TILTED @ Z, bias)
     rng = np.random.default_rng(3)
+    follow = again = 0
     for k in range(len(world)):
         if k:
             tau = world.time_s[k] - world.time_s[k - 1]
             ekf.predict(world.twist[k], tau)
             literal.predict(world.twist[k], tau)
+        else:
+            ekf.begin(world.twist[0])
+            literal.begin(world.twist[0])
         ids, pixels = world.observations.at(k)
         # Of what is there some are left out, the first among them, and the others come in any order.
         some = rng.permutation(len(ids))[: max(3, len(ids) - 2)]
         if k > 1:
             some = some[ids[some] != literal.ids[0]]
+        last = [literal.last[i] for i in ids[some].tolist() if i in literal.ids]
+        follow, again = follow + last.count(k - 1), again + sum(seen < k - 1 for seen in last)
         ekf.update(k, ids[some], pixels[some])
         literal.update(ids[some], pixels[some])
         assert literal.ids == ekf.ids.tolist()
         for ours, theirs in (
             (ekf.T_imu_world, literal.T),
-            (ekf.parameters, literal.c),
-            (ekf.up, literal.W @ Z),
+            (ekf.values["calibration"], literal.c),
+            (ekf.values["up"], literal.W @ Z),
             (ekf.positions_m, literal.m),
             (ekf.P, literal.P),
         ):
             np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(ekf.P, ekf.P.T)
+        if bias is not None:
+            np.testing.assert_allclose(ekf.values["twist_bias"], literal.b, atol=1e-9)
         if walks and k:
-            np.testing.assert_allclose(ekf.twist, literal.twist, atol=1e-9)
+            np.testing.assert_allclose(ekf.values["twist"], literal.twist, atol=1e-9)
+        if tracks and k:
+            np.testing.assert_allclose(ekf.values["previous_pose"], literal.before, rtol=1e-9, atol=1e-9)
     assert len(ekf.ids) > 6
-    assert (np.abs(ekf.parameters[free]) > 1e-6).all()
-    assert not np.delete(ekf.parameters, free).any()
+    assert follow > 20 and again > 5
+    assert (np.abs(ekf.values["calibration"][free]) > 1e-6).all()
+    assert not np.delete(ekf.values["calibration"], free).any()
 
 
+@pytest.mark.parametrize("tracks", [TRACKS, {}], ids=["tracks", "white"])
 @pytest.mark.parametrize("variant", ["invariant", "fej", "standard"])
-def test_information_about_the_gauge_with_up_and_calibration(variant):
+def test_information_about_the_gauge_with_up_and_calibration(variant, tracks):
     """Velocities taken as exact: not the least is gained or lost, but by the standard variant."""
-    world = in_level_frame(small_world(seed=4), TILTED, twist_std=np.zeros(6), tilt_rad=0.05)
-    config = dataclasses.replace(OPEN, variant=variant)
-    ekf = filter_of(world, config, EVERYTHING)
-    ekf.up = TILTED @ Z
-    prior = se3.adjoint(ekf.T_imu_world).T @ np.linalg.solve(P0, se3.adjoint(ekf.T_imu_world))
+    world = in_level_frame(small_world(seed=4), TILTED, twist_std=np.zeros(6), tilt_rad=0.05, **tracks)
+    ekf = filter_of(world, dataclasses.replace(OPEN, variant=variant), EVERYTHING, up=TILTED @ Z)
+    prior = gauge_information(ekf)
     for k in range(len(world)):
         if k:
             ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
         ekf.update(k, *world.observations.at(k))
-    ratio = gauge_ratio(ekf, variant, prior)
+    ratio = np.linalg.eigvals(np.linalg.solve(prior, gauge_information(ekf))).real
     if variant == "standard":
         assert ratio.max() > 10
     else:
         np.testing.assert_allclose(ratio, 1.0, atol=1e-6)
 
 
-def gauge_ratio(ekf, variant, prior):
-    T, m = (ekf._T_predicted, ekf._initial_m) if variant == "fej" else (ekf.T_imu_world, ekf.positions_m)
-    N = gauge_directions(T, m)
-    N = np.vstack([N[:6], np.zeros((ekf._body - 6, 6)), N[6:]])
-    return np.linalg.eigvals(np.linalg.solve(prior, N.T @ np.linalg.solve(ekf.P, N))).real
+def gauge_information(ekf):
+    """Information (6, 6) about where the world is, from all but the clone, which exact velocities tell for certain."""
+    body, layout = np.zeros((ekf.gaussian.body, 6)), ekf.model.layout
+    N = gauge_directions(ekf.linear_T_imu_world, ekf.linear_positions_m)
+    body[layout["pose"]] = N[:6]
+    body[layout["up"], 3:] = np.eye(3)
+    clone = layout.get("previous_pose", slice(0))
+    N, P = np.delete(np.vstack([body, N[6:]]), clone, 0), np.delete(np.delete(ekf.P, clone, 0), clone, 1)
+    return N.T @ np.linalg.solve(P, N)
 
 
 DRIVE = "city?frames=120&outlier_fraction=0&max_tracks=6&sigma_v_m_s=0.02&sigma_w_rad_s=0.001&seed={}"
@@ -421,8 +548,15 @@ def position_error(result, world):
 def end_of(world):
     """The filter after the last frame."""
     rig = Rig(world.camera, world.T_cam_imu, world.noise)
-    config = dataclasses.replace(OPEN, retire="unseen")
-    return run_joint(world, rig, config, range(len(world)))[0]
+    return run_joint(world, rig, dataclasses.replace(OPEN, retire="unseen"))[0]
+
+
+def up_in_imu(ekf):
+    """Up in the frame of the IMU, and the covariance (3, 3) of its angles."""
+    up, R, at = ekf.values["up"], ekf.T_imu_world[:3, :3], ekf.model.layout["up"]
+    by = np.zeros((3, ekf.gaussian.body))
+    by[:, 3:6], by[:, at] = np.eye(3), R
+    return R @ up, by @ ekf.gaussian.body_covariance @ by.T
 
 
 @pytest.mark.slow
@@ -433,12 +567,13 @@ def test_up_is_found_and_the_trajectory_is_better_for_it(walk, seeds):
         world = recorded(builtin(DRIVE.format(seed)), np.zeros(9), np.random.default_rng(seed))
         world = in_level_frame(world, TILT, tilt_rad=TILT_STD, twist_walk_std=walk)
         ekf, truth = end_of(world), gravity(world, TILT)[-1]
-        across = level_axes(ekf.up)[:, :2]
-        P_across = across.T @ ekf.P[ekf._at_up, ekf._at_up] @ across
-        error = across.T @ np.cross(ekf.up, truth)
+        up, covariance = up_in_imu(ekf)
+        across = level_axes(up)[:, :2]
+        P_across = across.T @ covariance @ across
+        error = across.T @ np.cross(up, truth)
         squares.append(error @ np.linalg.solve(P_across, error))
         assert np.sqrt(np.linalg.eigvalsh(P_across)).max() < TILT_STD / 3
-        assert abs(np.linalg.norm(ekf.up) - 1) < 1e-12
+        assert abs(np.linalg.norm(up) - 1) < 1e-12
         ratio.append(position_error(run(with_noise(world, tilt_rad=0.0)), world) / position_error(run(world), world))
     assert max(squares) < 11.8  # 3 sigma, two degrees of freedom
     assert min(ratio) > 3
@@ -461,7 +596,7 @@ def test_a_rig_that_stays_level_loses_nothing():
 
 def test_velocities_are_those_of_the_imu_unless_a_tilt_is_assumed():
     world = small_world(frames=5)
-    assert filter_of(world, OPEN).up is None
+    assert list(filter_of(world, OPEN).values) == ["pose"]
     unstated = dataclasses.replace(world, noise=None)
     assert noise_of(unstated, Config()).tilt_rad == 0
     assert noise_of(dataclasses.replace(unstated, velocity_frame="level"), Config()).tilt_rad > 0
@@ -472,9 +607,15 @@ def test_unknown_velocity_frames_are_refused():
         dataclasses.replace(small_world(frames=5), velocity_frame="body")
 
 
-def test_the_log_holds_velocities_of_the_imu_as_turned_by_all_that_is_known_of_up():
+def test_the_log_and_all_that_is_known_of_up_give_the_velocities_of_the_imu():
     world = recorded(builtin(DRIVE.format(0)), np.zeros(9), np.random.default_rng(0))
     level = in_level_frame(world, TILT, tilt_rad=TILT_STD)
     assert np.abs(level.twist - world.twist).max() > 0.2
-    log = end_of(level).log()
-    np.testing.assert_allclose(log.twist[1:], world.twist[1:], atol=0.03)
+    ekf = end_of(level)
+    log = ekf.log()
+    np.testing.assert_array_equal(log.twist[1:], level.twist[1:])
+    up = (log.T_departed[1:, :3, :3] @ log.up[1:, :, None])[..., 0]
+    np.testing.assert_allclose(log.imu_twist[1:], in_imu(log.twist[1:], up), atol=1e-12)
+    values = {"pose": log.T_updated[:-1], "up": np.broadcast_to(ekf.values["up"], (len(world) - 1, 3))}
+    turned, _ = ekf.model.imu_velocities(values, log.twist[1:], log.T_updated[:-1, :3, :3])
+    np.testing.assert_allclose(turned, world.twist[1:], atol=0.03)
