@@ -1,28 +1,34 @@
 """Calibration in the joint filter's state: Jacobians, recovery in simulation, what no motion shows, bad input."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers import run_joint
 from reference import CAMERA, T_CAM_IMU, small_world
 from test_archive import assert_same
 from test_jacobians import POSES, TWISTS, visible_points
 from test_level import OPEN, recorded, seen_rows, sighted, stencil
 
 from ekfslam.cli import main
-from ekfslam.config import CalibrationConfig, Config
+from ekfslam.config import CalibrationConfig, Config, PosteriorConfig
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
-from ekfslam.errors import ConfigError, PosteriorError
-from ekfslam.filters import calibration as cal
-from ekfslam.filters.joint import JointEKF, run_joint
-from ekfslam.filters.observing import Rig, linearise
+from ekfslam.errors import ConfigError
+from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import se3
+from ekfslam.models.blocks import calibration as cal
+from ekfslam.models.build import model_of
+from ekfslam.models.observation import linearise
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
-from ekfslam.smoother.posterior import posterior
+from ekfslam.smoother.posterior import posterior, posterior_of_log, smooth
 from ekfslam.storage.archive import open_result, write_archive
 
 RIG = Rig(CAMERA, T_CAM_IMU, Noise(np.full(6, 0.1), np.array([0.7, 0.9, 1.1, 0.9])))
+ALL = cal.Calibration(np.ones(9))
+SOME = CalibrationConfig(rotation_deg=0.5, lever_arm_m=0.2, baseline=0.02, disparity_px=0.5)
 C = np.array([0.1, -0.2, 0.15, 0.05, -0.08, 0.06, 0.1, 0.7, 0.15])
 TWIST = TWISTS[3]
 poses = pytest.mark.parametrize("T", POSES.values(), ids=POSES.keys())
@@ -32,6 +38,12 @@ parameters = pytest.mark.parametrize("c", [np.zeros(9), C, -C], ids=["none", "so
 def seen(T, c, m):
     rows = seen_rows(T, c, TWIST, m)
     return rows.reshape(*rows.shape[:-2], -1)
+
+
+def linearised(T, c, m, linear):
+    """Points, rows by pose and parameters (n, 3, 15), rows by landmarks."""
+    q, H_x, H_c, H_m = ALL.linearise(RIG, c, TWIST, T, m, T, linear)
+    return q, np.concatenate([H_x, H_c], axis=-1), H_m
 
 
 def points(T, c):
@@ -44,7 +56,7 @@ def points(T, c):
 @poses
 def test_measurement_jacobians_by_pose_parameters_and_landmark(T, c):
     m = points(T, c)
-    q, H, H_m = cal.linearise_calibrated(RIG, c, TWIST, T, m, m)
+    q, H, H_m = linearised(T, c, m, m)
     predicted = cal.calibrated(RIG, c).predict(q)
     np.testing.assert_allclose(predicted, seen_rows(T, c, TWIST, m), rtol=1e-11)
     both = stencil(lambda e: seen(se3.exp(e[..., :6]) @ T, c + e[..., 6:], m), 15)
@@ -57,8 +69,8 @@ def test_measurement_jacobians_by_pose_parameters_and_landmark(T, c):
 @poses
 def test_without_parameters_it_is_the_sensor_as_given(T):
     m = visible_points(T)
-    q, H, H_m = cal.linearise_calibrated(RIG, np.zeros(9), TWIST, T, m, m)
-    for ours, theirs in zip((q, H[..., :6], H_m), linearise(RIG, T, m, m), strict=True):
+    q, H, H_m = linearised(T, np.zeros(9), m, m)
+    for ours, theirs in zip((q, H[..., :6], H_m), linearise(RIG, T, m, T, m), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-10)
 
 
@@ -66,9 +78,10 @@ def test_without_parameters_it_is_the_sensor_as_given(T):
 @poses
 def test_new_landmarks_with_parameters(T, c):
     z = seen_rows(T, c, TWIST, points(T, c)) + np.array([0.5, -0.2, 0.3])
-    positions, G, covariance = cal.first_sight_calibrated(RIG, c, TWIST, T, z, T)
+    positions, G_x, G_c, covariance = ALL.initialise(RIG, c, TWIST, T, z, RIG.variance(z), T)
+    G = np.concatenate([G_x, G_c], axis=-1)
     np.testing.assert_allclose(positions, sighted(T, c, TWIST, z), rtol=1e-9, atol=1e-9)
-    _, H, H_m = cal.linearise_calibrated(RIG, c, TWIST, T, positions, positions)
+    _, H, H_m = linearised(T, c, positions, positions)
     V = np.diag(RIG.variance_px2)
     root = np.random.default_rng(2).normal(size=(15, 15)) * np.repeat([0.1, 0.01, 0.1, 0.01, 0.02], [3, 3, 3, 3, 3])
     P = root.T @ root + 1e-6 * np.eye(15)
@@ -92,9 +105,9 @@ def test_a_camera_and_its_first_estimates_moved_as_one_look_the_same(T):
     """While the rig stands its extrinsics cannot be seen, wherever landmarks have moved since their first estimates."""
     first = visible_points(T)
     m = first + np.array([0.2, -0.1, 0.3])
-    _, H_first, H_m_first = cal.linearise_calibrated(RIG, np.zeros(9), TWIST, T, first, first)
+    _, H_first, H_m_first = linearised(T, np.zeros(9), first, first)
     along = -np.linalg.solve(H_m_first, H_first[..., 6:12])
-    _, H, H_m = cal.linearise_calibrated(RIG, np.zeros(9), TWIST, T, m, first)
+    _, H, H_m = linearised(T, np.zeros(9), m, first)
     np.testing.assert_allclose(H[..., 6:12] + H_m @ along, 0, atol=1e-8 * np.abs(H).max())
 
 
@@ -115,9 +128,9 @@ def test_priors_are_in_the_order_of_the_names():
 def estimated(world, calibration, variant="invariant"):
     """Free parameters and their covariance after the last frame."""
     config = dataclasses.replace(OPEN, variant=variant, retire="unseen", retire_after=1)
-    rig = Rig(world.camera, world.T_cam_imu, world.noise)
-    ekf = run_joint(world, rig, config, range(len(world)), calibration)[0]
-    return ekf.parameters[ekf._free], ekf.P[6 : ekf._seen, 6 : ekf._seen]
+    ekf, _, _ = run_joint(world, Rig(world.camera, world.T_cam_imu, world.noise), config, calibration)
+    at = ekf.model.layout["calibration"]
+    return ekf.values["calibration"][ekf.model.calibration.free], ekf.P[at, at]
 
 
 DRIVE = "city?frames={}&outlier_fraction=0&max_tracks=12&sigma_v_m_s={}&sigma_w_rad_s={}"
@@ -182,8 +195,9 @@ def test_noise_of_the_velocities_does_not_hide_a_time_offset():
 
 def test_only_a_stereo_rig_can_be_calibrated():
     world = small_world()
-    with pytest.raises(ConfigError, match="calibration"):
-        JointEKF(object(), OPEN, world.initial_T_world_imu, calibration=CalibrationConfig(time_s=0.02))
+    sensor, T = SimpleNamespace(noise=world.noise), world.initial_T_world_imu
+    with pytest.raises(ConfigError, match="only a stereo rig"):
+        JointEKF(sensor, OPEN, T, calibration=CalibrationConfig(time_s=0.02))
 
 
 def test_straight_driving_shows_neither_lever_arm_nor_time_offset():
@@ -223,9 +237,23 @@ def test_straight_driving_shows_neither_lever_arm_nor_time_offset():
 def test_nothing_free_is_the_filter_without_calibration():
     world = small_world(frames=20)
     rig = Rig(world.camera, world.T_cam_imu, world.noise)
-    ekf = run_joint(world, rig, OPEN, range(20))[0]
+    ekf, _, _ = run_joint(world, rig, OPEN, CalibrationConfig())
     assert len(ekf.P) == 6 + 3 * len(ekf.ids)
-    assert not ekf.parameters.any()
+    assert list(ekf.values) == ["pose"]
+    assert ekf.parameters() is None
+    np.testing.assert_array_equal(ekf.P, run_joint(world, rig, OPEN)[0].P)
+
+
+@pytest.mark.parametrize("calibrated", [SOME, CalibrationConfig(time_s=0.02)], ids=["all but time", "time"])
+def test_parameters_that_are_not_free_stay_as_given(calibrated):
+    """The free ones are the columns, in the order of the names; the value is always all nine."""
+    free = np.flatnonzero(cal.prior_std(calibrated))
+    block, m = cal.Calibration(cal.prior_std(calibrated)), points(np.eye(4), np.zeros(9))
+    assert block.size == len(free)
+    np.testing.assert_allclose(block.retract(C, np.ones(len(free))) - C, np.isin(np.arange(9), free), atol=1e-15)
+    arguments = C, TWIST, np.eye(4), m, np.eye(4), m
+    for ours, theirs in zip(block.linearise(RIG, *arguments), ALL.linearise(RIG, *arguments), strict=True):
+        np.testing.assert_array_equal(ours, theirs[..., free] if theirs.shape[-1] == 9 else theirs)
 
 
 @pytest.mark.parametrize("name", ["rotation_deg", "lever_arm_m", "baseline", "disparity_px", "time_s"])
@@ -269,11 +297,33 @@ def test_what_was_found_is_kept_printed_and_used_by_the_posterior(tmp_path, caps
         f"full: ln baseline: {found.value[-1, 0]:.3g} +- {found.std[-1, 0]:.2g} 1 (before: 0 +- 0.1)"
         in capsys.readouterr().out
     )
-    # The posterior sees with what was found: with the calibration as given it would fit far worse.
-    cost = posterior(result).costs[-1]
-    assert cost < 0.9 * posterior(dataclasses.replace(result, parameters=None)).costs[-1]
-    with pytest.raises(PosteriorError, match="ln baseline, disparity offset"):
-        posterior(result, dataclasses.replace(config.posterior, linearisation="filtered"))
-    delayed = run(world, "full", Config(calibration=CalibrationConfig(time_s=0.02)))
-    with pytest.raises(PosteriorError, match="time offset"):
-        posterior(delayed)
+    # The posterior estimates it, too: with the calibration as given all would fit far worse.
+    smoothed = posterior(result)
+    noise, log = result.noise, result.log
+    as_given = model_of(Rig(world.camera, world.T_cam_imu, noise), noise, log.T_predicted[0], log.initial_covariance)
+    assert smoothed.cost < 0.9 * posterior_of_log(log, as_given, result.landmarks.position_m).cost
+    std = np.sqrt(np.diag(smoothed.block_covariance("calibration")))
+    assert abs(smoothed.values["calibration"][6] - 0.05) < 3 * std[0]
+    assert (std < 1.1 * found.std[-1]).all()
+
+
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_as_filtered_is_the_filter_also_with_a_time_offset(variant):
+    c = np.array([0.05, -0.05, 0.05, *TURNED, 0.01, 0.3, 0.02])
+    world = recorded(builtin(DRIVE.format(40, 0.02, 0.001)), c, np.random.default_rng(2))
+    calibration = dataclasses.replace(SOME, time_s=0.02)
+    settings = dataclasses.replace(OPEN, variant=variant)
+    result = run(world, "full", Config(filter=settings, calibration=calibration))
+    found = posterior(result, PosteriorConfig(linearisation="filtered"))
+    np.testing.assert_allclose(found.T_world_imu[-1], result.T_world_imu[-1], atol=1e-8)
+    np.testing.assert_allclose(found.position_m, result.landmarks.position_m, atol=1e-8)
+    np.testing.assert_allclose(found.values["calibration"], result.parameters.value[-1], atol=1e-8)
+    std = np.sqrt(np.diag(found.block_covariance("calibration")))
+    np.testing.assert_allclose(std, result.parameters.std[-1], rtol=1e-8)
+    assert smooth(result, PosteriorConfig(linearisation="filtered"), found).mode == "as filtered"
+    # There is a maximum a posteriori, too, and the truth is within its deviations.
+    best = posterior(result)
+    error = best.values["calibration"] - c
+    std = np.sqrt(np.diag(best.block_covariance("calibration")))
+    assert (np.abs(error) < 4 * std).all()
+    assert std[8] < 0.02 / 2
