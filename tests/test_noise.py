@@ -1,33 +1,42 @@
-"""Noise from the data, and the filter that lives with it: velocities in the state, drifting and moving tracks."""
+"""Noise from the data, and the filter that lives with it: velocities in the state, errors of tracks, moving tracks."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from reference import small_world
+from helpers import run_joint
+from reference import D, circle_dot, homogeneous, jacobian_of_pi, small_world, stereo_matrix
 from test_jacobians import central
 from test_variants import gauge_directions
 
-from ekfslam.config import Config, FilterConfig, NoiseConfig
+from ekfslam.config import Config, FilterConfig, NoiseConfig, PosteriorConfig
+from ekfslam.data.noise import TrackError
 from ekfslam.data.readers import open_sequence, write_sequence
 from ekfslam.data.sequence import Observations
 from ekfslam.data.simulate import builtin
-from ekfslam.errors import PosteriorError
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.observing import MOVING, Rig
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import project
 from ekfslam.models.build import noise_of
-from ekfslam.models.noise import MOTION_STD, automatic_noise, velocity_noise
+from ekfslam.models.noise import MOTION_STD, TRACK_WALK_PX, automatic_noise, velocity_noise, with_drift
+from ekfslam.models.sensors.base import MOVING
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
-from ekfslam.smoother.problem import aged
 from ekfslam.storage.archive import open_result, write_archive
 
 OPEN = FilterConfig(gate_probability=1.0, split_after=0)
+STILL = dataclasses.replace(OPEN, moving_sigma=1e9)
 WALK = np.repeat([0.2, 0.02], 3)
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
+TRACKS = {
+    "track_first_px": np.array([0.3, 0.4, 0.8]),
+    "track_walk_px": np.array([0.2, 0.25, 0.3]),
+    "track_memory": 0.9,
+    "track_flow_px": 40.0,
+}
+ERROR = TrackError(*TRACKS.values())
 
 
 def with_noise(sequence, **changes):
@@ -60,15 +69,15 @@ def test_velocity_noise_of_the_recordings(data_path):
 
 def test_automatic_noise_is_for_recordings_that_state_none():
     stated = builtin("city?frames=200")
-    assert noise_of(stated, Config()).drift == 0
+    assert noise_of(stated, Config()).track_error is None
     unstated = without_noise(stated)
     found = noise_of(unstated, Config())
-    assert found.drift > 0
+    assert (found.track_error.first_std > 0).all() and (found.track_error.walk_std > 0).all()
     assert found.twist_walk_std is not None
     np.testing.assert_allclose(found.twist_std[[0, 3]], velocity_noise(stated.twist).sigma)
     # Whatever is given by hand is white, and so is everything on request.
     for config in (Config(noise=NoiseConfig(sigma_px=2.0)), Config(noise=NoiseConfig(model="white"))):
-        assert noise_of(unstated, config).drift == 0
+        assert noise_of(unstated, config).track_error is None
         assert noise_of(unstated, config).twist_walk_std is None
     # Velocities that are cleaner than what is there anyway are not filtered.
     still = automatic_noise(np.zeros((100, 6)))
@@ -97,77 +106,186 @@ def test_twist_jacobian_against_central_differences():
 
 
 class NaiveTwistFilter:
-    """The standard variant with velocities in the state, written out with full matrices and explicit inverses."""
+    """The standard variant with pose, pose before, velocities and landmarks, errors of whose tracks walk.
 
-    def __init__(self, ekf, sequence):
-        self.T, self.P, self.u, self.noise = ekf.T_imu_world, ekf.P.copy(), None, sequence.noise
-        self.m = np.empty((0, 3))
+    Written out with four pixels, full matrices and explicit inverses.
+    """
+
+    def __init__(self, sequence):
+        self.sequence, self.noise, self.u = sequence, sequence.noise, None
+        self.T, self.T_before = np.linalg.inv(sequence.initial_T_world_imu), np.eye(4)
+        self.P = np.zeros((18, 18))
+        self.P[:6, :6] = P0
+        self.m, self.ids, self.first, self.last, self.pixels, self.k = np.empty((0, 3)), [], {}, {}, {}, 0
 
     def predict(self, measured, tau):
         n = 3 * len(self.m)
         if self.u is None:
             self.u = measured.copy()
-            assert not self.P[6:12].any()
-            self.P[6:12, 6:12] = np.diag(self.noise.twist_std**2)
+            assert not self.P[12:18].any()
+            self.P[12:18, 12:18] = np.diag(self.noise.twist_std**2)
         else:
-            H = np.zeros((6, 12 + n))
-            H[:, 6:12] = np.eye(6)
-            self.P[6:12, 6:12] += np.diag(self.noise.twist_walk_std**2)
-            K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + np.diag(self.noise.twist_std**2))
-            x = K @ (measured - self.u)
-            self.P = self.P - K @ H @ self.P
-            self.T, self.u = se3.exp(x[:6]) @ self.T, self.u + x[6:12]
-            self.m = self.m + x[12:].reshape(-1, 3)
+            H = np.zeros((6, 18 + n))
+            H[:, 12:18] = np.eye(6)
+            self.P[12:18, 12:18] += np.diag(self.noise.twist_walk_std**2)
+            self.condition(H, measured - self.u, np.diag(self.noise.twist_std**2))
         E = motion.increment(self.u, tau)
-        F = np.eye(12 + n)
-        F[:6, :6], F[:6, 6:12] = se3.adjoint(E), -motion.twist_jacobian(self.u, tau)
+        F = np.eye(18 + n)
+        F[:6, :6], F[:6, 12:18] = se3.adjoint(E), -motion.twist_jacobian(self.u, tau)
+        F[6:12, 6:12], F[6:12, :6] = 0.0, np.eye(6)
         self.P = F @ self.P @ F.T
         self.P[:6, :6] += motion.process_noise(self.u, tau, self.noise.motion_std, self.noise.misalignment_rad)
-        self.T = E @ self.T
-        step = self.noise.drift * self.T[:3, :3].T @ self.u[:3] * tau
-        for j in range(len(self.m)):
-            own = slice(12 + 3 * j, 15 + 3 * j)
-            self.P[own, own] += np.outer(step, step)
+        self.T, self.T_before, self.k = E @ self.T, self.T, self.k + 1
+
+    def condition(self, H, residual, V):
+        K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + V)
+        x = K @ residual
+        self.P = self.P - K @ H @ self.P
+        self.T, self.T_before = se3.exp(x[:6]) @ self.T, se3.exp(x[6:12]) @ self.T_before
+        if self.u is not None:
+            self.u = self.u + x[12:18]
+        self.m = self.m + x[18:].reshape(-1, 3)
+
+    def seen(self, T, m):
+        """Rows (u, v, disparity) of a landmark, by pose and by landmark."""
+        # Of four pixels with equal noise: the left column, the mean row, the difference of the columns.
+        B = np.array([[1, 0, 0, 0], [0, 0.5, 0, 0.5], [1, 0, -1, 0]])
+        M, oTi = B @ stereo_matrix(self.sequence.camera), self.sequence.T_cam_imu
+        q = oTi @ T @ homogeneous(m)
+        by_point = M @ jacobian_of_pi(q) @ oTi
+        return M @ (q / q[2]), by_point @ circle_dot(T @ homogeneous(m)), by_point @ T @ D
+
+    def update(self, ids, pixels):
+        tracks, H, residual, variance = self.noise, [], [], []
+        rows = np.column_stack([pixels[:, 0], pixels[:, [1, 3]].mean(axis=1), pixels[:, 0] - pixels[:, 2]])
+        for i, z in zip(ids.tolist(), rows, strict=True):
+            if i not in self.ids:
+                continue
+            at = 18 + 3 * self.ids.index(i)
+            row, m = np.zeros((3, len(self.P))), self.m[self.ids.index(i)]
+            h, row[:, :6], row[:, at : at + 3] = self.seen(self.T, m)
+            residual.append(z - h)
+            if self.last[i] == self.k - 1:
+                before, by_pose, by_landmark = self.seen(self.T_before, m)
+                residual[-1] = residual[-1] - tracks.track_memory * (self.pixels[i] - before)
+                row[:, 6:12] -= tracks.track_memory * by_pose
+                row[:, at : at + 3] -= tracks.track_memory * by_landmark
+                flow = np.hypot(*(z - self.pixels[i])[:2])
+                variance.append(tracks.track_walk_px**2 * (1 + (flow / tracks.track_flow_px) ** 2))
+            else:
+                variance.append(tracks.track_first_px**2)
+                for _ in range(self.k - self.first[i]):
+                    variance[-1] = tracks.track_memory**2 * variance[-1] + tracks.track_walk_px**2
+            H.append(row)
+        if H:
+            self.condition(np.vstack(H), np.concatenate(residual), np.diag(np.concatenate(variance)))
+        for i, z in zip(ids.tolist(), rows, strict=True):
+            if i not in self.ids:
+                self.start(i, z)
+            self.last[i], self.pixels[i] = self.k, z
+
+    def start(self, i, z):
+        camera, n = self.sequence.camera, len(self.P)
+        depth = camera.fu_px * camera.baseline_m / z[2]
+        x, y = (z[0] - camera.cu_px) / camera.fu_px, (z[1] - camera.cv_px) / camera.fv_px
+        m = (np.linalg.inv(self.sequence.T_cam_imu @ self.T) @ np.array([x * depth, y * depth, depth, 1.0]))[:3]
+        h, by_pose, by_landmark = self.seen(self.T, m)
+        np.testing.assert_allclose(h, z, rtol=1e-12)
+        back = np.linalg.inv(by_landmark)
+        wide = np.vstack([np.eye(n), np.hstack([-back @ by_pose, np.zeros((3, n - 6))])])
+        self.P = wide @ self.P @ wide.T
+        self.P[n:, n:] += back @ np.diag(self.noise.track_first_px**2) @ back.T
+        self.m = np.vstack([self.m, m])
+        self.ids.append(i)
+        self.first[i] = self.k
 
 
-def test_prediction_with_velocities_in_the_state_equals_the_naive_one():
+def with_gaps(world, share=0.1):
+    """The world with a share of its observations missing, so that tracks come back after some frames."""
+    observations = world.observations
+    kept = np.random.default_rng(9).random(len(observations)) > share
+    parts = (observations.frame, observations.landmark, observations.pixels_px)
+    return dataclasses.replace(world, observations=Observations(*(part[kept] for part in parts)))
+
+
+@pytest.mark.parametrize("memory", [0.9, 1.0])
+def test_filter_with_velocities_and_errors_of_tracks_equals_the_naive_one(memory):
     world = with_noise(
-        small_world(), twist_walk_std=WALK, motion_std=np.full(6, 0.01), misalignment_rad=0.02, drift=0.3
+        with_gaps(small_world()),
+        twist_walk_std=WALK,
+        motion_std=np.full(6, 0.01),
+        misalignment_rad=0.02,
+        **{**TRACKS, "track_memory": memory},
     )
-    config = dataclasses.replace(OPEN, variant="standard", retire="never", moving_sigma=1e9)
+    config = dataclasses.replace(STILL, variant="standard", retire="never")
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu, P0)
-    ekf.update(0, *world.observations.at(0))
-    naive = NaiveTwistFilter(ekf, world)
-    naive.m = ekf.positions_m.copy()
-    assert len(naive.m) > 5
-    for k in range(1, 15):
-        tau = world.time_s[k] - world.time_s[k - 1]
-        ekf.predict(world.twist[k], tau)
-        naive.predict(world.twist[k], tau)
-        np.testing.assert_allclose(ekf.P, naive.P, atol=1e-10)
-        np.testing.assert_array_equal(ekf.P, ekf.P.T)
-        np.testing.assert_allclose(ekf.twist, naive.u, atol=1e-12)
-        np.testing.assert_allclose(ekf.positions_m, naive.m, atol=1e-12)
-        np.testing.assert_allclose(ekf.T_imu_world, naive.T, atol=1e-12)
-        # What vision does to the rest of the state is tested elsewhere; here both go on from there.
-        ekf.update(k, *world.observations.at(k))
-        naive.T, naive.u, naive.P, naive.m = ekf.T_imu_world, ekf.twist.copy(), ekf.P.copy(), ekf.positions_m.copy()
+    naive = NaiveTwistFilter(world)
+    for k in range(15):
+        if k:
+            tau = world.time_s[k] - world.time_s[k - 1]
+            ekf.predict(world.twist[k], tau)
+            naive.predict(world.twist[k], tau)
+            assert_same_state(ekf, naive)
+        ids, pixels = world.observations.at(k)
+        ekf.update(k, ids, pixels)
+        naive.update(ids, pixels)
+        assert_same_state(ekf, naive)
+    log = ekf.log()
+    assert 10 < len(naive.m) < (log.previous < 0).sum() - 5
+    assert (log.previous >= 0).sum() > 50
 
 
-def test_transition_and_measurement_jacobians_know_of_the_velocities():
-    world = with_noise(small_world(), twist_walk_std=WALK)
-    ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), OPEN, world.initial_T_world_imu, P0)
+def assert_same_state(ekf, naive):
+    np.testing.assert_allclose(ekf.P, naive.P, atol=1e-10)
+    np.testing.assert_array_equal(ekf.P, ekf.P.T)
+    assert ekf.ids.tolist() == naive.ids
+    np.testing.assert_allclose(ekf.positions_m, naive.m, atol=1e-10)
+    np.testing.assert_allclose(ekf.T_imu_world, naive.T, atol=1e-11)
+    np.testing.assert_allclose(ekf.values["previous_pose"], naive.T_before, atol=1e-11)
+    if naive.u is not None:
+        np.testing.assert_allclose(ekf.values["twist"], naive.u, atol=1e-11)
+
+
+@pytest.mark.parametrize("tracks", [{}, TRACKS], ids=["white", "tracks"])
+def test_transition_and_measurement_jacobians_know_of_the_velocities(tracks):
+    world = with_noise(small_world(), twist_walk_std=WALK, **tracks)
+    ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), STILL, world.initial_T_world_imu, P0)
     for k in range(3):
         if k:
             ekf.predict(world.twist[k], 0.1)
         ekf.update(k, *world.observations.at(k))
-    F = ekf.transition_jacobian(ekf.twist, 0.1).toarray()
-    np.testing.assert_allclose(F[:6, 6:12], -motion.twist_jacobian(ekf.twist, 0.1))
-    np.testing.assert_array_equal(F[6:], np.eye(len(F))[6:])
-    N = gauge_directions(ekf.T_imu_world, ekf.positions_m)
-    N = np.vstack([N[:6], np.zeros((6, 6)), N[6:]])
+    at = ekf.model.layout["twist"]
+    F = ekf.transition_jacobian(ekf.values["twist"], 0.1).toarray()
+    np.testing.assert_allclose(F[:6, at], -motion.twist_jacobian(ekf.values["twist"], 0.1))
+    expected = np.eye(len(F))
+    if tracks:
+        expected[6:12] = expected[:6]
+    np.testing.assert_array_equal(F[6:], expected[6:])
+    N = gauge_of_all(ekf)
     H = ekf.measurement_jacobian(ekf.ids)
     assert np.abs(H @ N).max() < 1e-9 * np.abs(H.toarray()).max() * np.abs(N).max()
+    if not tracks:
+        return
+    # Differences from the frame before see the gauge no more than the rows themselves.
+    ekf.predict(world.twist[3], 0.1)
+    seen_then = np.isin(ekf.ids, world.observations.at(2)[0])
+    _, rows = ekf.observe(np.arange(len(ekf.ids)), ekf.table.seen_rows)
+    N = gauge_of_all(ekf)
+    by = rows.H_x @ N[: ekf.gaussian.seen] + rows.H_m @ N[ekf.gaussian.body :].reshape(-1, 3, 6)
+    assert np.abs(by).max() < 1e-9 * np.abs(rows.H_x).max() * np.abs(N).max()
+    differs = np.abs(rows.H_x[..., 6:12]).max(axis=(1, 2)) > 0
+    np.testing.assert_array_equal(differs, seen_then)
+    assert differs.sum() > 3
+
+
+def gauge_of_all(ekf):
+    """What moving the world does to all errors: of the pose and the one before, and of landmarks."""
+    layout, N = ekf.model.layout, gauge_directions(ekf.linear_T_imu_world, ekf.linear_positions_m)
+    body = np.zeros((ekf.gaussian.body, 6))
+    body[layout["pose"]] = N[:6]
+    if "previous_pose" in layout:
+        body[layout["previous_pose"]] = -se3.adjoint(ekf.moment_before().T_linear)
+    return np.vstack([body, N[6:]])
 
 
 @pytest.mark.parametrize("variant", ["standard", "invariant", "fej"])
@@ -194,55 +312,65 @@ def test_knowing_how_velocities_walk_helps_where_little_is_seen():
 
 
 @pytest.mark.parametrize("variant", ["invariant", "fej"])
-def test_no_information_about_the_gauge_comes_with_velocities_and_drift(variant):
+def test_no_information_about_the_gauge_comes_with_velocities_and_errors_of_tracks(variant):
     world = with_noise(
         small_world(seed=4),
         twist_std=np.full(6, 1e-2),
         twist_walk_std=np.full(6, 1e-2),
-        drift=0.05,
+        motion_std=np.full(6, 1e-3),
         misalignment_rad=1e-3,
+        **TRACKS,
     )
-    config = dataclasses.replace(OPEN, variant=variant, moving_sigma=1e9)
+    config = dataclasses.replace(STILL, variant=variant)
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu, P0)
     prior = se3.adjoint(ekf.T_imu_world).T @ np.linalg.solve(P0, se3.adjoint(ekf.T_imu_world))
     for k in range(len(world)):
         if k:
             ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
         ekf.update(k, *world.observations.at(k))
-        T, m = (ekf._T_predicted, ekf._initial_m) if variant == "fej" else (ekf.T_imu_world, ekf.positions_m)
         if k == 0:
             continue  # nothing is known of the velocities, and P is singular
-        N = gauge_directions(T, m)
-        N = np.vstack([N[:6], np.zeros((6, 6)), N[6:]])
+        N = gauge_of_all(ekf)
         ratio = np.linalg.eigvals(np.linalg.solve(prior, N.T @ np.linalg.solve(ekf.P, N))).real
         assert ratio.max() < 1 + 1e-6
 
 
-def moving_world(share=0.3, speed=0.3):
-    """A small world in which some landmarks travel along with the rig; also their ids."""
-    world = small_world(frames=80, landmarks=120, sigma_v=0.02, sigma_w=0.002)
-    rng = np.random.default_rng(1)
+def tracked(world, error, seed=1, movers=(), speed=0.3):
+    """A small world recorded once more with errors of tracks; some landmarks travel along with the rig."""
+    rng = np.random.default_rng(seed)
     observations, truth = world.observations, world.truth
-    movers = rng.permutation(observations.ids)[: int(share * len(observations.ids))]
-    pixels = observations.pixels_px.copy()
+    pixels, last = np.empty_like(observations.pixels_px), {}
     place = dict(zip(truth.landmark.tolist(), truth.position_m, strict=True))
     first = {}
     for i, (k, j) in enumerate(zip(observations.frame.tolist(), observations.landmark.tolist(), strict=True)):
-        if j in movers:
-            k0 = first.setdefault(j, k)
-            travelled = truth.T_world_imu[k, :3, 3] - truth.T_world_imu[k0, :3, 3]
-            q = se3.apply(world.T_cam_imu @ se3.inverse(truth.T_world_imu[k]), place[j] + speed * travelled)
-            camera = world.camera
-            u, v = camera.fu_px * q[0] / q[2] + camera.cu_px, camera.fv_px * q[1] / q[2] + camera.cv_px
-            right = u - camera.fu_px * camera.baseline_m / q[2]
-            pixels[i] = np.array([u, v, right, v]) + 0.8 * rng.normal(size=4)
+        k0 = first.setdefault(j, k)
+        travelled = truth.T_world_imu[k, :3, 3] - truth.T_world_imu[k0, :3, 3]
+        m = place[j] + (speed * travelled if j in movers else 0.0)
+        seen = project(world.camera, se3.apply(world.T_cam_imu @ se3.inverse(truth.T_world_imu[k]), m))
+        if j not in last:
+            e = error.first_std * rng.normal(size=3)
+        else:
+            k_last, e, seen_last = last[j]
+            flow = np.hypot(*(seen - seen_last)[:2])
+            for _ in range(k_last, k):
+                e = error.memory * e + error.walk_std * np.hypot(1.0, flow / error.flow_px) * rng.normal(size=3)
+        last[j] = k, e, seen
+        pixels[i] = seen + np.array([e[0], e[1], e[0] - e[2], e[1]])
     moved = Observations(observations.frame, observations.landmark, pixels)
-    return dataclasses.replace(world, observations=moved), movers
+    return dataclasses.replace(world, observations=moved)
+
+
+def moving_world(share=0.3, speed=0.3, **changes):
+    """A small world in which some landmarks travel along with the rig, and errors of tracks walk; also their ids."""
+    world = small_world(frames=80, landmarks=120, sigma_v=0.02, sigma_w=0.002)
+    ids = world.observations.ids
+    movers = np.random.default_rng(1).permutation(ids)[: int(share * len(ids))]
+    world = with_noise(world, **{**TRACKS, "motion_std": np.repeat([0.02, 0.002], 3), **changes})
+    return tracked(world, world.noise.track_error, 1, movers, speed), movers
 
 
 def test_tracks_that_travel_with_the_rig_are_found_and_listed():
     world, movers = moving_world()
-    world = with_noise(world, drift=0.02, motion_std=np.repeat([0.02, 0.002], 3))
     rejections = (result := run(world, "full", Config(filter=FilterConfig()))).rejections
     accused = np.unique(rejections.landmark[rejections.reason == REASONS.index("moving")])
     assert result.counts["moving"] == len(accused) > 10
@@ -254,14 +382,11 @@ def test_tracks_that_travel_with_the_rig_are_found_and_listed():
     assert np.isin(long, rejections.landmark).mean() > 0.9
 
 
-def test_moving_is_for_good_and_never_without_drift():
+def test_moving_is_for_good_and_never_where_pixels_are_white():
     world, _ = moving_world()
-    assert run(world, "full").counts["moving"] == 0
-    ekf = JointEKF(
-        Rig(world.camera, world.T_cam_imu, dataclasses.replace(world.noise, drift=0.02)),
-        FilterConfig(),
-        world.initial_T_world_imu,
-    )
+    white = with_noise(world, track_first_px=None, track_walk_px=None)
+    assert run(white, "full").counts["moving"] == 0
+    ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), FilterConfig(), world.initial_T_world_imu)
     banned = set()
     for k in range(len(world)):
         if k:
@@ -272,37 +397,65 @@ def test_moving_is_for_good_and_never_without_drift():
     assert banned
 
 
-def test_bearing_drift_widens_landmarks_with_distance_and_nothing_else():
-    world = small_world(frames=12)
-    drifting = with_noise(world, bearing_drift_rad=2e-3)
-    rigid, drifts = (
-        JointEKF(Rig(world.camera, world.T_cam_imu, w.noise), OPEN, world.initial_T_world_imu, P0)
-        for w in (world, drifting)
-    )
-    for ekf in (rigid, drifts):
-        ekf.update(0, *world.observations.at(0))
-        ekf.predict(world.twist[1], 0.1)
-    np.testing.assert_array_equal(drifts.T_imu_world, rigid.T_imu_world)
-    distance = np.linalg.norm(se3.apply(rigid.T_imu_world, rigid.positions_m), axis=1)
-    driven = 0.1 * np.linalg.norm(world.twist[1, :3])
-    grown = np.zeros(len(rigid.P))
-    grown[6:] = np.repeat(2e-3**2 * driven * distance**2, 3)
-    np.testing.assert_allclose(drifts.P - rigid.P, np.diag(grown), atol=1e-14)
-    assert drifts.sensor.noise.landmarks_walk
+@pytest.mark.parametrize("memory", [0.8, 1.0])
+def test_variances_of_tracks_are_those_of_errors_that_walk(memory):
+    error = dataclasses.replace(ERROR, memory=memory)
+    rng = np.random.default_rng(0)
+    e = error.first_std * rng.normal(size=(40_000, 3))
+    for age in range(12):
+        np.testing.assert_allclose(error.absolute_variance(np.array([age]))[0], e.var(axis=0), rtol=0.05)
+        e = memory * e + error.walk_std * rng.normal(size=e.shape)
+    still, moving = error.step_variance(np.array([[0.0, 0.0, 7.0], [24.0, -32.0, 0.0]]))
+    np.testing.assert_allclose(still, error.walk_std**2)
+    np.testing.assert_allclose(moving, 2 * error.walk_std**2)
 
 
-def test_bearing_drift_is_the_same_for_any_frame_rate():
-    """Ten short steps widen a landmark as much as one long one: it is a walk over the distance."""
-    world = with_noise(small_world(frames=12), bearing_drift_rad=2e-3, twist_std=np.zeros(6))
-    found = []
-    for steps in (1, 10):
-        rig = Rig(world.camera, world.T_cam_imu, world.noise)
-        ekf = JointEKF(rig, OPEN, world.initial_T_world_imu, P0)
-        ekf.update(0, *world.observations.at(0))
-        for _ in range(steps):
-            ekf.predict(np.array([0.5, 0, 0, 0, 0, 0]), 0.1 / steps)
-        found.append(np.diag(ekf.P)[6:])
-    np.testing.assert_allclose(*found, rtol=1e-2)
+def test_innovations_of_tracks_are_as_large_as_stated():
+    """Errors that walk slowly, taken for white ones of the same size, look too small in every frame."""
+    nis = {"tracks": [], "white": []}
+    for seed in range(4):
+        world = small_world(seed=seed, frames=40, sigma_v=0.02, sigma_w=0.002)
+        world = with_noise(world, track_memory=0.95, track_first_px=np.full(3, 0.8), track_walk_px=np.full(3, 0.25))
+        world = tracked(world, world.noise.track_error, seed)
+        white = with_noise(world, track_first_px=None, track_walk_px=None)
+        for name, sequence in (("tracks", world), ("white", white)):
+            innovation = run(sequence, "full", Config(filter=STILL)).innovation
+            nis[name].append(innovation.nis.sum() / innovation.dof.sum())
+    assert 0.95 < np.mean(nis["tracks"]) < 1.05
+    assert np.mean(nis["white"]) < 0.6
+
+
+def test_landmarks_whose_tracks_err_are_as_uncertain_as_they_are_wrong():
+    """What stays along a track no number of frames averages out; taken for white it makes the map overconfident."""
+    squares = {"tracks": [], "white": []}
+    for seed in range(6):
+        world = small_world(seed=seed, frames=40, sigma_v=0.02, sigma_w=0.002)
+        world = with_noise(world, track_first_px=np.full(3, 0.8), track_walk_px=np.full(3, 0.05))
+        world = tracked(world, world.noise.track_error, seed)
+        white = with_noise(world, track_first_px=None, track_walk_px=None)
+        for name, sequence in (("tracks", world), ("white", white)):
+            rig = Rig(sequence.camera, sequence.T_cam_imu, sequence.noise)
+            ekf, _, _ = run_joint(sequence, rig, dataclasses.replace(STILL, retire="never"), covariance=1e-12 * P0)
+            at = np.searchsorted(np.sort(world.truth.landmark), ekf.ids)
+            error = world.truth.position_m[np.argsort(world.truth.landmark)][at] - ekf.positions_m
+            P = ekf.gaussian.landmark_blocks()
+            squares[name].extend(np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., None])[..., 0]) / 3)
+    assert 0.8 < np.mean(squares["tracks"]) < 1.3
+    assert np.mean(squares["white"]) > 3
+
+
+def test_drift_scales_how_errors_of_tracks_walk():
+    stated = small_world(frames=5).noise
+    assert with_drift(stated, 0.0).track_error is None
+    found = with_drift(stated, 0.4)
+    np.testing.assert_allclose(found.track_walk_px, 2 * TRACK_WALK_PX)
+    assert found.track_first_px is not None
+    np.testing.assert_array_equal(found.pixel_std_px, stated.pixel_std_px)
+    # What else is known of tracks stays.
+    given = dataclasses.replace(stated, **TRACKS)
+    np.testing.assert_array_equal(with_drift(given, 0.4).track_first_px, TRACKS["track_first_px"])
+    assert with_drift(given, 0.4).track_memory == 0.9
+    assert with_drift(given, 0.0).track_error is None
 
 
 def test_the_whole_noise_is_stored(tmp_path):
@@ -318,45 +471,45 @@ def test_the_whole_noise_is_stored(tmp_path):
         np.testing.assert_array_equal(value, getattr(result.noise, name))
 
 
-def test_the_posterior_of_what_walks_is_the_map_only():
-    result = run(without_noise(builtin("city?frames=60")), "full")
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_the_posterior_of_what_walks_is_the_filter_as_filtered(variant):
+    world = without_noise(builtin("city?frames=60"))
+    settings = dataclasses.replace(STILL, variant=variant, retire="never")
+    result = run(world, "full", Config(filter=settings))
+    assert result.noise.track_error is not None and result.noise.twist_walk_std is not None
     assert smooth(result).mode == "smoothed"
-    with pytest.raises(PosteriorError, match="only the linearisation 'map'"):
-        posterior(result, dataclasses.replace(Config().posterior, linearisation="filtered"))
+    found = posterior(result, PosteriorConfig(linearisation="filtered"))
+    np.testing.assert_allclose(found.T_world_imu[-1], result.T_world_imu[-1], atol=1e-8)
+    np.testing.assert_allclose(
+        found.pose_covariance[-1], result.covariance[-1], atol=1e-8 * result.covariance[-1].max()
+    )
+    np.testing.assert_allclose(found.position_m, result.landmarks.position_m, atol=1e-7)
+    np.testing.assert_allclose(found.landmark_covariance, result.landmarks.covariance, rtol=1e-6, atol=1e-7)
 
 
-def test_observations_are_worth_less_the_further_the_rig_has_driven_since_first_sight():
-    world = with_noise(small_world(frames=15), drift=0.1, bearing_drift_rad=2e-3)
-    rig = Rig(world.camera, world.T_cam_imu, world.noise)
-    result = run(world, "full", Config(filter=dataclasses.replace(OPEN, moving_sigma=1e9)))
-    log = result.log
-    found = aged(log, rig)
-    first = {}
-    position = se3.inverse(log.T_updated)[:, :3, 3]
-    grown = 0
+def test_observations_are_worth_what_is_known_of_the_error_of_their_track():
+    world = with_noise(with_gaps(small_world(frames=15)), **TRACKS)
+    log = run(world, "full", Config(filter=dataclasses.replace(STILL, retire="never"))).log
+    first, last, kinds = {}, {}, [0, 0, 0]
     for i, (k, j) in enumerate(zip(log.frame.tolist(), log.landmark.tolist(), strict=True)):
         k0 = first.setdefault(j, k)
-        moved = np.zeros((3, 3))
-        for step in np.diff(position[k0 : k + 1], axis=0):
-            along = 0.1 * step
-            distance = np.linalg.norm(se3.apply(world.T_cam_imu @ log.T_updated[k], log.position_m[i]))
-            across = (2e-3 * distance) ** 2 * np.linalg.norm(step)
-            moved += np.outer(along, along) + across * np.eye(3)
-
-        def seen(m, k=k):
-            return project(world.camera, se3.apply(world.T_cam_imu @ log.T_updated[k], m))[:3]
-
-        H = central(lambda d, i=i, seen=seen: seen(log.position_m[i] + d), 3)
-        np.testing.assert_allclose(found.variance[i], log.variance[i] + np.diag(H @ moved @ H.T), rtol=1e-6)
-        grown += k > k0
-    assert grown > 50
-    stays = dataclasses.replace(rig, noise=dataclasses.replace(world.noise, drift=0.0, bearing_drift_rad=0.0))
-    assert aged(log, stays) is log
+        follows = j in last and log.frame[last[j]] == k - 1
+        assert log.previous[i] == (last[j] if follows else -1)
+        if follows:
+            flow = np.hypot(*(log.rows[i] - log.rows[last[j]])[:2])
+            expected = (0.2**2, 0.25**2, 0.3**2) * np.array(1 + (flow / 40) ** 2)
+        else:
+            expected = np.array([0.3**2, 0.4**2, 0.8**2])
+            for _ in range(k0, k):
+                expected = 0.81 * expected + (0.2**2, 0.25**2, 0.3**2)
+        np.testing.assert_allclose(log.variance[i], expected, rtol=1e-9)
+        kinds[0 if k == k0 else 1 + follows] += 1
+        last[j] = i
+    assert min(kinds) > 10
 
 
 def test_a_margin_of_the_noise_is_not_allowed_to_single_tracks():
-    world, _ = moving_world()
-    plain, wide = (with_noise(world, drift=0.02, margin=margin) for margin in (1.0, 3.0))
+    plain, wide = (moving_world(margin=margin)[0] for margin in (1.0, 3.0))
     found = [
         run(part, "full", Config(filter=FilterConfig(moving_sigma=sigma))).rejections
         for part, sigma in ((plain, 3.0), (wide, 9.0), (wide, 3.0))
