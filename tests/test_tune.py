@@ -1,11 +1,14 @@
 """Noise from the innovations: the likelihood itself, what it finds in simulations, and the way of a tuned file."""
 
+import copy
 import dataclasses
 import tomllib
 
 import numpy as np
 import pytest
+from helpers import run_joint
 from reference import small_world
+from test_noise import tracked
 
 from ekfslam.cli import main
 from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig
@@ -14,12 +17,15 @@ from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError, EmptyTracksError
 from ekfslam.filters.dead_reckoning import dead_reckon
-from ekfslam.filters.joint import JointEKF, run_joint
-from ekfslam.filters.mapping import map_landmarks
-from ekfslam.filters.observing import MOVING, Rig
+from ekfslam.filters.gaussian import Gaussian
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
+from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.geometry import motion
 from ekfslam.models.build import noise_of, resolve
-from ekfslam.models.noise import VelocityNoise, velocity_noise
+from ekfslam.models.noise import VelocityNoise, velocity_noise, with_drift
+from ekfslam.models.sensors.base import MOVING
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
 from ekfslam.storage.archive import open_result
 from ekfslam.studies.tuning import (
@@ -66,25 +72,23 @@ def dense_log_density(ekf, report, measured):
 
 
 @pytest.mark.parametrize("gate", [1.0, 0.99])
-def test_log_likelihood_equals_the_dense_one_also_where_rows_are_taken_out_again(gate):
+def test_log_likelihood_equals_the_dense_one_also_where_rows_are_taken_out_again(gate, monkeypatch):
     # Where the pose is uncertain the first gate passes outliers that the second then finds, and takes out.
     world = with_outliers(small_world(sigma_v=1.0, sigma_w=0.1), 0.0 if gate == 1.0 else 0.08, 12.0)
     config = FilterConfig(gate_probability=gate, split_after=0, retire="never")
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu)
-    taken_out, condition = [], ekf._condition
+    taken_out, condition = [], Gaussian.condition
 
-    def spy(frame, rows, sign=1.0):
+    def spy(gaussian, rows, frame, ids, sign=1.0):
         taken_out.append(sign < 0)
-        return condition(frame, rows, sign)
+        return condition(gaussian, rows, frame, ids, sign)
 
-    ekf._condition = spy
+    monkeypatch.setattr(Gaussian, "condition", spy)
     for k in range(len(world)):
         if k:
             ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
         ids, pixels = world.observations.at(k)
-        before = JointEKF(ekf.sensor, config, world.initial_T_world_imu)
-        before._books, before.positions_m, before._initial_m = ekf._books.copy(), ekf.positions_m, ekf._initial_m
-        before.T_imu_world, before.P = ekf.T_imu_world, ekf.P.copy()
+        before = copy.deepcopy(ekf)
         report = ekf.update(k, ids, pixels)
         np.testing.assert_allclose(
             report.log_likelihood, dense_log_density(before, report, pixels), rtol=1e-7, atol=1e-6
@@ -115,10 +119,10 @@ def test_mapping_and_the_joint_filter_agree_where_nothing_but_landmarks_is_uncer
     world = small_world()
     noise = Noise.isotropic(0.0, 0.0, 0.8)
     config = resolve(Config(filter=OPEN), world)
-    reports = run_joint(world, Rig(world.camera, world.T_cam_imu, noise), config.filter, range(len(world)))[3]
-    T, _ = dead_reckon(world, noise, np.zeros((6, 6)))
     rig = Rig(world.camera, world.T_cam_imu, noise)
-    other = map_landmarks(world.observations, T, rig, config.filter, range(len(world)))[1]
+    reports = run_joint(world, rig, config.filter)[2]
+    T, _ = dead_reckon(world, noise, np.zeros((6, 6)))
+    other = [frame.report for frame in run_filter(IndependentLandmarks(rig, config.filter, T), world)]
     np.testing.assert_allclose([a.log_likelihood for a in reports], [b.log_likelihood for b in other], rtol=1e-6)
 
 
@@ -245,13 +249,44 @@ def test_little_noise_and_much_are_told_apart_without_outliers():
         assert abs(values["sigma_w_rad_s"].value - 0.05) < 4 * values["sigma_w_rad_s"].error
 
 
+def tuned_where_tracks_err(drift_px):
+    """Estimates by name, of a drive through a town whose tracks err by so much more from frame to frame."""
+    world = builtin("city?frames=60&max_tracks=12&outlier_fraction=0")
+    world = without_noise(tracked(world, with_drift(world.noise, drift_px).track_error))
+    return {estimate.name: estimate for estimate in tune(world, WHITE, drift=True).estimates}
+
+
 @pytest.mark.slow
-def test_tracks_of_a_world_that_stands_still_do_not_drift():
-    world = without_noise(builtin("city?frames=40&max_tracks=12&outlier_fraction=0"))
-    v, w, px, drift = tune(world, WHITE, drift=True).estimates
-    assert drift.value < 0.05 and "bound" in drift.remark
-    for estimate, true in ((v, 0.5), (w, 0.05), (px, 0.7)):
-        assert abs(estimate.value - true) < 4 * estimate.error
+@pytest.mark.parametrize("drift_px", [0.1, 0.4])
+def test_how_errors_of_tracks_walk_is_recovered(drift_px):
+    found = tuned_where_tracks_err(drift_px)
+    for name, true in (("sigma_v_m_s", 0.5), ("sigma_w_rad_s", 0.05), ("drift", drift_px)):
+        assert abs(found[name].value / true - 1) < 0.15
+        assert "bound" not in found[name].remark
+
+
+# The likelihood's Hessian is singular with it: no standard errors, or any.
+UNSEEN_PIXELS = "sigma_px is looked for, though nothing depends on it where tracks err"
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason=UNSEEN_PIXELS)
+@pytest.mark.parametrize("drift_px", [0.1, 0.4])
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_standard_errors_where_tracks_err(drift_px):
+    found = tuned_where_tracks_err(drift_px)
+    for name, true in (("sigma_v_m_s", 0.5), ("sigma_w_rad_s", 0.05), ("drift", drift_px)):
+        assert abs(found[name].value - true) < 4 * found[name].error
+        assert 0.01 < found[name].error / true < 0.1
+
+
+@pytest.mark.xfail(strict=True, reason=UNSEEN_PIXELS)
+def test_the_likelihood_has_a_maximum_where_tracks_err():
+    world = without_noise(builtin("city?frames=30&max_tracks=10"))
+    tuned = tune(world)
+    assert noise_of(world, tuned.config).track_error is not None
+    v, w = tuned.estimates[:2]
+    assert v.likely_error is not None and w.likely_error is not None
 
 
 @pytest.mark.slow
@@ -291,7 +326,8 @@ def test_a_tuned_file_goes_from_tune_to_run(tmp_path, capsys):
     assert "| sigma_v_m_s | m/s |" in printed and "| sigma_px | px |" in printed and "+-" in printed
     stored = tomllib.loads(file.read_text())
     assert stored["noise"]["model"] == "tuned"
-    assert f"{stored['noise']['sigma_px']:.3g} +- {stored['tuning']['sigma_px_error']:.2g}" in printed
+    for key in ("sigma_v_m_s", "sigma_w_rad_s"):
+        assert f"{stored['noise'][key]:.3g} +- {stored['tuning'][f'{key}_error']:.2g}" in printed
 
     assert main(["run", str(recording), "--config", str(file), "--out", str(archive)]) == 0
     result = open_result(archive, "full")
@@ -300,7 +336,7 @@ def test_a_tuned_file_goes_from_tune_to_run(tmp_path, capsys):
     sigmas = [stored["noise"][key] for key in ("sigma_v_m_s", "sigma_w_rad_s")]
     np.testing.assert_array_equal(result.noise.twist_std[[0, 3]], sigmas)
     np.testing.assert_array_equal(result.noise.pixel_std_px, stored["noise"]["sigma_px"])
-    for name in ("twist_walk_std", "motion_std", "misalignment_rad", "drift"):
+    for name in vars(automatic).keys() - {"twist_std", "pixel_std_px"}:
         np.testing.assert_array_equal(getattr(result.noise, name), getattr(automatic, name))
     for key, value in stored["tuning"].items():
         assert result.attributes[f"tuned_{key}"] == value
@@ -324,15 +360,20 @@ def test_the_models_of_noise():
     automatic = noise_of(world, Config())
     by_hand = noise_of(world, Config(noise=NoiseConfig(sigma_px=2.0)))
     tuned = noise_of(world, Config(noise=NoiseConfig(sigma_px=2.0, model="tuned")))
-    assert by_hand.drift == 0 and by_hand.twist_walk_std is None
-    assert tuned.drift == automatic.drift > 0
+    assert by_hand.track_error is None and by_hand.twist_walk_std is None
+    assert automatic.track_error is not None
+    for name in ("track_first_px", "track_walk_px", "track_memory", "track_flow_px", "margin"):
+        np.testing.assert_array_equal(getattr(tuned, name), getattr(automatic, name))
     np.testing.assert_array_equal(tuned.twist_std, automatic.twist_std)
     np.testing.assert_array_equal(tuned.pixel_std_px, 2.0)
     # Drift alone leaves the model as it is; what a recording states stays, too.
-    assert noise_of(world, Config(noise=NoiseConfig(drift=0.2))).twist_walk_std is not None
-    assert noise_of(world, Config(noise=NoiseConfig(drift=0.2))).drift == 0.2
+    drifting = noise_of(world, Config(noise=NoiseConfig(drift=0.3)))
+    assert drifting.twist_walk_std is not None
+    np.testing.assert_allclose(drifting.track_walk_px, automatic.track_walk_px * 0.3 / automatic.track_walk_px[0])
+    np.testing.assert_array_equal(drifting.track_first_px, automatic.track_first_px)
+    assert noise_of(world, Config(noise=NoiseConfig(drift=0.0))).track_error is None
     stated = noise_of(builtin("city?frames=100"), Config(noise=NoiseConfig(sigma_px=2.0, model="tuned")))
-    assert stated.drift == 0 and stated.twist_std[0] == 0.5 and stated.pixel_std_px[0] == 2.0
+    assert stated.track_error is None and stated.twist_std[0] == 0.5 and stated.pixel_std_px[0] == 2.0
     with pytest.raises(ConfigError, match="drift"):
         Config(noise=NoiseConfig(drift=-1.0))
 
