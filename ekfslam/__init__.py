@@ -31,6 +31,25 @@ Equations (docstrings cite these numbers)::
     T+ = exp(xi) T,  m_i+ = exp(e_theta) m_i + J_l(e_theta) e_i,  P+ = J P J^T       (7) invariant retraction
     u = diag(R, R) u_level,  R = [x, up^ x, up],  x ~ forward - (forward . up) up    (8) velocities over level ground
     q = exp(c^) T_cam_imu exp(-c_time u^) T_imu_world m                              (9) calibration in the state
+    z(k) = h(k) + e(k),  e(k) = f e(k-1) + w,  hence
+    z(k) - f z(k-1) = h(k) - f h(k-1) + w  over pose k, pose k-1 and landmark        (10) errors of tracks
+
+Glossary:
+
+- *state block*: a part of the state besides landmarks: pose, twist, up, calibration, ... (`ekfslam.models.blocks`).
+- *body*: all blocks; *layout*: which columns of the covariance each has.
+- *sensor*: what observes landmarks (`ekfslam.models.sensors`); its *rows* are the numbers that one observation gives.
+- *landmark initialisation*: eq. (5). A *delayed* one waits for a second view.
+- *innovation*: measured rows minus predicted ones; *gate*: the chi-square limit on its normalised square.
+- *NIS*, *NEES*: normalised innovation, estimation error squared; honest if their means are their degrees of freedom.
+- *variant*: where the joint filter linearises and how a correction acts: invariant, fej, standard.
+- *gauge*: directions that nothing observes: where the world's origin is, and which way it is turned.
+- *track*: observations under one id; *hygiene*: cutting and dropping tracks before any estimator sees them.
+- *retire*: marginalise a landmark out of view; *map revival*: bring it back from the batch problem.
+- *batch problem*: all rows of a log over all frames and landmarks; *posterior*: its Gaussian.
+- *as filtered*: rows frozen where the filter linearised them; *map*: relinearised at the maximum a posteriori.
+- *coordinates* of a block: the sum of its corrections; those of vectors are their values.
+- *standard deviation*: of a Gaussian error, always one sigma.
 """
 
 from importlib.metadata import version

@@ -65,7 +65,7 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
         if e.model.has_time_offset and e.tau_s:
             e.imu_twist = _seen_twist(e, frame, rows.only(some))
             _, rows = e.observe(slot, measured)
-        tried = rows.only(some)
+        tried = rows if len(some) == len(verdict) else rows.only(some)
         done = e.gaussian.condition(tried, frame, e.ids[tried.slot])
         if np.isfinite(gate):
             left = tried.corrected(*e.parts(done.correction))
@@ -75,7 +75,8 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
                 out = left.only(~inside)
                 done = done - e.gaussian.condition(out, frame, e.ids[out.slot], sign=-1.0)
     taken = verdict == ACCEPTED
-    rows, measured = rows.only(taken), measured[taken]
+    if not taken.all():
+        rows, measured = rows.only(taken), measured[taken]
     clone = e.values.get("previous_pose", e.T_departed)
     linear = e.coordinates, e.T_imu_world, clone
     position = e.table.position_m[rows.slot]
@@ -87,12 +88,13 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
 def _gate_alone(e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArray, gate: float) -> IntArray:
     """Which landmarks (j,) of the rows pass the gate by themselves; the verdict (k,) on the others is written."""
     some = np.flatnonzero(verdict == ACCEPTED)
-    rows = rows.only(some)
+    rows = rows if len(some) == len(verdict) else rows.only(some)
     S = e.gaussian.variances(rows) + gates.diagonal(rows.variance)
     # So near to the camera plane that its image may be anywhere: linearised, it would spoil the whole frame.
     blurred = np.any(np.diagonal(S, axis1=1, axis2=2) > _MOST_BLURRED * rows.variance, axis=1)
-    verdict[some[blurred]] = BEHIND_CAMERA
-    some, S, rows = some[~blurred], S[~blurred], rows.only(~blurred)
+    if blurred.any():
+        verdict[some[blurred]] = BEHIND_CAMERA
+        some, S, rows = some[~blurred], S[~blurred], rows.only(~blurred)
     squares = gates.normalised_squares(S, rows.residual, frame, e.ids[rows.slot])
     inside = squares <= gate
     verdict[some[~inside]] = GATE
@@ -127,7 +129,7 @@ def _iterate(
     Returns:
         The last correction; the landmarks (j, 3), coordinates and poses at which it was linearised.
     """
-    values, positions, first = e.values, e.table.position_m, done
+    values, positions, first = e.values, e.positions_m, done
     for _ in range(e.config.iterations - 1):
         x, d = e.parts(done.correction)
         after, m = e.retracted(done.correction)

@@ -85,7 +85,7 @@ class Estimate:
     @property
     def positions_m(self) -> Array:
         """(n, 3) their positions in world."""
-        return self.table.position_m
+        return self.table.position_m.copy()
 
     @property
     def linear_positions_m(self) -> Array:
@@ -189,7 +189,7 @@ class Estimate:
 
     def retract(self, correction: Array) -> None:
         """Move the mean, and re-express the covariance where the variant does."""
-        before, positions = self.values, self.table.position_m
+        before, positions = self.values, self.positions_m
         self.values, self.table.position_m = self.retracted(correction)
         self.coordinates = self.coordinates + correction[: self.gaussian.body]
         self.variant.transport(self.gaussian, self.model, before, self.values, self.table.position_m - positions)

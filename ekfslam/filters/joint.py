@@ -186,7 +186,7 @@ class JointEKF(Estimate):
         self._log.amend(T_updated=self.T_imu_world, updated=self.coordinates)
         # 5. Start new landmarks, eq. (5), or let them wait.
         reason[np.flatnonzero(new)[~self._start(frame, ids[new], rows[new])]] = WAITING
-        self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
+        self._reported.append(self.model.reported(self.values, self.gaussian.P))
         likelihood = self._log_likelihood + log_density(found.done.nis, found.done.log_det, found.dof)
         self._log_likelihood = 0.0
         return FrameReport(frame, ids, reason, found.done.nis, found.dof, split, likelihood)

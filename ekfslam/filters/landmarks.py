@@ -5,14 +5,46 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters.result import Landmarks
 
+_INTS = (
+    "id",
+    "first_frame",
+    "last_frame",
+    "observations",
+    "misses",
+    "log_row",
+    "stay_until",
+    "first_step",
+    "last_step",
+    "last_observation",
+)
+
+
+def _column(name: str) -> Any:
+    """A named column (n,) of whole numbers: a view that can be written to."""
+    at = _INTS.index(name)
+    return property(lambda table: table._ints[: len(table), at])
+
+
+def _columns(start: int, stop: int | None) -> Any:
+    """Named columns (n, k) of real numbers: a view; what is assigned is copied."""
+
+    def replace(table: LandmarkTable, value: Array) -> None:
+        table._floats[: len(table), start:stop] = value
+
+    return property(lambda table: table._floats[: len(table), start:stop], replace)
+
 
 class LandmarkTable:
     """Named columns, one row a landmark.
+
+    Args:
+        dimension: Rows d of an observation.
+        extra: Number of further columns.
 
     Attributes:
         id: (n,) landmark ids.
@@ -25,39 +57,50 @@ class LandmarkTable:
         stay_until: (n,) frame up to which the landmark stays without being seen.
         position_m, initial_m: (n, 3) estimate, and the one at landmark initialisation.
         seen_rows: (n, d) rows of the last accepted observation.
+        extra: (n, extra) whatever a filter keeps besides.
         evidence: (n, 2) of the test for moving tracks, see `ekfslam.filters.gates`.
     """
 
-    def __init__(self, dimension: int = 3) -> None:
-        self.id = self.first_frame = self.last_frame = self.observations = np.empty(0, dtype=np.int64)
-        self.misses = self.log_row = self.stay_until = np.empty(0, dtype=np.int64)
-        self.first_step = self.last_step = self.last_observation = np.empty(0, dtype=np.int64)
-        self.position_m = self.initial_m = np.empty((0, 3))
-        self.seen_rows, self.evidence = np.empty((0, dimension)), np.empty((0, 2))
+    def __init__(self, dimension: int = 3, extra: int = 0) -> None:
+        # Two matrices and not a dozen arrays, with room to grow: a frame that starts or drops landmarks costs little.
+        self._ints = np.empty((0, len(_INTS)), dtype=np.int64)
+        self._floats = np.empty((0, 8 + dimension + extra))
+        self._rows, self._dimension = 0, dimension
 
     def __len__(self) -> int:
-        return len(self.id)
+        return self._rows
+
+    id, first_frame, last_frame, observations, misses = (_column(name) for name in _INTS[:5])
+    log_row, stay_until, first_step, last_step, last_observation = (_column(name) for name in _INTS[5:])
+    position_m, initial_m = _columns(0, 3), _columns(3, 6)
+    evidence = _columns(6, 8)
 
     @property
-    def columns(self) -> dict[str, NDArray]:
-        """All columns by name."""
-        return vars(self)
+    def seen_rows(self) -> Array:
+        return self._floats[: len(self), 8 : 8 + self._dimension]
 
-    def append(self, **values: Any) -> None:
+    @property
+    def extra(self) -> Array:
+        return self._floats[: len(self), 8 + self._dimension :]
+
+    def append(self, **values: ArrayLike) -> None:
         """Append rows; columns not given are 0."""
-        n = len(values["id"])
-        for name, column in self.columns.items():
-            new = np.broadcast_to(values.get(name, 0), (n, *column.shape[1:]))
-            setattr(self, name, np.concatenate([column, new.astype(column.dtype)]))
+        before = len(self)
+        after = before + len(np.asarray(values["id"]))
+        if after > len(self._ints):
+            self._ints, self._floats = _wider(self._ints[:before], after), _wider(self._floats[:before], after)
+        self._ints[before:after], self._floats[before:after], self._rows = 0, 0.0, after
+        for name, value in values.items():
+            getattr(self, name)[before:] = value
 
     def keep(self, stay: BoolArray) -> None:
         """Drop the rows that do not stay (n,)."""
-        for name, column in self.columns.items():
-            setattr(self, name, column[stay])
+        self._ints, self._floats = self._ints[: len(self)][stay], self._floats[: len(self)][stay]
+        self._rows = len(self._ints)
 
     def lookup(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
         """Slot (k,) of each id, and whether (k,) it is in the table at all."""
-        order = np.argsort(self.id)
+        order = np.argsort(self.id, kind="stable")  # fast where ids ascend already, as they mostly do
         index, is_known = lookup(self.id[order], ids)
         return (order[index] if len(order) else index), is_known
 
@@ -82,6 +125,13 @@ class LandmarkTable:
             self.last_frame[slot],
             self.observations[slot],
         )
+
+
+def _wider(rows: NDArray, least: int) -> NDArray:
+    """A copy of the rows (n, k) with room for at least so many, and for half as many again."""
+    room = np.empty((least + least // 2, rows.shape[1]), dtype=rows.dtype)
+    room[: len(rows)] = rows
+    return room
 
 
 def lookup(sorted_ids: IntArray, ids: IntArray) -> tuple[IntArray, BoolArray]:

@@ -28,8 +28,7 @@ class IndependentLandmarks:
 
     def __init__(self, sensor: Sensor, config: FilterConfig, T_imu_world: Array) -> None:
         self.sensor, self.config, self._poses = sensor, config, T_imu_world
-        self.table = LandmarkTable(sensor.dimension)
-        self.covariance = np.empty((0, 3, 3))
+        self.table = LandmarkTable(sensor.dimension, extra=9)
         self._gate = gates.threshold(config.gate_probability, sensor.dimension)
         self._split: list[Landmarks] = []
 
@@ -56,7 +55,7 @@ class IndependentLandmarks:
         known, q, H = known[in_front], q[in_front], H[in_front]
 
         residual = rows[known] - self.sensor.predict(q)
-        HP = H @ self.covariance[slot[known]]
+        HP = H @ self.table.extra[slot[known]].reshape(-1, 3, 3)
         S = HP @ np.swapaxes(H, -1, -2) + gates.diagonal(self.sensor.variance(rows[known]))
         squares = gates.normalised_squares(S, residual, frame, ids[known])
         inside = squares <= self._gate
@@ -66,36 +65,50 @@ class IndependentLandmarks:
         table.accepted(slot[known[inside]], frame)
         table.misses[slot[is_known & missed(reason)]] += 1
         split = self._retire((table.misses >= self.config.split_after) & (self.config.split_after > 0))
-        new = (~is_known & (reason == ACCEPTED)) | np.isin(ids, split)
-        reason[new] = ACCEPTED
-        self._start(frame, ids[new], rows[new])
+        new = ~is_known & (reason == ACCEPTED)
+        if len(split):
+            new |= np.isin(ids, split)
+            reason[new] = ACCEPTED
+        if new.any():
+            self._start(frame, ids[new], rows[new])
         nis, dof = float(squares[inside].sum()), int(residual[inside].size)
         likelihood = log_density(nis, np.linalg.slogdet(S[inside])[1].sum(), dof)
         return FrameReport(frame, ids, reason, nis, dof, split, likelihood)
 
+    @property
+    def covariance(self) -> Array:
+        """(n, 3, 3) of the landmarks in the table, a copy."""
+        return self.table.extra.reshape(-1, 3, 3)
+
     def _condition(self, slot: IntArray, S: Array, HP: Array, residual: Array) -> None:
         gain = np.swapaxes(np.linalg.solve(S, HP), -1, -2)
         self.table.position_m[slot] += (gain @ residual[..., None])[..., 0]
-        P = self.covariance[slot] - gain @ HP
-        self.covariance[slot] = 0.5 * (P + np.swapaxes(P, -1, -2))
+        P = self.table.extra[slot].reshape(-1, 3, 3) - gain @ HP
+        self.table.extra[slot] = 0.5 * (P + np.swapaxes(P, -1, -2)).reshape(-1, 9)
 
     def _start(self, frame: int, ids: IntArray, rows: Array) -> None:
         T = self._poses[frame]
         positions, _, covariance = initialise(self.sensor, T, rows, self.sensor.variance(rows), T)
         at = np.full(len(ids), frame)
         self.table.append(
-            id=ids, first_frame=at, last_frame=at, observations=at * 0 + 1, position_m=positions, initial_m=positions
+            id=ids,
+            first_frame=at,
+            last_frame=at,
+            observations=at * 0 + 1,
+            position_m=positions,
+            initial_m=positions,
+            extra=covariance.reshape(-1, 9),
         )
-        self.covariance = np.concatenate([self.covariance, covariance])
 
     def _retire(self, gone: BoolArray) -> IntArray:
         """Keep what was split off; returns the ids, which are then free to start anew."""
         slot = np.flatnonzero(gone)
+        if not len(slot):
+            return slot
         slot = slot[np.argsort(self.table.id[slot])]
         ids = self.table.id[slot]
         self._split.append(self.table.snapshot(slot, self.covariance))
         self.table.keep(~gone)
-        self.covariance = self.covariance[~gone]
         return ids
 
     def landmarks(self) -> Landmarks:

@@ -47,7 +47,11 @@ def process_noise(twist: Array, tau_s: Array | float, twist_std: Array, misalign
     ``B B^T misalignment_rad^2`` besides, with ``B = [v^; w^]``.
     """
     twist = np.asarray(twist, dtype=float)
-    G = twist_jacobian(twist, tau_s)
+    return process_noise_by(twist_jacobian(twist, tau_s), twist, twist_std, misalignment_rad)
+
+
+def process_noise_by(G: Array, twist: Array, twist_std: Array, misalignment_rad: float = 0.0) -> Array:
+    """`process_noise` where G is known."""
     Q = (G * np.asarray(twist_std) ** 2) @ np.swapaxes(G, -1, -2)
     if misalignment_rad:
         turned = misalignment_rad * G @ turned_by(twist)

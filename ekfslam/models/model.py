@@ -144,6 +144,13 @@ class Model:
         return any(isinstance(block, Twist) for block in self.blocks)
 
     @cached_property
+    def has_velocity_blocks(self) -> bool:
+        """Whether the velocities of the IMU depend on blocks, and are not simply those measured."""
+        kinds = (type(block) for block in self.blocks)
+        turns = any(kind.turn_velocities is not StateBlock.turn_velocities for kind in kinds)
+        return self.has_twist or bool(self._offsets) or turns
+
+    @cached_property
     def wandering(self) -> tuple[StateBlock, ...]:
         """Blocks that change from frame to frame by themselves, in the order of their columns."""
         return tuple(block for block in self.layout.blocks if block.transition(0.0) is not None)
@@ -177,10 +184,13 @@ class Model:
         )
 
     def reported(self, values: Values, covariance: Array) -> Array:
-        """Estimates and standard deviations (2, p) of what has labels, from the covariance (body, body)."""
+        """Estimates and standard deviations (2, p) of what has labels; the covariance begins with the body."""
+        if not self.labels[0]:
+            return np.empty((2, 0))
         blocks = [block for block in self.layout.blocks if block.labels]
+        covariance = covariance[: self.layout.body, : self.layout.body]
         found = [np.array(block.reported(values, covariance, self.layout)) for block in blocks]
-        return np.hstack([np.empty((2, 0)), *found])
+        return np.hstack(found)
 
     # --- velocities ---------------------------------------------------------------------------------------------------
 
@@ -252,16 +262,19 @@ class Model:
             first_estimates: Whether F leads from there (FEJ) and not from the estimate.
         """
         at, R_linear = self.layout["pose"], T_linear[:3, :3]
-        twist, by = self.imu_velocities(values, measured, R_linear)
-        E = motion.increment(twist, tau_s)
+        process, twist, by = self.noise.process, measured, None
+        if self.has_velocity_blocks:
+            twist, by = self.imu_velocities(values, measured, R_linear)
+        E, G = motion.increment(twist, tau_s), motion.twist_jacobian(twist, tau_s)
         T_next = E @ values["pose"]
         Phi, Q = np.eye(self.layout.body), np.zeros((self.layout.body, self.layout.body))
         if self.has_clone:
             clone = self.layout["previous_pose"]
             Phi[clone, clone], Phi[clone, at] = 0.0, np.eye(6)
-        Phi[at] = -motion.twist_jacobian(twist, tau_s) @ by
-        Phi[at, at] += motion.error_jacobian(T_next @ se3.inverse(T_linear) if first_estimates else E)
-        Q[at, at] = self.process_noise(twist, tau_s)
+        Phi[at, at] = motion.error_jacobian(T_next @ se3.inverse(T_linear) if first_estimates else E)
+        if by is not None:
+            Phi[at] -= G @ by
+        Q[at, at] = motion.process_noise_by(G, twist, process.pose_std, process.misalignment_rad)
         return Step(T_next, twist, Phi, Q)
 
     # --- observations of landmarks ------------------------------------------------------------------------------------

@@ -1,0 +1,191 @@
+"""What was added to the house to show that it can be: a bias of velocities, wheels beside the IMU, one camera alone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from reference import CAMERA, T_CAM_IMU
+
+from ekfslam.config import FilterConfig, PosteriorConfig
+from ekfslam.data.noise import Noise
+from ekfslam.data.sequence import Observations, Sequence, Truth
+from ekfslam.data.simulate import builtin
+from ekfslam.errors import ConfigError, PosteriorError
+from ekfslam.evaluation.consistency import nees, pose_error
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
+from ekfslam.geometry import camera, motion, se3
+from ekfslam.models.blocks import TwistBias
+from ekfslam.models.sensors.monocular import Monocular
+from ekfslam.models.sensors.stereo import Rig
+from ekfslam.models.sensors.velocities import VelocitySource
+from ekfslam.runner import run
+from ekfslam.smoother.posterior import posterior_of_log
+
+OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never")
+SMOOTHED = PosteriorConfig(kernel="none")
+NOISE = Noise(np.repeat([0.2, 0.02], 3), np.ones(4), motion_std=np.full(6, 1e-3))
+WALK = np.array([0.2, 0.05, 0.05, 0.01, 0.01, 0.02])
+BIAS = TwistBias(sigma_v_m_s=0.3, sigma_w_rad_s=0.02, time_v_s=5.0, time_w_s=8.0)
+
+
+def walking_world(rng, bias=None, frames=100):
+    """A drive whose true velocities walk, past landmarks about its path; also the true velocities and biases (T, 6)."""
+    twist = np.array([6.0, 0, 0, 0, 0, 0.3]) + np.cumsum(WALK * rng.standard_normal((frames, 6)), axis=0)
+    time_s, offset = 0.1 * np.arange(frames), np.zeros((frames, 6))
+    if bias is not None:
+        phi, std = bias.transition(0.1)
+        offset[0] = np.sqrt(np.diag(bias.prior_covariance())) * rng.standard_normal(6)
+        for k in range(1, frames):
+            offset[k] = phi * offset[k - 1] + std * rng.standard_normal(6)
+    T_imu_world = motion.integrate(np.eye(4), twist, np.diff(time_s))
+    T_world_imu = se3.inverse(T_imu_world)
+    anchor = rng.integers(0, frames, 150)
+    points = se3.apply(T_world_imu[anchor], rng.uniform([6, -6, -2], [25, 6, 4], (150, 3)))
+    q = se3.apply((T_CAM_IMU @ T_imu_world)[:, None], points)
+    pixels = camera.project(CAMERA, np.where(q[..., 2:] > 1, q, 1.0))
+    inside = (q[..., 2] > 3) & (q[..., 2] < 30) & (np.abs(pixels[..., :2] - [600, 180]) < [600, 300]).all(axis=-1)
+    frame, landmark = np.nonzero(inside)
+    seen = pixels[frame, landmark] + rng.standard_normal((len(frame), 4))
+    sequence = Sequence(
+        name="walking",
+        source="tests",
+        time_s=time_s,
+        twist=twist + offset + NOISE.twist_std * rng.standard_normal((frames, 6)),
+        camera=CAMERA,
+        T_cam_imu=T_CAM_IMU,
+        observations=Observations(frame, landmark, seen),
+        truth=Truth(np.arange(frames), T_world_imu),
+        noise=dataclasses.replace(NOISE, twist_walk_std=WALK),
+    )
+    return sequence, twist, offset
+
+
+def drive(sequence, sensor, config=OPEN, further=None, **options):
+    """The filter as it ended, pose NEES (T-1,) of the filter, and the smoothed posterior with its pose NEES."""
+    ekf = JointEKF(sensor, config, sequence.initial_T_world_imu, **options)
+    T, P = [], []
+    for _ in run_filter(ekf, sequence, further=further):
+        T.append(ekf.T_world_imu)
+        P.append(ekf.P[:6, :6].copy())
+    smoothed = posterior_of_log(ekf.log(), ekf.model, ekf.landmarks().position_m, SMOOTHED)
+    truth = sequence.truth.T_world_imu
+    filtered = nees(pose_error(np.array(T), truth)[1:], np.array(P)[1:])
+    behind = nees(pose_error(smoothed.T_world_imu, truth)[1:], smoothed.pose_covariance[1:])
+    return ekf, filtered, smoothed, behind
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("with_twist", [True, False], ids=["twist in the state", "white"])
+def test_a_bias_of_the_velocities_is_found_consistently(with_twist):
+    """20 drives: NEES of the pose and of the bias, by filter and smoother; expected is 6 each."""
+    found = {name: [] for name in ("filter", "smoother", "bias", "smoothed bias")}
+    for seed in range(20):
+        sequence, _, offset = walking_world(np.random.default_rng(seed), BIAS)
+        noise = sequence.noise if with_twist else NOISE
+        ekf, filtered, smoothed, behind = drive(sequence, Rig(CAMERA, T_CAM_IMU, noise), blocks=[BIAS])
+        at = ekf.model.layout["twist_bias"]
+        found["filter"].append(filtered.mean())
+        found["smoother"].append(behind.mean())
+        found["bias"].append(nees(offset[-1:] - ekf.values["twist_bias"], ekf.P[at, at][None])[0])
+        middle = 50
+        error = offset[middle] - smoothed.values["twist_bias"][middle]
+        found["smoothed bias"].append(nees(error[None], smoothed.block_covariance("twist_bias")[middle][None])[0])
+        # It says more than its prior did.
+        std = np.sqrt(np.diag(smoothed.block_covariance("twist_bias")[middle]))
+        assert (std < 0.8 * np.sqrt(np.diag(BIAS.prior_covariance()))).all()
+    means = {name: np.mean(values) for name, values in found.items()}
+    # 95 % bounds of a mean over 20 samples of six degrees of freedom; along a drive NEES hardly averages out.
+    assert all(4.55 < value < 7.65 for value in means.values()), means
+
+
+def test_without_its_block_a_bias_spoils_the_covariance():
+    with_block, without = [], []
+    for seed in range(4):
+        sequence, _, _ = walking_world(np.random.default_rng(seed), TwistBias(0.6, 0.05, 50.0, 50.0))
+        rig = Rig(CAMERA, T_CAM_IMU, NOISE)
+        with_block.append(drive(sequence, rig, blocks=[TwistBias(0.6, 0.05, 50.0, 50.0)])[1].mean())
+        without.append(drive(sequence, rig)[1].mean())
+    assert np.mean(without) > 2 * np.mean(with_block)
+
+
+def wheels_of(sequence, twist, rng, period_s=0.04):
+    """Forward speed and yaw rate at a rate of their own, with the noise that they state."""
+    time_s = np.arange(0.01, sequence.time_s[-1], period_s)
+    interval = np.searchsorted(sequence.time_s, time_s)  # (t[k-1], t[k]] has number k
+    std = np.array([0.05, 0.005])
+    value = twist[interval][:, [0, 5]] + std * rng.standard_normal((len(time_s), 2))
+    return VelocitySource(time_s, ("v_x", "w_z"), value, std)
+
+
+@pytest.mark.slow
+def test_wheels_beside_an_imu_help_and_stay_consistent():
+    filtered, behind, variance = [], [], {"with": [], "without": []}
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        sequence, twist, _ = walking_world(rng)
+        sequence = dataclasses.replace(
+            sequence,
+            observations=Observations(*(part[::3] for part in vars(sequence.observations).values())),
+        )
+        rig = Rig(CAMERA, T_CAM_IMU, sequence.noise)
+        ekf, of_filter, _, of_smoother = drive(sequence, rig, further=wheels_of(sequence, twist, rng))
+        assert np.unique(ekf.log().velocity_axis[~ekf.log().velocity_is_biased]).tolist() == [0, 5]
+        filtered.append(of_filter.mean())
+        behind.append(of_smoother.mean())
+        variance["with"].append(np.trace(ekf.P[:6, :6]))
+        variance["without"].append(np.trace(drive(sequence, rig)[0].P[:6, :6]))
+    assert 4.55 < np.mean(filtered) < 7.65
+    assert 4.55 < np.mean(behind) < 7.65
+    assert np.mean(variance["with"]) < 0.8 * np.mean(variance["without"])
+
+
+def test_wheels_belong_to_a_filter_that_estimates_velocities():
+    rng = np.random.default_rng(0)
+    sequence, twist, _ = walking_world(rng, frames=20)
+    wheels = wheels_of(sequence, twist, rng)
+    white = dataclasses.replace(sequence, noise=NOISE)
+    with pytest.raises(ConfigError, match="need the twist in the state"):
+        run(white, "full", further=wheels)
+    assert wheels.during(0.0, 0.009) is None
+    rows = wheels.during(0.0, 0.1)
+    assert rows.axis.tolist() == [0, 5] * 3
+    for change, words in (
+        ({"axes": ("v_x", "yaw")}, "must be among"),
+        ({"std": np.array([0.05, 0.0])}, "must be positive"),
+        ({"time_s": wheels.time_s[::-1]}, "ascending"),
+        ({"value": wheels.value[:, :1]}, "shape"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            dataclasses.replace(wheels, **change)
+
+
+@pytest.mark.slow
+def test_one_camera_maps_consistently():
+    """12 drives through the city with the left camera alone: scale comes from the velocities."""
+    filtered, behind, error = [], [], {"camera": [], "reckoned": []}
+    for seed in range(12):
+        world = builtin(f"city?frames=100&seed={seed}&outlier_fraction=0")
+        sensor = Monocular(world.camera, world.T_cam_imu, world.noise)
+        ekf, of_filter, smoothed, of_smoother = drive(world, sensor, FilterConfig(retire="unseen", retire_after=1))
+        assert len(ekf.landmarks()) > 20
+        filtered.append(of_filter.mean())
+        behind.append(of_smoother.mean())
+        truth = world.truth.T_world_imu[:, :3, 3]
+        reckoned = run(world, "dead-reckoning").T_world_imu
+        error["camera"].append(np.linalg.norm(smoothed.T_world_imu[:, :3, 3] - truth, axis=1).mean())
+        error["reckoned"].append(np.linalg.norm(reckoned[:, :3, 3] - truth, axis=1).mean())
+    assert 4.2 < np.mean(filtered) < 8.2
+    assert 4.2 < np.mean(behind) < 8.2
+    assert np.median(error["camera"]) < 0.5 * np.median(error["reckoned"])
+
+
+def test_tracks_that_wait_are_listed_and_start_with_both_views():
+    world = builtin("city?frames=60&outlier_fraction=0")
+    ekf = JointEKF(Monocular(world.camera, world.T_cam_imu, world.noise), OPEN, world.initial_T_world_imu)
+    reasons = np.concatenate([frame.report.reason for frame in run_filter(ekf, world)])
+    log = ekf.log()
+    assert (reasons == 5).sum() > 100
+    assert (reasons == -1).sum() == log.observations - log.landmarks  # the view from the anchor was reported as waiting
+    with pytest.raises(PosteriorError, match="waited"):
+        posterior_of_log(log, ekf.model, ekf.landmarks().position_m, PosteriorConfig(linearisation="filtered"))
