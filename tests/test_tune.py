@@ -266,11 +266,9 @@ def test_how_errors_of_tracks_walk_is_recovered(drift_px):
 
 
 # The likelihood's Hessian is singular with it: no standard errors, or any.
-UNSEEN_PIXELS = "sigma_px is looked for, though nothing depends on it where tracks err"
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason=UNSEEN_PIXELS)
 @pytest.mark.parametrize("drift_px", [0.1, 0.4])
 @pytest.mark.filterwarnings("ignore:invalid value")
 def test_standard_errors_where_tracks_err(drift_px):
@@ -280,7 +278,6 @@ def test_standard_errors_where_tracks_err(drift_px):
         assert 0.01 < found[name].error / true < 0.1
 
 
-@pytest.mark.xfail(strict=True, reason=UNSEEN_PIXELS)
 def test_the_likelihood_has_a_maximum_where_tracks_err():
     world = without_noise(builtin("city?frames=30&max_tracks=10"))
     tuned = tune(world)

@@ -23,8 +23,8 @@ all runs of a round, and the likelihood as smooth as the filter is. A step after
 by then, is less than before is halved. (With the gate inside of the likelihood, half a
 frame is turned down at once where a velocity is off by three deviations, and the maximum is where that happens least.)
 
-What it can say on real tracks is limited. It takes pixel errors as white; those of a tracker agree along a track and
-among tracks for many frames. So it wants far less pixel noise than serves the estimate, and what then does not fit is
+What it can say on real tracks is limited. Errors of tracks agree among tracks for many frames, which no model here
+knows. So it wants far less pixel noise than serves the estimate, and what then does not fit is
 laid at the door of the velocities. Standard errors are therefore those of the `sandwich`: where the model holds, they
 are the inverse Hessian's, elsewhere the scatter of the frames' gradients makes them larger. Weighted by these,
 likelihood and the differences of the velocities (`ekfslam.models.noise`) are put together. Both know the velocities, so
@@ -179,6 +179,7 @@ class TunedNoise:
         return document(markdown_table(headings, rows, left=len(headings)), "\n".join([fit, *self.remarks])).rstrip()
 
 
+_NO_PART = "the likelihood does not depend on it where tracks err; not refined"
 _UNSEEN = "the differences see none; not refined"
 _BELOW_FLOOR = "below the errors of the motion that are assumed anyway; not refined"
 
@@ -215,16 +216,23 @@ def tune(
     start = {
         "sigma_v_m_s": found.sigma[0] or base.twist_std[0],
         "sigma_w_rad_s": found.sigma[1] or base.twist_std[3],
-        "sigma_px": 2.0 * float(base.pixel_std_px.mean()),
+        "sigma_px": (2.0 if base.track_error is None else 1.0) * float(base.pixel_std_px.mean()),
     }
     free = [name for name, sigma, least in zip(start, found.sigma, floor, strict=False) if sigma > least or not least]
-    free.append("sigma_px")
+    if base.track_error is None and not drift:
+        free.append("sigma_px")
     if drift:
         start["drift"] = 0.2 if base.track_walk_px is None else float(base.track_walk_px[0])
         free.append("drift")
 
     moving, gated, ungated = _settings(config)
     parts = [without_rejected(part, base, moving, (MOVING,))[0] for part in stretches(sequence, config, observations)]
+    if not free:
+        with one_thread():
+            here = sum(float(log_likelihoods(part, base, gated).sum()) for part in parts)
+        given = tuple(_as_it_is(name, start[name], found) for name in start)
+        frames = sum(len(part) for part in parts)
+        return TunedNoise(sequence.name, model, given, found, here, frames, len(parts), converged=True)
     bounds = np.log([PARAMETERS[name][1] for name in free])
     x = np.clip(np.log([start[name] for name in free]), *bounds.T)
     best, step, here, converged, runs = x, np.zeros(len(x)), -np.inf, False, 0
@@ -275,8 +283,7 @@ def tune(
     for name in start:
         sigma, sigma_error = differences.get(name, (0.0, 0.0))
         if name not in free:
-            remark = _BELOW_FLOOR if sigma else _UNSEEN
-            estimates.append(Estimate(name, sigma, sigma_error or None, remark=remark))
+            estimates.append(_as_it_is(name, start[name], found))
         elif name in likely:
             (value, error), i = likely[name], free.index(name)
             apart = abs(value - sigma) / np.hypot(error, sigma_error)
@@ -298,6 +305,15 @@ def tune(
         runs=runs,
         converged=converged,
     )
+
+
+def _as_it_is(name: str, start: float, found: VelocityNoise) -> Estimate:
+    """A parameter that the likelihood is not asked for."""
+    if name == "sigma_px":
+        return Estimate(name, start, None, remark=_NO_PART)
+    i = list(PARAMETERS).index(name)
+    sigma, error = float(found.sigma[i]), float(found.sigma_error[i])
+    return Estimate(name, sigma, error or None, remark=_BELOW_FLOOR if sigma else _UNSEEN)
 
 
 def log_likelihoods(sequence: Sequence, noise: Noise, config: Config) -> Array:
@@ -442,7 +458,7 @@ def _with(base: Noise, names: list[str], x: Array) -> Noise:
     twist = np.array(base.twist_std, dtype=float)
     twist[:3] = value.get("sigma_v_m_s", twist[0])
     twist[3:] = value.get("sigma_w_rad_s", twist[3])
-    pixels = np.full(4, value["sigma_px"])
+    pixels = np.full(4, value["sigma_px"]) if "sigma_px" in value else base.pixel_std_px
     noise = dataclasses.replace(base, twist_std=twist, pixel_std_px=pixels)
     return with_drift(noise, value["drift"]) if "drift" in value else noise
 
