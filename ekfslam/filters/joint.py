@@ -1,7 +1,6 @@
 """The joint EKF over state blocks and all active landmarks, with full cross-covariance.
 
-Nothing here is as wide as the state but P itself and the rows ``H P``: measurement Jacobians stay at the columns of the
-blocks that are seen and 3 columns a landmark, and a frame is a fixed number of NumPy calls.
+A frame is a fixed number of NumPy calls; nothing is as wide as the state but P itself and the rows ``H P``.
 """
 
 from __future__ import annotations
@@ -21,11 +20,12 @@ from ekfslam.filters.log import Log
 from ekfslam.filters.logbook import LogBook
 from ekfslam.filters.reports import FrameReport, log_density, missed
 from ekfslam.filters.result import Landmarks, Parameters
+from ekfslam.filters.starting import start
 from ekfslam.filters.waiting import Waiting
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import StateBlock
 from ekfslam.models.build import model_of
-from ekfslam.models.model import Model, Moment, VelocityRows
+from ekfslam.models.model import Model, VelocityRows
 from ekfslam.models.sensors.base import ACCEPTED, MOVING, WAITING, DelayedSensor, Sensor
 
 
@@ -77,8 +77,6 @@ class JointEKF(Estimate):
         delayed = model.sensor if isinstance(model.sensor, DelayedSensor) else None
         self._waiting = None if delayed is None else Waiting(delayed, config.gate_probability)
         self._log_likelihood = 0.0  # of the velocities measured since the last frame
-
-    # --- prediction ---------------------------------------------------------------------------------------------------
 
     def begin(self, twist: Array) -> None:
         """Velocities (6,) at the first frame, which no prediction leads to; only a time offset asks for them."""
@@ -143,8 +141,6 @@ class JointEKF(Estimate):
             self._log_likelihood += log_density(done.nis, done.log_det, len(residual))
             self.retract(done.correction)
 
-    # --- update -------------------------------------------------------------------------------------------------------
-
     def update(self, frame: int, ids: IntArray, measured: Array) -> FrameReport:
         """Retire what is out of view, correct with what is known (6), start what is new (5).
 
@@ -185,58 +181,13 @@ class JointEKF(Estimate):
         reason[new] = ACCEPTED
         self._log.amend(T_updated=self.T_imu_world, updated=self.coordinates)
         # 5. Start new landmarks, eq. (5), or let them wait.
-        reason[np.flatnonzero(new)[~self._start(frame, ids[new], rows[new])]] = WAITING
+        started = start(self, self._log, self._waiting, frame, ids[new], rows[new])
+        self.retired.start_afresh(ids[new][started])
+        reason[np.flatnonzero(new)[~started]] = WAITING
         self._reported.append(self.model.reported(self.values, self.gaussian.P))
         likelihood = self._log_likelihood + log_density(found.done.nis, found.done.log_det, found.dof)
         self._log_likelihood = 0.0
         return FrameReport(frame, ids, reason, found.done.nis, found.dof, split, likelihood)
-
-    def _start(self, frame: int, ids: IntArray, rows: Array) -> BoolArray:
-        """Append new landmarks with their full cross-covariance, eq. (5); returns which (n,) need not wait."""
-        if self._waiting is not None:
-            return self._start_after_waiting(self._waiting, frame, ids, rows)
-        if len(ids):
-            error, now = self.model.track_error, self.moment()
-            none = np.zeros(len(ids), dtype=np.int64)
-            variance = self.sensor.variance(rows) if error is None else error.absolute_variance(none)
-            T_linear = self.variant.linear(now.T_imu_world, self.T_predicted)
-            moment = Moment(now.T_imu_world, T_linear, now.calibration, now.twist)
-            positions, G, covariance = self.model.initialise(moment, rows, variance)
-            self.gaussian.augment(G, covariance)
-            self._append(frame, ids, positions, rows, (self.step, rows, variance))
-        return np.ones(len(ids), dtype=bool)
-
-    def _start_after_waiting(self, waiting: Waiting, frame: int, ids: IntArray, rows: Array) -> BoolArray:
-        """The same for a sensor that needs two views: what these leave over is a measurement of the blocks."""
-        found = waiting.start(self, ids, rows)
-        if found.which.any():
-            now, variance = rows[found.which], self.sensor.variance(rows[found.which])
-            self.gaussian.augment(found.G, found.covariance)
-            views = (found.step, found.rows, variance), (self.step, now, variance)
-            self._append(frame, ids[found.which], found.position_m, now, *views)
-            done = self.gaussian.condition_body(found.H, found.residual, np.ones(len(found.residual)), self.step)
-            self.retract(done.correction)
-        waiting.move_on(self, ids[~found.which], rows[~found.which])
-        return found.which
-
-    def _append(
-        self, frame: int, ids: IntArray, positions: Array, rows: Array, *views: tuple[int, Array, Array]
-    ) -> None:
-        """Write new landmarks into the books."""
-        fresh = np.zeros(len(ids), dtype=np.int64)
-        self.table.append(
-            id=ids,
-            first_frame=fresh + frame,
-            last_frame=fresh + frame,
-            observations=fresh + len(views),
-            log_row=self._log.started(ids, positions, *views),
-            first_step=fresh + self.step,
-            position_m=positions,
-            initial_m=positions,
-        )
-        slot = np.arange(len(self.ids) - len(ids), len(self.ids))
-        self.table.observed(slot, self.step, rows, self._log.last(len(ids)))
-        self.retired.start_afresh(ids)
 
     def _retire(self, gone: BoolArray, may_return: bool = False) -> None:
         """Marginalise landmarks (n,): drop their rows and columns, keep their last estimate."""
@@ -270,8 +221,6 @@ class JointEKF(Estimate):
         found = self.revival.marginal(log, known.position_m, self.table.log_row)
         self.values, self.table.position_m, self.P = {**self.values, **found.values}, found.position_m, found.P
         self.coordinates[found.columns] = found.coordinates
-
-    # --- what it has found --------------------------------------------------------------------------------------------
 
     def landmarks(self) -> Landmarks:
         """Every landmark so far, in the order of landmark initialisation, which is that of the log."""
