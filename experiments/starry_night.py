@@ -22,6 +22,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from common import STARRY_NIGHT, argument_parser, has_recordings, truth_of, write
@@ -31,7 +32,7 @@ from threadpoolctl import threadpool_limits
 import ekfslam
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig, Variant
-from ekfslam.data.sequence import Noise, Observations, Sequence
+from ekfslam.data.sequence import WITHOUT_TRACKS, Noise, Observations, Sequence
 from ekfslam.evaluation.consistency import chi2_bounds, invariant_landmark_error, nees, pose_error
 from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.evaluation.trajectory import match_landmarks
@@ -99,7 +100,10 @@ def robust_std(values: Array) -> Array:
 # --- Windows ---------------------------------------------------------------------------------------------------------
 
 
-NOTHING_SEEN = Observations(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 4)))
+NOTHING_SEEN: dict[str, Any] = {
+    "observations": Observations(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 4))),
+    "attributes": WITHOUT_TRACKS,
+}
 
 
 @dataclass(frozen=True)
@@ -128,7 +132,7 @@ def run_window(
     # T_imu_world = exp(xi^) T_hat, hence T_hat^-1 = T_world_imu exp(xi^).
     ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, noise), config, truth.T_world_imu[start] @ se3.exp(xi))
     T_world_imu, covariance = np.empty((stop - start, 4, 4)), np.empty((stop - start, 6, 6))
-    frames = dataclasses.replace(sequence, observations=NOTHING_SEEN) if variant is None else sequence
+    frames = dataclasses.replace(sequence, **NOTHING_SEEN) if variant is None else sequence
     for i, _ in enumerate(run_filter(ekf, frames, range(start, stop))):
         T_world_imu[i], covariance[i] = ekf.T_world_imu, ekf.P[:6, :6]
 
