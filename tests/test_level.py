@@ -257,8 +257,9 @@ class Literal:
             if self.tracks is None:
                 variance.append(self.noise.pixel_std_px[0] ** 2 * np.array([1, 0.5, 1]))
             elif self.last[i] == self.k - 1:
-                flow = np.linalg.norm((z - self.rows[i])[:2])
-                variance.append(self.noise.track_walk_px**2 * (1 + (flow / self.noise.track_flow_px) ** 2))
+                u, v, d = (z - self.rows[i]) ** 2
+                flow = np.array([u + 0.35 * (v + d), v + 0.35 * (u + d), d + 0.35 * (u + v)])
+                variance.append(self.noise.track_walk_px**2 * (1 + flow / self.noise.track_flow_px**2))
             else:
                 spread = self.noise.track_first_px**2
                 for _ in range(self.first[i], self.k):

@@ -39,6 +39,12 @@ TRACKS = {
 ERROR = TrackError(*TRACKS.values())
 
 
+def grown(motion, flow_px):
+    """By what the variances of a walk have grown (3,) where u, v and disparity have moved by ``motion`` (3,)."""
+    u, v, d = motion**2
+    return 1 + np.array([u + 0.35 * (v + d), v + 0.35 * (u + d), d + 0.35 * (u + v)]) / flow_px**2
+
+
 def with_noise(sequence, **changes):
     return dataclasses.replace(sequence, noise=dataclasses.replace(sequence.noise, **changes))
 
@@ -170,8 +176,7 @@ class NaiveTwistFilter:
                 residual[-1] = residual[-1] - tracks.track_memory * (self.pixels[i] - before)
                 row[:, 6:12] -= tracks.track_memory * by_pose
                 row[:, at : at + 3] -= tracks.track_memory * by_landmark
-                flow = np.hypot(*(z - self.pixels[i])[:2])
-                variance.append(tracks.track_walk_px**2 * (1 + (flow / tracks.track_flow_px) ** 2))
+                variance.append(tracks.track_walk_px**2 * grown(z - self.pixels[i], tracks.track_flow_px))
             else:
                 variance.append(tracks.track_first_px**2)
                 for _ in range(self.k - self.first[i]):
@@ -351,9 +356,10 @@ def tracked(world, error, seed=1, movers=(), speed=0.3):
             e = error.first_std * rng.normal(size=3)
         else:
             k_last, e, seen_last = last[j]
-            flow = np.hypot(*(seen - seen_last)[:2])
+            u, v, right, _ = seen - seen_last
+            growth = np.sqrt(grown(np.array([u, v, u - right]), error.flow_px))
             for _ in range(k_last, k):
-                e = error.memory * e + error.walk_std * np.hypot(1.0, flow / error.flow_px) * rng.normal(size=3)
+                e = error.memory * e + error.walk_std * growth * rng.normal(size=3)
         last[j] = k, e, seen
         pixels[i] = seen + np.array([e[0], e[1], e[0] - e[2], e[1]])
     moved = Observations(observations.frame, observations.landmark, pixels)
@@ -377,7 +383,7 @@ def test_tracks_that_travel_with_the_rig_are_found_and_listed():
     assert np.isin(accused, movers).mean() > 0.85
     # Of what is seen long enough to be judged most are found so, and the others at the gate.
     seen = np.bincount(np.searchsorted(world.observations.ids, world.observations.landmark))
-    long = np.intersect1d(movers, world.observations.ids[seen > 6])
+    long = np.intersect1d(movers, world.observations.ids[seen > 9])
     assert np.isin(long, accused).mean() > 0.5
     assert np.isin(long, rejections.landmark).mean() > 0.9
 
@@ -405,9 +411,9 @@ def test_variances_of_tracks_are_those_of_errors_that_walk(memory):
     for age in range(12):
         np.testing.assert_allclose(error.absolute_variance(np.array([age]))[0], e.var(axis=0), rtol=0.05)
         e = memory * e + error.walk_std * rng.normal(size=e.shape)
-    still, moving = error.step_variance(np.array([[0.0, 0.0, 7.0], [24.0, -32.0, 0.0]]))
+    still, moving = error.step_variance(np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0]]))
     np.testing.assert_allclose(still, error.walk_std**2)
-    np.testing.assert_allclose(moving, 2 * error.walk_std**2)
+    np.testing.assert_allclose(moving, np.array([2.0, 1.35, 1.35]) * error.walk_std**2)
 
 
 def test_innovations_of_tracks_are_as_large_as_stated():
@@ -496,8 +502,7 @@ def test_observations_are_worth_what_is_known_of_the_error_of_their_track():
         follows = j in last and log.frame[last[j]] == k - 1
         assert log.previous[i] == (last[j] if follows else -1)
         if follows:
-            flow = np.hypot(*(log.rows[i] - log.rows[last[j]])[:2])
-            expected = (0.2**2, 0.25**2, 0.3**2) * np.array(1 + (flow / 40) ** 2)
+            expected = (0.2**2, 0.25**2, 0.3**2) * grown(log.rows[i] - log.rows[last[j]], 40.0)
         else:
             expected = np.array([0.3**2, 0.4**2, 0.8**2])
             for _ in range(k0, k):

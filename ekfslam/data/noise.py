@@ -8,6 +8,9 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 
+# How much of the squared motion of a track's other rows counts for a row, see `TrackError.step_variance`.
+ACROSS = 0.35
+
 
 @dataclass(frozen=True)
 class ProcessNoise:
@@ -42,8 +45,8 @@ class TrackError:
 
     An observation is ``z(k) = h(k) + e(k)`` with ``e ~ N(0, first^2)`` at landmark initialisation and
     ``e(k) = memory e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2))`` while the track goes on: the further pixels move
-    from one frame to the next, the worse they are followed. With memory 1 it is a random walk about a constant error,
-    with less an AR(1) process.
+    from one frame to the next, the worse they are followed, most along their motion. With memory 1 it is a random walk
+    about a constant error, with less an AR(1) process.
 
     Args:
         first_std: (3,) standard deviation at landmark initialisation, in the sensor's rows, px.
@@ -58,9 +61,13 @@ class TrackError:
     flow_px: float
 
     def step_variance(self, motion_px: Array) -> Array:
-        """Variances (n, 3) of differences from the frame before, whose rows have moved by ``motion_px`` (n, 3)."""
-        square_flow = (motion_px[:, :2] ** 2).sum(axis=1, keepdims=True)
-        return self.walk_std**2 * (1.0 + square_flow / self.flow_px**2)
+        """Variances (n, 3) of differences from the frame before, whose rows have moved by ``motion_px`` (n, 3).
+
+        A row suffers from its own motion, and from that of the others by the share `ACROSS`.
+        """
+        square = np.asarray(motion_px) ** 2
+        flow = (1.0 - ACROSS) * square + ACROSS * square.sum(axis=1, keepdims=True)
+        return self.walk_std**2 * (1.0 + flow / self.flow_px**2)
 
     def absolute_variance(self, age: IntArray) -> Array:
         """Variances (n, 3) of observations without a predecessor in the frame before, ``age`` (n,) frames old.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.gaussian import Conditioned, Rows
@@ -67,13 +67,12 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
             _, rows = e.observe(slot, measured)
         tried = rows if len(some) == len(verdict) else rows.only(some)
         done = e.gaussian.condition(tried, frame, e.ids[tried.slot])
-        if np.isfinite(gate):
-            left = tried.corrected(*e.parts(done.correction))
-            inside = gates.agrees_with_others(e.gaussian, left, gate)
-            if not inside.all():
-                verdict[some[~inside]] = GATE
-                out = left.only(~inside)
-                done = done - e.gaussian.condition(out, frame, e.ids[out.slot], sign=-1.0)
+        left = tried.corrected(*e.parts(done.correction))
+        verdict[some] = _gate_by_others(e, left, seen, some, gate)
+        inside = verdict[some] == ACCEPTED
+        if not inside.all():
+            out = left.only(~inside)
+            done = done - e.gaussian.condition(out, frame, e.ids[out.slot], sign=-1.0)
     taken = verdict == ACCEPTED
     if not taken.all():
         rows, measured = rows.only(taken), measured[taken]
@@ -98,13 +97,46 @@ def _gate_alone(e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArr
     squares = gates.normalised_squares(S, rows.residual, frame, e.ids[rows.slot])
     inside = squares <= gate
     verdict[some[~inside]] = GATE
-    if e.model.track_error is not None and e.tau_s:
-        h = seen.H_m[some] @ (e.T_imu_world[:3, :3].T @ (e.imu_twist[:3] * e.tau_s))
-        sigma = e.config.moving_sigma / e.model.noise.margin
-        moving = gates.moves_along(e.table, rows, h, S, squares, gate, sigma, e.config.moving_share)
+    if _judges_motion(e) and not e.model.has_twist:
+        evidence = gates.evidence_alone(rows, S, _motion(e, seen, some))
+        moving = _moving(e, rows.slot, evidence, squares, gate)
         verdict[some[moving]] = MOVING
         inside &= ~moving
     return some[inside]
+
+
+def _gate_by_others(e: Estimate, left: Rows, seen: Seen, some: IntArray, gate: float) -> IntArray:
+    """Verdicts (j,) on landmarks by what all others of the frame say.
+
+    Args:
+        left: Rows (j) on which P was conditioned, with the residuals that the correction leaves.
+        seen: What all landmarks (k,) look like, of which these are ``some`` (j,).
+    """
+    verdict, judges_motion = np.full(len(some), ACCEPTED), _judges_motion(e) and e.model.has_twist
+    if np.isfinite(gate) or judges_motion:
+        C = gates.given_others(e.gaussian, left)
+        squares, judged = gates.agrees_with_others(left, C)
+        verdict[squares > gate] = GATE
+        if judges_motion:
+            # Noisy velocities would accuse all tracks of a frame alike: only what others leave counts.
+            evidence = gates.evidence_given_others(left, C, _motion(e, seen, some))
+            verdict[_moving(e, left.slot, evidence, squares, gate) & judged] = MOVING
+    return verdict
+
+
+def _judges_motion(e: Estimate) -> bool:
+    """Whether tracks are tested for moving along: where they may err at all, from the second frame on."""
+    return e.model.track_error is not None and e.tau_s > 0
+
+
+def _motion(e: Estimate, seen: Seen, some: IntArray) -> Array:
+    """Derivative (j, d) of the rows by a motion of their landmarks along the last step of the rig."""
+    return seen.H_m[some] @ (e.T_imu_world[:3, :3].T @ (e.imu_twist[:3] * e.tau_s))
+
+
+def _moving(e: Estimate, slot: IntArray, evidence: tuple[Array, Array], squares: Array, gate: float) -> BoolArray:
+    sigma = e.config.moving_sigma / e.model.noise.margin
+    return gates.moves_along(e.table, slot, *evidence, squares, gate, sigma, e.config.moving_share)
 
 
 def _seen_twist(e: Estimate, frame: int, rows: Rows) -> Array:

@@ -43,49 +43,78 @@ def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> 
     return np.einsum("ni,ni->n", whitened, whitened)
 
 
-def agrees_with_others(gaussian: Gaussian, left: Rows, gate: float) -> BoolArray:
-    """Whether (k,) each landmark agrees with the prediction as corrected by all *other* landmarks of the frame.
+def given_others(gaussian: Gaussian, left: Rows) -> Array:
+    """``C_i = V - H_i P H_i^T`` (k, d, d) in units of the rows' standard deviations, after conditioning on all of them.
 
-    With ``e_i = r_i - H_i (xi, d)`` and ``C_i = V - H_i P H_i^T`` after conditioning on all of them,
-    ``e_i^T C_i^-1 e_i`` is the normalised square of landmark i's innovation given all others.
+    With ``e_i = r_i - H_i (xi, d)``, what the correction leaves, the innovation of landmark i given all *others* is
+    ``V C_i^-1 e_i`` with covariance ``V C_i^-1 V``: nothing has to be computed once for each landmark left out.
 
     Args:
         gaussian: Conditioned on all of the rows.
         left: The rows with the residuals that the correction leaves.
-        gate: Chi-square threshold.
     """
     std = np.sqrt(left.variance)
-    C = np.eye(std.shape[1]) - gaussian.variances(left) / (std[:, :, None] * std[:, None, :])
+    return np.eye(std.shape[1]) - gaussian.variances(left) / (std[:, :, None] * std[:, None, :])
+
+
+def agrees_with_others(left: Rows, C: Array) -> tuple[Array, BoolArray]:
+    """``e_i^T C_i^-1 e_i`` (k,), the normalised square of each landmark's innovation given all others.
+
+    Args:
+        left, C: As for and from `given_others`.
+
+    Returns:
+        The squares, and whether (k,) a landmark can be judged: where C is nothing but rounding, no other landmark says
+        anything about it, and its square counts as 0.
+    """
     share, axes = np.linalg.eigh(C)
-    # Where C is nothing but rounding, no other landmark says anything about this one: it cannot be judged.
     judged = share[:, 0] > _LEAST_SHARE
-    along = np.einsum("nji,nj->ni", axes, left.residual / std)
+    along = np.einsum("nji,nj->ni", axes, left.residual / np.sqrt(left.variance))
     squares = np.divide(along**2, share, out=np.zeros_like(along), where=judged[:, None]).sum(axis=1)
-    return ~judged | (squares <= gate)
+    return squares, judged
 
 
 def moves_along(
-    table: LandmarkTable, rows: Rows, h: Array, S: Array, squares: Array, gate: float, sigma: float, share: float
+    table: LandmarkTable,
+    slot: IntArray,
+    along: Array,
+    information: Array,
+    squares: Array,
+    gate: float,
+    sigma: float,
+    share: float,
 ) -> BoolArray:
     """Which landmarks (k,) travel with the rig or against it, by all that their tracks have shown so far.
 
-    A landmark that moves by a share b of the rig's step between two frames has innovations of mean ``b h``. Over a
-    track ``N = sum h^T S^-1 r`` and ``D = sum h^T S^-1 h`` estimate b as N / D with standard deviation ``D^-1/2``.
-    Per-frame gates never see it: the pose gives way first.
+    A landmark that moves by a share b of the rig's step between two frames has innovations of mean ``b h``, with h the
+    derivative of its rows by a motion of the landmark, times that step. Over a track ``N = sum h^T S^-1 r`` and
+    ``D = sum h^T S^-1 h`` estimate b as N / D with standard deviation ``D^-1/2``. Per-frame gates never see it: the
+    pose gives way first.
 
     Args:
         table: Keeps the evidence, which grows.
-        rows: Measurement rows.
-        h: (k, d) derivative of the rows by a motion of their landmarks, times the last step of the rig.
-        S: (k, d, d) innovation covariances.
+        slot: (k,) the landmarks.
+        along, information: (k,) what this frame adds to N and D.
         squares: (k,) normalised innovations squared; gross outliers count as at the gate.
         gate: Its threshold.
         sigma, share: A landmark moves if b exceeds this many standard deviations, and this share.
     """
-    weighted = np.linalg.solve(S, h[..., None])[..., 0]
     clip = np.sqrt(np.minimum(1.0, gate / np.maximum(squares, np.finfo(float).tiny)))
-    table.evidence[rows.slot, 0] += clip * (weighted * rows.residual).sum(axis=1)
-    table.evidence[rows.slot, 1] += (weighted * h).sum(axis=1)
-    N, D = table.evidence[rows.slot].T
+    table.evidence[slot, 0] += clip * along
+    table.evidence[slot, 1] += np.maximum(information, 0.0)
+    N, D = table.evidence[slot].T
     least = np.maximum(sigma * np.sqrt(D), share * D)
-    return (np.abs(N) > least) & (table.observations[rows.slot] >= SEEN_TO_MOVE)
+    return (np.abs(N) > least) & (table.observations[slot] >= SEEN_TO_MOVE)
+
+
+def evidence_alone(rows: Rows, S: Array, h: Array) -> tuple[Array, Array]:
+    """``h^T S^-1 r`` and ``h^T S^-1 h`` (k,) of innovations with covariances S (k, d, d)."""
+    weighted = np.linalg.solve(S, h[..., None])[..., 0]
+    return (weighted * rows.residual).sum(axis=1), (weighted * h).sum(axis=1)
+
+
+def evidence_given_others(left: Rows, C: Array, h: Array) -> tuple[Array, Array]:
+    """The same of the innovations given all others: ``h^T V^-1 e`` and ``h^T V^-1 C V^-1 h``, see `given_others`."""
+    std = np.sqrt(left.variance)
+    g = h / std
+    return (g * left.residual / std).sum(axis=1), np.einsum("ni,nij,nj->n", g, C, g)

@@ -31,9 +31,9 @@ TILT_RAD = np.deg2rad(3.0)
 # Of tracks of a KLT tracker (u, v, disparity): their error at landmark initialisation and how it walks from frame to
 # frame, see `ekfslam.data.noise.TrackError`. White pixel noise only sets the limits of hygiene.
 PIXEL_STD_PX = 0.7
-TRACK_FIRST_PX = np.array([0.1, 0.1, 1.0])
+TRACK_FIRST_PX = np.array([0.5, 0.5, 1.0])
 TRACK_WALK_PX = np.array([0.2, 0.2, 0.15])
-TRACK_FLOW_PX = 1.5
+TRACK_FLOW_PX = 1.0
 MARGIN = 3.0
 
 _BLOCKS = 20  # of the jackknife
