@@ -14,7 +14,6 @@ from typing import Any
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import IllPosedError
-from ekfslam.evaluation.study import study_table, summarise_study
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.figures.posterior import plot_map_before_and_after
 from ekfslam.figures.run import save_figure, save_figures
@@ -25,6 +24,7 @@ from ekfslam.smoother.posterior import smooth
 from ekfslam.storage.archive import write_archive
 from ekfslam.studies.executors import open_executor
 from ekfslam.studies.study import Study, StudyArchive, run_study
+from ekfslam.studies.summary import study_table, summarise_study
 
 
 @dataclass(frozen=True)

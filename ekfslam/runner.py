@@ -50,7 +50,7 @@ def run(
         return smooth(run(sequence, "full", config, further))
     problem = build(sequence, config, clean=mode != "dead-reckoning")
     sequence, config, model = problem.sequence, problem.config, problem.model
-    account, hygiene = dict(problem.account), problem.hygiene
+    account, hygiene = {**problem.account, "model": "; ".join(problem.lines)}, problem.hygiene
     frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
     counts: dict[str, int] = {}
     reports, landmarks = [], Landmarks.empty()

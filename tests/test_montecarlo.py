@@ -30,7 +30,6 @@ from ekfslam.evaluation.consistency import (
     pose_nees,
     time_average,
 )
-from ekfslam.evaluation.study import study_table, summarise_study
 from ekfslam.filters import JointEKF
 from ekfslam.geometry import se3
 from ekfslam.models.sensors.stereo import Rig
@@ -39,6 +38,7 @@ from ekfslam.runner import run
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import SerialExecutor, open_executor
 from ekfslam.studies.study import FIELDS, LEVELS, Study, levels_of, read_study, realisation, run_one, run_study
+from ekfslam.studies.summary import study_table, summarise_study
 
 
 def short(level: str = "mid", frames: int = 8, **changes):

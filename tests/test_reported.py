@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from ekfslam import LEVELS, Config, NoiseConfig, Study, open_sequence, read_archive, run, write_archive
 from ekfslam.data.sequence import Noise
-from ekfslam.evaluation.study import summarise_study
 from ekfslam.evaluation.summary import summarise
 from ekfslam.studies.study import StudyArchive, run_one
+from ekfslam.studies.summary import summarise_study
 
 # --- velocities of a level frame --------------------------------------------------------------------------------------
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from ekfslam.evaluation.study import study_table
 from ekfslam.evaluation.summary import compare_table
 from ekfslam.evaluation.tables import document, markdown_table, number, plus_minus, significant
+from ekfslam.studies.summary import study_table
 
 RESULTS = Path(__file__).parents[1] / "results"
 

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array
 from ekfslam.evaluation.consistency import anees, chi2_bounds, time_average
-from ekfslam.evaluation.study import BOUND_PROBABILITY
 from ekfslam.figures.style import BOUNDS, EXPECTED, WIDE_BOUNDS, line_of, log_axis, save_all, style_of, styled
 from ekfslam.studies.study import StudyArchive
+from ekfslam.studies.summary import BOUND_PROBABILITY
 
 _BOUNDS = ((BOUND_PROBABILITY, WIDE_BOUNDS), (0.95, BOUNDS))  # the narrow ones are drawn over the wide ones
 _SHOWN_RUNS = 12  # lines of errors; more are a grey blot

@@ -15,7 +15,7 @@
         timing              ms_per_frame
         log                 what `ekfslam.smoother.posterior` needs: see `ekfslam.filters.log.Log` (mode full only)
 
-Reading gives back every number bit for bit. See `ekfslam.storage.hdf5` for what all files have in common.
+Reading gives back every number bit for bit. See `ekfslam.hdf5` for what all files have in common.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ import h5py
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ekfslam import hdf5
 from ekfslam.arrays import Array
 from ekfslam.config import HygieneConfig
 from ekfslam.data.hygiene import RULES, HygieneReport
@@ -55,7 +56,6 @@ from ekfslam.filters.result import (
     Result,
 )
 from ekfslam.geometry.camera import StereoCamera
-from ekfslam.storage import hdf5
 
 FORMAT = "ekfslam-archive"
 FORMAT_VERSION = 4  # 2 added log, 3 hygiene and parameters, 4 state blocks and track errors in the log

@@ -3,7 +3,7 @@
     study = Study({"mid": LEVELS["mid"]}, ("invariant", "standard"), runs=50)
     with open_executor("processes") as executor:
         archive = run_study(study, "study.h5", executor)
-    print(study_table(summarise_study(archive)))  # of ekfslam.evaluation.study
+    print(study_table(summarise_study(archive)))  # of ekfslam.studies.summary
 
 A realisation is decided by the study's seed, the name of its level and its number, by nothing else: neither the
 executor, nor the number of workers, nor the order in which they finish, nor an interruption changes one bit of the data
@@ -36,6 +36,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from ekfslam import hdf5
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import VARIANTS, Config, FilterConfig
 from ekfslam.data.sequence import Sequence
@@ -55,7 +56,6 @@ from ekfslam.geometry import se3
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress as with_progress
 from ekfslam.runner import versions
-from ekfslam.storage import hdf5
 
 FORMAT = "ekfslam-study"
 FORMAT_VERSION = 1

@@ -9,7 +9,7 @@
     /truth              frame (F,), T_world_imu (F, 4, 4); only if there is truth
         landmarks       id (M,), position (M, 3)
 
-See `ekfslam.storage.hdf5` for what all files have in common.
+See `ekfslam.hdf5` for what all files have in common.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from typing import Any
 import h5py
 import numpy as np
 
+from ekfslam import hdf5
 from ekfslam.data.noise import Noise
 from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
 from ekfslam.data.sequence import Observations, Sequence, Truth
 from ekfslam.errors import ArchiveError, ShapeError, UnknownFormatError
 from ekfslam.geometry.camera import StereoCamera
-from ekfslam.storage import hdf5
 
 FORMAT = "ekfslam-sequence"
 FORMAT_VERSION = 1
