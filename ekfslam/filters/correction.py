@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.errors import InnovationError
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.gaussian import Conditioned, Rows
@@ -71,8 +72,7 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
         verdict[some] = _gate_by_others(e, left, seen, some, gate)
         inside = verdict[some] == ACCEPTED
         if not inside.all():
-            out = left.only(~inside)
-            done = done - e.gaussian.condition(out, frame, e.ids[out.slot], sign=-1.0)
+            done = _without(e, frame, done, tried, left, inside)
     taken = verdict == ACCEPTED
     if not taken.all():
         rows, measured = rows.only(taken), measured[taken]
@@ -82,6 +82,20 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     if P_prior is not None and taken.any():
         done, position, linear = _iterate(e, frame, P_prior, done, rows.slot, measured)
     return Correction(done, rows.residual.size, verdict, rows.slot, measured, rows.variance, position, *linear)
+
+
+def _without(e: Estimate, frame: int, done: Conditioned, tried: Rows, left: Rows, inside: BoolArray) -> Conditioned:
+    """Take the rows outside out of the conditioning ``done``; ``left`` are the rows ``tried`` with what it leaves."""
+    out = left.only(~inside)
+    try:
+        return done - e.gaussian.condition(out, frame, e.ids[out.slot], sign=-1.0)
+    except InnovationError:
+        # Together the other rows say nothing about these, so that the difference is all rounding: once more without.
+        e.gaussian.undo(done)
+        kept = tried.only(inside)
+        if not inside.any():
+            return Conditioned(np.zeros(len(e.P)), 0.0, 0.0)
+        return e.gaussian.condition(kept, frame, e.ids[kept.slot])
 
 
 def _gate_alone(e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArray, gate: float) -> IntArray:

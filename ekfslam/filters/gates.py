@@ -70,7 +70,8 @@ def agrees_with_others(left: Rows, C: Array) -> tuple[Array, BoolArray]:
     share, axes = np.linalg.eigh(C)
     judged = share[:, 0] > _LEAST_SHARE
     along = np.einsum("nji,nj->ni", axes, left.residual / np.sqrt(left.variance))
-    squares = np.divide(along**2, share, out=np.zeros_like(along), where=judged[:, None]).sum(axis=1)
+    with np.errstate(over="ignore"):
+        squares = np.divide(along**2, share, out=np.zeros_like(along), where=judged[:, None]).sum(axis=1)
     return squares, judged
 
 

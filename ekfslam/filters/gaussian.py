@@ -50,11 +50,13 @@ class Conditioned:
         correction: (body+3n,) of the mean.
         nis: Normalised innovation squared.
         log_det: ``log det S``.
+        Y: (body+3n, k) ``Y^T`` of eq. (6), by whose square P has shrunk; None of a difference.
     """
 
     correction: Array
     nis: float
     log_det: float
+    Y: Array | None = None
 
     def __sub__(self, other: Conditioned) -> Conditioned:
         return Conditioned(self.correction - other.correction, self.nis - other.nis, self.log_det - other.log_det)
@@ -151,7 +153,12 @@ class Gaussian:
     def _condition(self, HP: Array, S: Array, residual: Array, sign: float, frame: int, ids: IntArray) -> Conditioned:
         Y_transposed, whitened, log_det = _whiten(S, HP, residual, frame, ids)
         add_square(self.P, Y_transposed, -sign)
-        return Conditioned(Y_transposed @ whitened, float(whitened @ whitened), log_det)
+        return Conditioned(Y_transposed @ whitened, float(whitened @ whitened), log_det, Y_transposed)
+
+    def undo(self, done: Conditioned) -> None:
+        """Take back the last conditioning, to rounding."""
+        assert done.Y is not None
+        add_square(self.P, done.Y, 1.0)
 
     def augment(self, G: Array, covariance: Array) -> None:
         """Append landmarks with ``d = G x + w``, eq. (5): G (n, 3, seen), covariance (n, 3, 3) of w."""
