@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from reference import CAMERA, T_CAM_IMU
+from test_jacobians import central
 
 from ekfslam.config import FilterConfig, PosteriorConfig
 from ekfslam.data.noise import Noise
@@ -16,6 +17,7 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.geometry import camera, motion, se3
 from ekfslam.models.blocks import TwistBias
+from ekfslam.models.build import model_of
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.models.sensors.velocities import VelocitySource
@@ -152,6 +154,8 @@ def test_wheels_belong_to_a_filter_that_estimates_velocities():
     assert wheels.during(0.0, 0.009) is None
     rows = wheels.during(0.0, 0.1)
     assert rows.axis.tolist() == [0, 5] * 3
+    # A stamp at the end of an interval belongs to it, one at its beginning to the interval before.
+    assert wheels.during(wheels.time_s[0], wheels.time_s[2]).value.tolist() == wheels.value[1:3].ravel().tolist()
     for change, words in (
         ({"axes": ("v_x", "yaw")}, "must be among"),
         ({"std": np.array([0.05, 0.0])}, "must be positive"),
@@ -191,3 +195,34 @@ def test_tracks_that_wait_are_listed_and_start_with_both_views():
     assert (reasons == -1).sum() == log.observations - log.landmarks  # the view from the anchor was reported as waiting
     with pytest.raises(PosteriorError, match="waited"):
         posterior_of_log(log, ekf.model, ekf.landmarks().position_m, PosteriorConfig(linearisation="filtered"))
+
+
+def test_a_bias_keeps_its_size():
+    phi, std = BIAS.transition(np.array([0.1, 3.0]))
+    variance = np.diag(BIAS.prior_covariance())
+    np.testing.assert_allclose(phi**2 * variance + std**2, np.broadcast_to(variance, (2, 6)))
+    np.testing.assert_allclose(phi[1], np.exp(-3.0 / np.repeat([5.0, 8.0], 3)))
+
+
+@pytest.mark.parametrize("with_twist", [True, False])
+def test_velocities_by_every_block_against_central_differences(with_twist):
+    noise = dataclasses.replace(NOISE, twist_walk_std=WALK if with_twist else None, tilt_rad=0.05)
+    T = se3.exp(np.array([1.0, -2.0, 0.5, 0.3, -0.4, 0.8]))
+    model = model_of(Rig(CAMERA, T_CAM_IMU, noise), noise, T, np.eye(6), None, [BIAS])
+    rng, measured = np.random.default_rng(0), np.array([6.0, 0.1, 0.2, 0.02, -0.03, 0.3])
+    values = model.retract(model.initial_values(), 0.1 * rng.normal(size=model.layout.body))
+    _, by = model.imu_velocities(values, measured, values["pose"][:3, :3])
+    numeric = central(
+        lambda x: model.imu_velocities(model.retract(values, x), measured, T[:3, :3])[0], model.layout.body
+    )
+    np.testing.assert_allclose(by, numeric, atol=1e-8)
+    assert np.abs(by[:, model.layout["twist_bias"]]).max() > 0.5 or with_twist
+
+
+@pytest.mark.parametrize("tracks_err", [True, False])
+def test_rows_by_an_error_of_the_disparity(tracks_err):
+    noise = dataclasses.replace(NOISE, track_first_px=np.ones(3), track_walk_px=np.ones(3)) if tracks_err else NOISE
+    rig, q = Rig(CAMERA, T_CAM_IMU, noise), np.array([[1.0, -0.5, 8.0], [-3.0, 1.0, 20.0]])
+    moved = dataclasses.replace(rig, disparity_offset_px=0.3)
+    np.testing.assert_allclose(moved.predict(q) - rig.predict(q), 0.3 * rig.by_disparity(q), atol=1e-12)
+    np.testing.assert_allclose(moved.invert(moved.predict(q)), q, atol=1e-9)

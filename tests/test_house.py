@@ -124,13 +124,16 @@ def test_every_block_by_itself(variant, part):
 def test_a_loop_closes_under_automatic_noise():
     """A loop whose file states no noise: landmarks come back, and it ends as well as if they had never left."""
     world = dataclasses.replace(builtin("loop"), noise=None)
-    error = {}
+    error, kept = {}, []
     for retire in ("never", "unseen"):
         result = run(world, "full", Config().with_overrides({"filter": {"retire": retire}}))
         error[retire] = truth_error(world, result)[-1]
+        kept.append({name: result.counts[name] for name in ("accepted", "split", "moving")})
         assert (result.counts["revived"] > 0) == (retire == "unseen")
         assert result.counts["reappeared"] == 0
     assert error["unseen"] < 1.2 * error["never"]
+    # What speaks against a landmark is kept while it is away.
+    assert kept[0] == kept[1]
 
 
 def test_as_filtered_of_a_run_with_every_block_is_the_filter():

@@ -329,6 +329,13 @@ def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything):
     signed = np.concatenate([-residual[: motion.stop], residual[motion.stop :]])
     np.testing.assert_allclose(signed, r[:size], atol=1e-8)
     assert (np.abs(J).max(axis=0) > 0).all()
+    # Rows over blocks alone: the gradient of their cost is -J^T r.
+    if everything:
+        aux, start = state.aux.size, 6 * 8
+        slope = -(J[size:].T @ r[size:])[start : start + aux].reshape(state.aux.shape)
+        h = 1e-6 * rng.normal(size=state.aux.shape)
+        above, below = (problem.block_cost(dataclasses.replace(state, aux=state.aux + s * h)) for s in (1, -1))
+        np.testing.assert_allclose(above - below, 2 * (slope * h).sum(), rtol=1e-5)
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy", "none"])

@@ -125,6 +125,4 @@ class Waiting:
         Phi[layout["anchor"], layout["anchor"]], Phi[layout["anchor"], layout["pose"]] = 0.0, np.eye(6)
         e.gaussian.propagate(Phi, np.zeros_like(Phi))
         e.values = {**e.values, "anchor": e.T_imu_world}
-        e.coordinates = e.coordinates.copy()
-        e.coordinates[layout["anchor"]] = e.coordinates[layout["pose"]]
         self._ids, self._rows, self._step, self._T_linear = ids, rows, e.step, e.T_predicted
