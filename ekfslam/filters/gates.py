@@ -100,7 +100,7 @@ def moves_along(
         gate: Its threshold.
         sigma, share: A landmark moves if b exceeds this many standard deviations, and this share.
     """
-    clip = np.sqrt(np.minimum(1.0, gate / np.maximum(squares, np.finfo(float).tiny)))
+    clip = np.sqrt(np.minimum(1.0, gate / np.maximum(squares, 1e-12)))
     table.evidence[slot, 0] += clip * along
     table.evidence[slot, 1] += np.maximum(information, 0.0)
     N, D = table.evidence[slot].T

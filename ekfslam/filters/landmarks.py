@@ -27,16 +27,16 @@ _INTS = (
 def _column(name: str) -> Any:
     """A named column (n,) of whole numbers: a view that can be written to."""
     at = _INTS.index(name)
-    return property(lambda table: table._ints[: len(table), at])
+    return property(lambda table: table._ints[at, : table._rows])
 
 
 def _columns(start: int, stop: int | None) -> Any:
     """Named columns (n, k) of real numbers: a view; what is assigned is copied."""
 
     def replace(table: LandmarkTable, value: Array) -> None:
-        table._floats[: len(table), start:stop] = value
+        table._floats[: table._rows, start:stop] = value
 
-    return property(lambda table: table._floats[: len(table), start:stop], replace)
+    return property(lambda table: table._floats[: table._rows, start:stop], replace)
 
 
 class LandmarkTable:
@@ -63,7 +63,7 @@ class LandmarkTable:
 
     def __init__(self, dimension: int = 3, extra: int = 0) -> None:
         # Two matrices and not a dozen arrays, with room to grow: a frame that starts or drops landmarks costs little.
-        self._ints = np.empty((0, len(_INTS)), dtype=np.int64)
+        self._ints = np.empty((len(_INTS), 0), dtype=np.int64)
         self._floats = np.empty((0, 8 + dimension + extra))
         self._rows, self._dimension = 0, dimension
 
@@ -87,16 +87,17 @@ class LandmarkTable:
         """Append rows; columns not given are 0."""
         before = len(self)
         after = before + len(np.asarray(values["id"]))
-        if after > len(self._ints):
-            self._ints, self._floats = _wider(self._ints[:before], after), _wider(self._floats[:before], after)
-        self._ints[before:after], self._floats[before:after], self._rows = 0, 0.0, after
+        if after > len(self._floats):
+            self._floats = _wider(self._floats[:before], after)
+            self._ints = np.ascontiguousarray(_wider(self._ints[:, :before].T, after).T)
+        self._ints[:, before:after], self._floats[before:after], self._rows = 0, 0.0, after
         for name, value in values.items():
             getattr(self, name)[before:] = value
 
     def keep(self, stay: BoolArray) -> None:
         """Drop the rows that do not stay (n,)."""
-        self._ints, self._floats = self._ints[: len(self)][stay], self._floats[: len(self)][stay]
-        self._rows = len(self._ints)
+        self._ints, self._floats = self._ints[:, : len(self)][:, stay], self._floats[: len(self)][stay]
+        self._rows = len(self._floats)
 
     def lookup(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
         """Slot (k,) of each id, and whether (k,) it is in the table at all."""
