@@ -35,7 +35,7 @@ class Estimate:
         T_predicted, T_predicted_before: (4, 4) ``T_imu_world`` before the last update, and before the one before.
         T_departed: (4, 4) pose from which the last prediction led.
         imu_twist, imu_twist_before: (6,) velocities of the IMU that led to the last frame, and to the one before.
-        tau_s: How long the last prediction took; 0 before the first one.
+        tau_s, way_m: How long the last prediction took, and how far it led; 0 before the first one.
         step: Number of predictions so far.
     """
 
@@ -48,7 +48,7 @@ class Estimate:
         self.gaussian = Gaussian(model.prior_covariance, model.layout.seen)
         self.T_predicted = self.T_predicted_before = self.T_departed = self.values["pose"]
         self.imu_twist = self.imu_twist_before = np.zeros(6)
-        self.tau_s, self.step = 0.0, 0
+        self.tau_s, self.way_m, self.step = 0.0, np.zeros(()), 0
 
     @property
     def P(self) -> Array:
@@ -145,13 +145,17 @@ class Estimate:
 
     def moment(self) -> Moment:
         """From where landmarks are seen now."""
-        return Moment(self.T_imu_world, self.linear_T_imu_world, self.values.get("calibration", GIVEN), self.imu_twist)
+        shared = {block.name: self.values[block.name] for block in self.model.shared}
+        calibration = self.values.get("calibration", GIVEN)
+        return Moment(self.T_imu_world, self.linear_T_imu_world, calibration, self.imu_twist, shared, self.way_m)
 
     def moment_before(self) -> Moment:
         """From where they were seen in the frame before, as far as the clone knows."""
         T = self.values["previous_pose"]
         T_linear = self.variant.linear(T, self.T_predicted_before)
-        return Moment(T, T_linear, self.values.get("calibration", GIVEN), self.imu_twist_before)
+        clones = self.model.layout.clones
+        shared = {block.name: self.values[clones.get(block.name, block.name)] for block in self.model.shared}
+        return Moment(T, T_linear, self.values.get("calibration", GIVEN), self.imu_twist_before, shared)
 
     def observe(self, slot: IntArray, measured: Array) -> tuple[Seen, Rows]:
         """Landmarks at the slots (k,) as they are seen now, and the measurement rows of what was ``measured`` (k, d).
@@ -159,12 +163,14 @@ class Estimate:
         Where tracks err, eq. (10), an observation that follows another one is the difference from it.
         """
         positions, linear = self.table.position_m[slot], self.linear_positions_m[slot]
-        seen = self.model.see(self.moment(), positions, linear)
-        error, H_x, H_m, residual = self.model.track_error, seen.H_x, seen.H_m, measured - seen.z
+        error = self.model.track_error
+        is_difference = (self.table.last_step[slot] == self.step - 1) & (error is not None)
+        seen = self.model.see(self.moment(), positions, linear, is_difference=is_difference)
+        H_x, H_m, residual = seen.H_x, seen.H_m, measured - seen.z
         if error is None:
             return seen, Rows(slot, H_x, H_m, residual, self.sensor.variance(measured))
         variance = error.absolute_variance(self.step - self.table.first_step[slot])
-        follows = np.flatnonzero(self.table.last_step[slot] == self.step - 1)
+        follows = np.flatnonzero(is_difference)
         if len(follows):
             before = self.model.see(self.moment_before(), positions[follows], linear[follows], "previous_pose")
             rows_before = self.table.seen_rows[slot[follows]]

@@ -94,6 +94,11 @@ class Gaussian:
         own = np.arange(at.start, at.stop)
         self.P[own, own] += std**2
 
+    def copy(self, at: slice, of: slice) -> None:
+        """Some body columns (n,) become a clone of others: ``x_at+ = x_of``."""
+        self.P[at] = self.P[of]
+        self.P[:, at] = self.P[:, of]
+
     def variances(self, rows: Rows) -> Array:
         """``H_i P H_i^T`` (k, d, d) of each landmark's own rows, without what is between landmarks."""
         seen = self.seen

@@ -93,6 +93,11 @@ class JointEKF(Estimate):
             also: What further sensors measured of these velocities, where they are in the state.
         """
         model, pose = self.model, self.model.layout["pose"]
+        self.way_m = model.way_m(np.asarray(twist, dtype=float), tau_s)
+        for clone, name in model.clones:
+            self.gaussian.copy(model.layout[clone], model.layout[name])
+            self.coordinates[model.layout[clone]] = self.coordinates[model.layout[name]]
+            self.values = {**self.values, clone: self.values[name]}
         for block in model.wandering:
             self._wander(block, tau_s)
         if model.has_twist:
@@ -115,7 +120,7 @@ class JointEKF(Estimate):
 
     def _wander(self, block: StateBlock, tau_s: float) -> None:
         """A block that changes by itself; velocities that nothing has measured yet are not there to change."""
-        moves = block.transition(tau_s)
+        moves = block.transition(tau_s, self.way_m)
         if moves is None or (block.name == "twist" and not self._is_twist_known):
             return
         at, (phi, std) = self.model.layout[block.name], moves

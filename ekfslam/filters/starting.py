@@ -8,7 +8,6 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.logbook import LogBook
 from ekfslam.filters.waiting import Waiting
-from ekfslam.models.model import Moment
 
 
 def start(e: Estimate, log: LogBook, waiting: Waiting | None, frame: int, ids: IntArray, rows: Array) -> BoolArray:
@@ -30,8 +29,7 @@ def start(e: Estimate, log: LogBook, waiting: Waiting | None, frame: int, ids: I
         error, now = e.model.track_error, e.moment()
         none = np.zeros(len(ids), dtype=np.int64)
         variance = e.sensor.variance(rows) if error is None else error.absolute_variance(none)
-        T_linear = e.variant.linear(now.T_imu_world, e.T_predicted)
-        moment = Moment(now.T_imu_world, T_linear, now.calibration, now.twist)
+        moment = now.linearised_at(e.variant.linear(now.T_imu_world, e.T_predicted))
         positions, G, covariance = e.model.initialise(moment, rows, variance)
         e.gaussian.augment(G, covariance)
         _append(e, log, frame, ids, positions, rows, (e.step, rows, variance))

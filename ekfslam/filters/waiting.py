@@ -100,7 +100,7 @@ class Waiting:
         T_anchor, present = e.values["anchor"], e.moment()
         T_linear = e.variant.linear(present.T_imu_world, e.T_predicted)
         anchor = Moment(T_anchor, e.variant.linear(T_anchor, self._T_linear), present.calibration, present.twist)
-        present = Moment(present.T_imu_world, T_linear, present.calibration, present.twist)
+        present = present.linearised_at(T_linear)
         views = (
             (e.model.see(anchor, position, position, "anchor"), then),
             (e.model.see(present, position, position), now),

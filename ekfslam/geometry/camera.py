@@ -56,10 +56,16 @@ def projection_jacobian(camera: StereoCamera, q: Array) -> Array:
 def rectified_rows(pixels_px: Array, pixel_std_px: Array) -> tuple[Array, Array]:
     """Rows ``(uL, v, uR)`` of pixels (..., 4) and their variances (3,) px^2, for pixel noise (4,) px."""
     variance = np.asarray(pixel_std_px, dtype=float) ** 2
-    weight_left = variance[3] / (variance[1] + variance[3])
+    weight_left = weight_of_left_row(pixel_std_px)
     v = weight_left * pixels_px[..., 1] + (1.0 - weight_left) * pixels_px[..., 3]
     rows = np.stack([pixels_px[..., 0], v, pixels_px[..., 2]], axis=-1)
     return rows, np.array([variance[0], weight_left * variance[1], variance[2]])
+
+
+def weight_of_left_row(pixel_std_px: Array) -> float:
+    """Share of vL in the mean v of the rectified rows, for pixel noise (4,) px."""
+    variance = np.asarray(pixel_std_px, dtype=float) ** 2
+    return float(variance[3] / (variance[1] + variance[3]))
 
 
 def rectified_jacobian(camera: StereoCamera, q: Array) -> Array:

@@ -21,7 +21,17 @@ from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import WITHOUT_TRACKS, Sequence
 from ekfslam.errors import ConfigError
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import OPTIONAL_BLOCKS, Anchor, Calibration, Pose, PreviousPose, StateBlock, Twist, Up
+from ekfslam.models.blocks import (
+    OPTIONAL_BLOCKS,
+    Anchor,
+    Calibration,
+    Pose,
+    Previous,
+    PreviousPose,
+    StateBlock,
+    Twist,
+    Up,
+)
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.model import Model
 from ekfslam.models.noise import VelocityNoise, automatic_noise, velocity_noise, with_drift
@@ -117,7 +127,7 @@ def model_of(
         blocks: Further ones.
 
     Raises:
-        ConfigError: A calibration to estimate, but no stereo rig; or a block twice.
+        ConfigError: A calibration to estimate, but no stereo rig; a block twice; or one that the sensor has no use for.
     """
     chosen: list[StateBlock] = [Pose(T_imu_world, covariance)]
     if noise.track_error is not None:
@@ -134,10 +144,21 @@ def model_of(
     if isinstance(sensor, DelayedSensor):
         chosen.append(Anchor())
     chosen.extend(blocks)
+    shared = [block for block in blocks if block.is_seen and block.per_frame]
+    if shared and isinstance(sensor, DelayedSensor):
+        raise ConfigError(f"{shared[0].name}: not with landmarks that wait for a second view")
+    if noise.track_error is not None:
+        chosen.extend(Previous(block) for block in shared if _is_seen_before(block))
     names = [block.name for block in chosen]
     if len(set(names)) < len(names):
         raise ConfigError(f"a state block is there twice: {', '.join(names)}")
     return Model(sensor, noise, tuple(chosen))
+
+
+def _is_seen_before(block: StateBlock) -> bool:
+    """Whether the view from the frame before depends on a block, and not only what is new in this frame."""
+    share = block.camera_share(np.ones(()), np.zeros((), dtype=bool))
+    return share is None or bool(share != 0)
 
 
 def optional_blocks(settings: Mapping[str, Mapping[str, Any]]) -> tuple[StateBlock, ...]:

@@ -13,11 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.noise import Noise, TrackError
 from ekfslam.geometry import motion, se3
-from ekfslam.models.blocks import Calibration, Layout, PreviousPose, StateBlock, Twist, Values
-from ekfslam.models.observation import initialise, linearise
+from ekfslam.models.blocks import Calibration, Layout, PreviousPose, StateBlock, StereoRotation, Twist, Values
+from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
 
@@ -31,16 +31,26 @@ class Moment:
         T_linear: (..., 4, 4) pose at which its error is linearised: the same, or (FEJ) the predicted one.
         calibration: (9,) parameters, where they are a block.
         twist: (..., 6) velocities of the IMU, by which a time offset counts.
+        shared: Values (..., size) of the blocks in `Model.shared`, by name.
+        way_m: (...) way driven since the frame before.
     """
 
     T_imu_world: Array
     T_linear: Array
     calibration: Array = field(default_factory=lambda: np.zeros(9))
     twist: Array = field(default_factory=lambda: np.zeros(6))
+    shared: Values = field(default_factory=dict)
+    way_m: Array = field(default_factory=lambda: np.zeros(()))
 
     def at(self, index: IntArray) -> Moment:
         """The moments of some observations, given the frame of each, where poses and velocities are of all frames."""
-        return Moment(self.T_imu_world[index], self.T_linear[index], self.calibration, self.twist[index])
+        shared = {name: value[index] for name, value in self.shared.items()}
+        way = self.way_m[index] if self.way_m.ndim else self.way_m
+        return Moment(self.T_imu_world[index], self.T_linear[index], self.calibration, self.twist[index], shared, way)
+
+    def linearised_at(self, T_linear: Array) -> Moment:
+        """The same moment, its error linearised at another pose."""
+        return dataclasses.replace(self, T_linear=T_linear)
 
 
 @dataclass(frozen=True)
@@ -139,6 +149,12 @@ class Model:
         return any(isinstance(block, PreviousPose) for block in self.blocks)
 
     @cached_property
+    def clones(self) -> tuple[tuple[str, str], ...]:
+        """Clones of shared blocks, as pairs of names: the clone's and the block's."""
+        pairs = ((clone, name) for name, clone in self.layout.clones.items())
+        return tuple((clone, name) for clone, name in pairs if name != "pose")
+
+    @cached_property
     def has_twist(self) -> bool:
         """Whether the velocities are in the state, so that velocity sensors measure them."""
         return any(isinstance(block, Twist) for block in self.blocks)
@@ -153,7 +169,32 @@ class Model:
     @cached_property
     def wandering(self) -> tuple[StateBlock, ...]:
         """Blocks that change from frame to frame by themselves, in the order of their columns."""
-        return tuple(block for block in self.layout.blocks if block.transition(0.0) is not None)
+        return tuple(block for block in self.layout.blocks if block.transition(0.0, 0.0) is not None)
+
+    @cached_property
+    def shared(self) -> tuple[StateBlock, ...]:
+        """Blocks of each frame, besides the pose, that observations of all landmarks depend on."""
+        return tuple(block for block in self.layout.blocks if block.is_seen and block.per_frame and not block.is_pose)
+
+    @cached_property
+    def _moves_camera(self) -> tuple[StateBlock, ...]:
+        now = np.zeros(())
+        return tuple(block for block in self.shared if block.camera_share(now, now.astype(bool)) is not None)
+
+    @cached_property
+    def _turns_right_camera(self) -> bool:
+        return any(isinstance(block, StereoRotation) for block in self.shared)
+
+    @cached_property
+    def has_drift(self) -> bool:
+        """Whether what a difference of observations shows of the present frame is not what one alone would show."""
+        one = np.ones(())
+        differs = (block.camera_share(one, one > 0) != block.camera_share(one, one < 0) for block in self._moves_camera)
+        return any(differs)
+
+    def way_m(self, measured: Array, tau_s: Array | float) -> Array:
+        """Way (...) driven over intervals, by the measured velocities (..., 6)."""
+        return np.linalg.norm(measured[..., :3], axis=-1) * np.asarray(tau_s)
 
     @cached_property
     def prior_covariance(self) -> Array:
@@ -279,52 +320,118 @@ class Model:
 
     # --- observations of landmarks ------------------------------------------------------------------------------------
 
-    def see(self, moment: Moment, positions_m: Array, linear_positions_m: Array, pose: str = "pose") -> Seen:
-        """Eq. (3), (4) and (9): landmarks (n, 3) as the sensor sees them.
+    def see(
+        self,
+        moment: Moment,
+        positions_m: Array,
+        linear_positions_m: Array,
+        pose: str = "pose",
+        is_difference: BoolArray | None = None,
+    ) -> Seen:
+        """Eq. (3), (4), (9) and (11): landmarks (n, 3) as the sensor sees them.
 
         Args:
             moment: From where.
             positions_m, linear_positions_m: As in `ekfslam.models.observation.linearise`.
-            pose: Whose columns the pose of the moment has: those of the pose, or of a clone.
+            pose: Whose columns the pose of the moment has: those of the pose, or of a clone. Where it is the pose of
+                the frame before, shared blocks have the columns of their clones, too.
+            is_difference: (n,) which observations are differences from the frame before; None: none is.
         """
-        T, T_linear, layout = moment.T_imu_world, moment.T_linear, self.layout
+        layout, sensor = self.layout, self._sensor_of(moment)
+        T, T_linear, offset = moment.T_imu_world, moment.T_linear, None
+        if self._moves_camera:
+            offset, shares = self._camera_offset(moment, is_difference)
+            moved = se3.exp(offset)
+            T, T_linear = moved @ T, moved @ T_linear
         if self.calibration is None:
-            q, H_pose, H_m = linearise(self.sensor, T, positions_m, T_linear, linear_positions_m)
-            if layout.seen == 6:
-                return Seen(q, self.sensor.predict(q), H_pose, H_m)
+            q, H_pose, H_m = linearise(sensor, T, positions_m, T_linear, linear_positions_m)
         else:
             q, H_pose, H_c, H_m = self.calibration.linearise(
-                self.rig, moment.calibration, moment.twist, T, positions_m, T_linear, linear_positions_m
+                self._rig_of(moment), moment.calibration, moment.twist, T, positions_m, T_linear, linear_positions_m
             )
+        if layout.seen == 6:
+            return Seen(q, sensor.predict(q), H_pose, H_m)
         H_x = np.zeros((*H_pose.shape[:2], layout.seen))
-        H_x[..., layout[pose]] = H_pose
+        H_x[..., layout[pose]] = H_pose if offset is None else H_pose @ se3.adjoint(moved)
         if self.calibration is not None:
             H_x[..., layout["calibration"]] = H_c
-        return Seen(q, self.sensor_at(moment.calibration).predict(q), H_x, H_m)
+        if offset is not None:
+            H_offset = H_pose @ se3.left_jacobian(offset)
+            for block, share in zip(self._moves_camera, shares, strict=True):
+                if (at := self._columns_in(block, pose)) is not None:
+                    H_x[..., at] = share[..., None, None] * H_offset
+        if self._turns_right_camera:
+            at = self._columns_in(self.block("stereo_rotation"), pose)
+            assert at is not None and isinstance(sensor, Rig)
+            H_x[..., at] = sensor.by_right_rotation(q)
+        return Seen(q, sensor.predict(q), H_x, H_m)
 
-    def points(self, moment: Moment, positions_m: Array) -> Array:
-        """Landmarks (n, 3) in the frame of the sensor (n, 3)."""
+    def _columns_in(self, block: StateBlock | None, pose: str) -> slice | None:
+        """Columns of a shared block as seen from a pose; None: it is of no account there."""
+        assert block is not None
+        return self.layout[block.name] if pose != "previous_pose" else self.layout.get(self.layout.clones.get(block.name))
+
+    def _camera_offset(self, moment: Moment, is_difference: BoolArray | None) -> tuple[Array, list[Array]]:
+        """Eq. (11): the tangent by which the shared blocks move the camera, and the share of each.
+
+        Shapes are (n, 6) and (n,) only where observations of one frame differ, and otherwise without n.
+        """
+        if is_difference is None or not self.has_drift or not is_difference.any():
+            is_difference = np.zeros(np.shape(moment.way_m), dtype=bool)
+        elif is_difference.all():
+            is_difference = np.ones(np.shape(moment.way_m), dtype=bool)
+        shares = [block.camera_share(moment.way_m, is_difference) for block in self._moves_camera]
+        parts = [
+            np.asarray(share)[..., None] * moment.shared[block.name]
+            for block, share in zip(self._moves_camera, shares, strict=True)
+        ]
+        return sum(parts[1:], parts[0]), [np.asarray(share) for share in shares]
+
+    def points(self, moment: Moment, positions_m: Array, is_difference: BoolArray | None = None) -> Array:
+        """Landmarks (n, 3) in the frame of the sensor (n, 3); arguments as of `see`."""
         T = moment.T_imu_world
+        if self._moves_camera:
+            T = se3.exp(self._camera_offset(moment, is_difference)[0]) @ T
         if self.calibration is not None:
             T = self.calibration.delay(moment.calibration, moment.twist) @ T
         return se3.apply(self.sensor_at(moment.calibration).T_cam_imu @ T, positions_m)
 
+    def predicted(self, moment: Moment, q: Array) -> Array:
+        """Rows (n, d) of points (n, 3) in the frame of the sensor."""
+        return self._sensor_of(moment).predict(q)
+
     def initialise(self, moment: Moment, rows: Array, variance: Array) -> tuple[Array, Array, Array]:
-        """Eq. (5): positions (n, 3) of new landmarks, G (n, 3, seen), and what the measurement adds (n, 3, 3)."""
-        T, T_linear, layout = moment.T_imu_world, moment.T_linear, self.layout
-        if self.calibration is None:
-            positions, G_pose, covariance = initialise(self.sensor, T, rows, variance, T_linear)
-            if layout.seen == 6:
-                return positions, G_pose, covariance
-        else:
-            positions, G_pose, G_c, covariance = self.calibration.initialise(
-                self.rig, moment.calibration, moment.twist, T, rows, variance, T_linear
-            )
-        G = np.zeros((len(rows), 3, layout.seen))
-        G[..., layout["pose"]] = G_pose
+        """Eq. (5): positions (n, 3) of new landmarks, G (n, 3, seen), and what the measurement adds (n, 3, 3).
+
+        What was seen stays as it is: ``H_x x + H_m d = 0``, hence ``G = -H_m^-1 H_x``.
+        """
+        T = moment.T_imu_world
+        if self._moves_camera:
+            T = se3.exp(self._camera_offset(moment, None)[0]) @ T
         if self.calibration is not None:
-            G[..., layout["calibration"]] = G_c
-        return positions, G, covariance
+            T = self.calibration.delay(moment.calibration, moment.twist) @ T
+        sensor = self._sensor_of(moment)
+        positions = se3.apply(se3.inverse(sensor.T_cam_imu @ T), sensor.invert(rows))
+        here = self.see(moment.linearised_at(moment.T_imu_world), positions, positions)
+        by_rows = np.linalg.inv(here.H_m)
+        covariance = (by_rows * variance[:, None, :]) @ by_rows.swapaxes(-1, -2)
+        G = -by_rows @ here.H_x
+        if moment.T_linear is not moment.T_imu_world:
+            pose, there = self.layout["pose"], self.see(moment, positions, positions)
+            G[..., pose] = -np.linalg.solve(there.H_m, there.H_x[..., pose])
+        return positions, G, 0.5 * (covariance + covariance.swapaxes(-1, -2))
+
+    def _sensor_of(self, moment: Moment) -> Sensor:
+        """The sensor as all blocks of a moment have it."""
+        if self.calibration is None and not self._turns_right_camera:
+            return self.sensor
+        return self.calibration.applied(self._rig_of(moment), moment.calibration) if self.calibration else self._rig_of(moment)
+
+    def _rig_of(self, moment: Moment) -> Rig:
+        """The rig before it is calibrated, its right camera turned."""
+        if not self._turns_right_camera:
+            return self.rig
+        return dataclasses.replace(self.rig, right_rotation_rad=moment.shared["stereo_rotation"])
 
     def sensor_at(self, parameters: Array) -> Sensor:
         """The sensor with a calibration (9,) applied."""

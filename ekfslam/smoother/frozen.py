@@ -7,15 +7,15 @@ standard or first-estimates EKF that never retires a landmark has exactly the so
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import PosteriorError
+from ekfslam.filters.estimate import GIVEN
 from ekfslam.geometry import motion, se3
 from ekfslam.models.model import Moment, Seen
-from ekfslam.models.observation import landmark_by_pose
 from ekfslam.models.sensors.base import DelayedSensor
 from ekfslam.smoother.rows import BatchRows
 from ekfslam.smoother.sparse.information import LinearSystem
@@ -33,10 +33,11 @@ class FrozenRows(BatchRows):
         log, W = self.log, self._weight_motion
         Phi = self._frozen_transition()
         identity = np.broadcast_to(np.eye(6), W.shape)
-        zeros = np.zeros((log.frames, len(self.aux_columns)))
+        zeros, shared = np.zeros((log.frames, len(self.aux_columns))), np.zeros((log.frames, self.width - 6))
+        r_motion = -(W @ Phi @ log.departed[1:, :, None])[..., 0]
         return LinearSystem(
-            r_prior=np.zeros(6),
-            r_motion=-(W @ Phi @ log.departed[1:, :, None])[..., 0],
+            r_prior=np.zeros(self.width),
+            r_motion=np.hstack([r_motion, -self._shared_residual(shared)]),
             **self._motion_rows(Phi, identity, identity, self.B),
             **self._observation_rows(*self._frozen_observations(), 1.0 / np.sqrt(log.variance), self.B),
             **self._common(zeros, np.zeros(len(self.drive_columns))),
@@ -56,6 +57,7 @@ class FrozenRows(BatchRows):
     def _frozen_observations(self) -> tuple[Array, Array | None, Array, Array, Array]:
         """Rows over pose, pose before, drive and landmark, and their right sides over coordinates, before weighting."""
         log, first, pose = self.log, self.is_initial, self._pose
+        is_difference = log.previous >= 0
         position, first_position = log.position_m, log.first_position_m[log.landmark]
         linear_position = first_position if log.first_estimates else position
         # A new landmark is initialised after the update of its frame, all others are linearised before it.
@@ -65,12 +67,14 @@ class FrozenRows(BatchRows):
         if log.first_estimates:
             T_linear = np.where(first[:, None, None], T, log.T_predicted[log.frame])
         group = 2 * log.frame + first
-        seen = self._see(group, T, T_linear, x, log.seen_twist[log.frame], position, linear_position)
+        seen_twist = log.seen_twist[log.frame]
+        seen = self._see(group, T, T_linear, x, seen_twist, position, linear_position, "pose", is_difference)
         H_x, H_m, width = seen.H_x, seen.H_m, self.model.layout.seen
         if log.first_estimates:
-            T_first = self._delayed(log.T_predicted[log.frame[first]], x[first], log.seen_twist[log.frame[first]])
-            G = landmark_by_pose(T_first[0], first_position[first]) @ T_first[1]
-            H_x[first, :, pose] = -H_m[first] @ G
+            # A new landmark follows the pose as it was predicted, whatever it is seen from.
+            T_first, at, place = log.T_predicted[log.frame[first]], group[first], first_position[first]
+            there = self._see(at, T[first], T_first, x[first], seen_twist[first], place, place)
+            H_x[first, :, pose] = H_m[first] @ np.linalg.solve(there.H_m, there.H_x[..., pose])
         H_x = self._carried_back(H_x, pose, log.T_linear, log.T_predicted, log.frame, ~first)
         r = log.rows - seen.z + (H_x @ x[:, :width, None])[..., 0]
         J_p, follows = None, self._follows
@@ -94,11 +98,11 @@ class FrozenRows(BatchRows):
             r[follows] -= memory * (log.rows[log.previous[follows]] - before.z + shifted)
             H_x[follows] -= memory * B_x
             H_m[follows] -= memory * before.H_m
-            J_p = H_x[..., self._clone]
+            J_p = self._over_previous(H_x)
         r += (H_m @ (position - first_position)[..., None])[..., 0]
         wide = np.zeros((*H_x.shape[:2], self.model.layout.body))
         wide[..., :width] = H_x
-        return H_x[..., pose], J_p, wide[..., self.drive_columns], H_m, r
+        return wide[..., self.frame_columns], J_p, wide[..., self.drive_columns], H_m, r
 
     def _see(
         self,
@@ -110,28 +114,24 @@ class FrozenRows(BatchRows):
         positions_m: Array,
         linear_positions_m: Array,
         pose: str = "pose",
+        is_difference: BoolArray | None = None,
     ) -> Seen:
-        """Landmarks (K, 3) from poses (K, 4, 4), calibrated as coordinates (K, body) say, alike within a group."""
+        """Landmarks (K, 3) from poses (K, 4, 4), with blocks as coordinates (K, body) say, alike within a group."""
         model, calibration = self.model, self.model.calibration
+        layout = model.layout
+        clones = layout.clones if pose == "previous_pose" else {}
+        shared = {block.name: coordinates[:, layout[clones.get(block.name, block.name)]] for block in model.shared}
+        moment = Moment(T, T_linear, GIVEN, twist, shared, self._way_m[group // 2 if pose == "pose" else group])
         if calibration is None:
-            return model.see(Moment(T, T_linear), positions_m, linear_positions_m, pose)
+            return model.see(moment, positions_m, linear_positions_m, pose, is_difference)
         parts, order = [], np.argsort(group, kind="stable")
         for some in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-            found = calibration.retract(calibration.initial(), coordinates[some[0], model.layout["calibration"]])
-            moment = Moment(T[some], T_linear[some], found, twist[some])
-            parts.append(model.see(moment, positions_m[some], linear_positions_m[some], pose))
+            found = calibration.retract(calibration.initial(), coordinates[some[0], layout["calibration"]])
+            here = replace(moment.at(some), calibration=found)
+            differs = None if is_difference is None else is_difference[some]
+            parts.append(model.see(here, positions_m[some], linear_positions_m[some], pose, differs))
         back = np.argsort(order, kind="stable")
         return Seen(*(np.concatenate([getattr(part, field.name) for part in parts])[back] for field in fields(Seen)))
-
-    def _delayed(self, T: Array, coordinates: Array, twist: Array) -> tuple[Array, Array]:
-        """Poses (n, 4, 4) at the exposure, and how their errors follow from those at the stamp (n, 6, 6)."""
-        calibration = self.model.calibration
-        if calibration is None or not calibration.has_time_offset:
-            return T, np.broadcast_to(np.eye(6), (len(T), 6, 6))
-        start, at = calibration.initial(), self.model.layout["calibration"]
-        found = np.array([calibration.retract(start, x[at]) for x in coordinates])
-        delay = np.array([calibration.delay(c, u) for c, u in zip(found, twist, strict=True)])
-        return delay @ T, se3.adjoint(delay)
 
     def _carried_back(
         self, H_x: Array, at: slice, T_linear: Array, T_reference: Array, frame: IntArray, which: BoolArray | None

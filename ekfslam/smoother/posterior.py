@@ -89,6 +89,7 @@ class Posterior:
         """
         for blocks, covariance in (
             (self.problem.aux_blocks, self.information.aux_covariances),
+            (self.problem.shared_blocks, lambda: self.information.frame_covariances()[:, 6:, 6:]),
             (self.problem.drive_blocks, self.information.drive_covariance),
         ):
             start = 0
@@ -106,9 +107,12 @@ class Posterior:
             PosteriorError: There is no such frame or landmark.
         """
         e = self.information.elimination
-        return self.information.covariance(
-            _checked("frame", frames, e.frames), _checked("landmark", landmarks, e.landmarks)
-        )
+        frame = _checked("frame", frames, e.frames)
+        P = self.information.covariance(frame, _checked("landmark", landmarks, e.landmarks))
+        # Of each frame its pose alone.
+        of_poses = (e.width * np.arange(len(frame))[:, None] + np.arange(6)).ravel()
+        kept = np.concatenate([of_poses, np.arange(e.width * len(frame), len(P))])
+        return P[np.ix_(kept, kept)]
 
     def dense_covariance(self, frames: ArrayLike = (-1,)) -> Array:
         """Covariance of some poses (by default the last: the state of the EKF) and of all landmarks, in their order.
@@ -134,7 +138,7 @@ class Posterior:
         """Independent draws: poses ``T_world_imu`` (size, T, 4, 4) and landmarks (size, M, 3)."""
         eps, d = self.information.sample(rng, size)
         return (
-            se3.inverse(se3.exp(eps - self.information.eps) @ se3.inverse(self.T_world_imu)),
+            se3.inverse(se3.exp((eps - self.information.eps)[..., :6]) @ se3.inverse(self.T_world_imu)),
             self.position_m + d - self.information.d,
         )
 

@@ -99,15 +99,19 @@ class MapRevival:
 
     def covariance(self, problem: BatchProblem, information: JointInformation, landmarks: IntArray) -> Array:
         """Covariance (body+3n, body+3n) in the columns of the filter."""
-        last, layout = problem.log.frames - 1, self._model.layout
+        last, width = problem.log.frames - 1, problem.width
         has_clone = self._model.has_clone and last > 0
         frames = np.array([last, last - 1] if has_clone else [last])
         P = information.covariance(frames, landmarks, np.array([last]), drive=True)
-        names = ["pose", *(["previous_pose"] if has_clone else [])]
-        columns = np.concatenate([layout.columns(names), problem.aux_columns, problem.drive_columns])
-        order = np.concatenate([columns, layout.body + np.arange(3 * len(landmarks))])
-        wide = np.zeros((layout.body + 3 * len(landmarks),) * 2)
-        wide[np.ix_(order, order)] = P
+        # Of the frame before only what is cloned counts.
+        before, of_clones = problem.cloned if has_clone else (np.empty(0, dtype=np.int64),) * 2
+        rest = np.arange(width * len(frames), len(P))
+        kept = np.concatenate([np.arange(width), width + before, rest])
+        columns = np.concatenate([problem.frame_columns, of_clones, problem.aux_columns, problem.drive_columns])
+        body = self._model.layout.body
+        order = np.concatenate([columns, body + np.arange(3 * len(landmarks))])
+        wide = np.zeros((body + 3 * len(landmarks),) * 2)
+        wide[np.ix_(order, order)] = P[np.ix_(kept, kept)]
         return wide
 
     def _start(self, problem: BatchProblem, positions_m: Array) -> State:
@@ -123,4 +127,5 @@ class MapRevival:
         positions[: len(unseen)][unseen] = last.positions_m[unseen]
         T = np.concatenate([last.T_imu_world, state.T_imu_world[known:]])
         aux = np.concatenate([last.aux, state.aux[known:]])
-        return State(T, positions, last.zeta, aux, last.drive, last.drive_values)
+        shared = np.concatenate([last.shared, state.shared[known:]])
+        return State(T, positions, last.zeta, shared, aux, last.drive, last.drive_values)

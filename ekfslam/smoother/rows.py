@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Sequence as SequenceType
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import IllPosedError
 from ekfslam.filters.log import Log
+from ekfslam.models.blocks import StateBlock
 from ekfslam.models.model import Model, VelocityRows
 from ekfslam.smoother.sparse.information import Elimination
 
@@ -23,8 +25,9 @@ class State:
     Args:
         T_imu_world: (T, 4, 4) poses.
         positions_m: (M, 3) landmarks in world.
-        zeta: (6,) the first pose in units of its prior: ``T_0 = exp((B zeta)^) T_prior``.
-        aux: (T, a) coordinates of the blocks that each frame has besides its pose; they are vectors, so their values.
+        zeta: (w,) the first frame in units of its prior: ``T_0 = exp((B zeta)^) T_prior``, and shared blocks likewise.
+        shared: (T, w-6) values of the blocks of a frame, besides its pose, that observations depend on.
+        aux: (T, a) coordinates of the blocks that each frame has besides; they are vectors, so their values.
         drive: (g,) coordinates of the blocks of the drive: sums of corrections.
         drive_values: Values of the blocks of the drive, by name.
     """
@@ -32,6 +35,7 @@ class State:
     T_imu_world: Array
     positions_m: Array
     zeta: Array
+    shared: Array
     aux: Array
     drive: Array
     drive_values: Mapping[str, Array]
@@ -48,20 +52,45 @@ class BatchRows:
     def __init__(self, log: Log, model: Model) -> None:
         self.log, self.model = log, model
         layout = model.layout
-        # Symmetric root of the first pose's covariance, which may be singular.
+        self.shared_blocks = list(model.shared)
+        self.aux_blocks = [block for block in layout.blocks if block.per_frame and not block.is_seen]
+        of_drive = (block for block in layout.blocks if not block.per_frame and not block.clones)
+        self.drive_blocks = [block for block in of_drive if not block.is_pose]
+        self.frame_columns = layout.columns(["pose", *(block.name for block in self.shared_blocks)])
+        self.width = len(self.frame_columns)
+        # Symmetric root of the first frame's covariance, which may be singular.
+        self.B = np.zeros((self.width, self.width))
         eigenvalues, vectors = np.linalg.eigh(log.initial_covariance)
-        self.B = (vectors * np.sqrt(np.maximum(eigenvalues, 0.0))) @ vectors.T
-        self.aux_blocks = [block for block in layout.blocks if block.per_frame and block.name != "pose"]
-        self.drive_blocks = [block for block in layout.blocks if not block.per_frame and not block.is_pose]
+        self.B[:6, :6] = (vectors * np.sqrt(np.maximum(eigenvalues, 0.0))) @ vectors.T
+        own = np.arange(6, self.width)
+        self.B[own, own] = np.sqrt(np.diag(model.prior_covariance)[self.frame_columns[6:]])
         self.aux_columns = layout.columns(block.name for block in self.aux_blocks)
         self.drive_columns = layout.columns(block.name for block in self.drive_blocks)
         self._pose, self._clone = layout["pose"], layout.get("previous_pose")
+        self._way_m = model.way_m(log.twist, log.tau_s)
+        # Where the clones are, and which of a frame's columns they clone.
+        at = dict(zip(self.frame_columns.tolist(), range(self.width), strict=True))
+        names = [name for name in layout.clones if name == "pose" or layout[name].start in at]
+        self._clone_columns = layout.columns(layout.clones[name] for name in names)
+        self._cloned = np.array([at[column] for column in layout.columns(names).tolist()], dtype=np.int64)
+
+    @property
+    def cloned(self) -> tuple[IntArray, IntArray]:
+        """Which of a frame's columns (c,) the filter has clones of, and in which columns (c,) of the body these are."""
+        return self._cloned, self._clone_columns
 
     def elimination(self) -> Elimination:
         """The structure of the rows."""
         log = self.log
         return Elimination(
-            log.frames, log.landmarks, log.frame, log.landmark, log.id, len(self.aux_columns), len(self.drive_columns)
+            log.frames,
+            log.landmarks,
+            log.frame,
+            log.landmark,
+            log.id,
+            len(self.aux_columns),
+            len(self.drive_columns),
+            width=self.width,
         )
 
     # --- what does not depend on where the rows are linearised --------------------------------------------------------
@@ -106,11 +135,18 @@ class BatchRows:
 
     @cached_property
     def _aux_moves(self) -> tuple[Array, Array]:
-        """``phi`` and weights (T-1, a) of what blocks of a frame do by themselves; the twist starts at frame 1."""
-        phi, weight = np.empty((2, self.log.frames - 1, len(self.aux_columns)))
+        return self._moves(self.aux_blocks)
+
+    @cached_property
+    def _shared_moves(self) -> tuple[Array, Array]:
+        return self._moves(self.shared_blocks)
+
+    def _moves(self, blocks: SequenceType[StateBlock]) -> tuple[Array, Array]:
+        """``phi`` and weights (T-1, n) of what blocks of a frame do by themselves; the twist starts at frame 1."""
+        phi, weight = np.empty((2, self.log.frames - 1, sum(block.size for block in blocks)))
         start = 0
-        for block in self.aux_blocks:
-            moves = block.transition(self.log.tau_s[1:])
+        for block in blocks:
+            moves = block.transition(self.log.tau_s[1:], self._way_m[1:])
             assert moves is not None
             at = slice(start, start + block.size)
             start = at.stop
@@ -149,17 +185,37 @@ class BatchRows:
         }
 
     def _motion_rows(self, Phi: Array, by_last: Array, by_next: Array, B: Array) -> dict[str, Any]:
-        """Rows of the steps from Phi (T-1, 6, body), scaled by derivatives (T-1, 6, 6) of the residual."""
-        W = self._weight_motion
-        WPhi = -W @ by_last @ Phi
-        J_from = WPhi[..., self._pose].copy()
+        """Rows of the steps over poses and shared blocks.
+
+        Args:
+            Phi: (T-1, 6, body) transition of the pose.
+            by_last, by_next: (T-1, 6, 6) derivatives of the residual.
+            B: (w, w) of the first frame.
+        """
+        W, (phi, weight) = self._weight_motion, self._shared_moves
+        WPhi, own = -W @ by_last @ Phi, np.arange(6, self.width)
+        J_from, J_to = np.zeros((2, len(W), self.width, self.width))
+        J_from[:, :6, :6], J_from[:, own, own] = WPhi[..., self._pose], -weight * phi
+        J_to[:, :6, :6], J_to[:, own, own] = W @ by_next, weight
         J_from[:1] = J_from[:1] @ B
+        padding = ((0, 0), (0, self.width - 6), (0, 0))
         return {
             "J_from": J_from,
-            "J_to": W @ by_next,
-            "J_motion_aux": WPhi[..., self.aux_columns],
-            "J_motion_drive": WPhi[..., self.drive_columns],
+            "J_to": J_to,
+            "J_motion_aux": np.pad(WPhi[..., self.aux_columns], padding),
+            "J_motion_drive": np.pad(WPhi[..., self.drive_columns], padding),
         }
+
+    def _shared_residual(self, shared: Array) -> Array:
+        """Whitened errors (T-1, w-6) of what shared blocks (T, w-6) do by themselves."""
+        phi, weight = self._shared_moves
+        return weight * (shared[1:] - phi * shared[:-1])
+
+    def _over_previous(self, H_x: Array) -> Array:
+        """Rows (n, d, seen) over clones as rows (n, d, w) over the frame before."""
+        J = np.zeros((*H_x.shape[:2], self.width))
+        J[..., self._cloned] = H_x[..., self._clone_columns]
+        return J
 
     def _observation_rows(
         self, J_x: Array, J_p: Array | None, J_g: Array, J_m: Array, r: Array, scale: Array, B: Array

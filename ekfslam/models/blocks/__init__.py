@@ -6,14 +6,22 @@ The filter and the smoother know blocks only by this interface: a new one is a n
 
 from ekfslam.models.blocks.base import OPTIONAL_BLOCKS, Layout, StateBlock, Values, optional_block
 from ekfslam.models.blocks.calibration import Calibration
+from ekfslam.models.blocks.camera_jitter import CameraJitter
 from ekfslam.models.blocks.pose import Anchor, Pose, PreviousPose
+from ekfslam.models.blocks.previous import Previous
+from ekfslam.models.blocks.stereo_rotation import StereoRotation
 from ekfslam.models.blocks.twist import Twist
 from ekfslam.models.blocks.twist_bias import TwistBias
 from ekfslam.models.blocks.up import Up
+from ekfslam.models.blocks.vision_drift import VisionDrift
 
 __all__ = [
     "OPTIONAL_BLOCKS",
     "Anchor",
+    "VisionDrift",
+    "StereoRotation",
+    "Previous",
+    "CameraJitter",
     "Calibration",
     "Layout",
     "Pose",

@@ -7,7 +7,7 @@ from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 
 # Estimates by name of their block; arrays may have leading dimensions (frames), so that a whole drive is one call.
 Values = Mapping[str, Array]
@@ -25,13 +25,21 @@ class StateBlock:
             whole drive.
         is_seen: Whether observations of landmarks depend on it.
         is_pose: Whether it is a pose ``T_imu_world`` with the error of one: the pose itself, or a clone of it.
+        clones: Name of the block whose value of the frame before it is; "" where it is no clone.
         labels, units: Names and units of what `reported` returns; none is not reported.
     """
 
-    name: ClassVar[str]
     per_frame: ClassVar[bool] = False
     is_seen: ClassVar[bool] = False
     is_pose: ClassVar[bool] = False
+
+    @property
+    def name(self) -> str:
+        raise NotImplementedError
+
+    @property
+    def clones(self) -> str:
+        return ""
 
     @property
     def size(self) -> int:
@@ -57,11 +65,12 @@ class StateBlock:
         """The value after a correction (..., size) of its error."""
         return value + correction
 
-    def transition(self, tau_s: Array | float) -> tuple[Array, Array] | None:
+    def transition(self, tau_s: Array | float, way_m: Array | float) -> tuple[Array, Array] | None:
         """How value and error go from frame to frame: ``x+ = phi x + w``, element by element; None: it is constant.
 
         Returns:
-            ``phi`` (..., size) and the standard deviation (..., size) of w over intervals ``tau_s`` (...).
+            ``phi`` (..., size) and the standard deviation (..., size) of w over intervals of ``tau_s`` (...), in which
+            the rig drives ``way_m`` (...).
         """
         return None
 
@@ -81,6 +90,18 @@ class StateBlock:
             layout: Columns of the blocks.
         """
         return twist, by
+
+    def camera_share(self, way_m: Array, is_difference: BoolArray) -> Array | None:
+        """How the value (6,) moves the camera: ``T_imu_world`` seems to be ``exp((share value)^) T_imu_world``.
+
+        Args:
+            way_m: (...) way driven since the frame before, for each observation.
+            is_difference: (...) whether it is a difference from the frame before, eq. (10).
+
+        Returns:
+            Shares (...); None: the block does not move the camera.
+        """
+        return None
 
     def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
         """Estimates and standard deviations (p,) of what `labels` name, given all blocks and their covariance."""
@@ -104,6 +125,7 @@ class Layout(dict[str, slice]):
         body: Number of columns of all blocks.
         seen: Number of leading columns that observations of landmarks depend on.
         poses: Names of the pose and of its clones.
+        clones: Name of the clone of each block that has one in the frame before.
     """
 
     def __init__(self, blocks: Iterable[StateBlock]) -> None:
@@ -114,6 +136,7 @@ class Layout(dict[str, slice]):
         )
         self.body = end[-1]
         self.poses = tuple(block.name for block in self.blocks if block.is_pose)
+        self.clones = {block.clones: block.name for block in self.blocks if block.clones}
         self.seen = sum(block.size for block in self.blocks if block.is_seen)
 
     def columns(self, names: Iterable[str]) -> IntArray:
@@ -128,5 +151,5 @@ _Block = TypeVar("_Block", bound=type[StateBlock])
 
 def optional_block(block: _Block) -> _Block:
     """Make a block available by name: the table ``[blocks.<name>]`` of a configuration puts it into the state."""
-    OPTIONAL_BLOCKS[block.name] = block
+    OPTIONAL_BLOCKS[str(block.name)] = block
     return block

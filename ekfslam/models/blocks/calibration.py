@@ -17,7 +17,7 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.config import CalibrationConfig
 from ekfslam.geometry import motion, se3
 from ekfslam.models.blocks.base import Layout, StateBlock, Values
-from ekfslam.models.observation import initialise, linearise
+from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.stereo import Rig
 
 NAMES = (
@@ -140,28 +140,6 @@ class Calibration(StateBlock):
         H[..., _DISPARITY] = by_disparity
         H[..., TIME] = -(H_x @ twist[..., None])[..., 0]
         return q, H_x @ se3.adjoint(delay), H[..., self.free], H_m
-
-    def initialise(
-        self,
-        rig: Rig,
-        parameters: Array,
-        twist: Array,
-        T_imu_world: Array,
-        rows: Array,
-        variance: Array,
-        T_linear: Array,
-    ) -> tuple[Array, Array, Array, Array]:
-        """Eq. (5) with parameters.
-
-        Returns:
-            Positions (n, 3), G (n, 3, 6) by the pose and (n, 3, size) by the block, covariance (n, 3, 3).
-        """
-        now, delay = calibrated(rig, parameters), to_exposure(parameters, twist)
-        positions, G, covariance = initialise(now, delay @ T_imu_world, rows, variance, delay @ T_linear)
-        _, _, H, H_m = self.linearise(rig, parameters, twist, T_imu_world, positions, T_imu_world, positions)
-        # What is seen stays as it is: H (xi, c) + H_m d = 0.
-        G_c = np.asarray(-np.linalg.solve(H_m, H), dtype=float)
-        return positions, G @ se3.adjoint(delay), G_c, covariance
 
     def landmarks_by_rotation(self, rig: Rig, parameters: Array, T_imu_world: Array, moved_m: Array) -> Array:
         """New landmark errors (n, 3, 3) by the camera's rotation, where a correction moves landmarks by ``moved_m``.

@@ -69,6 +69,7 @@ class PreviousPose(Clone):
     """
 
     name = "previous_pose"
+    clones = "pose"
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,6 @@ class Twist(StateBlock):
     def size(self) -> int:
         return 6
 
-    def transition(self, tau_s: Array | float) -> tuple[Array, Array] | None:
+    def transition(self, tau_s: Array | float, way_m: Array | float) -> tuple[Array, Array] | None:
         std = np.broadcast_to(self.walk_std, (*np.shape(tau_s), 6))
         return np.ones_like(std), std

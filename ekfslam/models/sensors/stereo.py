@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,9 +11,12 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.noise import Noise
 from ekfslam.geometry import camera as cam
+from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.models.sensors.base import ACCEPTED, DISPARITY
 
+_NEWTON_STEPS = 6
+_LEAST_DISPARITY_PX = 1e-3
 _DISPARITY_ROWS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, -1.0]])
 
 
@@ -27,12 +31,15 @@ class Rig:
         T_cam_imu: (4, 4) extrinsics.
         noise: Of pixels, tracks and velocities.
         disparity_offset_px: Disparities come out larger by this than the camera's matrix says.
+        right_rotation_rad: (3,) or one a point (n, 3): rotation psi of the right camera against the calibration,
+            ``q_right = exp(psi^) (q - (b, 0, 0))``; None: the pair is rectified.
     """
 
     camera: StereoCamera
     T_cam_imu: Array
     noise: Noise
     disparity_offset_px: float = 0.0
+    right_rotation_rad: Array | None = None
 
     dimension = 3
 
@@ -67,14 +74,24 @@ class Rig:
         return np.broadcast_to(self.variance_px2, rows.shape)
 
     def predict(self, q: Array) -> Array:
-        rows = cam.project(self.camera, q)[..., :3]
+        rows = self._rectified(q)
         if self.disparity_offset_px:
             rows = rows - np.array([0.0, 0.0, self.disparity_offset_px])
         return rows @ _DISPARITY_ROWS.T if self._sees_disparity else rows
 
     def jacobian(self, q: Array) -> Array:
         A = cam.rectified_jacobian(self.camera, q)
+        if self.right_rotation_rad is not None:
+            right, by_point = self._seen_right(q)[1:]
+            A = self._of_both(A, right @ by_point)
         return _DISPARITY_ROWS @ A if self._sees_disparity else A
+
+    def by_right_rotation(self, q: Array) -> Array:
+        """Derivative (n, 3, 3) of the rows by the rotation of the right camera, at ``right_rotation_rad``."""
+        psi = np.zeros(3) if self.right_rotation_rad is None else self.right_rotation_rad
+        q_right, right, _ = self._seen_right(q)
+        B = self._of_both(np.zeros((*q.shape, 3)), -right @ se3.skew(q_right) @ se3.so3_left_jacobian(psi))
+        return _DISPARITY_ROWS @ B if self._sees_disparity else B
 
     def by_disparity(self, q: Array) -> Array:
         """Derivative (n, 3) of the rows by an error of the disparity in px."""
@@ -83,4 +100,40 @@ class Rig:
     def invert(self, rows: Array) -> Array:
         if self._sees_disparity:  # _DISPARITY_ROWS is its own inverse
             rows = rows @ _DISPARITY_ROWS.T
-        return cam.triangulate(self.camera, rows + np.array([0.0, 0.0, self.disparity_offset_px]))
+        rows = rows + np.array([0.0, 0.0, self.disparity_offset_px])
+        if self.right_rotation_rad is None:
+            return cam.triangulate(self.camera, rows)
+        # Newton's method in the rows: what a rectified pair would see of the point. Rotations are small, so few steps
+        # reach rounding; a disparity below what the rotation makes of infinity has no point and stays at the limit.
+        seen = rows
+        for _ in range(_NEWTON_STEPS):
+            q = cam.triangulate(self.camera, self._in_front(seen))
+            seen = seen + rows - self._rectified(q)
+        return cam.triangulate(self.camera, self._in_front(seen))
+
+    @staticmethod
+    def _in_front(rows: Array) -> Array:
+        """Rows (uL, v, uR) whose disparity is positive."""
+        return np.stack([rows[..., 0], rows[..., 1], np.minimum(rows[..., 2], rows[..., 0] - _LEAST_DISPARITY_PX)], -1)
+
+    def _rectified(self, q: Array) -> Array:
+        """Rows (uL, v, uR) of points (n, 3) by the camera's matrix and the rotation of the right camera."""
+        rows = cam.project(self.camera, q)[..., :3]
+        if self.right_rotation_rad is None:
+            return rows
+        q_right = self._seen_right(q)[0]
+        camera = replace(self.camera, baseline_m=0.0)
+        return self._of_both(rows[..., None], cam.project(camera, q_right)[..., :2, None])[..., 0]
+
+    def _seen_right(self, q: Array) -> tuple[Array, Array, Array]:
+        """Points (n, 3) in the right camera, the derivative (n, 2, 3) of its pixels by them, and theirs by ``q``."""
+        psi = np.zeros(3) if self.right_rotation_rad is None else self.right_rotation_rad
+        R = se3.so3_exp(psi)
+        q_right = (R @ (q - np.array([self.camera.baseline_m, 0.0, 0.0]))[..., None])[..., 0]
+        return q_right, cam.projection_jacobian(replace(self.camera, baseline_m=0.0), q_right)[..., :2, :], R
+
+    def _of_both(self, left: Array, right: Array) -> Array:
+        """Rows (uL, v, uR) or their derivatives (n, 3, k) from those of the rectified pair and of (uR, vR) (n, 2, k)."""
+        weight = cam.weight_of_left_row(self.noise.pixel_std_px)
+        v = weight * left[..., 1, :] + (1.0 - weight) * right[..., 1, :]
+        return np.stack([left[..., 0, :], v, right[..., 0, :]], axis=-2)

@@ -1,6 +1,6 @@
 """A Gaussian over poses, other blocks and landmarks in information form: whitened rows, normal equations, CHOLMOD.
 
-Unknowns are ``eps`` (T, 6), one vector a pose; ``aux`` (T, a), what else has a value for each frame; ``drive`` (g,),
+Unknowns are ``eps`` (T, w), one vector a frame: its pose, and what else of it observations depend on; ``aux`` (T, a), what else has a value for each frame; ``drive`` (g,),
 what has one value for the drive; and ``d`` (M, 3), one a landmark. Observations touch a pose, perhaps the one before,
 the drive and a landmark; motion touches consecutive poses, the aux of the later one and the drive. Landmarks know of
 each other only through poses and drive, so those with few observations are eliminated first, all at once, by their
@@ -35,21 +35,21 @@ _AT_ONCE = 20_000  # observations or pairs of them, so that temporary arrays sta
 class LinearSystem:
     """Whitened rows ``J x = r`` over all unknowns, to be solved in the least-squares sense.
 
-    The first pose is ``eps_0 = B zeta`` with ``zeta ~ N(0, I)``; its columns in all Jacobians are those of zeta.
+    The first frame is ``eps_0 = B zeta`` with ``zeta ~ N(0, I)``; its columns in all Jacobians are those of zeta.
 
     Args:
         landmarks: Number of landmarks M.
-        B: (6, 6) see above; ``B B^T`` may be singular.
-        r_prior: (6,) right side of the rows ``zeta = r``.
-        J_from, J_to: (T-1, 6, 6) motion rows of step k over ``eps_k`` and ``eps_{k+1}``.
-        r_motion: (T-1, 6) their right sides.
+        B: (w, w) see above; ``B B^T`` may be singular.
+        r_prior: (w,) right side of the rows ``zeta = r``.
+        J_from, J_to: (T-1, w, w) motion rows of step k over ``eps_k`` and ``eps_{k+1}``.
+        r_motion: (T-1, w) their right sides.
         frame, landmark: (K,) pose and landmark of each observation.
-        J_x, J_m: (K, d, 6) and (K, d, 3) rows of the observations.
+        J_x, J_m: (K, d, w) and (K, d, 3) rows of the observations.
         r: (K, d) their right sides.
         previous: (K,) observation whose pose the rows touch, too; -1: none.
-        J_p: (K, d, 6) rows over that pose; None: there is no such observation.
+        J_p: (K, d, w) rows over that frame; None: there is no such observation.
         J_g: (K, d, g) rows over the drive.
-        J_motion_aux, J_motion_drive: (T-1, 6, a) over ``aux_{k+1}`` and (T-1, 6, g).
+        J_motion_aux, J_motion_drive: (T-1, w, a) over ``aux_{k+1}`` and (T-1, w, g).
         aux_prior: (a,) weights of the rows ``weight aux_0 = r``, (a,) ``r_aux_prior``.
         phi, aux_weight: (T-1, a) of the rows ``weight (aux_{k+1} - phi aux_k) = r_aux``, element by element.
         r_aux: (T-1, a) their right sides.
@@ -101,6 +101,7 @@ class Elimination:
         ids: (M,) landmark ids, for error messages.
         aux, drive: Sizes a and g of the blocks of a frame besides its pose, and of those of the drive.
         eliminate_up_to: Landmarks with at most this many observations are eliminated before CHOLMOD's turn.
+        width: Number w of unknowns of a frame: six of its pose, and what else observations depend on.
     """
 
     def __init__(
@@ -113,7 +114,9 @@ class Elimination:
         aux: int = 0,
         drive: int = 0,
         eliminate_up_to: int = ELIMINATE_UP_TO,
+        width: int = 6,
     ) -> None:
+        self.width = width
         self.frames, self.landmarks, self.ids = frames, landmarks, ids
         self.frame, self.landmark = frame, landmark
         self.aux, self.drive = aux, drive
@@ -124,7 +127,7 @@ class Elimination:
         self.kept = np.flatnonzero(self.is_kept)
         # Blocks of the reduced system: poses, aux of the frames, the drive, kept landmarks.
         counts = [frames, frames if aux else 0, 1 if drive else 0, len(self.kept)]
-        self.block_sizes = np.repeat([6, aux, drive, 3], counts)
+        self.block_sizes = np.repeat([width, aux, drive, 3], counts)
         self.start = np.concatenate([[0], np.cumsum(self.block_sizes)])
         self.first_block = np.concatenate([[0], np.cumsum(counts)[:-1]])  # of each of the four kinds
         self.block_of_landmark = np.full(landmarks, -1)
@@ -136,12 +139,12 @@ class Elimination:
         self._lay_out()
 
     def parts(self, x: Array) -> tuple[Array, Array, Array, Array]:
-        """Poses (T, 6, ...), aux (T, a, ...), drive (g, ...) and kept landmarks (n, 3, ...) of the reduced unknowns."""
+        """Frames (T, w, ...), aux (T, a, ...), drive (g, ...) and kept landmarks (n, 3, ...) of the reduced unknowns."""
         ends = self.start[self.first_block[1:]]
         poses, aux, drive, kept = np.split(x, ends)
         rest = x.shape[1:]
         return (
-            poses.reshape(self.frames, 6, *rest),
+            poses.reshape(self.frames, self.width, *rest),
             aux.reshape(self.frames, self.aux, *rest),
             drive,
             kept.reshape(-1, 3, *rest),
@@ -192,18 +195,19 @@ class Elimination:
         landmark = own[self.first_block[3] :]
         of_drive = np.broadcast_to(drive, (len(pose),)) if self.drive else pose[:0]
         seen = self.block_of_landmark[self.landmark[self.of_kept]]
+        w = self.width
         kinds = (  # block rows, block columns, height, width
-            (pose, pose, 6, 6),
-            (steps + 1, steps, 6, 6),
-            (self.coupled[:, 0], self.coupled[:, 1], 6, 6),
+            (pose, pose, w, w),
+            (steps + 1, steps, w, w),
+            (self.coupled[:, 0], self.coupled[:, 1], w, w),
             (landmark, landmark, 3, 3),
-            (seen, self.frame[self.of_kept], 3, 6),
+            (seen, self.frame[self.of_kept], 3, w),
             (aux, aux, self.aux, self.aux),
             (aux[1:], aux[:-1], self.aux, self.aux),
-            (aux, pose[: len(aux)], self.aux, 6),
-            (aux[1:], steps[: len(aux[1:])], self.aux, 6),
+            (aux, pose[: len(aux)], self.aux, w),
+            (aux[1:], steps[: len(aux[1:])], self.aux, w),
             (drive, drive, self.drive, self.drive),
-            (of_drive, pose[: len(of_drive)], self.drive, 6),
+            (of_drive, pose[: len(of_drive)], self.drive, w),
             (of_drive[: len(aux)], aux[: len(of_drive)], self.drive, self.aux),
             (landmark[: len(of_drive) * len(landmark)], np.repeat(drive, len(landmark)), 3, self.drive),
         )
@@ -275,8 +279,8 @@ class JointInformation:
         factor: CHOLMOD's factor of an earlier system with the same structure, whose analysis is used again.
 
     Attributes:
-        eps: (T, 6) mean of the pose unknowns.
-        zeta: (6,) mean of the first pose in units of its prior.
+        eps: (T, w) mean of the unknowns of the frames, those of their poses first.
+        zeta: (w,) mean of the first frame in units of its prior.
         aux: (T, a) mean of what else each frame has.
         drive: (g,) mean of what the drive has.
         d: (M, 3) mean of the landmark unknowns.
@@ -330,9 +334,9 @@ class JointInformation:
             part = slice(begin, begin + _AT_ONCE)
             self._Y[part] = self._L_inverse[e.landmark[part]] @ self._Y[part]
         self._Y[e.of_kept] = 0.0
-        coupling = np.empty((len(e.coupled), 6, 6))
+        coupling = np.empty((len(e.coupled), e.width, e.width))
         for groups, later, earlier in e.groups():
-            stacked = len(later), 3 * later.shape[1], 6
+            stacked = len(later), 3 * later.shape[1], e.width
             coupling[groups] = self._Y[later].reshape(stacked).swapaxes(1, 2) @ self._Y[earlier].reshape(stacked)
         # The drive goes through every landmark.
         H_md = _sum_products(e.landmark, e.landmarks, system.J_m, system.J_g)
@@ -400,12 +404,16 @@ class JointInformation:
     def _selected(self) -> SelectedInverse:
         return SelectedInverse(self.factor)
 
-    def pose_covariances(self) -> Array:
-        """Marginal covariances (T, 6, 6) of all poses, by selected inversion."""
+    def frame_covariances(self) -> Array:
+        """Marginal covariances (T, w, w) of all frames, by selected inversion."""
         own = np.arange(self.elimination.frames)
         covariance = self._selected.blocks(own, own)
         covariance[0] = self._B @ covariance[0] @ self._B.T
         return covariance
+
+    def pose_covariances(self) -> Array:
+        """Marginal covariances (T, 6, 6) of all poses, by selected inversion."""
+        return self.frame_covariances()[:, :6, :6]
 
     def aux_covariances(self) -> Array:
         """Marginal covariances (T, a, a) of what else each frame has, by selected inversion."""
@@ -429,7 +437,7 @@ class JointInformation:
         half = np.zeros((e.landmarks, 3, 3))
         for groups, later, earlier in e.groups():
             Z = self._selected.blocks(*e.coupled[groups].T)
-            YZ = (self._Y[later].reshape(len(later), -1, 6) @ Z).reshape(-1, 3, 6)
+            YZ = (self._Y[later].reshape(len(later), -1, e.width) @ Z).reshape(-1, 3, e.width)
             later, earlier = later.ravel(), earlier.ravel()
             terms = YZ @ self._Y[earlier].swapaxes(1, 2)
             terms[later == earlier] *= 0.5
@@ -450,7 +458,7 @@ class JointInformation:
         """Joint covariance, by solves: of some poses, of the aux of some frames, of the drive, of some landmarks.
 
         Args:
-            frames: (p,) pose numbers, six columns each.
+            frames: (p,) frame numbers, w columns each.
             landmarks: (b,) landmark numbers, not ids, three columns each; they come last.
             aux: (q,) frames whose aux follows the poses, a columns each; None: of no frame.
             drive: Whether the drive follows, with g columns.
@@ -494,10 +502,10 @@ class JointInformation:
         )
 
     def sample(self, rng: np.random.Generator, size: int) -> tuple[Array, Array]:
-        """Independent draws of the unknowns: ``eps`` (size, T, 6) and ``d`` (size, M, 3)."""
+        """Independent draws of the unknowns: ``eps`` (size, T, w) and ``d`` (size, M, 3)."""
         e = self.elimination
         reduced = self.factor.sample_transform(rng.standard_normal((int(e.start[-1]), size)))
-        eps, d = np.empty((size, e.frames, 6)), np.empty((size, e.landmarks, 3))
+        eps, d = np.empty((size, e.frames, e.width)), np.empty((size, e.landmarks, 3))
         for i in range(size):
             x, _, drive, kept = e.parts(reduced[:, i])
             white = rng.standard_normal((e.landmarks, 3))
@@ -508,9 +516,10 @@ class JointInformation:
     def _selection(self, frames: IntArray, aux: IntArray, drive: bool, landmarks: IntArray) -> sp.csr_array:
         """What picks unknowns out of the reduced ones: an eliminated landmark follows its poses and the drive."""
         e = self.elimination
-        pose_blocks = np.broadcast_to(np.eye(6), (len(frames), 6, 6)).copy()
+        w = e.width
+        pose_blocks = np.broadcast_to(np.eye(w), (len(frames), w, w)).copy()
         pose_blocks[frames == 0] = self._B
-        before_aux = 6 * len(frames)
+        before_aux = w * len(frames)
         before_drive = before_aux + e.aux * len(aux)
         before = before_drive + (e.drive if drive else 0)
         at_drive = e.start[e.first_block[2]]
@@ -524,7 +533,7 @@ class JointInformation:
         drives = np.arange(1 if drive and e.drive else 0)
 
         parts = (
-            (6 * np.arange(len(frames)), e.start[frames], pose_blocks),
+            (w * np.arange(len(frames)), e.start[frames], pose_blocks),
             (
                 before_aux + e.aux * np.arange(len(aux)),
                 e.start[e.first_block[1] + aux] if e.aux else aux,
@@ -558,7 +567,7 @@ def _blocks(e: Elimination, system: LinearSystem) -> dict[str, Array]:
     """Blocks of the information of poses, aux and drive among themselves, before landmarks are eliminated."""
     J_from, J_to, J_a, J_d = system.J_from, system.J_to, system.J_motion_aux, system.J_motion_drive
     pose = _sum_products(e.frame, e.frames, system.J_x, system.J_x)
-    pose[0] += np.eye(6)
+    pose[0] += np.eye(e.width)
     pose[:-1] += J_from.swapaxes(1, 2) @ J_from
     pose[1:] += J_to.swapaxes(1, 2) @ J_to
     step = J_to.swapaxes(1, 2) @ J_from
@@ -580,14 +589,14 @@ def _blocks(e: Elimination, system: LinearSystem) -> dict[str, Array]:
         aux += _sum_products(system.at, e.frames, system.J_at[:, None], system.J_at[:, None])
     blocks["aux"] = aux
     blocks["aux step"] = -((system.aux_weight**2 * system.phi)[: max(n_aux - 1, 0), :, None] * np.eye(e.aux))
-    aux_pose = np.zeros((n_aux, e.aux, 6))
+    aux_pose = np.zeros((n_aux, e.aux, e.width))
     if e.aux:
         aux_pose[1:] = J_a.swapaxes(1, 2) @ J_to
     blocks["aux pose"] = aux_pose
     blocks["aux pose before"] = (J_a.swapaxes(1, 2) @ J_from)[: max(n_aux - 1, 0)]
 
     n_drive = 1 if e.drive else 0
-    drive, drive_pose = np.zeros((n_drive, e.drive, e.drive)), np.zeros((n_drive * e.frames, e.drive, 6))
+    drive, drive_pose = np.zeros((n_drive, e.drive, e.drive)), np.zeros((n_drive * e.frames, e.drive, e.width))
     drive_aux = np.zeros((n_drive * n_aux, e.drive, e.aux))
     if e.drive:
         flat = system.J_g.reshape(-1, e.drive)
@@ -628,7 +637,7 @@ def _right_side(e: Elimination, system: LinearSystem) -> Array:
 
 
 def _H_mx(system: LinearSystem) -> Array:
-    """Blocks (K, 3, 6) of the information between landmarks and the poses that observed them, one an observation."""
+    """Blocks (K, 3, w) of the information between landmarks and the poses that observed them, one an observation."""
     blocks = system.J_m.swapaxes(1, 2) @ system.J_x
     follows = np.flatnonzero(system.previous >= 0)
     if system.J_p is not None and len(follows):

@@ -1,0 +1,42 @@
+"""Jitter of the camera against the IMU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray
+from ekfslam.models.blocks.base import optional_block
+from ekfslam.models.blocks.gauss_markov import GaussMarkov
+
+
+@optional_block
+@dataclass(frozen=True)
+class CameraJitter(GaussMarkov):
+    """Error n of the camera's pose that all landmarks of a frame share: ``q = T_cam_imu exp(n^) T_imu_world m``.
+
+    Mounts that swing, stamps that jitter, motion blur and rolling shutters look like it. It is a Gauss-Markov process
+    of time, [m; rad] along the axes of the IMU.
+
+    Args:
+        translation_m, rotation_deg: Stationary standard deviations, each axis.
+        time_s: Its time constant.
+    """
+
+    translation_m: float = 0.02
+    rotation_deg: float = 0.06
+    time_s: float = 0.6
+
+    name = "camera_jitter"
+    is_seen = True
+
+    @property
+    def stationary_std(self) -> Array:
+        return np.repeat([self.translation_m, np.deg2rad(self.rotation_deg)], 3)
+
+    def lengths(self, tau_s: Array | float, way_m: Array | float) -> Array:
+        return np.asarray(tau_s)[..., None] / self.time_s
+
+    def camera_share(self, way_m: Array, is_difference: BoolArray) -> Array | None:
+        return np.ones(np.shape(is_difference))

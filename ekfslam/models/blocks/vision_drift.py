@@ -1,0 +1,48 @@
+"""Slow drift of vision: an error of the flow that all tracks share and that looks like a motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray
+from ekfslam.models.blocks.base import optional_block
+from ekfslam.models.blocks.gauss_markov import GaussMarkov
+
+# Way a frame that counts at least: a tracker drifts a little where the rig stands, too.
+_LEAST_WAY_M = 0.1
+
+
+@optional_block
+@dataclass(frozen=True)
+class VisionDrift(GaussMarkov):
+    """Rates b of a motion that the flow of a frame shows besides the true one, [m/m; rad/m] along the axes of the IMU.
+
+    From one frame to the next the errors of all tracks grow alike, by what a motion ``b way`` of the camera would do:
+    ``z(k) - z(k-1) = h(exp(way b(k)^) T_k m) - h(T_k-1 m) + w``, eq. (10). Trackers that creep along edges, and what is
+    left of the rig's calibration look like it. It is a Gauss-Markov process of the way driven, and says nothing of
+    observations that are no differences.
+
+    Args:
+        translation_percent: Stationary standard deviation of the translation, each axis, in percent of the way.
+        rotation_deg_m: Of the rotation, each axis, in degrees a metre of way.
+        length_m: Way after which a share 1/e is left.
+    """
+
+    translation_percent: float = 2.0
+    rotation_deg_m: float = 0.01
+    length_m: float = 60.0
+
+    name = "vision_drift"
+    is_seen = True
+
+    @property
+    def stationary_std(self) -> Array:
+        return np.repeat([self.translation_percent / 100.0, np.deg2rad(self.rotation_deg_m)], 3)
+
+    def lengths(self, tau_s: Array | float, way_m: Array | float) -> Array:
+        return np.maximum(way_m, _LEAST_WAY_M)[..., None] / self.length_m
+
+    def camera_share(self, way_m: Array, is_difference: BoolArray) -> Array | None:
+        return np.where(is_difference, np.maximum(way_m, _LEAST_WAY_M), 0.0)
