@@ -22,7 +22,9 @@ from ekfslam.smoother.sparse.information import JointInformation
 
 PRIOR = {"moving_sigma": 20.0, "initial_position_std_m": 0.1, "initial_rotation_std_rad": 0.05}
 CALIBRATION = {"rotation_deg": 0.3, "lever_arm_m": 0.05, "baseline": 0.01, "disparity_px": 0.3, "time_s": 0.01}
-ALL_BLOCKS = ["pose", "previous_pose", "calibration", "twist", "up", "twist_bias"]
+BLOCKS = {"twist_bias": {}, "camera_jitter": {}, "vision_drift": {}, "stereo_rotation": {"time_s": 5.0}}
+SHARED = ["camera_jitter", "vision_drift", "stereo_rotation", "previous_camera_jitter", "previous_stereo_rotation"]
+ALL_BLOCKS = ["pose", "previous_pose", "calibration", *SHARED, "twist", "up", "twist_bias"]
 
 
 def drive(sequence, settings, blocks=ALL_BLOCKS):
@@ -42,9 +44,9 @@ def assert_equal_to_frozen_rows(ekf):
     information = JointInformation(problem.elimination(), problem.as_filtered())
     landmarks, layout = ekf.table.log_row, ekf.model.layout
     found = np.zeros(layout.body)
-    found[layout["pose"]] = information.eps[-1]
-    if "previous_pose" in layout:
-        found[layout["previous_pose"]] = information.eps[-2]
+    found[problem.frame_columns] = information.eps[-1]
+    cloned, clones = problem.cloned
+    found[clones] = information.eps[-2, cloned]
     found[problem.aux_columns], found[problem.drive_columns] = information.aux[-1], information.drive
     np.testing.assert_allclose(found, ekf.coordinates, atol=1e-8)
     np.testing.assert_allclose(
@@ -64,7 +66,7 @@ def test_every_block_and_errors_of_tracks_in_the_city(variant, iterations):
     settings = {"filter": {"variant": variant, "retire": "never", "iterations": iterations, **PRIOR}}
     ekf = drive(
         with_everything(builtin("city?frames=60")),
-        {**settings, "calibration": CALIBRATION, "blocks": {"twist_bias": {}}},
+        {**settings, "calibration": CALIBRATION, "blocks": BLOCKS},
     )
     assert (ekf.log().previous >= 0).sum() > 500
     assert_equal_to_frozen_rows(ekf)
@@ -100,25 +102,29 @@ def test_every_block_and_errors_of_tracks_on_a_recording(data_path, variant):
     )
     found = build(short).model.noise
     noise = dataclasses.replace(found, twist_walk_std=EVERYTHING["twist_walk_std"], twist_std=np.full(6, 0.05))
-    settings = {"filter": {"variant": variant}, "calibration": CALIBRATION, "blocks": {"twist_bias": {}}}
+    settings = {"filter": {"variant": variant}, "calibration": CALIBRATION, "blocks": BLOCKS}
     assert_equal_to_frozen_rows(drive(dataclasses.replace(short, noise=noise), settings))
 
 
-@pytest.mark.parametrize("part", ["twist", "up", "track", "calibration", "twist_bias"])
+@pytest.mark.parametrize(
+    "part", ["twist", "up", "track", "calibration", "twist_bias", "camera_jitter", "vision_drift", "stereo_rotation"]
+)
 @pytest.mark.parametrize("variant", ["standard", "fej"])
 def test_every_block_by_itself(variant, part):
     keys = {
         "twist": ("twist_walk_std", "motion_std"),
         "up": ("tilt_rad",),
         "track": ("track_first_px", "track_walk_px"),
+        "vision_drift": ("track_first_px", "track_walk_px"),
     }
     world = builtin("city?frames=40")
     chosen = {key: EVERYTHING[key] for key in keys.get(part, ())}
     world = dataclasses.replace(world, noise=dataclasses.replace(world.noise, **chosen))
     settings = {"filter": {"variant": variant, **PRIOR}}
     settings |= {"calibration": CALIBRATION} if part == "calibration" else {}
-    settings |= {"blocks": {"twist_bias": {}}} if part == "twist_bias" else {}
-    assert_equal_to_frozen_rows(drive(world, settings, ["pose", "previous_pose" if part == "track" else part]))
+    settings |= {"blocks": {part: BLOCKS[part]}} if part in BLOCKS else {}
+    clone = ["previous_pose"] if part in ("track", "vision_drift") else []
+    assert_equal_to_frozen_rows(drive(world, settings, ["pose", *clone, *([] if part == "track" else [part])]))
 
 
 def test_a_loop_closes_under_automatic_noise():
@@ -138,7 +144,7 @@ def test_a_loop_closes_under_automatic_noise():
 
 def test_as_filtered_of_a_run_with_every_block_is_the_filter():
     world = with_everything(builtin("city?frames=60"))
-    settings = {"filter": {"variant": "standard"}, "calibration": CALIBRATION, "blocks": {"twist_bias": {}}}
+    settings = {"filter": {"variant": "standard"}, "calibration": CALIBRATION, "blocks": BLOCKS}
     settings["posterior"] = {"linearisation": "filtered"}
     result = run(world, "full", Config().with_overrides(settings))
     found = posterior(result)

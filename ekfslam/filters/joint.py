@@ -94,6 +94,7 @@ class JointEKF(Estimate):
         """
         model, pose = self.model, self.model.layout["pose"]
         self.way_m = model.way_m(np.asarray(twist, dtype=float), tau_s)
+        self.coordinates = self.coordinates.copy()  # the log has those after the update
         for clone, name in model.clones:
             self.gaussian.copy(model.layout[clone], model.layout[name])
             self.coordinates[model.layout[clone]] = self.coordinates[model.layout[name]]
