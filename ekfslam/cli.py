@@ -239,6 +239,12 @@ def _add_data_options(parser: argparse.ArgumentParser) -> None:
         default="corrected",
         help="how to read cam_T_imu of .npz recordings (default: %(default)s)",
     )
+    parser.add_argument(
+        "--lateral",
+        choices=("corrected", "as-stored"),
+        default="corrected",
+        help="sign of the lateral velocity of KITTI, stored positive to the right (default: %(default)s)",
+    )
 
 
 def _add_filter_options(parser: argparse.ArgumentParser) -> None:
@@ -272,7 +278,7 @@ def _config(options: argparse.Namespace) -> Config:
 
 
 def _open(options: argparse.Namespace, data: str) -> Sequence:
-    return open_sequence(data, extrinsics=options.extrinsics, truth=options.truth)
+    return open_sequence(data, extrinsics=options.extrinsics, lateral=options.lateral, truth=options.truth)
 
 
 def _compare(options: argparse.Namespace) -> None:

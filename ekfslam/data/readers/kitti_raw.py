@@ -23,8 +23,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.data.readers.fields import checksum, spelled_as_in
-from ekfslam.data.readers.registry import Poses, Reader, TruthReader
+from ekfslam.data.readers.fields import LATERAL_NOTES, checksum, spelled_as_in, with_lateral
+from ekfslam.data.readers.registry import Lateral, Poses, Reader, TruthReader
 from ekfslam.data.readers.text import line_of, parse_numbers, parse_table, read_lines
 from ekfslam.data.sequence import WITHOUT_TRACKS, Observations, Sequence, Truth, require_rigid, validate_camera
 from ekfslam.data.tracks import inspect_tracks
@@ -97,7 +97,7 @@ class KittiRaw:
         camera: Intrinsics of the rectified stereo pair.
         T_cam_imu: (4, 4) IMU to rectified left camera of the pair.
         notes: What the reader found and did about it, one sentence each.
-        attributes: Checksum, reader and stereo pair.
+        attributes: Checksum, reader, stereo pair, and how the lateral velocity was taken.
     """
 
     folder: Path
@@ -142,12 +142,13 @@ def is_kitti_raw(folder: Path) -> bool:
     return folder.is_dir() and ((folder / "oxts").is_dir() or bool(_FOLDER_NAME.fullmatch(folder.resolve().name)))
 
 
-def open_kitti_raw(folder: str | Path, pair: Pair = "gray") -> KittiRaw:
+def open_kitti_raw(folder: str | Path, pair: Pair = "gray", lateral: Lateral = "corrected") -> KittiRaw:
     """Read a drive folder and its calibration.
 
     Args:
         folder: The drive folder, such as ``2011_09_30/2011_09_30_drive_0027_sync``.
         pair: Which stereo pair is the camera: ``gray`` (image_00, image_01) or ``color`` (image_02, image_03).
+        lateral: Sign of the lateral velocity, see `with_lateral`.
 
     Raises:
         ConfigError: There is no such pair.
@@ -157,7 +158,7 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray") -> KittiRaw:
     if pair not in CAMERAS:
         raise ConfigError(f"pair must be one of {', '.join(CAMERAS)}, found {pair!r}")
     folder = Path(folder)
-    oxts = read_oxts(folder)
+    oxts = read_oxts(folder, lateral)
     camera, T_cam_imu, files = read_calibration(folder, pair)
     return KittiRaw(
         folder=folder,
@@ -169,16 +170,18 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray") -> KittiRaw:
             "checksum_sha256": checksum(*oxts.files, *files),
             "reader": READER.name,
             "stereo_pair": pair,
+            "lateral": lateral,
         },
     )
 
 
-def read_oxts(folder: Path) -> Oxts:
+def read_oxts(folder: Path, lateral: Lateral = "corrected") -> Oxts:
     """Stamps, velocities and poses of a drive folder.
 
     Velocities: ``vf vl vu`` and ``wf wl wu`` are *level*, along forward, left and up of a vehicle without roll and
     pitch (``vu`` is the rate of ``alt``, and ``wx wy wz`` turned by roll and pitch are ``wf wl wu``). They are turned
-    into the IMU frame, ``v_imu = (R_y(pitch) R_x(roll))^T v_level``.
+    into the IMU frame, ``v_imu = (R_y(pitch) R_x(roll))^T v_level``, after ``vl``, which is stored positive to the
+    right, has been negated (``lateral`` = ``as-stored`` leaves it, see `with_lateral`).
 
     Poses: east and north are the Mercator projection of the sphere, scaled by the cosine of the first latitude, up is
     ``alt``; the rotation is ``R_z(yaw) R_y(pitch) R_x(roll)``. World is the first pose.
@@ -225,13 +228,14 @@ def read_oxts(folder: Path) -> Oxts:
     gaps = _check_steps(time_s, stamp_ns, stamped, stamps_file)
     packets = np.array([_read_packet(path) for path in files.values()])
     twist = np.zeros((frames, 6))
-    twist[present] = _body_twist(packets)
+    twist[present] = _body_twist(packets, lateral)
     return Oxts(
         time_s=time_s,
         twist=_interpolated(twist, present),
         truth=Truth(np.flatnonzero(present), _poses(packets)),
         notes=(
             "The level velocities vf vl vu wf wl wu are turned into the IMU frame by each packet's roll and pitch.",
+            LATERAL_NOTES[lateral],
             *_repair_notes(stamped, present),
             *gaps,
         ),
@@ -392,11 +396,11 @@ def _columns(packets: Array, names: tuple[str, ...]) -> Array:
     return packets[:, [PACKET_FIELDS.index(name) for name in names]]
 
 
-def _body_twist(packets: Array) -> Array:
+def _body_twist(packets: Array, lateral: Lateral) -> Array:
     """(n, 6) velocities in the IMU frame, see `read_oxts`."""
     roll, pitch = _columns(packets, ("roll", "pitch")).T
     R_level_imu = Rotation.from_euler("YX", np.column_stack([pitch, roll]))
-    level = _columns(packets, _TWIST)
+    level = with_lateral(_columns(packets, _TWIST), lateral)
     return np.hstack([R_level_imu.apply(level[:, i : i + 3], inverse=True) for i in (0, 3)])
 
 
@@ -458,6 +462,6 @@ READER = Reader(
     "kitti_raw",
     "a drive folder of KITTI raw",
     lambda source: is_kitti_raw(source.path),
-    lambda source: open_kitti_raw(source.path).sequence(),
+    lambda source: open_kitti_raw(source.path, lateral=source.lateral).sequence(),
 )
 TRUTH_READER = TruthReader("KITTI raw", READER.expected, is_kitti_raw, _poses_of_drive)

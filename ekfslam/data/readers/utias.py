@@ -10,9 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
-from ekfslam.data.readers.fields import checksum, flat_observations, require_numbers, spelled_as_in
+from ekfslam.data.readers.fields import (
+    LATERAL_NOTES,
+    checksum,
+    flat_observations,
+    require_numbers,
+    spelled_as_in,
+    with_lateral,
+)
 from ekfslam.data.readers.matfile import parse_mat
-from ekfslam.data.readers.registry import Reader, Source
+from ekfslam.data.readers.registry import Lateral, Reader, Source
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Noise, Sequence, Truth
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import DataError, ShapeError, TruthError, UnknownFormatError
@@ -32,12 +39,17 @@ _SPELLING = {
 }
 
 
-def read_utias(path: Path) -> Sequence:
+def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
     """Read tracks ``y_k_j`` (4 x T x M, -1 where unseen), stamps, velocities, calibration and 6-DoF truth.
 
     The vehicle frame ``v`` is the IMU frame, the inertial frame ``i`` the world; ``T_world_imu`` has the rotation
     ``exp(theta_vk_i^)`` and ``T_cam_imu = [C_c_v, -C_c_v rho_v_c_v]``. Stamps, velocities and truth may run longer than
     the tracks: they are cut, with a note. Starry Night adds landmark positions ``rho_i_pj_i`` and noise variances.
+
+    Args:
+        path: The .mat file.
+        lateral: Sign of the lateral velocity of a KITTI drive, see `with_lateral`; Starry Night has no level velocities
+            and is read as it is.
 
     Raises:
         UnknownFormatError: The file is damaged, or a .mat file of other content.
@@ -62,9 +74,12 @@ def read_utias(path: Path) -> Sequence:
         rho = require_numbers(fields, "rho_v_c_v", (3, 1))[:, 0]
         observations = flat_observations(pixels, frame_axis=1, field="y_k_j")
         notes = (f"Cut to the {frames} frames of y_k_j: {', '.join(cut)}.",) if cut else ()
+        attributes = {"checksum_sha256": checksum(path), "reader": READER.name}
         noise = _noise(fields)  # stated by Starry Night alone, whose velocities are those of its IMU
         if noise is None:
-            notes = (*notes, LEVEL_VELOCITIES_NOTE)
+            twist = with_lateral(twist, lateral)
+            notes = (*notes, LEVEL_VELOCITIES_NOTE, LATERAL_NOTES[lateral])
+            attributes["lateral"] = lateral
         return Sequence(
             name=path.stem,
             source=source,
@@ -77,7 +92,7 @@ def read_utias(path: Path) -> Sequence:
             noise=noise,
             velocity_frame="level" if noise is None else "imu",
             notes=(*notes, *inspect_tracks(observations, twist).notes),
-            attributes={"checksum_sha256": checksum(path), "reader": READER.name},
+            attributes=attributes,
         )
 
 
@@ -116,7 +131,7 @@ def _noise(fields: dict[str, NDArray]) -> Noise | None:
 def _open(source: Source) -> Sequence:
     if source.head.startswith(b"MATLAB 7.3"):
         raise UnknownFormatError(f"{source.place}: a MATLAB 7.3 file, save it with -v7; expected {READER.expected}")
-    return read_utias(source.path)
+    return read_utias(source.path, source.lateral)
 
 
 READER = Reader(
