@@ -242,6 +242,29 @@ class PosteriorConfig:
 
 
 @dataclass(frozen=True)
+class TruthConfig:
+    """How far the true poses may be wrong, as standard deviations; None takes what their format states, if anything.
+
+    Only the evaluation uses it, see `ekfslam.data.truth_noise.TruthNoise`.
+
+    Args:
+        roll_deg, pitch_deg, yaw_deg: Attitude of the first pose, about the axes of the IMU.
+        first_position_m: Position of the first pose, each axis.
+        stamp_s: Jitter of the stamps.
+        position_m: Position of each pose, each axis.
+        attitude_deg: Attitude of each pose, each axis.
+    """
+
+    roll_deg: float | None = field(default=None, metadata=_FINITE)
+    pitch_deg: float | None = field(default=None, metadata=_FINITE)
+    yaw_deg: float | None = field(default=None, metadata=_FINITE)
+    first_position_m: float | None = field(default=None, metadata=_FINITE)
+    stamp_s: float | None = field(default=None, metadata=_FINITE)
+    position_m: float | None = field(default=None, metadata=_FINITE)
+    attitude_deg: float | None = field(default=None, metadata=_FINITE)
+
+
+@dataclass(frozen=True)
 class TuningRecord:
     """Where the noise of a tuned file comes from; it decides nothing, but is kept with every result.
 
@@ -280,7 +303,7 @@ class Config:
     """Everything that decides what a run does besides the data, and the record of what was tuned.
 
     Args:
-        noise, filter, posterior, calibration, hygiene, tuning: The tables of a file.
+        noise, filter, posterior, calibration, hygiene, truth, tuning: The tables of a file.
         blocks: Name of an optional state block to its settings, ``[blocks.<name>]`` in a file. Here they are only
             plain values; `ekfslam.models.build` knows the blocks and what can be set of them.
 
@@ -293,6 +316,7 @@ class Config:
     posterior: PosteriorConfig = field(default_factory=PosteriorConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     hygiene: HygieneConfig = field(default_factory=HygieneConfig)
+    truth: TruthConfig = field(default_factory=TruthConfig)
     tuning: TuningRecord = field(default_factory=TuningRecord)
     blocks: Mapping[str, Mapping[str, BlockSetting]] = field(default_factory=dict, hash=False)
 

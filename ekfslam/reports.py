@@ -15,6 +15,7 @@ from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import IllPosedError
 from ekfslam.evaluation.summary import compare_table, summarise
+from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.posterior import plot_map_before_and_after
 from ekfslam.figures.run import save_figure, save_figures
 from ekfslam.figures.study import save_study_figures
@@ -80,6 +81,8 @@ def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | 
     """
     results: dict[str, Result] = {}
     skipped: dict[str, str] = {}
+    if config is not None:
+        sequence = with_truth_noise(sequence, config.truth)
     for mode in modes:
         # The filter that "smoothed" starts from need not run twice.
         known = mode == "smoothed" and "full" in results

@@ -50,6 +50,8 @@ SUMMARY_KEYS = {
     "rejected",
     "nis_per_dof",
     "pose_nees_mean",
+    "pose_nees_with_truth_noise_mean",
+    *(f"pose_nees_{axis}_mean" for axis in ("x", "y", "z", "roll", "pitch", "yaw")),
     "landmark_rmse_m",
 }
 
@@ -356,7 +358,7 @@ def test_summary_without_truth_leaves_errors_undefined():
         "rpe_10_m_deg",
         "t_rel_percent",
         "r_rel_deg_per_100m",
-        "pose_nees_mean",
+        *(key for key in SUMMARY_KEYS if key.startswith("pose_nees")),
         "landmark_rmse_m",
     }
 

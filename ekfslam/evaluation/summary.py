@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ekfslam.arrays import Array
 from ekfslam.data.sequence import Sequence
-from ekfslam.evaluation.consistency import pose_nees
+from ekfslam.evaluation.consistency import pose_nees, pose_nees_by_axis
 from ekfslam.evaluation.tables import document, markdown_table, number
 from ekfslam.evaluation.trajectory import (
     absolute_trajectory_error,
@@ -22,6 +23,7 @@ from ekfslam.filters.result import Result
 from ekfslam.storage.archive import Archive
 
 RPE_PATH_M = 10.0
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")  # of the error xi, in the IMU frame
 
 # Key of a summary, heading of its row in the table, format of the value.
 _ROWS = (
@@ -34,7 +36,9 @@ _ROWS = (
     ("rpe_10_m_deg", f"RPE [deg], {RPE_PATH_M:g} m", ".4f"),
     ("t_rel_percent", "t_rel [%]", ".3f"),
     ("r_rel_deg_per_100m", "r_rel [deg/100 m]", ".4f"),
-    ("pose_nees_mean", "pose NEES (6)", ".2f"),
+    ("pose_nees_mean", "pose NEES (6), truth as exact", ".2f"),
+    ("pose_nees_with_truth_noise_mean", "pose NEES (6), with truth noise", ".2f"),
+    *((f"pose_nees_{axis}_mean", f"{axis} alone (1), with truth noise", ".2f") for axis in AXES),
     ("nis_per_dof", "NIS / dof (1)", ".3f"),
     ("landmark_rmse_m", "landmark RMSE [m]", ".3f"),
     ("accepted", "accepted", "d"),
@@ -52,8 +56,10 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
     `ekfslam.evaluation.trajectory` for their definitions. Only ``ate_aligned_m`` is aligned; ``ate_m``,
     ``final_error_m`` and ``landmark_rmse_m`` are of what stands in world. ``rpe_1_frame_*`` and ``rpe_10_m_*`` are
     relative errors over one frame and over 10 m of true path. ``pose_nees_mean`` (6 expected) is over the frames whose
-    covariance is not singular, ``nis_per_dof`` (1 expected) is the sum of NIS over the sum of degrees of freedom,
-    ``total_s`` the sum of the time spent on the frames. None stands where truth is missing or the value is undefined.
+    covariance is not singular, and takes the truth as exact. ``pose_nees_with_truth_noise_mean`` allows for the noise
+    that the truth states; so do ``pose_nees_x_mean`` and its like (1 expected), each of a single axis of the error
+    ``xi``. ``nis_per_dof`` (1 expected) is the sum of NIS over the sum of degrees of freedom, ``total_s`` the sum of
+    the time spent on the frames. None stands where truth is missing or the value is undefined.
     """
     summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _ROWS)
     truth = sequence.truth
@@ -73,9 +79,10 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
         segments = kitti_segment_errors(T_est, T_true)
         if segments is not None:
             summary["t_rel_percent"], summary["r_rel_deg_per_100m"] = segments
-        _, values = pose_nees(result, truth)
-        if np.isfinite(values).any():
-            summary["pose_nees_mean"] = float(np.nanmean(values))
+        summary["pose_nees_mean"] = _mean(pose_nees(result, truth)[1])
+        summary["pose_nees_with_truth_noise_mean"] = _mean(pose_nees(result, truth, with_truth_noise=True)[1])
+        for axis, values in zip(AXES, pose_nees_by_axis(result, truth).T, strict=True):
+            summary[f"pose_nees_{axis}_mean"] = _mean(values)
     innovation = result.innovation
     if innovation.dof.sum() > 0:
         summary["nis_per_dof"] = float(innovation.nis.sum() / innovation.dof.sum())
@@ -85,6 +92,12 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
     summary["ms_per_frame_max"] = float(result.ms_per_frame.max())
     summary["total_s"] = float(result.ms_per_frame.sum()) / 1e3
     return summary
+
+
+def _mean(values: Array) -> float | None:
+    """Mean of the values that are not NaN, if there are any."""
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else None
 
 
 def compare_table(summary: Mapping[str, Any]) -> str:

@@ -64,13 +64,21 @@ def plot_errors(results: Mapping[str, Result], truth: Truth) -> Figure:
             ax.set_ylabel(f"{kind} {'xyz'[i % 3]} [{unit}]")
             ax.margins(x=0.01)
         inside = np.mean(np.abs(errors) <= bands[truth.frame])
-        _, values = pose_nees(result, truth)
-        nees = f", mean NEES {np.nanmean(values):.3g} (6 expected)" if np.isfinite(values).any() else ""
+        nees = _nees_words(result, truth)
         column[0].set_title(f"{title}\n{100 * inside:.1f} % inside {_BAND_SIGMAS:g} sigma{nees}")
         column[-1].set_xlabel("time [s]")
     figure.align_ylabels()
     figure.suptitle(f"{next(iter(results.values())).sequence_name}: estimate minus truth, world axes")
     return figure
+
+
+def _nees_words(result: Result, truth: Truth) -> str:
+    """Mean pose NEES for a title, with truth noise besides where some is stated."""
+    exact, noisy = (pose_nees(result, truth, with_noise)[1] for with_noise in (False, True))
+    if not np.isfinite(exact).any():
+        return ""
+    words = f", mean NEES {np.nanmean(exact):.3g} (6 expected)"
+    return words if truth.noise is None else f"{words}, {np.nanmean(noisy):.3g} with truth noise"
 
 
 @styled

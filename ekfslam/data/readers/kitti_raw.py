@@ -28,6 +28,7 @@ from ekfslam.data.readers.registry import Lateral, Poses, Reader, TruthReader
 from ekfslam.data.readers.text import line_of, parse_numbers, parse_table, read_lines
 from ekfslam.data.sequence import WITHOUT_TRACKS, Observations, Sequence, Truth, require_rigid, validate_camera
 from ekfslam.data.tracks import inspect_tracks
+from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import (
     CalibrationError,
     ConfigError,
@@ -184,7 +185,8 @@ def read_oxts(folder: Path, lateral: Lateral = "corrected") -> Oxts:
     right, has been negated (``lateral`` = ``as-stored`` leaves it, see `with_lateral`).
 
     Poses: east and north are the Mercator projection of the sphere, scaled by the cosine of the first latitude, up is
-    ``alt``; the rotation is ``R_z(yaw) R_y(pitch) R_x(roll)``. World is the first pose.
+    ``alt``; the rotation is ``R_z(yaw) R_y(pitch) R_x(roll)``. World is the first pose. Their noise is
+    `KITTI_TRUTH_NOISE`.
 
     An empty line of ``timestamps.txt`` is a stamp that the recorder lost: it is interpolated between its neighbours.
     Where its packet is missing too, so are the velocities, and the frame is without truth. A note says so.
@@ -232,7 +234,7 @@ def read_oxts(folder: Path, lateral: Lateral = "corrected") -> Oxts:
     return Oxts(
         time_s=time_s,
         twist=_interpolated(twist, present),
-        truth=Truth(np.flatnonzero(present), _poses(packets)),
+        truth=Truth(np.flatnonzero(present), _poses(packets), noise=KITTI_TRUTH_NOISE),
         notes=(
             "The level velocities vf vl vu wf wl wu are turned into the IMU frame by each packet's roll and pitch.",
             LATERAL_NOTES[lateral],
@@ -455,7 +457,7 @@ def _split_projection(values: Array, name: str) -> tuple[Array, Array]:
 
 def _poses_of_drive(folder: Path, sequence: Sequence) -> Poses:
     oxts = read_oxts(folder)
-    return Poses(oxts.truth.T_world_imu, oxts.time_s[oxts.truth.frame], oxts.files)
+    return Poses(oxts.truth.T_world_imu, oxts.time_s[oxts.truth.frame], oxts.files, KITTI_TRUTH_NOISE)
 
 
 READER = Reader(

@@ -19,6 +19,7 @@ from typing import Literal, TypeVar
 
 from ekfslam.arrays import Array
 from ekfslam.data.sequence import Sequence
+from ekfslam.data.truth_noise import TruthNoise
 
 Extrinsics = Literal["corrected", "as-stored"]
 Lateral = Literal["corrected", "as-stored"]
@@ -84,11 +85,13 @@ class Poses:
         T_world_imu: (F, 4, 4).
         time_s: (F,) their stamps, which increase; None where row i is the pose of frame i.
         files: What was read.
+        noise: How far they may be wrong; None: the format says nothing of it.
     """
 
     T_world_imu: Array
     time_s: Array | None
     files: tuple[Path, ...]
+    noise: TruthNoise | None = None
 
 
 @dataclass(frozen=True)

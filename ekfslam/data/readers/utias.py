@@ -22,6 +22,7 @@ from ekfslam.data.readers.matfile import parse_mat
 from ekfslam.data.readers.registry import Lateral, Reader, Source
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Noise, Sequence, Truth
 from ekfslam.data.tracks import inspect_tracks
+from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import DataError, ShapeError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
@@ -44,7 +45,8 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
 
     The vehicle frame ``v`` is the IMU frame, the inertial frame ``i`` the world; ``T_world_imu`` has the rotation
     ``exp(theta_vk_i^)`` and ``T_cam_imu = [C_c_v, -C_c_v rho_v_c_v]``. Stamps, velocities and truth may run longer than
-    the tracks: they are cut, with a note. Starry Night adds landmark positions ``rho_i_pj_i`` and noise variances.
+    the tracks: they are cut, with a note. Starry Night adds landmark positions ``rho_i_pj_i`` and noise variances. The
+    truth of a KITTI drive has the noise `KITTI_TRUTH_NOISE`; of that of Starry Night none is stated.
 
     Args:
         path: The .mat file.
@@ -110,7 +112,7 @@ def _load(path: Path) -> dict[str, NDArray]:
 def _truth(fields: dict[str, NDArray], T_world_imu: Array, tracks: int) -> Truth:
     frame = np.arange(len(T_world_imu))
     if "rho_i_pj_i" not in fields:
-        return Truth(frame, T_world_imu)
+        return Truth(frame, T_world_imu, noise=KITTI_TRUTH_NOISE)
     position_m = require_numbers(fields, "rho_i_pj_i", (3, tracks)).T
     return Truth(frame, T_world_imu, np.arange(tracks), position_m)
 
