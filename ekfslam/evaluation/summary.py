@@ -10,6 +10,7 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.data.sequence import Sequence
 from ekfslam.evaluation.consistency import pose_nees, pose_nees_by_axis
+from ekfslam.evaluation.relative import FRAMES, PATHS_M, over_frames, over_path, relative_pose_nees
 from ekfslam.evaluation.tables import document, markdown_table, number
 from ekfslam.evaluation.trajectory import (
     absolute_trajectory_error,
@@ -36,9 +37,14 @@ _ROWS = (
     ("rpe_10_m_deg", f"RPE [deg], {RPE_PATH_M:g} m", ".4f"),
     ("t_rel_percent", "t_rel [%]", ".3f"),
     ("r_rel_deg_per_100m", "r_rel [deg/100 m]", ".4f"),
-    ("pose_nees_mean", "pose NEES (6), truth as exact", ".2f"),
+    ("pose_nees_mean", "pose NEES (6)", ".2f"),
     ("pose_nees_with_truth_noise_mean", "pose NEES (6), with truth noise", ".2f"),
     *((f"pose_nees_{axis}_mean", f"{axis} alone (1), with truth noise", ".2f") for axis in AXES),
+    *((f"pose_nees_relative_{frames}_mean", f"over {frames} frames (6), with truth noise", ".2f") for frames in FRAMES),
+    *(
+        (f"pose_nees_relative_{path_m:g}_m_mean", f"over {path_m:g} m (6), with truth noise", ".2f")
+        for path_m in PATHS_M
+    ),
     ("nis_per_dof", "NIS / dof (1)", ".3f"),
     ("landmark_rmse_m", "landmark RMSE [m]", ".3f"),
     ("accepted", "accepted", "d"),
@@ -57,9 +63,10 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
     ``final_error_m`` and ``landmark_rmse_m`` are of what stands in world. ``rpe_1_frame_*`` and ``rpe_10_m_*`` are
     relative errors over one frame and over 10 m of true path. ``pose_nees_mean`` (6 expected) is over the frames whose
     covariance is not singular, and takes the truth as exact. ``pose_nees_with_truth_noise_mean`` allows for the noise
-    that the truth states; so do ``pose_nees_x_mean`` and its like (1 expected), each of a single axis of the error
-    ``xi``. ``nis_per_dof`` (1 expected) is the sum of NIS over the sum of degrees of freedom, ``total_s`` the sum of
-    the time spent on the frames. None stands where truth is missing or the value is undefined.
+    that the truth states. So do ``pose_nees_x_mean`` and its like (1 expected), each of a single axis of the error
+    ``xi``, and ``pose_nees_relative_100_mean`` and its like (6 expected), of the motion over so many frames, or metres
+    of true path. ``nis_per_dof`` (1 expected) is the sum of NIS over the sum of degrees of freedom, ``total_s`` the sum
+    of the time spent on the frames. None stands where truth is missing or the value is undefined.
     """
     summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _ROWS)
     truth = sequence.truth
@@ -83,6 +90,11 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
         summary["pose_nees_with_truth_noise_mean"] = _mean(pose_nees(result, truth, with_truth_noise=True)[1])
         for axis, values in zip(AXES, pose_nees_by_axis(result, truth).T, strict=True):
             summary[f"pose_nees_{axis}_mean"] = _mean(values)
+        pairs, values = relative_pose_nees(result, truth)
+        for frames in FRAMES:
+            summary[f"pose_nees_relative_{frames}_mean"] = _mean(values[over_frames(pairs, frames)])
+        for path_m in PATHS_M:
+            summary[f"pose_nees_relative_{path_m:g}_m_mean"] = _mean(values[over_path(pairs, truth, path_m)])
     innovation = result.innovation
     if innovation.dof.sum() > 0:
         summary["nis_per_dof"] = float(innovation.nis.sum() / innovation.dof.sum())
@@ -109,7 +121,7 @@ def compare_table(summary: Mapping[str, Any]) -> str:
     modes = summary["modes"]
     rows = []
     for key, heading, spec in _ROWS:
-        values = [mode[key] for mode in modes.values()]
+        values = [mode.get(key) for mode in modes.values()]  # older summaries lack some
         if any(value is not None for value in values):
             rows.append([heading, *(number(value, spec) for value in values)])
     landmarks = "" if summary["landmarks"] is None else f", {summary['landmarks']} landmarks"

@@ -10,6 +10,7 @@
         innovation          nis, dof, accepted, rejected
         rejections          frame, landmark, reason (index into its attribute ``names``)
         parameters          value, std, prior_std; attributes name, unit; see `ekfslam.filters.result.Parameters`
+        pairs               first, second, cross: see `ekfslam.filters.result.PosePairs` (where truth is known)
         hygiene             rule (index into its attribute ``names``), frame, landmark, continuation: see
                             `ekfslam.data.hygiene.HygieneReport`; attribute observations (not in dead reckoning)
         timing              ms_per_frame
@@ -52,6 +53,7 @@ from ekfslam.filters.result import (
     Innovation,
     Landmarks,
     Parameters,
+    PosePairs,
     Rejections,
     Result,
 )
@@ -124,6 +126,13 @@ _PARAMETERS_LAYOUT: hdf5.Layout = (
     ("value", "value", ("T", "P"), "see attribute unit of the group", "imu"),
     ("std", "std", ("T", "P"), "see attribute unit of the group", "imu"),
     ("prior_std", "prior_std", ("P",), "see attribute unit of the group", "imu"),
+)
+
+# The same below /runs/<mode>/pairs, fields of `PosePairs` (N of them).
+_PAIRS_LAYOUT: hdf5.Layout = (
+    ("first", "first", ("N",), "frame index", "none"),
+    ("second", "second", ("N",), "frame index", "none"),
+    ("cross", "cross", ("N", 6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu of first, imu of second"),
 )
 
 # The same below /runs/<mode>/hygiene, fields of `HygieneReport` (N findings).
@@ -296,6 +305,8 @@ def _write_result(group: h5py.Group, result: Result) -> None:
         parameters = group.create_group("parameters")
         hdf5.write_attributes(parameters, {"name": result.parameters.name, "unit": result.parameters.unit})
         hdf5.write_fields(parameters, _PARAMETERS_LAYOUT, result.parameters)
+    if result.pairs is not None:
+        hdf5.write_fields(group.create_group("pairs"), _PAIRS_LAYOUT, result.pairs)
     if result.hygiene is not None:
         hygiene = group.create_group("hygiene")
         hdf5.write_attributes(hygiene, {"observations": result.hygiene.observations})
@@ -342,6 +353,7 @@ def _read_result(h5file: h5py.File, mode: str, camera: StereoCamera, T_cam_imu: 
         log=_read_log(hdf5.subgroup(group, "log"), sizes, version) if "log" in group else None,
         hygiene=_read_hygiene(hdf5.subgroup(group, "hygiene")) if "hygiene" in group else None,
         parameters=_read_parameters(hdf5.subgroup(group, "parameters"), sizes) if "parameters" in group else None,
+        pairs=_read_pairs(hdf5.subgroup(group, "pairs"), sizes["T"]) if "pairs" in group else None,
         attributes=hdf5.attributes(hdf5.subgroup(group, "attributes")),
     )
 
@@ -362,6 +374,13 @@ def _read_parameters(group: h5py.Group, sizes: Mapping[str, int]) -> Parameters:
             f"{len(found['prior_std'])} parameters"
         )
     return Parameters(names, units, **found)
+
+
+def _read_pairs(group: h5py.Group, frames: int) -> PosePairs:
+    pairs = PosePairs(**hdf5.read_fields(group, _PAIRS_LAYOUT))
+    if not ((pairs.first >= 0) & (pairs.first < pairs.second) & (pairs.second < frames)).all():
+        raise ArchiveError(f"{group.file.filename}: {group.name.strip('/')} holds frames that are no pair of {frames}")
+    return pairs
 
 
 def _read_hygiene(group: h5py.Group) -> HygieneReport:
