@@ -15,6 +15,7 @@ import h5py
 
 from ekfslam import __version__
 from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation, NoiseModel
+from ekfslam.data.interpolation import stretches
 from ekfslam.data.readers import BUILTIN, open_sequence, write_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import builtin
@@ -380,6 +381,8 @@ def _info(options: argparse.Namespace) -> None:
     print(f"truth         {known}")
     if truth is not None:
         print(f"truth noise   {'none stated: taken as exact' if truth.noise is None else truth.noise.text}")
+    gaps = ", ".join(f"{begin} to {end}" for begin, end in stretches(sequence.interpolated))
+    print(f"gaps          {f'intervals {gaps} are interpolated' if gaps else 'none'}")
     for key, value in sequence.attributes.items():
         print(f"{key:13s} {value}")
     for note in sequence.notes:
@@ -407,7 +410,7 @@ def _plot(options: argparse.Namespace) -> None:
     archive = read_archive(options.archive)
     directory = options.out or options.archive.parent
     directory.mkdir(parents=True, exist_ok=True)
-    for path in save_figures(directory, archive.results, archive.truth):
+    for path in save_figures(directory, archive.results, archive.truth, archive.interpolated):
         print(path)
 
 

@@ -64,7 +64,7 @@ class Comparison:
         _write_json(summary, self.summary)
         notes = "".join(f"- {note}\n" for note in self.sequence.notes)
         table.write_text(self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""), encoding="utf-8")
-        figures = save_figures(directory, self.results, self.sequence.truth)
+        figures = save_figures(directory, self.results, self.sequence.truth, self.sequence.interpolated)
         if "full" in self.results and "smoothed" in self.results:
             figures.append(directory / "map_before_and_after.png")
             drawn = plot_map_before_and_after(self.results["full"], self.results["smoothed"], self.sequence.truth)

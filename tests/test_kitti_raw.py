@@ -184,6 +184,18 @@ def test_level_velocities_are_turned_by_roll_and_pitch_with_the_signs_of_the_for
     np.testing.assert_allclose(twist[3], [10, 1, 0, 0, 0, 0], atol=1e-12)
 
 
+def test_a_line_that_the_unit_drew_across_a_gap_is_named_although_roll_and_pitch_turn_it(drive):
+    whole = packets()
+    share = np.linspace(0, 1, 13)[:, None]
+    whole[20:33] = (1 - share) * whole[20] + share * whole[32]
+    for k in range(20, 33):
+        (drive / f"oxts/data/{k:010d}.txt").write_text(" ".join(repr(float(x)) for x in whole[k]) + "\n")
+    sequence = open_sequence(drive)
+    assert sequence.attributes["interpolated"] == "21-32"
+    np.testing.assert_array_equal(np.flatnonzero(sequence.interpolated), np.arange(21, 33))
+    assert sum("intervals 21 to 32 are interpolated" in note for note in sequence.notes) == 1
+
+
 def test_position_is_metric_east_north_up_and_yaw_counts_from_east(drive):
     hand_made(drive, 0, yaw=np.pi / 2, alt=100.0)
     hand_made(drive, 1, yaw=np.pi / 2, alt=101.0, lat=49.0 + 1e-5, lon=8.4 + 2e-5)

@@ -181,7 +181,7 @@ def test_pairs_across_a_map_revival_are_left_out():
     first, second = relative_pairs(world.truth, 100)
     assert 0 < len(result.pairs) < len(first)
     assert set(zip(result.pairs.first, result.pairs.second, strict=True)) < set(zip(first, second, strict=True))
-    _, values = relative_pose_nees(result, world.truth)
+    _, values = relative_pose_nees(result, world.truth, world.interpolated)
     assert np.isfinite(values).all()
 
 
@@ -201,7 +201,7 @@ def test_dead_reckoning_has_the_cross_covariances_of_its_recursion():
 def test_every_mode_has_pairs_whose_joint_covariance_is_one(mode):
     world = open_sequence("builtin:loop?frames=60")
     result = run(world, mode, Config().with_overrides({"filter": {"relative_frames": 40}}))
-    pairs, values = relative_pose_nees(result, world.truth)
+    pairs, values = relative_pose_nees(result, world.truth, world.interpolated)
     assert len(pairs) >= 5
     assert np.isfinite(values).all()
     for j, k, cross in zip(pairs.first, pairs.second, pairs.cross, strict=True):
@@ -255,10 +255,10 @@ def test_relative_nees_is_six_whatever_the_first_pose_and_with_the_noise_of_the_
         result = synthetic_result(sequence, "dead-reckoning")
         pairs = dead_reckoned_pairs(np.array([20]), np.array([40]), result.T_world_imu, result.covariance)
         result = dataclasses.replace(result, pairs=pairs)
-        exact.append(relative_pose_nees(result, sequence.truth)[1][0])
+        exact.append(relative_pose_nees(result, sequence.truth, sequence.interpolated)[1][0])
         truth = erring_truth(sequence.truth, sequence.time_s, noise, np.random.default_rng(seed))
-        erring.append(relative_pose_nees(result, truth)[1][0])
-        blind.append(relative_pose_nees(result, dataclasses.replace(truth, noise=None))[1][0])
+        erring.append(relative_pose_nees(result, truth, sequence.interpolated)[1][0])
+        blind.append(relative_pose_nees(result, dataclasses.replace(truth, noise=None), sequence.interpolated)[1][0])
     low, high = chi2_bounds(6, 0.999, runs=60)
     assert low < np.mean(exact) < high
     assert low < np.mean(erring) < high

@@ -14,7 +14,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.interpolation import known_intervals
 from ekfslam.data.noise import Noise
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import (
@@ -156,6 +157,11 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    @cached_property
+    def interpolated(self) -> BoolArray:
+        """Which intervals (T,) have velocities, and probably true poses, that were never measured."""
+        return known_intervals(self.attributes, self.twist)
 
     @property
     def initial_T_world_imu(self) -> Array:

@@ -8,6 +8,7 @@ NEES is correlated over some sixty frames, so that the frames of one run are now
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from dataclasses import dataclass
 
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.evaluation.trajectory import match_landmarks
@@ -47,6 +48,12 @@ def nees(error: Array, covariance: Array) -> Array:
     L = np.linalg.cholesky(np.where(definite[..., None, None], correlation, np.eye(size)))
     whitened = np.linalg.solve(L, (error / scale)[..., None])[..., 0]
     return np.where(definite, np.sum(whitened**2, axis=-1), np.nan)
+
+
+def measured_truth(truth: Truth, interpolated: BoolArray) -> Truth:
+    """The truth of the frames that no interpolated interval (T,) leads to: of the others nothing should be judged."""
+    kept = ~interpolated[truth.frame]
+    return dataclasses.replace(truth, frame=truth.frame[kept], T_world_imu=truth.T_world_imu[kept])
 
 
 def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Array:

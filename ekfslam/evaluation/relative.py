@@ -47,7 +47,7 @@ def dead_reckoned_pairs(first: IntArray, second: IntArray, T_world_imu: Array, c
     return PosePairs(first, second, covariance[first] @ np.swapaxes(A, -1, -2))
 
 
-def relative_pose_nees(result: Result, truth: Truth) -> tuple[PosePairs, Array]:
+def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) -> tuple[PosePairs, Array]:
     """Pairs with both true poses and the NEES (n,) of their relative pose, 6 degrees of freedom; NaN where singular.
 
     The error of the motion ``T_k T_j^-1`` is, to first order in the stored errors,
@@ -55,11 +55,14 @@ def relative_pose_nees(result: Result, truth: Truth) -> tuple[PosePairs, Array]:
         e = xi_k - A xi_j,    A = Ad(T_hat_k T_hat_j^-1),
         cov(e) = P_kk + A P_jj A^T - P_kj A^T - A P_jk (+ N_k + A N_j A^T),
 
-    where N is the noise of single true poses, if the truth states any. An error of the first pose cancels.
+    where N is the noise of single true poses, if the truth states any. An error of the first pose cancels. Pairs with
+    an ``interpolated`` interval (T,) between them are left out.
     """
     pairs, place = result.pairs or PosePairs.empty(), np.full(len(result.time_s), -1)
     place[truth.frame] = np.arange(len(truth.frame))
-    pairs = pairs.only((place[pairs.first] >= 0) & (place[pairs.second] >= 0))
+    invented = np.cumsum(interpolated)
+    is_measured = invented[pairs.first] == invented[pairs.second]
+    pairs = pairs.only((place[pairs.first] >= 0) & (place[pairs.second] >= 0) & is_measured)
     j, k = place[pairs.first], place[pairs.second]
     T_true, T_est = truth.T_world_imu, result.T_world_imu
     motion_est = se3.inverse(T_est[pairs.second]) @ T_est[pairs.first]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.data.sequence import Sequence
-from ekfslam.evaluation.consistency import pose_nees, pose_nees_by_axis
+from ekfslam.evaluation.consistency import measured_truth, pose_nees, pose_nees_by_axis
 from ekfslam.evaluation.relative import FRAMES, PATHS_M, over_frames, over_path, relative_pose_nees
 from ekfslam.evaluation.tables import document, markdown_table, number
 from ekfslam.evaluation.trajectory import (
@@ -56,7 +56,7 @@ _ROWS = (
 
 
 def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float | int | None]:
-    """Figures of merit of one run as plain Python numbers, ready for JSON; of the sequence only the truth is used.
+    """Figures of merit of one run as plain Python numbers, ready for JSON; the sequence tells the truth.
 
     Trajectory errors are over the frames with known true pose, the estimate starting where the run started it; see
     `ekfslam.evaluation.trajectory` for their definitions. Only ``ate_aligned_m`` is aligned; ``ate_m``,
@@ -65,8 +65,9 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
     covariance is not singular, and takes the truth as exact. ``pose_nees_with_truth_noise_mean`` allows for the noise
     that the truth states. So do ``pose_nees_x_mean`` and its like (1 expected), each of a single axis of the error
     ``xi``, and ``pose_nees_relative_100_mean`` and its like (6 expected), of the motion over so many frames, or metres
-    of true path. ``nis_per_dof`` (1 expected) is the sum of NIS over the sum of degrees of freedom, ``total_s`` the sum
-    of the time spent on the frames. None stands where truth is missing or the value is undefined.
+    of true path. All of these leave interpolated stretches out. ``nis_per_dof`` (1 expected) is the sum of NIS over the
+    sum of degrees of freedom, ``total_s`` the sum of the time spent on the frames. None stands where truth is missing
+    or the value is undefined.
     """
     summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _ROWS)
     truth = sequence.truth
@@ -86,11 +87,12 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
         segments = kitti_segment_errors(T_est, T_true)
         if segments is not None:
             summary["t_rel_percent"], summary["r_rel_deg_per_100m"] = segments
-        summary["pose_nees_mean"] = _mean(pose_nees(result, truth)[1])
-        summary["pose_nees_with_truth_noise_mean"] = _mean(pose_nees(result, truth, with_truth_noise=True)[1])
-        for axis, values in zip(AXES, pose_nees_by_axis(result, truth).T, strict=True):
+        measured = measured_truth(truth, sequence.interpolated)
+        summary["pose_nees_mean"] = _mean(pose_nees(result, measured)[1])
+        summary["pose_nees_with_truth_noise_mean"] = _mean(pose_nees(result, measured, with_truth_noise=True)[1])
+        for axis, values in zip(AXES, pose_nees_by_axis(result, measured).T, strict=True):
             summary[f"pose_nees_{axis}_mean"] = _mean(values)
-        pairs, values = relative_pose_nees(result, truth)
+        pairs, values = relative_pose_nees(result, truth, sequence.interpolated)
         for frames in FRAMES:
             summary[f"pose_nees_relative_{frames}_mean"] = _mean(values[over_frames(pairs, frames)])
         for path_m in PATHS_M:

@@ -26,6 +26,7 @@ import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,9 +35,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ekfslam import hdf5
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import HygieneConfig
 from ekfslam.data.hygiene import RULES, HygieneReport
+from ekfslam.data.interpolation import known_intervals
 from ekfslam.data.readers.hdf5 import (
     noise_attributes,
     noise_of_attributes,
@@ -152,6 +154,7 @@ class Archive:
         name, source, time_s, twist, camera, T_cam_imu, truth, noise, velocity_frame, notes, attributes: As in
             `Sequence`.
         results: Mode to result, in the order of writing.
+        interpolated: As in `Sequence`.
     """
 
     name: str
@@ -166,6 +169,10 @@ class Archive:
     notes: tuple[str, ...]
     attributes: Mapping[str, str | int | float]
     results: Mapping[str, Result]
+
+    @cached_property
+    def interpolated(self) -> BoolArray:
+        return known_intervals(self.attributes, self.twist)
 
 
 def write_archive(path: str | Path, sequence: Sequence, results: Mapping[str, Result]) -> None:

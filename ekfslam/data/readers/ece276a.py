@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ekfslam.arrays import Array
+from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.readers.fields import (
     LATERAL_NOTES,
     checksum,
@@ -75,6 +76,7 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
                 _EXTRINSICS_NOTES[extrinsics],
                 LEVEL_VELOCITIES_NOTE,
                 LATERAL_NOTES[lateral],
+                *interpolation_notes(twist),
                 *inspect_tracks(observations, twist).notes,
             ),
             attributes={
@@ -82,6 +84,7 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
                 "reader": READER.name,
                 "extrinsics": extrinsics,
                 "lateral": lateral,
+                **interpolation_attributes(twist),
             },
         )
 

@@ -23,6 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.readers.fields import LATERAL_NOTES, checksum, spelled_as_in, with_lateral
 from ekfslam.data.readers.registry import Lateral, Poses, Reader, TruthReader
 from ekfslam.data.readers.text import line_of, parse_numbers, parse_table, read_lines
@@ -78,6 +79,7 @@ class Oxts:
         twist: (T, 6) velocities ``[v; w]`` in the IMU frame.
         truth: ``T_world_imu`` of every frame that has a packet; the world is the IMU frame of the first.
         notes: What was repaired, one sentence each.
+        attributes: Which intervals are interpolated, where any are.
         files: The files that were read.
     """
 
@@ -85,6 +87,7 @@ class Oxts:
     twist: Array
     truth: Truth
     notes: tuple[str, ...]
+    attributes: dict[str, str]
     files: tuple[Path, ...]
 
 
@@ -172,6 +175,7 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray", lateral: Lateral = "
             "reader": READER.name,
             "stereo_pair": pair,
             "lateral": lateral,
+            **oxts.attributes,
         },
     )
 
@@ -229,7 +233,10 @@ def read_oxts(folder: Path, lateral: Lateral = "corrected") -> Oxts:
     time_s = _interpolated(stamp_ns[:, None] / 1e9, stamped)[:, 0]
     gaps = _check_steps(time_s, stamp_ns, stamped, stamps_file)
     packets = np.array([_read_packet(path) for path in files.values()])
-    twist = np.zeros((frames, 6))
+    level, twist = np.zeros((2, frames, 6))
+    # Turned by roll and pitch, a line is one no more.
+    level[present] = _columns(packets, _TWIST)
+    level = _interpolated(level, present)
     twist[present] = _body_twist(packets, lateral)
     return Oxts(
         time_s=time_s,
@@ -239,8 +246,10 @@ def read_oxts(folder: Path, lateral: Lateral = "corrected") -> Oxts:
             "The level velocities vf vl vu wf wl wu are turned into the IMU frame by each packet's roll and pitch.",
             LATERAL_NOTES[lateral],
             *_repair_notes(stamped, present),
+            *interpolation_notes(level),
             *gaps,
         ),
+        attributes=interpolation_attributes(level),
         files=(*format_files, stamps_file, *files.values()),
     )
 

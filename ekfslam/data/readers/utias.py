@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
+from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.readers.fields import (
     LATERAL_NOTES,
     checksum,
@@ -93,8 +94,8 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
             truth=_truth(fields, se3.transform(se3.so3_exp(theta), r), tracks=pixels.shape[2]),
             noise=noise,
             velocity_frame="level" if noise is None else "imu",
-            notes=(*notes, *inspect_tracks(observations, twist).notes),
-            attributes=attributes,
+            notes=(*notes, *interpolation_notes(twist), *inspect_tracks(observations, twist).notes),
+            attributes={**attributes, **interpolation_attributes(twist)},
         )
 
 
