@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ekfslam.arrays import Array
-from ekfslam.data.sequence import Sequence
+from ekfslam.arrays import Array, BoolArray
+from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.consistency import measured_truth, pose_nees, pose_nees_by_axis
 from ekfslam.evaluation.relative import FRAMES, PATHS_M, over_frames, over_path, relative_pose_nees
 from ekfslam.evaluation.tables import document, markdown_table, number
@@ -87,16 +87,7 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
         segments = kitti_segment_errors(T_est, T_true)
         if segments is not None:
             summary["t_rel_percent"], summary["r_rel_deg_per_100m"] = segments
-        measured = measured_truth(truth, sequence.interpolated)
-        summary["pose_nees_mean"] = _mean(pose_nees(result, measured)[1])
-        summary["pose_nees_with_truth_noise_mean"] = _mean(pose_nees(result, measured, with_truth_noise=True)[1])
-        for axis, values in zip(AXES, pose_nees_by_axis(result, measured).T, strict=True):
-            summary[f"pose_nees_{axis}_mean"] = _mean(values)
-        pairs, values = relative_pose_nees(result, truth, sequence.interpolated)
-        for frames in FRAMES:
-            summary[f"pose_nees_relative_{frames}_mean"] = _mean(values[over_frames(pairs, frames)])
-        for path_m in PATHS_M:
-            summary[f"pose_nees_relative_{path_m:g}_m_mean"] = _mean(values[over_path(pairs, truth, path_m)])
+        summary |= _pose_consistency(result, truth, sequence.interpolated)
     innovation = result.innovation
     if innovation.dof.sum() > 0:
         summary["nis_per_dof"] = float(innovation.nis.sum() / innovation.dof.sum())
@@ -106,6 +97,23 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
     summary["ms_per_frame_max"] = float(result.ms_per_frame.max())
     summary["total_s"] = float(result.ms_per_frame.sum()) / 1e3
     return summary
+
+
+def _pose_consistency(result: Result, truth: Truth, interpolated: BoolArray) -> dict[str, float | None]:
+    """The part of `summarise` that compares pose errors with their covariance."""
+    measured = measured_truth(truth, interpolated)
+    found = {
+        "pose_nees_mean": _mean(pose_nees(result, measured)[1]),
+        "pose_nees_with_truth_noise_mean": _mean(pose_nees(result, measured, with_truth_noise=True)[1]),
+    }
+    for axis, values in zip(AXES, pose_nees_by_axis(result, measured).T, strict=True):
+        found[f"pose_nees_{axis}_mean"] = _mean(values)
+    pairs, values = relative_pose_nees(result, truth, interpolated)
+    for frames in FRAMES:
+        found[f"pose_nees_relative_{frames}_mean"] = _mean(values[over_frames(pairs, frames)])
+    for path_m in PATHS_M:
+        found[f"pose_nees_relative_{path_m:g}_m_mean"] = _mean(values[over_path(pairs, truth, path_m)])
+    return found
 
 
 def _mean(values: Array) -> float | None:
