@@ -15,12 +15,14 @@ import h5py
 
 from ekfslam import __version__
 from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation, NoiseModel
+from ekfslam.data.interpolation import stretches
 from ekfslam.data.readers import BUILTIN, open_sequence, write_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
 from ekfslam.evaluation.summary import compare_table, summarise
+from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.posterior import save_posterior_figures
 from ekfslam.figures.run import save_figures
 from ekfslam.filters.result import Result
@@ -239,6 +241,26 @@ def _add_data_options(parser: argparse.ArgumentParser) -> None:
         default="corrected",
         help="how to read cam_T_imu of .npz recordings (default: %(default)s)",
     )
+    parser.add_argument(
+        "--lateral",
+        choices=("corrected", "as-stored"),
+        default="corrected",
+        help="sign of the lateral velocity of KITTI, stored positive to the right (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--truth-noise",
+        nargs="+",
+        type=_setting,
+        default=[],
+        metavar="KEY=VALUE",
+        help="standard deviations of the truth in place of those that its format states: roll_deg, pitch_deg, yaw_deg, "
+        "first_position_m, stamp_s, position_m, attitude_deg",
+    )
+
+
+def _setting(text: str) -> tuple[str, float]:
+    key, _, value = text.partition("=")
+    return key, float(value)  # argparse reports a ValueError
 
 
 def _add_filter_options(parser: argparse.ArgumentParser) -> None:
@@ -247,7 +269,7 @@ def _add_filter_options(parser: argparse.ArgumentParser) -> None:
         "--config",
         type=Path,
         metavar="FILE.toml",
-        help="tables [noise], [hygiene], [filter], [calibration], [posterior]; what `tune` writes is one",
+        help="tables [noise], [hygiene], [filter], [calibration], [posterior], [truth]; what `tune` writes is one",
     )
     group.add_argument("--variant", choices=VARIANTS, help="linearisation of the joint filter")
     group.add_argument("--iterations", type=int, metavar="N", help="Gauss-Newton iterations of an update")
@@ -267,12 +289,13 @@ def _config(options: argparse.Namespace) -> Config:
                 "sigma_px": options.sigma_px,
             },
             "filter": {"variant": options.variant, "iterations": options.iterations, "retire": options.retire},
+            "truth": dict(options.truth_noise),
         }
     )
 
 
 def _open(options: argparse.Namespace, data: str) -> Sequence:
-    return open_sequence(data, extrinsics=options.extrinsics, truth=options.truth)
+    return open_sequence(data, extrinsics=options.extrinsics, lateral=options.lateral, truth=options.truth)
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -299,8 +322,9 @@ def _folders(sequences: list[Sequence]) -> list[str]:
 
 
 def _run(options: argparse.Namespace) -> None:
-    sequence = _open(options, options.data)
-    result = run(sequence, options.mode, _config(options))
+    config = _config(options)
+    sequence = with_truth_noise(_open(options, options.data), config.truth)
+    result = run(sequence, options.mode, config)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_archive(options.out, sequence, {result.mode: result})
     print(_table(sequence, len(sequence.observations.ids), {result.mode: result}))
@@ -337,7 +361,8 @@ def _info(options: argparse.Namespace) -> None:
                 for line in result.hygiene.lines(result.config["hygiene"]):
                     print(f"{mode}: hygiene: {line}")
         return
-    sequence = _open(options, options.data)
+    given = Config().with_overrides({"truth": dict(options.truth_noise)})
+    sequence = with_truth_noise(_open(options, options.data), given.truth)
     camera, truth, noise = sequence.camera, sequence.truth, sequence.noise
     tracks = inspect_tracks(sequence.observations, sequence.twist)
     print(f"name          {sequence.name} ({sequence.source})")
@@ -354,6 +379,10 @@ def _info(options: argparse.Namespace) -> None:
         print(f"noise         twist {noise.twist_std} (m/s, rad/s), pixels {noise.pixel_std_px} px")
     known = "none" if truth is None else f"{len(truth.frame)} poses, {len(truth.landmark)} landmarks"
     print(f"truth         {known}")
+    if truth is not None:
+        print(f"truth noise   {'none stated: taken as exact' if truth.noise is None else truth.noise.text}")
+    gaps = ", ".join(f"{begin} to {end}" for begin, end in stretches(sequence.interpolated))
+    print(f"gaps          {f'intervals {gaps} are interpolated' if gaps else 'none'}")
     for key, value in sequence.attributes.items():
         print(f"{key:13s} {value}")
     for note in sequence.notes:
@@ -381,7 +410,7 @@ def _plot(options: argparse.Namespace) -> None:
     archive = read_archive(options.archive)
     directory = options.out or options.archive.parent
     directory.mkdir(parents=True, exist_ok=True)
-    for path in save_figures(directory, archive.results, archive.truth):
+    for path in save_figures(directory, archive.results, archive.truth, archive.interpolated):
         print(path)
 
 

@@ -172,6 +172,8 @@ class FilterConfig:
             when it moves along with the rig. Over all its observations it must do so by more than this share of the
             way, and by more than this many standard deviations (without their `Noise.margin`).
         min_depth_m: Observations of a landmark predicted nearer than this (or behind) are rejected.
+        relative_frames: Where truth is known, cross-covariances of reported poses up to so many frames apart are
+            kept, for the NEES of relative poses; 0 keeps none. Estimates do not depend on it.
         initial_position_std_m: Standard deviation of the first pose's translation, each axis.
         initial_rotation_std_rad: Standard deviation of the first pose's rotation, each axis.
     """
@@ -186,6 +188,7 @@ class FilterConfig:
     moving_sigma: float = field(default=1.5, metadata=_NOT_NEGATIVE)
     moving_share: float = field(default=0.1, metadata=_NOT_NEGATIVE)
     min_depth_m: float = field(default=0.1, metadata=_FINITE)
+    relative_frames: int = field(default=100, metadata=_whole(0))
     initial_position_std_m: float = field(default=0.0, metadata=_FINITE)
     initial_rotation_std_rad: float = field(default=0.0, metadata=_FINITE)
 
@@ -242,6 +245,29 @@ class PosteriorConfig:
 
 
 @dataclass(frozen=True)
+class TruthConfig:
+    """How far the true poses may be wrong, as standard deviations; None takes what their format states, if anything.
+
+    Only the evaluation uses it, see `ekfslam.data.truth_noise.TruthNoise`.
+
+    Args:
+        roll_deg, pitch_deg, yaw_deg: Attitude of the first pose, about the axes of the IMU.
+        first_position_m: Position of the first pose, each axis.
+        stamp_s: Jitter of the stamps.
+        position_m: Position of each pose, each axis.
+        attitude_deg: Attitude of each pose, each axis.
+    """
+
+    roll_deg: float | None = field(default=None, metadata=_FINITE)
+    pitch_deg: float | None = field(default=None, metadata=_FINITE)
+    yaw_deg: float | None = field(default=None, metadata=_FINITE)
+    first_position_m: float | None = field(default=None, metadata=_FINITE)
+    stamp_s: float | None = field(default=None, metadata=_FINITE)
+    position_m: float | None = field(default=None, metadata=_FINITE)
+    attitude_deg: float | None = field(default=None, metadata=_FINITE)
+
+
+@dataclass(frozen=True)
 class TuningRecord:
     """Where the noise of a tuned file comes from; it decides nothing, but is kept with every result.
 
@@ -280,7 +306,7 @@ class Config:
     """Everything that decides what a run does besides the data, and the record of what was tuned.
 
     Args:
-        noise, filter, posterior, calibration, hygiene, tuning: The tables of a file.
+        noise, filter, posterior, calibration, hygiene, truth, tuning: The tables of a file.
         blocks: Name of an optional state block to its settings, ``[blocks.<name>]`` in a file. Here they are only
             plain values; `ekfslam.models.build` knows the blocks and what can be set of them.
 
@@ -293,6 +319,7 @@ class Config:
     posterior: PosteriorConfig = field(default_factory=PosteriorConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     hygiene: HygieneConfig = field(default_factory=HygieneConfig)
+    truth: TruthConfig = field(default_factory=TruthConfig)
     tuning: TuningRecord = field(default_factory=TuningRecord)
     blocks: Mapping[str, Mapping[str, BlockSetting]] = field(default_factory=dict, hash=False)
 

@@ -15,6 +15,7 @@ from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import IllPosedError
 from ekfslam.evaluation.summary import compare_table, summarise
+from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.posterior import plot_map_before_and_after
 from ekfslam.figures.run import save_figure, save_figures
 from ekfslam.figures.study import save_study_figures
@@ -63,7 +64,7 @@ class Comparison:
         _write_json(summary, self.summary)
         notes = "".join(f"- {note}\n" for note in self.sequence.notes)
         table.write_text(self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""), encoding="utf-8")
-        figures = save_figures(directory, self.results, self.sequence.truth)
+        figures = save_figures(directory, self.results, self.sequence.truth, self.sequence.interpolated)
         if "full" in self.results and "smoothed" in self.results:
             figures.append(directory / "map_before_and_after.png")
             drawn = plot_map_before_and_after(self.results["full"], self.results["smoothed"], self.sequence.truth)
@@ -80,6 +81,8 @@ def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | 
     """
     results: dict[str, Result] = {}
     skipped: dict[str, str] = {}
+    if config is not None:
+        sequence = with_truth_noise(sequence, config.truth)
     for mode in modes:
         # The filter that "smoothed" starts from need not run twice.
         known = mode == "smoothed" and "full" in results

@@ -14,10 +14,12 @@ import scipy
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError
+from ekfslam.evaluation.relative import dead_reckoned_pairs, relative_pairs
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import FurtherVelocities, one_thread, run_filter
 from ekfslam.filters.mapping import IndependentLandmarks
+from ekfslam.filters.references import References
 from ekfslam.filters.reports import collect
 from ekfslam.filters.result import Innovation, Landmarks, Rejections, Result
 from ekfslam.geometry import se3
@@ -54,7 +56,9 @@ def run(
     frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
     counts: dict[str, int] = {}
     reports, landmarks = [], Landmarks.empty()
-    log = parameters = None
+    log = parameters = pairs = None
+    reach = config.filter.relative_frames
+    judged = relative_pairs(sequence.truth, reach) if sequence.truth is not None and reach else None
 
     with one_thread():
         if mode == "full":
@@ -62,13 +66,19 @@ def run(
             ekf = JointEKF(model, config.filter, revival=revival)
             T_imu_world, covariance = np.empty((len(sequence), 4, 4)), np.empty((len(sequence), 6, 6))
             ms = np.empty(len(sequence))
+            references = None if judged is None else References(ekf, *judged)
             for k, report, ms[k] in run_filter(ekf, sequence, frames, further):
                 T_imu_world[k], covariance[k] = ekf.T_imu_world, ekf.P[:6, :6]
                 reports.append(report)
+                if references is not None:
+                    references.record(k)
+            pairs = None if references is None else references.pairs()
             landmarks, counts, log, parameters = ekf.landmarks(), ekf.counts, ekf.log(), ekf.parameters()
         else:
             begin = perf_counter()
             T_imu_world, covariance = dead_reckon(sequence, model.noise, config.filter.initial_covariance)
+            if judged is not None:
+                pairs = dead_reckoned_pairs(*judged, se3.inverse(T_imu_world), covariance)
             # Dead reckoning is computed for all frames at once; each frame bears its share.
             ms = np.full(len(sequence), 1e3 * (perf_counter() - begin) / len(sequence))
             if mode == "mapping-only":
@@ -103,6 +113,7 @@ def run(
         log=log,
         hygiene=hygiene,
         parameters=parameters,
+        pairs=pairs,
         attributes={**sequence.attributes, **account, **versions()},
     )
 

@@ -33,7 +33,7 @@ from matplotlib.figure import Figure
 
 import ekfslam
 from ekfslam.data.sequence import Sequence
-from ekfslam.evaluation.consistency import pose_nees
+from ekfslam.evaluation.consistency import measured_truth, pose_nees
 from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.figures.style import ORANGE, REFERENCE, marker_of, styled
 from ekfslam.filters.result import Result
@@ -107,7 +107,7 @@ def statistics(sequence: Sequence, result: Result) -> dict[str, float]:
         "cuts": float(cut - counts["dropped by hygiene"]),
         "moving tracks": float(counts.get("moving", 0)),
         "nis_per_dof": float(innovation.nis.sum() / max(innovation.dof.sum(), 1)),
-        "pose_nees": float(np.nanmean(pose_nees(result, truth_of(sequence))[1])),
+        "pose_nees": float(np.nanmean(pose_nees(result, measured_truth(truth_of(sequence), sequence.interpolated))[1])),
     }
 
 

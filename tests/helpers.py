@@ -12,6 +12,7 @@ import numpy as np
 
 from ekfslam.config import Config
 from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.evaluation.relative import dead_reckoned_pairs, relative_pairs
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.filters.result import REASONS, Innovation, Landmarks, Rejections, Result
@@ -64,6 +65,7 @@ def synthetic_result(sequence: Sequence, mode: str = "full", seed: int = 1) -> R
         F = motion.error_jacobian(motion.increment(sequence.twist[k], STEP_S))
         covariance[k] = F @ covariance[k - 1] @ F.T + motion.process_noise(sequence.twist[k], STEP_S, NOISE.twist_std)
     scale = FULL_SCALE if mode == "full" else 1.0
+    pairs = dead_reckoned_pairs(*relative_pairs(truth, 100), truth.T_world_imu, scale**2 * covariance)
     xi = scale * se3.log(se3.inverse(truth.T_world_imu) @ T_est)
     zeros = np.zeros(frames, dtype=np.int64)
     blank = Innovation(np.zeros(frames), zeros, zeros, zeros)
@@ -83,6 +85,7 @@ def synthetic_result(sequence: Sequence, mode: str = "full", seed: int = 1) -> R
         noise=NOISE,
         camera=sequence.camera,
         T_cam_imu=sequence.T_cam_imu,
+        pairs=pairs,
         attributes={**sequence.attributes, "version_ekfslam": "0.1.0"},
     )
     if mode == "dead-reckoning":

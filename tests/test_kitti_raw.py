@@ -89,7 +89,9 @@ def packets() -> np.ndarray:
         "alt": T[:, 2, 3],
     }
     fields |= {"roll": roll, "pitch": pitch, "yaw": yaw}
-    fields |= dict(zip(("vf", "vl", "vu", "wf", "wl", "wu"), (*level[0], *level[1]), strict=True))
+    forward, left, up = level[0]
+    # The unit writes its lateral velocity positive to the right.
+    fields |= dict(zip(("vf", "vl", "vu", "wf", "wl", "wu"), (forward, -left, up, *level[1]), strict=True))
     return np.column_stack(list(fields.values()))
 
 
@@ -125,6 +127,31 @@ def drive(tmp_path) -> Path:
 # What the reader makes of a drive
 
 
+# From the first packet of 2011_09_26_drive_0001: yaw counts from east, leftward to the north.
+PUBLISHED = {
+    "yaw": -1.2219096732051,
+    "vn": -3.3256321640686,
+    "ve": 1.1384311814592,
+    "vf": 3.5147680214713,
+    "vl": 0.037625160413037,
+}
+
+
+def test_the_published_packet_goes_to_the_right_as_its_north_and_east_velocities_say(drive):
+    packet = packets()[0]
+    for name, value in {**PUBLISHED, "roll": 0.0, "pitch": 0.0}.items():
+        packet[PACKET_FIELDS.index(name)] = value
+    (drive / "oxts/data/0000000000.txt").write_text(" ".join(repr(float(x)) for x in packet) + "\n")
+    sine, cosine = np.sin(PUBLISHED["yaw"]), np.cos(PUBLISHED["yaw"])
+    forward = cosine * PUBLISHED["ve"] + sine * PUBLISHED["vn"]
+    left = -sine * PUBLISHED["ve"] + cosine * PUBLISHED["vn"]
+    corrected, stored = (open_sequence(drive, lateral=how).twist[0] for how in ("corrected", "as-stored"))
+    assert corrected[0] == pytest.approx(forward, abs=1e-3)
+    assert left == pytest.approx(-0.067, abs=5e-4)
+    assert abs(corrected[1] - left) < 0.04 < 0.1 < abs(stored[1] - left)
+    np.testing.assert_array_equal(corrected, stored * [1, -1, 1, 1, 1, 1])
+
+
 def test_dead_reckoning_on_the_read_velocities_reproduces_the_read_truth(drive):
     sequence = open_sequence(drive)
     stamp_ns, twist, T = trajectory()
@@ -149,12 +176,24 @@ def test_level_velocities_are_turned_by_roll_and_pitch_with_the_signs_of_the_for
     hand_made(drive, 1, pitch=0.1, vf=10.0, wu=1.0)
     # Positive roll is left side up, so what rises moves towards its own left.
     hand_made(drive, 2, roll=0.1, vu=2.0, wf=0.3)
-    hand_made(drive, 3, yaw=1.0, vf=10.0, vl=1.0)
+    hand_made(drive, 3, yaw=1.0, vf=10.0, vl=-1.0)  # stored to the right
     twist = open_sequence(drive).twist
     s, c = np.sin(0.1), np.cos(0.1)
     np.testing.assert_allclose(twist[1], [10 * c, 0, 10 * s, -s, 0, c], atol=1e-12)
     np.testing.assert_allclose(twist[2], [0, 2 * s, 2 * c, 0.3, 0, 0], atol=1e-12)
     np.testing.assert_allclose(twist[3], [10, 1, 0, 0, 0, 0], atol=1e-12)
+
+
+def test_a_line_that_the_unit_drew_across_a_gap_is_named_although_roll_and_pitch_turn_it(drive):
+    whole = packets()
+    share = np.linspace(0, 1, 13)[:, None]
+    whole[20:33] = (1 - share) * whole[20] + share * whole[32]
+    for k in range(20, 33):
+        (drive / f"oxts/data/{k:010d}.txt").write_text(" ".join(repr(float(x)) for x in whole[k]) + "\n")
+    sequence = open_sequence(drive)
+    assert sequence.attributes["interpolated"] == "21-32"
+    np.testing.assert_array_equal(np.flatnonzero(sequence.interpolated), np.arange(21, 33))
+    assert sum("intervals 21 to 32 are interpolated" in note for note in sequence.notes) == 1
 
 
 def test_position_is_metric_east_north_up_and_yaw_counts_from_east(drive):

@@ -50,6 +50,9 @@ SUMMARY_KEYS = {
     "rejected",
     "nis_per_dof",
     "pose_nees_mean",
+    "pose_nees_with_truth_noise_mean",
+    *(f"pose_nees_{axis}_mean" for axis in ("x", "y", "z", "roll", "pitch", "yaw")),
+    *(f"pose_nees_relative_{stretch}_mean" for stretch in ("10", "50", "100", "50_m", "100_m")),
     "landmark_rmse_m",
 }
 
@@ -323,7 +326,9 @@ def test_summary_has_exactly_its_keys_in_plain_numbers():
     result = synthetic_result(sequence)
     summary = summarise(sequence, result)
     assert set(summary) == SUMMARY_KEYS
-    assert all(type(value) in (int, float) for value in summary.values())
+    # The road has no 100 m within the 100 frames that a pair may be apart.
+    assert {key for key, value in summary.items() if value is None} == {"pose_nees_relative_100_m_mean"}
+    assert all(type(value) in (int, float) for value in summary.values() if value is not None)
     assert json.loads(json.dumps(summary)) == summary
     assert summary["nis_per_dof"] == pytest.approx(1.0, abs=0.05)
     assert summary["landmark_rmse_m"] == landmark_rmse(result.landmarks, sequence.truth)
@@ -356,7 +361,7 @@ def test_summary_without_truth_leaves_errors_undefined():
         "rpe_10_m_deg",
         "t_rel_percent",
         "r_rel_deg_per_100m",
-        "pose_nees_mean",
+        *(key for key in SUMMARY_KEYS if key.startswith("pose_nees")),
         "landmark_rmse_m",
     }
 

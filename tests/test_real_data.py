@@ -7,8 +7,9 @@ import pytest
 
 from ekfslam import open_sequence, run
 from ekfslam.evaluation.trajectory import absolute_trajectory_error
+from ekfslam.geometry import se3
 
-pytestmark = [pytest.mark.data, pytest.mark.slow]
+pytestmark = pytest.mark.data
 
 UTIAS = (
     "09_26_drive_0001",
@@ -24,13 +25,28 @@ ODOMETRY = {"0020": "06", "0027": "07", "0042": "01", "0027_dense_noisy": "07"}
 
 @pytest.fixture
 def opened(data_path):
-    def open_(name):
+    def open_(name, **arguments):
         if name in ODOMETRY:
             truth = data_path(f"kitti_odometry_poses/{ODOMETRY[name]}.txt")
-            return open_sequence(data_path(f"ece276a/{name}.npz"), truth=truth)
-        return open_sequence(data_path(f"utias/2011_{name}_sync_KLT.mat"))
+            return open_sequence(data_path(f"ece276a/{name}.npz"), truth=truth, **arguments)
+        return open_sequence(data_path(f"utias/2011_{name}_sync_KLT.mat"), **arguments)
 
     return open_
+
+
+def lateral_slope(sequence):
+    """Slope of the true lateral velocity on the stored one, 10-frame means."""
+    truth = sequence.truth
+    tau = np.diff(sequence.time_s[truth.frame])
+    true = se3.log(se3.inverse(truth.T_world_imu[:-1]) @ truth.T_world_imu[1:])[:, 1] / tau
+    stored = sequence.twist[truth.frame[1:], 1]
+    true, stored = (x[: len(x) // 10 * 10].reshape(-1, 10).mean(axis=1) for x in (true, stored))
+    return np.polyfit(stored, true, 1)[0]
+
+
+@pytest.mark.parametrize("name", [*UTIAS, *ODOMETRY])
+def test_true_lateral_velocity_opposes_the_stored_one_on_every_recording(opened, name):
+    assert lateral_slope(opened(name, lateral="as-stored")) < 0 < lateral_slope(opened(name))
 
 
 def error(sequence, mode, align=False):
@@ -42,6 +58,7 @@ def gain(sequence):
     return error(sequence, "dead-reckoning") / error(sequence, "full")
 
 
+@pytest.mark.slow
 def test_full_slam_gains_on_the_drives_with_dense_tracks(opened):
     gains = [gain(opened(name)) for name in UTIAS]
     assert sum(g > 1 for g in gains) >= 5
@@ -49,11 +66,13 @@ def test_full_slam_gains_on_the_drives_with_dense_tracks(opened):
     assert min(gains) > 1 / 1.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["0020", "0027", "0042"])
 def test_full_slam_never_loses_badly_on_few_tracks(opened, name):
     assert gain(opened(name)) > 1 / 1.15
 
 
+@pytest.mark.slow
 def test_dense_tracks_with_noisy_and_with_clean_velocities(opened):
     noisy = opened("0027_dense_noisy")
     assert error(noisy, "full") <= 6.0
@@ -63,6 +82,7 @@ def test_dense_tracks_with_noisy_and_with_clean_velocities(opened):
         assert error(clean, "full", align) <= error(clean, "dead-reckoning", align)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["09_26_drive_0009", "09_26_drive_0036", "09_30_drive_0027"])
 def test_noise_added_to_the_velocities_is_filtered_out(opened, name):
     clean = opened(name)

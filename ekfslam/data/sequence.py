@@ -14,8 +14,10 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.interpolation import known_intervals
 from ekfslam.data.noise import Noise
+from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import (
     CalibrationError,
     DataError,
@@ -94,12 +96,14 @@ class Truth:
         T_world_imu: (F, 4, 4) true poses.
         landmark: (M,) ids of landmarks with known position (may be empty).
         position_m: (M, 3) their positions in world.
+        noise: How far the poses themselves may be wrong; None: they are exact, or nothing is known of it.
     """
 
     frame: IntArray
     T_world_imu: Array
     landmark: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     position_m: Array = field(default_factory=lambda: np.empty((0, 3)))
+    noise: TruthNoise | None = None
 
     def __post_init__(self) -> None:
         for name, dtype in (("frame", np.int64), ("landmark", np.int64)):
@@ -153,6 +157,11 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    @cached_property
+    def interpolated(self) -> BoolArray:
+        """Which intervals (T,) have velocities, and probably true poses, that were never measured."""
+        return known_intervals(self.attributes, self.twist)
 
     @property
     def initial_T_world_imu(self) -> Array:
@@ -294,6 +303,9 @@ def _validate_truth(truth: Truth, frames: int) -> None:
             field="truth.position_m",
         )
     require_finite(truth.position_m, "truth.position_m")
+    for name, value in vars(truth.noise).items() if truth.noise is not None else ():
+        if not (np.isfinite(value) and value >= 0):
+            raise DataError(f"must be finite and not negative, found {value}", field=f"truth.noise.{name}")
 
 
 def _validate_noise(noise: Noise) -> None:

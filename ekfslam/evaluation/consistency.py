@@ -8,6 +8,7 @@ NEES is correlated over some sixty frames, so that the frames of one run are now
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from dataclasses import dataclass
 
@@ -15,8 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
+from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.evaluation.trajectory import match_landmarks
 from ekfslam.filters.result import Landmarks, Result
 from ekfslam.geometry import se3
@@ -48,10 +50,81 @@ def nees(error: Array, covariance: Array) -> Array:
     return np.where(definite, np.sum(whitened**2, axis=-1), np.nan)
 
 
-def pose_nees(result: Result, truth: Truth) -> tuple[IntArray, Array]:
-    """Frames with true pose (n,) and the pose NEES there (n,), 6 degrees of freedom; NaN where P is singular."""
-    error = pose_error(result.T_world_imu[truth.frame], truth.T_world_imu)
-    return truth.frame, nees(error, result.covariance[truth.frame])
+def measured_truth(truth: Truth, interpolated: BoolArray) -> Truth:
+    """The truth of the frames that no interpolated interval (T,) leads to: of the others nothing should be judged."""
+    kept = ~interpolated[truth.frame]
+    return dataclasses.replace(truth, frame=truth.frame[kept], T_world_imu=truth.T_world_imu[kept])
+
+
+def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Array:
+    """What the error of the first true pose adds to the covariance of later errors: (n, 4, 4) to (n, 6, 6).
+
+    An estimate starts at the first true pose. Where that is wrong by ``e0``, the whole estimate is moved, and with
+    ``T_hat`` the estimated ``T_imu_world``, the first of which comes first,
+
+        xi_k += Ad(T_hat_k T_hat_0^-1) e0,    e0 ~ N(0, P_0).
+    """
+    first = np.array([noise.first_roll_rad, noise.first_pitch_rad, noise.first_yaw_rad])
+    variance = np.concatenate([np.full(3, noise.first_position_m), first]) ** 2
+    A = se3.adjoint(se3.inverse(T_world_imu_est) @ T_world_imu_est[0])
+    return (A * variance) @ np.swapaxes(A, -1, -2)
+
+
+def pose_noise_covariance(noise: TruthNoise, T_world_imu_true: Array, time_s: Array) -> Array:
+    """Covariance of the errors of single true poses, in the coordinates of ``xi``: (n, 4, 4) and (n,) to (n, 6, 6).
+
+    A stamp that is off by dt gives the pose ``exp(-dt u^) T_imu_world`` for the velocities u of the IMU, which are
+    taken from the true poses on both sides. So the covariance is ``stamp^2 u u^T + diag(position^2, attitude^2)``.
+    """
+    white = np.diag(np.repeat([noise.position_m, noise.attitude_rad], 3) ** 2)
+    if len(time_s) < 2:
+        return np.broadcast_to(white, (len(time_s), 6, 6))
+    before, after = np.maximum(np.arange(len(time_s)) - 1, 0), np.minimum(np.arange(len(time_s)) + 1, len(time_s) - 1)
+    step = se3.log(se3.inverse(T_world_imu_true[before]) @ T_world_imu_true[after])
+    jitter = noise.stamp_s * step / (time_s[after] - time_s[before])[:, None]
+    return white + jitter[:, :, None] * jitter[:, None, :]
+
+
+def pose_errors(result: Result, truth: Truth, with_truth_noise: bool) -> tuple[Array, Array]:
+    """Errors ``xi`` (n, 6) at the frames of the truth, and their covariance (n, 6, 6).
+
+    Args:
+        result: The estimate; starts at the first true pose.
+        truth: Its truth.
+        with_truth_noise: Whether the covariance is of estimate *and* truth, whose errors are independent. A truth
+            that states no noise is exact.
+    """
+    frame = truth.frame
+    error = pose_error(result.T_world_imu[frame], truth.T_world_imu)
+    covariance = result.covariance[frame]
+    if with_truth_noise and truth.noise is not None:
+        T_est = np.concatenate([result.T_world_imu[:1], result.T_world_imu[frame]])
+        covariance = covariance + first_pose_error_covariance(truth.noise, T_est)[1:]
+        covariance = covariance + pose_noise_covariance(truth.noise, truth.T_world_imu, result.time_s[frame])
+    return error, covariance
+
+
+def pose_nees(result: Result, truth: Truth, with_truth_noise: bool = False) -> tuple[IntArray, Array]:
+    """Frames with true pose (n,) and the pose NEES there (n,), 6 degrees of freedom; NaN where P is singular.
+
+    By default the truth counts as exact; ``with_truth_noise`` adds its noise to the covariance, see `pose_errors`. Both
+    are of the same frames: those where the estimate's own P is not singular.
+    """
+    values = nees(*pose_errors(result, truth, with_truth_noise=False))
+    if with_truth_noise and truth.noise is not None:
+        values = np.where(np.isnan(values), np.nan, nees(*pose_errors(result, truth, with_truth_noise)))
+    return truth.frame, values
+
+
+def pose_nees_by_axis(result: Result, truth: Truth) -> Array:
+    """Squared errors over their variances (n, 6), truth noise included: 1 expected of each axis of ``xi``.
+
+    NaN where the estimate's own variance is 0. Axes are those of the IMU: position x, y, z, then rotation about them.
+    """
+    error, covariance = pose_errors(result, truth, with_truth_noise=True)
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    is_uncertain = np.diagonal(result.covariance[truth.frame], axis1=-2, axis2=-1) > 0
+    return np.where(is_uncertain, error**2 / np.where(is_uncertain, variance, 1.0), np.nan)
 
 
 def landmark_nees(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, Array]:

@@ -65,7 +65,7 @@ def relative_pose_error_over_path(T_est: Array, T_true: Array, path_m: float) ->
     whose distance from it along the true path comes nearest to ``path_m``, and left out where that differs by more than
     `PATH_TOLERANCE` of it. These are the pairs of ``evo_rpe -d PATH -u m --all_pairs --pairs_from_reference``.
     """
-    distance = _distance_along(T_true)
+    distance = distance_along(T_true)
     after = np.minimum(np.searchsorted(distance, distance + path_m), len(distance) - 1)
     before = np.maximum(after - 1, 0)
     off_after, off_before = (np.abs(distance[end] - distance - path_m) for end in (after, before))
@@ -75,7 +75,7 @@ def relative_pose_error_over_path(T_est: Array, T_true: Array, path_m: float) ->
     return _rms_relative_error(T_est, T_true, np.flatnonzero(fits), end[fits])
 
 
-def _distance_along(T: Array) -> Array:
+def distance_along(T: Array) -> Array:
     """Distance driven in metres from the first pose to each: (n, 4, 4) to (n,)."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1))])
 
@@ -103,7 +103,7 @@ def kitti_segment_errors(T_est: Array, T_true: Array) -> tuple[float, float] | N
     translation and rotation error divided by its nominal length (Geiger et al., *Are we ready for autonomous driving?*,
     CVPR 2012, and its devkit). None if no segment fits, i.e. the path is not longer than 100 m.
     """
-    distance = _distance_along(T_true)
+    distance = distance_along(T_true)
     start, length = np.meshgrid(np.arange(0, len(T_true), KITTI_START_STEP), KITTI_SEGMENT_LENGTHS_M, indexing="ij")
     # The devkit ends a segment at the first pose that lies strictly further than the nominal length.
     end = np.searchsorted(distance, distance[start] + length, side="right")

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.sequence import Truth
-from ekfslam.evaluation.consistency import chi2_bounds, pose_nees, world_axes_covariance
+from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_nees, world_axes_covariance
 from ekfslam.figures.maps import plot_landmark_arrows, plot_map
 from ekfslam.figures.style import BAND_ALPHA, BOUNDS, EXPECTED, PRIOR, ZERO, log_axis, save_all, style_of, styled
 from ekfslam.figures.style import save_figure as save_figure  # one of `save_figures` by itself
@@ -31,11 +31,12 @@ def world_error_covariance(result: Result) -> tuple[Array, Array]:
 
 
 @styled
-def plot_errors(results: Mapping[str, Result], truth: Truth) -> Figure:
+def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolArray | None = None) -> Figure:
     """Estimate minus truth against time, world axes: position (m) and rotation (degrees) with 3-sigma bands.
 
     One column a mode, each on its own scale, so that a small error stays legible beside a large one. Modes that share
-    their trajectory (mapping-only and dead reckoning) share a column.
+    their trajectory (mapping-only and dead reckoning) share a column. NEES is of the frames that no ``interpolated``
+    interval (T,) leads to.
     """
     columns: dict[str, Result] = {}
     for mode, result in results.items():
@@ -64,13 +65,21 @@ def plot_errors(results: Mapping[str, Result], truth: Truth) -> Figure:
             ax.set_ylabel(f"{kind} {'xyz'[i % 3]} [{unit}]")
             ax.margins(x=0.01)
         inside = np.mean(np.abs(errors) <= bands[truth.frame])
-        _, values = pose_nees(result, truth)
-        nees = f", mean NEES {np.nanmean(values):.3g} (6 expected)" if np.isfinite(values).any() else ""
+        nees = _nees_words(result, truth if interpolated is None else measured_truth(truth, interpolated))
         column[0].set_title(f"{title}\n{100 * inside:.1f} % inside {_BAND_SIGMAS:g} sigma{nees}")
         column[-1].set_xlabel("time [s]")
     figure.align_ylabels()
     figure.suptitle(f"{next(iter(results.values())).sequence_name}: estimate minus truth, world axes")
     return figure
+
+
+def _nees_words(result: Result, truth: Truth) -> str:
+    """Mean pose NEES for a title, with truth noise besides where some is stated."""
+    exact, noisy = (pose_nees(result, truth, with_noise)[1] for with_noise in (False, True))
+    if not np.isfinite(exact).any():
+        return ""
+    words = f", mean NEES {np.nanmean(exact):.3g} (6 expected)"
+    return words if truth.noise is None else f"{words}, {np.nanmean(noisy):.3g} with truth noise"
 
 
 @styled
@@ -145,7 +154,12 @@ def plot_parameters(result: Result) -> Figure:
     return figure
 
 
-def save_figures(directory: str | Path, results: Mapping[str, Result], truth: Truth | None = None) -> list[Path]:
+def save_figures(
+    directory: str | Path,
+    results: Mapping[str, Result],
+    truth: Truth | None = None,
+    interpolated: BoolArray | None = None,
+) -> list[Path]:
     """Write the figures that the results allow as PNG into a folder, made if missing; the paths written.
 
     ``map.png`` always, ``errors.png`` with true poses, ``nis.png`` with updates, ``parameters.png`` where more than
@@ -153,7 +167,7 @@ def save_figures(directory: str | Path, results: Mapping[str, Result], truth: Tr
     """
     figures = {"map": plot_map(results, truth)}
     if truth is not None and len(truth.frame):
-        figures["errors"] = plot_errors(results, truth)
+        figures["errors"] = plot_errors(results, truth, interpolated)
     if any(result.innovation.dof.any() for result in results.values()):
         figures["nis"] = plot_nis(results)
     for mode, result in results.items():

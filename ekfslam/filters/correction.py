@@ -180,7 +180,7 @@ def _iterate(
         x, d = e.parts(done.correction)
         after, m = e.retracted(done.correction)
         linear = (
-            e.coordinates + done.correction[: e.gaussian.body],
+            e.coordinates + done.correction[: len(e.coordinates)],
             after["pose"],
             after.get("previous_pose", e.T_departed),
         )

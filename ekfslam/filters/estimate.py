@@ -54,7 +54,8 @@ class Estimate:
     def P(self) -> Array:
         """(b+3n, b+3n) covariance of the blocks, in the columns of ``model.layout``, and of ``(d_1, ..., d_n)``.
 
-        ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``. The pose has the first six columns.
+        ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``. The pose has the first six columns. Columns that are only
+        considered (`ekfslam.filters.references`) stand between blocks and landmarks where a run asks for them.
         """
         return self.gaussian.P
 
@@ -108,8 +109,8 @@ class Estimate:
         Raises:
             KeyError: An id is not active.
         """
-        slot, body = self._slots(ids), np.arange(self.gaussian.body)
-        columns = np.concatenate([body, (len(body) + 3 * slot[:, None] + np.arange(3)).ravel()])
+        slot, body = self._slots(ids), np.arange(self.model.layout.body)
+        columns = np.concatenate([body, (self.gaussian.body + 3 * slot[:, None] + np.arange(3)).ravel()])
         return self.P[np.ix_(columns, columns)]
 
     def measurement_jacobian(self, ids: IntArray) -> sp.csr_array:
@@ -132,7 +133,7 @@ class Estimate:
         """Full-width F (b+3n, b+3n) of a prediction by velocities (6,), identity but for the rows of the body."""
         step = self.model.step(self.values, twist, tau_s, self.linear_T_imu_world, self.variant.first_estimates)
         full = sp.lil_array(sp.identity(len(self.P)))
-        full[: self.gaussian.body, : self.gaussian.body] = step.Phi
+        full[: len(step.Phi), : len(step.Phi)] = step.Phi
         return sp.csr_array(full)
 
     def _slots(self, ids: IntArray) -> IntArray:
@@ -197,5 +198,5 @@ class Estimate:
         """Move the mean, and re-express the covariance where the variant does."""
         before, positions = self.values, self.positions_m
         self.values, self.table.position_m = self.retracted(correction)
-        self.coordinates = self.coordinates + correction[: self.gaussian.body]
+        self.coordinates = self.coordinates + correction[: len(self.coordinates)]
         self.variant.transport(self.gaussian, self.model, before, self.values, self.table.position_m - positions)

@@ -68,19 +68,44 @@ class Gaussian:
     Args:
         body: (body, body) covariance before there are landmarks.
         seen: Leading body columns that observations depend on.
+
+    Attributes:
+        body: Number of columns before those of landmarks.
+        considered: How many of these, at their end, are *considered*: see `consider`.
     """
 
     def __init__(self, body: Array, seen: int) -> None:
         self.P, self.body, self.seen = np.array(body, dtype=float), len(body), seen
+        self.considered = 0
 
     @property
     def body_covariance(self) -> Array:
         """(body, body), a copy."""
         return self.P[: self.body, : self.body].copy()
 
+    def consider(self, columns: int) -> int:
+        """Add columns to the end of the body, certain zeros at first, of what is considered but not estimated.
+
+        Conditioning changes their cross-covariances, and leaves their own covariance and their mean as they are
+        (Schmidt, "Application of state-space methods to navigation problems", 1966).
+
+        Returns:
+            The first of them.
+        """
+        start = self.body
+        self.P = np.insert(np.insert(self.P, [start] * columns, 0.0, axis=0), [start] * columns, 0.0, axis=1)
+        self.body, self.considered = start + columns, self.considered + columns
+        return start
+
+    def clone(self, source: slice, to: slice) -> None:
+        """Considered columns take the place of body columns: from now on they are what these are now."""
+        self.P[to] = self.P[source]
+        self.P[:, to] = self.P[to].T
+        self.P[to, to] = self.P[source, source]
+
     def propagate(self, Phi: Array, Q: Array) -> None:
-        """``P <- F P F^T + Q`` with F = Phi (body, body) on the body and identity on landmarks."""
-        b, P = self.body, self.P
+        """``P <- F P F^T + Q`` with F = Phi (b, b) on the body and identity on what is considered and on landmarks."""
+        b, P = len(Phi), self.P
         P_b = Phi @ P[:b]
         P_bb = P_b[:, :b] @ Phi.T + Q
         P[:b, b:] = P_b[:, b:]
@@ -143,9 +168,9 @@ class Gaussian:
         return done
 
     def condition_body(self, H: Array, residual: Array, variance: Array, frame: int) -> Conditioned:
-        """Eq. (6) for rows H (k, body) that no landmark is in, with residuals and variances (k,)."""
-        HP = H @ self.P[: self.body]
-        S = HP[:, : self.body] @ H.T + np.diag(variance)
+        """Eq. (6) for rows H (k, b) of the body alone, with residuals and variances (k,)."""
+        HP = H @ self.P[: H.shape[1]]
+        S = HP[:, : H.shape[1]] @ H.T + np.diag(variance)
         return self._condition(HP, S, residual, 1.0, frame, np.empty(0, dtype=np.int64))
 
     def correction(self, rows: Rows, frame: int, ids: IntArray) -> Array:
@@ -157,13 +182,22 @@ class Gaussian:
 
     def _condition(self, HP: Array, S: Array, residual: Array, sign: float, frame: int, ids: IntArray) -> Conditioned:
         Y_transposed, whitened, log_det = _whiten(S, HP, residual, frame, ids)
-        add_square(self.P, Y_transposed, -sign)
-        return Conditioned(Y_transposed @ whitened, float(whitened @ whitened), log_det, Y_transposed)
+        self._add_square(Y_transposed, -sign)
+        correction = Y_transposed @ whitened
+        correction[self.body - self.considered : self.body] = 0.0
+        return Conditioned(correction, float(whitened @ whitened), log_det, Y_transposed)
+
+    def _add_square(self, A: Array, sign: float) -> None:
+        """`add_square` on all but the own covariance of what is considered."""
+        at = slice(self.body - self.considered, self.body)
+        own = self.P[at, at].copy()
+        add_square(self.P, A, sign)
+        self.P[at, at] = own
 
     def undo(self, done: Conditioned) -> None:
         """Take back the last conditioning, to rounding."""
         assert done.Y is not None
-        add_square(self.P, done.Y, 1.0)
+        self._add_square(done.Y, 1.0)
 
     def augment(self, G: Array, covariance: Array) -> None:
         """Append landmarks with ``d = G x + w``, eq. (5): G (n, 3, seen), covariance (n, 3, 3) of w."""
@@ -186,8 +220,14 @@ class Gaussian:
         self.P = self.P[kept].take(kept, axis=1)
 
     def replace(self, P: Array) -> None:
-        """Another covariance of the same body and of other landmarks: at a map revival, and when P is put back."""
+        """Another covariance of the same body and of other landmarks: when P is put back."""
         self.P = P
+
+    def start_over(self, P: Array) -> None:
+        """The same at a map revival: P has no columns of what is considered, whose covariance is lost."""
+        columns, self.body, self.P = self.considered, self.body - self.considered, np.ascontiguousarray(P, dtype=float)
+        self.considered = 0
+        self.consider(columns)
 
     def landmark_blocks(self) -> Array:
         """The landmarks' own covariances (n, 3, 3), a view of P that must not be written to."""

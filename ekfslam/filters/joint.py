@@ -225,7 +225,8 @@ class JointEKF(Estimate):
         log, known = self._log.log(), self.landmarks()
         self.retired.fetch(self.table, known, log, ids, self.revival, frame)
         found = self.revival.marginal(log, known.position_m, self.table.log_row)
-        self.values, self.table.position_m, self.P = {**self.values, **found.values}, found.position_m, found.P
+        self.values, self.table.position_m = {**self.values, **found.values}, found.position_m
+        self.gaussian.start_over(found.P)
         self.coordinates[found.columns] = found.coordinates
 
     def landmarks(self) -> Landmarks:

@@ -135,6 +135,32 @@ class Parameters:
 
 
 @dataclass(frozen=True)
+class PosePairs:
+    """How the errors of reported poses hang together.
+
+    Args:
+        first, second: (n,) frames j < k.
+        cross: (n, 6, 6) covariance of ``xi_j`` (rows) and ``xi_k`` as both were reported.
+    """
+
+    first: IntArray
+    second: IntArray
+    cross: Array
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def only(self, which: NDArray[np.bool_]) -> PosePairs:
+        """Some of the pairs."""
+        return PosePairs(self.first[which], self.second[which], self.cross[which])
+
+    @staticmethod
+    def empty() -> PosePairs:
+        none = np.empty(0, dtype=np.int64)
+        return PosePairs(none, none, np.empty((0, 6, 6)))
+
+
+@dataclass(frozen=True)
 class Result:
     """One mode run on one sequence.
 
@@ -156,6 +182,7 @@ class Result:
         log: What the joint filter conditioned on; ``landmarks`` are in its order (full mode only).
         hygiene: What was done to the tracks before (None: nothing, as in dead reckoning).
         parameters: What else was estimated: calibration, roll and pitch (None: nothing).
+        pairs: Cross-covariances of some of the poses (None: there is no truth to judge them by).
         attributes: Sequence attributes, versions, seed, input checksum; ``log_likelihood`` of the innovations of
             what was accepted (runs that reject alike may be compared by it).
     """
@@ -177,4 +204,5 @@ class Result:
     log: Log | None = None
     hygiene: HygieneReport | None = None
     parameters: Parameters | None = None
+    pairs: PosePairs | None = None
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)

@@ -24,7 +24,7 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.config import Config, FilterConfig, PosteriorConfig
 from ekfslam.errors import PosteriorError
 from ekfslam.filters.log import Log
-from ekfslam.filters.result import Innovation, Rejections, Result
+from ekfslam.filters.result import Innovation, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
 from ekfslam.models.build import model_of, optional_blocks
 from ekfslam.models.model import Model
@@ -113,6 +113,15 @@ class Posterior:
         of_poses = (e.width * np.arange(len(frame))[:, None] + np.arange(6)).ravel()
         kept = np.concatenate([of_poses, np.arange(e.width * len(frame), len(P))])
         return P[np.ix_(kept, kept)]
+
+    def pairs(self, first: IntArray, second: IntArray) -> PosePairs:
+        """Cross-covariances of pairs of smoothed poses, given by the frames (n,) of each."""
+        cross = np.empty((len(first), 6, 6))
+        for j in np.unique(first):
+            own = np.flatnonzero(first == j)
+            P = self.joint_covariance([j, *second[own]])
+            cross[own] = P[:6, 6:].reshape(6, len(own), 6).swapaxes(0, 1)
+        return PosePairs(first, second, cross)
 
     def dense_covariance(self, frames: ArrayLike = (-1,)) -> Array:
         """Covariance of some poses (by default the last: the state of the EKF) and of all landmarks, in their order.
@@ -239,6 +248,7 @@ def smooth(result: Result, config: PosteriorConfig | None = None, found: Posteri
     found = found or posterior(result, config)
     T, landmarks = len(result.time_s), result.landmarks
     covariance, landmark_covariance = found.pose_covariance, found.landmark_covariance
+    pairs = None if result.pairs is None else found.pairs(result.pairs.first, result.pairs.second)
     seconds = perf_counter() - begin
     settings = dict(result.config)
     if config is not None:
@@ -259,6 +269,7 @@ def smooth(result: Result, config: PosteriorConfig | None = None, found: Posteri
         },
         config=settings,
         log=None,
+        pairs=pairs,
     )
 
 

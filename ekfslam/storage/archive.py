@@ -10,6 +10,7 @@
         innovation          nis, dof, accepted, rejected
         rejections          frame, landmark, reason (index into its attribute ``names``)
         parameters          value, std, prior_std; attributes name, unit; see `ekfslam.filters.result.Parameters`
+        pairs               first, second, cross: see `ekfslam.filters.result.PosePairs` (where truth is known)
         hygiene             rule (index into its attribute ``names``), frame, landmark, continuation: see
                             `ekfslam.data.hygiene.HygieneReport`; attribute observations (not in dead reckoning)
         timing              ms_per_frame
@@ -25,6 +26,7 @@ import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,9 +35,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ekfslam import hdf5
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import HygieneConfig
 from ekfslam.data.hygiene import RULES, HygieneReport
+from ekfslam.data.interpolation import known_intervals
 from ekfslam.data.readers.hdf5 import (
     noise_attributes,
     noise_of_attributes,
@@ -52,6 +55,7 @@ from ekfslam.filters.result import (
     Innovation,
     Landmarks,
     Parameters,
+    PosePairs,
     Rejections,
     Result,
 )
@@ -126,6 +130,13 @@ _PARAMETERS_LAYOUT: hdf5.Layout = (
     ("prior_std", "prior_std", ("P",), "see attribute unit of the group", "imu"),
 )
 
+# The same below /runs/<mode>/pairs, fields of `PosePairs` (N of them).
+_PAIRS_LAYOUT: hdf5.Layout = (
+    ("first", "first", ("N",), "frame index", "none"),
+    ("second", "second", ("N",), "frame index", "none"),
+    ("cross", "cross", ("N", 6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu of first, imu of second"),
+)
+
 # The same below /runs/<mode>/hygiene, fields of `HygieneReport` (N findings).
 _HYGIENE_LAYOUT: hdf5.Layout = (
     ("rule", "rule", ("N",), "code, see names", "none"),
@@ -143,6 +154,7 @@ class Archive:
         name, source, time_s, twist, camera, T_cam_imu, truth, noise, velocity_frame, notes, attributes: As in
             `Sequence`.
         results: Mode to result, in the order of writing.
+        interpolated: As in `Sequence`.
     """
 
     name: str
@@ -157,6 +169,10 @@ class Archive:
     notes: tuple[str, ...]
     attributes: Mapping[str, str | int | float]
     results: Mapping[str, Result]
+
+    @cached_property
+    def interpolated(self) -> BoolArray:
+        return known_intervals(self.attributes, self.twist)
 
 
 def write_archive(path: str | Path, sequence: Sequence, results: Mapping[str, Result]) -> None:
@@ -296,6 +312,8 @@ def _write_result(group: h5py.Group, result: Result) -> None:
         parameters = group.create_group("parameters")
         hdf5.write_attributes(parameters, {"name": result.parameters.name, "unit": result.parameters.unit})
         hdf5.write_fields(parameters, _PARAMETERS_LAYOUT, result.parameters)
+    if result.pairs is not None:
+        hdf5.write_fields(group.create_group("pairs"), _PAIRS_LAYOUT, result.pairs)
     if result.hygiene is not None:
         hygiene = group.create_group("hygiene")
         hdf5.write_attributes(hygiene, {"observations": result.hygiene.observations})
@@ -342,6 +360,7 @@ def _read_result(h5file: h5py.File, mode: str, camera: StereoCamera, T_cam_imu: 
         log=_read_log(hdf5.subgroup(group, "log"), sizes, version) if "log" in group else None,
         hygiene=_read_hygiene(hdf5.subgroup(group, "hygiene")) if "hygiene" in group else None,
         parameters=_read_parameters(hdf5.subgroup(group, "parameters"), sizes) if "parameters" in group else None,
+        pairs=_read_pairs(hdf5.subgroup(group, "pairs"), sizes["T"]) if "pairs" in group else None,
         attributes=hdf5.attributes(hdf5.subgroup(group, "attributes")),
     )
 
@@ -362,6 +381,13 @@ def _read_parameters(group: h5py.Group, sizes: Mapping[str, int]) -> Parameters:
             f"{len(found['prior_std'])} parameters"
         )
     return Parameters(names, units, **found)
+
+
+def _read_pairs(group: h5py.Group, frames: int) -> PosePairs:
+    pairs = PosePairs(**hdf5.read_fields(group, _PAIRS_LAYOUT))
+    if not ((pairs.first >= 0) & (pairs.first < pairs.second) & (pairs.second < frames)).all():
+        raise ArchiveError(f"{group.file.filename}: {group.name.strip('/')} holds frames that are no pair of {frames}")
+    return pairs
 
 
 def _read_hygiene(group: h5py.Group) -> HygieneReport:

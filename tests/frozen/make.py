@@ -132,7 +132,8 @@ def of_world(name: str) -> Frozen:
 
 
 def of_recording(name: str, path: Path) -> Frozen:
-    return _joined(name, of_runs(open_sequence(path), {}, numbers=False))
+    # As stored, as it was when these were frozen.
+    return _joined(name, of_runs(open_sequence(path, lateral="as-stored"), {}, numbers=False))
 
 
 def of_starry_night(path: Path) -> Frozen:

@@ -18,7 +18,7 @@ from typing import get_args
 
 from ekfslam.data.readers.hdf5 import read_sequence, write_sequence
 from ekfslam.data.readers.kitti_raw import KittiRaw, open_kitti_raw
-from ekfslam.data.readers.registry import Extrinsics, Reader, Source, discovered, listed
+from ekfslam.data.readers.registry import Extrinsics, Lateral, Reader, Source, discovered, listed
 from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.readers.truth import attach_truth
 from ekfslam.data.sequence import Sequence
@@ -28,7 +28,11 @@ __all__ = ["BUILTIN", "KittiRaw", "open_kitti_raw", "open_sequence", "read_seque
 
 
 def open_sequence(
-    source: str | Path, *, extrinsics: Extrinsics = "corrected", truth: str | Path | None = None
+    source: str | Path,
+    *,
+    extrinsics: Extrinsics = "corrected",
+    lateral: Lateral = "corrected",
+    truth: str | Path | None = None,
 ) -> Sequence:
     """The recording in a file or folder, or the built-in world ``builtin:NAME``.
 
@@ -37,19 +41,25 @@ def open_sequence(
             `open_kitti_raw` takes tracks from elsewhere.
         extrinsics: How to take ``cam_T_imu`` of an .npz recording, see `read_ece276a`; other formats store
             ``T_cam_imu`` unambiguously and know only ``corrected``.
+        lateral: How to take the lateral velocity of KITTI (.npz, .mat, a drive folder), which is stored with the wrong
+            sign, see `with_lateral`; others know only ``corrected``. The attribute ``lateral`` says what was done.
         truth: File or folder of true poses (see `attach_truth`) to use instead of the recording's own truth.
 
     Raises:
         UnknownFormatError: The file is missing, empty, damaged or of unknown content, or there is no such world.
-        ConfigError: The recording's format does not know ``extrinsics``.
+        ConfigError: The recording's format does not know ``extrinsics`` or ``lateral``.
         ArchiveError: A newer release wrote the file.
         DataError: A field is missing or malformed; the subclass says how.
     """
-    if extrinsics not in get_args(Extrinsics):
-        raise ConfigError(f"extrinsics must be one of {', '.join(get_args(Extrinsics))}, found {extrinsics!r}")
-    sequence = _open(Source.at(source, extrinsics))
-    if extrinsics != sequence.attributes.get("extrinsics", "corrected"):
-        raise ConfigError(f"{source}: extrinsics {extrinsics!r} apply to .npz recordings only")
+    choices = {"extrinsics": (extrinsics, Extrinsics), "lateral": (lateral, Lateral)}
+    for name, (choice, known) in choices.items():
+        if choice not in get_args(known):
+            raise ConfigError(f"{name} must be one of {', '.join(get_args(known))}, found {choice!r}")
+    sequence = _open(Source.at(source, extrinsics, lateral))
+    for name, (choice, _) in choices.items():
+        # A file of our own has been through a reader before: what was chosen then stands.
+        if choice != "corrected" and choice != sequence.attributes.get(name):
+            raise ConfigError(f"{source}: {name} {choice!r} mean nothing for this format")
     return sequence if truth is None else attach_truth(sequence, Path(truth))
 
 

@@ -8,8 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.data.readers.fields import checksum, flat_observations, require_numbers, spelled_as_in
-from ekfslam.data.readers.registry import Extrinsics, Reader
+from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
+from ekfslam.data.readers.fields import (
+    LATERAL_NOTES,
+    checksum,
+    flat_observations,
+    require_numbers,
+    spelled_as_in,
+    with_lateral,
+)
+from ekfslam.data.readers.registry import Extrinsics, Lateral, Reader
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, validate_camera
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import CalibrationError, UnknownFormatError
@@ -28,13 +36,14 @@ _EXTRINSICS_NOTES: dict[Extrinsics, str] = {
 }
 
 
-def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected") -> Sequence:
+def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Lateral = "corrected") -> Sequence:
     """Read ``features`` (4 x M x T, -1 where unseen), velocities (3 x T), stamps (1 x T), ``K``, ``b``, ``cam_T_imu``.
 
     Args:
         path: The .npz file.
         extrinsics: ``corrected`` takes ``T_cam_imu = [R, -R t]`` from the stored rotation and translation;
             ``as-stored`` takes the stored matrix, which reproduces the report.
+        lateral: Sign of the lateral velocity, see `with_lateral`; ``as-stored`` reproduces the report.
 
     Raises:
         UnknownFormatError: The file is damaged, or an .npz of other content.
@@ -48,6 +57,7 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected") -> Sequence:
         twist = np.concatenate(
             [require_numbers(fields, name, (3, frames)) for name in ("linear_velocity", "rotational_velocity")]
         ).T
+        twist = with_lateral(twist, lateral)
         camera = _camera(require_numbers(fields, "K", (3, 3)), float(require_numbers(fields, "b", ())))
         stored = require_numbers(fields, "cam_T_imu", (4, 4))
         observations = flat_observations(
@@ -62,8 +72,20 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected") -> Sequence:
             T_cam_imu=stored if extrinsics == "as-stored" else _with_camera_position(stored),
             observations=observations,
             velocity_frame="level",
-            notes=(_EXTRINSICS_NOTES[extrinsics], LEVEL_VELOCITIES_NOTE, *inspect_tracks(observations, twist).notes),
-            attributes={"checksum_sha256": checksum(path), "reader": READER.name, "extrinsics": extrinsics},
+            notes=(
+                _EXTRINSICS_NOTES[extrinsics],
+                LEVEL_VELOCITIES_NOTE,
+                LATERAL_NOTES[lateral],
+                *interpolation_notes(twist),
+                *inspect_tracks(observations, twist).notes,
+            ),
+            attributes={
+                "checksum_sha256": checksum(path),
+                "reader": READER.name,
+                "extrinsics": extrinsics,
+                "lateral": lateral,
+                **interpolation_attributes(twist),
+            },
         )
 
 
@@ -108,5 +130,5 @@ READER = Reader(
     "ece276a",
     "an .npz recording (ECE 276A)",
     lambda source: source.head.startswith(b"PK\x03\x04"),
-    lambda source: read_ece276a(source.path, source.extrinsics),
+    lambda source: read_ece276a(source.path, source.extrinsics, source.lateral),
 )

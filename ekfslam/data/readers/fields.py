@@ -12,9 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
+from ekfslam.data.readers.registry import Lateral
 from ekfslam.data.sequence import Observations, require_finite, require_shape
 from ekfslam.errors import DataError, EmptyTracksError, ShapeError
 
+LATERAL_NOTES: dict[Lateral, str] = {
+    "corrected": (
+        "The lateral velocity is stored positive to the right, against the description of its format: it is negated."
+    ),
+    "as-stored": "The lateral velocity is used as stored, although it is positive to the right.",
+}
 UNSEEN = -1.0  # what the dense formats write into all four pixels of a track that a frame does not see
 
 
@@ -95,3 +102,14 @@ def flat_observations(dense: Array, frame_axis: int, field: str) -> Observations
     first, second = np.nonzero(seen)
     frame, landmark = (first, second) if frame_axis == 1 else (second, first)
     return Observations(frame, landmark, dense[:, first, second].T)
+
+
+def with_lateral(level_twist: Array, lateral: Lateral) -> Array:
+    """Level velocities (..., 6) of KITTI with the lateral one to the left: ``corrected`` negates it.
+
+    The data format calls ``vl`` leftward, but on every drive it opposes the true lateral velocity, and already the
+    first packet of 2011_09_26_drive_0001 contradicts its own velocity north and east. All other signs are right.
+    """
+    if lateral == "as-stored":
+        return level_twist
+    return level_twist * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])

@@ -6,7 +6,7 @@
         attributes      the further facts, as attributes
         observations    frame (K,), landmark (K,), pixels (K, 4)
         noise           twist_std (6,), pixel_std (4,), the rest of `Noise` as attributes; only if noise is stated
-    /truth              frame (F,), T_world_imu (F, 4, 4); only if there is truth
+    /truth              frame (F,), T_world_imu (F, 4, 4), `TruthNoise` as attributes if any; only if there is truth
         landmarks       id (M,), position (M, 3)
 
 See `ekfslam.hdf5` for what all files have in common.
@@ -26,6 +26,7 @@ from ekfslam import hdf5
 from ekfslam.data.noise import Noise
 from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
 from ekfslam.data.sequence import Observations, Sequence, Truth
+from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import ArchiveError, ShapeError, UnknownFormatError
 from ekfslam.geometry.camera import StereoCamera
 
@@ -58,6 +59,7 @@ _TRUTH: hdf5.Layout = (
 _NOTES: hdf5.Layout = (("sequence/notes", "notes", ("n",), "text", "none"),)
 _CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
 _OLD_NOISE = ("drift", "bearing_drift_rad")  # walks of landmarks, before errors of tracks walked in the image
+_TRUTH_NOISE = "noise_"  # before the names of attributes
 _NOISE_FIELDS = tuple(field for _, field, *_ in _NOISE)
 
 _PARTS = {"": _SEQUENCE, "observations.": _OBSERVATIONS, "noise.": _NOISE, "truth.": _TRUTH}
@@ -162,6 +164,10 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
 def write_truth_group(h5file: h5py.Group, truth: Truth) -> None:
     """Write ``/truth`` below an open file or group."""
     hdf5.write_fields(h5file, _TRUTH, truth, compact=True)
+    if truth.noise is not None:
+        hdf5.write_attributes(
+            h5file["truth"], {_TRUTH_NOISE + name: value for name, value in vars(truth.noise).items()}
+        )
 
 
 def read_truth_group(h5file: h5py.Group, source: str) -> Truth:
@@ -171,7 +177,12 @@ def read_truth_group(h5file: h5py.Group, source: str) -> Truth:
         DataError: A field is missing or malformed; the subclass says how.
     """
     with spelled_as_in(source):
-        return Truth(**_read(h5file, _TRUTH))
+        found, stored = _read(h5file, _TRUTH), _attributes(h5file, "truth")
+        noise = {f.name: stored[_TRUTH_NOISE + f.name] for f in fields(TruthNoise) if _TRUTH_NOISE + f.name in stored}
+        for name, value in noise.items():
+            if not isinstance(value, int | float):
+                raise ShapeError("this attribute is no number", field=f"truth@{_TRUTH_NOISE}{name}")
+        return Truth(**found, noise=TruthNoise(**noise) if noise else None)
 
 
 def noise_attributes(noise: Noise, prefix: str = "") -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from ekfslam.data.readers.registry import Poses, TruthReader
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
 from ekfslam.data.sequence import Sequence, require_rigid
+from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import TruthError
 from ekfslam.geometry import se3
 
@@ -18,6 +19,7 @@ def read_kitti_odometry(path: Path, sequence: Sequence) -> Poses:
     """3x4 matrices: row i is ``T_cam0_cam`` of frame i, the pose of the left camera in its first frame.
 
     ``T_world_imu = T_imu_cam T_cam0_cam T_cam_imu`` with the sequence's extrinsics, so the first pose is the identity.
+    They are from the GPS/INS unit of KITTI, so their noise is `KITTI_TRUTH_NOISE`.
 
     Raises:
         UnknownFormatError: The file is not text.
@@ -32,7 +34,8 @@ def read_kitti_odometry(path: Path, sequence: Sequence) -> Poses:
     except TruthError as error:
         assert isinstance(error.index, int)
         raise TruthError(error.message, **table.where(error.index)) from None
-    return Poses(se3.inverse(sequence.T_cam_imu) @ T_cam0_cam @ sequence.T_cam_imu, None, (path,))
+    T_world_imu = se3.inverse(sequence.T_cam_imu) @ T_cam0_cam @ sequence.T_cam_imu
+    return Poses(T_world_imu, None, (path,), KITTI_TRUTH_NOISE)
 
 
 def _recognises(path: Path) -> bool:

@@ -23,11 +23,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.data.readers.fields import checksum, spelled_as_in
-from ekfslam.data.readers.registry import Poses, Reader, TruthReader
+from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
+from ekfslam.data.readers.fields import LATERAL_NOTES, checksum, spelled_as_in, with_lateral
+from ekfslam.data.readers.registry import Lateral, Poses, Reader, TruthReader
 from ekfslam.data.readers.text import line_of, parse_numbers, parse_table, read_lines
 from ekfslam.data.sequence import WITHOUT_TRACKS, Observations, Sequence, Truth, require_rigid, validate_camera
 from ekfslam.data.tracks import inspect_tracks
+from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import (
     CalibrationError,
     ConfigError,
@@ -77,6 +79,7 @@ class Oxts:
         twist: (T, 6) velocities ``[v; w]`` in the IMU frame.
         truth: ``T_world_imu`` of every frame that has a packet; the world is the IMU frame of the first.
         notes: What was repaired, one sentence each.
+        attributes: Which intervals are interpolated, where any are.
         files: The files that were read.
     """
 
@@ -84,6 +87,7 @@ class Oxts:
     twist: Array
     truth: Truth
     notes: tuple[str, ...]
+    attributes: dict[str, str]
     files: tuple[Path, ...]
 
 
@@ -97,7 +101,7 @@ class KittiRaw:
         camera: Intrinsics of the rectified stereo pair.
         T_cam_imu: (4, 4) IMU to rectified left camera of the pair.
         notes: What the reader found and did about it, one sentence each.
-        attributes: Checksum, reader and stereo pair.
+        attributes: Checksum, reader, stereo pair, and how the lateral velocity was taken.
     """
 
     folder: Path
@@ -142,12 +146,13 @@ def is_kitti_raw(folder: Path) -> bool:
     return folder.is_dir() and ((folder / "oxts").is_dir() or bool(_FOLDER_NAME.fullmatch(folder.resolve().name)))
 
 
-def open_kitti_raw(folder: str | Path, pair: Pair = "gray") -> KittiRaw:
+def open_kitti_raw(folder: str | Path, pair: Pair = "gray", lateral: Lateral = "corrected") -> KittiRaw:
     """Read a drive folder and its calibration.
 
     Args:
         folder: The drive folder, such as ``2011_09_30/2011_09_30_drive_0027_sync``.
         pair: Which stereo pair is the camera: ``gray`` (image_00, image_01) or ``color`` (image_02, image_03).
+        lateral: Sign of the lateral velocity, see `with_lateral`.
 
     Raises:
         ConfigError: There is no such pair.
@@ -157,7 +162,7 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray") -> KittiRaw:
     if pair not in CAMERAS:
         raise ConfigError(f"pair must be one of {', '.join(CAMERAS)}, found {pair!r}")
     folder = Path(folder)
-    oxts = read_oxts(folder)
+    oxts = read_oxts(folder, lateral)
     camera, T_cam_imu, files = read_calibration(folder, pair)
     return KittiRaw(
         folder=folder,
@@ -169,19 +174,23 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray") -> KittiRaw:
             "checksum_sha256": checksum(*oxts.files, *files),
             "reader": READER.name,
             "stereo_pair": pair,
+            "lateral": lateral,
+            **oxts.attributes,
         },
     )
 
 
-def read_oxts(folder: Path) -> Oxts:
+def read_oxts(folder: Path, lateral: Lateral = "corrected") -> Oxts:
     """Stamps, velocities and poses of a drive folder.
 
     Velocities: ``vf vl vu`` and ``wf wl wu`` are *level*, along forward, left and up of a vehicle without roll and
     pitch (``vu`` is the rate of ``alt``, and ``wx wy wz`` turned by roll and pitch are ``wf wl wu``). They are turned
-    into the IMU frame, ``v_imu = (R_y(pitch) R_x(roll))^T v_level``.
+    into the IMU frame, ``v_imu = (R_y(pitch) R_x(roll))^T v_level``, after ``vl``, which is stored positive to the
+    right, has been negated (``lateral`` = ``as-stored`` leaves it, see `with_lateral`).
 
     Poses: east and north are the Mercator projection of the sphere, scaled by the cosine of the first latitude, up is
-    ``alt``; the rotation is ``R_z(yaw) R_y(pitch) R_x(roll)``. World is the first pose.
+    ``alt``; the rotation is ``R_z(yaw) R_y(pitch) R_x(roll)``. World is the first pose. Their noise is
+    `KITTI_TRUTH_NOISE`.
 
     An empty line of ``timestamps.txt`` is a stamp that the recorder lost: it is interpolated between its neighbours.
     Where its packet is missing too, so are the velocities, and the frame is without truth. A note says so.
@@ -224,17 +233,23 @@ def read_oxts(folder: Path) -> Oxts:
     time_s = _interpolated(stamp_ns[:, None] / 1e9, stamped)[:, 0]
     gaps = _check_steps(time_s, stamp_ns, stamped, stamps_file)
     packets = np.array([_read_packet(path) for path in files.values()])
-    twist = np.zeros((frames, 6))
-    twist[present] = _body_twist(packets)
+    level, twist = np.zeros((2, frames, 6))
+    # Turned by roll and pitch, a line is one no more.
+    level[present] = _columns(packets, _TWIST)
+    level = _interpolated(level, present)
+    twist[present] = _body_twist(packets, lateral)
     return Oxts(
         time_s=time_s,
         twist=_interpolated(twist, present),
-        truth=Truth(np.flatnonzero(present), _poses(packets)),
+        truth=Truth(np.flatnonzero(present), _poses(packets), noise=KITTI_TRUTH_NOISE),
         notes=(
             "The level velocities vf vl vu wf wl wu are turned into the IMU frame by each packet's roll and pitch.",
+            LATERAL_NOTES[lateral],
             *_repair_notes(stamped, present),
+            *interpolation_notes(level),
             *gaps,
         ),
+        attributes=interpolation_attributes(level),
         files=(*format_files, stamps_file, *files.values()),
     )
 
@@ -392,11 +407,11 @@ def _columns(packets: Array, names: tuple[str, ...]) -> Array:
     return packets[:, [PACKET_FIELDS.index(name) for name in names]]
 
 
-def _body_twist(packets: Array) -> Array:
+def _body_twist(packets: Array, lateral: Lateral) -> Array:
     """(n, 6) velocities in the IMU frame, see `read_oxts`."""
     roll, pitch = _columns(packets, ("roll", "pitch")).T
     R_level_imu = Rotation.from_euler("YX", np.column_stack([pitch, roll]))
-    level = _columns(packets, _TWIST)
+    level = with_lateral(_columns(packets, _TWIST), lateral)
     return np.hstack([R_level_imu.apply(level[:, i : i + 3], inverse=True) for i in (0, 3)])
 
 
@@ -451,13 +466,13 @@ def _split_projection(values: Array, name: str) -> tuple[Array, Array]:
 
 def _poses_of_drive(folder: Path, sequence: Sequence) -> Poses:
     oxts = read_oxts(folder)
-    return Poses(oxts.truth.T_world_imu, oxts.time_s[oxts.truth.frame], oxts.files)
+    return Poses(oxts.truth.T_world_imu, oxts.time_s[oxts.truth.frame], oxts.files, KITTI_TRUTH_NOISE)
 
 
 READER = Reader(
     "kitti_raw",
     "a drive folder of KITTI raw",
     lambda source: is_kitti_raw(source.path),
-    lambda source: open_kitti_raw(source.path).sequence(),
+    lambda source: open_kitti_raw(source.path, lateral=source.lateral).sequence(),
 )
 TRUTH_READER = TruthReader("KITTI raw", READER.expected, is_kitti_raw, _poses_of_drive)

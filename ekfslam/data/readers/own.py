@@ -9,11 +9,19 @@ from ekfslam.data.readers.hdf5 import read_sequence
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.sequence import Sequence
 
+_UNKNOWN_LATERAL = (
+    "The file does not say how the sign of the lateral velocity was taken, so it is used as it is; older releases "
+    "wrote that of KITTI positive to the right."
+)
+
 
 def _open(source: Source) -> Sequence:
     sequence = read_sequence(source.path)
     own = {"checksum_sha256": checksum(source.path), "reader": READER.name}
-    return dataclasses.replace(sequence, attributes={**sequence.attributes, **own})
+    notes = sequence.notes
+    if sequence.velocity_frame == "level" and "lateral" not in sequence.attributes:
+        notes = (*notes, _UNKNOWN_LATERAL)
+    return dataclasses.replace(sequence, attributes={**sequence.attributes, **own}, notes=notes)
 
 
 READER = Reader("hdf5", "an ekfslam HDF5 file", lambda source: source.head.startswith(b"\x89HDF\r\n\x1a\n"), _open)

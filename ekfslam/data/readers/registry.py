@@ -19,8 +19,10 @@ from typing import Literal, TypeVar
 
 from ekfslam.arrays import Array
 from ekfslam.data.sequence import Sequence
+from ekfslam.data.truth_noise import TruthNoise
 
 Extrinsics = Literal["corrected", "as-stored"]
+Lateral = Literal["corrected", "as-stored"]
 Entry = TypeVar("Entry")
 
 _HEAD_BYTES = 128
@@ -33,12 +35,14 @@ class Source:
     Args:
         place: Path of a file or folder, or the name of what is no file.
         extrinsics: How to take the extrinsics of a format that stores them ambiguously.
+        lateral: How to take the lateral velocity of a format that stores level velocities.
         head: The first 128 bytes; empty for what is no file.
         problem: Why there is no ``head``; empty where there is one.
     """
 
     place: str
     extrinsics: Extrinsics
+    lateral: Lateral
     head: bytes
     problem: str
 
@@ -47,13 +51,13 @@ class Source:
         return Path(self.place)
 
     @staticmethod
-    def at(place: str | Path, extrinsics: Extrinsics) -> Source:
+    def at(place: str | Path, extrinsics: Extrinsics, lateral: Lateral) -> Source:
         """The source at a place, whatever is there."""
         try:
             with Path(place).open("rb") as file:
-                return Source(str(place), extrinsics, file.read(_HEAD_BYTES), "")
+                return Source(str(place), extrinsics, lateral, file.read(_HEAD_BYTES), "")
         except OSError as error:
-            return Source(str(place), extrinsics, b"", str(error.strerror))
+            return Source(str(place), extrinsics, lateral, b"", str(error.strerror))
 
 
 @dataclass(frozen=True)
@@ -81,11 +85,13 @@ class Poses:
         T_world_imu: (F, 4, 4).
         time_s: (F,) their stamps, which increase; None where row i is the pose of frame i.
         files: What was read.
+        noise: How far they may be wrong; None: the format says nothing of it.
     """
 
     T_world_imu: Array
     time_s: Array | None
     files: tuple[Path, ...]
+    noise: TruthNoise | None = None
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ def attach_truth(sequence: Sequence, path: Path) -> Sequence:
     fits, and the error names both spans. Text after ``#`` is a comment. Rows beyond the sequence are cut and missing
     ones leave frames without truth; a note says so.
 
+    Poses of KITTI bring their noise (`ekfslam.data.truth_noise`); TUM and EuRoC state none, so theirs is None.
+
     Raises:
         UnknownFormatError: The file is missing, is not text, or of no known format.
         TruthError: A line is malformed or not a rigid transform, or less than 90 % of the frames are covered.
@@ -77,13 +79,13 @@ def _matched(sequence: Sequence, poses: Poses) -> Truth:
     """The poses of the frames that have one."""
     if poses.time_s is None:
         used = min(len(sequence), len(poses.T_world_imu))
-        return Truth(np.arange(used), poses.T_world_imu[:used])
+        return Truth(np.arange(used), poses.T_world_imu[:used], noise=poses.noise)
     # Nearest in both directions, so that no pose serves two frames.
     row = _nearest(poses.time_s, sequence.time_s)
     mutual = _nearest(sequence.time_s, poses.time_s)[row] == np.arange(len(sequence))
     tolerance_s = 0.5 * np.median(np.diff(sequence.time_s)) if len(sequence) > 1 else 0.0
     frame = np.flatnonzero(mutual & (np.abs(poses.time_s[row] - sequence.time_s) <= tolerance_s))
-    return Truth(frame, poses.T_world_imu[row[frame]])
+    return Truth(frame, poses.T_world_imu[row[frame]], noise=poses.noise)
 
 
 def _nearest(ascending: Array, wanted: Array) -> IntArray:

@@ -10,11 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
-from ekfslam.data.readers.fields import checksum, flat_observations, require_numbers, spelled_as_in
+from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
+from ekfslam.data.readers.fields import (
+    LATERAL_NOTES,
+    checksum,
+    flat_observations,
+    require_numbers,
+    spelled_as_in,
+    with_lateral,
+)
 from ekfslam.data.readers.matfile import parse_mat
-from ekfslam.data.readers.registry import Reader, Source
+from ekfslam.data.readers.registry import Lateral, Reader, Source
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Noise, Sequence, Truth
 from ekfslam.data.tracks import inspect_tracks
+from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import DataError, ShapeError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
@@ -32,12 +41,18 @@ _SPELLING = {
 }
 
 
-def read_utias(path: Path) -> Sequence:
+def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
     """Read tracks ``y_k_j`` (4 x T x M, -1 where unseen), stamps, velocities, calibration and 6-DoF truth.
 
     The vehicle frame ``v`` is the IMU frame, the inertial frame ``i`` the world; ``T_world_imu`` has the rotation
     ``exp(theta_vk_i^)`` and ``T_cam_imu = [C_c_v, -C_c_v rho_v_c_v]``. Stamps, velocities and truth may run longer than
-    the tracks: they are cut, with a note. Starry Night adds landmark positions ``rho_i_pj_i`` and noise variances.
+    the tracks: they are cut, with a note. Starry Night adds landmark positions ``rho_i_pj_i`` and noise variances. The
+    truth of a KITTI drive has the noise `KITTI_TRUTH_NOISE`; of that of Starry Night none is stated.
+
+    Args:
+        path: The .mat file.
+        lateral: Sign of the lateral velocity of a KITTI drive, see `with_lateral`; Starry Night has no level velocities
+            and is read as it is.
 
     Raises:
         UnknownFormatError: The file is damaged, or a .mat file of other content.
@@ -62,9 +77,12 @@ def read_utias(path: Path) -> Sequence:
         rho = require_numbers(fields, "rho_v_c_v", (3, 1))[:, 0]
         observations = flat_observations(pixels, frame_axis=1, field="y_k_j")
         notes = (f"Cut to the {frames} frames of y_k_j: {', '.join(cut)}.",) if cut else ()
+        attributes = {"checksum_sha256": checksum(path), "reader": READER.name}
         noise = _noise(fields)  # stated by Starry Night alone, whose velocities are those of its IMU
         if noise is None:
-            notes = (*notes, LEVEL_VELOCITIES_NOTE)
+            twist = with_lateral(twist, lateral)
+            notes = (*notes, LEVEL_VELOCITIES_NOTE, LATERAL_NOTES[lateral])
+            attributes["lateral"] = lateral
         return Sequence(
             name=path.stem,
             source=source,
@@ -76,8 +94,8 @@ def read_utias(path: Path) -> Sequence:
             truth=_truth(fields, se3.transform(se3.so3_exp(theta), r), tracks=pixels.shape[2]),
             noise=noise,
             velocity_frame="level" if noise is None else "imu",
-            notes=(*notes, *inspect_tracks(observations, twist).notes),
-            attributes={"checksum_sha256": checksum(path), "reader": READER.name},
+            notes=(*notes, *interpolation_notes(twist), *inspect_tracks(observations, twist).notes),
+            attributes={**attributes, **interpolation_attributes(twist)},
         )
 
 
@@ -95,7 +113,7 @@ def _load(path: Path) -> dict[str, NDArray]:
 def _truth(fields: dict[str, NDArray], T_world_imu: Array, tracks: int) -> Truth:
     frame = np.arange(len(T_world_imu))
     if "rho_i_pj_i" not in fields:
-        return Truth(frame, T_world_imu)
+        return Truth(frame, T_world_imu, noise=KITTI_TRUTH_NOISE)
     position_m = require_numbers(fields, "rho_i_pj_i", (3, tracks)).T
     return Truth(frame, T_world_imu, np.arange(tracks), position_m)
 
@@ -116,7 +134,7 @@ def _noise(fields: dict[str, NDArray]) -> Noise | None:
 def _open(source: Source) -> Sequence:
     if source.head.startswith(b"MATLAB 7.3"):
         raise UnknownFormatError(f"{source.place}: a MATLAB 7.3 file, save it with -v7; expected {READER.expected}")
-    return read_utias(source.path)
+    return read_utias(source.path, source.lateral)
 
 
 READER = Reader(

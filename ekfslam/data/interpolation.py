@@ -1,0 +1,73 @@
+"""Stretches of a recording that were never measured: where a unit had a gap, and a line was drawn across it.
+
+OXTS units (KITTI) fill gaps so, velocities and poses alike: over the first second of 2011_09_30_drive_0020, for
+instance, where vision shows that the velocities are wrong by 10 %.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray
+
+SHORTEST = 3  # samples in a row that lie on the line between their neighbours; a single lost packet does no harm
+_ATTRIBUTE = "interpolated"
+_ROUNDING = 1e-9  # of the largest value; measured velocities bend by more than 1e-4 of it
+
+
+def interpolated_intervals(twist: Array) -> BoolArray:
+    """Which intervals (T,) have interpolated velocities: ``[k]`` stands for that from frame k-1 to frame k.
+
+    All six velocities of (T, 6) must have second differences of 0, to rounding, at `SHORTEST` samples in a row, and
+    must change: a vehicle that stands still, and a simulation of constant velocity, have nothing interpolated. A line
+    that was rounded to few digits, or had noise added, is not recognised.
+    """
+    found = np.zeros(len(twist), dtype=bool)
+    if len(twist) < SHORTEST + 2:
+        return found
+    largest = np.repeat([np.abs(twist[:, :3]).max(), np.abs(twist[:, 3:]).max()], 3)
+    is_straight = (np.abs(np.diff(twist, 2, axis=0)) <= _ROUNDING * largest).all(axis=1)
+    changes = np.asarray((np.abs(np.diff(twist, axis=0)) > _ROUNDING * largest).any(axis=1))
+    on_line = np.concatenate([[False], is_straight & changes[1:] & changes[:-1], [False]])
+    for begin, end in stretches(on_line):
+        if end - begin + 1 >= SHORTEST:
+            found[begin : end + 2] = True  # up to the measured sample behind
+    return found
+
+
+def stretches(which: BoolArray) -> list[tuple[int, int]]:
+    """First and last index of every run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
+    return [(int(begin), int(end) - 1) for begin, end in edges.reshape(-1, 2)]
+
+
+def interpolation_attributes(twist: Array) -> dict[str, str]:
+    """The intervals as the attribute ``interpolated`` of a recording, such as ``1-12 178-182``; nothing if none.
+
+    It stays with a recording whose velocities are changed, for instance turned or given noise.
+    """
+    found = " ".join(f"{begin}-{end}" for begin, end in stretches(interpolated_intervals(twist)))
+    return {_ATTRIBUTE: found} if found else {}
+
+
+def known_intervals(attributes: Mapping[str, str | int | float], twist: Array) -> BoolArray:
+    """Interpolated intervals (T,) of a recording: as its attributes have them, or else as its velocities show."""
+    text = str(attributes.get(_ATTRIBUTE, ""))
+    if not re.fullmatch(r"\d+-\d+( \d+-\d+)*", text):
+        return interpolated_intervals(twist)
+    found = np.zeros(len(twist), dtype=bool)
+    for begin, end in (map(int, stretch.split("-")) for stretch in text.split()):
+        found[begin : end + 1] = True
+    return found
+
+
+def interpolation_notes(twist: Array) -> tuple[str, ...]:
+    """One sentence a stretch of interpolated velocities."""
+    return tuple(
+        f"The velocities of intervals {begin} to {end} are interpolated, and so probably are true poses there: no NEES "
+        "is taken of them."
+        for begin, end in stretches(interpolated_intervals(twist))
+    )

@@ -1,0 +1,95 @@
+"""Consistency of poses relative to earlier ones: which needs no first pose, and shows how a covariance grows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.sequence import Truth
+from ekfslam.evaluation.consistency import nees, pose_noise_covariance
+from ekfslam.evaluation.trajectory import PATH_TOLERANCE, distance_along
+from ekfslam.filters.result import PosePairs, Result
+from ekfslam.geometry import se3
+
+FRAMES = (10, 50, 100)
+PATHS_M = (50.0, 100.0)
+
+
+def relative_pairs(truth: Truth, reach: int) -> tuple[IntArray, IntArray]:
+    """Pairs of frames (n,), (n,) whose relative pose shall be judged: the true poses of both are known.
+
+    The first frames are every quarter of ``reach``. The second ones come `FRAMES` later, or they are those, up to
+    ``reach`` frames later, whose true path from the first is nearest to `PATHS_M`, where it comes near enough.
+    """
+    frame, found = truth.frame, set[tuple[int, int]]()
+    distance = distance_along(truth.T_world_imu)
+    for place in np.flatnonzero(frame % max(reach // 4, 1) == 0) if reach else ():
+        later = slice(place + 1, int(np.searchsorted(frame, frame[place] + reach, side="right")))
+        wanted = [int(k) for k in frame[later] if k - frame[place] in FRAMES]
+        way = distance[later] - distance[place]
+        for path_m in PATHS_M if len(way) else ():
+            off = np.abs(way - path_m)
+            if off.min() <= PATH_TOLERANCE * path_m:
+                wanted.append(int(frame[later][off.argmin()]))
+        found.update((int(frame[place]), k) for k in wanted)
+    pairs = np.array(sorted(found), dtype=np.int64).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def dead_reckoned_pairs(first: IntArray, second: IntArray, T_world_imu: Array, covariance: Array) -> PosePairs:
+    """Cross-covariances of poses that were predicted alone: ``cov(xi_k, xi_j) = Ad(T_k T_j^-1) P_jj``, by eq. (2).
+
+    Args:
+        first, second: (n,) frames j and k.
+        T_world_imu, covariance: (T, 4, 4) and (T, 6, 6) of all frames.
+    """
+    A = se3.adjoint(se3.inverse(T_world_imu[second]) @ T_world_imu[first])
+    return PosePairs(first, second, covariance[first] @ np.swapaxes(A, -1, -2))
+
+
+def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) -> tuple[PosePairs, Array]:
+    """Pairs with both true poses and the NEES (n,) of their relative pose, 6 degrees of freedom; NaN where singular.
+
+    The error of the motion ``T_k T_j^-1`` is, to first order in the stored errors,
+
+        e = xi_k - A xi_j,    A = Ad(T_hat_k T_hat_j^-1),
+        cov(e) = P_kk + A P_jj A^T - P_kj A^T - A P_jk (+ N_k + A N_j A^T),
+
+    where N is the noise of single true poses, if the truth states any. An error of the first pose cancels. Pairs with
+    an ``interpolated`` interval (T,) between them are left out.
+    """
+    pairs, place = result.pairs or PosePairs.empty(), np.full(len(result.time_s), -1)
+    place[truth.frame] = np.arange(len(truth.frame))
+    invented = np.cumsum(interpolated)
+    is_measured = invented[pairs.first] == invented[pairs.second]
+    pairs = pairs.only((place[pairs.first] >= 0) & (place[pairs.second] >= 0) & is_measured)
+    j, k = place[pairs.first], place[pairs.second]
+    T_true, T_est = truth.T_world_imu, result.T_world_imu
+    motion_est = se3.inverse(T_est[pairs.second]) @ T_est[pairs.first]
+    error = se3.log(se3.inverse(T_true[k]) @ T_true[j] @ se3.inverse(motion_est))
+    P = result.covariance
+    A = se3.adjoint(motion_est)
+    A_cross = A @ pairs.cross
+    covariance = P[pairs.second] + A @ P[pairs.first] @ np.swapaxes(A, -1, -2)
+    covariance = covariance - A_cross - np.swapaxes(A_cross, -1, -2)
+    if truth.noise is not None:
+        N = pose_noise_covariance(truth.noise, T_true, result.time_s[truth.frame])
+        covariance = covariance + N[k] + A @ N[j] @ np.swapaxes(A, -1, -2)
+    return pairs, nees(error, covariance)
+
+
+def over_frames(pairs: PosePairs, frames: int) -> BoolArray:
+    """Which of the pairs (n,) are so many frames apart."""
+    return pairs.second - pairs.first == frames
+
+
+def over_path(pairs: PosePairs, truth: Truth, path_m: float) -> BoolArray:
+    """Which of the pairs (n,), of each first frame at most one, are nearest to so many metres of true path."""
+    distance = np.full(truth.frame[-1] + 1 if len(truth.frame) else 0, np.nan)
+    distance[truth.frame] = distance_along(truth.T_world_imu)
+    off = np.abs(distance[pairs.second] - distance[pairs.first] - path_m)
+    order = np.lexsort((pairs.second, off, pairs.first))
+    nearest = order[np.diff(pairs.first[order], prepend=-1) != 0]
+    chosen = np.zeros(len(off), dtype=bool)
+    chosen[nearest[off[nearest] <= PATH_TOLERANCE * path_m]] = True
+    return chosen

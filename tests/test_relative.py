@@ -1,0 +1,298 @@
+"""Consistency of relative poses: cross-covariances of reported poses, and what is made of them."""
+
+import dataclasses
+
+import h5py
+import numpy as np
+import pytest
+from helpers import STEP_S, synthetic_result, synthetic_sequence
+from test_truth_noise import erring_truth
+
+from ekfslam.config import Config, PosteriorConfig
+from ekfslam.data.readers import open_sequence
+from ekfslam.data.sequence import Truth
+from ekfslam.data.truth_noise import TruthNoise
+from ekfslam.errors import ArchiveError
+from ekfslam.evaluation.consistency import chi2_bounds
+from ekfslam.evaluation.relative import (
+    dead_reckoned_pairs,
+    over_frames,
+    over_path,
+    relative_pairs,
+    relative_pose_nees,
+)
+from ekfslam.evaluation.summary import summarise
+from ekfslam.filters.gaussian import Gaussian, Rows
+from ekfslam.filters.result import PosePairs
+from ekfslam.geometry import motion
+from ekfslam.runner import run
+from ekfslam.smoother.posterior import posterior, smooth
+from ekfslam.storage.archive import open_result, write_archive
+
+BODY, CONSIDERED, LANDMARKS, SEEN = 8, 12, 3, 6
+
+
+def considered_gaussian(rng):
+    """A covariance of body, considered columns and landmarks, and which columns are estimated."""
+    gaussian = Gaussian(np.eye(BODY), SEEN)
+    assert gaussian.consider(CONSIDERED) == BODY
+    size = BODY + CONSIDERED + 3 * LANDMARKS
+    root = rng.normal(size=(size, size))
+    gaussian.replace(root @ root.T)
+    estimated = np.ones(size, dtype=bool)
+    estimated[BODY : BODY + CONSIDERED] = False
+    return gaussian, gaussian.P.copy(), estimated
+
+
+def some_rows(rng, k=2):
+    return Rows(
+        np.array([2, 0]),
+        rng.normal(size=(k, 3, SEEN)),
+        rng.normal(size=(k, 3, 3)),
+        rng.normal(size=(k, 3)),
+        rng.uniform(0.5, 2.0, (k, 3)),
+    )
+
+
+def full_jacobian(rows):
+    H = np.zeros((rows.residual.size, BODY + CONSIDERED + 3 * LANDMARKS))
+    for i, slot in enumerate(rows.slot):
+        start = BODY + CONSIDERED + 3 * slot
+        H[3 * i : 3 * i + 3, :SEEN], H[3 * i : 3 * i + 3, start : start + 3] = rows.H_x[i], rows.H_m[i]
+    return H
+
+
+# The verbs of the covariance
+
+
+def test_conditioning_is_that_of_schmidt_and_kalman():
+    rng = np.random.default_rng(0)
+    gaussian, P, estimated = considered_gaussian(rng)
+    rows = some_rows(rng)
+    H, R = full_jacobian(rows), np.diag(rows.variance.ravel())
+    # The gain of what is considered is zero; any gain has the covariance (I - K H) P (I - K H)^T + K R K^T.
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    K[~estimated] = 0.0
+    naive = (np.eye(len(P)) - K @ H) @ P @ (np.eye(len(P)) - K @ H).T + K @ R @ K.T
+    done = gaussian.condition(rows, 0, np.arange(2))
+    np.testing.assert_allclose(gaussian.P, naive, atol=1e-10)
+    np.testing.assert_array_equal(gaussian.P[np.ix_(~estimated, ~estimated)], P[np.ix_(~estimated, ~estimated)])
+    np.testing.assert_allclose(done.correction, K @ rows.residual.ravel(), atol=1e-10)
+    gaussian.undo(done)
+    np.testing.assert_allclose(gaussian.P, P, atol=1e-10)
+
+
+def test_taking_rows_out_and_rows_of_the_body_alone():
+    rng = np.random.default_rng(1)
+    gaussian, P, _ = considered_gaussian(rng)
+    rows = some_rows(rng)
+    gaussian.condition(rows, 0, np.arange(2))
+    gaussian.condition(rows, 0, np.arange(2), sign=-1.0)
+    np.testing.assert_allclose(gaussian.P, P, atol=1e-8)
+    H, r = rng.normal(size=(2, BODY)), rng.normal(size=2)
+    wide = np.hstack([H, np.zeros((2, len(P) - BODY))])
+    K = P @ wide.T @ np.linalg.inv(wide @ P @ wide.T + np.eye(2))
+    gaussian.replace(P.copy())
+    gaussian.condition_body(H, r, np.ones(2), 0)
+    np.testing.assert_allclose(gaussian.P[:BODY], (P - K @ wide @ P)[:BODY], atol=1e-10)
+
+
+@pytest.mark.parametrize("verb", ["propagate", "condition", "augment", "marginalise", "wander"])
+def test_what_is_estimated_does_not_notice(verb):
+    rng = np.random.default_rng(2)
+    gaussian, P, estimated = considered_gaussian(rng)
+    plain = Gaussian(np.eye(BODY), SEEN)
+    plain.replace(P[np.ix_(estimated, estimated)].copy())
+    rows, Phi = some_rows(rng), rng.normal(size=(BODY, BODY))
+    for one in (gaussian, plain):
+        if verb == "propagate":
+            one.propagate(Phi, np.eye(BODY))
+        elif verb == "condition":
+            one.condition(rows, 0, np.arange(2))
+        elif verb == "augment":
+            one.augment(np.arange(2 * 3 * SEEN, dtype=float).reshape(2, 3, SEEN), np.tile(np.eye(3), (2, 1, 1)))
+        elif verb == "marginalise":
+            one.marginalise(np.array([True, False, True]))
+        else:
+            one.wander(slice(6, 8), np.array([0.9, 0.5]), np.array([0.1, 0.2]))
+    kept = np.ones(len(gaussian.P), dtype=bool)
+    kept[BODY : BODY + CONSIDERED] = False
+    np.testing.assert_allclose(gaussian.P[np.ix_(kept, kept)], plain.P, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(gaussian.P, gaussian.P.T)
+
+
+def test_prediction_carries_cross_covariances_and_a_clone_is_its_source():
+    rng = np.random.default_rng(3)
+    gaussian, P, _ = considered_gaussian(rng)
+    Phi = rng.normal(size=(BODY, BODY))
+    at = slice(BODY, BODY + CONSIDERED)
+    gaussian.propagate(Phi, np.eye(BODY))
+    np.testing.assert_allclose(gaussian.P[:BODY, at], Phi @ P[:BODY, at], atol=1e-12)
+    np.testing.assert_array_equal(gaussian.P[at, at], P[at, at])
+    slot = slice(BODY + 6, BODY + 12)
+    before = gaussian.P.copy()
+    gaussian.clone(slice(0, 6), slot)
+    take = np.arange(len(P))
+    take[slot] = np.arange(6)
+    np.testing.assert_array_equal(gaussian.P, before[np.ix_(take, take)])
+
+
+# Where cross-covariances come from
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_the_filters_cross_covariance_is_that_of_the_posterior_at_the_later_frame(iterations):
+    """The error reported at k is uncorrelated with all data up to k, so smoothing j by these changes nothing."""
+    world = open_sequence("builtin:loop?frames=41")
+    settings = {"variant": "standard", "retire": "never", "relative_frames": 40, "iterations": iterations}
+    settings |= {"initial_position_std_m": 0.1, "initial_rotation_std_rad": 0.02}
+    result = run(world, "full", Config().with_overrides({"filter": settings}))
+    found = posterior(result, PosteriorConfig(linearisation="filtered"))
+    last = np.flatnonzero(result.pairs.second == 40)
+    assert 30 in result.pairs.first[last] and len(last) >= 1
+    for i in last:
+        j = result.pairs.first[i]
+        P = found.joint_covariance([j, 40])
+        std = np.sqrt(np.diag(P))
+        assert (np.abs(result.pairs.cross[i] - P[:6, 6:]) <= 1e-7 * np.outer(std[:6], std[6:])).all()
+        assert np.abs(P[:6, 6:] / np.outer(std[:6], std[6:])).max() > 0.1
+
+
+def test_estimates_do_not_depend_on_references():
+    world = open_sequence("builtin:city?frames=120")
+    with_, without = (
+        run(world, "full", Config().with_overrides({"filter": {"relative_frames": frames}})) for frames in (40, 0)
+    )
+    assert with_.pairs is not None and len(with_.pairs) > 8 and without.pairs is None
+    np.testing.assert_allclose(with_.T_world_imu, without.T_world_imu, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(with_.covariance, without.covariance, rtol=0, atol=1e-12)
+    # Landmarks at a distance are known to metres: what rounding does to them is small beside that.
+    std = np.sqrt(np.diagonal(without.landmarks.covariance, axis1=1, axis2=2))
+    assert (np.abs(with_.landmarks.position_m - without.landmarks.position_m) <= 1e-9 * std).all()
+    assert with_.counts == without.counts
+    assert run(dataclasses.replace(world, truth=None), "full").pairs is None
+
+
+def test_pairs_across_a_map_revival_are_left_out():
+    world = open_sequence("builtin:loop?frames=330")
+    settings = {"retire": "unseen", "retire_after": 3, "variant": "standard"}
+    result = run(world, "full", Config().with_overrides({"filter": settings}))
+    assert result.counts["revived"] > 0
+    first, second = relative_pairs(world.truth, 100)
+    assert 0 < len(result.pairs) < len(first)
+    assert set(zip(result.pairs.first, result.pairs.second, strict=True)) < set(zip(first, second, strict=True))
+    _, values = relative_pose_nees(result, world.truth, world.interpolated)
+    assert np.isfinite(values).all()
+
+
+def test_dead_reckoning_has_the_cross_covariances_of_its_recursion():
+    sequence = synthetic_sequence(frames=60, landmarks=40)
+    result = synthetic_result(sequence, "dead-reckoning")
+    first, second = np.array([10, 10, 30]), np.array([20, 60 - 1, 31])
+    found = dead_reckoned_pairs(first, second, result.T_world_imu, result.covariance)
+    for i, (j, k) in enumerate(zip(first, second, strict=True)):
+        cross = result.covariance[j]
+        for step in range(j + 1, k + 1):
+            cross = cross @ motion.error_jacobian(motion.increment(sequence.twist[step], STEP_S)).T
+        np.testing.assert_allclose(found.cross[i], cross, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", ["dead-reckoning", "mapping-only", "full", "smoothed"])
+def test_every_mode_has_pairs_whose_joint_covariance_is_one(mode):
+    world = open_sequence("builtin:loop?frames=60")
+    result = run(world, mode, Config().with_overrides({"filter": {"relative_frames": 40}}))
+    pairs, values = relative_pose_nees(result, world.truth, world.interpolated)
+    assert len(pairs) >= 5
+    assert np.isfinite(values).all()
+    for j, k, cross in zip(pairs.first, pairs.second, pairs.cross, strict=True):
+        joint = np.block([[result.covariance[j], cross], [cross.T, result.covariance[k]]])
+        scale = np.sqrt(np.maximum(np.diag(joint), 1e-30))
+        assert np.linalg.eigvalsh(joint / np.outer(scale, scale))[0] > -1e-9
+
+
+def test_smoothed_pairs_are_those_of_the_posterior():
+    result = run(open_sequence("builtin:loop?frames=60"), "full")
+    found = posterior(result)
+    smoothed = smooth(result, found=found)
+    for j, k, cross in zip(smoothed.pairs.first, smoothed.pairs.second, smoothed.pairs.cross, strict=True):
+        np.testing.assert_allclose(cross, found.joint_covariance([j, k])[:6, 6:], rtol=1e-9, atol=1e-15)
+
+
+# Which pairs, and their NEES
+
+
+def straight_truth(frames, step_m):
+    T = np.tile(np.eye(4), (len(frames), 1, 1))
+    T[:, 0, 3] = step_m * np.asarray(frames)
+    return Truth(np.asarray(frames), T)
+
+
+def test_pairs_are_so_many_frames_or_metres_apart_and_both_have_truth():
+    truth = straight_truth(np.arange(201), 0.8)
+    first, second = relative_pairs(truth, 100)
+    assert set(first) == {0, 25, 50, 75, 100, 125, 150, 175}
+    apart = second - first
+    # 50 m are 62 or 63 frames, 100 m more than the 100 frames that references live.
+    assert set(apart) == {10, 50, 62, 100}
+    pairs = PosePairs(first, second, np.zeros((len(first), 6, 6)))
+    assert over_frames(pairs, 100).sum() == 5
+    np.testing.assert_array_equal(np.flatnonzero(over_path(pairs, truth, 50.0)), np.flatnonzero(apart == 62))
+    assert not over_path(pairs, truth, 100.0).any()
+    gap = straight_truth(np.delete(np.arange(201), [35, 50]), 0.8)
+    first_gap, second_gap = relative_pairs(gap, 100)
+    assert not np.isin([35, 50], [first_gap, second_gap]).any()
+    assert len(relative_pairs(truth, 0)[0]) == 0
+    assert len(relative_pairs(straight_truth(np.arange(0), 1.0), 100)[0]) == 0
+    standing = relative_pairs(straight_truth(np.arange(201), 0.0), 100)
+    assert set(standing[1] - standing[0]) == {10, 50, 100}
+
+
+def test_relative_nees_is_six_whatever_the_first_pose_and_with_the_noise_of_the_truth():
+    noise = TruthNoise(0.1, 0.1, 0.3, 1.0, 0.005, 0.02, 0.002)
+    exact, erring, blind = [], [], []
+    for seed in range(60):
+        sequence = synthetic_sequence(frames=41, landmarks=30, seed=seed)
+        result = synthetic_result(sequence, "dead-reckoning")
+        pairs = dead_reckoned_pairs(np.array([20]), np.array([40]), result.T_world_imu, result.covariance)
+        result = dataclasses.replace(result, pairs=pairs)
+        exact.append(relative_pose_nees(result, sequence.truth, sequence.interpolated)[1][0])
+        truth = erring_truth(sequence.truth, sequence.time_s, noise, np.random.default_rng(seed))
+        erring.append(relative_pose_nees(result, truth, sequence.interpolated)[1][0])
+        blind.append(relative_pose_nees(result, dataclasses.replace(truth, noise=None), sequence.interpolated)[1][0])
+    low, high = chi2_bounds(6, 0.999, runs=60)
+    assert low < np.mean(exact) < high
+    assert low < np.mean(erring) < high
+    assert np.mean(blind) > 1.2 * np.mean(erring)
+
+
+def test_a_covariance_that_is_too_small_shows():
+    sequence = synthetic_sequence(frames=60, landmarks=30)
+    result = synthetic_result(sequence, "dead-reckoning")
+    pairs = dead_reckoned_pairs(*relative_pairs(sequence.truth, 40), result.T_world_imu, result.covariance)
+    honest = dataclasses.replace(result, pairs=pairs)
+    small = dataclasses.replace(
+        honest, covariance=result.covariance / 9, pairs=dataclasses.replace(pairs, cross=pairs.cross / 9)
+    )
+    before, after = (summarise(sequence, one)["pose_nees_relative_10_mean"] for one in (honest, small))
+    assert after == pytest.approx(9 * before, rel=1e-9)
+
+
+# Archives
+
+
+def test_pairs_are_stored_and_archives_without_them_are_read(tmp_path):
+    world = open_sequence("builtin:loop?frames=40")
+    result = run(world, "full", Config().with_overrides({"filter": {"relative_frames": 20}}))
+    write_archive(tmp_path / "a.h5", world, {"full": result})
+    found = open_result(tmp_path / "a.h5", "full")
+    for name in ("first", "second", "cross"):
+        np.testing.assert_array_equal(getattr(found.pairs, name), getattr(result.pairs, name))
+    assert summarise(world, found) == summarise(world, result)
+    with h5py.File(tmp_path / "a.h5", "a") as h5file:
+        h5file["runs/full/pairs/second"][0] = 400
+    with pytest.raises(ArchiveError, match=r"runs/full/pairs holds frames"):
+        open_result(tmp_path / "a.h5", "full")
+    with h5py.File(tmp_path / "a.h5", "a") as h5file:
+        del h5file["runs/full/pairs"]
+    assert open_result(tmp_path / "a.h5", "full").pairs is None
+    assert summarise(world, open_result(tmp_path / "a.h5", "full"))["pose_nees_relative_10_mean"] is None
