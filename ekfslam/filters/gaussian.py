@@ -175,6 +175,15 @@ class Gaussian:
         P[size:, size:].reshape(n, 3, n, 3)[block, :, block, :] += covariance
         self.P = P
 
+    def transform_landmarks(self, M: Array) -> None:
+        """``d_i <- M_i d_i``: landmark errors in other coordinates, M (n, 3, 3)."""
+        b, P, n = self.body, self.P, len(M)
+        by_rows = (M @ P[b:].reshape(n, 3, len(P))).reshape(3 * n, len(P))
+        P[b:, :b] = by_rows[:, :b]
+        P[:b, b:] = P[b:, :b].T
+        P_mm = (M @ by_rows[:, b:].T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
+        P[b:, b:] = 0.5 * (P_mm + P_mm.T)
+
     def marginalise(self, stay: BoolArray) -> None:
         """Drop the rows and columns of landmarks that do not stay (n,): exact marginalisation."""
         kept = np.flatnonzero(np.concatenate([np.ones(self.body, dtype=bool), np.repeat(stay, 3)]))
