@@ -362,7 +362,8 @@ class Literal:
         x, rest = K @ residual, np.eye(len(self.P)) - K @ H
         self.P = rest @ self.P @ rest.T + K @ V @ K.T
         if self.images:
-            return self.act_on_images(x)
+            self.act_on_images(x)
+            return
         stored, T_before, m_before, c_before = self.to_stored(), self.T, self.m, self.c
         after = self.moved_by(x)
         self.c, self.twist, self.W, self.b = (after[name] for name in ("c", "twist", "W", "b"))

@@ -11,8 +11,8 @@ Civera, Davison, Montiel, "Inverse depth parametrization for monocular SLAM", T-
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import Values
 from ekfslam.models.model import Model
-from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.stereo import Rig
 
 # A landmark is beside the camera where a ray is this much longer across than along the optical axis.
@@ -51,21 +50,19 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Linear:
-    """Where derivatives are taken: at a pose (4, 4) and landmarks (n, 3) in world."""
+class View:
+    """Landmarks as the camera has them.
 
-    T_imu_world: Array
-    positions_m: Array
+    Args:
+        q: (n, 3) in its frame.
+        q_linear, R_linear: (n, 3), (3, 3) the same points, and the rotation from world, where derivatives are taken.
+        by_columns: (6, c) error of the camera's pose by columns of the body, ``dq = [I, -q^] by_columns x``.
+    """
 
-
-@dataclass(frozen=True)
-class _Points:
-    """What `linearise` asks of a sensor, for points in the camera frame as they are."""
-
-    T_cam_imu: Array
-
-    def jacobian(self, q: Array) -> Array:
-        return np.broadcast_to(np.eye(3), (len(q), 3, 3))
+    q: Array
+    q_linear: Array
+    R_linear: Array
+    by_columns: Array
 
 
 @dataclass(frozen=True)
@@ -85,19 +82,31 @@ class CameraCoordinates:
     pose: str
     min_depth_m: float
 
-    def retract(self, before: Values, after: Values, positions_m: Array, x: Array, d: Array) -> tuple[Array, BoolArray]:
+    def view(self, values: Values, positions_m: Array, T_linear: Array, linear_positions_m: Array) -> View:
+        """Landmarks (n, 3) in world from the camera, at blocks; derivatives are of another pose and of others (FEJ)."""
+        calibration, T_cam_imu = self.model.calibration, self._T_cam_imu(values)
+        by_columns = np.asarray(se3.adjoint(T_cam_imu), dtype=float)
+        if calibration is not None:
+            by_calibration = calibration.camera_by_extrinsic(values["calibration"])
+            by_columns = np.concatenate([by_columns, by_calibration], axis=1)
+        q = q_linear = se3.apply(T_cam_imu @ values[self.pose], positions_m)
+        if T_linear is not values[self.pose]:
+            q_linear = se3.apply(T_cam_imu @ T_linear, linear_positions_m)
+        return View(q, q_linear, T_cam_imu[:3, :3] @ T_linear[:3, :3], by_columns)
+
+    def retract(self, before: View, after: Values, x: Array, d: Array) -> tuple[Array, BoolArray]:
         """Landmarks ``m+`` (n, 3) of eq. (7') after a correction of blocks ``x`` (seen,) and landmarks d (n, 3).
 
         Args:
-            before, after: Blocks before and after it.
-            positions_m: (n, 3) landmarks before it.
+            before: The view before it, linear where it is.
+            after: Blocks after it.
             x, d: The correction.
 
         Returns:
             Also whether (n,) a landmark counts by its image.
         """
-        q, Q_x, Q_m = self._points(before, positions_m, Linear(before[self.pose], positions_m))
-        step = Q_x @ x[self._columns] + (Q_m @ d[..., None])[..., 0]
+        q, xi = before.q, before.by_columns @ x[self.columns]
+        step = xi[:3] + q @ se3.skew(xi[3:]).T + d @ before.R_linear.T
         in_image = self._is_in_image(q)
         front = np.where(in_image[:, None], q, _AHEAD)
         y = image(front)
@@ -106,35 +115,29 @@ class CameraCoordinates:
         q_after = np.where(in_image[:, None], image(np.where(in_image[:, None], y_after, _AHEAD)), q + step)
         return se3.apply(se3.inverse(self._T_cam_imu(after) @ after[self.pose]), q_after), in_image
 
-    def change(
-        self,
-        before: tuple[Values, Array, Linear],
-        after: tuple[Values, Array, Linear],
-        in_image: BoolArray,
-        turned: Callable[[Array, Array], Array],
-    ) -> Change:
+    def change(self, before: View, after: View, in_image: BoolArray, turned: Array) -> Change:
         """``M`` and ``B`` of eq. (7').
 
         Args:
-            before, after: Blocks, landmarks (n, 3), and where their derivatives are taken, before and after.
+            before, after: The views before and after a correction.
             in_image: (n,) which landmarks count by their images.
-            turned: How the error of a pose before becomes that after, (6, 6), given both poses.
+            turned: (6, 6) how the error of the pose before becomes that after.
         """
-        (values, _, _), (values_after, _, _) = before, after
-        q, Q_x, Q_m = self._points(*before)
-        q_after, Q_x_after, Q_m_after = self._points(*after)
         # The image is its own inverse: its derivative at an image is the inverse of that at the point.
-        J = image_jacobian(np.where(in_image[:, None], q, _AHEAD))
-        J_inverse_after = image_jacobian(image(np.where(in_image[:, None], q_after, _AHEAD)))
+        J = image_jacobian(np.where(in_image[:, None], before.q, _AHEAD))
+        J_inverse_after = image_jacobian(image(np.where(in_image[:, None], after.q, _AHEAD)))
         J = np.where(in_image[:, None, None], J_inverse_after @ J, np.eye(3))
-        by_pose = Q_x_after[..., :6] @ turned(values[self.pose], values_after[self.pose])
-        back = Q_m_after.swapaxes(1, 2)  # a rotation
-        B = back @ (J @ Q_x - np.concatenate([by_pose, Q_x_after[..., 6:]], axis=-1))
-        return Change(self._columns, B, back @ J @ Q_m)
+        by_after = after.by_columns.copy()
+        by_after[:, :6] = by_after[:, :6] @ turned
+        minus_one = np.broadcast_to(-np.eye(3), J.shape)
+        by_camera = [J, -J @ se3.skew(before.q_linear), minus_one, se3.skew(after.q_linear)]
+        B = np.concatenate(by_camera, axis=-1) @ np.concatenate([before.by_columns, by_after])
+        back = after.R_linear.T
+        return Change(self.columns, back @ B, back @ J @ before.R_linear)
 
-    @property
-    def _columns(self) -> IntArray:
-        """Columns of pose and camera in the body."""
+    @cached_property
+    def columns(self) -> IntArray:
+        """Columns (c,) of pose and camera in the body."""
         layout, calibration = self.model.layout, self.model.calibration
         columns = layout.columns([self.pose])
         if calibration is None:
@@ -142,18 +145,8 @@ class CameraCoordinates:
         return np.concatenate([columns, layout["calibration"].start + calibration.extrinsic])
 
     def _T_cam_imu(self, values: Values) -> Array:
-        return self.model.sensor_at(values["calibration"] if self.model.calibration else _GIVEN).T_cam_imu
-
-    def _points(self, values: Values, positions_m: Array, linear: Linear) -> tuple[Array, Array, Array]:
-        """Points q (n, 3) in the camera frame, their derivatives by pose and camera (n, 3, c) and by landmarks."""
-        T_cam_imu, calibration = self._T_cam_imu(values), self.model.calibration
-        at = linear.T_imu_world, linear.positions_m
-        q, Q_x, Q_m = linearise(_Points(T_cam_imu), values[self.pose], positions_m, *at)
-        if calibration is not None:
-            q_linear = se3.apply(T_cam_imu @ at[0], at[1])
-            by_camera = calibration.points_by_extrinsic(values["calibration"], q_linear)
-            Q_x = np.concatenate([Q_x, by_camera], axis=-1)
-        return q, Q_x, Q_m
+        """(4, 4) extrinsics as calibrated."""
+        return self.model.sensor_at(values.get("calibration", _GIVEN)).T_cam_imu
 
     def _is_in_image(self, q: Array) -> BoolArray:
         """Whether points (n, 3) are in front of the camera and near enough."""

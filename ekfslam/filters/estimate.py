@@ -11,12 +11,11 @@ import scipy.sparse as sp
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import FilterConfig
 from ekfslam.errors import ConfigError
-from ekfslam.filters.coordinates import CameraCoordinates, Change, Linear
+from ekfslam.filters.coordinates import CameraCoordinates, Change, View
 from ekfslam.filters.gaussian import Gaussian, Rows
 from ekfslam.filters.landmarks import LandmarkTable
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import Values
 from ekfslam.models.build import has_image_coordinates
 from ekfslam.models.model import Model, Moment, Seen
 from ekfslam.models.sensors.base import Sensor
@@ -32,12 +31,14 @@ class Moved:
     Args:
         values: Of the blocks.
         position_m: (n, 3) landmarks.
-        in_image: (n,) which of them were moved by their images, eq. (7'); None: all were moved in xyz.
+        in_image, before: (n,) which of them were moved by their images, eq. (7'), and how these were before; None: all
+            were moved in xyz.
     """
 
     values: dict[str, Array]
     position_m: Array
-    in_image: BoolArray | None
+    in_image: BoolArray | None = None
+    before: View | None = None
 
 
 class Estimate:
@@ -77,9 +78,12 @@ class Estimate:
         self.imu_twist = self.imu_twist_before = np.zeros(6)
         self.tau_s, self.step = 0.0, 0
         self.updated_pose: str | None = "pose"
-        self._has_images = has_image_coordinates(model.sensor, config.landmark_coordinates)
-        if self._has_images and not model.has_clone:
-            raise ConfigError("filter.landmark_coordinates: 'image' needs previous_pose in the model, see model_of")
+        self._cameras: dict[str, CameraCoordinates] = {}
+        if has_image_coordinates(model.sensor, config.landmark_coordinates):
+            if not model.has_clone:
+                raise ConfigError("filter.landmark_coordinates: 'image' needs previous_pose in the model, see model_of")
+            for name in ("pose", "previous_pose"):
+                self._cameras[name] = CameraCoordinates(model, name, config.min_depth_m)
 
     @property
     def P(self) -> Array:
@@ -217,8 +221,9 @@ class Estimate:
         x, d = self.parts(correction)
         after, positions = self.model.retract(self.values, correction), self.table.position_m
         if (camera := self._camera) is None:
-            return Moved(after, self.variant.retract_landmarks(self.T_imu_world, positions, correction[:6], d), None)
-        return Moved(after, *camera.retract(self.values, after, positions, x, d))
+            return Moved(after, self.variant.retract_landmarks(self.T_imu_world, positions, correction[:6], d))
+        before = camera.view(self.values, positions, self.values[camera.pose], positions)
+        return Moved(after, *camera.retract(before, after, x, d), before)
 
     def retract(self, correction: Array) -> None:
         """Move the mean, and re-express the covariance where the variant does."""
@@ -236,20 +241,20 @@ class Estimate:
     @property
     def _camera(self) -> CameraCoordinates | None:
         """Coordinates of landmarks in the last updated camera; None: they count by their positions in world."""
-        if not self._has_images or self.updated_pose is None:
-            return None
-        return CameraCoordinates(self.model, self.updated_pose, self.config.min_depth_m)
+        return None if self.updated_pose is None else self._cameras.get(self.updated_pose)
 
     def _change(self, moved: Moved, turned: Callable[[Array, Array], Array]) -> Change:
         """How errors of landmarks change where a correction leads."""
-        positions, camera = self.table.position_m, self._camera
-        if camera is None or moved.in_image is None:
-            return self.variant.change(self.model, self.values, moved.position_m - positions)
-        first = self.T_predicted if camera.pose == "pose" else self.T_predicted_before
-
-        def side(values: Values, positions_m: Array) -> tuple[Values, Array, Linear]:
-            linear = self.variant.linear(positions_m, self.table.initial_m)
-            return values, positions_m, Linear(self.variant.linear(values[camera.pose], first), linear)
-
-        sides = side(self.values, positions), side(moved.values, moved.position_m)
-        return camera.change(*sides, moved.in_image, turned)
+        positions, values, after, camera = self.table.position_m, self.values, moved.values, self._camera
+        if camera is None or moved.before is None or moved.in_image is None:
+            return self.variant.change(self.model, values, moved.position_m - positions)
+        T, T_after, before = values[camera.pose], after[camera.pose], moved.before
+        if self.variant.first_estimates:
+            T_first = self.T_predicted if camera.pose == "pose" else self.T_predicted_before
+            before, then = (
+                camera.view(at, m, T_first, self.table.initial_m)
+                for at, m in ((values, positions), (after, moved.position_m))
+            )
+        else:
+            then = camera.view(after, moved.position_m, T_after, moved.position_m)
+        return camera.change(before, then, moved.in_image, turned(T, T_after))

@@ -68,12 +68,12 @@ class Standard:
     def transport(self, gaussian: Gaussian, model: Model, before: Values, after: Values, change: Change) -> None:
         """Re-express the covariance after a correction that changed errors of landmarks: ``P <- G P G^T``.
 
-        G has M and B of the change, and `turned` of each pose. It costs a product of 3x3 blocks with P, and a rank
-        beyond that which is the number of the change's columns.
+        G has M and B of the change, and `turned` of each pose: 3x3 blocks, and a rank beyond them which is the number
+        of the change's columns.
         """
         if change.M is not None:
-            gaussian.transform_landmarks(change.M)
-        if len(change.columns):
+            gaussian.transform_landmarks(change.M, change.B, change.columns)
+        elif len(change.columns):
             # d+ = d + B a, hence P+ = P + B Z^T + Z B^T with Z = P_a + B P_aa / 2.
             P, columns = gaussian.P, change.columns
             B = np.zeros((len(P), len(columns)))

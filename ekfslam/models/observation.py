@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from ekfslam.arrays import Array
@@ -11,17 +9,8 @@ from ekfslam.geometry import se3
 from ekfslam.models.sensors.base import Sensor
 
 
-class View(Protocol):
-    """What `linearise` asks of a sensor: its extrinsics (4, 4), and the derivative (n, d, 3) of its rows by points."""
-
-    @property
-    def T_cam_imu(self) -> Array: ...
-
-    def jacobian(self, q: Array) -> Array: ...
-
-
 def linearise(
-    sensor: View, T_imu_world: Array, positions_m: Array, T_linear: Array, linear_positions_m: Array
+    sensor: Sensor, T_imu_world: Array, positions_m: Array, T_linear: Array, linear_positions_m: Array
 ) -> tuple[Array, Array, Array]:
     """Eq. (4): landmarks (n, 3) in world as the sensor sees them, with their Jacobians.
 

@@ -111,9 +111,9 @@ class Calibration(StateBlock):
         """Columns of the block that move or turn the camera."""
         return np.flatnonzero(self.free < _EXTRINSIC.stop)
 
-    def points_by_extrinsic(self, parameters: Array, q: Array) -> Array:
-        """Derivative (n, 3, e) of points q (n, 3) in the camera frame by the columns `extrinsic`."""
-        return _by_extrinsic(parameters, q)[..., self.free[self.extrinsic]]
+    def camera_by_extrinsic(self, parameters: Array) -> Array:
+        """Error (6, e) of the camera's pose ``exp(c_0..5^) T_cam_imu T_imu_world`` by the columns `extrinsic`."""
+        return np.asarray(se3.left_jacobian(parameters[_EXTRINSIC])[:, self.free[self.extrinsic]], dtype=float)
 
     @cached_property
     def turns_camera(self) -> IntArray:
@@ -141,7 +141,8 @@ class Calibration(StateBlock):
         H = np.zeros((len(q), 3, 9))
         # First estimates here, too: a camera and its landmarks turned about it as one must look the same for good.
         q_linear = se3.apply(now.T_cam_imu @ delay @ T_linear, linear_positions_m)
-        H[..., _EXTRINSIC] = A @ _by_extrinsic(parameters, q_linear)
+        moved = np.concatenate([np.broadcast_to(np.eye(3), A.shape), -se3.skew(q_linear)], axis=-1)
+        H[..., _EXTRINSIC] = A @ moved @ se3.left_jacobian(parameters[_EXTRINSIC])
         by_disparity = now.by_disparity(q)
         disparity_px = now.camera.fu_px * now.camera.baseline_m / q[:, 2:]
         H[..., _BASELINE] = by_disparity * disparity_px
@@ -182,12 +183,6 @@ class Calibration(StateBlock):
         R_world_cam = (se3.exp(parameters[_EXTRINSIC]) @ rig.T_cam_imu @ T_imu_world)[:3, :3].T
         by_rotation = se3.skew(moved_m) @ R_world_cam @ se3.so3_left_jacobian(parameters[_ROTATION])
         return by_rotation[..., self.free[self.turns_camera] - _ROTATION.start]
-
-
-def _by_extrinsic(parameters: Array, q: Array) -> Array:
-    """Derivative (n, 3, 6) of ``q = exp(c^) T_cam_imu s`` by the six parameters c."""
-    moved = np.concatenate([np.broadcast_to(np.eye(3), (*q.shape, 3)), -se3.skew(q)], axis=-1)
-    return np.asarray(moved @ se3.left_jacobian(parameters[_EXTRINSIC]), dtype=float)
 
 
 def calibrated(rig: Rig, parameters: Array) -> Rig:
