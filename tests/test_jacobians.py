@@ -57,7 +57,8 @@ def transport_invariant(P, T, T_after, moved):
     model = model_of(RIG, RIG.noise, T, np.eye(6))
     gaussian = Gaussian(np.eye(6), 6)
     gaussian.replace(P.copy())
-    VARIANTS["invariant"].transport(gaussian, model, {"pose": T}, {"pose": T_after}, moved)
+    variant, before = VARIANTS["invariant"], {"pose": T}
+    variant.transport(gaussian, model, before, {"pose": T_after}, variant.change(model, before, moved))
     return gaussian.P
 
 

@@ -178,16 +178,17 @@ def _iterate(
     values, positions, first = e.values, e.positions_m, done
     for _ in range(e.config.iterations - 1):
         x, d = e.parts(done.correction)
-        after, m = e.retracted(done.correction)
+        moved = e.retracted(done.correction)
+        after = moved.values
         linear = (
             e.coordinates + done.correction[: len(e.coordinates)],
             after["pose"],
             after.get("previous_pose", e.T_departed),
         )
-        e.values, e.table.position_m = after, m
+        e.values, e.table.position_m = after, moved.position_m
         _, rows = e.observe(slot, measured)
         e.values, e.table.position_m = values, positions
-        rows = e.variant.carry_back(rows, e.model, values, after, (m - positions)[slot])
+        rows = e.carried_back(rows, moved)
         e.P = P_prior.copy()
         done = e.gaussian.condition(rows.corrected(-x, -d), frame, e.ids[slot])
-    return Conditioned(done.correction, first.nis, first.log_det), m[slot], linear
+    return Conditioned(done.correction, first.nis, first.log_det), moved.position_m[slot], linear

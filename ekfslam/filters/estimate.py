@@ -2,20 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 import scipy.sparse as sp
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import FilterConfig
+from ekfslam.errors import ConfigError
+from ekfslam.filters.coordinates import CameraCoordinates, Change, View
 from ekfslam.filters.gaussian import Gaussian, Rows
 from ekfslam.filters.landmarks import LandmarkTable
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
+from ekfslam.models.build import has_image_coordinates
 from ekfslam.models.model import Model, Moment, Seen
 from ekfslam.models.sensors.base import Sensor
 
 # Calibration parameters where they are as given.
 GIVEN = np.zeros(9)
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What a correction leads to.
+
+    Args:
+        values: Of the blocks.
+        position_m: (n, 3) landmarks.
+        in_image, before: (n,) which of them were moved by their images, eq. (7'), and how these were before; None: all
+            were moved in xyz.
+    """
+
+    values: dict[str, Array]
+    position_m: Array
+    in_image: BoolArray | None = None
+    before: View | None = None
 
 
 class Estimate:
@@ -25,6 +48,9 @@ class Estimate:
         model: Blocks, sensor and noise.
         config: Variant, gate and limits.
 
+    Raises:
+        ConfigError: Landmarks in image coordinates, but no clone of the last pose in the model.
+
     Attributes:
         model, config: As given.
         variant: What is the variant's own.
@@ -33,6 +59,8 @@ class Estimate:
         table: The active landmarks, in the order of their blocks in P.
         gaussian: The covariance.
         T_predicted, T_predicted_before: (4, 4) ``T_imu_world`` before the last update, and before the one before.
+        updated_pose: Block of the pose that was updated last: ``pose`` itself between an update and the next
+            prediction, then ``previous_pose``. None: what was seen in the frame before has not updated it.
         T_departed: (4, 4) pose from which the last prediction led.
         imu_twist, imu_twist_before: (6,) velocities of the IMU that led to the last frame, and to the one before.
         tau_s, way_m: How long the last prediction took, and how far it led; 0 before the first one.
@@ -49,6 +77,13 @@ class Estimate:
         self.T_predicted = self.T_predicted_before = self.T_departed = self.values["pose"]
         self.imu_twist = self.imu_twist_before = np.zeros(6)
         self.tau_s, self.way_m, self.step = 0.0, np.zeros(()), 0
+        self.updated_pose: str | None = "pose"
+        self._cameras: dict[str, CameraCoordinates] = {}
+        if has_image_coordinates(model.sensor, config.landmark_coordinates):
+            if not model.has_clone:
+                raise ConfigError("filter.landmark_coordinates: 'image' needs previous_pose in the model, see model_of")
+            for name in ("pose", "previous_pose"):
+                self._cameras[name] = CameraCoordinates(model, name, config.min_depth_m)
 
     @property
     def P(self) -> Array:
@@ -188,15 +223,45 @@ class Estimate:
         """What observations depend on (seen,), and the landmarks' part (n, 3) of a correction."""
         return correction[: self.gaussian.seen], correction[self.gaussian.body :].reshape(-1, 3)
 
-    def retracted(self, correction: Array) -> tuple[dict[str, Array], Array]:
-        """Blocks and landmarks (n, 3) after a correction (b+3n,); the estimate stays."""
-        _, d = self.parts(correction)
-        m = self.variant.retract_landmarks(self.T_imu_world, self.table.position_m, correction[:6], d)
-        return self.model.retract(self.values, correction), m
+    def retracted(self, correction: Array) -> Moved:
+        """Blocks and landmarks after a correction (b+3n,); the estimate stays."""
+        x, d = self.parts(correction)
+        after, positions = self.model.retract(self.values, correction), self.table.position_m
+        if (camera := self._camera) is None:
+            return Moved(after, self.variant.retract_landmarks(self.T_imu_world, positions, correction[:6], d))
+        before = camera.view(self.values, positions, self.values[camera.pose], positions)
+        return Moved(after, *camera.retract(before, after, x, d), before)
 
     def retract(self, correction: Array) -> None:
         """Move the mean, and re-express the covariance where the variant does."""
-        before, positions = self.values, self.positions_m
-        self.values, self.table.position_m = self.retracted(correction)
+        moved = self.retracted(correction)
+        change = self._change(moved, self.variant.turned)
+        self.variant.transport(self.gaussian, self.model, self.values, moved.values, change)
+        self.values, self.table.position_m = moved.values, moved.position_m
         self.coordinates = self.coordinates + correction[: len(self.coordinates)]
-        self.variant.transport(self.gaussian, self.model, before, self.values, self.table.position_m - positions)
+
+    def carried_back(self, rows: Rows, moved: Moved) -> Rows:
+        """Rows taken where a correction leads, in the errors at the estimate."""
+        change = self._change(moved, self.variant.derivative).only(rows.slot)
+        return self.variant.carry_back(rows, self.model, self.values, moved.values, change)
+
+    @property
+    def _camera(self) -> CameraCoordinates | None:
+        """Coordinates of landmarks in the last updated camera; None: they count by their positions in world."""
+        return None if self.updated_pose is None else self._cameras.get(self.updated_pose)
+
+    def _change(self, moved: Moved, turned: Callable[[Array, Array], Array]) -> Change:
+        """How errors of landmarks change where a correction leads."""
+        positions, values, after, camera = self.table.position_m, self.values, moved.values, self._camera
+        if camera is None or moved.before is None or moved.in_image is None:
+            return self.variant.change(self.model, values, moved.position_m - positions)
+        T, T_after, before = values[camera.pose], after[camera.pose], moved.before
+        if self.variant.first_estimates:
+            T_first = self.T_predicted if camera.pose == "pose" else self.T_predicted_before
+            before, then = (
+                camera.view(at, m, T_first, self.table.initial_m)
+                for at, m in ((values, positions), (after, moved.position_m))
+            )
+        else:
+            then = camera.view(after, moved.position_m, T_after, moved.position_m)
+        return camera.change(before, then, moved.in_image, turned(T, T_after))

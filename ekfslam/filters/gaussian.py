@@ -214,6 +214,24 @@ class Gaussian:
         P[size:, size:].reshape(n, 3, n, 3)[block, :, block, :] += covariance
         self.P = P
 
+    def transform_landmarks(self, M: Array, B: Array, columns: IntArray) -> None:
+        """``d_i <- M_i d_i + B_i x``: landmark errors in other coordinates.
+
+        Args:
+            M: (n, 3, 3).
+            B: (n, 3, c) by some of the body, x.
+            columns: (c,) of x.
+        """
+        b, P, n = self.body, self.P, len(M)
+        B = B.reshape(3 * n, len(columns))
+        rows = (M @ P[b:].reshape(n, 3, len(P))).reshape(3 * n, len(P))
+        rows += B @ P[columns]
+        P_mm = (M @ rows[:, b:].T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
+        P_mm += B @ rows[:, columns].T
+        P[b:, :b] = rows[:, :b]
+        P[:b, b:] = P[b:, :b].T
+        np.multiply(P_mm + P_mm.T, 0.5, out=P[b:, b:])
+
     def marginalise(self, stay: BoolArray) -> None:
         """Drop the rows and columns of landmarks that do not stay (n,): exact marginalisation."""
         kept = np.flatnonzero(np.concatenate([np.ones(self.body, dtype=bool), np.repeat(stay, 3)]))

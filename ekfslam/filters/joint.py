@@ -21,6 +21,7 @@ from ekfslam.filters.logbook import LogBook
 from ekfslam.filters.reports import FrameReport, log_density, missed
 from ekfslam.filters.result import Landmarks, Parameters
 from ekfslam.filters.starting import start
+from ekfslam.filters.variants import is_frozen_exactly
 from ekfslam.filters.waiting import Waiting
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import StateBlock
@@ -67,7 +68,8 @@ class JointEKF(Estimate):
             raise ConfigError("a filter of a sensor needs a first pose")
         else:
             P_pose = config.initial_covariance if covariance is None else np.array(covariance, dtype=float)
-            model = model_of(sensor, sensor.noise, se3.inverse(T_world_imu), P_pose, calibration, blocks)
+            coordinates = config.landmark_coordinates
+            model = model_of(sensor, sensor.noise, se3.inverse(T_world_imu), P_pose, calibration, blocks, coordinates)
         super().__init__(model, config)
         self.revival, self.retired = revival, Retired()
         self._log = LogBook(self)
@@ -115,6 +117,7 @@ class JointEKF(Estimate):
             self.values["previous_pose"] = self.T_departed
             self.coordinates[model.layout["previous_pose"]] = departed[pose]
         self.T_predicted_before, self.T_predicted = self.T_predicted, step.T_imu_world
+        self.updated_pose = "previous_pose" if self.updated_pose == "pose" and model.has_clone else None
         self.imu_twist_before, self.imu_twist, self.tau_s = self.imu_twist, step.twist, tau_s
         self.step += 1
         self._log.predicted(self, twist, departed)
@@ -178,6 +181,7 @@ class JointEKF(Estimate):
         self._log.corrected(self, found)
         self.table.observed(found.slot, self.step, found.measured, self._log.last(len(found.slot)))
         self.retract(found.done.correction)
+        self.updated_pose = "pose" if found.dof else self.updated_pose
         reason[known] = found.verdict
         self.table.accepted(found.slot, frame)
         self.table.misses[slot[known[missed(found.verdict)]]] += 1
@@ -188,6 +192,9 @@ class JointEKF(Estimate):
         self._log.amend(T_updated=self.T_imu_world, updated=self.coordinates)
         # 5. Start new landmarks, eq. (5), or let them wait.
         started = start(self, self._log, self._waiting, frame, ids[new], rows[new])
+        if not found.dof:
+            # Nothing has updated the pose; yet landmarks that are all new have their images here.
+            self.updated_pose = "pose" if (self.table.first_step == self.step).all() else None
         self.retired.start_afresh(ids[new][started])
         reason[np.flatnonzero(new)[~started]] = WAITING
         self._reported.append(self.model.reported(self.values, self.gaussian.P))
@@ -228,6 +235,10 @@ class JointEKF(Estimate):
         self.values, self.table.position_m = {**self.values, **found.values}, found.position_m
         self.gaussian.start_over(found.P)
         self.coordinates[found.columns] = found.coordinates
+        if self.variant.first_estimates and not is_frozen_exactly(self.config):
+            # All rows are linearised again: these are the first estimates from now on.
+            self.table.initial_m, self.T_predicted = found.position_m, self.values["pose"]
+            self.T_predicted_before = self.values["previous_pose"]
 
     def landmarks(self) -> Landmarks:
         """Every landmark so far, in the order of landmark initialisation, which is that of the log."""

@@ -2,9 +2,10 @@
 
 All variants share the prediction (1)-(2), the measurement rows (4), new landmarks (5) and the update (6), and keep P in
 the stored coordinates ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``. They differ in where Jacobians are taken and
-in how a correction acts.
+in how a correction acts. With landmarks in image coordinates, eq. (7'), all variants move them alike. Then they differ
+in how the errors of poses before a correction become those after it, and (FEJ) in where M and B are taken.
 
-The iterated update (``iterations > 1``) goes with ``standard`` and ``invariant``.
+The iterated update (``iterations > 1``) goes with ``standard`` and ``invariant``, in image coordinates.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from ekfslam.arrays import Array
+from ekfslam.config import FilterConfig
+from ekfslam.filters.coordinates import Change
 from ekfslam.filters.gaussian import Gaussian, Rows, add_product
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import Values
@@ -27,8 +30,8 @@ class Standard:
 
     Attributes:
         first_estimates: Whether Jacobians are taken at first estimates.
-        is_frozen_exactly: Whether rows frozen where the filter linearised them are the filter: a landmark that comes
-            back then takes its place among them, otherwise all rows are linearised again.
+        is_frozen_exactly: Whether, with landmarks in xyz, rows frozen where the filter linearised them are the filter;
+            see the function of this name.
     """
 
     name = "standard"
@@ -50,19 +53,45 @@ class Standard:
         """
         return positions_m + d
 
-    def transport(self, gaussian: Gaussian, model: Model, before: Values, after: Values, moved_m: Array) -> None:
-        """Re-express the covariance after a correction that moved landmarks by ``moved_m`` (n, 3); here it stays."""
+    def turned(self, before: Array, after: Array) -> Array:
+        """How the stored error (6,) of a pose (4, 4) before a correction becomes that after it: here it stays."""
+        return np.eye(6)
 
-    def carry_back(self, rows: Rows, model: Model, before: Values, after: Values, moved_m: Array) -> Rows:
-        """Rows taken at a corrected state in the errors before the correction, for an iterated update.
+    def derivative(self, before: Array, after: Array) -> Array:
+        """The same (6, 6) for rows of an iterated update: the derivative of ``exp(xi^) T``."""
+        return np.asarray(se3.left_jacobian(se3.log(after @ se3.inverse(before))), dtype=float)
 
-        The chain rule with the derivative of the retraction; ``moved_m`` (k, 3) is of the landmarks of the rows.
+    def change(self, model: Model, before: Values, moved_m: Array) -> Change:
+        """Errors of landmarks in xyz after a correction that moved them by ``moved_m`` (n, 3): here they stay."""
+        return Change(np.empty(0, dtype=np.int64), np.empty((len(moved_m), 3, 0)))
+
+    def transport(self, gaussian: Gaussian, model: Model, before: Values, after: Values, change: Change) -> None:
+        """Re-express the covariance after a correction that changed errors of landmarks: ``P <- G P G^T``.
+
+        G has M and B of the change, and `turned` of each pose: 3x3 blocks, and a rank beyond them which is the number
+        of the change's columns.
+        """
+        if change.M is not None:
+            gaussian.transform_landmarks(change.M, change.B, change.columns)
+        elif len(change.columns):
+            # d+ = d + B a, hence P+ = P + B Z^T + Z B^T with Z = P_a + B P_aa / 2.
+            P, columns = gaussian.P, change.columns
+            B = np.zeros((len(P), len(columns)))
+            B[gaussian.body :] = change.B.reshape(-1, len(columns))
+            add_product(P, B, P[:, columns] + 0.5 * B @ P[np.ix_(columns, columns)])
+
+    def carry_back(self, rows: Rows, model: Model, before: Values, after: Values, change: Change) -> Rows:
+        """Rows taken at a corrected state in the errors before the correction, for an iterated update: the chain rule.
+
+        The change (k) is of the landmarks of the rows, with `derivative` for its pose.
         """
         H_x = rows.H_x.copy()
         for name in model.layout.poses:
             at = model.layout[name]
-            H_x[..., at] = H_x[..., at] @ se3.left_jacobian(se3.log(after[name] @ se3.inverse(before[name])))
-        return Rows(rows.slot, H_x, rows.H_m, rows.residual, rows.variance)
+            H_x[..., at] = H_x[..., at] @ self.derivative(before[name], after[name])
+        H_x[..., change.columns] += rows.H_m @ change.B
+        H_m = rows.H_m if change.M is None else rows.H_m @ change.M
+        return Rows(rows.slot, H_x, H_m, rows.residual, rows.variance)
 
     def landmark_error(self, m_hat: Array, m_true: Array, T_world_imu_hat: Array, T_world_imu_true: Array) -> Array:
         """Errors d (..., 3) of landmarks that the covariance is about; shapes broadcast.
@@ -108,47 +137,37 @@ class Invariant(Standard):
         R, J = se3.so3_exp_and_left_jacobian(e_theta)
         return positions_m @ R.T + e @ J.T
 
-    def transport(self, gaussian: Gaussian, model: Model, before: Values, after: Values, moved_m: Array) -> None:
-        """Last line of eq. (7), ``P <- J P J^T``: rank 3 beyond the identity and the adjoints of the poses.
+    def turned(self, before: Array, after: Array) -> Array:
+        """Third line of eq. (7), ``Ad(T+ T^-1)``.
 
-        J is not the derivative of `retract`: it keeps the *invariant* error, which is the same before and after. So
-        ``J N(X) = N(X+)`` for the unobservable directions N, and rows carried back through J still see nothing along
+        It is not the derivative of the retraction: it keeps the *invariant* error, which is the same before and after.
+        So ``G N(X) = N(X+)`` for the unobservable directions N, and rows carried back through G still see nothing along
         them. The exact derivative turns them by ``J_l(e)``; an iterated update with it gains heading from nothing.
         """
-        P = gaussian.P
-        columns, by = self._landmarks_by_rotations(model, before, moved_m)
-        # d+ = d + B a for the rotations a, hence P+ = P + B Z^T + Z B^T with Z = P_a + B P_aa / 2.
-        B = np.zeros((len(P), by.shape[-1]))
-        B[gaussian.body :] = by.reshape(-1, by.shape[-1])
-        add_product(P, B, P[:, columns] + 0.5 * B @ P[np.ix_(columns, columns)])
-        for name in model.layout.poses:
-            at, Ad = model.layout[name], se3.adjoint(after[name] @ se3.inverse(before[name]))
-            P[at] = Ad @ P[at]
-            P[:, at] = P[at].T
-            P_xx = Ad @ P[at, at]
-            P[at, at] = 0.5 * (P_xx + P_xx.T)
+        return np.asarray(se3.adjoint(after @ se3.inverse(before)), dtype=float)
 
-    def carry_back(self, rows: Rows, model: Model, before: Values, after: Values, moved_m: Array) -> Rows:
-        """The chain rule with J of eq. (7)."""
-        H_x = rows.H_x.copy()
-        for name in model.layout.poses:
-            at = model.layout[name]
-            H_x[..., at] = H_x[..., at] @ se3.adjoint(after[name] @ se3.inverse(before[name]))
-        columns, by = self._landmarks_by_rotations(model, before, moved_m)
-        H_x[..., columns] += rows.H_m @ by
-        return Rows(rows.slot, H_x, rows.H_m, rows.residual, rows.variance)
+    derivative = turned
 
-    @staticmethod
-    def _landmarks_by_rotations(model: Model, before: Values, moved_m: Array) -> tuple[Array, Array]:
-        """Columns (a,) of rotations, and new landmark errors (n, 3, a) by them: of the pose, and of the camera."""
+    def change(self, model: Model, before: Values, moved_m: Array) -> Change:
+        """Of landmarks in xyz: new errors by rotations, of the pose and (where it is in the state) of the camera."""
         start = model.layout["pose"].start + 3
         columns, by = np.arange(start, start + 3), se3.skew(moved_m) @ before["pose"][:3, :3].T
         calibration = model.calibration
         if calibration is None or not len(calibration.turns_camera):
-            return columns, by
+            return Change(columns, by)
         by_camera = calibration.landmarks_by_rotation(model.rig, before["calibration"], before["pose"], moved_m)
         columns = np.concatenate([columns, model.layout["calibration"].start + calibration.turns_camera])
-        return columns, np.concatenate([by, by_camera], axis=-1)
+        return Change(columns, np.concatenate([by, by_camera], axis=-1))
+
+    def transport(self, gaussian: Gaussian, model: Model, before: Values, after: Values, change: Change) -> None:
+        super().transport(gaussian, model, before, after, change)
+        P = gaussian.P
+        for name in model.layout.poses:
+            at, Ad = model.layout[name], self.turned(before[name], after[name])
+            P[at] = Ad @ P[at]
+            P[:, at] = P[at].T
+            P_xx = Ad @ P[at, at]
+            P[at, at] = 0.5 * (P_xx + P_xx.T)
 
     def landmark_error(self, m_hat: Array, m_true: Array, T_world_imu_hat: Array, T_world_imu_true: Array) -> Array:
         """Errors (..., 3) as eq. (7) has them: what a rigid motion of the world does to pose and landmarks is no error.
@@ -167,3 +186,11 @@ class Invariant(Standard):
 
 
 VARIANTS: dict[str, Standard] = {variant.name: variant for variant in (Invariant(), FirstEstimates(), Standard())}
+
+
+def is_frozen_exactly(config: FilterConfig) -> bool:
+    """Whether rows frozen where the filter linearised them are the filter.
+
+    A landmark that comes back then takes its place among them, otherwise all rows are linearised again.
+    """
+    return config.landmark_coordinates == "xyz" and VARIANTS[config.variant].is_frozen_exactly

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.config import CalibrationConfig, Config
+from ekfslam.config import CalibrationConfig, Config, FilterConfig, LandmarkCoordinates
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import WITHOUT_TRACKS, Sequence
@@ -36,6 +36,7 @@ from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.model import Model
 from ekfslam.models.noise import VelocityNoise, automatic_noise, velocity_noise, with_drift
 from ekfslam.models.sensors.base import DelayedSensor, Sensor
+from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
 
 # What "auto" keeps in the state when landmarks come back: beyond this a dense covariance is no longer cheap.
@@ -105,6 +106,7 @@ def build(
         config.filter.initial_covariance,
         config.calibration,
         (*optional_blocks(config.blocks), *blocks),
+        config.filter.landmark_coordinates,
     )
     return Problem(sequence, config, model, hygiene, account)
 
@@ -116,6 +118,7 @@ def model_of(
     covariance: Array,
     calibration: CalibrationConfig | None = None,
     blocks: SequenceType[StateBlock] = (),
+    coordinates: LandmarkCoordinates = FilterConfig.landmark_coordinates,
 ) -> Model:
     """The state blocks that a sensor and its noise ask for: which there are, is decided here and nowhere else.
 
@@ -125,12 +128,13 @@ def model_of(
         T_imu_world, covariance: (4, 4) first pose and (6, 6) of its error.
         calibration: What of the sensor's calibration is estimated; None: nothing.
         blocks: Further ones.
+        coordinates: Of landmarks: those in the last updated camera need its pose.
 
     Raises:
         ConfigError: A calibration to estimate, but no stereo rig; a block twice; or one that the sensor has no use for.
     """
     chosen: list[StateBlock] = [Pose(T_imu_world, covariance)]
-    if noise.track_error is not None:
+    if noise.track_error is not None or has_image_coordinates(sensor, coordinates):
         chosen.append(PreviousPose())
     std = prior_std(calibration or CalibrationConfig())
     if std.any():
@@ -159,6 +163,11 @@ def _is_seen_before(block: StateBlock) -> bool:
     """Whether the view from the frame before depends on a block, and not only what is new in this frame."""
     share = block.camera_share(np.ones(()), np.zeros((), dtype=bool))
     return share is None or bool(share != 0)
+
+
+def has_image_coordinates(sensor: Sensor, coordinates: LandmarkCoordinates) -> bool:
+    """Whether corrections act on landmarks as images: only cameras have any."""
+    return coordinates == "image" and isinstance(sensor, Rig | Monocular)
 
 
 def optional_blocks(settings: Mapping[str, Mapping[str, Any]]) -> tuple[StateBlock, ...]:

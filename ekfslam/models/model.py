@@ -369,7 +369,10 @@ class Model:
     def _columns_in(self, block: StateBlock | None, pose: str) -> slice | None:
         """Columns of a shared block as seen from a pose; None: it is of no account there."""
         assert block is not None
-        return self.layout[block.name] if pose != "previous_pose" else self.layout.get(self.layout.clones.get(block.name))
+        if pose != "previous_pose":
+            return self.layout[block.name]
+        clone = self.layout.clones.get(block.name)
+        return None if clone is None else self.layout[clone]
 
     def _camera_offset(self, moment: Moment, is_difference: BoolArray | None) -> tuple[Array, list[Array]]:
         """Eq. (11): the tangent by which the shared blocks move the camera, and the share of each.
@@ -425,7 +428,11 @@ class Model:
         """The sensor as all blocks of a moment have it."""
         if self.calibration is None and not self._turns_right_camera:
             return self.sensor
-        return self.calibration.applied(self._rig_of(moment), moment.calibration) if self.calibration else self._rig_of(moment)
+        return (
+            self.calibration.applied(self._rig_of(moment), moment.calibration)
+            if self.calibration
+            else self._rig_of(moment)
+        )
 
     def _rig_of(self, moment: Moment) -> Rig:
         """The rig before it is calibrated, its right camera turned."""

@@ -165,7 +165,7 @@ def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterio
     """
     if result.log is None:
         raise PosteriorError(f"{result.sequence_name}: a result of mode {result.mode!r} has no log; run mode 'full'")
-    stored = Config().with_overrides(result.config)
+    stored = _config_of(result)
     return posterior_of_log(
         result.log,
         model_of_result(result),
@@ -179,17 +179,25 @@ def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterio
 def model_of_result(result: Result) -> Model:
     """The model that a full run believed in."""
     assert result.log is not None
-    stored, log = Config().with_overrides(result.config), result.log
+    stored, log = _config_of(result), result.log
     start = log.T_predicted[0], log.initial_covariance
     rig = Rig(result.camera, result.T_cam_imu, result.noise)
-    model = model_of(rig, result.noise, *start, stored.calibration, optional_blocks(stored.blocks))
+    blocks, coordinates = optional_blocks(stored.blocks), stored.filter.landmark_coordinates
+    model = model_of(rig, result.noise, *start, stored.calibration, blocks, coordinates)
     if model.layout.body == log.departed.shape[1]:
         return model
     # Archives before format version 4 know of poses alone: velocities are white there, and so are pixels.
     noise = dataclasses.replace(
         result.noise, twist_walk_std=None, tilt_rad=0.0, track_first_px=None, track_walk_px=None
     )
-    return model_of(dataclasses.replace(rig, noise=noise), noise, *start)
+    return model_of(dataclasses.replace(rig, noise=noise), noise, *start, coordinates="xyz")
+
+
+def _config_of(result: Result) -> Config:
+    """The configuration of a run, but for iterations of its updates: today's rules refuse some of older archives."""
+    settings = dict(result.config.get("filter", {}))
+    settings.pop("iterations", None)
+    return Config().with_overrides({**result.config, "filter": settings})
 
 
 def posterior_of_log(

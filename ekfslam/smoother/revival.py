@@ -4,13 +4,14 @@ The filter's state is the marginal, over its blocks and the landmarks in view, o
 landmarks. When retired landmarks are seen again, the marginal over the blocks, the active *and* the returning landmarks
 takes its place:
 
-- ``standard`` and ``fej``: the rows are frozen where the filter linearised them, and so the marginal is exactly the
-  state of a filter that never retired anything. FEJ keeps its consistency, since a landmark comes back with its first
-  estimate; standard is as inconsistent as it ever is.
-- ``invariant``: a never-retired filter would have moved the error of every retired landmark with every correction,
-  which no sparse row remembers. Here all rows are linearised again at their common maximum a posteriori, and mean and
-  covariance are taken from there. All rows then see the same unobservable directions, those at the new mean, and
-  nothing is learned about them: the invariant filter's own property, at a better estimate.
+- ``standard`` and ``fej`` with landmarks in xyz: the rows are frozen where the filter linearised them, and so the
+  marginal is exactly the state of a filter that never retired anything. FEJ keeps its consistency, since a landmark
+  comes back with its first estimate; standard is as inconsistent as it ever is.
+- ``invariant``, and every variant with landmarks in image coordinates: a never-retired filter would have moved the
+  error of every retired landmark with every correction, which no sparse row remembers. Here all rows are linearised
+  again at their common maximum a posteriori, and mean and covariance are taken from there. All rows then see the same
+  unobservable directions, those at the new mean, and nothing is learned about them: the invariant filter's own
+  property, at a better estimate. FEJ has its first estimates there from then on.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig, PosteriorConfig
 from ekfslam.filters.lifecycle import Marginal
 from ekfslam.filters.log import Log
-from ekfslam.filters.variants import VARIANTS
+from ekfslam.filters.variants import is_frozen_exactly
 from ekfslam.models.model import Model
 from ekfslam.smoother.optimise import maximise
 from ekfslam.smoother.problem import BatchProblem, State
@@ -80,7 +81,7 @@ class MapRevival:
         """
         problem = BatchProblem(log, self._model)
         elimination = problem.elimination()
-        if VARIANTS[self._config.variant].is_frozen_exactly:
+        if is_frozen_exactly(self._config):
             information = JointInformation(elimination, problem.as_filtered())
             # The blocks' mean is the filter's already, but for rounding.
             positions = log.first_position_m[landmarks] + information.d[landmarks]

@@ -398,11 +398,13 @@ def _read_hygiene(group: h5py.Group) -> HygieneReport:
 def _in_todays_terms(config: dict[str, Any], noise: Noise, version: int) -> dict[str, Any]:
     """A configuration of an older version.
 
+    Before there was a choice, landmarks counted by their positions in world.
     Before version 4, drift was a share of the distance driven: today's drift, in px, says nothing of it. Before version
     3, the filter had the rules that hygiene has now.
     """
     if version < 4 and "noise" in config:
         config = {**config, "noise": {**config["noise"], "drift": None}}
+    config = {**config, "filter": {"landmark_coordinates": "xyz", **config.get("filter", {})}}
     if "hygiene" in config:
         return config
     rest = dict(config.get("filter", {}))

@@ -256,11 +256,11 @@ def _evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str
                 continue
             m_true = truth.position_m[np.searchsorted(truth.landmark, ekf.ids)]
             error = ekf.variant.landmark_error(ekf.positions_m, m_true, T_est[k], T_true[k])
-            n = np.arange(len(error))
-            blocks = ekf.P[6:, 6:].reshape(len(n), 3, len(n), 3)[n, :, n, :]
-            record["landmark_nees"][k] = time_average(nees(error, blocks)[None])[0]
+            record["landmark_nees"][k] = time_average(nees(error, ekf.gaussian.landmark_blocks())[None])[0]
             if k in joint_frames:
-                value = joint_nees(pose_error(T_est[k], T_true[k]), error, ekf.P) / len(ekf.P)
+                other = slice(6, ekf.gaussian.body)  # blocks besides the pose
+                P = np.delete(np.delete(ekf.P, other, 0), other, 1)
+                value = joint_nees(pose_error(T_est[k], T_true[k]), error, P) / len(P)
                 record["joint_nees_per_dof"][joint_frames.index(k)] = value
     except (FilterError, np.linalg.LinAlgError):
         stopped = True

@@ -107,6 +107,15 @@ class Calibration(StateBlock):
         return to_exposure(parameters, twist)
 
     @cached_property
+    def extrinsic(self) -> IntArray:
+        """Columns of the block that move or turn the camera."""
+        return np.flatnonzero(self.free < _EXTRINSIC.stop)
+
+    def camera_by_extrinsic(self, parameters: Array) -> Array:
+        """Error (6, e) of the camera's pose ``exp(c_0..5^) T_cam_imu T_imu_world`` by the columns `extrinsic`."""
+        return np.asarray(se3.left_jacobian(parameters[_EXTRINSIC])[:, self.free[self.extrinsic]], dtype=float)
+
+    @cached_property
     def turns_camera(self) -> IntArray:
         """Columns of the block that turn the camera."""
         return np.flatnonzero((self.free >= _ROTATION.start) & (self.free < _ROTATION.stop))

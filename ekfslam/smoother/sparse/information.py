@@ -1,9 +1,10 @@
 """A Gaussian over poses, other blocks and landmarks in information form: whitened rows, normal equations, CHOLMOD.
 
-Unknowns are ``eps`` (T, w), one vector a frame: its pose, and what else of it observations depend on; ``aux`` (T, a), what else has a value for each frame; ``drive`` (g,),
-what has one value for the drive; and ``d`` (M, 3), one a landmark. Observations touch a pose, perhaps the one before,
-the drive and a landmark; motion touches consecutive poses, the aux of the later one and the drive. Landmarks know of
-each other only through poses and drive, so those with few observations are eliminated first, all at once, by their
+Unknowns are ``eps`` (T, w), one vector a frame: its pose, and what else of it observations depend on; ``aux`` (T, a),
+what else has a value for each frame; ``drive`` (g,), what has one value for the drive; and ``d`` (M, 3), one a
+landmark. Observations touch a frame, perhaps the one before, the drive and a landmark; motion touches consecutive
+frames, the aux of the later one and the drive. Landmarks know of each other only through frames and drive, so those
+with few observations are eliminated first, all at once, by their
 Schur complements. What remains goes to CHOLMOD. Both are steps of one sparse elimination: nothing is approximated, and
 no matrix as wide as the state is ever formed.
 
@@ -139,7 +140,7 @@ class Elimination:
         self._lay_out()
 
     def parts(self, x: Array) -> tuple[Array, Array, Array, Array]:
-        """Frames (T, w, ...), aux (T, a, ...), drive (g, ...) and kept landmarks (n, 3, ...) of the reduced unknowns."""
+        """Frames (T, w, ...), aux (T, a, ...), drive (g, ...), kept landmarks (n, 3, ...) of the reduced unknowns."""
         ends = self.start[self.first_block[1:]]
         poses, aux, drive, kept = np.split(x, ends)
         rest = x.shape[1:]

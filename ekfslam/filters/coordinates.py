@@ -1,0 +1,177 @@
+"""Coordinates in which a correction acts on landmarks: eq. (7'), the image in the last updated camera.
+
+An error of a landmark seen once is Gaussian in the image (u, v, disparity) of the camera that saw it. In world it is
+not: depth is the inverse of a disparity. Image coordinates are linear in (x/z, y/z, 1/z), which serve here instead: so
+intrinsics do not matter, and one camera alone has them, too. The camera must be one whose pose is updated already. That
+of the prediction turns by degrees in the update, and images are not linear in that.
+
+Sources: Castellanos, Martinez-Cantin, Tardos, Neira, "Robocentric map joining", RAS 2007 (a clone of the last pose);
+Civera, Davison, Montiel, "Inverse depth parametrization for monocular SLAM", T-RO 2008.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.geometry import se3
+from ekfslam.models.blocks import Values
+from ekfslam.models.model import Model
+from ekfslam.models.sensors.stereo import Rig
+
+# A landmark is beside the camera where a ray is this much longer across than along the optical axis.
+_MOST_OBLIQUE = 3.0
+# What has less disparity (px) is too far for its image to say anything of its depth.
+_LEAST_DISPARITY_PX = 0.5
+# Largest factor by which a correction may change a disparity.
+_LARGEST_FACTOR = 4.0
+
+
+@dataclass(frozen=True)
+class Change:
+    """``d_i+ = M_i d_i + B_i x``: landmark errors after a correction by those before, and by some of the body.
+
+    Args:
+        columns: (c,) of the body.
+        B: (n, 3, c).
+        M: (n, 3, 3); None is the identity.
+    """
+
+    columns: IntArray
+    B: Array
+    M: Array | None = None
+
+    def only(self, slot: IntArray) -> Change:
+        """The change of some of the landmarks."""
+        return Change(self.columns, self.B[slot], None if self.M is None else self.M[slot])
+
+
+@dataclass(frozen=True)
+class View:
+    """Landmarks as the camera has them.
+
+    Args:
+        q: (n, 3) in its frame.
+        q_linear, R_linear: (n, 3), (3, 3) the same points, and the rotation from world, where derivatives are taken.
+        by_columns: (6, c) error of the camera's pose by columns of the body, ``dq = [I, -q^] by_columns x``.
+    """
+
+    q: Array
+    q_linear: Array
+    R_linear: Array
+    by_columns: Array
+
+
+@dataclass(frozen=True)
+class CameraCoordinates:
+    """Landmarks by their images in the camera of a pose in the state.
+
+    Landmarks behind or beside the camera, those without disparity, and those whose disparity a correction would change
+    by too large a factor count by their positions (x, y, z) in the camera frame instead.
+
+    Args:
+        model: Of the filter.
+        pose: Name of the pose's block: of the last updated pose.
+        min_depth_m: What is nearer is behind the camera.
+    """
+
+    model: Model
+    pose: str
+    min_depth_m: float
+
+    def view(self, values: Values, positions_m: Array, T_linear: Array, linear_positions_m: Array) -> View:
+        """Landmarks (n, 3) in world from the camera, at blocks; derivatives are of another pose and of others (FEJ)."""
+        calibration, T_cam_imu = self.model.calibration, self._T_cam_imu(values)
+        by_columns = np.asarray(se3.adjoint(T_cam_imu), dtype=float)
+        if calibration is not None:
+            by_calibration = calibration.camera_by_extrinsic(values["calibration"])
+            by_columns = np.concatenate([by_columns, by_calibration], axis=1)
+        q = q_linear = se3.apply(T_cam_imu @ values[self.pose], positions_m)
+        if T_linear is not values[self.pose]:
+            q_linear = se3.apply(T_cam_imu @ T_linear, linear_positions_m)
+        return View(q, q_linear, T_cam_imu[:3, :3] @ T_linear[:3, :3], by_columns)
+
+    def retract(self, before: View, after: Values, x: Array, d: Array) -> tuple[Array, BoolArray]:
+        """Landmarks ``m+`` (n, 3) of eq. (7') after a correction of blocks ``x`` (seen,) and landmarks d (n, 3).
+
+        Args:
+            before: The view before it, linear where it is.
+            after: Blocks after it.
+            x, d: The correction.
+
+        Returns:
+            Also whether (n,) a landmark counts by its image.
+        """
+        q, xi = before.q, before.by_columns @ x[self.columns]
+        step = xi[:3] + q @ se3.skew(xi[3:]).T + d @ before.R_linear.T
+        in_image = self._is_in_image(q)
+        front = np.where(in_image[:, None], q, _AHEAD)
+        y = image(front)
+        y_after = y + (image_jacobian(front) @ step[..., None])[..., 0]
+        in_image &= (y_after[:, 2] > y[:, 2] / _LARGEST_FACTOR) & (y_after[:, 2] < y[:, 2] * _LARGEST_FACTOR)
+        q_after = np.where(in_image[:, None], image(np.where(in_image[:, None], y_after, _AHEAD)), q + step)
+        return se3.apply(se3.inverse(self._T_cam_imu(after) @ after[self.pose]), q_after), in_image
+
+    def change(self, before: View, after: View, in_image: BoolArray, turned: Array) -> Change:
+        """``M`` and ``B`` of eq. (7').
+
+        Args:
+            before, after: The views before and after a correction.
+            in_image: (n,) which landmarks count by their images.
+            turned: (6, 6) how the error of the pose before becomes that after.
+        """
+        # The image is its own inverse: its derivative at an image is the inverse of that at the point.
+        J = image_jacobian(np.where(in_image[:, None], before.q, _AHEAD))
+        J_inverse_after = image_jacobian(image(np.where(in_image[:, None], after.q, _AHEAD)))
+        J = np.where(in_image[:, None, None], J_inverse_after @ J, np.eye(3))
+        by_after = after.by_columns.copy()
+        by_after[:, :6] = by_after[:, :6] @ turned
+        minus_one = np.broadcast_to(-np.eye(3), J.shape)
+        by_camera = [J, -J @ se3.skew(before.q_linear), minus_one, se3.skew(after.q_linear)]
+        B = np.concatenate(by_camera, axis=-1) @ np.concatenate([before.by_columns, by_after])
+        back = after.R_linear.T
+        return Change(self.columns, back @ B, back @ J @ before.R_linear)
+
+    @cached_property
+    def columns(self) -> IntArray:
+        """Columns (c,) of pose and camera in the body."""
+        layout, calibration = self.model.layout, self.model.calibration
+        columns = layout.columns([self.pose])
+        if calibration is None:
+            return columns
+        return np.concatenate([columns, layout["calibration"].start + calibration.extrinsic])
+
+    def _T_cam_imu(self, values: Values) -> Array:
+        """(4, 4) extrinsics as calibrated."""
+        return self.model.sensor_at(values.get("calibration", _GIVEN)).T_cam_imu
+
+    def _is_in_image(self, q: Array) -> BoolArray:
+        """Whether points (n, 3) are in front of the camera and near enough."""
+        sensor, z = self.model.sensor, q[:, 2]
+        furthest_m = np.inf
+        if isinstance(sensor, Rig):
+            furthest_m = sensor.camera.fu_px * sensor.camera.baseline_m / _LEAST_DISPARITY_PX
+        is_ahead = np.abs(q[:, :2]).max(axis=1, initial=0.0) < _MOST_OBLIQUE * z
+        return is_ahead & (z > self.min_depth_m) & (z < furthest_m)
+
+
+# Stands for points whose image is not asked for.
+_AHEAD = np.array([0.0, 0.0, 1.0])
+_GIVEN = np.zeros(9)
+
+
+def image(q: Array) -> Array:
+    """``(x/z, y/z, 1/z)`` of points (..., 3); its own inverse."""
+    return np.concatenate([q[..., :2], np.ones_like(q[..., 2:])], axis=-1) / q[..., 2:]
+
+
+def image_jacobian(q: Array) -> Array:
+    """Derivative (..., 3, 3) of `image` by the points."""
+    y = image(q)
+    J = np.zeros((*q.shape, 3))
+    J[..., 0, 0] = J[..., 1, 1] = y[..., 2]
+    J[..., 2] = -y * y[..., 2:]
+    return J
