@@ -132,7 +132,7 @@ class Rig:
         return q_right, cam.projection_jacobian(replace(self.camera, baseline_m=0.0), q_right)[..., :2, :], R
 
     def _of_both(self, left: Array, right: Array) -> Array:
-        """Rows (uL, v, uR), or derivatives of them (n, 3, k), from those of the rectified pair and (uR, vR) (n, 2, k)."""
+        """Rows (uL, v, uR), or derivatives of them (n, 3, k), from those of the left camera and (uR, vR) (n, 2, k)."""
         weight = cam.weight_of_left_row(self.noise.pixel_std_px)
         v = weight * left[..., 1, :] + (1.0 - weight) * right[..., 1, :]
         return np.stack([left[..., 0, :], v, right[..., 0, :]], axis=-2)
