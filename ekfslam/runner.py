@@ -15,6 +15,7 @@ from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError
 from ekfslam.filters.dead_reckoning import dead_reckon
+from ekfslam.filters.innovations import collect_innovations
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import FurtherVelocities, one_thread, run_filter
 from ekfslam.filters.mapping import IndependentLandmarks
@@ -54,7 +55,7 @@ def run(
     frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
     counts: dict[str, int] = {}
     reports, landmarks = [], Landmarks.empty()
-    log = parameters = None
+    log = parameters = whitened = None
 
     with one_thread():
         if mode == "full":
@@ -82,6 +83,8 @@ def run(
     if reports:
         innovation, rejections, tallies = collect(reports)
         counts = {**tallies, **counts}
+        found = [report.innovations for report in reports if report.innovations is not None]
+        whitened = collect_innovations(found) if found else None
         account["log_likelihood"] = float(sum(report.log_likelihood for report in reports))
     if hygiene is not None:
         counts |= hygiene.counts
@@ -103,6 +106,7 @@ def run(
         log=log,
         hygiene=hygiene,
         parameters=parameters,
+        whitened=whitened,
         attributes={**sequence.attributes, **account, **versions()},
     )
 

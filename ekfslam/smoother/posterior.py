@@ -255,6 +255,7 @@ def smooth(result: Result, config: PosteriorConfig | None = None, found: Posteri
         },
         config=settings,
         log=None,
+        whitened=None,
     )
 
 
