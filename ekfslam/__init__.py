@@ -68,7 +68,7 @@ from ekfslam.data.readers import open_sequence, write_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import EkfslamError
 from ekfslam.filters.result import Result
-from ekfslam.reports import Comparison, check_consistency, compare
+from ekfslam.reports import Comparison, check, check_consistency, compare
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import Posterior, posterior, smooth
 from ekfslam.storage.archive import read_archive, write_archive
@@ -94,6 +94,7 @@ __all__ = [
     "Sequence",
     "Study",
     "TunedNoise",
+    "check",
     "check_consistency",
     "compare",
     "open_sequence",

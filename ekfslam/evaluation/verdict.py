@@ -31,10 +31,11 @@ from ekfslam.evaluation.honesty import (
     track_innovations,
 )
 from ekfslam.evaluation.tables import document, markdown_table, number, plus_minus
-from ekfslam.filters.result import Result
+from ekfslam.filters.result import Result, WhitenedInnovations
 from ekfslam.smoother.posterior import Posterior
 
 _NOTABLE = 1.3  # factor from which a deviation is worth a word
+_LEAST_LOW = 1.1  # of the factor, with near certainty
 _PERSISTS = 2.0  # persistence from which an error is called slow
 _LEAST_MEAN, _SURE_OF_MEAN = 0.3, 4.5  # of a constant error: standard deviations of a frame, standard errors
 _LEAST_OUTLIERS, _LEAST_MOVING = 0.01, 0.1  # shares of the observations
@@ -50,7 +51,8 @@ class Cause:
         kind: ``bias``, ``shared drift``, ``shared noise``, ``pixel noise``, ``tracks``, ``outliers``, ``moving``,
             ``prior`` or ``smoother``.
         where: Axes, rows, or names of parameters.
-        factor: By which errors exceed the covariance there; below 1: by which they are smaller; 1: it says nothing.
+        factor: By which errors exceed the covariance there, beyond what single observations explain; below 1: by which
+            they are smaller; 1: it says nothing.
         text: In words.
     """
 
@@ -177,6 +179,18 @@ _SHARED_HEADINGS = ("axis", "size", "lag 1", "lag 5", "mean", "persists", "grows
 _TRACK_HEADINGS = ("row", "lag 1", "lag 5", f"lag {LAGS}", "persists", "grows by")
 
 
+def innovations_of(result: Result) -> WhitenedInnovations:
+    """The whitened innovations of a result.
+
+    Raises:
+        HonestyError: It has none.
+    """
+    if result.whitened is None:
+        why = "was made before innovations were kept: run again" if result.mode == "full" else "has none: check 'full'"
+        raise HonestyError(f"{result.sequence_name}: no innovations to judge by: the result of {result.mode!r} {why}")
+    return result.whitened
+
+
 def judge(result: Result, smoothed: Posterior | None = None, skipped: str = "not asked for") -> Honesty:
     """Whether the covariance of a full run is honest, from its innovations.
 
@@ -188,10 +202,7 @@ def judge(result: Result, smoothed: Posterior | None = None, skipped: str = "not
     Raises:
         HonestyError: The result has no whitened innovations, or too few frames with them.
     """
-    whitened, innovation = result.whitened, result.innovation
-    if whitened is None:
-        why = "was made before innovations were kept: run again" if result.mode == "full" else "has no innovations"
-        raise HonestyError(f"{result.sequence_name}: the result of mode {result.mode!r} {why}")
+    whitened, innovation = innovations_of(result), result.innovation
     looked_at = np.isfinite(whitened.shared_nis) & (innovation.dof > LEAST_DOF)
     if looked_at.sum() <= LAGS:
         raise HonestyError(f"{result.sequence_name}: only {looked_at.sum()} frames have innovations to judge by")
@@ -232,29 +243,34 @@ def _causes(
 
 
 def _shared_causes(shared: SharedInnovations, tracks: TrackInnovations) -> list[Cause]:
-    """Shared errors, beyond what too small a noise of single observations explains."""
-    pixels = max(1.0, float(np.sqrt(tracks.scale)))
-    order, mean = shared.order, np.abs(shared.mean)
-    large = (shared.factor > _NOTABLE * pixels) & (shared.factor_low > pixels)
+    """Shared errors, beyond what errors of single observations explain: averages over landmarks inherit these."""
+    explained = max(1.0, float(np.sqrt(tracks.scale)), _grown(tracks))
+    order, mean, factor = shared.order, np.abs(shared.mean), shared.factor / explained
+    large = (factor > _NOTABLE) & (shared.factor_low > _LEAST_LOW * explained)
     constant = (mean > _LEAST_MEAN) & (mean > _SURE_OF_MEAN * shared.mean_error)
     rest = order[(large & ~constant)[order]]
     # An error that is new in each frame shows at once, a slow one only in sums.
     slow = np.log(shared.persistence[rest])
-    fast = 2.0 * np.log(shared.factor[rest] / pixels) - slow
+    fast = 2.0 * np.log(factor[rest]) - slow
     is_slow = len(rest) and slow.mean() > max(np.log(_PERSISTS), fast.mean())
     groups = {"bias": order[(large & constant)[order]], "shared drift" if is_slow else "shared noise": rest}
     return [
-        Cause(kind, tuple(AXES[a] for a in axes), float(shared.factor[axes[0]]), _spoken(kind, shared, axes.tolist()))
+        Cause(kind, tuple(AXES[a] for a in axes), float(factor[axes[0]]), _spoken(kind, shared, axes.tolist()))
         for kind, axes in groups.items()
         if len(axes)
     ]
+
+
+def _grown(tracks: TrackInnovations) -> float:
+    """Largest factor of the rows whose errors persist along tracks; 0 where none does."""
+    return float(tracks.factor[tracks.persistence > _PERSISTS].max(initial=0.0))
 
 
 def _spoken(kind: str, shared: SharedInnovations, axes: Sequence[int]) -> str:
     agree = f"innovations agree across landmarks in {_axes([AXES[a] for a in axes])}"
     if kind == "bias":
         sizes = _listed([_rate(shared.rate[a], a) for a in axes])
-        return f"{agree} and are constant: a bias of the velocities (at least {sizes})"
+        return f"{agree} and are constant: a bias of the velocities (up to {sizes})"
     if kind == "shared drift":
         return f"{agree} and persist over frames: a slow error of all tracks or of the velocities"
     return f"{agree}, anew in each frame: velocities noisier than stated, or a jitter of all tracks"
@@ -267,7 +283,7 @@ def _rate(rate: float, axis: int) -> str:
 def _track_causes(tracks: TrackInnovations) -> list[Cause]:
     pixels, names, causes = float(np.sqrt(tracks.scale)), ROWS[: len(tracks.factor)], []
     slow = np.flatnonzero(tracks.persistence > _PERSISTS)
-    grown = float(tracks.factor[slow].max(initial=0.0))
+    grown = _grown(tracks)
     if grown > _NOTABLE:
         where = tuple(names[i] for i in slow)
         text = f"errors persist along tracks in {_listed(where)}, where the model takes them as new in each frame"
