@@ -35,10 +35,11 @@ from ekfslam.filters.result import Result, WhitenedInnovations
 from ekfslam.smoother.posterior import Posterior
 
 _NOTABLE = 1.3  # factor from which a deviation is worth a word
-_LEAST_LOW = 1.1  # of the factor, with near certainty
-_PERSISTS = 2.0  # persistence from which an error is called slow
+_LEAST_LOW = 1.15  # of the factor, with near certainty
+_PERSISTS, _LEAST_SLOW = 2.0, 1.5  # persistence from which errors of tracks, and those that all share, are called slow
 _LEAST_MEAN, _SURE_OF_MEAN = 0.3, 4.5  # of a constant error: standard deviations of a frame, standard errors
 _LEAST_OUTLIERS, _LEAST_MOVING = 0.01, 0.1  # shares of the observations
+_LEAST_AGREEMENT = 1.5  # ratio of standard deviations
 _PULL = 3.5  # standard deviations from its prior that speak against a block
 _SMOOTHER = 3.0  # normalised square per degree of freedom: that of an EKF in XYZ may be 2
 
@@ -48,8 +49,8 @@ class Cause:
     """Something that is wrong with the model.
 
     Args:
-        kind: ``bias``, ``shared drift``, ``shared noise``, ``pixel noise``, ``tracks``, ``outliers``, ``moving``,
-            ``prior`` or ``smoother``.
+        kind: ``bias``, ``shared drift``, ``shared noise``, ``pixel noise``, ``tracks``, ``agreement``,
+            ``outliers``, ``moving``, ``prior`` or ``smoother``.
         where: Axes, rows, or names of parameters.
         factor: By which errors exceed the covariance there, beyond what single observations explain; below 1: by which
             they are smaller; 1: it says nothing.
@@ -96,6 +97,11 @@ class Honesty:
     findings: tuple[Cause, ...]
 
     @property
+    def agreement(self) -> float:
+        """Size of shared errors against that of single observations, by what the model says of it."""
+        return _agreement(self.shared, self.tracks)
+
+    @property
     def verdict(self) -> str:
         """The judgement in words."""
         if self.factor > 1 and self.causes:
@@ -103,7 +109,7 @@ class Honesty:
             where = f" in {_axes(worst.where)}" if worst.is_shared else ""
             text = f"covariance optimistic by about {self.factor:.1f}x{where}"
         elif self.causes:
-            text = f"covariance pessimistic by about {1 / self.factor:.1f}x"
+            text = f"covariance pessimistic by about {1 / self.factor:.1f}x, as far as innovations can tell"
         else:
             text = "honest as far as innovations can tell"
         if self.causes:
@@ -113,7 +119,13 @@ class Honesty:
     @property
     def values(self) -> dict[str, Any]:
         """Everything as plain values for JSON; what is not a number is None."""
-        words = {"verdict": self.verdict, "blind": BLIND, "axes": list(AXES), "rows": list(ROWS)}
+        words = {
+            "verdict": self.verdict,
+            "agreement": self.agreement,
+            "blind": BLIND,
+            "axes": list(AXES),
+            "rows": list(ROWS),
+        }
         return {**words, **_plain(dataclasses.asdict(self))}
 
     @property
@@ -138,7 +150,8 @@ class Honesty:
             ["NIS", _ratio_text(self.nis), "1"],
             ["NIS shared by the landmarks of a frame", _ratio_text(self.shared.size), "1"],
             ["NIS of single observations, without that", _ratio_text(self.tracks.size), "1"],
-            ["their variance, without the gate's cut", f"{self.tracks.scale:.3g}", "1"],
+            ["shared errors against single ones (deviations)", f"{self.agreement:.2f}", "1"],
+            ["variance of single ones, without the gate's cut", f"{self.tracks.scale:.3g}", "1"],
             ["rejected by gates, calm frames", _percent(self.rejections.gate), _percent(self.rejections.expected)],
         ]
         rows += [[f"rejected: {name}", _percent(share), ""] for name, share in self.rejections.reasons.items()]
@@ -213,6 +226,7 @@ def judge(result: Result, smoothed: Posterior | None = None, skipped: str = "not
     priors = () if result.parameters is None else prior_agreement(result.parameters)
     smoother = None if smoothed is None else smoother_agreement(result, smoothed)
     factor, causes, aside = _causes(shared, tracks, smoother)
+    aside = (*aside, *_agreement_causes(shared, tracks, causes))
     return Honesty(
         name=result.sequence_name,
         frames=len(result.time_s),
@@ -252,7 +266,7 @@ def _shared_causes(shared: SharedInnovations, tracks: TrackInnovations) -> list[
     # An error that is new in each frame shows at once, a slow one only in sums.
     slow = np.log(shared.persistence[rest])
     fast = 2.0 * np.log(factor[rest]) - slow
-    is_slow = len(rest) and slow.mean() > max(np.log(_PERSISTS), fast.mean())
+    is_slow = len(rest) and slow.mean() > max(np.log(_LEAST_SLOW), fast.mean())
     groups = {"bias": order[(large & constant)[order]], "shared drift" if is_slow else "shared noise": rest}
     return [
         Cause(kind, tuple(AXES[a] for a in axes), float(factor[axes[0]]), _spoken(kind, shared, axes.tolist()))
@@ -297,6 +311,22 @@ def _track_causes(tracks: TrackInnovations) -> list[Cause]:
     return causes
 
 
+def _agreement(shared: SharedInnovations, tracks: TrackInnovations) -> float:
+    return float(np.sqrt(shared.size.value / tracks.size.value))
+
+
+def _agreement_causes(shared: SharedInnovations, tracks: TrackInnovations, causes: Sequence[Cause]) -> list[Cause]:
+    """Landmarks that agree more than the model says, where the sizes of their errors do not tell it already."""
+    agreement = _agreement(shared, tracks)
+    if agreement < _LEAST_AGREEMENT or any(cause.is_shared for cause in causes):
+        return []
+    text = (
+        f"the landmarks of a frame agree: errors that they share are {agreement:.1f}x as large, "
+        "against those of single observations, as the model says"
+    )
+    return [Cause("agreement", (), 1.0, text)]
+
+
 def _rejection_causes(rejections: RejectedShares) -> list[Cause]:
     causes = []
     # Two gates, and a tail that is not quite Gaussian, reject somewhat more than one gate should.
@@ -316,7 +346,7 @@ def _prior_causes(priors: Sequence[PriorAgreement]) -> list[Cause]:
     if not off:
         return []
     names = tuple(prior.name for prior in off)
-    text = f"{_listed(names)} disagree with their prior, or take larger steps than they should"
+    text = f"disagreement with the prior of {_listed(names)}, or steps larger than its deviation allows"
     return [Cause("prior", names, 1.0, text)]
 
 
