@@ -41,6 +41,7 @@ Glossary:
 - *sensor*: what observes landmarks (`ekfslam.models.sensors`); its *rows* are the numbers that one observation gives.
 - *landmark initialisation*: eq. (5). A *delayed* one waits for a second view.
 - *innovation*: measured rows minus predicted ones; *gate*: the chi-square limit on its normalised square.
+- *shared innovation*: the motion of the camera on which all innovations of a frame agree; white if the model is true.
 - *NIS*, *NEES*: normalised innovation, estimation error squared; honest if their means are their degrees of freedom.
 - *variant*: where the joint filter linearises and how a correction acts: invariant, fej, standard.
 - *gauge*: directions that nothing observes: where the world's origin is, and which way it is turned.
@@ -68,7 +69,7 @@ from ekfslam.data.readers import open_sequence, write_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import EkfslamError
 from ekfslam.filters.result import Result
-from ekfslam.reports import Comparison, check_consistency, compare
+from ekfslam.reports import Comparison, check, check_consistency, compare
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import Posterior, posterior, smooth
 from ekfslam.storage.archive import read_archive, write_archive
@@ -94,6 +95,7 @@ __all__ = [
     "Sequence",
     "Study",
     "TunedNoise",
+    "check",
     "check_consistency",
     "compare",
     "open_sequence",

@@ -28,7 +28,7 @@ from ekfslam.figures.run import save_figures
 from ekfslam.filters.result import Result
 from ekfslam.models.build import build
 from ekfslam.models.noise import velocity_noise
-from ekfslam.reports import check_consistency, compare
+from ekfslam.reports import check, check_consistency, compare
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT
@@ -215,6 +215,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--kernel", choices=get_args(Kernel), help="robust kernel of map (default: as configured, huber)")
     sub.add_argument("--out", type=Path, metavar="DIR", help="for the figures; default: the folder of the archive")
+
+    sub = add(
+        "check",
+        _check,
+        "say whether the covariance of a run is honest, without truth, from its innovations",
+        "check city.h5",
+        "check drive.h5 --out figures",
+    )
+    sub.add_argument("archive", type=Path, metavar="ARCHIVE", help="as written by run or compare, mode full")
+    sub.add_argument("--mode", default="full", help="run in the archive (default: %(default)s)")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="for check.md, .json, .png; default: that of the archive")
 
     sub = add(
         "export",
@@ -429,6 +440,12 @@ def _posterior(options: argparse.Namespace) -> None:
     for path in save_posterior_figures(directory, full, smoothed, found.information, archive.truth):
         print(path)
     print(f"{smoothed.mode} written to {options.archive}")
+
+
+def _check(options: argparse.Namespace) -> None:
+    found = check(options.archive, options.mode, options.out)
+    print(found.honesty.table)
+    print("written: " + ", ".join(map(str, found.paths)))
 
 
 def _export(options: argparse.Namespace) -> None:

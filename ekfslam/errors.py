@@ -107,6 +107,10 @@ class InnovationError(FilterError):
         )
 
 
+class HonestyError(EkfslamError):
+    """A result has no innovations to judge its covariance by."""
+
+
 class PosteriorError(EkfslamError):
     """A posterior is asked for what it cannot give."""
 

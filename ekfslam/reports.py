@@ -1,6 +1,7 @@
 """Reports: a call runs, writes an archive, and says what it found in a table and figures.
 
-`compare`: the modes side by side on one sequence. `check_consistency`: whether covariances hold what they promise.
+`compare`: the modes side by side on one sequence. `check_consistency`: whether covariances hold what they promise, on
+simulations with their truth. `check`: the same of one run without truth, from its innovations.
 """
 
 from __future__ import annotations
@@ -13,16 +14,18 @@ from typing import Any
 
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
-from ekfslam.errors import IllPosedError
+from ekfslam.errors import IllPosedError, PosteriorError
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.evaluation.truth import with_truth_noise
+from ekfslam.evaluation.verdict import Honesty, innovations_of, judge
+from ekfslam.figures.check import plot_check
 from ekfslam.figures.posterior import plot_map_before_and_after
 from ekfslam.figures.run import save_figure, save_figures
 from ekfslam.figures.study import save_study_figures
 from ekfslam.filters.result import Result
 from ekfslam.runner import run
-from ekfslam.smoother.posterior import smooth
-from ekfslam.storage.archive import write_archive
+from ekfslam.smoother.posterior import posterior, smooth
+from ekfslam.storage.archive import open_result, write_archive
 from ekfslam.studies.executors import open_executor
 from ekfslam.studies.study import Study, StudyArchive, run_study
 from ekfslam.studies.summary import study_table, summarise_study
@@ -143,6 +146,48 @@ def check_consistency(
     table_path.write_text(study_table(summary), encoding="utf-8")
     paths = [archive_path, summary_path, table_path, *save_study_figures(directory, archive)]
     return ConsistencyReport(archive, summary, paths)
+
+
+@dataclass(frozen=True)
+class Check:
+    """What `check` found.
+
+    Args:
+        honesty: Verdict and evidence.
+        paths: The files written.
+    """
+
+    honesty: Honesty
+    paths: list[Path]
+
+
+def check(archive: str | Path, mode: str = "full", directory: str | Path | None = None) -> Check:
+    """Whether the covariance of a run is honest, without truth; writes ``check.json``, ``check.md``, ``check.png``.
+
+    Args:
+        archive: As written by run or compare.
+        mode: Of the run in it.
+        directory: Where to; made if missing. By default the folder of the archive.
+
+    Raises:
+        ArchiveError: The archive cannot be read or has no such mode.
+        HonestyError: The run has no innovations to judge by: of another mode than full, or of an older release.
+    """
+    result = open_result(archive, mode)
+    innovations_of(result)
+    smoothed, skipped = None, ""
+    try:
+        smoothed = posterior(result)
+    except PosteriorError as error:
+        skipped = str(error)
+    found = judge(result, smoothed, skipped)
+    directory = Path(archive).parent if directory is None else Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    values, table, figure = (directory / name for name in ("check.json", "check.md", "check.png"))
+    _write_json(values, found.values)
+    table.write_text(found.table, encoding="utf-8")
+    save_figure(plot_check(result, found), figure)
+    return Check(found, [values, table, figure])
 
 
 def _write_json(path: Path, summary: dict[str, Any]) -> None:

@@ -16,6 +16,7 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError
 from ekfslam.evaluation.relative import dead_reckoned_pairs, relative_pairs
 from ekfslam.filters.dead_reckoning import dead_reckon
+from ekfslam.filters.innovations import collect_innovations
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import FurtherVelocities, one_thread, run_filter
 from ekfslam.filters.mapping import IndependentLandmarks
@@ -56,7 +57,7 @@ def run(
     frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
     counts: dict[str, int] = {}
     reports, landmarks = [], Landmarks.empty()
-    log = parameters = pairs = None
+    log = parameters = pairs = whitened = None
     reach = config.filter.relative_frames
     judged = relative_pairs(sequence.truth, reach) if sequence.truth is not None and reach else None
 
@@ -92,6 +93,8 @@ def run(
     if reports:
         innovation, rejections, tallies = collect(reports)
         counts = {**tallies, **counts}
+        found = [report.innovations for report in reports if report.innovations is not None]
+        whitened = collect_innovations(found) if found else None
         account["log_likelihood"] = float(sum(report.log_likelihood for report in reports))
     if hygiene is not None:
         counts |= hygiene.counts
@@ -114,6 +117,7 @@ def run(
         hygiene=hygiene,
         parameters=parameters,
         pairs=pairs,
+        whitened=whitened,
         attributes={**sequence.attributes, **account, **versions()},
     )
 

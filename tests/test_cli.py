@@ -198,6 +198,19 @@ def test_posterior_of_what_has_none(tmp_path, capsys):
     assert "has no log" in failure(capsys, "posterior", tmp_path / "old.h5")
 
 
+def test_check_writes_verdict_evidence_and_figure(tmp_path, capsys):
+    archive = tmp_path / "city.h5"
+    assert main(["run", "builtin:city?frames=80", "--out", str(archive)]) == 0
+    assert main(["check", str(archive), "--out", str(tmp_path / "checked")]) == 0
+    assert "Verdict:" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "checked").iterdir()} == {"check.json", "check.md", "check.png"}
+    assert "axes" in json.loads((tmp_path / "checked" / "check.json").read_text())
+    assert "is missing" in failure(capsys, "check", archive, "--mode", "smoothed")
+    with h5py.File(archive, "r+") as h5file:
+        del h5file["runs/full/whitened"]
+    assert "was made before innovations were kept: run again" in failure(capsys, "check", archive)
+
+
 def test_as_an_installed_command(tmp_path):
     """A real process: exit code, silence of the progress bar off a terminal, and output that survives `head`."""
     program = [sys.executable, "-m", "ekfslam.cli"]

@@ -11,6 +11,7 @@ from ekfslam.errors import InnovationError
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.gaussian import Conditioned, Rows
+from ekfslam.filters.innovations import FrameInnovations, innovations_of
 from ekfslam.geometry import se3
 from ekfslam.models.model import Seen
 from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, MOVING
@@ -31,6 +32,7 @@ class Correction:
         position_m: (j, 3) where they were linearised.
         linear: (body,) coordinates at which the update was linearised.
         T_linear, T_linear_before: (4, 4) poses there, of this frame and of the one before.
+        innovations: Those of the accepted ones, of the first iteration.
     """
 
     done: Conditioned
@@ -43,6 +45,7 @@ class Correction:
     linear: Array
     T_linear: Array
     T_linear_before: Array
+    innovations: FrameInnovations
 
 
 def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correction:
@@ -59,7 +62,8 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     verdict = np.full(len(slot), ACCEPTED)
     seen, rows = e.observe(slot, measured)
     verdict[~e.sensor.in_view(seen.q, e.config.min_depth_m)] = BEHIND_CAMERA
-    some = _gate_alone(e, frame, rows, seen, verdict, gate)
+    some, S = _gate_alone(e, frame, rows, seen, verdict, gate)
+    innovations = FrameInnovations.none(e.sensor.dimension)
     done = Conditioned(np.zeros(len(e.P)), 0.0, 0.0)
     P_prior = e.P.copy() if e.config.iterations > 1 and len(some) else None
     if len(some):
@@ -73,6 +77,9 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
         inside = verdict[some] == ACCEPTED
         if not inside.all():
             done = _without(e, frame, done, tried, left, inside)
+            tried, S = tried.only(inside), S[inside]
+            left = tried.corrected(*e.parts(done.correction))
+        innovations = innovations_of(e.gaussian, e.table.log_row[tried.slot], tried, S, left.residual)
     taken = verdict == ACCEPTED
     if not taken.all():
         rows, measured = rows.only(taken), measured[taken]
@@ -81,7 +88,9 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     position = e.table.position_m[rows.slot]
     if P_prior is not None and taken.any():
         done, position, linear = _iterate(e, frame, P_prior, done, rows.slot, measured)
-    return Correction(done, rows.residual.size, verdict, rows.slot, measured, rows.variance, position, *linear)
+    return Correction(
+        done, rows.residual.size, verdict, rows.slot, measured, rows.variance, position, *linear, innovations
+    )
 
 
 def _without(e: Estimate, frame: int, done: Conditioned, tried: Rows, left: Rows, inside: BoolArray) -> Conditioned:
@@ -98,8 +107,13 @@ def _without(e: Estimate, frame: int, done: Conditioned, tried: Rows, left: Rows
         return e.gaussian.condition(kept, frame, e.ids[kept.slot])
 
 
-def _gate_alone(e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArray, gate: float) -> IntArray:
-    """Which landmarks (j,) of the rows pass the gate by themselves; the verdict (k,) on the others is written."""
+def _gate_alone(
+    e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArray, gate: float
+) -> tuple[IntArray, Array]:
+    """Which landmarks (j,) of the rows pass the gate by themselves, and the covariances (j, d, d) of their innovations.
+
+    The verdict (k,) on the others is written.
+    """
     some = np.flatnonzero(verdict == ACCEPTED)
     rows = rows if len(some) == len(verdict) else rows.only(some)
     S = e.gaussian.variances(rows) + gates.diagonal(rows.variance)
@@ -116,7 +130,7 @@ def _gate_alone(e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArr
         moving = _moving(e, rows.slot, evidence, squares, gate)
         verdict[some[moving]] = MOVING
         inside &= ~moving
-    return some[inside]
+    return some[inside], S[inside]
 
 
 def _gate_by_others(e: Estimate, left: Rows, seen: Seen, some: IntArray, gate: float) -> IntArray:

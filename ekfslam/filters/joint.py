@@ -200,7 +200,7 @@ class JointEKF(Estimate):
         self._reported.append(self.model.reported(self.values, self.gaussian.P))
         likelihood = self._log_likelihood + log_density(found.done.nis, found.done.log_det, found.dof)
         self._log_likelihood = 0.0
-        return FrameReport(frame, ids, reason, found.done.nis, found.dof, split, likelihood)
+        return FrameReport(frame, ids, reason, found.done.nis, found.dof, split, likelihood, found.innovations)
 
     def _retire(self, gone: BoolArray, may_return: bool = False) -> None:
         """Marginalise landmarks (n,): drop their rows and columns, keep their last estimate."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import BoolArray, IntArray
+from ekfslam.filters.innovations import FrameInnovations
 from ekfslam.filters.result import REASONS, Innovation, Rejections
 from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, WAITING
 
@@ -25,6 +26,7 @@ class FrameReport:
         split: Ids of tracks that were split, their observation starting a new landmark.
         log_likelihood: Log-density of the frame's innovations, of accepted updates and, where velocities are in the
             state, of their measurement; see `log_density`. Landmarks that start are without prior and contribute 0.
+        innovations: Of the accepted updates, whitened (joint filter only).
     """
 
     frame: int
@@ -34,6 +36,7 @@ class FrameReport:
     dof: int
     split: IntArray
     log_likelihood: float
+    innovations: FrameInnovations | None = None
 
 
 def log_density(nis: float, log_det: float, dof: int) -> float:

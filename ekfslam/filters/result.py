@@ -89,6 +89,49 @@ class Innovation:
 
 
 @dataclass(frozen=True)
+class WhitenedInnovations:
+    """What `ekfslam.evaluation.honesty` judges by: innovations in units of what the filter expects.
+
+    Of the K' accepted observations of landmarks that were known already, in the order of frames. Equations stand in
+    `ekfslam.filters.innovations`.
+
+    Args:
+        frame: (K',) frame of each.
+        landmark: (K',) row of its landmark in the log.
+        alone: (K', d) innovation by the Cholesky factor of its own covariance: u, v, disparity.
+        apart: (K', d) the same less the motion of the camera on which the frame's innovations agree, in its own
+            covariance; NaN where that leaves nothing.
+        score: (T, 6) ``c = J^T S^-1 r`` of each frame, along the axes of the IMU: rho, then theta.
+        information: (T, 6, 6) its covariance ``C = J^T S^-1 J``; 0 where nothing was accepted.
+    """
+
+    frame: IntArray
+    landmark: IntArray
+    alone: Array
+    apart: Array
+    score: Array
+    information: Array
+
+    @property
+    def shared(self) -> Array:
+        """(T, 6) components ``c_a / sqrt(C_aa)``: white over frames with unit variance; NaN where there is none."""
+        variance = np.diagonal(self.information, axis1=1, axis2=2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(variance > 0, self.score / np.sqrt(variance), np.nan)
+
+    @property
+    def shared_nis(self) -> Array:
+        """(T,) ``c^T C^-1 c``, six degrees of freedom; NaN where the frame leaves a direction undetermined."""
+        variance = np.diagonal(self.information, axis1=1, axis2=2)
+        std = np.sqrt(np.where(variance > 0, variance, 1.0))
+        correlation = self.information / (std[:, :, None] * std[:, None, :])
+        values, axes = np.linalg.eigh(correlation)
+        along = np.einsum("tba,tb->ta", axes, self.score / std)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(values[:, 0] > 1e-12, (along**2 / values).sum(axis=1), np.nan)
+
+
+@dataclass(frozen=True)
 class Rejections:
     """Every rejected observation: (R,) frame, landmark id, and index into `REASONS`."""
 
@@ -183,6 +226,7 @@ class Result:
         hygiene: What was done to the tracks before (None: nothing, as in dead reckoning).
         parameters: What else was estimated: calibration, roll and pitch (None: nothing).
         pairs: Cross-covariances of some of the poses (None: there is no truth to judge them by).
+        whitened: Innovations one by one and frame by frame (full mode only; older archives have none).
         attributes: Sequence attributes, versions, seed, input checksum; ``log_likelihood`` of the innovations of
             what was accepted (runs that reject alike may be compared by it).
     """
@@ -205,4 +249,5 @@ class Result:
     hygiene: HygieneReport | None = None
     parameters: Parameters | None = None
     pairs: PosePairs | None = None
+    whitened: WhitenedInnovations | None = None
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)

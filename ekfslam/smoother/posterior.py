@@ -278,6 +278,7 @@ def smooth(result: Result, config: PosteriorConfig | None = None, found: Posteri
         config=settings,
         log=None,
         pairs=pairs,
+        whitened=None,
     )
 
 

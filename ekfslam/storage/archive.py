@@ -8,6 +8,8 @@
         trajectory          time, T_world_imu, covariance
         landmarks           id, position, covariance, initial_position, first_frame, last_frame, observations
         innovation          nis, dof, accepted, rejected
+        whitened            frame, landmark, alone, apart, score, information: see
+                            `ekfslam.filters.result.WhitenedInnovations` (mode full only, not in older archives)
         rejections          frame, landmark, reason (index into its attribute ``names``)
         parameters          value, std, prior_std; attributes name, unit; see `ekfslam.filters.result.Parameters`
         pairs               first, second, cross: see `ekfslam.filters.result.PosePairs` (where truth is known)
@@ -58,6 +60,7 @@ from ekfslam.filters.result import (
     PosePairs,
     Rejections,
     Result,
+    WhitenedInnovations,
 )
 from ekfslam.geometry.camera import StereoCamera
 
@@ -122,6 +125,16 @@ _LOG_LAYOUT_4: hdf5.Layout = (
     ("velocity_is_biased", "velocity_is_biased", ("N",), "truth value", "none"),
 )
 
+
+# The same below /runs/<mode>/whitened, fields of `WhitenedInnovations` (N observations of d rows).
+_WHITENED_LAYOUT: hdf5.Layout = (
+    ("frame", "frame", ("N",), "frame index", "none"),
+    ("landmark", "landmark", ("N",), "row of log/landmark_id", "none"),
+    ("alone", "alone", ("N", "d"), "1", "image"),
+    ("apart", "apart", ("N", "d"), "1", "image"),
+    ("score", "score", ("T", 6), "1/m (rho 0-2), 1/rad (theta 3-5)", "imu"),
+    ("information", "information", ("T", 6, 6), "1/m^2, 1/(m rad), 1/rad^2 (rho 0-2, theta 3-5)", "imu"),
+)
 
 # The same below /runs/<mode>/parameters, fields of `Parameters` (P of them).
 _PARAMETERS_LAYOUT: hdf5.Layout = (
@@ -319,6 +332,8 @@ def _write_result(group: h5py.Group, result: Result) -> None:
         hdf5.write_attributes(hygiene, {"observations": result.hygiene.observations})
         hdf5.write_fields(hygiene, _HYGIENE_LAYOUT, result.hygiene)
         hygiene["rule"].attrs["names"] = RULES
+    if result.whitened is not None:
+        hdf5.write_fields(group.create_group("whitened"), _WHITENED_LAYOUT, result.whitened)
     if result.log is not None:
         log = group.create_group("log")
         hdf5.write_attributes(log, {"first_estimates": result.log.first_estimates})
@@ -361,6 +376,7 @@ def _read_result(h5file: h5py.File, mode: str, camera: StereoCamera, T_cam_imu: 
         hygiene=_read_hygiene(hdf5.subgroup(group, "hygiene")) if "hygiene" in group else None,
         parameters=_read_parameters(hdf5.subgroup(group, "parameters"), sizes) if "parameters" in group else None,
         pairs=_read_pairs(hdf5.subgroup(group, "pairs"), sizes["T"]) if "pairs" in group else None,
+        whitened=_read_whitened(hdf5.subgroup(group, "whitened"), sizes) if "whitened" in group else None,
         attributes=hdf5.attributes(hdf5.subgroup(group, "attributes")),
     )
 
@@ -388,6 +404,10 @@ def _read_pairs(group: h5py.Group, frames: int) -> PosePairs:
     if not ((pairs.first >= 0) & (pairs.first < pairs.second) & (pairs.second < frames)).all():
         raise ArchiveError(f"{group.file.filename}: {group.name.strip('/')} holds frames that are no pair of {frames}")
     return pairs
+
+
+def _read_whitened(group: h5py.Group, sizes: Mapping[str, int]) -> WhitenedInnovations:
+    return WhitenedInnovations(**hdf5.read_fields(group, _WHITENED_LAYOUT, {"T": sizes["T"]}))
 
 
 def _read_hygiene(group: h5py.Group) -> HygieneReport:

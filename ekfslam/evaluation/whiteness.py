@@ -1,0 +1,115 @@
+"""Statistics of series that should be white: autocorrelation, long-run variance, means that allow for correlation.
+
+The long-run variance of a series is ``gamma_0 + 2 sum gamma_l``, with gamma its autocovariances: that of its sums, as a
+share of what white noise of unit variance gives. Here with Bartlett's weights, and so never negative. Source: Newey
+and West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix",
+Econometrica 55, 1987. Its relative standard error over T samples is about ``sqrt(4 L / 3 T)`` for L lags.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.special import gammainc, gammaincinv
+
+from ekfslam.arrays import Array, IntArray
+
+_LARGEST_SCALE = 100.0  # of variances, that a gate still lets be told
+
+
+def autocovariance(series: Array, lags: int) -> Array:
+    """Second moments about 0 of samples 0 to ``lags`` apart: (T, n) to (lags+1, n); NaN samples do not count.
+
+    Each is divided by the number of all samples that count, so that the sequence is positive semi-definite.
+    """
+    known = np.isfinite(series)
+    filled, count = np.where(known, series, 0.0), np.maximum(known.sum(axis=0), 1)
+    shifted = (filled[: len(filled) - lag] * filled[lag:] for lag in range(lags + 1))
+    return np.array([product.sum(axis=0) / count for product in shifted])
+
+
+def long_run_variance(covariances: Array) -> Array:
+    """``gamma_0 + 2 sum w_l gamma_l`` (n,) of autocovariances (lags+1, n), with Bartlett's weights."""
+    weight = 1.0 - np.arange(len(covariances)) / len(covariances)
+    return 2.0 * (weight @ covariances) - covariances[0]
+
+
+def relative_error(samples: int, lags: int) -> float:
+    """Relative standard error of a long-run variance; that of a variance where there are no lags."""
+    return float(np.sqrt(max(4.0 * lags / 3.0, 2.0) / max(samples, 1)))
+
+
+def along_tracks(frame: IntArray, landmark: IntArray, values: Array, lags: int) -> tuple[Array, IntArray]:
+    """Autocovariance along tracks, all tracks together, and the pairs behind it.
+
+    Args:
+        frame, landmark: (K,) of each value; a landmark has at most one in a frame.
+        values: (K, d); NaN does not count.
+        lags: Frames.
+
+    Returns:
+        (lags+1, d) mean products of values that many frames apart, about 0; (lags+1,) how many.
+    """
+    span = (int(frame.max()) if len(frame) else 0) + lags + 1
+    key = landmark.astype(np.int64) * span + frame
+    order = np.argsort(key)
+    key, values = key[order], values[order]
+    known = np.isfinite(values).all(axis=1)
+    key, values = key[known], values[known]
+    products, pairs = np.zeros((lags + 1, values.shape[1])), np.zeros(lags + 1, dtype=np.int64)
+    for lag in range(lags + 1):
+        later = np.searchsorted(key, key + lag)
+        both = np.flatnonzero(key[np.minimum(later, len(key) - 1)] == key + lag) if len(key) else later
+        pairs[lag] = len(both)
+        if len(both):
+            products[lag] = (values[both] * values[later[both]]).mean(axis=0)
+    return products, pairs
+
+
+def ratio_error(values: Array, dof: IntArray, lags: int) -> float:
+    """Standard error of ``sum values / sum dof`` that allows for correlation over time, (T,) each.
+
+    Never less than that of independent chi-square values.
+    """
+    total = float(dof.sum())
+    if total == 0:
+        return float("nan")
+    ratio = float(values.sum()) / total
+    off = (values - ratio * dof)[:, None]
+    variance = len(dof) * float(long_run_variance(autocovariance(off, lags))[0])
+    return float(np.sqrt(max(variance, 2.0 * ratio**2 * total)) / total)
+
+
+def gated_scale(mean: float, dimension: int, probability: float) -> float:
+    """By how much variances are larger than stated, from the squares of what passed a gate.
+
+    Squares of innovations whose variances are s times those stated are s times chi-square; the gate cuts off what is
+    large, so that their mean understates s.
+
+    Args:
+        mean: Of the accepted squares, divided by their dimension.
+        dimension: Of each.
+        probability: With which the gate accepts what the model says; 1: there is none.
+
+    Returns:
+        s, at most 100.
+    """
+    if probability >= 1.0 or mean <= 0:
+        return mean
+    gate = 2.0 * float(gammaincinv(dimension / 2.0, probability))
+
+    def accepted_mean(scale: float) -> float:
+        x = gate / (2.0 * scale)
+        return scale * float(gammainc(dimension / 2.0 + 1.0, x) / gammainc(dimension / 2.0, x))
+
+    if accepted_mean(_LARGEST_SCALE) <= mean:
+        return _LARGEST_SCALE
+    return float(brentq(lambda scale: accepted_mean(scale) - mean, 1e-6 * mean, _LARGEST_SCALE))
+
+
+def rejected_share(scale: float, dimension: int, probability: float) -> float:
+    """Share of observations that a gate rejects where their variances are ``scale`` times those stated."""
+    if probability >= 1.0:
+        return 0.0
+    gate = float(gammaincinv(dimension / 2.0, probability))
+    return float(1.0 - gammainc(dimension / 2.0, gate / scale))

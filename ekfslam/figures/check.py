@@ -1,0 +1,117 @@
+"""The figure of `ekfslam check`: what the innovations of a run say about its covariance."""
+
+from __future__ import annotations
+
+from textwrap import fill
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.evaluation.consistency import chi2_bounds
+from ekfslam.evaluation.honesty import AXES, LAGS, ROWS
+from ekfslam.evaluation.verdict import Honesty
+from ekfslam.figures.style import BOUNDS, EXPECTED, SERIES, ZERO, line_of, log_axis, styled
+from ekfslam.filters.result import REASONS, Result
+
+_PROBABILITY, _SIGMAS = 0.95, 1.96
+_LOG_RATIO = 20.0  # largest over smallest NIS per dof from which a logarithmic axis shows more
+_BINS = 60  # of the time axis, in which rejections are counted
+
+
+@styled
+def plot_check(result: Result, found: Honesty) -> Figure:
+    """Six panels: NIS, rejections, autocorrelation along tracks and of shared innovations, and these over time.
+
+    Args:
+        result: With whitened innovations.
+        found: What `ekfslam.evaluation.verdict.judge` said of it.
+    """
+    figure = Figure(figsize=(11.0, 9.6))
+    panels = figure.subplots(3, 2)
+    _nis(panels[0, 0], result, found)
+    _rejections(panels[0, 1], result)
+    _along_tracks(panels[1, 0], found)
+    _over_frames(panels[1, 1], found)
+    shared, time_s = _shared(result)
+    for ax, axes, title in zip(panels[2], (range(3), range(3, 6)), ("translation", "rotation"), strict=True):
+        _over_time(ax, time_s, shared, axes)
+        ax.set_title(f"shared innovation, {title}: mean of {LAGS} frames")
+    figure.suptitle(fill(f"{found.name}: {found.verdict}".replace(" %", "\N{NO-BREAK SPACE}%"), 130), fontsize=10)
+    return figure
+
+
+def _nis(ax: Axes, result: Result, found: Honesty) -> None:
+    seen = result.innovation.dof > 0
+    time_s, dof = (result.time_s - result.time_s[0])[seen], result.innovation.dof[seen]
+    values = result.innovation.nis[seen] / dof
+    low, high = (bound / dof for bound in chi2_bounds(dof, _PROBABILITY))
+    ax.fill_between(time_s, low, high, step="mid", **BOUNDS, label=f"{100 * _PROBABILITY:g} % bounds")
+    ax.axhline(1.0, **EXPECTED, label="expected")
+    ax.plot(time_s, values, ".", color=line_of("full")["color"], markersize=2.5, label="frame")
+    if values.max() > _LOG_RATIO * max(values.min(), 1e-9):
+        log_axis(ax, (1.0, 3.0))
+    ax.set(xlabel="time [s]", ylabel="NIS per dof [-]", title=f"NIS: mean {found.nis.value:.2f} (1 expected)")
+    ax.margins(x=0.01, y=0.25)
+    ax.legend(loc="upper right", ncols=3)
+
+
+def _rejections(ax: Axes, result: Result) -> None:
+    time_s, innovation = result.time_s - result.time_s[0], result.innovation
+    edges = np.linspace(0.0, max(time_s[-1], 1e-9), min(_BINS, len(time_s)) + 1)
+    total = np.histogram(time_s, edges, weights=innovation.accepted + innovation.rejected)[0]
+    present = [code for code in range(len(REASONS)) if (result.rejections.reason == code).any()]
+    for code, style in zip(present, SERIES, strict=False):
+        at = time_s[result.rejections.frame[result.rejections.reason == code]]
+        share = 100.0 * np.histogram(at, edges)[0] / np.maximum(total, 1)
+        ax.step((edges[1:] + edges[:-1]) / 2, share, where="mid", **style, label=REASONS[code])
+    share = innovation.rejected.sum() / max(total.sum(), 1)
+    ax.set(xlabel="time [s]", ylabel="of all observations [%]", title=f"rejections: {100 * share:.2g} %")
+    ax.set_ylim(0.0, 1.4 * max(ax.get_ylim()[1], 0.1))
+    ax.margins(x=0.01)
+    if present:
+        ax.legend(loc="upper right")
+
+
+def _along_tracks(ax: Axes, found: Honesty) -> None:
+    lags, pairs = np.arange(LAGS + 1), np.maximum(found.tracks.pairs, 1)
+    _correlation(ax, lags, _SIGMAS / np.sqrt(pairs), found.tracks.correlation, ROWS)
+    ax.set_title("autocorrelation along tracks, shared motion taken out")
+
+
+def _over_frames(ax: Axes, found: Honesty) -> None:
+    lags = np.arange(LAGS + 1)
+    _correlation(ax, lags, np.full(LAGS + 1, _SIGMAS / np.sqrt(found.shared.frames)), found.shared.correlation, AXES)
+    ax.set_title("autocorrelation of what a frame's landmarks share")
+
+
+def _correlation(ax: Axes, lags: IntArray, bound: Array, values: Array, names: tuple[str, ...]) -> None:
+    ax.fill_between(lags, -bound, bound, **BOUNDS, label=f"{100 * _PROBABILITY:g} % if white")
+    ax.axhline(0.0, **ZERO)
+    for i in range(values.shape[1]):
+        ax.plot(lags[1:], values[1:, i], **SERIES[i], label=names[i])
+    ax.set(xlabel="lag [frames]", ylabel="correlation [-]", xticks=lags[::5])
+    ax.set_ylim(min(-0.3, 1.1 * values[1:].min()), max(0.8, 1.6 * values[1:].max()))
+    ax.legend(loc="upper right", ncols=2)
+
+
+def _shared(result: Result) -> tuple[Array, Array]:
+    """Sums over `LAGS` frames (n, 6) by their expected deviation, and the times (n,) at their middle."""
+    assert result.whitened is not None
+    series, time_s = result.whitened.shared, result.time_s - result.time_s[0]
+    known = np.isfinite(series).all(axis=1)
+    series, time_s = series[known], time_s[known]
+    total = np.cumsum(np.vstack([np.zeros(6), series]), axis=0)
+    return (total[LAGS:] - total[:-LAGS]) / np.sqrt(LAGS), time_s[LAGS // 2 :][: len(series) - LAGS + 1]
+
+
+def _over_time(ax: Axes, time_s: Array, shared: Array, axes: range) -> None:
+    ax.axhspan(-_SIGMAS, _SIGMAS, **BOUNDS, label=f"{100 * _PROBABILITY:g} % if white")
+    ax.axhline(0.0, **ZERO)
+    for a in axes:
+        ax.plot(time_s, shared[:, a], **SERIES[a], label=AXES[a])
+    limit = max(3.0, 1.1 * float(np.abs(shared).max()))
+    ax.set(xlabel="time [s]", ylabel="in expected deviations [-]", ylim=(-limit, 1.25 * limit))
+    ax.margins(x=0.01)
+    ax.legend(loc="upper right", ncols=4)

@@ -1,0 +1,263 @@
+"""On simulations whose model is wrong in a known way, `judge` names the right error; on true ones it finds none."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from ekfslam.data.sequence import Noise
+from ekfslam.data.simulate import CAMERA, T_CAM_IMU, City, simulate
+from ekfslam.errors import HonestyError
+from ekfslam.evaluation import honesty
+from ekfslam.evaluation.verdict import Honesty, judge
+from ekfslam.figures.check import plot_check
+from ekfslam.filters.result import Parameters, Result, WhitenedInnovations
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import project
+from ekfslam.runner import run
+from ekfslam.smoother.posterior import posterior
+
+SIGMA_V, SIGMA_W, SIGMA_PX = 0.1, 0.004, 0.7
+STATED = Noise.isotropic(SIGMA_V, SIGMA_W, SIGMA_PX)
+SEEDS = pytest.mark.parametrize("seed", range(3))
+
+
+def world(seed, **changes):
+    small = {"frames": 300, "max_tracks": 40, "outlier_fraction": 0.0, "loss_probability": 0.02}
+    noise = {"sigma_v_m_s": SIGMA_V, "sigma_w_rad_s": SIGMA_W, "sigma_px": SIGMA_PX}
+    return dataclasses.replace(simulate(City(seed=seed, **{**small, **noise, **changes})), noise=STATED)
+
+
+def displaced(sequence, shift_px):
+    seen = sequence.observations
+    return dataclasses.replace(sequence, observations=dataclasses.replace(seen, pixels_px=seen.pixels_px + shift_px))
+
+
+def with_yaw_bias(seed, bias=0.004):
+    true = world(seed)
+    return dataclasses.replace(true, twist=true.twist + bias * np.eye(6)[5])
+
+
+def with_turning_camera(seed, std_deg=0.3, time_frames=20):
+    """All tracks of a frame are displaced alike, as by a camera that slowly turns to and fro."""
+    true, rng = world(seed), np.random.default_rng(1000 + seed)
+    angle, rate = np.zeros((2, len(true), 3))
+    for k in range(1, len(true)):
+        rate[k] = (1 - 1 / time_frames) * rate[k - 1] + rng.normal(size=3)
+        angle[k] = (1 - 1 / time_frames) * angle[k - 1] + rate[k]
+    angle *= np.deg2rad(std_deg) / angle.std()
+    seen, T_imu_world = true.observations, se3.inverse(true.truth.T_world_imu)
+    points = true.truth.position_m[np.searchsorted(true.truth.landmark, seen.landmark)]
+    q = se3.apply(T_CAM_IMU @ T_imu_world[seen.frame], points)
+    turned = (se3.so3_exp(angle[seen.frame]) @ q[..., None])[..., 0]
+    return displaced(true, project(CAMERA, turned) - project(CAMERA, q))
+
+
+def with_walking_tracks(seed, step_px=(0.25, 0.25, 0.15)):
+    """The errors (u, v, disparity) of each track walk by themselves, where the model takes them as white."""
+    true, rng = world(seed, sigma_px=0.3), np.random.default_rng(2000 + seed)
+    seen = true.observations
+    order = np.lexsort((seen.frame, seen.landmark))
+    walk = np.cumsum(rng.normal(size=(len(order), 3)) * step_px, axis=0)
+    _, first, count = np.unique(seen.landmark[order], return_index=True, return_counts=True)
+    error = np.empty_like(walk)
+    error[order] = walk - np.repeat(walk[first], count, axis=0)
+    u, v, disparity = error.T
+    return displaced(true, np.stack([u, v, u - disparity, v], axis=1))
+
+
+def verdict_on(sequence) -> Honesty:
+    return judge(run(sequence))
+
+
+@SEEDS
+def test_a_true_model_is_honest(seed):
+    found = verdict_on(world(seed))
+    assert not found.causes and not found.findings
+    assert found.verdict == "honest as far as innovations can tell"
+    assert 0.8 < found.factor < 1.3
+    assert abs(found.nis.value - 1) < 4 * found.nis.error < 0.1
+
+
+@SEEDS
+def test_pixel_noise_understated_twice(seed):
+    found = verdict_on(world(seed, sigma_px=2 * SIGMA_PX))
+    assert [cause.kind for cause in found.causes] == ["pixel noise"]
+    assert found.factor == pytest.approx(2.0, abs=0.15)
+    assert not found.findings  # what the gates reject is explained by it
+
+
+@SEEDS
+def test_velocities_understated_three_times(seed):
+    found = verdict_on(world(seed, sigma_v_m_s=3 * SIGMA_V, sigma_w_rad_s=3 * SIGMA_W))
+    assert [cause.kind for cause in found.causes] == ["shared noise"]
+    assert len(found.causes[0].where) >= 5
+    assert found.factor == pytest.approx(3.0, abs=0.9)
+    assert np.sqrt(np.mean(found.shared.factor**2)) == pytest.approx(2.7, abs=0.5)
+    assert found.tracks.scale == pytest.approx(1.0, abs=0.1)
+    assert not found.findings
+
+
+@SEEDS
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_constant_bias_of_the_yaw_rate(seed, sign):
+    found = verdict_on(with_yaw_bias(seed, sign * 0.004))
+    assert [cause.kind for cause in found.causes] == ["bias"]
+    assert found.causes[0].where == ("yaw",)
+    assert found.shared.rate[5] == pytest.approx(sign * 0.004, rel=0.4)
+    assert "optimistic" in found.verdict and "in yaw" in found.verdict and "deg/s" in found.verdict
+
+
+@SEEDS
+def test_a_slow_drift_that_all_tracks_share(seed):
+    found = verdict_on(with_turning_camera(seed))
+    assert [cause.kind for cause in found.causes] == ["shared drift"]
+    assert {"pitch", "yaw"} & set(found.causes[0].where)
+    assert found.tracks.scale == pytest.approx(1.0, abs=0.1)
+
+
+@SEEDS
+def test_tracks_whose_errors_walk(seed):
+    found = verdict_on(with_walking_tracks(seed))
+    assert [cause.kind for cause in found.causes] == ["tracks"]
+    assert found.causes[0].where == ("u", "v", "disparity")
+    assert (found.tracks.correlation[1] > 0.5).all()
+
+
+@SEEDS
+def test_outliers(seed):
+    found = verdict_on(world(seed, outlier_fraction=0.1))
+    assert not found.causes
+    assert [cause.kind for cause in found.findings] == ["outliers"]
+    assert found.rejections.gate == pytest.approx(0.1, abs=0.025)
+    assert found.rejections.expected < 0.005
+
+
+@SEEDS
+def test_a_model_that_fears_too_much(seed):
+    stated = Noise.isotropic(3 * SIGMA_V, 3 * SIGMA_W, 3 * SIGMA_PX)
+    found = verdict_on(dataclasses.replace(world(seed), noise=stated))
+    assert [cause.kind for cause in found.causes] == ["pixel noise"]
+    assert found.verdict.startswith("covariance pessimistic by about")
+    assert 1 / found.factor == pytest.approx(3.0, abs=0.6)
+
+
+def test_pixels_that_are_better_than_stated_leave_what_landmarks_share():
+    stated = Noise.isotropic(SIGMA_V, SIGMA_W, 4 * SIGMA_PX)
+    found = verdict_on(dataclasses.replace(world(0), noise=stated))
+    assert found.agreement > 1.5
+    assert "agreement" in [cause.kind for cause in found.findings]
+    assert verdict_on(world(1)).agreement == pytest.approx(1.0, abs=0.1)
+
+
+# --- the evidence -----------------------------------------------------------------------------------------------------
+
+
+def shared_of(mean=0.0, size=1.0, frames=400, seed=0):
+    """Whitened innovations with scores drawn from their information, two observations a frame."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(frames, 6, 6))
+    C = A @ A.swapaxes(1, 2) + 0.5 * np.eye(6)
+    xi = np.linalg.solve(C, (np.linalg.cholesky(C) @ rng.normal(size=(frames, 6, 1))))[..., 0] * size + mean
+    rows = rng.normal(size=(2 * frames, 3))
+    frame = np.repeat(np.arange(frames), 2)
+    return WhitenedInnovations(frame, np.zeros_like(frame), rows, rows, (C @ xi[..., None])[..., 0], C)
+
+
+def test_components_given_others_are_those_of_the_conditional():
+    found, given = shared_of(frames=5), np.array([5, 1])
+    z = honesty.partial(found, 2, given)
+    for k in range(5):
+        c, C = found.score[k], found.information[k]
+        weight = np.linalg.solve(C[np.ix_(given, given)], C[given, 2])
+        expected = (c[2] - weight @ c[given]) / np.sqrt(C[2, 2] - weight @ C[given, 2])
+        assert z[k] == pytest.approx(expected)
+    np.testing.assert_allclose(honesty.partial(found, 0, given[:0]), found.shared[:, 0])
+
+
+def test_shared_squares_are_those_of_the_score():
+    found = shared_of(frames=4)
+    inverse = np.linalg.inv(found.information)
+    np.testing.assert_allclose(found.shared_nis, np.einsum("ta,tab,tb->t", found.score, inverse, found.score))
+    none = dataclasses.replace(found, score=np.zeros((4, 6)), information=np.zeros((4, 6, 6)))
+    assert np.isnan(none.shared).all() and np.isnan(none.shared_nis).all()
+
+
+def test_one_constant_motion_is_blamed_on_its_axis_alone():
+    motion = 0.4 * np.eye(6)[4]
+    found = honesty.shared_innovations(shared_of(motion), np.ones(400, dtype=bool), np.full(400, 0.1))
+    assert found.order[0] == 4
+    others = np.delete(np.arange(6), 4)
+    assert abs(found.mean[4]) > 8 * found.mean_error[4]
+    assert (np.abs(found.mean[others]) < 4 * found.mean_error[others]).all()
+    assert found.rate[4] == pytest.approx(4.0, rel=0.2)
+
+
+def test_errors_of_any_size_are_found():
+    found = honesty.shared_innovations(shared_of(size=2.5), np.ones(400, dtype=bool), np.full(400, 0.1))
+    np.testing.assert_allclose(found.std, 2.5, rtol=0.15)
+    assert found.size.value == pytest.approx(6.25, rel=0.1)
+    np.testing.assert_allclose(found.factor, 2.5, rtol=0.4)
+
+
+def test_blocks_that_follow_their_prior_agree_with_it():
+    rng, pulls, steps = np.random.default_rng(5), [], []
+    for _ in range(300):
+        # A constant parameter, measured in every frame with unit noise.
+        truth, measured = 0.3 * rng.normal(), rng.normal(size=200)
+        information = 1 / 0.3**2 + np.arange(1, 201)
+        value = np.cumsum(truth + measured) / information
+        parameters = Parameters(("x",), ("1",), np.array([0.3]), value[:, None], information[:, None] ** -0.5)
+        (found,) = honesty.prior_agreement(parameters)
+        pulls.append(found.pull)
+        steps.append(found.increment)
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.15)
+    assert np.sqrt(np.mean(np.square(steps))) == pytest.approx(1.0, abs=0.1)
+    still = Parameters(("x",), ("1",), np.array([0.3]), np.zeros((50, 1)), np.full((50, 1), 0.3))
+    assert honesty.prior_agreement(still) == (honesty.PriorAgreement("x", None, None),)
+
+
+@pytest.fixture(scope="module")
+def one_run() -> Result:
+    return run(world(0, frames=120))
+
+
+def test_smoother_against_filter(one_run):
+    smoothed = posterior(one_run)
+    found = honesty.smoother_agreement(one_run, smoothed)
+    assert 0.5 < found.size.value < 2.5
+    # Poses that are beside where they should be, but promise as much as before.
+    beside = np.full(6, 3.0) * np.sqrt(one_run.covariance[:, [0], 0])
+    bold = dataclasses.replace(one_run, T_world_imu=one_run.T_world_imu @ se3.exp(beside))
+    assert honesty.smoother_agreement(bold, smoothed).size.value > 3 * found.size.value
+
+
+def test_values_table_and_figure_say_the_same(one_run):
+    found = judge(one_run, posterior(one_run))
+    values = json.loads(json.dumps(found.values, allow_nan=False))
+    assert values["verdict"] == found.verdict and values["axes"] == list(honesty.AXES)
+    assert values["shared"]["factor"] == pytest.approx(found.shared.factor)
+    assert found.verdict in found.table and honesty.BLIND in found.table
+    assert f"{found.nis.value:.3g}" in found.table
+    figure = plot_check(one_run, found)
+    assert len(figure.axes) == 6
+    for ax in figure.axes:
+        assert "[" in ax.get_xlabel() and "[" in ax.get_ylabel() and ax.get_title()
+    assert found.verdict[:20] in figure.get_suptitle()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"whitened": None}, "run again"), ({"whitened": None, "mode": "smoothed"}, "check 'full'")],
+)
+def test_results_without_innovations_are_refused(one_run, changes, words):
+    with pytest.raises(HonestyError, match=words):
+        judge(dataclasses.replace(one_run, **changes))
+
+
+def test_a_recording_too_short_to_judge_is_refused():
+    with pytest.raises(HonestyError, match="only 14 frames"):
+        judge(run(world(0, frames=15)))
