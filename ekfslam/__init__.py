@@ -43,6 +43,9 @@ Glossary:
 - *innovation*: measured rows minus predicted ones; *gate*: the chi-square limit on its normalised square.
 - *shared innovation*: the motion of the camera on which all innovations of a frame agree; white if the model is true.
 - *NIS*, *NEES*: normalised innovation, estimation error squared; honest if their means are their degrees of freedom.
+- *truth noise*: how far the true poses may be wrong (`ekfslam.data.truth_noise`); *relative* NEES: of the motion
+  between two reported poses (`ekfslam.evaluation.relative`), whatever the error of the first.
+- *considered*: in the covariance, but never corrected (`ekfslam.filters.references`).
 - *variant*: where the joint filter linearises and how a correction acts: invariant, fej, standard.
 - *gauge*: directions that nothing observes: where the world's origin is, and which way it is turned.
 - *track*: observations under one id; *hygiene*: cutting and dropping tracks before any estimator sees them.
@@ -64,6 +67,7 @@ from ekfslam.config import (
     HygieneConfig,
     NoiseConfig,
     PosteriorConfig,
+    TruthConfig,
 )
 from ekfslam.data.readers import open_sequence, write_sequence
 from ekfslam.data.sequence import Sequence
@@ -94,6 +98,7 @@ __all__ = [
     "Result",
     "Sequence",
     "Study",
+    "TruthConfig",
     "TunedNoise",
     "check",
     "check_consistency",

@@ -236,6 +236,14 @@ def test_info_of_a_recording_lists_what_the_reader_noticed(tmp_path, capsys):
         assert note in printed
 
 
+def test_the_sign_of_the_lateral_velocity_is_a_flag(tmp_path, capsys):
+    npz = write_npz(tmp_path / "a.npz", ece276a_fields())
+    for flags, found in (([], "corrected"), (["--lateral", "as-stored"], "as-stored")):
+        assert main(["info", str(npz), *flags]) == 0
+        assert f"lateral       {found}" in capsys.readouterr().out
+    assert "lateral" in failure(capsys, "info", CITY, "--lateral", "as-stored")
+
+
 def test_compare_goes_on_without_a_posterior_that_is_ill_posed(tmp_path, capsys):
     """Without angular velocity noise the motion rows have no weight; the filter does not mind."""
     assert main(["compare", CITY, "--sigma-w", "0", "--out", str(tmp_path)]) == 0

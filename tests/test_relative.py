@@ -18,6 +18,7 @@ from ekfslam.evaluation.relative import (
     dead_reckoned_pairs,
     over_frames,
     over_path,
+    relative_covariance,
     relative_pairs,
     relative_pose_nees,
 )
@@ -156,6 +157,20 @@ def test_the_filters_cross_covariance_is_that_of_the_posterior_at_the_later_fram
         std = np.sqrt(np.diag(P))
         assert (np.abs(result.pairs.cross[i] - P[:6, 6:]) <= 1e-7 * np.outer(std[:6], std[6:])).all()
         assert np.abs(P[:6, 6:] / np.outer(std[:6], std[6:])).max() > 0.1
+
+
+def test_the_invariant_filters_motions_do_not_depend_on_where_the_world_is():
+    """The world's place is gauge: however uncertain, it must cancel, through every correction in between."""
+    found = []
+    for position_m, rotation_rad in ((0.01, 0.001), (1.0, 0.3)):
+        settings = {"initial_position_std_m": position_m, "initial_rotation_std_rad": rotation_rad}
+        config = Config().with_overrides({"filter": {**settings, "gate_probability": 1.0, "relative_frames": 40}})
+        result = run(open_sequence("builtin:loop?frames=90"), "full", config)
+        found.append(relative_covariance(result, result.pairs)[1])
+        assert np.diagonal(result.covariance[-1])[5] > 0.9 * rotation_rad**2
+    std = np.sqrt(np.diagonal(found[0], axis1=1, axis2=2))
+    assert len(std) == 8
+    assert (np.abs(found[1] - found[0]) <= 1e-6 * std[:, :, None] * std[:, None, :]).all()
 
 
 def test_estimates_do_not_depend_on_references():

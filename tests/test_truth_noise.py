@@ -24,6 +24,7 @@ from ekfslam.evaluation.consistency import (
 )
 from ekfslam.evaluation.summary import summarise
 from ekfslam.evaluation.truth import with_truth_noise
+from ekfslam.figures.run import plot_errors
 from ekfslam.geometry import se3
 from ekfslam.reports import compare
 from ekfslam.runner import run
@@ -120,6 +121,15 @@ def test_an_overconfident_axis_is_named():
     assert summary["pose_nees_yaw_mean"] == pytest.approx(100 * honest["pose_nees_yaw_mean"], rel=1e-9)
     for axis in ("x", "y", "z", "roll", "pitch"):
         assert summary[f"pose_nees_{axis}_mean"] == honest[f"pose_nees_{axis}_mean"]
+
+
+def test_the_figure_states_both():
+    sequence = synthetic_sequence(frames=30, landmarks=40)
+    results = {"full": synthetic_result(sequence)}
+    exact = plot_errors(results, sequence.truth).axes[0].get_title()
+    assert "(6 expected)" in exact and "truth noise" not in exact
+    noisy = plot_errors(results, dataclasses.replace(sequence.truth, noise=NOISE)).axes[0].get_title()
+    assert "(6 expected)" in noisy and "with truth noise" in noisy
 
 
 # Where it comes from

@@ -47,16 +47,26 @@ def dead_reckoned_pairs(first: IntArray, second: IntArray, T_world_imu: Array, c
     return PosePairs(first, second, covariance[first] @ np.swapaxes(A, -1, -2))
 
 
-def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) -> tuple[PosePairs, Array]:
-    """Pairs with both true poses and the NEES (n,) of their relative pose, 6 degrees of freedom; NaN where singular.
+def relative_covariance(result: Result, pairs: PosePairs) -> tuple[Array, Array]:
+    """Estimated motions ``T_hat_k T_hat_j^-1`` (n, 4, 4) of pairs j, k and the covariances (n, 6, 6) of their errors.
 
     The error of the motion ``T_k T_j^-1`` is, to first order in the stored errors,
 
-        e = xi_k - A xi_j,    A = Ad(T_hat_k T_hat_j^-1),
-        cov(e) = P_kk + A P_jj A^T - P_kj A^T - A P_jk (+ N_k + A N_j A^T),
+        e = xi_k - A xi_j,    A = Ad(T_hat_k T_hat_j^-1),    cov(e) = P_kk + A P_jj A^T - P_kj A^T - A P_jk.
+    """
+    motion = se3.inverse(result.T_world_imu[pairs.second]) @ result.T_world_imu[pairs.first]
+    A, P = se3.adjoint(motion), result.covariance
+    A_cross = A @ pairs.cross
+    own = P[pairs.second] + A @ P[pairs.first] @ np.swapaxes(A, -1, -2)
+    return motion, own - A_cross - np.swapaxes(A_cross, -1, -2)
 
-    where N is the noise of single true poses, if the truth states any. An error of the first pose cancels. Pairs with
-    an ``interpolated`` interval (T,) between them are left out.
+
+def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) -> tuple[PosePairs, Array]:
+    """Pairs with both true poses and the NEES (n,) of their relative pose, 6 degrees of freedom; NaN where singular.
+
+    The covariance is that of `relative_covariance` and, if the truth states noise, ``N_k + A N_j A^T`` with N that of
+    single true poses; an error of the first pose cancels. Pairs with an ``interpolated`` interval (T,) between them are
+    left out.
     """
     pairs, place = result.pairs or PosePairs.empty(), np.full(len(result.time_s), -1)
     place[truth.frame] = np.arange(len(truth.frame))
@@ -64,16 +74,10 @@ def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) ->
     is_measured = invented[pairs.first] == invented[pairs.second]
     pairs = pairs.only((place[pairs.first] >= 0) & (place[pairs.second] >= 0) & is_measured)
     j, k = place[pairs.first], place[pairs.second]
-    T_true, T_est = truth.T_world_imu, result.T_world_imu
-    motion_est = se3.inverse(T_est[pairs.second]) @ T_est[pairs.first]
-    error = se3.log(se3.inverse(T_true[k]) @ T_true[j] @ se3.inverse(motion_est))
-    P = result.covariance
-    A = se3.adjoint(motion_est)
-    A_cross = A @ pairs.cross
-    covariance = P[pairs.second] + A @ P[pairs.first] @ np.swapaxes(A, -1, -2)
-    covariance = covariance - A_cross - np.swapaxes(A_cross, -1, -2)
+    motion, covariance = relative_covariance(result, pairs)
+    error = se3.log(se3.inverse(truth.T_world_imu[k]) @ truth.T_world_imu[j] @ se3.inverse(motion))
     if truth.noise is not None:
-        N = pose_noise_covariance(truth.noise, T_true, result.time_s[truth.frame])
+        N, A = pose_noise_covariance(truth.noise, truth.T_world_imu, result.time_s[truth.frame]), se3.adjoint(motion)
         covariance = covariance + N[k] + A @ N[j] @ np.swapaxes(A, -1, -2)
     return pairs, nees(error, covariance)
 
