@@ -17,7 +17,7 @@ from ekfslam.models.build import noise_of
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
 
-OPEN = FilterConfig(gate_probability=1.0, split_after=0)
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0)
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
 
 

@@ -29,7 +29,7 @@ from ekfslam.storage.archive import open_result, write_archive
 
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
 SINGULAR_P0 = np.diag([0.1, 0.2, 0.0, 0.0, 0.0, 0.03]) ** 2
-OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never")
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0, retire="never")
 FILTERED = PosteriorConfig(linearisation="filtered")
 
 

@@ -20,7 +20,7 @@ from ekfslam.models.build import model_of
 from ekfslam.models.sensors.stereo import Rig
 
 P0 = np.diag([0.2, 0.1, 0.3, 0.05, 0.04, 0.08]) ** 2
-OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never")
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0, retire="never")
 
 
 def exact_motion(sequence):
