@@ -220,28 +220,26 @@ def test_information_about_the_gauge(variant, iterations, retire):
     prior = se3.adjoint(se3.inverse(world.initial_T_world_imu))
     prior = prior.T @ np.linalg.solve(P0, prior)
     ratio = np.linalg.eigvals(np.linalg.solve(prior, N.T @ np.linalg.solve(P, N))).real
-    if variant == "standard":
-        assert ratio.max() > 10
-    else:
-        np.testing.assert_allclose(ratio, 1.0, atol=1e-6)
+    # Exact velocities leave nothing to correct in the pose, and landmarks count relative to it: so the standard variant
+    # gains nothing either.
+    np.testing.assert_allclose(ratio, 1.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("sensor", ["stereo", "mono"])
-@pytest.mark.parametrize(("variant", "iterations"), [("invariant", 1), ("invariant", 3), ("fej", 1)])
-def test_what_is_seen_does_not_depend_on_the_prior_of_the_gauge(variant, iterations, sensor):
+@pytest.mark.parametrize(("variant", "iterations"), [("invariant", 1), ("invariant", 3), ("fej", 1), ("standard", 1)])
+def test_what_is_seen_does_not_depend_on_the_prior_of_the_gauge(variant, iterations):
     world = small_world(seed=6, frames=40)
     config = dataclasses.replace(OPEN, variant=variant, iterations=iterations)
-    kind = Rig if sensor == "stereo" else Monocular
     found = []
     for scale in (1e-4, 1.0):
-        ekf = JointEKF(kind(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu, scale * P0)
+        ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu, scale * P0)
         for k in range(len(world)):
             if k:
                 ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
             ekf.update(k, *world.observations.at(k))
         found.append(se3.apply(ekf.T_imu_world, ekf.positions_m))
-    assert len(found[0]) > 10
-    assert np.abs(found[0] - found[1]).max() < 1e-8 * np.abs(found[0]).max()
+    assert len(found[0]) >= 10
+    difference = np.abs(found[0] - found[1]).max() / np.abs(found[0]).max()
+    assert difference > 1e-6 if variant == "standard" else difference < 1e-8
 
 
 def test_two_views_from_one_place_give_the_mean_of_their_images():
@@ -260,6 +258,18 @@ def test_two_views_from_one_place_give_the_mean_of_their_images():
     exact = se3.apply(se3.inverse(T_CAM_IMU), rig.invert(rig.rows((first + second) / 2)))
     np.testing.assert_allclose(found["image"], exact, rtol=1e-12)
     assert np.abs(found["xyz"] - exact).max() > 0.1
+
+
+def test_one_camera_alone_has_images_too():
+    """Landmarks wait for parallax, and what two views leave over corrects the pose that was just updated."""
+    world = small_world(frames=40)
+    sensor = Monocular(world.camera, world.T_cam_imu, world.noise)
+    ekf = run_joint(world, sensor, OPEN)[0]
+    order = np.argsort(world.truth.landmark)
+    true = world.truth.position_m[order][np.searchsorted(world.truth.landmark[order], ekf.ids)]
+    std = np.sqrt(np.linalg.eigvalsh(ekf.gaussian.landmark_blocks())[:, -1])
+    assert len(ekf.ids) > 5
+    assert (np.linalg.norm(ekf.positions_m - true, axis=1) < 5 * std).all()
 
 
 def test_which_pose_was_updated_last():
@@ -298,8 +308,8 @@ def test_a_loop_closes_with_landmarks_that_come_back(variant):
     assert unseen.counts["revived"] > 0
     error = [np.linalg.norm(r.T_world_imu[-1, :3, 3] - world.truth.T_world_imu[-1, :3, 3]) for r in (never, unseen)]
     assert error[1] < 1.5 * error[0] + 0.05
-    found = posterior(unseen)
-    assert found.block_covariance("pose").shape[-1] == 6 if "pose" in found.values else True
+    smoothed = posterior(unseen)
+    assert np.linalg.norm(smoothed.T_world_imu[-1, :3, 3] - world.truth.T_world_imu[-1, :3, 3]) < 1.5 * error[0] + 0.05
 
 
 def test_a_model_without_the_clone_is_refused():
