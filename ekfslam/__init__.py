@@ -29,6 +29,10 @@ Equations (docstrings cite these numbers)::
     S = H P H^T + V = L L^T,  Y = L^-1 H P,  (xi, d) = Y^T L^-1 r,  P -= Y^T Y       (6) update
     e_theta = -C^T xi_theta,  e_i = d_i + m_i^ e_theta,
     T+ = exp(xi) T,  m_i+ = exp(e_theta) m_i + J_l(e_theta) e_i,  P+ = J P J^T       (7) invariant retraction
+    y = f(T_cam_imu T_p m),  f(x, y, z) = (x/z, y/z, 1/z),  T_p+ = exp(xi_p) T_p,
+    m_i+ = (T_cam_imu T_p+)^-1 f^-1(y_i + Y_x,i xi_p + Y_m,i d_i),                    (7') landmarks as images
+    d_i+ = M_i d_i + B_i xi_p,  M = Y_m+^-1 Y_m,  B = Y_m+^-1 (Y_x - Y_x+ D_p),
+    xi+ = D xi,  xi_p+ = D_p xi_p,  D = Ad(T+ T^-1) (invariant) or 1,  P+ = G P G^T
     u = diag(R, R) u_level,  R = [x, up^ x, up],  x ~ forward - (forward . up) up    (8) velocities over level ground
     q = exp(c^) T_cam_imu exp(-c_time u^) T_imu_world m                              (9) calibration in the state
     z(k) = h(k) + e(k),  e(k) = f e(k-1) + w,  hence
@@ -47,6 +51,7 @@ Glossary:
   between two reported poses (`ekfslam.evaluation.relative`), whatever the error of the first.
 - *considered*: in the covariance, but never corrected (`ekfslam.filters.references`).
 - *variant*: where the joint filter linearises and how a correction acts: invariant, fej, standard.
+- *image coordinates*: (7') for landmarks, T_p the last updated pose, Y_x and Y_m derivatives of y; else *xyz*.
 - *gauge*: directions that nothing observes: where the world's origin is, and which way it is turned.
 - *track*: observations under one id; *hygiene*: cutting and dropping tracks before any estimator sees them.
 - *retire*: marginalise a landmark out of view; *map revival*: bring it back from the batch problem.

@@ -184,7 +184,7 @@ class FilterConfig:
     """
 
     variant: Variant = field(default="invariant", metadata=_one_of(Variant))
-    landmark_coordinates: LandmarkCoordinates = field(default="xyz", metadata=_one_of(LandmarkCoordinates))
+    landmark_coordinates: LandmarkCoordinates = field(default="image", metadata=_one_of(LandmarkCoordinates))
     iterations: int = field(default=1, metadata=_whole(1))
     retire: Retire = field(default="auto", metadata=_one_of(Retire))
     retire_after: int | None = field(default=None, metadata=_whole(1))

@@ -24,7 +24,7 @@ from ekfslam.models.sensors.velocities import VelocitySource
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior_of_log
 
-OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never")
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0, retire="never")
 SMOOTHED = PosteriorConfig(kernel="none")
 NOISE = Noise(np.repeat([0.2, 0.02], 3), np.full(4, 0.5), motion_std=np.full(6, 1e-3))
 WALK = np.array([0.2, 0.05, 0.05, 0.01, 0.01, 0.02])

@@ -17,7 +17,7 @@ from ekfslam.models.build import noise_of
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
 
-OPEN = FilterConfig(gate_probability=1.0, split_after=0)
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0)
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
 
 
@@ -81,7 +81,7 @@ def test_mapping_only_equals_the_report_s_loop_over_landmarks(world):
 def test_mapping_only_is_the_joint_filter_without_pose_uncertainty(variant, gated):
     """P_xx(0) = 0 and W = 0; with gate and split in force the decisions must agree as well."""
     world = with_outliers(small_world(seed=3)) if gated else small_world(seed=3)
-    filter_config = FilterConfig() if gated else OPEN
+    filter_config = FilterConfig(landmark_coordinates="xyz") if gated else OPEN
     config = Config(NoiseConfig(0.0, 0.0, None), dataclasses.replace(filter_config, variant=variant, retire="never"))
     mapping, full = run(world, "mapping-only", config), run(world, "full", config)
     np.testing.assert_allclose(full.T_world_imu, mapping.T_world_imu, atol=1e-9)
@@ -145,7 +145,7 @@ def test_outliers_are_rejected_listed_and_a_jumped_track_is_split():
 def test_conditional_gate_equals_leaving_each_landmark_out(variant):
     """Brute force: each landmark tested against the posterior of all others, dense and with explicit inverses."""
     world = small_world(seed=10, sigma_v=1.0, sigma_w=0.15)
-    config = Config(filter=FilterConfig(variant=variant, split_after=0))
+    config = Config(filter=FilterConfig(variant=variant, landmark_coordinates="xyz", split_after=0))
     rig, tau = Rig(world.camera, world.T_cam_imu, world.noise), np.diff(world.time_s, prepend=np.nan)
     ekf, free = (JointEKF(rig, f, world.initial_T_world_imu) for f in (config.filter, settings(variant=variant).filter))
     for filter_ in (ekf, free):

@@ -54,7 +54,7 @@ def retract_invariant(T, m, xi, d):
 
 def transport_invariant(P, T, T_after, moved):
     """P (b+3n, b+3n) carried along by a correction that moves landmarks by ``moved`` (n, 3)."""
-    model = model_of(RIG, RIG.noise, T, np.eye(6))
+    model = model_of(RIG, RIG.noise, T, np.eye(6), coordinates="xyz")
     gaussian = Gaussian(np.eye(6), 6)
     gaussian.replace(P.copy())
     variant, before = VARIANTS["invariant"], {"pose": T}
@@ -95,7 +95,7 @@ def test_measurement_jacobians_by_pose_and_landmark(T):
 @pytest.mark.parametrize("variant", ["invariant", "standard"])
 def test_full_width_jacobians_of_a_shuffled_non_first_subset(T, variant):
     """The sparse H and F, seen through the state's retraction, with unseen landmarks before, between and behind."""
-    ekf = JointEKF(RIG, FilterConfig(variant=variant, retire="never"), se3.inverse(T))
+    ekf = JointEKF(RIG, FilterConfig(variant=variant, landmark_coordinates="xyz", retire="never"), se3.inverse(T))
     m = visible_points(T, 6)
     ids = np.array([40, 3, 17, 99, 8, 21])
     pixels = cam.project(CAMERA, se3.apply(T_CAM_IMU @ T, m))

@@ -25,7 +25,7 @@ from ekfslam.models.build import model_of, noise_of
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
 
-OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never", moving_sigma=1e9)
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0, retire="never", moving_sigma=1e9)
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
 EVERYTHING = CalibrationConfig(rotation_deg=0.5, lever_arm_m=0.1, baseline=0.02, disparity_px=0.5, time_s=0.02)
 SOME = CalibrationConfig(rotation_deg=0.5, disparity_px=0.5, time_s=0.02)

@@ -26,7 +26,7 @@ from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import open_result, write_archive
 
-OPEN = FilterConfig(gate_probability=1.0, split_after=0)
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0)
 STILL = dataclasses.replace(OPEN, moving_sigma=1e9)
 WALK = np.repeat([0.2, 0.02], 3)
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2

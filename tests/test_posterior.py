@@ -29,7 +29,7 @@ from ekfslam.storage.archive import open_result, write_archive
 
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
 SINGULAR_P0 = np.diag([0.1, 0.2, 0.0, 0.0, 0.0, 0.03]) ** 2
-OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never")
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0, retire="never")
 FILTERED = PosteriorConfig(linearisation="filtered")
 
 
@@ -77,7 +77,7 @@ def test_as_filtered_equals_the_dense_filter(variant, iterations, prior):
 @pytest.mark.parametrize("variant", ["standard", "fej"])
 def test_as_filtered_equals_the_dense_filter_with_gates_and_splits(variant):
     world = builtin("loop?frames=200&outlier_fraction=0.1")
-    config = FilterConfig(variant=variant, retire="never", split_after=2)
+    config = FilterConfig(variant=variant, landmark_coordinates="xyz", retire="never", split_after=2)
     ekf, _, reports = run_joint(world, rig_of(world), config)
     assert sum(len(report.split) for report in reports) > 0
     assert sum((report.reason != -1).sum() for report in reports) > 100
@@ -88,7 +88,9 @@ def test_as_filtered_equals_the_dense_filter_with_gates_and_splits(variant):
 @pytest.mark.parametrize("name", ["0027", "0020", "0042"])
 def test_as_filtered_equals_the_dense_filter_on_the_recordings(data_path, name):
     sequence = open_sequence(data_path(f"ece276a/{name}.npz"))
-    config = Config().with_overrides({"filter": {"variant": "standard", "retire": "never"}})
+    config = Config().with_overrides(
+        {"filter": {"variant": "standard", "landmark_coordinates": "xyz", "retire": "never"}}
+    )
     ekf, _, _ = run_joint(sequence, rig_of(sequence), config.filter)
     assert_equal_to_dense_filter(posterior_of(ekf), ekf)
 
@@ -415,13 +417,13 @@ def test_map_is_consistent():
 @pytest.mark.parametrize("variant", ["standard", "fej"])
 def test_revival_equals_never_retiring(variant):
     world = builtin("loop")
-    never, expected = drive(world, FilterConfig(variant=variant, retire="never"))
-    revived, poses = drive(world, FilterConfig(variant=variant, retire="unseen"))
+    never, expected = drive(world, FilterConfig(variant, "xyz", retire="never"))
+    revived, poses = drive(world, FilterConfig(variant, "xyz", retire="unseen"))
     assert len(revived.retired.revived) > 5
     assert revived.counts["retired"] > 100
     assert len(revived.landmarks()) == len(never.landmarks())
     np.testing.assert_allclose(poses, expected, atol=1e-6)
-    afresh, other = drive(world, FilterConfig(variant=variant, retire="unseen", revive=-1))
+    afresh, other = drive(world, FilterConfig(variant, "xyz", retire="unseen", revive=-1))
     assert len(afresh.retired.reappeared) > 50
     assert np.abs(other - expected).max() > 0.01
     # The log goes on through it all.

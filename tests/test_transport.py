@@ -28,7 +28,7 @@ CALIBRATIONS = {
 
 def corrected_once(world, variant, calibration):
     """The filter after a correction by the landmarks of its first frame; pose and landmarks just before it."""
-    config = FilterConfig(variant, retire="never", gate_probability=1.0, split_after=0)
+    config = FilterConfig(variant, "xyz", retire="never", gate_probability=1.0, split_after=0)
     rig = Rig(world.camera, world.T_cam_imu, world.noise)
     ekf = JointEKF(rig, config, world.initial_T_world_imu, P0, calibration)
     ekf.update(0, *world.observations.at(0))

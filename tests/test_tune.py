@@ -38,7 +38,7 @@ from ekfslam.studies.tuning import (
     without_rejected,
 )
 
-OPEN = FilterConfig(gate_probability=1.0, split_after=0)
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0)
 WHITE = Config(noise=NoiseConfig(model="white"))
 
 

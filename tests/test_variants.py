@@ -20,7 +20,7 @@ from ekfslam.models.build import model_of
 from ekfslam.models.sensors.stereo import Rig
 
 P0 = np.diag([0.2, 0.1, 0.3, 0.05, 0.04, 0.08]) ** 2
-OPEN = FilterConfig(gate_probability=1.0, split_after=0, retire="never")
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0, retire="never")
 
 
 def exact_motion(sequence):
@@ -167,7 +167,9 @@ def test_iterated_invariant_update_converges_to_a_better_fit():
 
 def derivatives(variant, T, T_after, m, m_after):
     """How pose and landmark errors before a correction become those after it, from rows that measure them."""
-    model = model_of(Rig(CAMERA, T_CAM_IMU, Noise.isotropic(1, 1, 1)), Noise.isotropic(1, 1, 1), T, P0)
+    model = model_of(
+        Rig(CAMERA, T_CAM_IMU, Noise.isotropic(1, 1, 1)), Noise.isotropic(1, 1, 1), T, P0, coordinates="xyz"
+    )
     n = len(m)
     H_x, H_m = np.zeros((n, 9, 6)), np.zeros((n, 9, 3))
     H_x[:, :6], H_m[:, 6:] = np.eye(6), np.eye(3)

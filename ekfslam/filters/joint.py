@@ -192,8 +192,7 @@ class JointEKF(Estimate):
         self._log.amend(T_updated=self.T_imu_world, updated=self.coordinates)
         # 5. Start new landmarks, eq. (5), or let them wait.
         started = start(self, self._log, self._waiting, frame, ids[new], rows[new])
-        if not found.dof:
-            # Nothing has updated the pose; yet landmarks that are all new have their images here.
+        if not found.dof:  # nothing has updated the pose; yet landmarks that are all new have their images here
             self.updated_pose = "pose" if (self.table.first_step == self.step).all() else None
         self.retired.start_afresh(ids[new][started])
         reason[np.flatnonzero(new)[~started]] = WAITING

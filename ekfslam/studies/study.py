@@ -211,7 +211,7 @@ def run_one(study: Study, level: str, run: int) -> Record:
     world = realisation(study, level, run)
     with _ONE_RUN_AT_A_TIME, one_thread(), np.errstate(all="ignore"):
         sequence = simulate(world)
-        return {variant: _evaluate(sequence, world, filter_config(world, variant)) for variant in study.variants}
+        return {variant: evaluate(sequence, world, filter_config(world, variant)) for variant in study.variants}
 
 
 def _blank(frames: int, runs: tuple[int, ...] = ()) -> dict[str, NDArray]:
@@ -229,8 +229,8 @@ def _joint_frames(frames: int) -> list[int]:
     return [(frames - 1) * (i + 1) // JOINT_INSTANTS for i in range(JOINT_INSTANTS)]
 
 
-def _evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str, NDArray]:
-    """One variant on one realisation, frame by frame."""
+def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str, NDArray]:
+    """The record of one filter on one realisation, frame by frame; fields and shapes as in `FIELDS`."""
     truth, noise = sequence.truth, sequence.noise
     assert truth is not None
     assert noise is not None
