@@ -132,7 +132,8 @@ class HygieneConfig:
 
     Args:
         min_disparity_sigma: Observations with less disparity, in sigmas of a disparity, are dropped: they have no
-            depth. (The filters reject observations without disparity.)
+            depth. (The filters reject observations without disparity.) By default 1; 3 in the automatic model, whose
+            tracks have a constant error of their disparity.
         max_row_mismatch_sigma: So are those with larger ``|vL - vR|``, in sigmas of that difference.
         restart_at_repeats: Where a frame repeats the pixels of the one before while the rig moves, every track is cut.
         restart_above_px: Of these, tracks that move by no more than this in the frames beside it are not cut: they show
@@ -148,7 +149,7 @@ class HygieneConfig:
     `Sequence` refuses it with a `DuplicateObservationError`.
     """
 
-    min_disparity_sigma: float = field(default=1.0, metadata=_FINITE)
+    min_disparity_sigma: float | None = field(default=None, metadata=_FINITE)
     max_row_mismatch_sigma: float = field(default=10.0, metadata=_FINITE)
     restart_at_repeats: bool = field(default=True, metadata=_SWITCH)
     restart_above_px: float = field(default=0.0, metadata=_FINITE)

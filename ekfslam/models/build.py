@@ -36,6 +36,7 @@ from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.model import Model
 from ekfslam.models.noise import (
     CAMERA_ROTATION_DEG,
+    MIN_DISPARITY_SIGMA,
     VelocityNoise,
     automatic_noise,
     shared_errors,
@@ -234,7 +235,12 @@ def with_automatic_blocks(config: Config, sequence: Sequence) -> Config:
     What the configuration says of a block goes before.
     """
     walks = noise_of(sequence, config).track_error is not None
-    if not (is_automatic(sequence, config) and config.noise.shared and walks):
+    if not (is_automatic(sequence, config) and walks):
+        return config
+    if config.hygiene.min_disparity_sigma is None:
+        hygiene = dataclasses.replace(config.hygiene, min_disparity_sigma=MIN_DISPARITY_SIGMA)
+        config = dataclasses.replace(config, hygiene=hygiene)
+    if not config.noise.shared:
         return config
     shared = {name: {**table, **config.blocks.get(name, {})} for name, table in shared_errors(sequence.twist).items()}
     calibration = config.calibration

@@ -26,10 +26,10 @@ from ekfslam.arrays import Array
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import VelocityFrame
 
-# Velocities of an automotive GNSS/INS unit: 0.05 km/h and 0.01 deg/s by the data sheet of the OXTS RT3003, here with
-# what mounting and latency add, the least that a sample is wrong by.
+# Velocities of an automotive GNSS/INS unit: the data sheets of OXTS's RT3000 family state 0.05 to 0.1 km/h (0.014 to
+# 0.028 m/s) and 0.01 deg/s. White errors of a sample are at least of that order, too.
 VELOCITY_STD = np.repeat([0.02, np.deg2rad(0.02)], 3)
-VELOCITY_BIAS_M_S, RATE_BIAS_RAD_S = 0.01, np.deg2rad(0.01)
+VELOCITY_BIAS_M_S, RATE_BIAS_RAD_S = 0.02, np.deg2rad(0.01)
 # A noisy sensor's bias is taken as a tenth of its noise: consumer units state no better.
 BIAS_SHARE = 0.1
 # What an interpolated sample is worth: a car changes its speed by 1 m/s and turns by 2 deg/s in a second or so.
@@ -46,6 +46,8 @@ PIXEL_STD_PX = 0.7
 TRACK_FIRST_PX = np.array([0.1, 0.1, 1.0])
 TRACK_WALK_PX = np.array([0.08, 0.08, 0.06])
 TRACK_FLOW_PX = 3.0
+# Disparity below which the constant error of a track leaves no depth, in standard deviations of a measured disparity.
+MIN_DISPARITY_SIGMA = 3.0
 
 # White noise from which velocities count as noisy, and are smoothed as a random walk.
 NOISY_FROM = np.repeat([0.15, 0.0025], 3)

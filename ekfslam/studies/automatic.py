@@ -21,7 +21,7 @@ from ekfslam.models.build import build, is_automatic
 from ekfslam.models.noise import velocity_noise
 
 # Square root of the long-run variance of errors along KLT tracks over that of a frame, as `ekfslam check` finds it.
-PERSISTENCE = 2.5
+PERSISTENCE = 3.0
 # Normalised innovation squared a degree of freedom: below 1, as errors persist.
 TARGET = 0.7
 _FRAMES, _ROUNDS, _LEAST_DOF, _LIMITS = 150, 2, 300, (0.3, 4.0)

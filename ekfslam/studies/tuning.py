@@ -53,8 +53,8 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.filters.reports import FrameReport
 from ekfslam.geometry import se3
-from ekfslam.models.build import found_attributes, noise_of, resolve
-from ekfslam.models.noise import VelocityNoise, velocity_noise, with_drift, with_error
+from ekfslam.models.build import found_attributes, noise_of, optional_blocks, resolve, with_automatic_blocks
+from ekfslam.models.noise import NOISY_FROM, VelocityNoise, velocity_noise, with_drift, with_error
 from ekfslam.models.sensors.base import BEHIND_CAMERA, GATE, MOVING
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
@@ -208,11 +208,11 @@ def tune(
     """
     if len(sequence.observations) == 0:
         raise EmptyTracksError("noise is tuned by observations, and there are none", source=sequence.source)
-    config = resolve(config or Config(), sequence)
+    config = with_automatic_blocks(resolve(config or Config(), sequence), sequence)
     model: NoiseModel = "white" if config.noise.model == "white" else "tuned"
     base = noise_of(sequence, dataclasses.replace(config, noise=NoiseConfig(model=model, drift=config.noise.drift)))
     found = velocity_noise(sequence.twist)
-    floor = base.motion_std[[0, 3]]
+    floor = base.motion_std[[0, 3]] if base.track_error is None else NOISY_FROM[[0, 3]]
 
     start = {
         "sigma_v_m_s": found.sigma[0] or base.twist_std[0],
@@ -337,7 +337,8 @@ def log_likelihoods(sequence: Sequence, noise: Noise, config: Config) -> Array:
 def _reports(sequence: Sequence, noise: Noise, config: Config) -> list[FrameReport]:
     """What a filter that assumes a noise did with every frame; what comes back starts afresh."""
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
-    ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu)
+    start, blocks = sequence.initial_T_world_imu, optional_blocks(config.blocks)
+    ekf = JointEKF(rig, config.filter, start, calibration=config.calibration, blocks=blocks)
     return [frame.report for frame in run_filter(ekf, sequence)]
 
 
