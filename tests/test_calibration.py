@@ -18,8 +18,10 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import se3
+from ekfslam.models.blocks import Pose
 from ekfslam.models.blocks import calibration as cal
 from ekfslam.models.build import model_of
+from ekfslam.models.model import Model, Moment
 from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
@@ -78,8 +80,8 @@ def test_without_parameters_it_is_the_sensor_as_given(T):
 @poses
 def test_new_landmarks_with_parameters(T, c):
     z = seen_rows(T, c, TWIST, points(T, c)) + np.array([0.5, -0.2, 0.3])
-    positions, G_x, G_c, covariance = ALL.initialise(RIG, c, TWIST, T, z, RIG.variance(z), T)
-    G = np.concatenate([G_x, G_c], axis=-1)
+    model = Model(RIG, RIG.noise, (Pose(T, np.eye(6)), ALL))
+    positions, G, covariance = model.initialise(Moment(T, T, c, TWIST), z, RIG.variance(z))
     np.testing.assert_allclose(positions, sighted(T, c, TWIST, z), rtol=1e-9, atol=1e-9)
     _, H, H_m = linearised(T, c, positions, positions)
     V = np.diag(RIG.variance_px2)

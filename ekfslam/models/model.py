@@ -21,7 +21,6 @@ from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
 
-
 @dataclass(frozen=True)
 class Moment:
     """What observations of one frame depend on, besides landmarks.
@@ -402,6 +401,18 @@ class Model:
     def predicted(self, moment: Moment, q: Array) -> Array:
         """Rows (n, d) of points (n, 3) in the frame of the sensor."""
         return self._sensor_of(moment).predict(q)
+
+    def has_point(self, moment: Moment, rows: Array) -> BoolArray:
+        """Whether (n,) rows (n, d) are those of a point whose depth they show.
+
+        The sensor's `screen` has judged that of the sensor as given. Where blocks change it, disparities may be less
+        than that of a point at infinity.
+        """
+        sensor = self._sensor_of(moment)
+        if sensor is self.sensor:
+            return np.ones(len(rows), dtype=bool)
+        assert isinstance(sensor, Rig)
+        return sensor.has_point(rows)
 
     def initialise(self, moment: Moment, rows: Array, variance: Array) -> tuple[Array, Array, Array]:
         """Eq. (5): positions (n, 3) of new landmarks, G (n, 3, seen), and what the measurement adds (n, 3, 3).

@@ -15,7 +15,10 @@ from ekfslam.geometry.camera import StereoCamera
 from ekfslam.models.sensors.base import ACCEPTED, DISPARITY
 
 _NEWTON_STEPS = 6
+_ROUNDING_PX = 1e-11
 _LEAST_DISPARITY_PX = 1e-3
+# What has less disparity (px) says nothing of a depth.
+_NO_DEPTH_PX = 0.5
 _DISPARITY_ROWS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, -1.0]])
 
 
@@ -106,9 +109,16 @@ class Rig:
         # reach rounding; a disparity below what the rotation makes of infinity has no point and stays at the limit.
         seen = rows
         for _ in range(_NEWTON_STEPS):
-            q = cam.triangulate(self.camera, self._in_front(seen))
-            seen = seen + rows - self._rectified(q)
+            step = rows - self._rectified(cam.triangulate(self.camera, self._in_front(seen)))
+            seen = seen + step
+            if np.abs(step).max(initial=0.0) < _ROUNDING_PX:
+                break
         return cam.triangulate(self.camera, self._in_front(seen))
+
+    def has_point(self, rows: Array) -> BoolArray:
+        """Whether (n,) rows (n, 3) are those of a point in front of the rig, near enough to have a depth."""
+        z = self.invert(rows)[:, 2]
+        return (z > 0) & (z < self.camera.fu_px * self.camera.baseline_m / _NO_DEPTH_PX)
 
     @staticmethod
     def _in_front(rows: Array) -> Array:
