@@ -21,6 +21,7 @@ from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
 
+
 @dataclass(frozen=True)
 class Moment:
     """What observations of one frame depend on, besides landmarks.
