@@ -583,13 +583,13 @@ def test_information_about_the_gauge_with_up_and_calibration(variant, coordinate
 
 
 def gauge_information(ekf):
-    """Information (6, 6) about where the world is, from all but the clone, which exact velocities tell for certain."""
+    """Information (6, 6) about where the world is, from all but clones: exact velocities tell that of the pose."""
     body, layout = np.zeros((ekf.gaussian.body, 6)), ekf.model.layout
     N = gauge_directions(ekf.linear_T_imu_world, ekf.linear_positions_m)
     body[layout["pose"]] = N[:6]
     body[layout["up"], 3:] = np.eye(3)
-    clone = layout.get("previous_pose", slice(0))
-    N, P = np.delete(np.vstack([body, N[6:]]), clone, 0), np.delete(np.delete(ekf.P, clone, 0), clone, 1)
+    clones = layout.columns(layout.clones.values())
+    N, P = np.delete(np.vstack([body, N[6:]]), clones, 0), np.delete(np.delete(ekf.P, clones, 0), clones, 1)
     return N.T @ np.linalg.solve(P, N)
 
 

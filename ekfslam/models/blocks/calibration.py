@@ -143,10 +143,8 @@ class Calibration(StateBlock):
         q_linear = se3.apply(now.T_cam_imu @ delay @ T_linear, linear_positions_m)
         moved = np.concatenate([np.broadcast_to(np.eye(3), A.shape), -se3.skew(q_linear)], axis=-1)
         H[..., _EXTRINSIC] = A @ moved @ se3.left_jacobian(parameters[_EXTRINSIC])
-        by_disparity = now.by_disparity(q)
-        disparity_px = now.camera.fu_px * now.camera.baseline_m / q[:, 2:]
-        H[..., _BASELINE] = by_disparity * disparity_px
-        H[..., _DISPARITY] = by_disparity
+        H[..., _BASELINE] = now.by_log_baseline(q)
+        H[..., _DISPARITY] = now.by_disparity(q)
         H[..., TIME] = -(H_x @ twist[..., None])[..., 0]
         return q, H_x @ se3.adjoint(delay), H[..., self.free], H_m
 

@@ -99,6 +99,15 @@ class Rig:
         """Derivative (n, 3) of the rows by an error of the disparity in px."""
         return np.broadcast_to([0.0, 0.0, 1.0 if self._sees_disparity else -1.0], q.shape)
 
+    def by_log_baseline(self, q: Array) -> Array:
+        """Derivative (n, 3) of the rows by the logarithm of the baseline."""
+        if self.right_rotation_rad is None:
+            return self.by_disparity(q) * (self.camera.fu_px * self.camera.baseline_m / q[:, 2:])
+        _, right, R = self._seen_right(q)
+        by_baseline = -self.camera.baseline_m * (right @ R[..., :1])
+        B = self._of_both(np.zeros((*q.shape, 1)), by_baseline)
+        return ((_DISPARITY_ROWS @ B) if self._sees_disparity else B)[..., 0]
+
     def invert(self, rows: Array) -> Array:
         if self._sees_disparity:  # _DISPARITY_ROWS is its own inverse
             rows = rows @ _DISPARITY_ROWS.T
