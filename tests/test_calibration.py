@@ -44,7 +44,7 @@ def seen(T, c, m):
 
 def linearised(T, c, m, linear):
     """Points, rows by pose and parameters (n, 3, 15), rows by landmarks."""
-    q, H_x, H_c, H_m = ALL.linearise(RIG, c, TWIST, T, m, T, linear)
+    q, H_x, H_c, H_m = ALL.linearise(cal.calibrated(RIG, c), c, TWIST, T, m, T, linear)
     return q, np.concatenate([H_x, H_c], axis=-1), H_m
 
 
@@ -253,8 +253,8 @@ def test_parameters_that_are_not_free_stay_as_given(calibrated):
     block, m = cal.Calibration(cal.prior_std(calibrated)), points(np.eye(4), np.zeros(9))
     assert block.size == len(free)
     np.testing.assert_allclose(block.retract(C, np.ones(len(free))) - C, np.isin(np.arange(9), free), atol=1e-15)
-    arguments = C, TWIST, np.eye(4), m, np.eye(4), m
-    for ours, theirs in zip(block.linearise(RIG, *arguments), ALL.linearise(RIG, *arguments), strict=True):
+    arguments = cal.calibrated(RIG, C), C, TWIST, np.eye(4), m, np.eye(4), m
+    for ours, theirs in zip(block.linearise(*arguments), ALL.linearise(*arguments), strict=True):
         np.testing.assert_array_equal(ours, theirs[..., free] if theirs.shape[-1] == 9 else theirs)
 
 

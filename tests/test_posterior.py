@@ -301,7 +301,9 @@ SHARED = [CameraJitter(time_s=0.3), VisionDrift(length_m=3.0), StereoRotation(ti
 
 
 @pytest.mark.parametrize(
-    ("everything", "shared"), [(False, []), (True, []), (False, SHARED), (True, SHARED)], ids=["white", "every block", "shared", "all"]
+    ("everything", "shared"),
+    [(False, []), (True, []), (False, SHARED), (True, SHARED)],
+    ids=["white", "every block", "shared", "all"],
 )
 @pytest.mark.parametrize("turn", [0.01, 1.0, 3.1], ids=["near identity", "random", "near pi"])
 def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything, shared):

@@ -11,9 +11,12 @@ from reference import CAMERA, T_CAM_IMU, small_world
 from test_jacobians import POSES, central, visible_points
 from test_level import EVERYTHING, OPEN, P0, TILTED, TRACKS, filter_of, gauge_information, in_level_frame
 
-from ekfslam.data.sequence import Noise
+from ekfslam.config import FilterConfig
+from ekfslam.data.sequence import Noise, Observations
+from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError
 from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import CameraJitter, Previous, StereoRotation, TwistBias, VisionDrift
@@ -277,7 +280,9 @@ def test_what_is_behind_infinity_has_no_point(noise):
 
 
 def test_which_blocks_have_clones():
-    names = list(model_of(Rig(CAMERA, T_CAM_IMU, KINDS["tracks"]), KINDS["tracks"], np.eye(4), P0, blocks=SHARED).layout)
+    names = list(
+        model_of(Rig(CAMERA, T_CAM_IMU, KINDS["tracks"]), KINDS["tracks"], np.eye(4), P0, blocks=SHARED).layout
+    )
     assert [name for name in names if name.startswith("previous_")] == [
         "previous_pose",
         "previous_camera_jitter",
@@ -285,7 +290,7 @@ def test_which_blocks_have_clones():
     ]
     white = model_of(Rig(CAMERA, T_CAM_IMU, NOISE), NOISE, np.eye(4), P0, blocks=SHARED)
     assert not white.clones
-    with pytest.raises(ConfigError, match="there twice: .*camera_jitter"):
+    with pytest.raises(ConfigError, match=r"there twice: .*camera_jitter"):
         model_of(Rig(CAMERA, T_CAM_IMU, NOISE), NOISE, np.eye(4), P0, blocks=[*SHARED, CameraJitter()])
 
 
@@ -331,3 +336,137 @@ def test_information_about_the_gauge_with_shared_errors(variant, coordinates, tr
         assert ratio.max() > 3
     else:
         np.testing.assert_allclose(ratio, 1.0, atol=1e-6)
+
+
+# --- recovery: worlds in which one error is put in ------------------------------------------------------------------
+
+# Sparse tracks, so that a run takes a second; errors of tracks are white but for what is put in.
+DRIVE = "city?frames=60&outlier_fraction=0&max_tracks=25&sigma_v_m_s={}&sigma_w_rad_s={}&seed={}"
+CLOSED = FilterConfig(gate_probability=1.0, split_after=0, retire="unseen", retire_after=1, moving_sigma=1e9)
+WALKS = {"track_first_px": np.full(3, 0.3), "track_walk_px": np.full(3, 0.3)}
+
+
+def plain_rows(world, T, m, psi):
+    """Pixels (n, 4) of landmarks (n, 3), the right camera turned."""
+    camera, q = world.camera, se3.apply(world.T_cam_imu @ T, m)
+    right = (q - np.array([camera.baseline_m, 0, 0])) @ se3.so3_exp(psi).T
+    f, c = np.array([camera.fu_px, camera.fv_px]), np.array([camera.cu_px, camera.cv_px])
+    return np.concatenate([f * q[:, :2] / q[:, 2:] + c, f * right[:, :2] / right[:, 2:] + c], axis=1)
+
+
+class Spoilt:
+    """A simulated drive recorded once more, with velocities and tracks that err as told.
+
+    Args:
+        seed: Of everything.
+        std: Of the velocities, m/s and rad/s.
+        psi: (3,) rotation of the right camera.
+        jitter, drift, bias: Blocks whose process is drawn from and put in; None: no such error.
+        walks: Whether errors of tracks walk.
+    """
+
+    def __init__(self, seed, std=(0.1, 0.005), psi=(0, 0, 0), jitter=None, drift=None, bias=None, walks=False):
+        world, rng = builtin(DRIVE.format(*std, seed)), np.random.default_rng(seed)
+        T, truth, tau = se3.inverse(world.truth.T_world_imu), world.truth, np.diff(world.time_s)
+        u = -se3.log(T[1:] @ se3.inverse(T[:-1])) / tau[:, None]
+        way_m = np.append(0.0, np.linalg.norm(u[:, :3], axis=1) * tau)
+        tau = np.append(0.0, tau)
+        self.jitter, self.drift, self.bias = (self.path(rng, b, tau, way_m) for b in (jitter, drift, bias))
+        observations, pixels, errors = world.observations, [], {}
+        for k in range(len(world)):
+            ids, _ = observations.at(k)
+            m = truth.position_m[np.searchsorted(truth.landmark, ids)]
+            seen_from = se3.exp(self.jitter[k]) @ T[k]
+            clean = plain_rows(world, seen_from, m, psi)
+            flow = plain_rows(world, se3.exp(max(way_m[k], LEAST_WAY_M) * self.drift[k]) @ seen_from, m, psi) - clean
+            noise = self.track_noise(rng, len(ids)) if walks else world.noise.pixel_std_px * rng.normal(size=flow.shape)
+            # An error that walks is that of the frame before and a new part; it starts with nothing of the drift.
+            old = [errors.get(i) if walks else None for i in ids.tolist()]
+            error = np.array([n if e is None else e + f + n for e, f, n in zip(old, flow, noise, strict=True)])
+            errors = dict(zip(ids.tolist(), error, strict=True))
+            pixels.append(clean + error.reshape(-1, 4))
+        order = np.argsort(observations.frame, kind="stable")
+        observations = Observations(
+            observations.frame[order],
+            np.concatenate([observations.at(k)[0] for k in range(len(world))]),
+            np.vstack(pixels),
+        )
+        twist = np.vstack([u[:1], u]) + self.bias + world.noise.twist_std * rng.normal(size=(len(world), 6))
+        noise = dataclasses.replace(world.noise, **WALKS) if walks else world.noise
+        self.sequence = dataclasses.replace(world, twist=twist, observations=observations, noise=noise)
+        self.T = T
+
+    @staticmethod
+    def track_noise(rng, n):
+        u, v, disparity = (WALKS["track_walk_px"] * rng.normal(size=(n, 3))).T
+        return np.column_stack([u, v, u - disparity, v])
+
+    @staticmethod
+    def path(rng, block, tau, way_m):
+        """A draw (T, 6) of a block's process."""
+        if block is None:
+            return np.zeros((len(tau), 6))
+        x = [block.stationary_std * rng.normal(size=6)]
+        for k in range(1, len(tau)):
+            phi, std = block.transition(tau[k], way_m[k])
+            x.append(phi * x[-1] + std * rng.normal(size=6))
+        return np.array(x)
+
+    def filtered(self, *blocks):
+        """Pose NEES (T-1,), and of every block its estimates (T, n) and standard deviations (T, n)."""
+        world = self.sequence
+        rig = Rig(world.camera, world.T_cam_imu, world.noise)
+        ekf, nees, found = (
+            JointEKF(rig, CLOSED, world.initial_T_world_imu, blocks=blocks),
+            [],
+            {b.name: [] for b in blocks},
+        )
+        for k, _ in enumerate(run_filter(ekf, world)):
+            if k:
+                xi = se3.log(self.T[k] @ se3.inverse(ekf.T_imu_world))
+                nees.append(xi @ np.linalg.solve(ekf.P[:6, :6], xi))
+            for name, values in found.items():
+                std = np.sqrt(np.diag(ekf.P)[ekf.model.layout[name]])
+                values.append([ekf.values[name], std])
+        return np.array(nees), {name: np.array(values).swapaxes(0, 1) for name, values in found.items()}
+
+
+QUIET = (0.02, 0.001)
+LARGE_BIAS = TwistBias(sigma_v_m_s=0.3, sigma_w_rad_s=0.02, time_v_s=30.0, time_w_s=30.0)
+YAW = np.array([0.0, np.deg2rad(0.08), 0.0])
+CASES = {
+    # The block, what is put in, and what of it is found to a quarter.
+    "rotation of the right camera": (StereoRotation(), {"psi": YAW}, [1]),
+    "jitter": (CameraJitter(), {"jitter": CameraJitter()}, []),
+    "jitter, good velocities": (CameraJitter(), {"jitter": CameraJitter(), "std": QUIET}, []),
+    "drift": (VisionDrift(), {"drift": VisionDrift(), "walks": True}, []),
+    "bias": (LARGE_BIAS, {"bias": LARGE_BIAS, "std": QUIET}, [1, 2, 3, 4, 5]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("block", "put_in", "well"), CASES.values(), ids=CASES.keys())
+def test_what_was_put_in_is_found_and_poses_are_honest_for_it(block, put_in, well):
+    """12 drives of 60 frames; estimates count once half of a drive is over."""
+    nees, without, errors, stds, truths = [], [], [], [], []
+    for seed in range(12):
+        world = Spoilt(seed, **put_in)
+        of_poses, found = world.filtered(block)
+        nees.append(of_poses.mean())
+        (estimate, std), which = (
+            found[block.name][:, 30:],
+            next(name for name in put_in if name not in ("std", "walks")),
+        )
+        true = YAW[None] if which == "psi" else getattr(world, which)[30:]
+        errors.append(estimate - true)
+        stds.append(std)
+        truths.append(np.broadcast_to(true, estimate.shape))
+        if seed < 4:
+            without.append(world.filtered()[0].mean())
+    assert 4 < np.mean(nees) < 8.5
+    assert np.mean(without) > 30
+    assert 0.6 < np.mean(np.square(np.array(errors) / stds)) < 1.5
+    size, error = (np.sqrt(np.mean(np.square(values), axis=(0, 1))) for values in (truths, errors))
+    assert (error[well] < 0.25 * size[well]).all()
+    # All are known better than before.
+    assert (np.mean(stds, axis=(0, 1)) < 0.99 * block.stationary_std).all()

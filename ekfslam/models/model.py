@@ -346,8 +346,9 @@ class Model:
         if self.calibration is None:
             q, H_pose, H_m = linearise(sensor, T, positions_m, T_linear, linear_positions_m)
         else:
+            assert isinstance(sensor, Rig)
             q, H_pose, H_c, H_m = self.calibration.linearise(
-                self._rig_of(moment), moment.calibration, moment.twist, T, positions_m, T_linear, linear_positions_m
+                sensor, moment.calibration, moment.twist, T, positions_m, T_linear, linear_positions_m
             )
         if layout.seen == 6:
             return Seen(q, sensor.predict(q), H_pose, H_m)
