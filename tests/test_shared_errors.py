@@ -23,6 +23,7 @@ from ekfslam.models.blocks import CameraJitter, Previous, StereoRotation, TwistB
 from ekfslam.models.build import model_of
 from ekfslam.models.model import Moment
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.smoother.problem import BatchProblem
 
 NOISE = Noise(
     np.repeat([0.3, 0.05], 3),
@@ -336,6 +337,39 @@ def test_information_about_the_gauge_with_shared_errors(variant, coordinates, tr
         assert ratio.max() > 3
     else:
         np.testing.assert_allclose(ratio, 1.0, atol=1e-6)
+
+
+def test_residuals_of_the_batch_problem():
+    """Of observations and of the blocks themselves, at any state; their derivatives are looked at elsewhere."""
+    world = dataclasses.replace(small_world(frames=9, landmarks=20), noise=KINDS["tracks"])
+    ekf = filter_of(world, OPEN, EVERYTHING, blocks=BLOCKS)
+    for _ in run_filter(ekf, world):
+        pass
+    problem, rng = BatchProblem(ekf.log(), ekf.model), np.random.default_rng(4)
+    log, state = problem.log, problem.filtered_state(ekf.landmarks().position_m)
+    drive_values = {**state.drive_values, "calibration": ERRORS["calibration"]}
+    shared = state.shared + 0.01 * rng.normal(size=state.shared.shape)
+    state = dataclasses.replace(state, shared=shared, drive_values=drive_values)
+    names = ["camera_jitter", "vision_drift", "stereo_rotation"]
+    T, tau, way_m = state.T_imu_world, log.tau_s, np.linalg.norm(log.twist[:, :3], axis=1) * log.tau_s
+    twist = [log.seen_twist[0], *(-se3.log(T[k] @ se3.inverse(T[k - 1])) / tau[k] for k in range(1, 9))]
+
+    def left(i, follows):
+        k, m = log.frame[i], state.positions_m[log.landmark[i]]
+        values = {"pose": T[k], **drive_values, **dict(zip(names, np.split(shared[k], [6, 12]), strict=True))}
+        return log.rows[i] - literal_rows(values, m[None], way_m[k], [follows], twist[k])[0]
+
+    found, expected = problem.observation_residual(problem.points(state), state) * np.sqrt(log.variance), []
+    for i, previous in enumerate(log.previous):
+        expected.append(left(i, previous >= 0) - (0.9 * left(previous, False) if previous >= 0 else 0.0))
+    assert (log.previous >= 0).sum() > 20
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+    lengths = {"camera_jitter": tau / 0.6, "vision_drift": way_m / 20.0, "stereo_rotation": tau / 5.0}
+    parts = []
+    for block, x in zip(SHARED, np.split(shared, [6, 12], axis=1), strict=True):
+        kept = np.exp(-lengths[block.name][1:, None])
+        parts.append((x[1:] - kept * x[:-1]) / (block.stationary_std * np.sqrt(1 - kept**2)))
+    np.testing.assert_allclose(problem.motion_residual(state)[:, 6:], np.hstack(parts), rtol=1e-9)
 
 
 # --- recovery: worlds in which one error is put in ------------------------------------------------------------------
