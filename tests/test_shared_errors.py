@@ -9,7 +9,19 @@ import numpy as np
 import pytest
 from reference import CAMERA, T_CAM_IMU, small_world
 from test_jacobians import POSES, central, visible_points
-from test_level import EVERYTHING, OPEN, P0, TILTED, TRACKS, filter_of, gauge_information, in_level_frame
+from test_level import (
+    BY_DISPARITY,
+    EVERYTHING,
+    OPEN,
+    P0,
+    TILTED,
+    TRACKS,
+    Literal,
+    camera_pose,
+    filter_of,
+    gauge_information,
+    in_level_frame,
+)
 
 from ekfslam.config import FilterConfig
 from ekfslam.data.sequence import Noise, Observations
@@ -20,6 +32,7 @@ from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import CameraJitter, Previous, StereoRotation, TwistBias, VisionDrift
+from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.build import model_of
 from ekfslam.models.model import Moment
 from ekfslam.models.sensors.stereo import Rig
@@ -337,6 +350,132 @@ def test_information_about_the_gauge_with_shared_errors(variant, coordinates, tr
         assert ratio.max() > 3
     else:
         np.testing.assert_allclose(ratio, 1.0, atol=1e-6)
+
+
+class LiteralShared(Literal):
+    """The textbook EKF with shared errors; their columns come after those of all other blocks.
+
+    Rotations of the right camera count in units of `UNIT` rad: as far as its differences go in others, depths are lost.
+    """
+
+    UNIT = 0.02
+    OWN = ("jitter", "drift", "psi", "jitter_before", "psi_before")
+    SIZE = (6, 6, 3, 6, 3)
+
+    def __init__(self, sequence, variant, images):
+        super().__init__(sequence, variant, np.arange(9), prior_std(EVERYTHING), TILTED[:, 2], BIAS, images)
+        kept = len(self.SIZE) if self.tracks is not None else 3
+        for name, size in zip(self.OWN[:kept], self.SIZE[:kept], strict=True):
+            self.at[name] = slice(self.body, self.body + size)
+            self.body += size
+        self.P = np.pad(self.P, (0, self.body - len(self.P)))
+        for block, name in zip(SHARED, self.OWN[:3], strict=True):
+            self.P[self.at[name], self.at[name]] = np.diag((block.stationary_std / self.unit(name)) ** 2)
+        vars(self).update({name: np.zeros(size) for name, size in zip(self.OWN, self.SIZE, strict=True)})
+
+    def unit(self, name):
+        return self.UNIT if name.startswith("psi") else 1.0
+
+    @property
+    def units(self):
+        """Of the columns of P."""
+        units = np.ones(len(self.P))
+        for name in self.OWN:
+            units[self.at.get(name, slice(0))] = self.unit(name)
+        return units
+
+    def moved_by(self, e):
+        own = {name: getattr(self, name) for name in self.OWN}
+        own |= {name: own[name] + self.unit(name) * e[..., self.at[name]] for name in self.OWN if name in self.at}
+        return {**super().moved_by(e), **own}
+
+    def predict(self, measured, tau):
+        self.way_m = tau * np.linalg.norm(measured[:3])
+        super().predict(measured, tau)
+
+    def wander(self, tau):
+        F = np.eye(len(self.P))
+        for name in ("jitter", "psi"):
+            if f"{name}_before" in self.at:
+                F[self.at[f"{name}_before"]] = np.eye(len(self.P))[self.at[name]]
+                setattr(self, f"{name}_before", getattr(self, name))
+        self.P = F @ self.P @ F.T
+        super().wander(tau)
+        lengths = tau / 0.6, max(self.way_m, LEAST_WAY_M) / 20.0, tau / 5.0
+        for block, name, length in zip(SHARED, self.OWN[:3], lengths, strict=True):
+            F, kept = np.eye(len(self.P)), np.exp(-length)
+            F[self.at[name], self.at[name]] *= kept
+            self.P = F @ self.P @ F.T
+            self.P[self.at[name], self.at[name]] += np.diag(
+                (1 - kept**2) * (block.stationary_std / self.unit(name)) ** 2
+            )
+            setattr(self, name, kept * getattr(self, name))
+
+    def look(self, x, m, before=False, follows=False):
+        offset, psi = (x["jitter_before"], x["psi_before"]) if before else (x["jitter"], x["psi"])
+        if follows:
+            offset = offset + max(self.way_m, LEAST_WAY_M) * x["drift"]
+        T, u = (x["before"], self.u_before) if before else (x["T"], self.u)
+        q = se3.apply(camera_pose(se3.exp(offset) @ T, x["c"], u, T_CAM_IMU)[..., None, :, :], m)
+        baseline = CAMERA.baseline_m * np.exp(x["c"][..., 6])
+        right = se3.so3_exp(psi)[..., None, :, :] @ (q - baseline[..., None, None] * np.eye(3)[0])[..., None]
+        left, right = (np.moveaxis(pixel(np.moveaxis(p, -1, 0)), 0, -1) for p in (q, right[..., 0]))
+        disparity = left[..., 0] - right[..., 0] + x["c"][..., None, 7]
+        rows = np.stack([left[..., 0], (left[..., 1] + right[..., 1]) / 2, disparity], axis=-1)
+        return rows if self.tracks is not None else rows @ BY_DISPARITY.T
+
+    def point(self, x, row):
+        moved, rows = {**x, "T": se3.exp(x["jitter"]) @ x["T"]}, row
+        for _ in range(10):
+            rows = rows + row - self.look(x, super().point(moved, rows)[..., None, :])[..., 0, :]
+        return super().point(moved, rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tracks", [TRACKS, {}], ids=["tracks", "white"])
+@pytest.mark.parametrize("coordinates", ["xyz", "image"])
+@pytest.mark.parametrize("variant", ["standard", "invariant"])
+def test_filter_with_shared_errors_equals_the_literal_one(variant, coordinates, tracks):
+    """As in `test_level`: of what is there some are left out, the first among them, and others come in any order."""
+    walk = {"twist_walk_std": NOISE.twist_walk_std, "motion_std": NOISE.motion_std, "tilt_rad": 0.05, **tracks}
+    world = in_level_frame(small_world(frames=10, landmarks=20), TILTED, **walk)
+    config = dataclasses.replace(OPEN, variant=variant, landmark_coordinates=coordinates)
+    ekf = filter_of(world, config, EVERYTHING, up=TILTED[:, 2], blocks=BLOCKS)
+    literal, layout, rng = (
+        LiteralShared(world, variant, coordinates == "image"),
+        ekf.model.layout,
+        np.random.default_rng(3),
+    )
+    names = ["pose", "previous_pose", "calibration", "twist", "up", "twist_bias", *(block.name for block in SHARED)]
+    names += ["previous_camera_jitter", "previous_stereo_rotation"]
+    body = layout.columns(name for name in names if name in layout)
+    accuracy = 1e-9 if coordinates == "xyz" else 2e-8
+    for k in range(len(world)):
+        if k:
+            tau = world.time_s[k] - world.time_s[k - 1]
+            ekf.predict(world.twist[k], tau)
+            literal.predict(world.twist[k], tau)
+        else:
+            ekf.begin(world.twist[0])
+            literal.begin(world.twist[0])
+        ids, pixels = world.observations.at(k)
+        some = rng.permutation(len(ids))[: max(3, len(ids) - 2)]
+        if k > 1:
+            some = some[ids[some] != literal.ids[0]]
+        ekf.update(k, ids[some], pixels[some])
+        literal.update(ids[some], pixels[some])
+        assert literal.ids == ekf.ids.tolist()
+        columns = np.concatenate([body, np.arange(layout.body, len(ekf.P))])
+        own = zip(names[6:], literal.OWN, strict=True)
+        pairs = [(ekf.values[name], getattr(literal, value)) for name, value in own if name in layout]
+        for ours, theirs in (
+            *pairs,
+            (ekf.T_imu_world, literal.T),
+            (ekf.positions_m, literal.m),
+            (ekf.P[np.ix_(columns, columns)], literal.P * np.outer(literal.units, literal.units)),
+        ):
+            np.testing.assert_allclose(ours, theirs, rtol=accuracy, atol=accuracy)
+    assert (np.abs(ekf.values["stereo_rotation"]) > 1e-6).all()
 
 
 def test_residuals_of_the_batch_problem():

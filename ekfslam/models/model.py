@@ -411,7 +411,7 @@ class Model:
         than that of a point at infinity.
         """
         sensor = self._sensor_of(moment)
-        if sensor is self.sensor:
+        if sensor is self.sensor or not len(rows):
             return np.ones(len(rows), dtype=bool)
         assert isinstance(sensor, Rig)
         return sensor.has_point(rows)
