@@ -18,8 +18,10 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import se3
+from ekfslam.models.blocks import Pose
 from ekfslam.models.blocks import calibration as cal
 from ekfslam.models.build import model_of
+from ekfslam.models.model import Model, Moment
 from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
@@ -42,7 +44,7 @@ def seen(T, c, m):
 
 def linearised(T, c, m, linear):
     """Points, rows by pose and parameters (n, 3, 15), rows by landmarks."""
-    q, H_x, H_c, H_m = ALL.linearise(RIG, c, TWIST, T, m, T, linear)
+    q, H_x, H_c, H_m = ALL.linearise(cal.calibrated(RIG, c), c, TWIST, T, m, T, linear)
     return q, np.concatenate([H_x, H_c], axis=-1), H_m
 
 
@@ -78,8 +80,8 @@ def test_without_parameters_it_is_the_sensor_as_given(T):
 @poses
 def test_new_landmarks_with_parameters(T, c):
     z = seen_rows(T, c, TWIST, points(T, c)) + np.array([0.5, -0.2, 0.3])
-    positions, G_x, G_c, covariance = ALL.initialise(RIG, c, TWIST, T, z, RIG.variance(z), T)
-    G = np.concatenate([G_x, G_c], axis=-1)
+    model = Model(RIG, RIG.noise, (Pose(T, np.eye(6)), ALL))
+    positions, G, covariance = model.initialise(Moment(T, T, c, TWIST), z, RIG.variance(z))
     np.testing.assert_allclose(positions, sighted(T, c, TWIST, z), rtol=1e-9, atol=1e-9)
     _, H, H_m = linearised(T, c, positions, positions)
     V = np.diag(RIG.variance_px2)
@@ -251,8 +253,8 @@ def test_parameters_that_are_not_free_stay_as_given(calibrated):
     block, m = cal.Calibration(cal.prior_std(calibrated)), points(np.eye(4), np.zeros(9))
     assert block.size == len(free)
     np.testing.assert_allclose(block.retract(C, np.ones(len(free))) - C, np.isin(np.arange(9), free), atol=1e-15)
-    arguments = C, TWIST, np.eye(4), m, np.eye(4), m
-    for ours, theirs in zip(block.linearise(RIG, *arguments), ALL.linearise(RIG, *arguments), strict=True):
+    arguments = cal.calibrated(RIG, C), C, TWIST, np.eye(4), m, np.eye(4), m
+    for ours, theirs in zip(block.linearise(*arguments), ALL.linearise(*arguments), strict=True):
         np.testing.assert_array_equal(ours, theirs[..., free] if theirs.shape[-1] == 9 else theirs)
 
 

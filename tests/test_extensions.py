@@ -36,7 +36,7 @@ def walking_world(rng, bias=None, frames=100):
     twist = np.array([6.0, 0, 0, 0, 0, 0.3]) + np.cumsum(WALK * rng.standard_normal((frames, 6)), axis=0)
     time_s, offset = 0.1 * np.arange(frames), np.zeros((frames, 6))
     if bias is not None:
-        phi, std = bias.transition(0.1)
+        phi, std = bias.transition(0.1, 0.0)
         offset[0] = np.sqrt(np.diag(bias.prior_covariance())) * rng.standard_normal(6)
         for k in range(1, frames):
             offset[k] = phi * offset[k - 1] + std * rng.standard_normal(6)
@@ -198,7 +198,7 @@ def test_tracks_that_wait_are_listed_and_start_with_both_views():
 
 
 def test_a_bias_keeps_its_size():
-    phi, std = BIAS.transition(np.array([0.1, 3.0]))
+    phi, std = BIAS.transition(np.array([0.1, 3.0]), np.zeros(2))
     variance = np.diag(BIAS.prior_covariance())
     np.testing.assert_allclose(phi**2 * variance + std**2, np.broadcast_to(variance, (2, 6)))
     np.testing.assert_allclose(phi[1], np.exp(-3.0 / np.repeat([5.0, 8.0], 3)))

@@ -30,6 +30,7 @@ CALIBRATION = {"rotation_deg": 0.3, "lever_arm_m": 0.05, "baseline": 0.01, "disp
 BLOCKS = {"twist_bias": {}, "camera_jitter": {}, "vision_drift": {}, "stereo_rotation": {"time_s": 5.0}}
 SHARED = ["camera_jitter", "vision_drift", "stereo_rotation", "previous_camera_jitter", "previous_stereo_rotation"]
 ALL_BLOCKS = ["pose", "previous_pose", "calibration", *SHARED, "twist", "up", "twist_bias"]
+UNSHARED = [name for name in ALL_BLOCKS if name not in SHARED]
 
 
 def drive(sequence, settings, blocks=ALL_BLOCKS):
@@ -74,11 +75,16 @@ def test_every_block_and_errors_of_tracks_in_the_city(variant):
     assert_equal_to_frozen_rows(ekf)
 
 
+@pytest.mark.parametrize(
+    ("blocks", "names"),
+    [({"twist_bias": {}}, UNSHARED), pytest.param(BLOCKS, ALL_BLOCKS, marks=pytest.mark.slow)],
+    ids=["unshared", "every"],
+)
 @pytest.mark.parametrize("variant", ["standard", "fej"])
-def test_every_block_and_errors_of_tracks_on_a_loop_with_revival(variant):
+def test_every_block_and_errors_of_tracks_on_a_loop_with_revival(variant, blocks, names):
     settings = {"filter": {"variant": variant, "retire": "unseen", "retire_after": 3, **PRIOR}}
     world = with_everything(builtin("loop?frames=330"))
-    ekf = drive(world, {**settings, "calibration": CALIBRATION, "blocks": BLOCKS})
+    ekf = drive(world, {**settings, "calibration": CALIBRATION, "blocks": blocks}, names)
     assert len(ekf.retired.revived) > 0
     assert_equal_to_frozen_rows(ekf)
 

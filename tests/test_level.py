@@ -250,10 +250,16 @@ class Literal:
             self.last[i], self.rows[i] = self.k, z
         self.updated = "T"
 
-    def look(self, T, c, u, m):
-        """Rows of points (..., n, 3), with disparities where tracks err."""
-        rows = seen_rows(T, c, u, m)
+    def look(self, x, m, before=False, follows=False):
+        """Rows of points (..., n, 3) now, or in the frame before, with disparities where tracks err."""
+        T, u = (x["before"], self.u_before) if before else (x["T"], self.u)
+        rows = seen_rows(T, x["c"], u, m)
         return rows if self.tracks is None else rows @ BY_DISPARITY.T
+
+    def point(self, x, row):
+        """The point (3,) that is seen so now."""
+        back = np.eye(3) if self.tracks is None else BY_DISPARITY
+        return sighted(x["T"], x["c"], self.u, row @ back.T)
 
     def correct(self, seen):
         variance = []
@@ -275,9 +281,10 @@ class Literal:
             m = self.m + e[..., self.body :].reshape(*e.shape[:-1], -1, 3)
             for i, z, place in seen:
                 own = m[..., place : place + 1, :]
-                residual = z - self.look(x["T"], x["c"], self.u, own)
-                if self.tracks is not None and self.last[i] == self.k - 1:
-                    before = self.rows[i] - self.look(x["before"], x["c"], self.u_before, own)
+                follows = self.tracks is not None and self.last[i] == self.k - 1
+                residual = z - self.look(x, own, follows=follows)
+                if follows:
+                    before = self.rows[i] - self.look(x, own, before=True)
                     residual = residual - self.noise.track_memory * before
                 parts.append(residual[..., 0, :])
             return np.concatenate(parts, axis=-1)
@@ -286,21 +293,17 @@ class Literal:
         self.condition(H, left(np.zeros(len(self.P))), np.diag(np.concatenate(variance)))
 
     def start(self, i, z):
-        n, back = len(self.P), np.eye(3) if self.tracks is None else BY_DISPARITY
-
-        def point(x, row):
-            return sighted(x["T"], x["c"], self.u, row @ back.T)
-
+        n = len(self.P)
         here = self.moved_by(np.zeros(n))
-        G = stencil(lambda e: point(self.moved_by(e), z), n)
-        by_row = stencil(lambda d: point(here, z + d), 3)
+        G = stencil(lambda e: self.point(self.moved_by(e), z), n)
+        by_row = stencil(lambda d: self.point(here, z + d), 3)
         variance = self.noise.pixel_std_px[0] ** 2 * np.array([1, 0.5, 1])
         if self.tracks is not None:
             variance = self.noise.track_first_px**2
         wide = np.vstack([np.eye(n), G])
         self.P = wide @ self.P @ wide.T
         self.P[n:, n:] += by_row @ np.diag(variance) @ by_row.T
-        self.m = np.vstack([self.m, point(here, z)])
+        self.m = np.vstack([self.m, self.point(here, z)])
         self.ids.append(i)
         self.first[i] = self.k
 
@@ -341,8 +344,7 @@ class Literal:
         H = stencil(coordinates, len(x), 2e-3)
         moved_to = (coordinates(zero) + H @ x).reshape(-1, 3)
         poses = {"pose": self.T, "before": self.before}
-        after = self.moved_by(x)
-        self.T, self.before, self.c, self.twist, self.W, self.b = after.values()
+        vars(self).update(self.moved_by(x))
         c, camera = self.c * (np.arange(9) < 6), getattr(self, self.updated)
         from_pixels = sighted(camera, c, np.zeros(6), np.where(away[:, None], 1.0, moved_to) @ BY_DISPARITY.T)
         from_positions = se3.apply(np.linalg.inv(camera_pose(camera, c, np.zeros(6), T_CAM_IMU)), moved_to)
@@ -366,7 +368,7 @@ class Literal:
             return
         stored, T_before, m_before, c_before = self.to_stored(), self.T, self.m, self.c
         after = self.moved_by(x)
-        self.c, self.twist, self.W, self.b = (after[name] for name in ("c", "twist", "W", "b"))
+        vars(self).update({name: value for name, value in after.items() if name not in ("T", "before")})
         if self.variant == "standard":
             self.T, self.before, self.m = after["T"], after["before"], self.m + x[self.body :].reshape(-1, 3)
             return
@@ -583,13 +585,13 @@ def test_information_about_the_gauge_with_up_and_calibration(variant, coordinate
 
 
 def gauge_information(ekf):
-    """Information (6, 6) about where the world is, from all but the clone, which exact velocities tell for certain."""
+    """Information (6, 6) about where the world is, from all but clones: exact velocities tell that of the pose."""
     body, layout = np.zeros((ekf.gaussian.body, 6)), ekf.model.layout
     N = gauge_directions(ekf.linear_T_imu_world, ekf.linear_positions_m)
     body[layout["pose"]] = N[:6]
     body[layout["up"], 3:] = np.eye(3)
-    clone = layout.get("previous_pose", slice(0))
-    N, P = np.delete(np.vstack([body, N[6:]]), clone, 0), np.delete(np.delete(ekf.P, clone, 0), clone, 1)
+    clones = layout.columns(layout.clones.values())
+    N, P = np.delete(np.vstack([body, N[6:]]), clones, 0), np.delete(np.delete(ekf.P, clones, 0), clones, 1)
     return N.T @ np.linalg.solve(P, N)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -113,7 +114,8 @@ if __name__ == "__main__":
 def test_a_study_killed_in_the_middle_goes_on_and_ends_as_if_undisturbed(tmp_path, monkeypatch, executor):
     script, path = tmp_path / "killed.py", tmp_path / "study.h5"
     script.write_text(KILLED)
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    tests = Path(__file__).parent
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(tests.parent), str(tests))))
     process = subprocess.Popen([sys.executable, script, path, executor], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not (path.exists() and read_study(path).done["mid"].sum() >= 5):

@@ -16,7 +16,7 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import IllPosedError, PosteriorError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import TwistBias
+from ekfslam.models.blocks import CameraJitter, StereoRotation, TwistBias, VisionDrift
 from ekfslam.models.build import noise_of
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
@@ -113,7 +113,7 @@ def test_where_landmarks_are_eliminated_makes_no_difference():
         np.testing.assert_allclose(one.log_determinant, found[0].log_determinant, rtol=1e-12)
 
 
-def random_system(rng, frames, landmarks, share, aux=0, drive=0, chained=False):
+def random_system(rng, frames, landmarks, share, aux=0, drive=0, chained=False, w=6):
     """A random system whose landmarks are seen by a random, shuffled choice of frames, loops and all.
 
     Chained observations touch the pose of the frame before, too, where their landmark was seen there.
@@ -129,21 +129,21 @@ def random_system(rng, frames, landmarks, share, aux=0, drive=0, chained=False):
     rows = 2 * frames if aux else 0
     return LinearSystem(
         landmarks=landmarks,
-        B=rng.normal(size=(6, 6)),
-        r_prior=rng.normal(size=6),
-        J_from=rng.normal(size=(steps, 6, 6)),
-        J_to=rng.normal(size=(steps, 6, 6)),
-        r_motion=rng.normal(size=(steps, 6)),
+        B=rng.normal(size=(w, w)),
+        r_prior=rng.normal(size=w),
+        J_from=rng.normal(size=(steps, w, w)),
+        J_to=rng.normal(size=(steps, w, w)),
+        r_motion=rng.normal(size=(steps, w)),
         frame=frame,
         landmark=landmark,
-        J_x=rng.normal(size=(K, 3, 6)),
+        J_x=rng.normal(size=(K, 3, w)),
         J_m=rng.normal(size=(K, 3, 3)),
         r=rng.normal(size=(K, 3)),
         previous=previous,
-        J_p=rng.normal(size=(K, 3, 6)) * (previous >= 0)[:, None, None] if chained else None,
+        J_p=rng.normal(size=(K, 3, w)) * (previous >= 0)[:, None, None] if chained else None,
         J_g=rng.normal(size=(K, 3, drive)),
-        J_motion_aux=rng.normal(size=(steps, 6, aux)),
-        J_motion_drive=rng.normal(size=(steps, 6, drive)),
+        J_motion_aux=rng.normal(size=(steps, w, aux)),
+        J_motion_drive=rng.normal(size=(steps, w, drive)),
         aux_prior=rng.uniform(0.5, 2, size=aux),
         r_aux_prior=rng.normal(size=aux),
         phi=rng.uniform(0.5, 1, size=(steps, aux)),
@@ -159,8 +159,8 @@ def random_system(rng, frames, landmarks, share, aux=0, drive=0, chained=False):
 
 def dense_rows(system, frames):
     """The same rows as one dense matrix over zeta, eps_1, ..., aux, drive, d_0, ..., and what turns zeta into eps_0."""
-    aux, drive = len(system.aux_prior), len(system.drive_prior)
-    at_aux, at_drive = 6 * frames, (6 + aux) * frames
+    aux, drive, w = len(system.aux_prior), len(system.drive_prior), len(system.B)
+    at_aux, at_drive = w * frames, (w + aux) * frames
     at_landmarks = at_drive + drive
     width = at_landmarks + 3 * system.landmarks
     rows, right = [], []
@@ -172,14 +172,14 @@ def dense_rows(system, frames):
         rows.append(row)
         right.append(r)
 
-    add([(0, np.eye(6))], system.r_prior)
+    add([(0, np.eye(w))], system.r_prior)
     for k in range(frames - 1):
-        motion = [(6 * k, system.J_from[k]), (6 * k + 6, system.J_to[k]), (at_drive, system.J_motion_drive[k])]
+        motion = [(w * k, system.J_from[k]), (w * (k + 1), system.J_to[k]), (at_drive, system.J_motion_drive[k])]
         add([*motion, (at_aux + aux * (k + 1), system.J_motion_aux[k])], system.r_motion[k])
     for i, (k, j) in enumerate(zip(system.frame, system.landmark, strict=True)):
-        blocks = [(6 * k, system.J_x[i]), (at_landmarks + 3 * j, system.J_m[i]), (at_drive, system.J_g[i])]
+        blocks = [(w * k, system.J_x[i]), (at_landmarks + 3 * j, system.J_m[i]), (at_drive, system.J_g[i])]
         if system.previous[i] >= 0:
-            blocks.append((6 * (k - 1), system.J_p[i]))
+            blocks.append((w * (k - 1), system.J_p[i]))
         add(blocks, system.r[i])
     add([(at_aux, np.diag(system.aux_prior))], system.r_aux_prior)
     for k in range(frames - 1):
@@ -189,39 +189,43 @@ def dense_rows(system, frames):
         add([(at_aux + aux * k, J[None])], np.array([r]))
     add([(at_drive, np.diag(system.drive_prior))], system.r_drive)
     first = np.eye(width)
-    first[:6, :6] = system.B
+    first[:w, :w] = system.B
     return np.vstack(rows), np.concatenate(right), first
 
 
 @pytest.mark.parametrize(("frames", "landmarks", "share"), [(1, 3, 1.0), (12, 1, 0.3), (15, 25, 0.25), (30, 40, 0.05)])
 @pytest.mark.parametrize("up_to", [0, 4, 100])
-@pytest.mark.parametrize(("aux", "drive", "chained"), [(0, 0, False), (0, 2, True), (5, 0, False), (4, 3, True)])
-def test_information_equals_dense_least_squares(frames, landmarks, share, up_to, aux, drive, chained):
+@pytest.mark.parametrize(
+    ("aux", "drive", "chained", "w"),
+    [(0, 0, False, 6), (0, 2, True, 6), (5, 0, False, 6), (4, 3, True, 6), (0, 0, True, 8), (4, 3, True, 11)],
+)
+def test_information_equals_dense_least_squares(frames, landmarks, share, up_to, aux, drive, chained, w):
     rng = np.random.default_rng(frames)
-    system = random_system(rng, frames, landmarks, share, aux, drive, chained)
+    system = random_system(rng, frames, landmarks, share, aux, drive, chained, w)
     J, r, first = dense_rows(system, frames)
     ids = rng.permutation(1000)[:landmarks]
-    structure = Elimination(frames, landmarks, system.frame, system.landmark, ids, aux, drive, up_to)
+    structure = Elimination(frames, landmarks, system.frame, system.landmark, ids, aux, drive, up_to, w)
     found = JointInformation(structure, system)
     x = np.linalg.lstsq(J, r, rcond=None)[0]
     mean, covariance = first @ x, first @ np.linalg.inv(J.T @ J) @ first.T
     largest = np.abs(covariance).max()
 
-    np.testing.assert_allclose(found.eps.ravel(), mean[: 6 * frames], rtol=1e-8, atol=1e-9)
-    before = (6 + aux) * frames + drive
-    np.testing.assert_allclose(found.aux.ravel(), mean[6 * frames : (6 + aux) * frames], rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(found.eps.ravel(), mean[: w * frames], rtol=1e-8, atol=1e-9)
+    before = (w + aux) * frames + drive
+    np.testing.assert_allclose(found.aux.ravel(), mean[w * frames : (w + aux) * frames], rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(found.drive, mean[before - drive : before], rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(found.d.ravel(), mean[before:], rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(found.cost, 0.5 * ((J @ x - r) ** 2).sum(), rtol=1e-9, atol=1e-12 * (r @ r))
     np.testing.assert_allclose(found.log_determinant, np.linalg.slogdet(covariance)[1], rtol=1e-9)
-    for k, block in enumerate(found.pose_covariances()):
-        np.testing.assert_allclose(block, covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6], atol=1e-9 * largest)
+    np.testing.assert_array_equal(found.pose_covariances(), found.frame_covariances()[:, :6, :6])
+    for k, block in enumerate(found.frame_covariances()):
+        np.testing.assert_allclose(block, covariance[w * k : w * k + w, w * k : w * k + w], atol=1e-9 * largest)
     for j, block in enumerate(found.landmark_covariances()):
         own = slice(before + 3 * j, before + 3 * j + 3)
         np.testing.assert_allclose(block, covariance[own, own], atol=1e-9 * largest)
 
     for k, block in enumerate(found.aux_covariances()):
-        own = slice(6 * frames + aux * k, 6 * frames + aux * (k + 1))
+        own = slice(w * frames + aux * k, w * frames + aux * (k + 1))
         np.testing.assert_allclose(block, covariance[own, own], atol=1e-9 * largest)
     own = slice(before - drive, before)
     np.testing.assert_allclose(found.drive_covariance(), covariance[own, own], atol=1e-9 * largest)
@@ -230,8 +234,8 @@ def test_information_equals_dense_least_squares(frames, landmarks, share, up_to,
     some_frames = rng.permutation(frames)[: max(1, frames // 2)]
     some = rng.permutation(landmarks)[: max(1, landmarks // 2)]
     parts = (
-        (6 * some_frames[:, None] + np.arange(6)).ravel(),
-        (6 * frames + aux * some_frames[:, None] + np.arange(aux)).ravel(),
+        (w * some_frames[:, None] + np.arange(w)).ravel(),
+        (w * frames + aux * some_frames[:, None] + np.arange(aux)).ravel(),
         np.arange(before - drive, before),
         (before + 3 * some[:, None] + np.arange(3)).ravel(),
     )
@@ -277,11 +281,11 @@ def with_everything(world):
 def numeric_rows(problem, state):
     """Central differences of the residuals of a problem through `BatchProblem.moved`, in the layout of `dense_rows`."""
     T, M, aux, drive = len(state.T_imu_world), len(state.positions_m), state.aux.shape[1], len(state.drive)
-    ends = np.cumsum([6 * T, aux * T, drive, 3 * M])
+    ends = np.cumsum([problem.width * T, aux * T, drive, 3 * M])
 
     def residuals(x):
         eps, of_frames, of_drive, d = np.split(x, ends[:-1])
-        eps = eps.reshape(T, 6).copy()
+        eps = eps.reshape(T, problem.width).copy()
         zeta, eps[0] = eps[0].copy(), 0.0
         step = SimpleNamespace(eps=eps, zeta=zeta, aux=of_frames.reshape(T, aux), drive=of_drive, d=d.reshape(M, 3))
         moved = problem.moved(state, step)
@@ -293,16 +297,23 @@ def numeric_rows(problem, state):
     return np.column_stack(columns), residuals(np.zeros(ends[-1]))
 
 
-@pytest.mark.parametrize("everything", [False, True], ids=["white", "every block"])
+SHARED = [CameraJitter(time_s=0.3), VisionDrift(length_m=3.0), StereoRotation(time_s=1.0)]
+
+
+@pytest.mark.parametrize(
+    ("everything", "shared"),
+    [(False, []), (True, []), (False, SHARED), (True, SHARED)],
+    ids=["white", "every block", "shared", "all"],
+)
 @pytest.mark.parametrize("turn", [0.01, 1.0, 3.1], ids=["near identity", "random", "near pi"])
-def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything):
+def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything, shared):
     world = small_world(frames=8, landmarks=20)
     if everything:
         world = with_everything(world)
-        options = {"calibration": CALIBRATION, "blocks": [TwistBias(0.1, 0.01, 3.0, 5.0)]}
+        options = {"calibration": CALIBRATION, "blocks": [TwistBias(0.1, 0.01, 3.0, 5.0), *shared]}
         ekf, _, _ = run_joint(world, rig_of(world), OPEN, covariance=P0, **options)
     else:
-        ekf, _ = drive(world, OPEN, P0)
+        ekf, _, _ = run_joint(world, rig_of(world), OPEN, covariance=P0, blocks=shared)
     problem = BatchProblem(ekf.log(), ekf.model)
     rng = np.random.default_rng(8)
     state = problem.filtered_state(ekf.landmarks().position_m)
@@ -313,9 +324,11 @@ def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything):
         state,
         T_imu_world=se3.exp(0.03 * rng.normal(size=(8, 6))) @ state.T_imu_world @ se3.inverse(T_world),
         positions_m=se3.apply(T_world, state.positions_m) + 0.1 * rng.normal(size=state.positions_m.shape),
-        zeta=0.3 * rng.normal(size=6),
+        zeta=0.3 * rng.normal(size=problem.width),
+        shared=state.shared + 0.003 * rng.normal(size=state.shared.shape),
     )
-    first = se3.inverse(se3.exp(problem.B @ state.zeta) @ problem.log.T_predicted[0]) @ state.T_imu_world[0]
+    state.shared[0] = (problem.B @ state.zeta)[6:]
+    first = se3.inverse(se3.exp((problem.B @ state.zeta)[:6]) @ problem.log.T_predicted[0]) @ state.T_imu_world[0]
     state = dataclasses.replace(
         state,
         T_imu_world=state.T_imu_world @ se3.inverse(first),
@@ -324,7 +337,7 @@ def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything):
     J, r, _ = dense_rows(problem.relinearised(state), 8)
     expected, residual = numeric_rows(problem, state)
     # Pixel rows explain z - h, motion rows minus the error.
-    motion, size = slice(6, 6 + 6 * 7), len(residual)
+    motion, size = slice(problem.width, 8 * problem.width), len(residual)
     expected[motion.stop :] *= -1
     tolerance = 2e-6 * np.abs(expected).max(axis=1, keepdims=True)
     assert (np.abs(J[:size] - expected) <= tolerance + 1e-6).all()
@@ -333,7 +346,7 @@ def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything):
     assert (np.abs(J).max(axis=0) > 0).all()
     # Rows over blocks alone: the gradient of their cost is -J^T r.
     if everything:
-        aux, start = state.aux.size, 6 * 8
+        aux, start = state.aux.size, problem.width * 8
         slope = -(J[size:].T @ r[size:])[start : start + aux].reshape(state.aux.shape)
         h = 1e-6 * rng.normal(size=state.aux.shape)
         above, below = (problem.block_cost(dataclasses.replace(state, aux=state.aux + s * h)) for s in (1, -1))

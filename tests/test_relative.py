@@ -141,11 +141,11 @@ def test_prediction_carries_cross_covariances_and_a_clone_is_its_source():
 # Where cross-covariances come from
 
 
-@pytest.mark.parametrize("iterations", [1, 3])
-def test_the_filters_cross_covariance_is_that_of_the_posterior_at_the_later_frame(iterations):
+def test_the_filters_cross_covariance_is_that_of_the_posterior_at_the_later_frame():
     """The error reported at k is uncorrelated with all data up to k, so smoothing j by these changes nothing."""
     world = open_sequence("builtin:loop?frames=41")
-    settings = {"variant": "standard", "retire": "never", "relative_frames": 40, "iterations": iterations}
+    # Frozen rows are the filter in xyz only, where iterations are refused.
+    settings = {"variant": "standard", "retire": "never", "relative_frames": 40, "landmark_coordinates": "xyz"}
     settings |= {"initial_position_std_m": 0.1, "initial_rotation_std_rad": 0.02}
     result = run(world, "full", Config().with_overrides({"filter": settings}))
     found = posterior(result, PosteriorConfig(linearisation="filtered"))
@@ -179,7 +179,7 @@ def test_estimates_do_not_depend_on_references():
         run(world, "full", Config().with_overrides({"filter": {"relative_frames": frames}})) for frames in (40, 0)
     )
     assert with_.pairs is not None and len(with_.pairs) > 8 and without.pairs is None
-    np.testing.assert_allclose(with_.T_world_imu, without.T_world_imu, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(with_.T_world_imu, without.T_world_imu, rtol=1e-13, atol=1e-12)
     np.testing.assert_allclose(with_.covariance, without.covariance, rtol=0, atol=1e-12)
     # Landmarks at a distance are known to metres: what rounding does to them is small beside that.
     std = np.sqrt(np.diagonal(without.landmarks.covariance, axis1=1, axis2=2))

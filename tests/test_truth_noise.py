@@ -151,9 +151,9 @@ def test_formats_of_kitti_state_the_noise_of_their_truth(tmp_path):
 def test_kitti_is_stated_in_the_units_it_was_found_in():
     noise = KITTI_TRUTH_NOISE
     angles = (noise.first_roll_rad, noise.first_pitch_rad, noise.first_yaw_rad, noise.attitude_rad)
-    np.testing.assert_allclose(np.degrees(angles), [0.2, 0.2, 0.5, 0.02])
-    assert (noise.first_position_m, noise.stamp_s, noise.position_m) == (0.0, 0.003, 0.01)
-    assert noise.text == "first pose 0.2, 0.2, 0.5 deg (roll, pitch, yaw), 0 m; each pose 0.01 m, 0.02 deg, stamps 3 ms"
+    np.testing.assert_allclose(np.degrees(angles), [0.2, 0.2, 0.5, 0.1])
+    assert (noise.first_position_m, noise.stamp_s, noise.position_m) == (0.0, 0.003, 0.02)
+    assert noise.text == "first pose 0.2, 0.2, 0.5 deg (roll, pitch, yaw), 0 m; each pose 0.02 m, 0.1 deg, stamps 3 ms"
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])

@@ -84,7 +84,8 @@ def whitened(S: Array, residual: Array) -> Array:
     to u, which is the disparity.
     """
     std = np.sqrt(np.maximum(np.diagonal(S, axis1=1, axis2=2), np.finfo(float).tiny))
-    correlation = S / (std[:, :, None] * std[:, None, :])
+    with np.errstate(over="ignore"):
+        correlation = S / (std[:, :, None] * std[:, None, :])
     finite = np.isfinite(correlation).all(axis=(1, 2))
     correlation = np.where(finite[:, None, None], correlation, 0.0)
     definite = np.linalg.eigvalsh(correlation)[:, 0] > _LEAST_SHARE

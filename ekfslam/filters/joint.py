@@ -27,7 +27,7 @@ from ekfslam.geometry import se3
 from ekfslam.models.blocks import StateBlock
 from ekfslam.models.build import model_of
 from ekfslam.models.model import Model, VelocityRows
-from ekfslam.models.sensors.base import ACCEPTED, MOVING, WAITING, DelayedSensor, Sensor
+from ekfslam.models.sensors.base import ACCEPTED, DISPARITY, MOVING, WAITING, DelayedSensor, Sensor
 
 
 class JointEKF(Estimate):
@@ -196,7 +196,7 @@ class JointEKF(Estimate):
         if not found.dof:  # nothing has updated the pose; yet landmarks that are all new have their images here
             self.updated_pose = "pose" if (self.table.first_step == self.step).all() else None
         self.retired.start_afresh(ids[new][started])
-        reason[np.flatnonzero(new)[~started]] = WAITING
+        reason[np.flatnonzero(new)[~started]] = DISPARITY if self._waiting is None else WAITING
         self._reported.append(self.model.reported(self.values, self.gaussian.P))
         likelihood = self._log_likelihood + log_density(found.done.nis, found.done.log_det, found.dof)
         self._log_likelihood = 0.0

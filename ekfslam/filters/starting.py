@@ -21,19 +21,21 @@ def start(e: Estimate, log: LogBook, waiting: Waiting | None, frame: int, ids: I
         ids, rows: (n,), (n, d) new tracks, distinct from all in the state.
 
     Returns:
-        Which (n,) have a landmark now; the others wait.
+        Which (n,) have a landmark now; the others wait, or see nothing that is in front of the sensor.
     """
     if waiting is not None:
         return _start_after_waiting(e, log, waiting, frame, ids, rows)
+    error, now = e.model.track_error, e.moment()
+    has_point = e.model.has_point(now, rows)
+    ids, rows = ids[has_point], rows[has_point]
     if len(ids):
-        error, now = e.model.track_error, e.moment()
         none = np.zeros(len(ids), dtype=np.int64)
         variance = e.sensor.variance(rows) if error is None else error.absolute_variance(none)
         moment = now.linearised_at(e.variant.linear(now.T_imu_world, e.T_predicted))
         positions, G, covariance = e.model.initialise(moment, rows, variance)
         e.gaussian.augment(G, covariance)
         _append(e, log, frame, ids, positions, rows, (e.step, rows, variance))
-    return np.ones(len(ids), dtype=bool)
+    return has_point
 
 
 def _start_after_waiting(

@@ -356,8 +356,9 @@ class Model:
         if self.calibration is None:
             q, H_pose, H_m = linearise(sensor, T, positions_m, T_linear, linear_positions_m)
         else:
+            assert isinstance(sensor, Rig)
             q, H_pose, H_c, H_m = self.calibration.linearise(
-                self._rig_of(moment), moment.calibration, moment.twist, T, positions_m, T_linear, linear_positions_m
+                sensor, moment.calibration, moment.twist, T, positions_m, T_linear, linear_positions_m
             )
         if layout.seen == 6:
             return Seen(q, sensor.predict(q), H_pose, H_m)
@@ -412,6 +413,18 @@ class Model:
     def predicted(self, moment: Moment, q: Array) -> Array:
         """Rows (n, d) of points (n, 3) in the frame of the sensor."""
         return self._sensor_of(moment).predict(q)
+
+    def has_point(self, moment: Moment, rows: Array) -> BoolArray:
+        """Whether (n,) rows (n, d) are those of a point whose depth they show.
+
+        The sensor's `screen` has judged that of the sensor as given. Where blocks change it, disparities may be less
+        than that of a point at infinity.
+        """
+        sensor = self._sensor_of(moment)
+        if sensor is self.sensor or not len(rows):
+            return np.ones(len(rows), dtype=bool)
+        assert isinstance(sensor, Rig)
+        return sensor.has_point(rows)
 
     def initialise(self, moment: Moment, rows: Array, variance: Array) -> tuple[Array, Array, Array]:
         """Eq. (5): positions (n, 3) of new landmarks, G (n, 3, seen), and what the measurement adds (n, 3, 3).

@@ -132,21 +132,21 @@ class Calibration(StateBlock):
     ) -> tuple[Array, Array, Array, Array]:
         """Eq. (4) with parameters (9,) at which to linearise, and velocities ``twist`` (6,) or (n, 6) of the IMU.
 
+        The rig is the calibrated one, see `applied`.
+
         Returns:
             As `ekfslam.models.observation.linearise`, with H (n, 3, size) by the free parameters before H_m.
         """
-        now, delay = calibrated(rig, parameters), to_exposure(parameters, twist)
-        q, H_x, H_m = linearise(now, delay @ T_imu_world, positions_m, delay @ T_linear, linear_positions_m)
-        A = now.jacobian(q)
+        delay = to_exposure(parameters, twist)
+        q, H_x, H_m = linearise(rig, delay @ T_imu_world, positions_m, delay @ T_linear, linear_positions_m)
+        A = rig.jacobian(q)
         H = np.zeros((len(q), 3, 9))
         # First estimates here, too: a camera and its landmarks turned about it as one must look the same for good.
-        q_linear = se3.apply(now.T_cam_imu @ delay @ T_linear, linear_positions_m)
+        q_linear = se3.apply(rig.T_cam_imu @ delay @ T_linear, linear_positions_m)
         moved = np.concatenate([np.broadcast_to(np.eye(3), A.shape), -se3.skew(q_linear)], axis=-1)
         H[..., _EXTRINSIC] = A @ moved @ se3.left_jacobian(parameters[_EXTRINSIC])
-        by_disparity = now.by_disparity(q)
-        disparity_px = now.camera.fu_px * now.camera.baseline_m / q[:, 2:]
-        H[..., _BASELINE] = by_disparity * disparity_px
-        H[..., _DISPARITY] = by_disparity
+        H[..., _BASELINE] = rig.by_log_baseline(q)
+        H[..., _DISPARITY] = rig.by_disparity(q)
         H[..., TIME] = -(H_x @ twist[..., None])[..., 0]
         return q, H_x @ se3.adjoint(delay), H[..., self.free], H_m
 

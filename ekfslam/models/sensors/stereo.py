@@ -15,7 +15,10 @@ from ekfslam.geometry.camera import StereoCamera
 from ekfslam.models.sensors.base import ACCEPTED, DISPARITY
 
 _NEWTON_STEPS = 6
+_ROUNDING_PX = 1e-11
 _LEAST_DISPARITY_PX = 1e-3
+# What has less disparity (px) says nothing of a depth.
+_NO_DEPTH_PX = 0.5
 _DISPARITY_ROWS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, -1.0]])
 
 
@@ -87,14 +90,22 @@ class Rig:
 
     def by_right_rotation(self, q: Array) -> Array:
         """Derivative (n, 3, 3) of the rows by the rotation of the right camera, at ``right_rotation_rad``."""
-        psi = np.zeros(3) if self.right_rotation_rad is None else self.right_rotation_rad
         q_right, right, _ = self._seen_right(q)
-        B = self._of_both(np.zeros((*q.shape, 3)), -right @ se3.skew(q_right) @ se3.so3_left_jacobian(psi))
+        B = self._of_both(np.zeros((*q.shape, 3)), -right @ se3.skew(q_right) @ self._right_turn[1])
         return _DISPARITY_ROWS @ B if self._sees_disparity else B
 
     def by_disparity(self, q: Array) -> Array:
         """Derivative (n, 3) of the rows by an error of the disparity in px."""
         return np.broadcast_to([0.0, 0.0, 1.0 if self._sees_disparity else -1.0], q.shape)
+
+    def by_log_baseline(self, q: Array) -> Array:
+        """Derivative (n, 3) of the rows by the logarithm of the baseline."""
+        if self.right_rotation_rad is None:
+            return self.by_disparity(q) * (self.camera.fu_px * self.camera.baseline_m / q[:, 2:])
+        _, right, R = self._seen_right(q)
+        by_baseline = -self.camera.baseline_m * (right @ R[..., :1])
+        B = self._of_both(np.zeros((*q.shape, 1)), by_baseline)
+        return ((_DISPARITY_ROWS @ B) if self._sees_disparity else B)[..., 0]
 
     def invert(self, rows: Array) -> Array:
         if self._sees_disparity:  # _DISPARITY_ROWS is its own inverse
@@ -106,9 +117,16 @@ class Rig:
         # reach rounding; a disparity below what the rotation makes of infinity has no point and stays at the limit.
         seen = rows
         for _ in range(_NEWTON_STEPS):
-            q = cam.triangulate(self.camera, self._in_front(seen))
-            seen = seen + rows - self._rectified(q)
+            step = rows - self._rectified(cam.triangulate(self.camera, self._in_front(seen)))
+            seen = seen + step
+            if np.abs(step).max(initial=0.0) < _ROUNDING_PX:
+                break
         return cam.triangulate(self.camera, self._in_front(seen))
+
+    def has_point(self, rows: Array) -> BoolArray:
+        """Whether (n,) rows (n, 3) are those of a point in front of the rig, near enough to have a depth."""
+        z = self.invert(rows)[:, 2]
+        return (z > 0) & (z < self.camera.fu_px * self.camera.baseline_m / _NO_DEPTH_PX)
 
     @staticmethod
     def _in_front(rows: Array) -> Array:
@@ -120,16 +138,27 @@ class Rig:
         rows = cam.project(self.camera, q)[..., :3]
         if self.right_rotation_rad is None:
             return rows
-        q_right = self._seen_right(q)[0]
-        camera = replace(self.camera, baseline_m=0.0)
-        return self._of_both(rows[..., None], cam.project(camera, q_right)[..., :2, None])[..., 0]
+        q_right = self._in_right(q)
+        return self._of_both(rows[..., None], cam.project(self._right_camera, q_right)[..., :2, None])[..., 0]
+
+    @cached_property
+    def _right_camera(self) -> StereoCamera:
+        return replace(self.camera, baseline_m=0.0)
+
+    @cached_property
+    def _right_turn(self) -> tuple[Array, Array]:
+        """Rotation of the right camera, (3, 3) or one a point, and its left Jacobian."""
+        psi = np.zeros(3) if self.right_rotation_rad is None else self.right_rotation_rad
+        return se3.so3_exp_and_left_jacobian(psi)
+
+    def _in_right(self, q: Array) -> Array:
+        """Points (n, 3) in the right camera."""
+        return (self._right_turn[0] @ (q - np.array([self.camera.baseline_m, 0.0, 0.0]))[..., None])[..., 0]
 
     def _seen_right(self, q: Array) -> tuple[Array, Array, Array]:
         """Points (n, 3) in the right camera, the derivative (n, 2, 3) of its pixels by them, and theirs by ``q``."""
-        psi = np.zeros(3) if self.right_rotation_rad is None else self.right_rotation_rad
-        R = se3.so3_exp(psi)
-        q_right = (R @ (q - np.array([self.camera.baseline_m, 0.0, 0.0]))[..., None])[..., 0]
-        return q_right, cam.projection_jacobian(replace(self.camera, baseline_m=0.0), q_right)[..., :2, :], R
+        q_right = self._in_right(q)
+        return q_right, cam.projection_jacobian(self._right_camera, q_right)[..., :2, :], self._right_turn[0]
 
     def _of_both(self, left: Array, right: Array) -> Array:
         """Rows (uL, v, uR), or derivatives of them (n, 3, k), from those of the left camera and (uR, vR) (n, 2, k)."""

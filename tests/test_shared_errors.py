@@ -1,0 +1,645 @@
+"""Errors that all landmarks of a frame share: jitter of the camera, drift of vision, rotation of the right camera.
+
+`literal_rows` is the model written down once more, landmark by landmark; it shares nothing with the package but `se3`.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from reference import CAMERA, T_CAM_IMU, small_world
+from test_jacobians import POSES, central, visible_points
+from test_level import (
+    BY_DISPARITY,
+    EVERYTHING,
+    OPEN,
+    P0,
+    TILTED,
+    TRACKS,
+    Literal,
+    camera_pose,
+    filter_of,
+    gauge_information,
+    in_level_frame,
+)
+
+from ekfslam.config import FilterConfig
+from ekfslam.data.sequence import Noise, Observations
+from ekfslam.data.simulate import builtin
+from ekfslam.errors import ConfigError
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
+from ekfslam.geometry import camera as cam
+from ekfslam.geometry import se3
+from ekfslam.models.blocks import CameraJitter, Previous, StereoRotation, TwistBias, VisionDrift
+from ekfslam.models.blocks.calibration import prior_std
+from ekfslam.models.build import model_of
+from ekfslam.models.model import Moment
+from ekfslam.models.sensors.stereo import Rig
+from ekfslam.smoother.problem import BatchProblem
+
+NOISE = Noise(
+    np.repeat([0.3, 0.05], 3),
+    np.array([0.7, 0.9, 1.1, 1.3]),
+    twist_walk_std=np.repeat([0.2, 0.02], 3),
+    motion_std=np.repeat([0.05, 0.01], 3),
+    tilt_rad=0.05,
+)
+KINDS = {"tracks": dataclasses.replace(NOISE, **TRACKS), "white": NOISE}
+BIAS = TwistBias(sigma_v_m_s=0.1, sigma_w_rad_s=0.01, time_v_s=3.0, time_w_s=7.0)
+SHARED = [CameraJitter(), VisionDrift(length_m=20.0), StereoRotation(time_s=5.0)]
+BLOCKS = [*SHARED, BIAS]
+ERRORS = {
+    "calibration": np.array([0.05, -0.08, 0.06, 0.02, -0.03, 0.025, 0.03, 0.7, 0.03]),
+    "camera_jitter": np.array([0.04, -0.03, 0.05, 0.02, -0.01, 0.015]),
+    "vision_drift": np.array([0.02, 0.03, -0.01, 0.004, 0.003, -0.005]),
+    "stereo_rotation": np.array([0.004, -0.006, 0.005]),
+    "previous_camera_jitter": np.array([-0.02, 0.05, 0.03, -0.015, 0.02, 0.01]),
+    "previous_stereo_rotation": np.array([-0.005, 0.003, 0.006]),
+}
+TWIST = np.array([7.0, 0.4, -0.3, 0.1, -0.2, 0.5])
+LEAST_WAY_M = 0.1
+poses = pytest.mark.parametrize("T", POSES.values(), ids=POSES.keys())
+kinds = pytest.mark.parametrize("noise", KINDS.values(), ids=KINDS.keys())
+
+
+def pixel(q):
+    return np.array([CAMERA.fu_px * q[0] / q[2] + CAMERA.cu_px, CAMERA.fv_px * q[1] / q[2] + CAMERA.cv_px])
+
+
+def literal_rows(values, m, way_m, follows, twist, before=False, disparity=True):
+    """Rows (n, 3) of landmarks (n, 3), those that follow another observation with the drift; or in the frame before."""
+    prefix = "previous_" if before else ""
+    T, jitter, psi = (values[prefix + name] for name in ("pose", "camera_jitter", "stereo_rotation"))
+    c, rows = values["calibration"], []
+    right_of_both = NOISE.pixel_std_px[1] ** 2 / (NOISE.pixel_std_px[1] ** 2 + NOISE.pixel_std_px[3] ** 2)
+    for point, follows_one in zip(m, follows, strict=True):
+        offset = jitter
+        if follows_one and not before:
+            offset = offset + max(way_m, LEAST_WAY_M) * values["vision_drift"]
+        moved = se3.exp(-c[8] * twist) @ se3.exp(offset) @ T
+        q = se3.apply(se3.exp(c[:6]) @ T_CAM_IMU @ moved, point)
+        baseline = np.array([CAMERA.baseline_m * np.exp(c[6]), 0.0, 0.0])
+        left, right = pixel(q), pixel(se3.so3_exp(psi) @ (q - baseline))
+        v = (1 - right_of_both) * left[1] + right_of_both * right[1]
+        rows.append([left[0], v, left[0] - right[0] + c[7] if disparity else right[0] - c[7]])
+    return np.array(rows)
+
+
+def everything(T, noise, blocks=BLOCKS):
+    """The model with every block, and values of it of which none is zero."""
+    model = model_of(Rig(CAMERA, T_CAM_IMU, noise), noise, T, P0, EVERYTHING, blocks)
+    T_before = se3.exp(np.array([0.6, 0.1, -0.05, 0.01, 0.02, -0.05])) @ T
+    values = {**model.initial_values(), "previous_pose": T_before, "pose": T, **ERRORS}
+    return model, {name: value for name, value in values.items() if name in model.layout}
+
+
+def moment_of(model, values, way_m, before=False):
+    prefix = "previous_" if before else ""
+    shared = {block.name: values.get(prefix + block.name, values[block.name]) for block in model.shared}
+    T = values[prefix + "pose"]
+    return Moment(T, T, values["calibration"], TWIST, shared, np.array(way_m))
+
+
+def wide(seen, body, slots, landmarks):
+    """H (3k, body+3n) by all blocks and landmarks."""
+    k, _, width = seen.H_x.shape
+    H = np.zeros((k, 3, body + 3 * landmarks))
+    H[..., :width] = seen.H_x
+    for i, slot in enumerate(slots):
+        H[i, :, body + 3 * slot : body + 3 * slot + 3] = seen.H_m[i]
+    return H.reshape(3 * k, -1)
+
+
+def assert_equal_rows(ours, numeric):
+    np.testing.assert_allclose(ours, numeric, rtol=1e-5, atol=1e-6 * np.abs(numeric).max())
+
+
+@pytest.mark.parametrize("way_m", [1.7, 0.03])
+@pytest.mark.parametrize("follows", ["some", "all", "none"])
+@kinds
+@poses
+def test_rows_by_every_block_and_landmark(T, noise, follows, way_m):
+    model, values = everything(T, noise)
+    m, slots = visible_points(T, 6), np.array([4, 1, 5, 2])
+    is_difference = {"some": np.array([True, False, True, False]), "all": np.ones(4, bool), "none": np.zeros(4, bool)}
+    body, follow, disparity = model.layout.body, is_difference[follows], noise.track_error is not None
+
+    def rows(x):
+        points = (m + x[body:].reshape(-1, 3))[slots]
+        moved = {**ERRORS, **model.retract(values, x[:body])}
+        return literal_rows(moved, points, way_m, follow, TWIST, disparity=disparity).ravel()
+
+    seen = model.see(moment_of(model, values, way_m), m[slots], m[slots], is_difference=follow)
+    nothing = np.zeros(body + 3 * len(m))
+    np.testing.assert_allclose(seen.z.ravel(), rows(nothing), rtol=1e-11)
+    H = wide(seen, body, slots, len(m))
+    assert_equal_rows(H, central(rows, len(nothing)))
+    drift = H[:, model.layout["vision_drift"]].reshape(4, 3, 6)
+    assert (np.abs(drift).max(axis=(1, 2)) > 0).tolist() == follow.tolist()
+    q = model.points(moment_of(model, values, way_m), m[slots], follow)
+    np.testing.assert_allclose(model.predicted(moment_of(model, values, way_m), q), seen.z, rtol=1e-13)
+
+
+@poses
+def test_rows_in_the_frame_before_by_every_block_and_landmark(T):
+    model, values = everything(T, KINDS["tracks"])
+    m, slots, body = visible_points(T, 5), np.array([3, 0, 4]), model.layout.body
+    none = np.zeros(3, dtype=bool)
+
+    def rows(x):
+        points = (m + x[body:].reshape(-1, 3))[slots]
+        return literal_rows(model.retract(values, x[:body]), points, 1.7, none, TWIST, before=True).ravel()
+
+    seen = model.see(moment_of(model, values, 0.0, before=True), m[slots], m[slots], "previous_pose")
+    np.testing.assert_allclose(seen.z.ravel(), rows(np.zeros(body + 15)), rtol=1e-11)
+    H = wide(seen, body, slots, len(m))
+    assert_equal_rows(H, central(rows, body + 15))
+    for name in ("pose", "camera_jitter", "stereo_rotation", "vision_drift"):
+        assert not H[:, model.layout[name]].any()
+
+
+@pytest.mark.parametrize("memory", [1.0, 0.9])
+@poses
+def test_observations_of_the_filter_by_every_block_and_landmark(T, memory):
+    """Some landmarks are seen again in the next frame, some after a gap, some not at all; the first one is not."""
+    model, values = everything(T, dataclasses.replace(KINDS["tracks"], track_memory=memory))
+    ekf = JointEKF(model, OPEN)
+    ids, m = np.array([40, 3, 17, 99, 8, 21]), visible_points(T, 6)
+    zero = {name: np.zeros_like(value) for name, value in ERRORS.items()}
+
+    def pixels(which):
+        rows = literal_rows({**zero, "pose": ekf.T_imu_world}, m[which], 0.0, np.zeros(len(which)), TWIST)
+        return np.column_stack([rows[:, :2], rows[:, 0] - rows[:, 2], rows[:, 1]])
+
+    ekf.begin(TWIST)
+    ekf.update(0, ids, pixels(np.arange(6)))
+    ekf.predict(TWIST, 0.02)
+    ekf.update(1, ids[[5, 0, 2, 4]], pixels([5, 0, 2, 4]) + 0.3)
+    ekf.predict(1.1 * TWIST, 0.03)
+    # Wherever all blocks may be.
+    ekf.values = {**ekf.values, **{name: ERRORS[name] for name in ERRORS}}
+    ekf.values["pose"] = se3.exp(np.array([0.02, -0.03, 0.01, 0.01, 0.02, -0.01])) @ ekf.values["pose"]
+    slots, body, values = np.array([4, 1, 5, 3, 2]), model.layout.body, ekf.values
+    follows = ekf.table.last_step[slots] == ekf.step - 1
+    assert follows.tolist() == [True, False, True, False, True]
+    before, way_m = ekf.table.seen_rows[slots], 0.03 * 1.1 * np.linalg.norm(TWIST[:3])
+    measured = before + np.array([3.0, -1.0, 0.5])
+
+    def residual(x):
+        moved, points = model.retract(values, x[:body]), (ekf.positions_m + x[body:].reshape(-1, 3))[slots]
+        now = measured - literal_rows(moved, points, way_m, follows, ekf.imu_twist)
+        last = before - literal_rows(moved, points, way_m, follows, ekf.imu_twist_before, before=True)
+        return (now - memory * follows[:, None] * last).ravel()
+
+    _, rows = ekf.observe(slots, measured)
+    size = body + 18
+    np.testing.assert_allclose(rows.residual.ravel(), residual(np.zeros(size)), atol=1e-8)
+    assert_equal_rows(wide(rows, body, rows.slot, 6), -central(residual, size))
+
+
+@kinds
+@poses
+def test_new_landmarks_by_every_block(T, noise):
+    """What was seen stays as it is, whatever the blocks are; the rest is the noise of the sight."""
+    model, values = everything(T, noise)
+    m, body, none = visible_points(T, 4), model.layout.body, np.zeros(4, dtype=bool)
+    disparity, variance = noise.track_error is not None, np.array([[0.5, 0.3, 0.7]]) * np.arange(1, 5)[:, None]
+    moment = moment_of(model, values, 1.7)
+    z = literal_rows({**ERRORS, **values}, m, 1.7, none, TWIST, disparity=disparity) + np.array([0.5, -0.2, 0.3])
+    positions, G, covariance = model.initialise(moment, z, variance)
+    seen = literal_rows({**ERRORS, **values}, positions, 1.7, none, TWIST, disparity=disparity)
+    np.testing.assert_allclose(seen, z, atol=1e-9)
+
+    def started(x):
+        return model.initialise(moment_of(model, model.retract(values, x), 1.7), z, variance)[0].ravel()
+
+    full = np.zeros((12, body))
+    full[:, : model.layout.seen] = G.reshape(12, -1)
+    assert_equal_rows(full, central(started, body))
+    for i in range(4):
+        by_row = central(lambda d, i=i: model.initialise(moment, z + d, variance)[0][i], 3)
+        expected = by_row @ np.diag(variance[i]) @ by_row.T
+        np.testing.assert_allclose(covariance[i], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+    assert model.has_point(moment, z).all()
+
+
+# --- the rig whose right camera is turned ---------------------------------------------------------------------------
+
+ROTATIONS = {
+    "none": np.zeros(3),
+    "hardly": np.full(3, 1e-9),
+    "yaw": np.array([0.0, np.deg2rad(0.1), 0.0]),
+    "all": np.deg2rad([0.3, -0.4, 0.5]),
+    "one a point": np.deg2rad(np.random.default_rng(5).normal(0, 0.3, (7, 3))),
+}
+
+
+@pytest.mark.parametrize("psi", ROTATIONS.values(), ids=ROTATIONS.keys())
+@kinds
+def test_a_turned_right_camera(noise, psi):
+    """Rows, their derivatives by point and rotation, and the way back."""
+    rng = np.random.default_rng(2)
+    rig = Rig(CAMERA, T_CAM_IMU, noise, disparity_offset_px=0.7, right_rotation_rad=psi)
+    q = rng.uniform([-3, -2, 2], [3, 2, 40], (7, 3))
+    each = np.broadcast_to(psi, (7, 3))
+    A, B, z = rig.jacobian(q), rig.by_right_rotation(q), rig.predict(q)
+    for i, (point, own) in enumerate(zip(q, each, strict=True)):
+
+        def rows(p, angles):
+            left, right = pixel(p), pixel(se3.so3_exp(angles) @ (p - np.array([CAMERA.baseline_m, 0, 0])))
+            weight = cam.weight_of_left_row(noise.pixel_std_px)
+            v, disparity = weight * left[1] + (1 - weight) * right[1], left[0] - right[0] + 0.7
+            return np.array([left[0], v, disparity if noise.track_error is not None else left[0] - disparity])
+
+        np.testing.assert_allclose(z[i], rows(point, own), rtol=1e-12)
+        assert_equal_rows(A[i], central(lambda d, p=point, a=own, f=rows: f(p + d, a), 3))
+        assert_equal_rows(B[i], central(lambda d, p=point, a=own, f=rows: f(p, a + d), 3))
+    np.testing.assert_allclose(rig.invert(z), q, rtol=1e-9, atol=1e-9)
+    assert rig.has_point(z).all()
+
+
+def test_a_right_camera_that_is_not_turned_is_the_rectified_pair():
+    rng = np.random.default_rng(2)
+    rig, turned = (Rig(CAMERA, T_CAM_IMU, NOISE, right_rotation_rad=psi) for psi in (None, np.zeros(3)))
+    q = rng.uniform([-3, -2, 2], [3, 2, 40], (9, 3))
+    np.testing.assert_allclose(turned.predict(q), rig.predict(q), rtol=1e-14)
+    np.testing.assert_allclose(turned.jacobian(q), rig.jacobian(q), rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(turned.invert(rig.predict(q)), rig.invert(rig.predict(q)))
+
+
+@kinds
+def test_what_is_behind_infinity_has_no_point(noise):
+    """With a yaw of 0.2 degrees infinity itself has a disparity of 2.4 px; less than that starts no landmark."""
+    psi = np.array([0.0, -np.deg2rad(0.2), 0.0])
+    rig = Rig(CAMERA, T_CAM_IMU, noise, right_rotation_rad=psi)
+    depth = np.array([10.0, 200.0, 700.0, 2000.0, 1e6])
+    q = depth[:, None] * np.array([0.1, 0.05, 1.0])
+    z = rig.predict(q)
+    np.testing.assert_array_equal(rig.has_point(z), [True, True, True, False, False])
+    less = z[:1] * np.ones((3, 1))
+    disparity = np.array([1.0, 2.0, 5.0])
+    less[:, 2] = disparity if noise.track_error is not None else less[:, 0] - disparity
+    np.testing.assert_array_equal(rig.has_point(less), [False, False, True])
+    model = model_of(Rig(CAMERA, T_CAM_IMU, noise), noise, np.eye(4), P0, blocks=[StereoRotation()])
+    ekf = JointEKF(model, OPEN)
+    ekf.values = {**ekf.values, "stereo_rotation": psi}
+    pixels = np.column_stack([less[:, :2], less[:, 0] - disparity, less[:, 1]])
+    report = ekf.update(0, np.array([7, 5, 9]), pixels)
+    assert ekf.ids.tolist() == [9]
+    assert report.reason.tolist() == [1, 1, -1]
+
+
+# --- the model ------------------------------------------------------------------------------------------------------
+
+
+def test_which_blocks_have_clones():
+    names = list(
+        model_of(Rig(CAMERA, T_CAM_IMU, KINDS["tracks"]), KINDS["tracks"], np.eye(4), P0, blocks=SHARED).layout
+    )
+    assert [name for name in names if name.startswith("previous_")] == [
+        "previous_pose",
+        "previous_camera_jitter",
+        "previous_stereo_rotation",
+    ]
+    white = model_of(Rig(CAMERA, T_CAM_IMU, NOISE), NOISE, np.eye(4), P0, blocks=SHARED)
+    assert not white.clones
+    with pytest.raises(ConfigError, match=r"there twice: .*camera_jitter"):
+        model_of(Rig(CAMERA, T_CAM_IMU, NOISE), NOISE, np.eye(4), P0, blocks=[*SHARED, CameraJitter()])
+
+
+def test_a_clone_is_its_block_before_it_changed():
+    """Value and cross-covariances are those of the block before the prediction, and both wander apart."""
+    model, _ = everything(np.eye(4), KINDS["tracks"])
+    ekf, rng, layout = JointEKF(model, OPEN), np.random.default_rng(0), model.layout
+    root = rng.normal(size=(layout.body, layout.body))
+    P = root @ root.T
+    ekf.P = P.copy()
+    ekf.values = {**ekf.values, **{name: ERRORS[name] for name in ("camera_jitter", "stereo_rotation", "vision_drift")}}
+    before = ekf.values
+    ekf.predict(TWIST, 0.2)
+    way_m = 0.2 * np.linalg.norm(TWIST[:3])
+    assert ekf.way_m == pytest.approx(way_m)
+    kept = {"camera_jitter": 0.2 / 0.6, "vision_drift": way_m / 20.0, "stereo_rotation": 0.2 / 5.0}
+    for block in SHARED:
+        at, phi = layout[block.name], np.exp(-kept[block.name])
+        own, std = P[at, at], block.stationary_std
+        np.testing.assert_allclose(ekf.values[block.name], phi * before[block.name])
+        np.testing.assert_allclose(ekf.P[at, at], phi**2 * own + np.diag(std**2 * (1 - phi**2)))
+        if (clone := Previous(block).name) in layout:
+            np.testing.assert_array_equal(ekf.values[clone], before[block.name])
+            np.testing.assert_allclose(ekf.P[layout[clone], layout[clone]], own)
+            np.testing.assert_allclose(ekf.P[at, layout[clone]], phi * own)
+
+
+@pytest.mark.parametrize("tracks", [TRACKS, {}], ids=["tracks", "white"])
+@pytest.mark.parametrize("coordinates", ["xyz", "image"])
+@pytest.mark.parametrize("variant", ["invariant", "fej", "standard"])
+def test_information_about_the_gauge_with_shared_errors(variant, coordinates, tracks):
+    """Velocities taken as exact: not the least is gained or lost, but by the standard variant."""
+    world = in_level_frame(small_world(seed=4), TILTED, twist_std=np.zeros(6), tilt_rad=0.05, **tracks)
+    config = dataclasses.replace(OPEN, variant=variant, landmark_coordinates=coordinates)
+    ekf = filter_of(world, config, EVERYTHING, up=TILTED[:, 2], blocks=SHARED)
+    prior = gauge_information(ekf)
+    for k in range(len(world)):
+        if k:
+            ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
+        ekf.update(k, *world.observations.at(k))
+    ratio = np.linalg.eigvals(np.linalg.solve(prior, gauge_information(ekf))).real
+    if variant == "standard":
+        assert ratio.max() > 3
+    else:
+        np.testing.assert_allclose(ratio, 1.0, atol=1e-6)
+
+
+class LiteralShared(Literal):
+    """The textbook EKF with shared errors; their columns come after those of all other blocks.
+
+    Rotations of the right camera count in units of `UNIT` rad: as far as its differences go in others, depths are lost.
+    """
+
+    UNIT = 0.02
+    OWN = ("jitter", "drift", "psi", "jitter_before", "psi_before")
+    SIZE = (6, 6, 3, 6, 3)
+
+    def __init__(self, sequence, variant, images):
+        super().__init__(sequence, variant, np.arange(9), prior_std(EVERYTHING), TILTED[:, 2], BIAS, images)
+        kept = len(self.SIZE) if self.tracks is not None else 3
+        for name, size in zip(self.OWN[:kept], self.SIZE[:kept], strict=True):
+            self.at[name] = slice(self.body, self.body + size)
+            self.body += size
+        self.P = np.pad(self.P, (0, self.body - len(self.P)))
+        for block, name in zip(SHARED, self.OWN[:3], strict=True):
+            self.P[self.at[name], self.at[name]] = np.diag((block.stationary_std / self.unit(name)) ** 2)
+        vars(self).update({name: np.zeros(size) for name, size in zip(self.OWN, self.SIZE, strict=True)})
+
+    def unit(self, name):
+        return self.UNIT if name.startswith("psi") else 1.0
+
+    @property
+    def units(self):
+        """Of the columns of P."""
+        units = np.ones(len(self.P))
+        for name in self.OWN:
+            units[self.at.get(name, slice(0))] = self.unit(name)
+        return units
+
+    def moved_by(self, e):
+        own = {name: getattr(self, name) for name in self.OWN}
+        own |= {name: own[name] + self.unit(name) * e[..., self.at[name]] for name in self.OWN if name in self.at}
+        return {**super().moved_by(e), **own}
+
+    def predict(self, measured, tau):
+        self.way_m = tau * np.linalg.norm(measured[:3])
+        super().predict(measured, tau)
+
+    def wander(self, tau):
+        F = np.eye(len(self.P))
+        for name in ("jitter", "psi"):
+            if f"{name}_before" in self.at:
+                F[self.at[f"{name}_before"]] = np.eye(len(self.P))[self.at[name]]
+                setattr(self, f"{name}_before", getattr(self, name))
+        self.P = F @ self.P @ F.T
+        super().wander(tau)
+        lengths = tau / 0.6, max(self.way_m, LEAST_WAY_M) / 20.0, tau / 5.0
+        for block, name, length in zip(SHARED, self.OWN[:3], lengths, strict=True):
+            F, kept = np.eye(len(self.P)), np.exp(-length)
+            F[self.at[name], self.at[name]] *= kept
+            self.P = F @ self.P @ F.T
+            self.P[self.at[name], self.at[name]] += np.diag(
+                (1 - kept**2) * (block.stationary_std / self.unit(name)) ** 2
+            )
+            setattr(self, name, kept * getattr(self, name))
+
+    def look(self, x, m, before=False, follows=False):
+        offset, psi = (x["jitter_before"], x["psi_before"]) if before else (x["jitter"], x["psi"])
+        if follows:
+            offset = offset + max(self.way_m, LEAST_WAY_M) * x["drift"]
+        T, u = (x["before"], self.u_before) if before else (x["T"], self.u)
+        q = se3.apply(camera_pose(se3.exp(offset) @ T, x["c"], u, T_CAM_IMU)[..., None, :, :], m)
+        baseline = CAMERA.baseline_m * np.exp(x["c"][..., 6])
+        right = se3.so3_exp(psi)[..., None, :, :] @ (q - baseline[..., None, None] * np.eye(3)[0])[..., None]
+        left, right = (np.moveaxis(pixel(np.moveaxis(p, -1, 0)), 0, -1) for p in (q, right[..., 0]))
+        disparity = left[..., 0] - right[..., 0] + x["c"][..., None, 7]
+        rows = np.stack([left[..., 0], (left[..., 1] + right[..., 1]) / 2, disparity], axis=-1)
+        return rows if self.tracks is not None else rows @ BY_DISPARITY.T
+
+    def point(self, x, row):
+        moved, rows = {**x, "T": se3.exp(x["jitter"]) @ x["T"]}, row
+        for _ in range(10):
+            rows = rows + row - self.look(x, super().point(moved, rows)[..., None, :])[..., 0, :]
+        return super().point(moved, rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tracks", [TRACKS, {}], ids=["tracks", "white"])
+@pytest.mark.parametrize("coordinates", ["xyz", "image"])
+@pytest.mark.parametrize("variant", ["standard", "invariant"])
+def test_filter_with_shared_errors_equals_the_literal_one(variant, coordinates, tracks):
+    """As in `test_level`: of what is there some are left out, the first among them, and others come in any order."""
+    walk = {"twist_walk_std": NOISE.twist_walk_std, "motion_std": NOISE.motion_std, "tilt_rad": 0.05, **tracks}
+    world = in_level_frame(small_world(frames=10, landmarks=20), TILTED, **walk)
+    config = dataclasses.replace(OPEN, variant=variant, landmark_coordinates=coordinates)
+    ekf = filter_of(world, config, EVERYTHING, up=TILTED[:, 2], blocks=BLOCKS)
+    literal, layout, rng = (
+        LiteralShared(world, variant, coordinates == "image"),
+        ekf.model.layout,
+        np.random.default_rng(3),
+    )
+    names = ["pose", "previous_pose", "calibration", "twist", "up", "twist_bias", *(block.name for block in SHARED)]
+    names += ["previous_camera_jitter", "previous_stereo_rotation"]
+    body = layout.columns(name for name in names if name in layout)
+    accuracy = 1e-9 if coordinates == "xyz" else 2e-8
+    for k in range(len(world)):
+        if k:
+            tau = world.time_s[k] - world.time_s[k - 1]
+            ekf.predict(world.twist[k], tau)
+            literal.predict(world.twist[k], tau)
+        else:
+            ekf.begin(world.twist[0])
+            literal.begin(world.twist[0])
+        ids, pixels = world.observations.at(k)
+        some = rng.permutation(len(ids))[: max(3, len(ids) - 2)]
+        if k > 1:
+            some = some[ids[some] != literal.ids[0]]
+        ekf.update(k, ids[some], pixels[some])
+        literal.update(ids[some], pixels[some])
+        assert literal.ids == ekf.ids.tolist()
+        columns = np.concatenate([body, np.arange(layout.body, len(ekf.P))])
+        own = zip(names[6:], literal.OWN, strict=True)
+        pairs = [(ekf.values[name], getattr(literal, value)) for name, value in own if name in layout]
+        for ours, theirs in (
+            *pairs,
+            (ekf.T_imu_world, literal.T),
+            (ekf.positions_m, literal.m),
+            (ekf.P[np.ix_(columns, columns)], literal.P * np.outer(literal.units, literal.units)),
+        ):
+            np.testing.assert_allclose(ours, theirs, rtol=accuracy, atol=accuracy)
+    assert (np.abs(ekf.values["stereo_rotation"]) > 1e-6).all()
+
+
+def test_residuals_of_the_batch_problem():
+    """Of observations and of the blocks themselves, at any state; their derivatives are looked at elsewhere."""
+    world = dataclasses.replace(small_world(frames=9, landmarks=20), noise=KINDS["tracks"])
+    ekf = filter_of(world, OPEN, EVERYTHING, blocks=BLOCKS)
+    for _ in run_filter(ekf, world):
+        pass
+    problem, rng = BatchProblem(ekf.log(), ekf.model), np.random.default_rng(4)
+    log, state = problem.log, problem.filtered_state(ekf.landmarks().position_m)
+    drive_values = {**state.drive_values, "calibration": ERRORS["calibration"]}
+    shared = state.shared + 0.01 * rng.normal(size=state.shared.shape)
+    state = dataclasses.replace(state, shared=shared, drive_values=drive_values)
+    names = ["camera_jitter", "vision_drift", "stereo_rotation"]
+    T, tau, way_m = state.T_imu_world, log.tau_s, np.linalg.norm(log.twist[:, :3], axis=1) * log.tau_s
+    twist = [log.seen_twist[0], *(-se3.log(T[k] @ se3.inverse(T[k - 1])) / tau[k] for k in range(1, 9))]
+
+    def left(i, follows):
+        k, m = log.frame[i], state.positions_m[log.landmark[i]]
+        values = {"pose": T[k], **drive_values, **dict(zip(names, np.split(shared[k], [6, 12]), strict=True))}
+        return log.rows[i] - literal_rows(values, m[None], way_m[k], [follows], twist[k])[0]
+
+    found, expected = problem.observation_residual(problem.points(state), state) * np.sqrt(log.variance), []
+    for i, previous in enumerate(log.previous):
+        expected.append(left(i, previous >= 0) - (0.9 * left(previous, False) if previous >= 0 else 0.0))
+    assert (log.previous >= 0).sum() > 20
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+    lengths = {"camera_jitter": tau / 0.6, "vision_drift": way_m / 20.0, "stereo_rotation": tau / 5.0}
+    parts = []
+    for block, x in zip(SHARED, np.split(shared, [6, 12], axis=1), strict=True):
+        kept = np.exp(-lengths[block.name][1:, None])
+        parts.append((x[1:] - kept * x[:-1]) / (block.stationary_std * np.sqrt(1 - kept**2)))
+    np.testing.assert_allclose(problem.motion_residual(state)[:, 6:], np.hstack(parts), rtol=1e-9)
+
+
+# --- recovery: worlds in which one error is put in ------------------------------------------------------------------
+
+# Sparse tracks, so that a run takes a second; errors of tracks are white but for what is put in.
+DRIVE = "city?frames=60&outlier_fraction=0&max_tracks=25&sigma_v_m_s={}&sigma_w_rad_s={}&seed={}"
+CLOSED = FilterConfig(gate_probability=1.0, split_after=0, retire="unseen", retire_after=1, moving_sigma=1e9)
+WALKS = {"track_first_px": np.full(3, 0.3), "track_walk_px": np.full(3, 0.3)}
+
+
+def plain_rows(world, T, m, psi):
+    """Pixels (n, 4) of landmarks (n, 3), the right camera turned."""
+    camera, q = world.camera, se3.apply(world.T_cam_imu @ T, m)
+    right = (q - np.array([camera.baseline_m, 0, 0])) @ se3.so3_exp(psi).T
+    f, c = np.array([camera.fu_px, camera.fv_px]), np.array([camera.cu_px, camera.cv_px])
+    return np.concatenate([f * q[:, :2] / q[:, 2:] + c, f * right[:, :2] / right[:, 2:] + c], axis=1)
+
+
+class Spoilt:
+    """A simulated drive recorded once more, with velocities and tracks that err as told.
+
+    Args:
+        seed: Of everything.
+        std: Of the velocities, m/s and rad/s.
+        psi: (3,) rotation of the right camera.
+        jitter, drift, bias: Blocks whose process is drawn from and put in; None: no such error.
+        walks: Whether errors of tracks walk.
+    """
+
+    def __init__(self, seed, std=(0.1, 0.005), psi=(0, 0, 0), jitter=None, drift=None, bias=None, walks=False):
+        world, rng = builtin(DRIVE.format(*std, seed)), np.random.default_rng(seed)
+        T, truth, tau = se3.inverse(world.truth.T_world_imu), world.truth, np.diff(world.time_s)
+        u = -se3.log(T[1:] @ se3.inverse(T[:-1])) / tau[:, None]
+        way_m = np.append(0.0, np.linalg.norm(u[:, :3], axis=1) * tau)
+        tau = np.append(0.0, tau)
+        self.jitter, self.drift, self.bias = (self.path(rng, b, tau, way_m) for b in (jitter, drift, bias))
+        observations, pixels, errors = world.observations, [], {}
+        for k in range(len(world)):
+            ids, _ = observations.at(k)
+            m = truth.position_m[np.searchsorted(truth.landmark, ids)]
+            seen_from = se3.exp(self.jitter[k]) @ T[k]
+            clean = plain_rows(world, seen_from, m, psi)
+            flow = plain_rows(world, se3.exp(max(way_m[k], LEAST_WAY_M) * self.drift[k]) @ seen_from, m, psi) - clean
+            noise = self.track_noise(rng, len(ids)) if walks else world.noise.pixel_std_px * rng.normal(size=flow.shape)
+            # An error that walks is that of the frame before and a new part; it starts with nothing of the drift.
+            old = [errors.get(i) if walks else None for i in ids.tolist()]
+            error = np.array([n if e is None else e + f + n for e, f, n in zip(old, flow, noise, strict=True)])
+            errors = dict(zip(ids.tolist(), error, strict=True))
+            pixels.append(clean + error.reshape(-1, 4))
+        order = np.argsort(observations.frame, kind="stable")
+        observations = Observations(
+            observations.frame[order],
+            np.concatenate([observations.at(k)[0] for k in range(len(world))]),
+            np.vstack(pixels),
+        )
+        twist = np.vstack([u[:1], u]) + self.bias + world.noise.twist_std * rng.normal(size=(len(world), 6))
+        noise = dataclasses.replace(world.noise, **WALKS) if walks else world.noise
+        self.sequence = dataclasses.replace(world, twist=twist, observations=observations, noise=noise)
+        self.T = T
+
+    @staticmethod
+    def track_noise(rng, n):
+        u, v, disparity = (WALKS["track_walk_px"] * rng.normal(size=(n, 3))).T
+        return np.column_stack([u, v, u - disparity, v])
+
+    @staticmethod
+    def path(rng, block, tau, way_m):
+        """A draw (T, 6) of a block's process."""
+        if block is None:
+            return np.zeros((len(tau), 6))
+        x = [block.stationary_std * rng.normal(size=6)]
+        for k in range(1, len(tau)):
+            phi, std = block.transition(tau[k], way_m[k])
+            x.append(phi * x[-1] + std * rng.normal(size=6))
+        return np.array(x)
+
+    def filtered(self, *blocks):
+        """Pose NEES (T-1,), and of every block its estimates (T, n) and standard deviations (T, n)."""
+        world = self.sequence
+        rig = Rig(world.camera, world.T_cam_imu, world.noise)
+        ekf, nees, found = (
+            JointEKF(rig, CLOSED, world.initial_T_world_imu, blocks=blocks),
+            [],
+            {b.name: [] for b in blocks},
+        )
+        for k, _ in enumerate(run_filter(ekf, world)):
+            if k:
+                xi = se3.log(self.T[k] @ se3.inverse(ekf.T_imu_world))
+                nees.append(xi @ np.linalg.solve(ekf.P[:6, :6], xi))
+            for name, values in found.items():
+                std = np.sqrt(np.diag(ekf.P)[ekf.model.layout[name]])
+                values.append([ekf.values[name], std])
+        return np.array(nees), {name: np.array(values).swapaxes(0, 1) for name, values in found.items()}
+
+
+QUIET = (0.02, 0.001)
+LARGE_BIAS = TwistBias(sigma_v_m_s=0.3, sigma_w_rad_s=0.02, time_v_s=30.0, time_w_s=30.0)
+YAW = np.array([0.0, np.deg2rad(0.08), 0.0])
+CASES = {
+    # The block, what is put in, and what of it is found to a quarter.
+    "rotation of the right camera": (StereoRotation(), {"psi": YAW}, [1]),
+    "jitter": (CameraJitter(), {"jitter": CameraJitter()}, []),
+    "jitter, good velocities": (CameraJitter(), {"jitter": CameraJitter(), "std": QUIET}, []),
+    "drift": (VisionDrift(), {"drift": VisionDrift(), "walks": True}, []),
+    "bias": (LARGE_BIAS, {"bias": LARGE_BIAS, "std": QUIET}, [1, 2, 3, 4, 5]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("block", "put_in", "well"), CASES.values(), ids=CASES.keys())
+def test_what_was_put_in_is_found_and_poses_are_honest_for_it(block, put_in, well):
+    """12 drives of 60 frames; estimates count once half of a drive is over."""
+    nees, without, errors, stds, truths = [], [], [], [], []
+    for seed in range(12):
+        world = Spoilt(seed, **put_in)
+        of_poses, found = world.filtered(block)
+        nees.append(of_poses.mean())
+        (estimate, std), which = (
+            found[block.name][:, 30:],
+            next(name for name in put_in if name not in ("std", "walks")),
+        )
+        true = YAW[None] if which == "psi" else getattr(world, which)[30:]
+        errors.append(estimate - true)
+        stds.append(std)
+        truths.append(np.broadcast_to(true, estimate.shape))
+        if seed < 4:
+            without.append(world.filtered()[0].mean())
+    assert 4 < np.mean(nees) < 8.5
+    assert np.mean(without) > 30
+    assert 0.6 < np.mean(np.square(np.array(errors) / stds)) < 1.5
+    size, error = (np.sqrt(np.mean(np.square(values), axis=(0, 1))) for values in (truths, errors))
+    assert (error[well] < 0.25 * size[well]).all()
+    # All are known better than before.
+    assert (np.mean(stds, axis=(0, 1)) < 0.99 * block.stationary_std).all()
