@@ -5,7 +5,7 @@ sizes start. The joint filter runs over stretches of the recording under each, a
 
 - Sizes of what landmarks or frames share are those of the largest log-likelihood, the prediction error decomposition of
   `ekfslam.studies.tuning`, whatever is rejected included. They are found one after the other, by a parabola through
-  three points of the logarithm.
+  three points, see `highest`.
 - The size of what is each observation's own is that at which the normalised innovation squared (NIS) is 1 per degree of
   freedom. Likelihood asks for less: it pays to call errors that last for many frames small ones.
 - The structure is the one of the largest ``log L - k log(n) / 2``, with k sizes found from n innovations: Schwarz,
@@ -163,17 +163,20 @@ def choose(
     config = resolve(config or Config(), sequence)
     observations = int(np.ceil(frames * len(sequence.observations) / len(sequence)))
     found: dict[int, Tried] = {}
+    error: InnovationError | None = None
     with one_thread():
         parts, gated, _ = parts_of(sequence, config, noise_of(sequence, config), observations)
         # What the simple ones leave of the runs goes to those with many sizes.
         for left, i in enumerate(sorted(range(len(candidates)), key=lambda i: len(candidates[i].sizes))):
             spent = sum(tried.runs for tried in found.values())
             share = max((runs - spent) // (len(candidates) - left), 1)
-            found[i] = _Search(sequence, config, gated, parts, candidates[i], share).tried()
+            search = _Search(sequence, config, gated, parts, candidates[i], share)
+            found[i] = search.tried()
+            error = search.error or error
     tried = tuple(found[i] for i in range(len(candidates)))
     chosen = max(tried, key=lambda tried: tried.score)
-    if not np.isfinite(chosen.log_likelihood):
-        raise InnovationError(f"{sequence.name}: the filter breaks down under every candidate")
+    if error is not None and not np.isfinite(chosen.log_likelihood):
+        raise error
     return Choice(chosen, tried, sum(len(part) for part in parts))
 
 
@@ -225,10 +228,17 @@ def with_value(overrides: Overrides, name: str, value: float) -> Overrides:
 
 
 def highest(step: float, below: float, here: float, above: float) -> float:
-    """Where the parabola through values at ``-step, 0, step`` is highest, if it is between; else the better side."""
-    curvature = above + below - 2.0 * here
-    if np.isfinite(curvature) and here >= max(above, below) and curvature < 0:
-        return 0.5 * step * (below - above) / curvature
+    """Where a likelihood is highest, from its values where the logarithm of a size is ``-step, 0, step`` off.
+
+    The log-likelihood of a standard deviation s has no third derivative at its maximum as a function of ``s^(-2/3)``.
+    So the parabola goes through three points of that. It counts up to 1.5 steps; where it has no maximum, the better
+    side does.
+    """
+    if np.isfinite(below + here + above):
+        at = np.exp(-2 / 3 * np.array([-step, 0.0, step]))
+        a, b, _ = np.polyfit(at, [below - here, 0.0, above - here], 2)
+        if a < 0:
+            return float(np.clip(-1.5 * np.log(max(-b / (2 * a), 1e-9)), -1.5 * step, 1.5 * step))
     return step if above > below else -step
 
 
@@ -257,6 +267,7 @@ class _Search:
         starting = config.with_overrides(candidate.overrides)
         self.start = np.log([value_at(starting, name) for name in candidate.sizes])
         self.runs: dict[tuple[float, ...], tuple[float, float, int]] = {}
+        self.error: InnovationError | None = None
 
     @property
     def left(self) -> int:
@@ -289,13 +300,14 @@ class _Search:
         key = tuple(x.tolist())
         if key not in self.runs:
             overrides = self._overrides(x)
-            noise, settings = (one.with_overrides(overrides) for one in (self.config, self.gated))
-            noise = noise_of(self.sequence, noise)
+            noise = noise_of(self.sequence, self.config.with_overrides(overrides))
+            settings = self.gated.with_overrides(overrides)
             try:
                 reports = [report for part in self.parts for report in filter_reports(part, noise, settings)]
                 nis, dof = sum(report.nis for report in reports), sum(report.dof for report in reports)
                 self.runs[key] = float(penalised(reports).sum()), float(nis), dof
-            except InnovationError:
+            except InnovationError as error:
+                self.error = error
                 self.runs[key] = -np.inf, np.nan, 0
         return self.runs[key]
 
