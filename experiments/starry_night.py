@@ -142,7 +142,8 @@ def camera_poses(sequence: Sequence) -> Array:
             r = (pixels - camera.project(sequence.camera, q)).ravel() / WHITE_PX
             away = se3.log(T @ se3.inverse(T_true)) / PRIOR_OF_CAMERA
             information = J.T @ J + np.eye(6) / PRIOR_OF_CAMERA**2
-            T = se3.exp(np.linalg.solve(information, J.T @ r - away / PRIOR_OF_CAMERA)) @ T
+            step: Array = np.linalg.solve(information, J.T @ r - away / PRIOR_OF_CAMERA)
+            T = se3.exp(step) @ T
         T_imu_world[k] = T
     return T_imu_world
 
@@ -177,7 +178,8 @@ def own_errors(sequence: Sequence) -> dict[str, Array]:
 def noise_of_truth(own: Array) -> TruthNoise:
     """Errors (6,) of one true pose as the evaluation knows them: each axis alike but for the first attitude."""
     position, attitude = np.sqrt(np.mean(own.reshape(2, 3) ** 2, axis=1)).tolist()
-    return TruthNoise(*own[3:].tolist(), position, position_m=position, attitude_rad=attitude)
+    roll, pitch, yaw = own[3:].tolist()
+    return TruthNoise(roll, pitch, yaw, position, position_m=position, attitude_rad=attitude)
 
 
 # --- Windows ---------------------------------------------------------------------------------------------------------
@@ -430,8 +432,8 @@ def structure_section(choices: dict[str, Choice]) -> list[str]:
         "## The structure, chosen by innovations without truth",
         *("\n".join([f"{name}:\n", *(f"- {line}" for line in choice.lines)]) for name, choice in choices.items()),
         "What the file states of a pixel is its whole error, and the candidates of *stated size* keep it. `white` "
-        "takes all of it as white; `camera jitter` as rotations of the camera that move the image as far, and white noise "
-        "beside them, of the size that the NIS asks for. The candidates of *any size* need not keep it.",
+        "takes all of it as white; `camera jitter` as rotations of the camera that move the image as far, and white "
+        "noise beside them, of the size that the NIS asks for. The candidates of *any size* need not keep it.",
     ]
 
 
@@ -449,11 +451,11 @@ def error_section(own: dict[str, Array]) -> list[str]:
                 for name, v in own.items()
             ),
         ),
-        "From the variances of the differences between truth, camera and velocities over "
-        f"{HAT_FRAMES} frames, where the camera sees at least {LEAST_LANDMARKS} landmarks. In roll and pitch the camera "
-        "agrees better with the velocities than the truth does. So what looks like a jitter of the camera is the "
-        "truth's attitude, and innovations cannot see it. It is in the stated noise because that was measured against "
-        "this truth, and the covariance must contain it if NEES is to be right against the truth as it stands.",
+        f"From the variances of the differences between truth, camera and velocities over {HAT_FRAMES} frames, where "
+        f"the camera sees at least {LEAST_LANDMARKS} landmarks. In roll and pitch the camera agrees better with the "
+        "velocities than the truth does. So what looks like a jitter of the camera is the truth's attitude, and "
+        "innovations cannot see it. It is in the stated noise because that was measured against this truth, and "
+        "the covariance must contain it if NEES is to be right against the truth as it stands.",
     ]
 
 
