@@ -142,7 +142,7 @@ def camera_poses(sequence: Sequence) -> Array:
             r = (pixels - camera.project(sequence.camera, q)).ravel() / WHITE_PX
             away = se3.log(T @ se3.inverse(T_true)) / PRIOR_OF_CAMERA
             information = J.T @ J + np.eye(6) / PRIOR_OF_CAMERA**2
-            step: Array = np.linalg.solve(information, J.T @ r - away / PRIOR_OF_CAMERA)
+            step = np.asarray(np.linalg.solve(information, J.T @ r - away / PRIOR_OF_CAMERA), dtype=float)
             T = se3.exp(step) @ T
         T_imu_world[k] = T
     return T_imu_world
