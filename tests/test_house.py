@@ -78,7 +78,7 @@ def test_every_block_and_errors_of_tracks_in_the_city(variant):
 def test_every_block_and_errors_of_tracks_on_a_loop_with_revival(variant):
     settings = {"filter": {"variant": variant, "retire": "unseen", "retire_after": 3, **PRIOR}}
     world = with_everything(builtin("loop?frames=330"))
-    ekf = drive(world, {**settings, "calibration": CALIBRATION, "blocks": {"twist_bias": {}}})
+    ekf = drive(world, {**settings, "calibration": CALIBRATION, "blocks": BLOCKS})
     assert len(ekf.retired.revived) > 0
     assert_equal_to_frozen_rows(ekf)
 

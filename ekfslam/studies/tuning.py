@@ -44,7 +44,8 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.config import Config, NoiseConfig, NoiseModel
 from ekfslam.data.hygiene import clean_tracks
-from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.data.sequence import Noise, Observations, Sequence
+from ekfslam.data.stretches import cut
 from ekfslam.errors import EmptyTracksError
 from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.filters.dead_reckoning import dead_reckon
@@ -457,21 +458,9 @@ def stretches(sequence: Sequence, config: Config, observations: int) -> list[Seq
     begins, length = np.zeros(1, dtype=np.int64), frames
     if count * _STRETCH < frames:
         begins, length = np.linspace(0, frames - _STRETCH, count).astype(np.int64), _STRETCH
-    parts = []
-    for begin in begins.tolist():
-        within = (tracks.frame >= begin) & (tracks.frame < begin + length)
-        if within.any():
-            part = dataclasses.replace(
-                sequence,
-                time_s=sequence.time_s[begin : begin + length],
-                twist=sequence.twist[begin : begin + length],
-                observations=Observations(
-                    tracks.frame[within] - begin, tracks.landmark[within], tracks.pixels_px[within]
-                ),
-                truth=Truth(np.zeros(1, dtype=np.int64), T_world_imu[begin : begin + 1]),
-            )
-            parts.append(part)
-    return parts
+    cleaned = dataclasses.replace(sequence, observations=tracks)
+    parts = (cut(cleaned, begin, begin + length, T_world_imu[begin]) for begin in begins.tolist())
+    return [part for part in parts if part is not None]
 
 
 def _with(base: Noise, names: list[str], x: Array) -> Noise:
