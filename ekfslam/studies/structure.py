@@ -185,7 +185,9 @@ def stated_candidates(sequence: Sequence) -> tuple[Candidate, ...]:
 
     What the file states of a pixel is its whole error. It says not how much of it is white and how much all landmarks
     of a frame share. The candidates keep the whole: ``white`` takes all of it as white, ``camera jitter`` takes it as
-    rotations of the camera that move the image as far, beside white noise of the size that the NIS asks for.
+    rotations of the camera that move the image as far, beside white noise of the size that the NIS asks for. Its time
+    is that of the block: a jitter slower than a stretch looks like a turned world, which costs nothing, so that
+    likelihood would make any jitter that innovations do not show as slow as that.
 
     Raises:
         ConfigError: The recording states no noise.
@@ -193,14 +195,17 @@ def stated_candidates(sequence: Sequence) -> tuple[Candidate, ...]:
     if sequence.noise is None:
         raise ConfigError(f"{sequence.name} states no noise")
     whole_px, camera = float(np.sqrt(np.mean(sequence.noise.pixel_std_px**2))), sequence.camera
-    jitter = {"rotation_deg": float(np.rad2deg(whole_px / np.sqrt(camera.fu_px * camera.fv_px)))}
-    sizes = {"translation_m": CameraJitter.translation_m, "time_s": CameraJitter.time_s}
+    jitter = {
+        "rotation_deg": float(np.rad2deg(whole_px / np.sqrt(camera.fu_px * camera.fv_px))),
+        "translation_m": CameraJitter.translation_m,
+        "time_s": CameraJitter.time_s,
+    }
     return (
         Candidate("white"),
         Candidate(
             "camera jitter",
-            {"noise": {"sigma_px": whole_px}, "blocks": {CameraJitter.name: {**jitter, **sizes}}},
-            tuple(f"blocks.{CameraJitter.name}.{size}" for size in sizes),
+            {"noise": {"sigma_px": whole_px}, "blocks": {CameraJitter.name: jitter}},
+            (f"blocks.{CameraJitter.name}.translation_m",),
             "noise.sigma_px",
         ),
     )
