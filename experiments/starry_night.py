@@ -262,6 +262,7 @@ def run_window(
 CHOSEN = ", chosen"  # behind the name of a variant: with the structure that was chosen
 STATED, ALONE = "stated size", "any size"
 OTHERS = (f"{STATED}, any time", ALONE)  # choices that are shown for the default variant only
+SHOWN = ("dead-reckoning", "invariant", *(f"{name}{CHOSEN}" for name in VARIANTS), f"invariant, {ALONE}")
 STYLES = {
     **{name: marker_of(name) for name in ("dead-reckoning", *VARIANTS)},
     **{f"{name}{CHOSEN}": {**marker_of(name), "markerfacecolor": "white"} for name in VARIANTS},
@@ -366,9 +367,10 @@ def plot_windows(windows: dict[str, list[Window]]) -> Figure:
     for ax, dof, label in ((pose_ax, 6, bounds_label), (landmark_ax, 3, None)):
         ax.axhspan(*chi2_bounds(dof, PROBABILITY), **BOUNDS, label=label)
         ax.axhline(dof, **EXPECTED)
-    for i, (name, runs) in enumerate(windows.items()):
+    for i, name in enumerate(SHOWN):
+        runs = windows[name]
         # Side by side, or filters that agree would hide one another.
-        number = np.arange(1, len(runs) + 1) + 0.14 * (i - (len(windows) - 1) / 2)
+        number = np.arange(1, len(runs) + 1) + 0.13 * (i - (len(SHOWN) - 1) / 2)
         pose_ax.plot(number, [run.pose_nees[-1] for run in runs], **STYLES[name], label=name)
         if len(runs[0].landmark_nees):
             landmark_ax.plot(number, [run.landmark_nees.mean() for run in runs], **STYLES[name])
