@@ -226,8 +226,7 @@ def tune(
         start["drift"] = 0.2 if base.track_walk_px is None else float(base.track_walk_px[0])
         free.append("drift")
 
-    moving, gated, ungated = _settings(config)
-    parts = [without_rejected(part, base, moving, (MOVING,))[0] for part in stretches(sequence, config, observations)]
+    parts, gated, ungated = parts_of(sequence, config, base, observations)
     if not free:
         with one_thread():
             here = sum(float(log_likelihoods(part, base, gated).sum()) for part in parts)
@@ -328,14 +327,21 @@ def log_likelihoods(sequence: Sequence, noise: Noise, config: Config) -> Array:
     Raises:
         InnovationError: The filter breaks down.
     """
-    reports = _reports(sequence, noise, config)
+    return penalised(filter_reports(sequence, noise, config))
+
+
+def penalised(reports: list[FrameReport]) -> Array:
+    """Log-likelihoods (T,) of frames, all that was rejected included, see the module's docstring."""
     rejected = np.array([np.isin(report.reason, _WRONG).sum() + len(report.split) for report in reports])
     accepted = np.array([report.log_likelihood + report.dof // 3 * _LOG_RIGHT for report in reports])
     return accepted + rejected * _LOG_WRONG
 
 
-def _reports(sequence: Sequence, noise: Noise, config: Config) -> list[FrameReport]:
-    """What a filter that assumes a noise did with every frame; what comes back starts afresh."""
+def filter_reports(sequence: Sequence, noise: Noise, config: Config) -> list[FrameReport]:
+    """What a filter that assumes a noise, and has the state blocks of a configuration, did with every frame.
+
+    What comes back starts afresh.
+    """
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
     start, blocks = sequence.initial_T_world_imu, optional_blocks(config.blocks)
     ekf = JointEKF(rig, config.filter, start, calibration=config.calibration, blocks=blocks)
@@ -352,7 +358,7 @@ def without_rejected(
     Raises:
         InnovationError: The filter breaks down.
     """
-    reports = _reports(sequence, noise, config)
+    reports = filter_reports(sequence, noise, config)
     tracks = sequence.observations
     # Reports are in the order of the observations: by frame and, within a frame, by id.
     keep = ~np.isin(np.concatenate([report.reason for report in reports]), reasons)
@@ -415,6 +421,20 @@ def _settings(config: Config) -> tuple[Config, Config, Config]:
     ungated = dataclasses.replace(gated, gate_probability=1.0, split_after=0)
     first, second, third = (dataclasses.replace(config, filter=settings) for settings in (moving, gated, ungated))
     return first, second, third
+
+
+def parts_of(
+    sequence: Sequence, config: Config, base: Noise, observations: int
+) -> tuple[list[Sequence], Config, Config]:
+    """Stretches of a recording, its moving tracks left out; settings that tell wrong matches, and that reject nothing.
+
+    Args:
+        sequence, config, observations: As for `stretches`.
+        base: The noise by which tracks are found to move.
+    """
+    moving, gated, ungated = _settings(config)
+    parts = [without_rejected(part, base, moving, (MOVING,))[0] for part in stretches(sequence, config, observations)]
+    return parts, gated, ungated
 
 
 def stretches(sequence: Sequence, config: Config, observations: int) -> list[Sequence]:
