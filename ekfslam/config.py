@@ -101,6 +101,10 @@ class NoiseConfig:
         sigma_px: Pixels.
         drift: How far the error of a track walks in the image from one frame to the next, px; 0 takes pixel noise as
             white, None takes what the model says.
+        track_scale: Factor on how far errors of tracks walk in the automatic model; None: it is found by their
+            innovations, see `ekfslam.studies.automatic`.
+        shared: Whether errors that all samples or all tracks share (`ekfslam.models.noise.shared_errors`) are in the
+            state of the automatic model.
         tilt_deg: Of velocities in a level frame: prior standard deviation of roll and pitch, which the joint filter
             estimates; 0 takes them as velocities of the IMU; None takes what the model says.
         model: ``auto`` finds the noise from the data (`ekfslam.models.noise`) where the sequence states none and no
@@ -114,6 +118,8 @@ class NoiseConfig:
     sigma_w_rad_s: float | None = field(default=None, metadata=_FINITE)
     sigma_px: float | None = field(default=None, metadata=_PIXELS)
     drift: float | None = field(default=None, metadata=_FINITE)
+    track_scale: float | None = field(default=None, metadata=_POSITIVE)
+    shared: bool = field(default=True, metadata=_SWITCH)
     tilt_deg: float | None = field(default=None, metadata=_FINITE)
     model: NoiseModel = field(default="auto", metadata=_one_of(NoiseModel))
 
@@ -126,7 +132,8 @@ class HygieneConfig:
 
     Args:
         min_disparity_sigma: Observations with less disparity, in sigmas of a disparity, are dropped: they have no
-            depth. (The filters reject observations without disparity.)
+            depth. (The filters reject observations without disparity.) By default 1; 3 in the automatic model, whose
+            tracks have a constant error of their disparity.
         max_row_mismatch_sigma: So are those with larger ``|vL - vR|``, in sigmas of that difference.
         restart_at_repeats: Where a frame repeats the pixels of the one before while the rig moves, every track is cut.
         restart_above_px: Of these, tracks that move by no more than this in the frames beside it are not cut: they show
@@ -142,7 +149,7 @@ class HygieneConfig:
     `Sequence` refuses it with a `DuplicateObservationError`.
     """
 
-    min_disparity_sigma: float = field(default=1.0, metadata=_FINITE)
+    min_disparity_sigma: float | None = field(default=None, metadata=_FINITE)
     max_row_mismatch_sigma: float = field(default=10.0, metadata=_FINITE)
     restart_at_repeats: bool = field(default=True, metadata=_SWITCH)
     restart_above_px: float = field(default=0.0, metadata=_FINITE)
@@ -172,7 +179,8 @@ class FilterConfig:
         gate_probability: Chi-square gate on each observation, once against the prediction and (joint filter) once
             against the prediction as corrected by the frame's other landmarks; 1 accepts everything.
         split_after: A track is split, its landmark retired and a new one started, when this many observations in a row
-            fail the gate (or put it behind the camera): the tracker has jumped to another point. 0 never splits.
+            fail the gate (or put it behind the camera): the tracker has jumped to another point. 0 never splits. By
+            default 3; 1 where errors of tracks walk, of which each observation continues that of the last frame.
         moving_sigma, moving_share: Where the errors of tracks walk (`Noise.track_error`), a track is dropped for good
             when it moves along with the rig. Over all its observations it must do so by more than this share of the
             way, and by more than this many standard deviations (without their `Noise.margin`).
@@ -190,9 +198,9 @@ class FilterConfig:
     retire_after: int | None = field(default=None, metadata=_whole(1))
     revive: int = field(default=100, metadata=_whole(-1))
     gate_probability: float = field(default=0.999, metadata=_PROBABILITY)
-    split_after: int = field(default=3, metadata=_whole(0))
+    split_after: int | None = field(default=None, metadata=_whole(0))
     moving_sigma: float = field(default=1.5, metadata=_NOT_NEGATIVE)
-    moving_share: float = field(default=0.1, metadata=_NOT_NEGATIVE)
+    moving_share: float = field(default=0.05, metadata=_NOT_NEGATIVE)
     min_depth_m: float = field(default=0.1, metadata=_FINITE)
     relative_frames: int = field(default=100, metadata=_whole(0))
     initial_position_std_m: float = field(default=0.0, metadata=_FINITE)
@@ -202,6 +210,12 @@ class FilterConfig:
     def gate(self) -> float:
         """Chi-square threshold of the gate, 3 degrees of freedom."""
         return 2.0 * float(gammaincinv(1.5, self.gate_probability))
+
+    def misses_to_split(self, tracks_walk: bool) -> int:
+        """`split_after`, or what is the default where errors of tracks walk, and where they do not; 0: never."""
+        if self.split_after is not None:
+            return self.split_after
+        return 1 if tracks_walk else 3
 
     @property
     def initial_covariance(self) -> np.ndarray:
@@ -214,14 +228,14 @@ class CalibrationConfig:
     """What of the calibration the joint filter estimates, as prior standard deviations; 0 takes it as given.
 
     Args:
-        rotation_deg: Rotation of the camera against the IMU, each axis.
+        rotation_deg: Rotation of the camera against the IMU, each axis. By default 0.3 in the automatic model, else 0.
         lever_arm_m: Position of the IMU in the camera frame, each axis.
         baseline: Length of the stereo baseline, as a share of it.
         disparity_px: Offset of all disparities.
         time_s: How much later than stamped the images are exposed.
     """
 
-    rotation_deg: float = field(default=0.0, metadata=_FINITE)
+    rotation_deg: float | None = field(default=None, metadata=_FINITE)
     lever_arm_m: float = field(default=0.0, metadata=_FINITE)
     baseline: float = field(default=0.0, metadata=_FINITE)
     disparity_px: float = field(default=0.0, metadata=_FINITE)

@@ -28,6 +28,7 @@ from ekfslam.models.build import build
 from ekfslam.progress import progress
 from ekfslam.smoother.posterior import smooth
 from ekfslam.smoother.revival import MapRevival
+from ekfslam.studies.automatic import with_track_scale
 
 
 def run(
@@ -51,6 +52,8 @@ def run(
         raise ConfigError(f"unknown mode {mode!r}; known: {', '.join(MODES)}")
     if mode == "smoothed":
         return smooth(run(sequence, "full", config, further))
+    if mode == "full":
+        config = with_track_scale(config or Config(), sequence)
     problem = build(sequence, config, clean=mode != "dead-reckoning")
     sequence, config, model = problem.sequence, problem.config, problem.model
     account, hygiene = {**problem.account, "model": "; ".join(problem.lines)}, problem.hygiene

@@ -15,16 +15,26 @@ from ekfslam.data.readers import open_sequence, write_sequence
 from ekfslam.data.sequence import Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import project
-from ekfslam.models.build import noise_of
-from ekfslam.models.noise import MOTION_STD, TRACK_WALK_PX, automatic_noise, velocity_noise, with_drift
+from ekfslam.models.build import build, noise_of
+from ekfslam.models.noise import (
+    TRACK_WALK_PX,
+    VELOCITY_STD,
+    automatic_noise,
+    shared_errors,
+    velocity_noise,
+    with_drift,
+)
 from ekfslam.models.sensors.base import MOVING
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
+from ekfslam.smoother.problem import BatchProblem
 from ekfslam.storage.archive import open_result, write_archive
+from ekfslam.studies.automatic import PERSISTENCE, with_track_scale
 
 OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0)
 STILL = dataclasses.replace(OPEN, moving_sigma=1e9)
@@ -88,7 +98,77 @@ def test_automatic_noise_is_for_recordings_that_state_none():
     # Velocities that are cleaner than what is there anyway are not filtered.
     still = automatic_noise(np.zeros((100, 6)))
     assert still.twist_walk_std is None
-    np.testing.assert_array_equal(still.velocity_std, MOTION_STD)
+    np.testing.assert_array_equal(still.velocity_std, VELOCITY_STD)
+
+
+@pytest.mark.parametrize("size", [0.1, 2.0])
+def test_sampling_noise_is_what_is_missed_between_samples(size):
+    """A fine random walk, sampled: what the trapezoids of its samples miss of its integral, and that alone."""
+    rng, fine, frames = np.random.default_rng(0), 64, 4000
+    walk = np.cumsum(rng.standard_normal((fine * frames + 1, 6)) * size / np.sqrt(fine), axis=0)
+    samples = walk[::fine]
+    means = walk[:-1].reshape(frames, fine, 6).mean(axis=1) + (walk[fine::fine] - walk[:-fine:fine]) / (2 * fine)
+    missed = (0.5 * (samples[1:] + samples[:-1]) - means).std(axis=0)
+    found = velocity_noise(samples)
+    np.testing.assert_allclose(found.sampling, missed, rtol=0.08)
+    noise = 3.0 * size * rng.standard_normal(samples.shape)
+    assert (velocity_noise(samples + noise).sampling < 2.0 * size).all()
+
+
+def test_shared_errors_follow_what_velocities_are_worth():
+    rng = np.random.default_rng(0)
+    clean = np.cumsum(0.02 * rng.standard_normal((400, 6)), axis=0) * np.repeat([1.0, 0.02], 3)
+    noisy = clean + np.repeat([0.5, 0.05], 3) * rng.standard_normal(clean.shape)
+    ours, theirs = shared_errors(clean), shared_errors(noisy)
+    assert ours.keys() == theirs.keys() == {"twist_bias", "stereo_rotation", "camera_jitter", "vision_drift"}
+    assert theirs["twist_bias"]["sigma_w_rad_s"] == pytest.approx(0.005, rel=0.2)
+    assert ours["twist_bias"]["sigma_v_m_s"] < theirs["twist_bias"]["sigma_v_m_s"]
+    assert ours["vision_drift"]["rotation_deg_m"] > theirs["vision_drift"]["rotation_deg_m"]
+
+
+def test_blocks_of_the_automatic_model_give_way_to_what_is_configured():
+    unstated = without_noise(builtin("city?frames=60"))
+    names = {"twist_bias", "stereo_rotation", "camera_jitter", "vision_drift"}
+    problem = build(unstated, Config().with_overrides({"blocks": {"camera_jitter": {"time_s": 2.0}}}))
+    assert set(problem.config.blocks) == names and problem.model.calibration is not None
+    assert problem.config.blocks["camera_jitter"] == {"time_s": 2.0}
+    for settings in ({"noise": {"shared": False}}, {"noise": {"model": "white"}}):
+        without = build(unstated, Config().with_overrides(settings))
+        assert not without.config.blocks and without.model.calibration is None
+    assert not build(builtin("city?frames=60"), Config()).config.blocks
+    # Run again with what was resolved: the same.
+    assert build(unstated, problem.config).config == problem.config
+
+
+def test_interpolated_velocities_are_trusted_less():
+    world = without_noise(builtin("city?frames=60"))
+    gap = dataclasses.replace(world, attributes={**world.attributes, "interpolated": "10-20"})
+    problem = build(gap, Config())
+    ekf = JointEKF(problem.model, problem.config.filter)
+    for _ in run_filter(ekf, problem.sequence):
+        pass
+    log = ekf.log()
+    assert np.flatnonzero(log.is_gap).tolist() == list(range(10, 21))
+    plain, wide = (problem.model.process_noise(log.imu_twist[11:12], 0.1, np.array([is_gap]))[0] for is_gap in (0, 1))
+    added = problem.model.noise.gap_std
+    np.testing.assert_allclose(np.diag(wide - plain)[0], (0.1 * added[0]) ** 2, rtol=0.05)
+    smoother = BatchProblem(log, problem.model)
+    weight = np.abs(smoother.relinearised(smoother.filtered_state(ekf.landmarks().position_m)).J_to[:, 0, 0])
+    assert weight[10:19].max() < 0.5 * np.median(weight[25:])
+
+
+def test_the_walk_of_tracks_is_found_by_innovations():
+    """Tracks that err twice as much as the model says have twice the factor; noisy velocities ask for the long run."""
+    walk = dataclasses.replace(automatic_noise(np.zeros((100, 6))).track_error, flow_px=np.inf)
+    quiet = builtin("city?frames=120&outlier_fraction=0&sigma_v_m_s=0.01&sigma_w_rad_s=0.0002")
+    found = []
+    for factor in (2.0, 4.0):
+        world = tracked(quiet, dataclasses.replace(walk, walk_std=factor * walk.walk_std), 0)
+        config = with_track_scale(Config(), without_noise(world))
+        found.append(config.noise.track_scale)
+    assert found[1] / found[0] == pytest.approx(2.0, rel=0.25)
+    assert with_track_scale(Config(), without_noise(builtin("city?frames=60"))).noise.track_scale == PERSISTENCE
+    assert with_track_scale(Config(), quiet).noise.track_scale is None  # it states its noise
 
 
 def test_misalignment_is_the_covariance_of_turned_velocities():
@@ -377,7 +457,7 @@ def moving_world(share=0.3, speed=0.3, **changes):
 
 def test_tracks_that_travel_with_the_rig_are_found_and_listed():
     world, movers = moving_world()
-    rejections = (result := run(world, "full", Config(filter=FilterConfig()))).rejections
+    rejections = (result := run(world, "full", Config(filter=FilterConfig(moving_share=0.1)))).rejections
     accused = np.unique(rejections.landmark[rejections.reason == REASONS.index("moving")])
     assert result.counts["moving"] == len(accused) > 10
     assert np.isin(accused, movers).mean() > 0.85
@@ -454,7 +534,7 @@ def test_drift_scales_how_errors_of_tracks_walk():
     stated = small_world(frames=5).noise
     assert with_drift(stated, 0.0).track_error is None
     found = with_drift(stated, 0.4)
-    np.testing.assert_allclose(found.track_walk_px, 2 * TRACK_WALK_PX)
+    np.testing.assert_allclose(found.track_walk_px, 5 * TRACK_WALK_PX)
     assert found.track_first_px is not None
     np.testing.assert_array_equal(found.pixel_std_px, stated.pixel_std_px)
     # What else is known of tracks stays.

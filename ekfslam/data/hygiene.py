@@ -137,8 +137,9 @@ def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tup
         cut(JUMP, jumps(kept, noise, config.jump_sigma))
     if config.reused_id_sigma:
         cut(REUSED_ID, reused_ids(sequence, kept, noise, config.reused_id_sigma))
-    if config.min_disparity_sigma:
-        drop(DISPARITY, _disparity(kept) <= config.min_disparity_sigma * disparity_std)
+    least = config.min_disparity_sigma
+    if least is None or least > 0:
+        drop(DISPARITY, _disparity(kept) <= (1.0 if least is None else least) * disparity_std)
     if config.max_row_mismatch_sigma:
         mismatch = np.abs(kept.pixels_px[:, 1] - kept.pixels_px[:, 3])
         drop(ROW_MISMATCH, mismatch > config.max_row_mismatch_sigma * row_std)

@@ -53,6 +53,11 @@ def interpolation_attributes(twist: Array) -> dict[str, str]:
     return {_ATTRIBUTE: found} if found else {}
 
 
+def without_interpolation(attributes: Mapping[str, str | int | float]) -> dict[str, str | int | float]:
+    """Attributes for a part of a recording, whose intervals have other numbers."""
+    return {name: value for name, value in attributes.items() if name != _ATTRIBUTE}
+
+
 def known_intervals(attributes: Mapping[str, str | int | float], twist: Array) -> BoolArray:
     """Interpolated intervals (T,) of a recording: as its attributes have them, or else as its velocities show."""
     text = str(attributes.get(_ATTRIBUTE, ""))

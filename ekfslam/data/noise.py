@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 
 # How much of the squared motion of a track's other rows counts for a row, see `TrackError.step_variance`.
 ACROSS = 0.35
@@ -21,12 +21,18 @@ class ProcessNoise:
         motion_std: (6,) error of the motion beyond it, which no averaging of velocities removes.
         misalignment_rad: Standard deviation of the angles between the frame of the velocities and the IMU frame.
         walk_std: (6,) change of the true velocities from one sample to the next. None: nothing is assumed of it.
+        gap_std: (6,) further error of samples that were interpolated across a gap.
     """
 
     twist_std: Array
     motion_std: Array
     misalignment_rad: float
     walk_std: Array | None
+    gap_std: Array
+
+    def pose_std_during(self, is_gap: BoolArray | bool) -> Array:
+        """(..., 6) error of the velocities that move the pose, by whether (...) they were interpolated."""
+        return np.hypot(self.pose_std, np.where(np.asarray(is_gap)[..., None], self.gap_std, 0.0))
 
     @property
     def velocity_std(self) -> Array:
@@ -98,6 +104,7 @@ class Noise:
         track_walk_px: (3,) how far that error walks from frame to frame (u, v, disparity).
         track_memory: Share of that error that stays from frame to frame.
         track_flow_px: Motion in the image at which the variance of the walk has doubled.
+        gap_std: (6,) further error of velocities that were interpolated across a gap.
         margin: How much larger the errors of tracks are taken than those of single measurements, to make up for errors
             that agree among tracks; what judges one track by itself need not allow for that.
     """
@@ -112,12 +119,13 @@ class Noise:
     track_walk_px: Array | None = None
     track_memory: float = 1.0
     track_flow_px: float = np.inf
+    gap_std: Array = field(default_factory=lambda: np.zeros(6))
     margin: float = 1.0
 
     @property
     def process(self) -> ProcessNoise:
         """The part that belongs to the velocities."""
-        return ProcessNoise(self.twist_std, self.motion_std, self.misalignment_rad, self.twist_walk_std)
+        return ProcessNoise(self.twist_std, self.motion_std, self.misalignment_rad, self.twist_walk_std, self.gap_std)
 
     @property
     def track_error(self) -> TrackError | None:

@@ -309,7 +309,7 @@ def _validate_truth(truth: Truth, frames: int) -> None:
 
 
 def _validate_noise(noise: Noise) -> None:
-    sizes = {"twist_std": 6, "pixel_std_px": 4, "motion_std": 6}
+    sizes = {"twist_std": 6, "pixel_std_px": 4, "motion_std": 6, "gap_std": 6}
     optional = {"twist_walk_std": 6, "track_first_px": 3, "track_walk_px": 3}
     for name, size in (sizes | optional).items():
         if name in optional and getattr(noise, name) is None:

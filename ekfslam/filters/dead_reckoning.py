@@ -24,7 +24,9 @@ def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> 
     tau = np.diff(sequence.time_s)
     T_imu_world = motion.integrate(se3.inverse(sequence.initial_T_world_imu), sequence.twist, tau)
     F = motion.error_jacobian(motion.increment(sequence.twist[1:], tau))
-    Q = motion.process_noise(sequence.twist[1:], tau, noise.velocity_std, noise.misalignment_rad)
+    gap_std = np.where(sequence.interpolated[1:, None], noise.gap_std, 0.0)
+    velocity_std = np.hypot(noise.velocity_std, gap_std)
+    Q = motion.process_noise(sequence.twist[1:], tau, velocity_std, noise.misalignment_rad)
     covariance = np.empty((len(sequence), 6, 6))
     covariance[0] = initial_covariance
     for k in range(1, len(sequence)):

@@ -86,13 +86,14 @@ class JointEKF(Estimate):
         self.imu_twist, _ = self.model.imu_velocities(values, twist, self.T_imu_world[:3, :3])
         self._log.amend(imu_twist=self.imu_twist, seen_twist=self.imu_twist)
 
-    def predict(self, twist: Array, tau_s: float, also: VelocityRows | None = None) -> None:
+    def predict(self, twist: Array, tau_s: float, also: VelocityRows | None = None, is_gap: bool = False) -> None:
         """Eq. (1) and (2) over one interval.
 
         Args:
             twist: (6,) measured velocities, m/s and rad/s.
             tau_s: Duration.
             also: What further sensors measured of these velocities, where they are in the state.
+            is_gap: Whether the velocities were interpolated across a gap, so that they are worth less.
         """
         model, pose = self.model, self.model.layout["pose"]
         self.way_m = model.way_m(np.asarray(twist, dtype=float), tau_s)
@@ -107,7 +108,7 @@ class JointEKF(Estimate):
             self._measure_velocities(twist, also)
         elif also is not None:
             raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
-        step = model.step(self.values, twist, tau_s, self.linear_T_imu_world, self.variant.first_estimates)
+        step = model.step(self.values, twist, tau_s, self.linear_T_imu_world, self.variant.first_estimates, is_gap)
         self.gaussian.propagate(step.Phi, step.Q)
         departed = self.coordinates
         self.coordinates = departed.copy()
@@ -120,7 +121,7 @@ class JointEKF(Estimate):
         self.updated_pose = "previous_pose" if self.updated_pose == "pose" and model.has_clone else None
         self.imu_twist_before, self.imu_twist, self.tau_s = self.imu_twist, step.twist, tau_s
         self.step += 1
-        self._log.predicted(self, twist, departed)
+        self._log.predicted(self, twist, departed, is_gap)
 
     def _wander(self, block: StateBlock, tau_s: float) -> None:
         """A block that changes by itself; velocities that nothing has measured yet are not there to change."""
@@ -216,7 +217,8 @@ class JointEKF(Estimate):
         """
         moves = np.zeros(len(self.ids), dtype=bool)
         moves[moving] = True
-        jumped = (self.table.misses >= self.config.split_after) & (self.config.split_after > 0) & ~moves
+        split_after = self.config.misses_to_split(self.model.track_error is not None)
+        jumped = (self.table.misses >= split_after) & (split_after > 0) & ~moves
         ids = self.ids[jumped]
         self._moving_ids.update(self.ids[moves].tolist())
         self._retire(jumped | moves)

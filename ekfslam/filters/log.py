@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.geometry import se3
 
 
@@ -49,6 +49,7 @@ class Log:
         rows: (K, d) what was measured: the sensor's rows.
         variance: (K, d) variances of the rows, or of their differences.
         position_m: (K, 3) where the landmark was linearised, in world.
+        is_gap: (T,) whether the velocities that led to a frame were interpolated across a gap.
         velocity_frame: (N,) frame of each scalar measurement of velocities, where these are estimated.
         velocity_axis, velocity_value, velocity_std, velocity_is_biased: (N,) see `ekfslam.models.model.VelocityRows`.
     """
@@ -81,6 +82,7 @@ class Log:
     velocity_value: Array
     velocity_std: Array
     velocity_is_biased: Array
+    is_gap: BoolArray
 
     @staticmethod
     def of_poses_alone(**known: Any) -> Log:
@@ -109,6 +111,7 @@ class Log:
             velocity_value=none,
             velocity_std=none,
             velocity_is_biased=np.empty(0, dtype=bool),
+            is_gap=np.zeros(frames, dtype=bool),
         )
 
     @property

@@ -26,6 +26,7 @@ _PER_FRAME = (
     "linear",
     "updated",
     "up",
+    "is_gap",
 )
 
 
@@ -59,7 +60,7 @@ class LogBook:
         self._landmarks = self._observations = 0
         self.predicted(start, np.zeros(6), start.coordinates)
 
-    def predicted(self, now: Estimate, twist: Array, departed: Array) -> None:
+    def predicted(self, now: Estimate, twist: Array, departed: Array, is_gap: bool = False) -> None:
         """A new frame, reached by a prediction with measured velocities (6,) from coordinates (body,)."""
         T, coordinates = now.T_imu_world, now.coordinates.copy()
         values = {
@@ -76,6 +77,7 @@ class LogBook:
             "linear": coordinates,
             "updated": coordinates,
             "up": now.up_world,
+            "is_gap": is_gap,
         }
         for name, value in values.items():
             self._frames[name].append(value)

@@ -59,7 +59,7 @@ def run_filter(
             if begun:
                 before, now = float(sequence.time_s[k - 1]), float(sequence.time_s[k])
                 also = None if further is None else further.during(before, now)
-                estimator.predict(sequence.twist[k], now - before, also)
+                estimator.predict(sequence.twist[k], now - before, also, bool(sequence.interpolated[k]))
             else:
                 estimator.begin(sequence.twist[k])
         begun = True

@@ -64,7 +64,8 @@ class IndependentLandmarks:
 
         table.accepted(slot[known[inside]], frame)
         table.misses[slot[is_known & missed(reason)]] += 1
-        split = self._retire((table.misses >= self.config.split_after) & (self.config.split_after > 0))
+        split_after = self.config.misses_to_split(tracks_walk=False)
+        split = self._retire((table.misses >= split_after) & (split_after > 0))
         new = ~is_known & (reason == ACCEPTED)
         if len(split):
             new |= np.isin(ids, split)

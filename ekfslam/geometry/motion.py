@@ -42,9 +42,9 @@ def twist_jacobian(twist: Array, tau_s: Array | float) -> Array:
 def process_noise(twist: Array, tau_s: Array | float, twist_std: Array, misalignment_rad: float = 0.0) -> Array:
     """``Q = G W G^T`` with G of `twist_jacobian`, eq. (2): (..., 6) to (..., 6, 6).
 
-    ``twist_std`` (6,) holds the standard deviations per sample, m/s and rad/s; ``W`` is the diagonal of their squares,
-    and where the frame of the velocities is turned by small angles of deviation ``misalignment_rad`` against the IMU,
-    ``B B^T misalignment_rad^2`` besides, with ``B = [v^; w^]``.
+    ``twist_std`` (..., 6) holds the standard deviations per sample, m/s and rad/s; ``W`` is the diagonal of their
+    squares, and where the frame of the velocities is turned by small angles of deviation ``misalignment_rad`` against
+    the IMU, ``B B^T misalignment_rad^2`` besides, with ``B = [v^; w^]``.
     """
     twist = np.asarray(twist, dtype=float)
     return process_noise_by(twist_jacobian(twist, tau_s), twist, twist_std, misalignment_rad)
@@ -52,7 +52,7 @@ def process_noise(twist: Array, tau_s: Array | float, twist_std: Array, misalign
 
 def process_noise_by(G: Array, twist: Array, twist_std: Array, misalignment_rad: float = 0.0) -> Array:
     """`process_noise` where G is known."""
-    Q = (G * np.asarray(twist_std) ** 2) @ np.swapaxes(G, -1, -2)
+    Q = (G * np.asarray(twist_std)[..., None, :] ** 2) @ np.swapaxes(G, -1, -2)
     if misalignment_rad:
         turned = misalignment_rad * G @ turned_by(twist)
         Q = Q + turned @ np.swapaxes(turned, -1, -2)

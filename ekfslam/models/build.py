@@ -34,7 +34,15 @@ from ekfslam.models.blocks import (
 )
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.model import Model
-from ekfslam.models.noise import VelocityNoise, automatic_noise, velocity_noise, with_drift
+from ekfslam.models.noise import (
+    CAMERA_ROTATION_DEG,
+    MIN_DISPARITY_SIGMA,
+    VelocityNoise,
+    automatic_noise,
+    shared_errors,
+    velocity_noise,
+    with_drift,
+)
 from ekfslam.models.sensors.base import DelayedSensor, Sensor
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
@@ -92,7 +100,7 @@ def build(
     Raises:
         ConfigError: An unknown block, or a setting that it does not have.
     """
-    config = resolve(config or Config(), sequence)
+    config = with_automatic_blocks(resolve(config or Config(), sequence), sequence)
     noise, account = noise_of(sequence, config), noise_account(sequence, config)
     hygiene = None
     if clean:
@@ -214,9 +222,31 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
         twist[3:] = given.sigma_w_rad_s
     if given.sigma_px is not None:
         pixels[:] = given.sigma_px
+    if given.track_scale is not None and stated.track_walk_px is not None:
+        stated = dataclasses.replace(stated, track_walk_px=given.track_scale * stated.track_walk_px)
     tilt = stated.tilt_rad if given.tilt_deg is None else float(np.deg2rad(given.tilt_deg))
     noise = dataclasses.replace(stated, twist_std=twist, pixel_std_px=pixels, tilt_rad=tilt)
     return noise if given.drift is None else with_drift(noise, given.drift)
+
+
+def with_automatic_blocks(config: Config, sequence: Sequence) -> Config:
+    """A configuration with the blocks and the calibration of the automatic model, where that is what is asked for.
+
+    What the configuration says of a block goes before.
+    """
+    walks = noise_of(sequence, config).track_error is not None
+    if not (is_automatic(sequence, config) and walks):
+        return config
+    if config.hygiene.min_disparity_sigma is None:
+        hygiene = dataclasses.replace(config.hygiene, min_disparity_sigma=MIN_DISPARITY_SIGMA)
+        config = dataclasses.replace(config, hygiene=hygiene)
+    if not config.noise.shared:
+        return config
+    shared = {name: {**table, **config.blocks.get(name, {})} for name, table in shared_errors(sequence.twist).items()}
+    calibration = config.calibration
+    if calibration.rotation_deg is None:
+        calibration = dataclasses.replace(calibration, rotation_deg=CAMERA_ROTATION_DEG)
+    return dataclasses.replace(config, blocks={**config.blocks, **shared}, calibration=calibration)
 
 
 def is_automatic(sequence: Sequence, config: Config) -> bool:

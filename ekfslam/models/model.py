@@ -287,12 +287,20 @@ class Model:
             twist, by = block.turn_velocities(twist, by, values, R_linear, self.layout)
         return twist, by
 
-    def process_noise(self, twist: Array, tau_s: Array | float) -> Array:
-        """Q (..., 6, 6) of eq. (2) for the velocities (..., 6) that move the pose."""
+    def process_noise(self, twist: Array, tau_s: Array | float, is_gap: BoolArray) -> Array:
+        """Q (n, 6, 6) of eq. (2) for the velocities (n, 6) that move the pose, some of which were interpolated."""
         process = self.noise.process
-        return motion.process_noise(twist, tau_s, process.pose_std, process.misalignment_rad)
+        return motion.process_noise(twist, tau_s, process.pose_std_during(is_gap), process.misalignment_rad)
 
-    def step(self, values: Values, measured: Array, tau_s: float, T_linear: Array, first_estimates: bool) -> Step:
+    def step(
+        self,
+        values: Values,
+        measured: Array,
+        tau_s: float,
+        T_linear: Array,
+        first_estimates: bool,
+        is_gap: bool = False,
+    ) -> Step:
         """Eq. (1) and (2): the pose moves, its clone takes the place where it was.
 
         Args:
@@ -301,6 +309,7 @@ class Model:
             tau_s: Duration.
             T_linear: (4, 4) pose at which the pose's error before the step is linearised.
             first_estimates: Whether F leads from there (FEJ) and not from the estimate.
+            is_gap: Whether the velocities were interpolated.
         """
         at, R_linear = self.layout["pose"], T_linear[:3, :3]
         process, twist, by = self.noise.process, measured, None
@@ -315,7 +324,8 @@ class Model:
         Phi[at, at] = motion.error_jacobian(T_next @ se3.inverse(T_linear) if first_estimates else E)
         if by is not None:
             Phi[at] -= G @ by
-        Q[at, at] = motion.process_noise_by(G, twist, process.pose_std, process.misalignment_rad)
+        pose_std = process.pose_std_during(is_gap) if is_gap else process.pose_std
+        Q[at, at] = motion.process_noise_by(G, twist, pose_std, process.misalignment_rad)
         return Step(T_next, twist, Phi, Q)
 
     # --- observations of landmarks ------------------------------------------------------------------------------------

@@ -5,8 +5,14 @@ have autocovariance 2 s^2 at lag 0 and -s^2 at lag 1; those of a signal that wal
 So ``s^2 = -cov(d_k, d_k+1)`` sees the noise alone. (Second and third differences see the vehicle itself shake: on clean
 KITTI velocities they find ten times the noise there is.)
 
-What no difference can see, slow errors of scale and alignment and what a track does that no white noise describes, is
-given by the constants below.
+A sample of velocities that are clean is not the mean over its interval either. Where the velocity walks between
+samples, second differences d of it have variance ``q tau / 2``, q tau being that of a step, and the integral by samples
+misses that of the path between them (a Brownian bridge) by ``q tau / 12`` a sample: half of what d, scaled to the
+variance of white noise by ``d / sqrt(1.5)``, would say. This *sampling noise* is found axis by axis; of roll and pitch
+rates of a car it is 0.1 to 0.3 deg/s, more than any sensor noise of the unit.
+
+What no difference can see are slow errors that all samples or all tracks of a recording share. They are state blocks
+(`SHARED_ERRORS`), whose sizes are priors of classes of sensors, stated below with their sources.
 """
 
 from __future__ import annotations
@@ -20,21 +26,31 @@ from ekfslam.arrays import Array
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import VelocityFrame
 
-# Errors of automotive velocities that are there even if no noise is: of each sample, and of the angles between their
-# frame and that of the IMU.
-MOTION_STD = np.repeat([0.15, 0.0008], 3)
-MISALIGNMENT_RAD = np.deg2rad(0.07)
+# Velocities of an automotive GNSS/INS unit: the data sheets of OXTS's RT3000 family state 0.05 to 0.1 km/h (0.014 to
+# 0.028 m/s) and 0.01 deg/s. White errors of a sample are at least of that order, too.
+VELOCITY_STD = np.repeat([0.02, np.deg2rad(0.02)], 3)
+VELOCITY_BIAS_M_S, RATE_BIAS_RAD_S = 0.02, np.deg2rad(0.01)
+# A noisy sensor's bias is taken as a tenth of its noise: consumer units state no better.
+BIAS_SHARE = 0.1
+# What an interpolated sample is worth: a car changes its speed by 1 m/s and turns by 2 deg/s in a second or so.
+GAP_STD = np.array([1.0, 0.1, 0.1, *np.deg2rad([2.0, 2.0, 2.0])])
 
-# Roll and pitch of a road vehicle.
+# Roll and pitch of a road vehicle, and how well the rotation of a camera against a unit elsewhere in a car is known.
 TILT_RAD = np.deg2rad(3.0)
+CAMERA_ROTATION_DEG = 0.3
 
 # Of tracks of a KLT tracker (u, v, disparity): their error at landmark initialisation and how it walks from frame to
-# frame, see `ekfslam.data.noise.TrackError`. White pixel noise only sets the limits of hygiene.
+# frame, see `ekfslam.data.noise.TrackError`. Their proportions are the tracker's; `track_scale` multiplies the walk.
+# White pixel noise only sets the limits of hygiene.
 PIXEL_STD_PX = 0.7
-TRACK_FIRST_PX = np.array([0.5, 0.5, 1.0])
-TRACK_WALK_PX = np.array([0.2, 0.2, 0.15])
-TRACK_FLOW_PX = 1.0
-MARGIN = 3.0
+TRACK_FIRST_PX = np.array([0.1, 0.1, 1.0])
+TRACK_WALK_PX = np.array([0.08, 0.08, 0.06])
+TRACK_FLOW_PX = 3.0
+# Disparity below which the constant error of a track leaves no depth, in standard deviations of a measured disparity.
+MIN_DISPARITY_SIGMA = 3.0
+
+# White noise from which velocities count as noisy, and are smoothed as a random walk.
+NOISY_FROM = np.repeat([0.15, 0.0025], 3)
 
 _BLOCKS = 20  # of the jackknife
 _ONE_SIDED_95 = 1.645  # deviations
@@ -51,12 +67,19 @@ class VelocityNoise:
         limit: (2,) what they are below with a confidence of 95 %, also where none is seen:
             ``s^2 + 1.645 e``, with e the standard error of ``s^2``.
         walk: (2,) how far the true velocities change per sample, root mean square.
+        sampling: (6,) noise of taking a sample for the mean over its interval, each axis.
     """
 
     sigma: Array
     sigma_error: Array
     limit: Array
     walk: Array
+    sampling: Array
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether the differences show no more white noise than a good unit has anyway."""
+        return bool((np.repeat(self.sigma, 3) <= NOISY_FROM).all())
 
     @property
     def texts(self) -> tuple[str, str]:
@@ -72,7 +95,7 @@ def velocity_noise(twist: Array) -> VelocityNoise:
     """White noise and walk of velocities (T, 6), m/s and rad/s."""
     d = np.diff(np.asarray(twist, dtype=float), axis=0)
     if len(d) < 2:
-        return VelocityNoise(np.zeros(2), np.full(2, np.inf), np.full(2, np.inf), np.zeros(2))
+        return VelocityNoise(np.zeros(2), np.full(2, np.inf), np.full(2, np.inf), np.zeros(2), np.zeros(6))
     product, square = d[1:] * d[:-1], d**2
     sigma = _white(product.mean(axis=0))
     parts = np.array_split(product, min(_BLOCKS, len(product)))
@@ -92,7 +115,9 @@ def velocity_noise(twist: Array) -> VelocityNoise:
         steps = _SPAN - (_SPAN**2 - 1) / (3 * _SPAN)
         slow = np.maximum((np.diff(means, axis=0) ** 2).mean(axis=0) + 2.0 / _SPAN * lag_1, 0.0) / steps
     walk = np.maximum(*(np.sqrt(variance.reshape(2, 3).mean(axis=1)) for variance in (fast, slow)))
-    return VelocityNoise(sigma, error, limit, walk)
+    # Of second differences white noise has 3/2 of its variance; what is more is the motion between samples.
+    bent = np.maximum(((d[1:] - d[:-1]) ** 2).mean(axis=0) / 6.0 - np.repeat(sigma, 3) ** 2, 0.0)
+    return VelocityNoise(sigma, error, limit, walk, 0.5 * np.sqrt(bent))
 
 
 def _jackknife(left_out: Array) -> Array:
@@ -108,21 +133,44 @@ def _white(lag_1: Array) -> Array:
 def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu") -> Noise:
     """The noise that a filter shall assume for a recording that states none, from its velocities (T, 6)."""
     found = velocity_noise(twist)
-    sigma = np.repeat(found.sigma, 3)
     # Where the white part is below what is there anyway, smoothing the velocities brings nothing.
-    is_clean = bool((sigma <= MOTION_STD).all())
+    walk = None if found.is_clean else np.repeat(found.walk, 3)
+    own = np.hypot(found.sampling, VELOCITY_STD)
     return Noise(
-        twist_std=sigma,
+        twist_std=own if found.is_clean else np.repeat(found.sigma, 3),
         pixel_std_px=np.full(4, PIXEL_STD_PX),
-        twist_walk_std=None if is_clean else np.repeat(found.walk, 3),
-        motion_std=MOTION_STD,
-        misalignment_rad=MISALIGNMENT_RAD,
+        twist_walk_std=walk,
+        motion_std=np.zeros(6) if found.is_clean else own,
         track_first_px=TRACK_FIRST_PX,
         track_walk_px=TRACK_WALK_PX,
         track_flow_px=TRACK_FLOW_PX,
-        margin=MARGIN,
         tilt_rad=TILT_RAD if velocity_frame == "level" else 0.0,
+        gap_std=GAP_STD,
     )
+
+
+def shared_errors(twist: Array) -> dict[str, dict[str, float]]:
+    """Tables ``[blocks.<name>]`` of the errors that all samples or all tracks of a recording share.
+
+    - ``twist_bias``: of the unit's class where velocities are clean, a tenth of their noise where it is seen.
+    - ``stereo_rotation``, ``camera_jitter``: the defaults of these blocks.
+    - ``vision_drift``: a tracker's own drift is about 1 % of the way and a few mdeg/m. Where velocities are clean a
+      larger, effective value leaves the low frequencies to them, as the long-term accuracy of such a unit deserves.
+    """
+    found = velocity_noise(twist)
+    if found.is_clean:
+        bias = {"sigma_v_m_s": VELOCITY_BIAS_M_S, "sigma_w_rad_s": float(RATE_BIAS_RAD_S), "time_v_s": 4.0}
+        drift = {"translation_percent": 4.0, "rotation_deg_m": 0.06}
+    else:
+        sigma_v, sigma_w = (BIAS_SHARE * found.sigma).tolist()
+        bias = {"sigma_v_m_s": max(sigma_v, VELOCITY_BIAS_M_S), "sigma_w_rad_s": max(sigma_w, float(RATE_BIAS_RAD_S))}
+        drift = {"translation_percent": 1.0, "rotation_deg_m": 0.004}
+    return {
+        "twist_bias": {**bias, "time_w_s": 20.0 if found.is_clean else 200.0},
+        "stereo_rotation": {},
+        "camera_jitter": {},
+        "vision_drift": drift,
+    }
 
 
 def with_drift(noise: Noise, drift_px: float) -> Noise:

@@ -7,6 +7,7 @@ Its blocks, sensor and noise are those of the filter's `ekfslam.models.model.Mod
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from ekfslam.smoother.rows import State
 from ekfslam.smoother.sparse.information import JointInformation, LinearSystem
 
 __all__ = ["BatchProblem", "State"]
+
+# How far a landmark may lie from where it was initialised: so weak that no landmark with a depth feels it.
+LANDMARK_PRIOR_M = 1e4
 
 
 class BatchProblem(FrozenRows):
@@ -56,9 +60,9 @@ class BatchProblem(FrozenRows):
         return np.hstack([of_poses, self._shared_residual(state.shared)])
 
     def block_cost(self, state: State) -> float:
-        """Half the sum of squares of all rows over aux and drive alone, and of the first pose's prior."""
-        rows = self._common(state.aux, state.drive)
-        names = ("r_aux_prior", "r_aux", "r_at", "r_drive")
+        """Half the sum of squares of all rows over aux, drive or landmarks alone, and of the first pose's prior."""
+        rows = {**self._common(state.aux, state.drive), **self._landmark_rows(state)}
+        names = ("r_aux_prior", "r_aux", "r_at", "r_drive", "r_landmark")
         return 0.5 * float((state.zeta**2).sum() + sum((rows[name] ** 2).sum() for name in names))
 
     def _moments(self, state: State) -> Moment:
@@ -111,7 +115,13 @@ class BatchProblem(FrozenRows):
             **self._motion_rows(Phi, by_last, by_next, B),
             **self._observation_rows(*self._observations(state), scale, B),
             **self._common(state.aux, state.drive),
+            **self._landmark_rows(state),
         )
+
+    def _landmark_rows(self, state: State) -> dict[str, Any]:
+        """Rows that say that landmarks are not infinitely far: a track that fits best there has no depth in metres."""
+        weight = 1.0 / LANDMARK_PRIOR_M
+        return {"landmark_weight": weight, "r_landmark": weight * (self.log.first_position_m - state.positions_m)}
 
     def _observations(self, state: State) -> tuple[Array, Array | None, Array, Array, Array]:
         """Rows over pose, pose before, drive and landmark at a state, and their right sides, before weighting."""

@@ -99,7 +99,7 @@ class BatchRows:
     def _weight_motion(self) -> Array:
         """``Q^-1/2`` (T-1, 6, 6) of eq. (2)."""
         log = self.log
-        Q = self.model.process_noise(log.imu_twist[1:], log.tau_s[1:])
+        Q = self.model.process_noise(log.imu_twist[1:], log.tau_s[1:], log.is_gap[1:])
         smallest = np.linalg.eigvalsh(Q)[:, 0] if len(Q) else np.empty(0)
         if not (smallest > 0).all():
             raise IllPosedError(

@@ -126,6 +126,9 @@ _LOG_LAYOUT_4: hdf5.Layout = (
 )
 
 
+# The same, of logs since there are interpolated intervals; without it none is.
+_LOG_GAPS: hdf5.Layout = (("is_gap", "is_gap", ("T",), "truth value", "none"),)
+
 # The same below /runs/<mode>/whitened, fields of `WhitenedInnovations` (N observations of d rows).
 _WHITENED_LAYOUT: hdf5.Layout = (
     ("frame", "frame", ("N",), "frame index", "none"),
@@ -337,7 +340,7 @@ def _write_result(group: h5py.Group, result: Result) -> None:
     if result.log is not None:
         log = group.create_group("log")
         hdf5.write_attributes(log, {"first_estimates": result.log.first_estimates})
-        hdf5.write_fields(log, (*_LOG_LAYOUT, *_LOG_LAYOUT_4), result.log)
+        hdf5.write_fields(log, (*_LOG_LAYOUT, *_LOG_LAYOUT_4, *_LOG_GAPS), result.log)
 
 
 def _sequence_fields(h5file: h5py.File) -> dict[str, Any]:
@@ -384,6 +387,9 @@ def _read_result(h5file: h5py.File, mode: str, camera: StereoCamera, T_cam_imu: 
 def _read_log(group: h5py.Group, sizes: Mapping[str, int], version: int) -> Log:
     is_old = version < 4
     found = hdf5.read_fields(group, _LOG_LAYOUT if is_old else (*_LOG_LAYOUT, *_LOG_LAYOUT_4), sizes)
+    if not is_old:
+        gaps = hdf5.read_fields(group, _LOG_GAPS, {"T": sizes["T"]}) if "is_gap" in group else {}
+        found["is_gap"] = gaps.get("is_gap", np.zeros(sizes["T"])).astype(bool)
     found["first_estimates"] = bool(hdf5.attribute(group, "first_estimates"))
     return Log.of_poses_alone(**found) if is_old else Log(**found)
 

@@ -44,7 +44,8 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.config import Config, NoiseConfig, NoiseModel
 from ekfslam.data.hygiene import clean_tracks
-from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.data.sequence import Noise, Observations, Sequence
+from ekfslam.data.stretches import cut
 from ekfslam.errors import EmptyTracksError
 from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.filters.dead_reckoning import dead_reckon
@@ -52,8 +53,8 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.filters.reports import FrameReport
 from ekfslam.geometry import se3
-from ekfslam.models.build import found_attributes, noise_of, resolve
-from ekfslam.models.noise import VelocityNoise, velocity_noise, with_drift, with_error
+from ekfslam.models.build import found_attributes, noise_of, optional_blocks, resolve, with_automatic_blocks
+from ekfslam.models.noise import NOISY_FROM, VelocityNoise, velocity_noise, with_drift, with_error
 from ekfslam.models.sensors.base import BEHIND_CAMERA, GATE, MOVING
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
@@ -207,11 +208,11 @@ def tune(
     """
     if len(sequence.observations) == 0:
         raise EmptyTracksError("noise is tuned by observations, and there are none", source=sequence.source)
-    config = resolve(config or Config(), sequence)
+    config = with_automatic_blocks(resolve(config or Config(), sequence), sequence)
     model: NoiseModel = "white" if config.noise.model == "white" else "tuned"
     base = noise_of(sequence, dataclasses.replace(config, noise=NoiseConfig(model=model, drift=config.noise.drift)))
     found = velocity_noise(sequence.twist)
-    floor = base.motion_std[[0, 3]]
+    floor = base.motion_std[[0, 3]] if base.track_error is None else NOISY_FROM[[0, 3]]
 
     start = {
         "sigma_v_m_s": found.sigma[0] or base.twist_std[0],
@@ -225,8 +226,7 @@ def tune(
         start["drift"] = 0.2 if base.track_walk_px is None else float(base.track_walk_px[0])
         free.append("drift")
 
-    moving, gated, ungated = _settings(config)
-    parts = [without_rejected(part, base, moving, (MOVING,))[0] for part in stretches(sequence, config, observations)]
+    parts, gated, ungated = parts_of(sequence, config, base, observations)
     if not free:
         with one_thread():
             here = sum(float(log_likelihoods(part, base, gated).sum()) for part in parts)
@@ -327,16 +327,24 @@ def log_likelihoods(sequence: Sequence, noise: Noise, config: Config) -> Array:
     Raises:
         InnovationError: The filter breaks down.
     """
-    reports = _reports(sequence, noise, config)
+    return penalised(filter_reports(sequence, noise, config))
+
+
+def penalised(reports: list[FrameReport]) -> Array:
+    """Log-likelihoods (T,) of frames, all that was rejected included, see the module's docstring."""
     rejected = np.array([np.isin(report.reason, _WRONG).sum() + len(report.split) for report in reports])
     accepted = np.array([report.log_likelihood + report.dof // 3 * _LOG_RIGHT for report in reports])
     return accepted + rejected * _LOG_WRONG
 
 
-def _reports(sequence: Sequence, noise: Noise, config: Config) -> list[FrameReport]:
-    """What a filter that assumes a noise did with every frame; what comes back starts afresh."""
+def filter_reports(sequence: Sequence, noise: Noise, config: Config) -> list[FrameReport]:
+    """What a filter that assumes a noise, and has the state blocks of a configuration, did with every frame.
+
+    What comes back starts afresh.
+    """
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
-    ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu)
+    start, blocks = sequence.initial_T_world_imu, optional_blocks(config.blocks)
+    ekf = JointEKF(rig, config.filter, start, calibration=config.calibration, blocks=blocks)
     return [frame.report for frame in run_filter(ekf, sequence)]
 
 
@@ -350,7 +358,7 @@ def without_rejected(
     Raises:
         InnovationError: The filter breaks down.
     """
-    reports = _reports(sequence, noise, config)
+    reports = filter_reports(sequence, noise, config)
     tracks = sequence.observations
     # Reports are in the order of the observations: by frame and, within a frame, by id.
     keep = ~np.isin(np.concatenate([report.reason for report in reports]), reasons)
@@ -415,6 +423,20 @@ def _settings(config: Config) -> tuple[Config, Config, Config]:
     return first, second, third
 
 
+def parts_of(
+    sequence: Sequence, config: Config, base: Noise, observations: int
+) -> tuple[list[Sequence], Config, Config]:
+    """Stretches of a recording, its moving tracks left out; settings that tell wrong matches, and that reject nothing.
+
+    Args:
+        sequence, config, observations: As for `stretches`.
+        base: The noise by which tracks are found to move.
+    """
+    moving, gated, ungated = _settings(config)
+    parts = [without_rejected(part, base, moving, (MOVING,))[0] for part in stretches(sequence, config, observations)]
+    return parts, gated, ungated
+
+
 def stretches(sequence: Sequence, config: Config, observations: int) -> list[Sequence]:
     """A recording as it is filtered by `tune`: whole if it is small, else stretches spread evenly over it.
 
@@ -435,21 +457,9 @@ def stretches(sequence: Sequence, config: Config, observations: int) -> list[Seq
     begins, length = np.zeros(1, dtype=np.int64), frames
     if count * _STRETCH < frames:
         begins, length = np.linspace(0, frames - _STRETCH, count).astype(np.int64), _STRETCH
-    parts = []
-    for begin in begins.tolist():
-        within = (tracks.frame >= begin) & (tracks.frame < begin + length)
-        if within.any():
-            part = dataclasses.replace(
-                sequence,
-                time_s=sequence.time_s[begin : begin + length],
-                twist=sequence.twist[begin : begin + length],
-                observations=Observations(
-                    tracks.frame[within] - begin, tracks.landmark[within], tracks.pixels_px[within]
-                ),
-                truth=Truth(np.zeros(1, dtype=np.int64), T_world_imu[begin : begin + 1]),
-            )
-            parts.append(part)
-    return parts
+    cleaned = dataclasses.replace(sequence, observations=tracks)
+    parts = (cut(cleaned, begin, begin + length, T_world_imu[begin]) for begin in begins.tolist())
+    return [part for part in parts if part is not None]
 
 
 def _with(base: Noise, names: list[str], x: Array) -> Noise:

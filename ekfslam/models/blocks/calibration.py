@@ -41,7 +41,7 @@ def prior_std(config: CalibrationConfig) -> Array:
     return np.array(
         [
             *[config.lever_arm_m] * 3,
-            *[np.deg2rad(config.rotation_deg)] * 3,
+            *[np.deg2rad(config.rotation_deg or 0.0)] * 3,
             config.baseline,
             config.disparity_px,
             config.time_s,

@@ -55,6 +55,8 @@ class LinearSystem:
         phi, aux_weight: (T-1, a) of the rows ``weight (aux_{k+1} - phi aux_k) = r_aux``, element by element.
         r_aux: (T-1, a) their right sides.
         at: (n,) frames of scalar rows over aux; J_at (n, a); r_at (n,).
+        landmark_weight: Weight of the rows ``weight d = r_landmark`` of every landmark; 0: there are none.
+        r_landmark: (M, 3) their right sides.
         drive_prior: (g,) weights of the rows ``weight drive = r_drive``, (g,).
     """
 
@@ -84,12 +86,14 @@ class LinearSystem:
     r_at: Array
     drive_prior: Array
     r_drive: Array
+    landmark_weight: float = 0.0
+    r_landmark: Array | float = 0.0
 
     @property
     def half_square(self) -> float:
         """Half the sum of squares of all right sides: the cost of leaving everything as it is."""
         right = (self.r_prior, self.r_motion, self.r, self.r_aux_prior, self.r_aux, self.r_at, self.r_drive)
-        return 0.5 * sum(float((r**2).sum()) for r in right)
+        return 0.5 * (sum(float((r**2).sum()) for r in right) + float(np.square(self.r_landmark).sum()))
 
 
 class Elimination:
@@ -302,6 +306,7 @@ class JointInformation:
         e = elimination
         self._factorise(system, damping, factor)
         g_m, right = e.sum_by_landmark(_transposed(system.J_m, system.r)), _right_side(e, system)
+        g_m = g_m + system.landmark_weight * system.r_landmark
         whitened = (self._L_inverse @ g_m[..., None])[..., 0]
         reduced = right.copy()
         reduced_poses, _, reduced_drive, reduced_kept = e.parts(reduced)
@@ -321,6 +326,7 @@ class JointInformation:
         """Schur complements of the eliminated landmarks, then CHOLMOD."""
         e = self.elimination
         H_mm = _sum_products(e.landmark, e.landmarks, system.J_m, system.J_m)
+        H_mm += system.landmark_weight**2 * np.eye(3)
         blocks = _blocks(e, system)
         if damping:
             for H in (H_mm, blocks["pose"], blocks["aux"], blocks["drive"]):
