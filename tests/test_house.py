@@ -109,7 +109,8 @@ def test_every_block_and_errors_of_tracks_on_a_recording(data_path, variant):
         truth=truth,
     )
     found = build(short).model.noise
-    noise = dataclasses.replace(found, twist_walk_std=EVERYTHING["twist_walk_std"], twist_std=np.full(6, 0.05))
+    walks = {key: EVERYTHING[key] for key in ("twist_walk_std", "motion_std")}
+    noise = dataclasses.replace(found, **walks, twist_std=np.full(6, 0.05))
     settings = {
         "filter": {"variant": variant, "landmark_coordinates": "xyz"},
         "calibration": CALIBRATION,
