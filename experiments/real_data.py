@@ -242,7 +242,7 @@ def plot(table: Table, noisy: Noisy) -> Figure:
     ax.set_yticks(range(len(names)), names)
     ax.invert_yaxis()
     ax.set_xlabel("ATE of dead reckoning over that of full SLAM [-]; more is better")
-    ax.legend(loc="lower right")
+    ax.legend(loc="center left")
     return figure
 
 
