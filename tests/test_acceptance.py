@@ -79,7 +79,8 @@ def test_state_stays_as_small_as_the_view():
 def test_retired_and_never_retired_agree_on_the_recordings(data_path, name, frames, variant):
     sequence = open_sequence(data_path(f"ece276a/{name}.npz"))
     assert len(sequence) == frames
-    base = Config().with_overrides({"filter": {"variant": variant}})
+    # In image coordinates landmarks out of view lose digits, and a gate may flip.
+    base = Config().with_overrides({"filter": {"variant": variant, "landmark_coordinates": "xyz"}})
     unseen, never = (
         run(sequence, "full", base.with_overrides({"filter": {"retire": retire}})) for retire in ("unseen", "never")
     )
