@@ -119,8 +119,11 @@ class BatchProblem(FrozenRows):
         )
 
     def _landmark_rows(self, state: State) -> dict[str, Any]:
-        """Rows that say that landmarks are not infinitely far: a track that fits best there has no depth in metres."""
-        weight = 1.0 / LANDMARK_PRIOR_M
+        """Rows that say that landmarks are not infinitely far, where errors of tracks walk.
+
+        Differences of successive observations leave the disparity itself open: some tracks fit best at infinity.
+        """
+        weight = 0.0 if self.model.track_error is None else 1.0 / LANDMARK_PRIOR_M
         return {"landmark_weight": weight, "r_landmark": weight * (self.log.first_position_m - state.positions_m)}
 
     def _observations(self, state: State) -> tuple[Array, Array | None, Array, Array, Array]:
