@@ -460,11 +460,11 @@ def test_the_report_comes_back_from_the_archive_and_info_prints_it(spoilt, tmp_p
 @pytest.mark.data
 def test_info_of_a_recording_prints_the_report_of_the_defaults(data_path, capsys):
     assert main(["info", str(data_path("ece276a/0042.npz"))]) == 0
-    assert "hygiene       disparity: 240 observations dropped and 14 cuts" in capsys.readouterr().out
+    assert "hygiene       disparity: 812 observations dropped and 13 cuts" in capsys.readouterr().out
     assert main(["info", str(data_path("ece276a/0027.npz"))]) == 0
     printed = capsys.readouterr().out
     assert "hygiene       repeated frame: 225 cuts, in 118 tracks, 91 frames from 14 to 1089\n" in printed
-    assert "hygiene       disparity: nothing found" in printed
+    assert "hygiene       disparity: 349 observations dropped, in 7 tracks" in printed
     assert "hygiene       too short: switched off\n" in printed
 
 
