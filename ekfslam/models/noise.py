@@ -18,7 +18,7 @@ What no difference can see are slow errors that all samples or all tracks of a r
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -74,7 +74,7 @@ class VelocityNoise:
     sigma_error: Array
     limit: Array
     walk: Array
-    sampling: Array
+    sampling: Array = field(default_factory=lambda: np.zeros(6))
 
     @property
     def is_clean(self) -> bool:
@@ -95,7 +95,7 @@ def velocity_noise(twist: Array) -> VelocityNoise:
     """White noise and walk of velocities (T, 6), m/s and rad/s."""
     d = np.diff(np.asarray(twist, dtype=float), axis=0)
     if len(d) < 2:
-        return VelocityNoise(np.zeros(2), np.full(2, np.inf), np.full(2, np.inf), np.zeros(2), np.zeros(6))
+        return VelocityNoise(np.zeros(2), np.full(2, np.inf), np.full(2, np.inf), np.zeros(2))
     product, square = d[1:] * d[:-1], d**2
     sigma = _white(product.mean(axis=0))
     parts = np.array_split(product, min(_BLOCKS, len(product)))
