@@ -34,7 +34,9 @@ def with_track_scale(config: Config, sequence: Sequence) -> Config:
         config: Settings.
         sequence: The recording; `_FRAMES` frames from its middle are filtered `_ROUNDS` times.
     """
-    if not is_automatic(sequence, config) or config.noise.track_scale is not None or config.noise.drift is not None:
+    given = config.noise.track_scale is not None or config.noise.drift is not None
+    # A tuned file was found with the walk as it is.
+    if not is_automatic(sequence, config) or given or config.noise.model != "auto":
         return config
     scale = 1.0
     if not velocity_noise(sequence.twist).is_clean:
