@@ -72,7 +72,7 @@ def run(
             ms = np.empty(len(sequence))
             references = None if judged is None else References(ekf, *judged)
             for k, report, ms[k] in run_filter(ekf, sequence, frames, further):
-                T_imu_world[k], covariance[k] = ekf.T_imu_world, ekf.P[:6, :6]
+                T_imu_world[k], covariance[k] = ekf.T_imu_world, ekf.gaussian.body_covariance[:6, :6]
                 reports.append(report)
                 if references is not None:
                     references.record(k)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.errors import InnovationError
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate
-from ekfslam.filters.gaussian import Conditioned, Rows
+from ekfslam.filters.gaussian import Conditioned, Projection, Rows, Solution
 from ekfslam.filters.innovations import FrameInnovations, innovations_of
 from ekfslam.geometry import se3
 from ekfslam.models.model import Seen
@@ -62,87 +61,87 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     verdict = np.full(len(slot), ACCEPTED)
     seen, rows = e.observe(slot, measured)
     verdict[~e.sensor.in_view(seen.q, e.config.min_depth_m)] = BEHIND_CAMERA
-    some, S = _gate_alone(e, frame, rows, seen, verdict, gate)
-    innovations = FrameInnovations.none(e.sensor.dimension)
-    done = Conditioned(np.zeros(len(e.P)), 0.0, 0.0)
-    P_prior = e.P.copy() if e.config.iterations > 1 and len(some) else None
+    some, tried = _gate_alone(e, frame, rows, seen, verdict, gate)
+    innovations, solution = FrameInnovations.none(e.sensor.dimension), None
     if len(some):
+        S = tried.variances + gates.diagonal(tried.rows.variance)
         if e.model.has_time_offset and e.tau_s:
-            e.imu_twist = _seen_twist(e, frame, rows.only(some))
+            e.imu_twist = _seen_twist(e, frame, tried)
             _, rows = e.observe(slot, measured)
-        tried = rows if len(some) == len(verdict) else rows.only(some)
-        done = e.gaussian.condition(tried, frame, e.ids[tried.slot])
-        left = tried.corrected(*e.parts(done.correction))
-        verdict[some] = _gate_by_others(e, left, seen, some, gate)
+            tried = e.gaussian.project(rows.only(some), frame, e.ids[slot[some]])
+        solution = e.gaussian.solve(tried, frame, e.ids[slot[some]])
+        left = tried.rows.corrected(*e.parts(solution.done.correction))
+        verdict[some] = _gate_by_others(e, solution, left, seen, some, gate)
         inside = verdict[some] == ACCEPTED
+        accepted = tried.rows
         if not inside.all():
-            done = _without(e, frame, done, tried, left, inside)
-            tried, S = tried.only(inside), S[inside]
-            left = tried.corrected(*e.parts(done.correction))
-        innovations = innovations_of(e.gaussian, e.table.log_row[tried.slot], tried, S, left.residual)
+            solution = solution.without(~inside)
+            accepted, S = accepted.only(inside), S[inside]
+            left = accepted.corrected(*e.parts(solution.done.correction))
+        innovations = innovations_of(solution, e.table.log_row[accepted.slot], accepted, S, left.residual)
     taken = verdict == ACCEPTED
     if not taken.all():
         rows, measured = rows.only(taken), measured[taken]
     clone = e.values.get("previous_pose", e.T_departed)
     linear = e.coordinates, e.T_imu_world, clone
     position = e.table.position_m[rows.slot]
-    if P_prior is not None and taken.any():
-        done, position, linear = _iterate(e, frame, P_prior, done, rows.slot, measured)
+    done = Conditioned(np.zeros(e.gaussian.body + 3 * e.gaussian.landmarks))
+    if solution is not None:
+        done = solution.done
+        if e.config.iterations > 1 and taken.any():
+            solution, position, linear = _iterate(e, frame, solution, rows.slot, measured)
+            done = replace(done, correction=solution.done.correction)
+        e.gaussian.apply(solution)
     return Correction(
         done, rows.residual.size, verdict, rows.slot, measured, rows.variance, position, *linear, innovations
     )
 
 
-def _without(e: Estimate, frame: int, done: Conditioned, tried: Rows, left: Rows, inside: BoolArray) -> Conditioned:
-    """Take the rows outside out of the conditioning ``done``; ``left`` are the rows ``tried`` with what it leaves."""
-    out = left.only(~inside)
-    try:
-        return done - e.gaussian.condition(out, frame, e.ids[out.slot], sign=-1.0)
-    except InnovationError:
-        # Together the other rows say nothing about these, so that the difference is all rounding: once more without.
-        e.gaussian.undo(done)
-        kept = tried.only(inside)
-        if not inside.any():
-            return Conditioned(np.zeros(len(e.P)), 0.0, 0.0)
-        return e.gaussian.condition(kept, frame, e.ids[kept.slot])
-
-
 def _gate_alone(
     e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArray, gate: float
-) -> tuple[IntArray, Array]:
-    """Which landmarks (j,) of the rows pass the gate by themselves, and the covariances (j, d, d) of their innovations.
+) -> tuple[IntArray, Projection]:
+    """Which landmarks (j,) of the rows pass the gate by themselves, and their rows seen through the covariance.
 
     The verdict (k,) on the others is written.
     """
     some = np.flatnonzero(verdict == ACCEPTED)
     rows = rows if len(some) == len(verdict) else rows.only(some)
-    S = e.gaussian.variances(rows) + gates.diagonal(rows.variance)
+    tried = e.gaussian.project(rows, frame, e.ids[rows.slot])
     # So near to the camera plane that its image may be anywhere: linearised, it would spoil the whole frame.
-    blurred = np.any(np.diagonal(S, axis1=1, axis2=2) > _MOST_BLURRED * rows.variance, axis=1)
+    blurred = np.any(_own_variance(tried) > _MOST_BLURRED * tried.rows.variance, axis=1)
     if blurred.any():
         verdict[some[blurred]] = BEHIND_CAMERA
-        some, S, rows = some[~blurred], S[~blurred], rows.only(~blurred)
-    squares = gates.normalised_squares(S, rows.residual, frame, e.ids[rows.slot])
+        some, tried = some[~blurred], tried.only(np.flatnonzero(~blurred))
+    S = tried.variances + gates.diagonal(tried.rows.variance)
+    squares = gates.normalised_squares(S, tried.rows.residual, frame, e.ids[tried.rows.slot])
     inside = squares <= gate
     verdict[some[~inside]] = GATE
     if _judges_motion(e) and not e.model.has_twist:
-        evidence = gates.evidence_alone(rows, S, _motion(e, seen, some))
-        moving = _moving(e, rows.slot, evidence, squares, gate)
+        evidence = gates.evidence_alone(tried.rows, S, _motion(e, seen, some))
+        moving = _moving(e, tried.rows.slot, evidence, squares, gate)
         verdict[some[moving]] = MOVING
         inside &= ~moving
-    return some[inside], S[inside]
+    if not inside.all():
+        some, tried = some[inside], tried.only(np.flatnonzero(inside))
+    return some, tried
 
 
-def _gate_by_others(e: Estimate, left: Rows, seen: Seen, some: IntArray, gate: float) -> IntArray:
+def _own_variance(tried: Projection) -> Array:
+    """Variances (k, d) of the innovations."""
+    return np.diagonal(tried.variances, axis1=1, axis2=2) + tried.rows.variance
+
+
+def _gate_by_others(e: Estimate, solution: Solution, left: Rows, seen: Seen, some: IntArray, gate: float) -> IntArray:
     """Verdicts (j,) on landmarks by what all others of the frame say.
 
     Args:
-        left: Rows (j) on which P was conditioned, with the residuals that the correction leaves.
+        solution: Of eq. (6) for the rows (j).
+        left: The rows with the residuals that the correction leaves.
         seen: What all landmarks (k,) look like, of which these are ``some`` (j,).
     """
     verdict, judges_motion = np.full(len(some), ACCEPTED), _judges_motion(e) and e.model.has_twist
     if np.isfinite(gate) or judges_motion:
-        C = gates.given_others(e.gaussian, left)
+        C = solution.given_others()
         squares, judged = gates.agrees_with_others(left, C)
         verdict[squares > gate] = GATE
         if judges_motion:
@@ -167,19 +166,19 @@ def _moving(e: Estimate, slot: IntArray, evidence: tuple[Array, Array], squares:
     return gates.moves_along(e.table, slot, *evidence, squares, gate, sigma, e.config.moving_share)
 
 
-def _seen_twist(e: Estimate, frame: int, rows: Rows) -> Array:
+def _seen_twist(e: Estimate, frame: int, tried: Projection) -> Array:
     """The velocities (6,) that led to this frame, as corrected by its observations.
 
     A time offset counts in proportion to them. With the measured ones, whose noise the innovations show, too, it would
     come out far too small.
     """
-    xi = e.gaussian.correction(rows, frame, e.ids[rows.slot])[:6]
+    xi = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot]).done.correction[:6]
     return -se3.log(se3.exp(xi) @ e.T_imu_world @ se3.inverse(e.T_departed)) / e.tau_s
 
 
 def _iterate(
-    e: Estimate, frame: int, P_prior: Array, done: Conditioned, slot: IntArray, measured: Array
-) -> tuple[Conditioned, Array, tuple[Array, Array, Array]]:
+    e: Estimate, frame: int, solution: Solution, slot: IntArray, measured: Array
+) -> tuple[Solution, Array, tuple[Array, Array, Array]]:
     """Gauss-Newton on eq. (6): linearise again at the corrected state, always from the same prior.
 
     Rows taken at the corrected state are carried back into the prior's coordinates by the variant's derivative D,
@@ -187,22 +186,22 @@ def _iterate(
     filter update as a Gauss-Newton method", IEEE TAC 1993.
 
     Returns:
-        The last correction; the landmarks (j, 3), coordinates and poses at which it was linearised.
+        The last solution; the landmarks (j, 3), coordinates and poses at which it was linearised.
     """
-    values, positions, first = e.values, e.positions_m, done
+    values, positions = e.values, e.positions_m
     for _ in range(e.config.iterations - 1):
-        x, d = e.parts(done.correction)
-        moved = e.retracted(done.correction)
+        correction = solution.done.correction
+        x, d = e.parts(correction)
+        moved = e.retracted(correction)
         after = moved.values
         linear = (
-            e.coordinates + done.correction[: len(e.coordinates)],
+            e.coordinates + correction[: len(e.coordinates)],
             after["pose"],
             after.get("previous_pose", e.T_departed),
         )
         e.values, e.table.position_m = after, moved.position_m
         _, rows = e.observe(slot, measured)
         e.values, e.table.position_m = values, positions
-        rows = e.carried_back(rows, moved)
-        e.P = P_prior.copy()
-        done = e.gaussian.condition(rows.corrected(-x, -d), frame, e.ids[slot])
-    return Conditioned(done.correction, first.nis, first.log_det), moved.position_m[slot], linear
+        rows = e.carried_back(rows, moved).corrected(-x, -d)
+        solution = e.gaussian.solve(e.gaussian.project(rows, frame, e.ids[slot]), frame, e.ids[slot])
+    return solution, moved.position_m[slot], linear

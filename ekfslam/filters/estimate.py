@@ -12,6 +12,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import FilterConfig
 from ekfslam.errors import ConfigError
 from ekfslam.filters.coordinates import CameraCoordinates, Change, View
+from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.gaussian import Gaussian, Rows
 from ekfslam.filters.landmarks import LandmarkTable
 from ekfslam.filters.variants import VARIANTS
@@ -73,7 +74,7 @@ class Estimate:
         self.values = model.initial_values()
         self.coordinates = np.zeros(model.layout.body)
         self.table = LandmarkTable(model.sensor.dimension)
-        self.gaussian = Gaussian(model.prior_covariance, model.layout.seen)
+        self.gaussian: Gaussian = DenseGaussian(model.prior_covariance, model.layout.seen)
         self.T_predicted = self.T_predicted_before = self.T_departed = self.values["pose"]
         self.imu_twist = self.imu_twist_before = np.zeros(6)
         self.tau_s, self.way_m, self.step = 0.0, np.zeros(()), 0
@@ -144,9 +145,9 @@ class Estimate:
         Raises:
             KeyError: An id is not active.
         """
-        slot, body = self._slots(ids), np.arange(self.model.layout.body)
-        columns = np.concatenate([body, (self.gaussian.body + 3 * slot[:, None] + np.arange(3)).ravel()])
-        return self.P[np.ix_(columns, columns)]
+        joint = self.gaussian.covariance_of(self._slots(ids))
+        kept = np.delete(np.arange(len(joint)), slice(self.model.layout.body, self.gaussian.body))
+        return joint[np.ix_(kept, kept)]
 
     def measurement_jacobian(self, ids: IntArray) -> sp.csr_array:
         """Full-width H (3k, b+3n) of the sensor's rows of active landmarks ``ids`` (k,), for inspection and tests.

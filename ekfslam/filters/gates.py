@@ -7,7 +7,7 @@ from scipy.special import gammaincinv
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import InnovationError
-from ekfslam.filters.gaussian import Gaussian, Rows
+from ekfslam.filters.gaussian import Rows
 from ekfslam.filters.landmarks import LandmarkTable
 
 # Observations of a landmark after which it may be found to move.
@@ -43,25 +43,16 @@ def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> 
     return np.einsum("ni,ni->n", whitened, whitened)
 
 
-def given_others(gaussian: Gaussian, left: Rows) -> Array:
-    """``C_i = V - H_i P H_i^T`` (k, d, d) in units of the rows' standard deviations, after conditioning on all of them.
-
-    With ``e_i = r_i - H_i (xi, d)``, what the correction leaves, the innovation of landmark i given all *others* is
-    ``V C_i^-1 e_i`` with covariance ``V C_i^-1 V``: nothing has to be computed once for each landmark left out.
-
-    Args:
-        gaussian: Conditioned on all of the rows.
-        left: The rows with the residuals that the correction leaves.
-    """
-    std = np.sqrt(left.variance)
-    return np.eye(std.shape[1]) - gaussian.variances(left) / (std[:, :, None] * std[:, None, :])
-
-
 def agrees_with_others(left: Rows, C: Array) -> tuple[Array, BoolArray]:
     """``e_i^T C_i^-1 e_i`` (k,), the normalised square of each landmark's innovation given all others.
 
+    With ``C_i = V (S^-1)_ii V`` and ``e_i = r_i - H_i (xi, d)``, what the correction leaves, the innovation of
+    landmark i given all *others* is ``V C_i^-1 e_i`` with covariance ``V C_i^-1 V``: nothing has to be computed once
+    for each landmark left out.
+
     Args:
-        left, C: As for and from `given_others`.
+        left: The rows with the residuals that the correction leaves.
+        C: (k, d, d) in units of the rows' standard deviations, from `Solution.given_others`.
 
     Returns:
         The squares, and whether (k,) a landmark can be judged: where C is nothing but rounding, no other landmark says
@@ -115,7 +106,10 @@ def evidence_alone(rows: Rows, S: Array, h: Array) -> tuple[Array, Array]:
 
 
 def evidence_given_others(left: Rows, C: Array, h: Array) -> tuple[Array, Array]:
-    """The same of the innovations given all others: ``h^T V^-1 e`` and ``h^T V^-1 C V^-1 h``, see `given_others`."""
+    """The same of the innovations given all others: ``h^T V^-1 e`` and ``h^T V^-1 C V^-1 h``.
+
+    Arguments as of `agrees_with_others`.
+    """
     std = np.sqrt(left.variance)
     g = h / std
     return (g * left.residual / std).sum(axis=1), np.einsum("ni,nij,nj->n", g, C, g)

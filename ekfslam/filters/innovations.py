@@ -6,7 +6,7 @@ With S the joint innovation covariance of a frame's accepted rows r, and J their
     score c = J^T S^-1 r,  cov c = C = J^T S^-1 J,  xi = C^-1 c,  cov xi = C^-1
 
 If the model is true, c is white over frames with covariance C, and ``r^T S^-1 r - c^T C^-1 c`` is chi-square and
-independent of it. No S has to be inverted: ``S^-1 = V^-1 - V^-1 H P+ H^T V^-1`` with P+ of eq. (6).
+independent of it. The score needs no S: ``S^-1 r = V^-1 e`` with e what the correction (6) leaves of r.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
-from ekfslam.filters.gaussian import Gaussian, Rows
+from ekfslam.filters.gaussian import Rows, Solution
 from ekfslam.filters.result import WhitenedInnovations
 
 # Share of its variance that an innovation must have besides the motion that all share.
@@ -48,11 +48,11 @@ class FrameInnovations:
         return FrameInnovations(np.empty(0, dtype=np.int64), rows, rows, np.zeros(6), np.zeros((6, 6)))
 
 
-def innovations_of(gaussian: Gaussian, landmark: IntArray, rows: Rows, S: Array, left: Array) -> FrameInnovations:
+def innovations_of(solution: Solution, landmark: IntArray, rows: Rows, S: Array, left: Array) -> FrameInnovations:
     """The innovations of one frame, see the module.
 
     Args:
-        gaussian: Conditioned on the rows.
+        solution: Of eq. (6) for the rows.
         landmark: (k,) row of each landmark in the log.
         rows: Of the accepted observations, with their innovations.
         S: (k, d, d) of each by itself, before the conditioning.
@@ -62,15 +62,8 @@ def innovations_of(gaussian: Gaussian, landmark: IntArray, rows: Rows, S: Array,
         return FrameInnovations.none(rows.residual.shape[1])
     k, d = rows.residual.shape
     J = rows.H_x[..., :6]
-    weighted = J / rows.variance[..., None]
-    flat = weighted.reshape(k * d, 6)
-    B = np.zeros((len(gaussian.P), 6))
-    B[: gaussian.seen] = rows.H_x.reshape(k * d, -1).T @ flat
-    own = gaussian.body + 3 * rows.slot[:, None] + np.arange(3)
-    B[own] = rows.H_m.swapaxes(1, 2) @ weighted
-    information = B[:6] - B.T @ gaussian.P @ B
-    information = 0.5 * (information + information.T)
-    score = flat.T @ left.ravel()
+    information = solution.information(J)
+    score = J.reshape(k * d, 6).T @ (left / rows.variance).ravel()
     shared = _inverse(information)
     S_apart, apart = S - J @ shared @ J.swapaxes(1, 2), rows.residual - J @ (shared @ score)
     both = whitened(np.concatenate([S, S_apart]), np.concatenate([rows.residual, apart]))

@@ -98,12 +98,7 @@ class JointEKF(Estimate):
         model, pose = self.model, self.model.layout["pose"]
         self.way_m = model.way_m(np.asarray(twist, dtype=float), tau_s)
         self.coordinates = self.coordinates.copy()  # the log has those after the update
-        for clone, name in model.clones:
-            self.gaussian.copy(model.layout[clone], model.layout[name])
-            self.coordinates[model.layout[clone]] = self.coordinates[model.layout[name]]
-            self.values = {**self.values, clone: self.values[name]}
-        for block in model.wandering:
-            self._wander(block, tau_s)
+        self._wander(tau_s)
         if model.has_twist:
             self._measure_velocities(twist, also)
         elif also is not None:
@@ -123,15 +118,25 @@ class JointEKF(Estimate):
         self.step += 1
         self._log.predicted(self, twist, departed, is_gap)
 
-    def _wander(self, block: StateBlock, tau_s: float) -> None:
-        """A block that changes by itself; velocities that nothing has measured yet are not there to change."""
-        moves = block.transition(tau_s, self.way_m)
-        if moves is None or (block.name == "twist" and not self._is_twist_known):
-            return
-        at, (phi, std) = self.model.layout[block.name], moves
-        self.gaussian.wander(at, phi, std)
-        self.coordinates[at] *= phi
-        self.values = {**self.values, block.name: phi * self.values[block.name]}
+    def _wander(self, tau_s: float) -> None:
+        """Clones of shared blocks take their values; blocks that change by themselves, ``x+ = phi x + w``, do so."""
+        model, layout, values = self.model, self.model.layout, dict(self.values)
+        Phi, Q = np.eye(layout.body), np.zeros((layout.body, layout.body))
+        for clone, name in model.clones:
+            at, of = layout[clone], layout[name]
+            Phi[at, at], Phi[at, of] = 0.0, np.eye(at.stop - at.start)
+            self.coordinates[at], values[clone] = self.coordinates[of], values[name]
+        for block in model.wandering:
+            moves = block.transition(tau_s, self.way_m)
+            # Velocities that nothing has measured yet are not there to change.
+            if moves is not None and (block.name != "twist" or self._is_twist_known):
+                at, (phi, std) = layout[block.name], moves
+                Phi[at, at], Q[at, at] = np.diag(phi), np.diag(std**2)
+                self.coordinates[at] *= phi
+                values[block.name] = phi * values[block.name]
+        self.values = values
+        if model.clones or model.wandering:
+            self.gaussian.propagate(Phi, Q)
 
     def _measure_velocities(self, twist: Array, also: VelocityRows | None) -> None:
         """Condition on velocity measurements; the first one of the IMU starts the twist."""
@@ -147,7 +152,9 @@ class JointEKF(Estimate):
             measured = VelocityRows.concatenate(rows)
             H = model.velocity_jacobian(measured)
             residual = measured.value - H @ self.coordinates
-            done = self.gaussian.condition_body(H, residual, measured.std**2, self.step + 1)
+            solution = self.gaussian.solve_body(H, residual, measured.std**2, self.step + 1)
+            self.gaussian.apply(solution)
+            done = solution.done
             self._log_likelihood += log_density(done.nis, done.log_det, len(residual))
             self.retract(done.correction)
 
@@ -197,7 +204,7 @@ class JointEKF(Estimate):
             self.updated_pose = "pose" if (self.table.first_step == self.step).all() else None
         self.retired.start_afresh(ids[new][started])
         reason[np.flatnonzero(new)[~started]] = DISPARITY if self._waiting is None else WAITING
-        self._reported.append(self.model.reported(self.values, self.gaussian.P))
+        self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
         likelihood = self._log_likelihood + log_density(found.done.nis, found.done.log_det, found.dof)
         self._log_likelihood = 0.0
         return FrameReport(frame, ids, reason, found.done.nis, found.dof, split, likelihood, found.innovations)
@@ -205,7 +212,7 @@ class JointEKF(Estimate):
     def _retire(self, gone: BoolArray, may_return: bool = False) -> None:
         """Marginalise landmarks (n,): drop their rows and columns, keep their last estimate."""
         if gone.any():
-            self.retired.add(self.table, self.gaussian.landmark_blocks(), gone, may_return)
+            self.retired.add(self.table, self.gaussian.landmark_blocks(np.flatnonzero(gone)), gone, may_return)
             self.gaussian.marginalise(~gone)
             self.table.keep(~gone)
 

@@ -116,11 +116,11 @@ class LandmarkTable:
         self.misses[slot] = 0
 
     def snapshot(self, slot: IntArray, covariance: Array) -> Landmarks:
-        """Some landmarks as a result has them, with covariances (n, 3, 3) of all."""
+        """Some landmarks as a result has them, with their covariances (k, 3, 3)."""
         return Landmarks(
             self.id[slot],
             self.position_m[slot],
-            covariance[slot],
+            covariance,
             self.initial_m[slot],
             self.first_frame[slot],
             self.last_frame[slot],

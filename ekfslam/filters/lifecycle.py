@@ -65,7 +65,7 @@ class Retired:
         return sum(len(part) for part in self._parts)
 
     def add(self, table: LandmarkTable, covariance: Array, gone: BoolArray, may_return: bool) -> None:
-        """Landmarks (n,) of a table that are gone, with the covariances (n, 3, 3) of all of them."""
+        """Landmarks (n,) of a table that are gone, with the covariances (k, 3, 3) of these."""
         slot = np.flatnonzero(gone)
         ids, rows = table.id[slot].tolist(), table.log_row[slot]
         self._parts.append(table.snapshot(slot, covariance))

@@ -39,7 +39,7 @@ class LogBook:
 
     def __init__(self, start: Estimate) -> None:
         self._first_estimates = start.variant.first_estimates
-        self._initial_covariance = start.P[:6, :6].copy()
+        self._initial_covariance = start.gaussian.body_covariance[:6, :6]
         self._frames: dict[str, list] = {name: [] for name in _PER_FRAME}
         no_index, none, rows = np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, start.sensor.dimension))
         self._lists: dict[str, list] = {

@@ -108,10 +108,11 @@ class IndependentLandmarks:
             return slot
         slot = slot[np.argsort(self.table.id[slot])]
         ids = self.table.id[slot]
-        self._split.append(self.table.snapshot(slot, self.covariance))
+        self._split.append(self.table.snapshot(slot, self.covariance[slot]))
         self.table.keep(~gone)
         return ids
 
     def landmarks(self) -> Landmarks:
         """Pieces that were split off, then the rest in the order of their ids."""
-        return Landmarks.concatenate([*self._split, self.table.snapshot(np.argsort(self.table.id), self.covariance)])
+        slot = np.argsort(self.table.id)
+        return Landmarks.concatenate([*self._split, self.table.snapshot(slot, self.covariance[slot])])

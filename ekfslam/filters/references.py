@@ -37,7 +37,7 @@ class References:
 
     def record(self, frame: int) -> None:
         """After the update of a frame: what it has to do with the references, and a new one if it is one."""
-        P = self._estimate.P
+        P = self._estimate.gaussian.body_covariance
         for i in np.flatnonzero(self._second == frame):
             j = int(self._first[i])
             # A map revival puts another covariance in place of the filter's, which knows nothing of references.

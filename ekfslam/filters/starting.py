@@ -48,8 +48,9 @@ def _start_after_waiting(
         e.gaussian.augment(found.G, found.covariance)
         views = (found.step, found.rows, variance), (e.step, now, variance)
         _append(e, log, frame, ids[found.which], found.position_m, now, *views)
-        done = e.gaussian.condition_body(found.H, found.residual, np.ones(len(found.residual)), e.step)
-        e.retract(done.correction)
+        solution = e.gaussian.solve_body(found.H, found.residual, np.ones(len(found.residual)), e.step)
+        e.gaussian.apply(solution)
+        e.retract(solution.done.correction)
     waiting.move_on(e, ids[~found.which], rows[~found.which])
     return found.which
 

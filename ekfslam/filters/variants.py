@@ -15,7 +15,7 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.config import FilterConfig
 from ekfslam.filters.coordinates import Change
-from ekfslam.filters.gaussian import Gaussian, Rows, add_product
+from ekfslam.filters.gaussian import Gaussian, Rows
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import Values
 from ekfslam.models.model import Model
@@ -71,14 +71,8 @@ class Standard:
         G has M and B of the change, and `turned` of each pose: 3x3 blocks, and a rank beyond them which is the number
         of the change's columns.
         """
-        if change.M is not None:
+        if len(change.columns):
             gaussian.transform_landmarks(change.M, change.B, change.columns)
-        elif len(change.columns):
-            # d+ = d + B a, hence P+ = P + B Z^T + Z B^T with Z = P_a + B P_aa / 2.
-            P, columns = gaussian.P, change.columns
-            B = np.zeros((len(P), len(columns)))
-            B[gaussian.body :] = change.B.reshape(-1, len(columns))
-            add_product(P, B, P[:, columns] + 0.5 * B @ P[np.ix_(columns, columns)])
 
     def carry_back(self, rows: Rows, model: Model, before: Values, after: Values, change: Change) -> Rows:
         """Rows taken at a corrected state in the errors before the correction, for an iterated update: the chain rule.
@@ -161,13 +155,8 @@ class Invariant(Standard):
 
     def transport(self, gaussian: Gaussian, model: Model, before: Values, after: Values, change: Change) -> None:
         super().transport(gaussian, model, before, after, change)
-        P = gaussian.P
         for name in model.layout.poses:
-            at, Ad = model.layout[name], self.turned(before[name], after[name])
-            P[at] = Ad @ P[at]
-            P[:, at] = P[at].T
-            P_xx = Ad @ P[at, at]
-            P[at, at] = 0.5 * (P_xx + P_xx.T)
+            gaussian.transform_body(model.layout[name], self.turned(before[name], after[name]))
 
     def landmark_error(self, m_hat: Array, m_true: Array, T_world_imu_hat: Array, T_world_imu_true: Array) -> Array:
         """Errors (..., 3) as eq. (7) has them: what a rigid motion of the world does to pose and landmarks is no error.

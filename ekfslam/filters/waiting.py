@@ -75,7 +75,8 @@ class Waiting:
         along = Q.swapaxes(1, 2)
         by_state, by_rows = along @ H_x, (along @ r[..., None])[..., 0]
         rest_H, rest_r = by_state[:, 3:], by_rows[:, 3:]
-        S = rest_H @ e.P[: e.gaussian.seen, : e.gaussian.seen] @ rest_H.swapaxes(1, 2) + np.eye(rest_H.shape[1])
+        P = e.gaussian.body_covariance[: e.gaussian.seen, : e.gaussian.seen]
+        S = rest_H @ P @ rest_H.swapaxes(1, 2) + np.eye(rest_H.shape[1])
         gate = gates.threshold(self._gate_probability, rest_H.shape[1])
         inside = gates.normalised_squares(S, rest_r, e.step, ids[which]) <= gate
 

@@ -246,11 +246,11 @@ def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str,
     stopped = False
     try:
         for k, report, _ in run_filter(ekf, sequence):
-            if not (np.isfinite(ekf.T_imu_world).all() and np.isfinite(ekf.P).all()):
+            if not (np.isfinite(ekf.T_imu_world).all() and ekf.gaussian.is_finite):
                 stopped = True
                 break
             record["nis"][k], record["nis_dof"][k] = report.nis, report.dof
-            T_est[k], P_pose[k] = ekf.T_world_imu, ekf.P[:6, :6]
+            T_est[k], P_pose[k] = ekf.T_world_imu, ekf.gaussian.body_covariance[:6, :6]
             known[k] = k >= truth.frame[0]
             if not known[k] or len(ekf.ids) == 0:
                 continue

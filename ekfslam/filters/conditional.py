@@ -1,0 +1,416 @@
+"""The conditional form of the joint covariance: exact, and linear in the number of landmarks.
+
+Landmarks that are initialised from the body and observed from the body are independent of each other given X: the body,
+what its columns were some frames ago (the *window*), and a few *promoted* landmarks. So the joint Gaussian factors:
+
+    N(x_X; 0, P_X) prod_i N(d_i; K_i x_X, S_i)
+
+P_X (n_X, n_X) is dense, K_i is (3, n_X), S_i (3, 3). A promoted landmark is part of X; its K_i has ones at its own columns
+and its S_i is zero, so that what follows holds for it as it stands. With rows ``r_i = H_x x + H_m d_i + v``, eq. (6) is
+
+    R_i = H_m S_i H_m^T + V = L_i L_i^T        B_i = L_i^-1 (H_x + H_m K_i)        w_i = L_i^-1 r_i
+    P_X = F F^T        T = B F        M = I + T^T T = U^T U        W = F U^-1        u = U^-T T^T w
+    P_X+ = W W^T       x+ = W u       d_i+ = K_i x+ + G_i (w_i - B_i x+)           G_i = S_i H_m^T L_i^-T
+    K_i+ = K_i - G_i B_i              S_i+ = S_i - G_i G_i^T
+
+and ``S^-1 = L^-T (I - Z Z^T) L^-1`` with ``Z = T U^-1``. Kin: Guivant and Nebot, "Optimization of the simultaneous
+localization and map-building algorithm for real-time implementation", T-RA 2001 (compressed filter); Bailey, thesis, 2002.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.errors import InnovationError
+from ekfslam.filters.dense import transform
+from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, full_correction, share_of
+from ekfslam.filters.window import Window
+
+
+@dataclass(frozen=True)
+class ConditionalProjection(Projection):
+    """Rows (k) over X, whitened by what landmarks are unsure of given X.
+
+    Args:
+        rows: As given.
+        L: (k, d, d) ``R_i = L_i L_i^T``.
+        B: (k, d, n_X).
+        T: (k, d, f) ``B F``.
+        G: (k, 3, d).
+    """
+
+    rows: Rows
+    L: Array
+    B: Array
+    T: Array
+    G: Array
+
+    @cached_property
+    def variances(self) -> Array:
+        square = self.L @ (self.T @ self.T.swapaxes(1, 2) + np.eye(self.L.shape[1])) @ self.L.swapaxes(1, 2)
+        diagonal = np.arange(self.L.shape[1])
+        square[:, diagonal, diagonal] -= self.rows.variance
+        return square
+
+    def only(self, which: IntArray) -> ConditionalProjection:
+        return ConditionalProjection(
+            self.rows.only(which), self.L[which], self.B[which], self.T[which], self.G[which]
+        )
+
+
+@dataclass(frozen=True)
+class ConditionalSolution(Solution):
+    """Eq. (6) solved over X, for some landmarks.
+
+    Args:
+        gaussian: The covariance that it is about.
+        at: What was projected.
+        w: (k, d) ``L^-1 r``.
+        U: (f, f) upper triangle.
+        left: (k,) which landmarks are left.
+    """
+
+    gaussian: ConditionalGaussian
+    at: ConditionalProjection
+    w: Array
+    U: Array
+    left: BoolArray
+
+    @cached_property
+    def u(self) -> Array:
+        """(f,) ``U^-T T^T w``."""
+        T, w = self.at.T[self.left], self.w[self.left]
+        return blas.dtrsm(1.0, self.U, (T.reshape(-1, T.shape[2]).T @ w.ravel())[:, None], lower=0, trans_a=1)[:, 0]
+
+    @cached_property
+    def W(self) -> Array:
+        """(n_X, f) ``F U^-1``, the root of the covariance afterwards."""
+        return blas.dtrsm(1.0, self.U, self.gaussian.root, side=1, lower=0)
+
+    @cached_property
+    def Z(self) -> Array:
+        """(k d, f) ``T U^-1`` of all rows."""
+        T = self.at.T.reshape(-1, self.at.T.shape[2])
+        # A row-major T is LAPACK's T^T, and Z^T = U^-T T^T.
+        return blas.dtrsm(1.0, self.U, T.T, lower=0, trans_a=1).T
+
+    @cached_property
+    def x(self) -> Array:
+        """(n_X,) correction of X."""
+        return self.W @ self.u
+
+    @cached_property
+    def residual(self) -> Array:
+        """(k, d) ``w - B x``."""
+        return self.w - self.at.B @ self.x
+
+    @cached_property
+    def done(self) -> Conditioned:
+        w, L = self.w[self.left], self.at.L[self.left]
+        log_det = 2.0 * float(np.log(self.U.diagonal()).sum() + np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
+        nis = float((w**2).sum() - self.u @ self.u)
+        return Conditioned(self.gaussian.correction(self), nis, log_det)
+
+    def given_others(self) -> Array:
+        k, d = self.w.shape
+        Z = self.Z.reshape(k, d, -1)
+        L_inverse = np.linalg.inv(self.at.L)
+        blocks = L_inverse.swapaxes(1, 2) @ (np.eye(d) - Z @ Z.swapaxes(1, 2)) @ L_inverse
+        return share_of(blocks, self.at.rows.variance)
+
+    def without(self, out: BoolArray) -> ConditionalSolution:
+        return self.gaussian.solve_left(replace(self, left=self.left & ~out))
+
+    def information(self, J: Array) -> Array:
+        k, d, c = J.shape
+        A = np.linalg.solve(self.at.L[self.left], J).reshape(k * d, c)
+        along = self.Z.reshape(*self.w.shape, -1)[self.left].reshape(k * d, -1).T @ A
+        return A.T @ A - along.T @ along
+
+
+class ConditionalGaussian(Gaussian):
+    """Covariance in the conditional form.
+
+    Args:
+        body: (body, body) covariance before there are landmarks.
+        seen: Leading body columns that observations depend on.
+
+    Attributes:
+        window: What the columns of X are.
+    """
+
+    def __init__(self, body: Array, seen: int) -> None:
+        self.body, self.seen, self.considered = len(body), seen, 0
+        self._P = np.array(body, dtype=float)
+        self._K, self._S = np.empty((0, 3, len(body))), np.empty((0, 3, 3))
+        self._P_c, self._P_cc = np.empty((0, len(body))), np.empty((0, 0))
+        self.window = Window(len(body))
+        self._root: Array | None = None
+
+    # --- what it is ---------------------------------------------------------------------------------------------------
+
+    @property
+    def landmarks(self) -> int:
+        return len(self._K)
+
+    @property
+    def width(self) -> int:
+        """Number n_X of columns of X."""
+        return len(self._P)
+
+    @property
+    def P(self) -> Array:
+        return self.covariance_of(np.arange(self.landmarks))
+
+    @property
+    def is_finite(self) -> bool:
+        return all(bool(np.isfinite(part).all()) for part in (self._P, self._K, self._S))
+
+    @property
+    def body_covariance(self) -> Array:
+        b = self.body - self.considered
+        P = np.empty((self.body, self.body))
+        P[:b, :b], P[b:, :b], P[b:, b:] = self._P[:b, :b], self._P_c[:, :b], self._P_cc
+        P[:b, b:] = P[b:, :b].T
+        return P
+
+    def landmark_blocks(self, slot: IntArray | None = None) -> Array:
+        K, S = (self._K, self._S) if slot is None else (self._K[slot], self._S[slot])
+        k = len(K)
+        return (K.reshape(3 * k, -1) @ self._P).reshape(k, 3, -1) @ K.swapaxes(1, 2) + S
+
+    def covariance_of(self, slot: IntArray) -> Array:
+        b, k = self.body, len(slot)
+        K = self._K[slot].reshape(3 * k, self.width)
+        P = np.empty((b + 3 * k, b + 3 * k))
+        P[:b, :b] = self.body_covariance
+        KP = K @ self._P
+        P[b:, : b - self.considered] = KP[:, : b - self.considered]
+        P[b:, b - self.considered : b] = K @ self._P_c.T
+        P[:b, b:] = P[b:, :b].T
+        P_mm, own = KP @ K.T, np.arange(k)
+        P_mm = _symmetric(P_mm)
+        P_mm.reshape(k, 3, k, 3)[own, :, own, :] += self._S[slot]
+        P[b:, b:] = P_mm
+        return P
+
+    @property
+    def root(self) -> Array:
+        """(n_X, f) F of ``P_X = F F^T``."""
+        if self._root is None:
+            F, failed = lapack.dpotrf(self._P.T, lower=1, clean=1)
+            self._root = _pivoted_root(self._P) if failed else F
+        return self._root
+
+    # --- what changes the body ----------------------------------------------------------------------------------------
+
+    def consider(self, columns: int) -> int:
+        start = self.body
+        self._P_c = np.concatenate([self._P_c, np.zeros((columns, self.width))])
+        self._P_cc = np.pad(self._P_cc, (0, columns))
+        self.body, self.considered = start + columns, self.considered + columns
+        return start
+
+    def clone(self, source: slice, to: slice) -> None:
+        first = self.body - self.considered
+        at = slice(to.start - first, to.stop - first)
+        self._P_cc[at] = self._P_c[:, source].T
+        self._P_c[at] = self._P[source]
+        self._P_cc[:, at] = self._P_cc[at].T
+        self._P_cc[at, at] = self._P[source, source]
+
+    def propagate(self, Phi: Array, Q: Array) -> None:
+        move = self.window.propagate(Phi, Q)
+        b, joined = len(Phi), move.promoted
+        K_joined = self._K[joined].reshape(-1, self.width)
+        A = np.concatenate([Phi @ self._P[:b], self._P[move.kept], K_joined @ self._P])
+        P = np.concatenate([A[:, :b] @ Phi.T, A[:, move.kept], A @ K_joined.T], axis=1)
+        P[:b, :b] += Q
+        _add_blocks(P, len(P) - 3 * len(joined), self._S[joined])
+        self._P = _symmetric(P)
+        P_c = self._P_c
+        self._P_c = np.concatenate([P_c[:, :b] @ Phi.T, P_c[:, move.kept], P_c @ K_joined.T], axis=1)
+        K = np.zeros((self.landmarks, 3, len(P)))
+        K[..., move.carried_to] = self._K[..., move.carried_from]
+        K[..., b : b + len(move.kept)] = self._K[..., move.kept]
+        _promote(K, joined, self.window.promoted[joined])
+        self._S[joined] = 0.0
+        self._K, self._root = K, None
+
+    def transform_body(self, at: slice, A: Array) -> None:
+        transform(self._P, at, A)
+        self._P_c[:, at] = self._P_c[:, at] @ A.T
+        self._K[..., at] = self._K[..., at] @ np.linalg.inv(A)
+        self._root = None
+
+    # --- conditioning -------------------------------------------------------------------------------------------------
+
+    def project(self, rows: Rows, frame: int, ids: IntArray) -> ConditionalProjection:
+        k, d = rows.residual.shape
+        S_H = self._S[rows.slot] @ rows.H_m.swapaxes(1, 2)
+        R = rows.H_m @ S_H
+        R[:, np.arange(d), np.arange(d)] += rows.variance
+        try:
+            L = np.linalg.cholesky(R)
+        except np.linalg.LinAlgError:
+            raise InnovationError(frame, ids) from None
+        L_inverse = np.linalg.inv(L)
+        B = (L_inverse @ rows.H_m) @ self._K[rows.slot]
+        B[..., : self.seen] += L_inverse @ rows.H_x
+        F = self.root
+        T = (B.reshape(k * d, self.width) @ F).reshape(k, d, F.shape[1])
+        return ConditionalProjection(rows, L, B, T, S_H @ L_inverse.swapaxes(1, 2))
+
+    def solve(self, projection: Projection, frame: int, ids: IntArray) -> ConditionalSolution:
+        assert isinstance(projection, ConditionalProjection)
+        w = np.linalg.solve(projection.L, projection.rows.residual[..., None])[..., 0]
+        everything = np.ones(len(w), dtype=bool)
+        blank = ConditionalSolution(self, projection, w, np.empty((0, 0)), everything)
+        try:
+            return self.solve_left(blank)
+        except np.linalg.LinAlgError:
+            raise InnovationError(frame, ids) from None
+
+    def solve_body(self, H: Array, residual: Array, variance: Array, frame: int) -> ConditionalSolution:
+        k, std = len(H), np.sqrt(variance)
+        B = np.zeros((k, 1, self.width))
+        B[:, 0, : H.shape[1]] = H / std[:, None]
+        none = np.empty((k, 1, 0))
+        rows = Rows(np.empty(0, dtype=np.int64), none, none, residual[:, None], variance[:, None])
+        T = (B[:, 0] @ self.root)[:, None]
+        projection = ConditionalProjection(rows, std[:, None, None], B, T, np.empty((k, 0, 1)))
+        return self.solve(projection, frame, np.empty(0, dtype=np.int64))
+
+    def solve_left(self, solution: ConditionalSolution) -> ConditionalSolution:
+        """The solution for the rows that are left: ``M = I + T^T T`` factorised.
+
+        Raises:
+            numpy.linalg.LinAlgError: M is not finite.
+        """
+        T = solution.at.T[solution.left]
+        M = np.eye(T.shape[2], order="F")
+        if len(T):
+            # dsyrk of LAPACK's T^T, which is the row-major T.
+            M = blas.dsyrk(1.0, T.reshape(-1, T.shape[2]).T, beta=1.0, c=M, overwrite_c=1)
+        U, failed = lapack.dpotrf(M, lower=0, clean=1, overwrite_a=1)
+        if failed or not np.isfinite(U.diagonal()).all():
+            raise np.linalg.LinAlgError("M is not positive definite")
+        return ConditionalSolution(self, solution.at, solution.w, U, solution.left)
+
+    def correction(self, solution: ConditionalSolution) -> Array:
+        """(body+3n,) of the mean."""
+        x, at = solution.x, solution.at
+        b = self.body - self.considered
+        d = (self._K.reshape(-1, self.width) @ x).reshape(-1, 3)
+        left = solution.left
+        if at.G.shape[1]:
+            d[at.rows.slot[left]] += (at.G[left] @ solution.residual[left][..., None])[..., 0]
+        correction = np.concatenate([x[:b], np.zeros(self.considered), d.ravel()])
+        return full_correction(correction, self.body, self.considered)
+
+    def apply(self, solution: Solution) -> None:
+        assert isinstance(solution, ConditionalSolution)
+        at, left, W, _ = solution.at, solution.left, solution.W, solution.done
+        if self.considered:
+            along = self._P_c @ at.B[left].reshape(-1, self.width).T
+            Z = solution.Z.reshape(*solution.w.shape, -1)[left].reshape(-1, W.shape[1])
+            self._P_c = self._P_c - (along @ Z) @ W.T
+        self._P, self._root = W @ W.T, None
+        if at.G.shape[1]:
+            slot, G = at.rows.slot[left], at.G[left]
+            self._K[slot] -= G @ at.B[left]
+            self._S[slot] = _symmetric(self._S[slot] - G @ G.swapaxes(1, 2))
+            self.window.refer(np.flatnonzero(at.rows.H_x[left].any(axis=(0, 1))))
+
+    # --- landmarks ----------------------------------------------------------------------------------------------------
+
+    def augment(self, G: Array, covariance: Array) -> None:
+        K = np.zeros((len(G), 3, self.width))
+        K[..., : self.seen] = G
+        self._K = np.concatenate([self._K, K])
+        self._S = np.concatenate([self._S, covariance])
+        self.window.augment(len(G))
+        self.window.refer(np.flatnonzero(G.any(axis=(0, 1))))
+
+    def transform_landmarks(self, M: Array | None, B: Array, columns: IntArray) -> None:
+        promoted = self.window.promoted
+        slot = np.flatnonzero(promoted >= 0)
+        if len(slot):
+            self._transform_promoted(_columns(promoted[slot]), None if M is None else M[slot], B[slot], columns)
+        if M is not None:
+            self._K = M @ self._K
+            self._S = _symmetric(M @ self._S @ M.swapaxes(1, 2))
+        self._K[..., columns] += B
+        _promote(self._K, slot, promoted[slot])
+        self.window.refer(columns)
+        self._root = None
+
+    def _transform_promoted(self, own: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
+        """The same for promoted landmarks, which have the columns ``own`` of X."""
+        P, k = self._P, len(B)
+        B = B.reshape(3 * k, -1)
+        rows = P[own] if M is None else (M @ P[own].reshape(k, 3, -1)).reshape(3 * k, -1)
+        rows = rows + B @ P[columns]
+        right = rows[:, own]
+        if M is not None:
+            right = (right.reshape(3 * k, k, 1, 3) @ M.swapaxes(1, 2)).reshape(3 * k, 3 * k)
+        right = right + rows[:, columns] @ B.T
+        P[own] = rows
+        P[:, own] = rows.T
+        P[np.ix_(own, own)] = _symmetric(right)
+        P_c = self._P_c[:, own]
+        if M is not None:
+            P_c = (P_c.reshape(len(P_c), k, 1, 3) @ M.swapaxes(1, 2)).reshape(len(P_c), 3 * k)
+        self._P_c[:, own] = P_c + self._P_c[:, columns] @ B.T
+
+    def marginalise(self, stay: BoolArray) -> None:
+        kept = self.window.marginalise(stay)
+        self._K, self._S = self._K[stay][..., kept], self._S[stay]
+        self._P, self._P_c, self._root = self._P[np.ix_(kept, kept)], self._P_c[:, kept], None
+
+    def replace(self, P: Array) -> None:
+        b = self.body - self.considered
+        kept = np.delete(np.arange(len(P)), slice(b, self.body))
+        n = (len(kept) - b) // 3
+        self._P, self._P_c = P[np.ix_(kept, kept)], P[b : self.body, kept]
+        self._P_cc, self._root = P[b : self.body, b : self.body].copy(), None
+        self._K, self._S = np.zeros((n, 3, len(kept))), np.zeros((n, 3, 3))
+        self.window = Window(b, n)
+        _promote(self._K, np.arange(n), self.window.promoted)
+
+
+def _symmetric(blocks: Array) -> Array:
+    return 0.5 * (blocks + blocks.swapaxes(-1, -2))
+
+
+def _columns(first: IntArray) -> IntArray:
+    """Columns (3n,) of landmarks by their first ones."""
+    return (first[:, None] + np.arange(3)).ravel()
+
+
+def _promote(K: Array, slot: IntArray, first: IntArray) -> None:
+    """``K_i`` of landmarks that are columns of X."""
+    K[slot] = 0.0
+    axis = np.arange(3)
+    K[slot[:, None], axis, first[:, None] + axis] = 1.0
+
+
+def _add_blocks(P: Array, start: int, blocks: Array) -> None:
+    """Add blocks (k, 3, 3) to the diagonal of P from a column on."""
+    at = start + 3 * np.arange(len(blocks))[:, None] + np.arange(3)
+    P[at[:, :, None], at[:, None, :]] += blocks
+
+
+def _pivoted_root(P: Array) -> Array:
+    """F (n, f) of ``P = F F^T`` where P is singular: what is known for certain has no column."""
+    std = np.sqrt(np.maximum(P.diagonal(), 0.0))
+    scale = np.divide(1.0, std, out=np.zeros_like(std), where=std > 0)
+    L, pivots, rank, _ = lapack.dpstrf(P * np.outer(scale, scale), lower=1)
+    F = np.zeros((len(P), rank), order="F")
+    F[pivots - 1] = np.tril(L)[:, :rank]
+    return F * std[:, None]

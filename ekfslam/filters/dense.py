@@ -1,0 +1,277 @@
+"""The dense form of the joint covariance: one matrix P. Readable, the oracle of the other form, fast for small frames.
+
+Every verb equals its naive form ``F P F^T + Q``, ``P - K S K^T`` and so on to rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.errors import InnovationError
+from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, full_correction, share_of
+
+
+@dataclass(frozen=True)
+class DenseProjection(Projection):
+    """``H P`` (k d, body+3n) and ``H P H^T`` (k d, k d) of rows."""
+
+    rows: Rows
+    HP: Array
+    HPH: Array
+
+    @property
+    def variances(self) -> Array:
+        k, d = self.rows.residual.shape
+        own = np.arange(k)
+        return self.HPH.reshape(k, d, k, d)[own, :, own, :]
+
+    def only(self, which: IntArray) -> DenseProjection:
+        d = self.rows.residual.shape[1]
+        row = (d * which[:, None] + np.arange(d)).ravel()
+        return DenseProjection(self.rows.only(which), self.HP[row], self.HPH[np.ix_(row, row)])
+
+
+@dataclass(frozen=True)
+class DenseSolution(Solution):
+    """Eq. (6) with ``S = L L^T``.
+
+    Rows are taken out by projection: what is left of the whitened rows is orthogonal to ``A = L^-1 E`` of those
+    rows E, because ``S_kk^-1 = L^-T (I - A (A^T A)^-1 A^T) L^-1``.
+
+    Args:
+        Y: (body+3n, m) ``Y^T = (L^-1 H P)^T``, by whose square P shrinks.
+        L: (m, m), of which only the lower triangle counts.
+        white: (m,) ``L^-1 r``.
+        log_det: ``log det S``.
+        shape: (k, d) of the rows; one row each where they are of the body alone.
+        variance: (m,).
+        body, considered: Of the covariance.
+        left: (k,) which landmarks are left; None: all.
+        Q: (m, r) orthonormal basis of what has been taken out.
+    """
+
+    Y: Array
+    L: Array
+    white: Array
+    log_det: float
+    shape: tuple[int, int]
+    variance: Array
+    body: int
+    considered: int
+    left: BoolArray | None = None
+    Q: Array | None = None
+
+    @cached_property
+    def done(self) -> Conditioned:
+        correction = full_correction(self.Y @ self.white, self.body, self.considered)
+        return Conditioned(correction, float(self.white @ self.white), self.log_det)
+
+    def given_others(self) -> Array:
+        inverse, _ = lapack.dtrtri(self.L, lower=1)
+        k, d = self.shape
+        columns = np.tril(inverse).T.reshape(k, d, k * d)
+        return share_of(columns @ columns.swapaxes(1, 2), self.variance.reshape(k, d))
+
+    def without(self, out: BoolArray) -> DenseSolution:
+        assert self.Q is None
+        d, out_rows = self.shape[1], np.repeat(out, self.shape[1])
+        E = np.zeros((len(out_rows), d * int(out.sum())))
+        E[out_rows, np.arange(E.shape[1])] = 1.0
+        Q, R = np.linalg.qr(blas.dtrsm(1.0, self.L, E, lower=1))
+        white = self.white - Q @ (Q.T @ self.white)
+        log_det = self.log_det + 2.0 * float(np.log(np.abs(R.diagonal())).sum())
+        if out.all():  # so that rounding is not left over
+            white, log_det = np.zeros_like(white), 0.0
+        return replace(self, Y=self.Y - (self.Y @ Q) @ Q.T, white=white, log_det=log_det, left=~out, Q=Q)
+
+    def information(self, J: Array) -> Array:
+        k, d = self.shape
+        wide = np.zeros((k, d, J.shape[-1]))
+        wide[slice(None) if self.left is None else self.left] = J
+        A = blas.dtrsm(1.0, self.L, wide.reshape(k * d, -1), lower=1)
+        if self.Q is not None:
+            A -= self.Q @ (self.Q.T @ A)
+        return A.T @ A
+
+
+class DenseGaussian(Gaussian):
+    """Dense covariance ``P`` (body+3n, body+3n).
+
+    Args:
+        body: (body, body) covariance before there are landmarks.
+        seen: Leading body columns that observations depend on.
+    """
+
+    def __init__(self, body: Array, seen: int) -> None:
+        self._P, self.body, self.seen = np.array(body, dtype=float), len(body), seen
+        self.considered = 0
+
+    @property
+    def P(self) -> Array:
+        return self._P
+
+    @property
+    def landmarks(self) -> int:
+        return (len(self._P) - self.body) // 3
+
+    @property
+    def is_finite(self) -> bool:
+        return bool(np.isfinite(self._P).all())
+
+    @property
+    def body_covariance(self) -> Array:
+        return self._P[: self.body, : self.body].copy()
+
+    def landmark_blocks(self, slot: IntArray | None = None) -> Array:
+        b, (row, column) = self.body, self._P.strides
+        blocks = np.lib.stride_tricks.as_strided(
+            self._P[b:, b:], (self.landmarks, 3, 3), (3 * (row + column), row, column), writeable=False
+        )
+        return blocks if slot is None else blocks[slot]
+
+    def covariance_of(self, slot: IntArray) -> Array:
+        columns = np.concatenate([np.arange(self.body), self._columns(slot)])
+        return self._P[np.ix_(columns, columns)]
+
+    def _columns(self, slot: IntArray) -> IntArray:
+        return (self.body + 3 * slot[:, None] + np.arange(3)).ravel()
+
+    def consider(self, columns: int) -> int:
+        start = self.body
+        self._P = np.insert(np.insert(self._P, [start] * columns, 0.0, axis=0), [start] * columns, 0.0, axis=1)
+        self.body, self.considered = start + columns, self.considered + columns
+        return start
+
+    def clone(self, source: slice, to: slice) -> None:
+        P = self._P
+        P[to] = P[source]
+        P[:, to] = P[to].T
+        P[to, to] = P[source, source]
+
+    def propagate(self, Phi: Array, Q: Array) -> None:
+        b, P = len(Phi), self._P
+        P_b = Phi @ P[:b]
+        P_bb = P_b[:, :b] @ Phi.T + Q
+        P[:b, b:] = P_b[:, b:]
+        P[b:, :b] = P_b[:, b:].T
+        P[:b, :b] = 0.5 * (P_bb + P_bb.T)
+
+    def project(self, rows: Rows, frame: int, ids: IntArray) -> DenseProjection:
+        k, d, size = *rows.residual.shape, len(self._P)
+        H_x, seen = rows.H_x.reshape(k * d, self.seen), self.seen
+        HP = (H_x @ self._P[:seen]).reshape(k, d, size)
+        HP += rows.H_m @ self._P[self.body :].reshape(self.landmarks, 3, size)[rows.slot]
+        HP = HP.reshape(k * d, size)
+        HPH = (rows.H_m @ HP.T[self._columns(rows.slot)].reshape(k, 3, k * d)).reshape(k * d, k * d)
+        HPH += H_x @ HP[:, :seen].T
+        return DenseProjection(rows, HP, HPH)
+
+    def solve(self, projection: Projection, frame: int, ids: IntArray) -> DenseSolution:
+        assert isinstance(projection, DenseProjection)
+        rows = projection.rows
+        return self._solve(projection.HP, projection.HPH, rows.residual, rows.variance, frame, ids)
+
+    def solve_body(self, H: Array, residual: Array, variance: Array, frame: int) -> DenseSolution:
+        HP = H @ self._P[: H.shape[1]]
+        HPH, nobody = HP[:, : H.shape[1]] @ H.T, np.empty(0, dtype=np.int64)
+        return self._solve(HP, HPH, residual[:, None], variance[:, None], frame, nobody)
+
+    def _solve(
+        self, HP: Array, HPH: Array, residual: Array, variance: Array, frame: int, ids: IntArray
+    ) -> DenseSolution:
+        S = HPH.copy()
+        S.ravel()[:: len(S) + 1] += variance.ravel()
+        # LAPACK sees row-major arrays as their transposes: S is symmetric, and (H P)^T is what dtrsm wants.
+        L, failed = lapack.dpotrf(S.T, lower=1, clean=0, overwrite_a=1)
+        if failed or not np.isfinite(L.diagonal()).all():
+            raise InnovationError(frame, ids)
+        Y = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1)
+        white = blas.dtrsm(1.0, L, residual.reshape(-1, 1), lower=1)[:, 0]
+        log_det = 2.0 * float(np.log(L.diagonal()).sum())
+        k, d = residual.shape
+        return DenseSolution(Y, L, white, log_det, (k, d), variance.ravel(), self.body, self.considered)
+
+    def apply(self, solution: Solution) -> None:
+        assert isinstance(solution, DenseSolution)
+        at = slice(self.body - self.considered, self.body)
+        own = self._P[at, at].copy()
+        add_square(self._P, solution.Y, -1.0)
+        self._P[at, at] = own
+
+    def augment(self, G: Array, covariance: Array) -> None:
+        n = len(G)
+        G = G.reshape(3 * n, self.seen)
+        size, grown = len(self._P), len(self._P) + 3 * n
+        P = np.empty((grown, grown))
+        P[:size, :size] = self._P
+        P[size:, :size] = G @ self._P[: self.seen]
+        P[:size, size:] = P[size:, :size].T
+        P_new = P[size:, : self.seen] @ G.T
+        P[size:, size:] = 0.5 * (P_new + P_new.T)
+        block = np.arange(n)
+        P[size:, size:].reshape(n, 3, n, 3)[block, :, block, :] += covariance
+        self._P = P
+
+    def transform_landmarks(self, M: Array | None, B: Array, columns: IntArray) -> None:
+        b, P, n = self.body, self._P, self.landmarks
+        if M is None:
+            # d+ = d + B a, hence P+ = P + B Z^T + Z B^T with Z = P_a + B P_aa / 2.
+            wide = np.zeros((len(P), len(columns)))
+            wide[b:] = B.reshape(-1, len(columns))
+            add_product(P, wide, P[:, columns] + 0.5 * wide @ P[np.ix_(columns, columns)])
+            return
+        B = B.reshape(3 * n, len(columns))
+        rows = (M @ P[b:].reshape(n, 3, len(P))).reshape(3 * n, len(P))
+        rows += B @ P[columns]
+        P_mm = (M @ rows[:, b:].T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
+        P_mm += B @ rows[:, columns].T
+        P[b:, :b] = rows[:, :b]
+        P[:b, b:] = P[b:, :b].T
+        np.multiply(P_mm + P_mm.T, 0.5, out=P[b:, b:])
+
+    def transform_body(self, at: slice, A: Array) -> None:
+        transform(self._P, at, A)
+
+    def marginalise(self, stay: BoolArray) -> None:
+        kept = np.flatnonzero(np.concatenate([np.ones(self.body, dtype=bool), np.repeat(stay, 3)]))
+        self._P = self._P[kept].take(kept, axis=1)
+
+    def replace(self, P: Array) -> None:
+        self._P = np.ascontiguousarray(P, dtype=float)
+
+
+def transform(P: Array, at: slice, A: Array) -> None:
+    """``x_at <- A x_at`` in place, for symmetric P."""
+    P[at] = A @ P[at]
+    P[:, at] = P[at].T
+    P_xx = A @ P[at, at]
+    P[at, at] = 0.5 * (P_xx + P_xx.T)
+
+
+def add_square(P: Array, A: Array, sign: float) -> None:
+    """``P += sign A A^T`` in place, for symmetric C-ordered P (n, n) and A (n, k); symmetric to the last bit."""
+    _require_order(P)
+    # NumPy's row-major P is LAPACK's column-major P^T: the upper triangle there is the lower one here.
+    blas.dsyrk(sign, A, beta=1.0, c=P.T, lower=0, overwrite_c=1)
+    _mirror(P)
+
+
+def add_product(P: Array, A: Array, B: Array) -> None:
+    """``P += A B^T + B A^T`` in place, for symmetric C-ordered P (n, n), A and B (n, k)."""
+    _require_order(P)
+    blas.dsyr2k(1.0, A, B, beta=1.0, c=P.T, lower=0, overwrite_c=1)
+    _mirror(P)
+
+
+def _require_order(P: Array) -> None:
+    if not P.flags.c_contiguous:
+        raise ValueError("P must be C-contiguous, or BLAS would update a copy of it")
+
+
+def _mirror(P: Array) -> None:
+    np.copyto(P, P.T, where=~np.tri(len(P), dtype=bool))
