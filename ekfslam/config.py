@@ -22,6 +22,7 @@ Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
 Variant = Literal["invariant", "fej", "standard"]
 LandmarkCoordinates = Literal["image", "xyz"]
 Retire = Literal["auto", "unseen", "never"]
+CovarianceForm = Literal["auto", "dense", "conditional"]
 Linearisation = Literal["map", "filtered"]
 NoiseModel = Literal["auto", "tuned", "white"]
 Kernel = Literal["huber", "cauchy", "none"]
@@ -168,6 +169,9 @@ class FilterConfig:
         landmark_coordinates: In which coordinates a correction acts on landmarks. ``image``: as their images in the
             last updated camera, where their errors are Gaussian, see `ekfslam.filters.coordinates`; sensors that are no
             cameras have none and go by ``xyz``. ``xyz``: as positions in world, which is the textbook's form.
+        covariance_form: How the joint covariance is kept; estimates are the same. ``dense``: as one matrix.
+            ``conditional``: see `ekfslam.filters.conditional`, linear in the number of landmarks. ``auto`` takes what
+            costs less for a sequence.
         iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. Not for ``fej``, nor for ``xyz``, where
             they take the depth of landmarks at the wrong point and make all distances too short.
         retire: ``unseen`` marginalises a landmark when it is out of view, ``never`` keeps all; ``auto`` is ``never``
@@ -193,6 +197,7 @@ class FilterConfig:
 
     variant: Variant = field(default="invariant", metadata=_one_of(Variant))
     landmark_coordinates: LandmarkCoordinates = field(default="image", metadata=_one_of(LandmarkCoordinates))
+    covariance_form: CovarianceForm = field(default="auto", metadata=_one_of(CovarianceForm))
     iterations: int = field(default=1, metadata=_whole(1))
     retire: Retire = field(default="auto", metadata=_one_of(Retire))
     retire_after: int | None = field(default=None, metadata=_whole(1))

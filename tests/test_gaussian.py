@@ -89,9 +89,7 @@ def rows_of(rng, slots, d=3):
     k = len(slots)
     H_x = rng.normal(size=(k, d, SEEN))
     H_x[rng.random(k) < 0.5, :, CLONE] = 0.0
-    return Rows(
-        np.array(slots), H_x, rng.normal(size=(k, d, 3)), rng.normal(size=(k, d)), rng.uniform(0.5, 2, (k, d))
-    )
+    return Rows(np.array(slots), H_x, rng.normal(size=(k, d, 3)), rng.normal(size=(k, d)), rng.uniform(0.5, 2, (k, d)))
 
 
 def same(gaussian, naive, scale=1e-9):
@@ -109,7 +107,9 @@ def same(gaussian, naive, scale=1e-9):
         columns = np.concatenate([np.arange(naive.b), own])
         part = naive.P[np.ix_(columns, columns)]
         assert (np.abs(gaussian.covariance_of(slot) - part) <= scale[np.ix_(columns, columns)]).all()
-        np.testing.assert_allclose(gaussian.landmark_blocks(slot)[0], part[naive.b : naive.b + 3, naive.b : naive.b + 3])
+        np.testing.assert_allclose(
+            gaussian.landmark_blocks(slot)[0], part[naive.b : naive.b + 3, naive.b : naive.b + 3]
+        )
         np.testing.assert_allclose(gaussian.landmark_blocks()[2], gaussian.landmark_blocks(slot)[0])
 
 

@@ -5,8 +5,8 @@ what its columns were some frames ago (the *window*), and a few *promoted* landm
 
     N(x_X; 0, P_X) prod_i N(d_i; K_i x_X, S_i)
 
-P_X (n_X, n_X) is dense, K_i is (3, n_X), S_i (3, 3). A promoted landmark is part of X; its K_i has ones at its own columns
-and its S_i is zero, so that what follows holds for it as it stands. With rows ``r_i = H_x x + H_m d_i + v``, eq. (6) is
+P_X (n_X, n_X) is dense, K_i is (3, n_X), S_i (3, 3). A promoted landmark is part of X; its K_i has ones at its own
+columns and its S_i is zero, so that what follows holds for it, too. With rows ``r_i = H_x x + H_m d_i + v``, eq. (6) is
 
     R_i = H_m S_i H_m^T + V = L_i L_i^T        B_i = L_i^-1 (H_x + H_m K_i)        w_i = L_i^-1 r_i
     P_X = F F^T        T = B F        M = I + T^T T = U^T U        W = F U^-1        u = U^-T T^T w
@@ -14,7 +14,7 @@ and its S_i is zero, so that what follows holds for it as it stands. With rows `
     K_i+ = K_i - G_i B_i              S_i+ = S_i - G_i G_i^T
 
 and ``S^-1 = L^-T (I - Z Z^T) L^-1`` with ``Z = T U^-1``. Kin: Guivant and Nebot, "Optimization of the simultaneous
-localization and map-building algorithm for real-time implementation", T-RA 2001 (compressed filter); Bailey, thesis, 2002.
+localization and map-building algorithm for real-time implementation", T-RA 2001 (compressed filter).
 """
 
 from __future__ import annotations
@@ -58,9 +58,7 @@ class ConditionalProjection(Projection):
         return square
 
     def only(self, which: IntArray) -> ConditionalProjection:
-        return ConditionalProjection(
-            self.rows.only(which), self.L[which], self.B[which], self.T[which], self.G[which]
-        )
+        return ConditionalProjection(self.rows.only(which), self.L[which], self.B[which], self.T[which], self.G[which])
 
 
 @dataclass(frozen=True)
@@ -82,10 +80,16 @@ class ConditionalSolution(Solution):
     left: BoolArray
 
     @cached_property
+    def T(self) -> Array:
+        """(j d, f) of the rows that are left."""
+        T = self.at.T if self.left.all() else self.at.T[self.left]
+        return T.reshape(-1, T.shape[2])
+
+    @cached_property
     def u(self) -> Array:
         """(f,) ``U^-T T^T w``."""
-        T, w = self.at.T[self.left], self.w[self.left]
-        return blas.dtrsm(1.0, self.U, (T.reshape(-1, T.shape[2]).T @ w.ravel())[:, None], lower=0, trans_a=1)[:, 0]
+        along = self.T.T @ self.w[self.left].ravel()
+        return blas.dtrsm(1.0, self.U, along[:, None], lower=0, trans_a=1)[:, 0]
 
     @cached_property
     def W(self) -> Array:
@@ -129,7 +133,7 @@ class ConditionalSolution(Solution):
     def information(self, J: Array) -> Array:
         k, d, c = J.shape
         A = np.linalg.solve(self.at.L[self.left], J).reshape(k * d, c)
-        along = self.Z.reshape(*self.w.shape, -1)[self.left].reshape(k * d, -1).T @ A
+        along = blas.dtrsm(1.0, self.U, self.T.T @ A, lower=0, trans_a=1)
         return A.T @ A - along.T @ along
 
 
@@ -256,7 +260,7 @@ class ConditionalGaussian(Gaussian):
         R = rows.H_m @ S_H
         R[:, np.arange(d), np.arange(d)] += rows.variance
         try:
-            L = np.linalg.cholesky(R)
+            L = np.asarray(np.linalg.cholesky(R), dtype=float)
         except np.linalg.LinAlgError:
             raise InnovationError(frame, ids) from None
         L_inverse = np.linalg.inv(L)
@@ -268,7 +272,7 @@ class ConditionalGaussian(Gaussian):
 
     def solve(self, projection: Projection, frame: int, ids: IntArray) -> ConditionalSolution:
         assert isinstance(projection, ConditionalProjection)
-        w = np.linalg.solve(projection.L, projection.rows.residual[..., None])[..., 0]
+        w = np.asarray(np.linalg.solve(projection.L, projection.rows.residual[..., None])[..., 0], dtype=float)
         everything = np.ones(len(w), dtype=bool)
         blank = ConditionalSolution(self, projection, w, np.empty((0, 0)), everything)
         try:
@@ -292,11 +296,10 @@ class ConditionalGaussian(Gaussian):
         Raises:
             numpy.linalg.LinAlgError: M is not finite.
         """
-        T = solution.at.T[solution.left]
-        M = np.eye(T.shape[2], order="F")
-        if len(T):
-            # dsyrk of LAPACK's T^T, which is the row-major T.
-            M = blas.dsyrk(1.0, T.reshape(-1, T.shape[2]).T, beta=1.0, c=M, overwrite_c=1)
+        M = np.eye(solution.T.shape[1], order="F")
+        if len(solution.T):
+            # A row-major T is LAPACK's T^T.
+            M = blas.dsyrk(1.0, solution.T.T, beta=1.0, c=M, overwrite_c=1)
         U, failed = lapack.dpotrf(M, lower=0, clean=1, overwrite_a=1)
         if failed or not np.isfinite(U.diagonal()).all():
             raise np.linalg.LinAlgError("M is not positive definite")
@@ -318,8 +321,7 @@ class ConditionalGaussian(Gaussian):
         at, left, W, _ = solution.at, solution.left, solution.W, solution.done
         if self.considered:
             along = self._P_c @ at.B[left].reshape(-1, self.width).T
-            Z = solution.Z.reshape(*solution.w.shape, -1)[left].reshape(-1, W.shape[1])
-            self._P_c = self._P_c - (along @ Z) @ W.T
+            self._P_c = self._P_c - blas.dtrsm(1.0, solution.U, along @ solution.T, side=1, lower=0) @ W.T
         self._P, self._root = W @ W.T, None
         if at.G.shape[1]:
             slot, G = at.rows.slot[left], at.G[left]

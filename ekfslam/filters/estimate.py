@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import FilterConfig
 from ekfslam.errors import ConfigError
+from ekfslam.filters.conditional import ConditionalGaussian
 from ekfslam.filters.coordinates import CameraCoordinates, Change, View
 from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.gaussian import Gaussian, Rows
@@ -47,7 +48,7 @@ class Estimate:
 
     Args:
         model: Blocks, sensor and noise.
-        config: Variant, gate and limits.
+        config: Variant, gate, limits, and the form of the covariance (``auto`` counts as ``dense``).
 
     Raises:
         ConfigError: Landmarks in image coordinates, but no clone of the last pose in the model.
@@ -74,7 +75,8 @@ class Estimate:
         self.values = model.initial_values()
         self.coordinates = np.zeros(model.layout.body)
         self.table = LandmarkTable(model.sensor.dimension)
-        self.gaussian: Gaussian = DenseGaussian(model.prior_covariance, model.layout.seen)
+        form = ConditionalGaussian if config.covariance_form == "conditional" else DenseGaussian
+        self.gaussian: Gaussian = form(model.prior_covariance, model.layout.seen)
         self.T_predicted = self.T_predicted_before = self.T_departed = self.values["pose"]
         self.imu_twist = self.imu_twist_before = np.zeros(6)
         self.tau_s, self.way_m, self.step = 0.0, np.zeros(()), 0

@@ -102,7 +102,7 @@ class Window:
         return carried, to[carried], np.flatnonzero(self._is_referenced & (to < 0))
 
     def _cut(self, group: IntArray) -> tuple[int, IntArray]:
-        """The oldest group that stays, so that X is as small as possible, and the landmarks that are promoted for it."""
+        """The oldest group that stays, so that X is smallest, and the landmarks that are promoted for it."""
         numbers, widths = np.unique(group[group != _LANDMARK], return_counts=True)
         free = np.flatnonzero(self.promoted < 0)
         since = np.sort(self._since[free])

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.config import CalibrationConfig, Config, FilterConfig, LandmarkCoordinates
+from ekfslam.config import CalibrationConfig, Config, CovarianceForm, FilterConfig, LandmarkCoordinates
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import WITHOUT_TRACKS, Sequence
@@ -33,6 +33,7 @@ from ekfslam.models.blocks import (
     Up,
 )
 from ekfslam.models.blocks.calibration import prior_std
+from ekfslam.models.form import is_conditional_cheaper
 from ekfslam.models.model import Model
 from ekfslam.models.noise import (
     CAMERA_ROTATION_DEG,
@@ -116,6 +117,7 @@ def build(
         (*optional_blocks(config.blocks), *blocks),
         config.filter.landmark_coordinates,
     )
+    config = _with_form(config, sequence, model)
     return Problem(sequence, config, model, hygiene, account)
 
 
@@ -206,6 +208,20 @@ def resolve(config: Config, sequence: Sequence) -> Config:
         retire_after = 10 if come_back else 1
     settings = dataclasses.replace(config.filter, retire=retire, retire_after=retire_after)
     return dataclasses.replace(config, filter=settings)
+
+
+def _with_form(config: Config, sequence: Sequence, model: Model) -> Config:
+    """A configuration with the form of the covariance decided."""
+    settings, layout = config.filter, model.layout
+    if settings.covariance_form != "auto":
+        return config
+    # What has a clone stays for a frame: as its clone.
+    moving = (block for block in layout.blocks if block.is_seen and (block.per_frame or block.clones))
+    group = sum(block.size for block in moving if block.name not in layout.clones)
+    stay = len(sequence) if settings.retire == "never" else settings.retire_after or 1
+    cheaper = is_conditional_cheaper(sequence.observations, len(sequence), layout.body, group, stay)
+    form: CovarianceForm = "conditional" if cheaper else "dense"
+    return dataclasses.replace(config, filter=dataclasses.replace(settings, covariance_form=form))
 
 
 def noise_of(sequence: Sequence, config: Config) -> Noise:
