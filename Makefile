@@ -5,13 +5,17 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint results setup clean
+.PHONY: demo test test-whole lint results setup clean
 
 demo: $(READY)
 	$(BIN)/ekfslam compare builtin:city --out results/local
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
+
+# The slow tests at their full length, about an hour on two cores.
+test-whole: $(READY)
+	OPENBLAS_NUM_THREADS=1 EKFSLAM_TESTS=whole $(BIN)/python -m pytest
 
 lint: $(READY)
 	$(BIN)/ruff check .

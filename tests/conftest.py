@@ -8,7 +8,14 @@ from pathlib import Path
 
 import pytest
 
+# The whole form of the slow tests; by default they are reduced: fewer seeds, shorter drives.
+WHOLE = os.environ.get("EKFSLAM_TESTS") == "whole"
 DATA = Path(os.environ.get("EKFSLAM_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+
+
+def seeds(whole: int, reduced: int) -> range:
+    """Seeds of a study: so many in the whole form of the tests, fewer in the reduced one."""
+    return range(whole if WHOLE else reduced)
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import seeds
 from reference import CAMERA, T_CAM_IMU
 from test_jacobians import central
 
@@ -83,7 +84,7 @@ def drive(sequence, sensor, config=OPEN, further=None, **options):
 def test_a_bias_of_the_velocities_is_found_consistently(with_twist):
     """20 drives: NEES of the pose and of the bias, by filter and smoother; expected is 6 each."""
     found = {name: [] for name in ("filter", "smoother", "bias", "smoothed bias")}
-    for seed in range(20):
+    for seed in (drives := seeds(20, 6)):
         sequence, _, offset = walking_world(np.random.default_rng(seed), BIAS)
         noise = sequence.noise if with_twist else NOISE
         ekf, filtered, smoothed, behind = drive(sequence, Rig(CAMERA, T_CAM_IMU, noise), blocks=[BIAS])
@@ -98,8 +99,8 @@ def test_a_bias_of_the_velocities_is_found_consistently(with_twist):
         std = np.sqrt(np.diag(smoothed.block_covariance("twist_bias")[middle]))
         assert (std < 0.8 * np.sqrt(np.diag(BIAS.prior_covariance()))).all()
     means = {name: np.mean(values) for name, values in found.items()}
-    # Four means at once, each over 20 samples: along a drive NEES hardly averages out.
-    low, high = chi2_bounds(6, 0.999, 20)
+    # Four means at once, each over as many samples as drives: along a drive NEES hardly averages out.
+    low, high = chi2_bounds(6, 0.999, len(drives))
     assert all(low < value < high for value in means.values()), means
 
 
@@ -125,7 +126,7 @@ def wheels_of(sequence, twist, rng, period_s=0.04):
 @pytest.mark.slow
 def test_wheels_beside_an_imu_help_and_stay_consistent():
     filtered, behind, variance = [], [], {"with": [], "without": []}
-    for seed in range(20):
+    for seed in (drives := seeds(20, 6)):
         rng = np.random.default_rng(seed)
         sequence, twist, _ = walking_world(rng)
         sequence = dataclasses.replace(
@@ -139,8 +140,9 @@ def test_wheels_beside_an_imu_help_and_stay_consistent():
         behind.append(of_smoother.mean())
         variance["with"].append(np.trace(ekf.P[:6, :6]))
         variance["without"].append(np.trace(drive(sequence, rig)[0].P[:6, :6]))
-    assert 4.55 < np.mean(filtered) < 7.65
-    assert 4.55 < np.mean(behind) < 7.65
+    low, high = chi2_bounds(6, 0.95, len(drives))
+    assert low < np.mean(filtered) < high
+    assert low < np.mean(behind) < high
     assert np.mean(variance["with"]) < 0.8 * np.mean(variance["without"])
 
 
@@ -170,7 +172,7 @@ def test_wheels_belong_to_a_filter_that_estimates_velocities():
 def test_one_camera_maps_consistently():
     """12 drives through the city with the left camera alone: scale comes from the velocities."""
     filtered, behind, error = [], [], {"camera": [], "reckoned": []}
-    for seed in range(12):
+    for seed in (drives := seeds(12, 5)):
         world = builtin(f"city?frames=100&seed={seed}&outlier_fraction=0")
         sensor = Monocular(world.camera, world.T_cam_imu, world.noise)
         ekf, of_filter, smoothed, of_smoother = drive(world, sensor, FilterConfig(retire="unseen", retire_after=1))
@@ -181,8 +183,9 @@ def test_one_camera_maps_consistently():
         reckoned = run(world, "dead-reckoning").T_world_imu
         error["camera"].append(np.linalg.norm(smoothed.T_world_imu[:, :3, 3] - truth, axis=1).mean())
         error["reckoned"].append(np.linalg.norm(reckoned[:, :3, 3] - truth, axis=1).mean())
-    assert 4.2 < np.mean(filtered) < 8.2
-    assert 4.2 < np.mean(behind) < 8.2
+    low, high = chi2_bounds(6, 0.95, len(drives))
+    assert low < np.mean(filtered) < high
+    assert low < np.mean(behind) < high
     assert np.median(error["camera"]) < 0.5 * np.median(error["reckoned"])
 
 

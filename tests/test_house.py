@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import WHOLE
 from helpers import truth_error
 from test_posterior import EVERYTHING, with_everything
 
@@ -80,7 +81,7 @@ def test_every_block_and_errors_of_tracks_in_the_city(variant):
     [({"twist_bias": {}}, UNSHARED), pytest.param(BLOCKS, ALL_BLOCKS, marks=pytest.mark.slow)],
     ids=["unshared", "every"],
 )
-@pytest.mark.parametrize("variant", ["standard", "fej"])
+@pytest.mark.parametrize("variant", ["standard", "fej"] if WHOLE else ["fej"])
 def test_every_block_and_errors_of_tracks_on_a_loop_with_revival(variant, blocks, names):
     settings = {"filter": {"variant": variant, "retire": "unseen", "retire_after": 3, **PRIOR}}
     world = with_everything(builtin("loop?frames=330"))

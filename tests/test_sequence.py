@@ -15,6 +15,7 @@ from recordings import FRAMES, TRACKS, ece276a_fields, utias_fields, write_mat, 
 from ekfslam import errors
 from ekfslam.data.readers import open_sequence, write_sequence
 from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.data.simulate import builtin
 from ekfslam.errors import (
     CalibrationError,
     DataError,
@@ -229,3 +230,38 @@ def test_initial_pose_is_the_true_one_only_where_frame_zero_is_known(valid):
 
 def test_every_data_error_is_an_ekfslam_error():
     assert all(issubclass(kind, errors.EkfslamError) for kind in (DataError, StampError, TruthError, ShapeError))
+
+
+def test_a_stretch_is_a_recording_of_its_own():
+    world = builtin("city?frames=60")
+    part = world[20:50]
+    assert len(part) == 30 and part.attributes["first_frame"] == 20
+    np.testing.assert_array_equal(part.time_s, world.time_s[20:50])
+    np.testing.assert_array_equal(part.initial_T_world_imu, world.truth.T_world_imu[20])
+    for frame in (0, 7, 29):
+        for here, there in zip(part.observations.at(frame), world.observations.at(20 + frame), strict=True):
+            np.testing.assert_array_equal(here, there)
+    assert part[5:].attributes["first_frame"] == 25 and len(world[-10:]) == 10 and len(world[:200]) == 60
+    between = world.between(float(world.time_s[20]), float(world.time_s[50]))
+    np.testing.assert_array_equal(between.twist, part.twist)
+
+
+def test_interpolated_intervals_of_a_stretch_have_other_numbers():
+    world = builtin("city?frames=60")
+    marked = replace(world, attributes={**world.attributes, "interpolated": "22-30"})
+    assert np.flatnonzero(marked[20:50].interpolated).tolist() == list(range(2, 11))
+    assert not marked[40:].interpolated.any()
+
+
+@pytest.mark.parametrize(
+    ("frames", "words"),
+    [
+        (slice(0, 50, 2), "successive"),
+        (7, "successive"),
+        (slice(30, 20), "no frames 30:20"),
+        (slice(70, None), "has 60"),
+    ],
+)
+def test_what_is_no_stretch_is_refused(frames, words):
+    with pytest.raises(ShapeError, match=words):
+        builtin("city?frames=60")[frames]

@@ -49,13 +49,20 @@ def interpolation_attributes(twist: Array) -> dict[str, str]:
 
     It stays with a recording whose velocities are changed, for instance turned or given noise.
     """
-    found = " ".join(f"{begin}-{end}" for begin, end in stretches(interpolated_intervals(twist)))
+    return _attributes(interpolated_intervals(twist))
+
+
+def attributes_of_part(
+    attributes: Mapping[str, str | int | float], is_interpolated: BoolArray
+) -> dict[str, str | int | float]:
+    """Attributes for a part of a recording, whose intervals have other numbers: which (T,) are interpolated."""
+    others = {name: value for name, value in attributes.items() if name != _ATTRIBUTE}
+    return {**others, **_attributes(is_interpolated)}
+
+
+def _attributes(is_interpolated: BoolArray) -> dict[str, str]:
+    found = " ".join(f"{begin}-{end}" for begin, end in stretches(is_interpolated))
     return {_ATTRIBUTE: found} if found else {}
-
-
-def without_interpolation(attributes: Mapping[str, str | int | float]) -> dict[str, str | int | float]:
-    """Attributes for a part of a recording, whose intervals have other numbers."""
-    return {name: value for name, value in attributes.items() if name != _ATTRIBUTE}
 
 
 def known_intervals(attributes: Mapping[str, str | int | float], twist: Array) -> BoolArray:

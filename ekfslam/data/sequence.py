@@ -7,7 +7,7 @@ that names source, field and index.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, get_args
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.data.interpolation import known_intervals
+from ekfslam.data.interpolation import attributes_of_part, known_intervals
 from ekfslam.data.noise import Noise
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import (
@@ -157,6 +157,46 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def __getitem__(self, frames: slice) -> Sequence:
+        """A stretch of successive frames as a recording of its own, ``sequence[100:300]``; frames count from 0 again.
+
+        Raises:
+            ShapeError: Not a slice, or one that skips frames or has none.
+            EmptyTracksError: No landmark is seen in these frames.
+        """
+        if not isinstance(frames, slice) or frames.step not in (None, 1):
+            raise ShapeError("only a stretch of successive frames can be taken, such as sequence[100:300]")
+        begin, end, _ = frames.indices(len(self))
+        if begin >= end:
+            raise ShapeError(f"there are no frames {begin}:{end}, the sequence has {len(self)}", source=self.source)
+        seen = (self.observations.frame >= begin) & (self.observations.frame < end)
+        parts = (self.observations.landmark[seen], self.observations.pixels_px[seen])
+        truth = self.truth
+        if truth is not None:
+            known = (truth.frame >= begin) & (truth.frame < end)
+            frame, T_world_imu = truth.frame[known] - begin, truth.T_world_imu[known]
+            truth = replace(truth, frame=frame, T_world_imu=T_world_imu) if known.any() else None
+        return replace(
+            self,
+            time_s=self.time_s[begin:end],
+            twist=self.twist[begin:end],
+            observations=Observations(self.observations.frame[seen] - begin, *parts),
+            truth=truth,
+            attributes={
+                **attributes_of_part(self.attributes, self.interpolated[begin:end]),
+                "first_frame": int(self.attributes.get("first_frame", 0)) + begin,
+            },
+        )
+
+    def between(self, begin_s: float, end_s: float) -> Sequence:
+        """The frames whose stamps are in ``[begin_s, end_s)``, on the clock of the recording.
+
+        Raises:
+            ShapeError: There are none.
+        """
+        begin, end = np.searchsorted(self.time_s, (begin_s, end_s)).tolist()
+        return self[begin:end]
 
     @cached_property
     def interpolated(self) -> BoolArray:

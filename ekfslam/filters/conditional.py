@@ -27,7 +27,7 @@ from scipy.linalg import blas, lapack
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import InnovationError
-from ekfslam.filters.dense import transform
+from ekfslam.filters.dense import transform, transform_part
 from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, full_correction, share_of
 from ekfslam.filters.window import Window
 
@@ -339,36 +339,25 @@ class ConditionalGaussian(Gaussian):
         self.window.augment(len(G))
         self.window.refer(np.flatnonzero(G.any(axis=(0, 1))))
 
-    def transform_landmarks(self, M: Array | None, B: Array, columns: IntArray) -> None:
+    def transform_landmarks(self, slot: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
         promoted = self.window.promoted
-        slot = np.flatnonzero(promoted >= 0)
-        if len(slot):
-            self._transform_promoted(_columns(promoted[slot]), None if M is None else M[slot], B[slot], columns)
+        is_promoted = promoted[slot] >= 0
+        if is_promoted.any():
+            own = _columns(promoted[slot[is_promoted]])
+            M_own, B_own = None if M is None else M[is_promoted], B[is_promoted]
+            transform_part(self._P, own, M_own, B_own, columns)
+            P_c = self._P_c[:, own]
+            if M_own is not None:
+                P_c = (M_own @ P_c.T.reshape(len(B_own), 3, len(P_c))).reshape(len(own), len(P_c)).T
+            self._P_c[:, own] = P_c + self._P_c[:, columns] @ B_own.reshape(len(own), -1).T
         if M is not None:
-            self._K = M @ self._K
-            self._S = _symmetric(M @ self._S @ M.swapaxes(1, 2))
-        self._K[..., columns] += B
-        _promote(self._K, slot, promoted[slot])
+            self._K[slot] = M @ self._K[slot]
+            self._S[slot] = _symmetric(M @ self._S[slot] @ M.swapaxes(1, 2))
+        self._K[slot[:, None, None], np.arange(3)[:, None], columns] += B
+        own = slot[is_promoted]
+        _promote(self._K, own, promoted[own])
         self.window.refer(columns)
         self._root = None
-
-    def _transform_promoted(self, own: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
-        """The same for promoted landmarks, which have the columns ``own`` of X."""
-        P, k = self._P, len(B)
-        B = B.reshape(3 * k, -1)
-        rows = P[own] if M is None else (M @ P[own].reshape(k, 3, -1)).reshape(3 * k, -1)
-        rows = rows + B @ P[columns]
-        right = rows[:, own]
-        if M is not None:
-            right = (right.reshape(3 * k, k, 1, 3) @ M.swapaxes(1, 2)).reshape(3 * k, 3 * k)
-        right = right + rows[:, columns] @ B.T
-        P[own] = rows
-        P[:, own] = rows.T
-        P[np.ix_(own, own)] = _symmetric(right)
-        P_c = self._P_c[:, own]
-        if M is not None:
-            P_c = (P_c.reshape(len(P_c), k, 1, 3) @ M.swapaxes(1, 2)).reshape(len(P_c), 3 * k)
-        self._P_c[:, own] = P_c + self._P_c[:, columns] @ B.T
 
     def marginalise(self, stay: BoolArray) -> None:
         kept = self.window.marginalise(stay)

@@ -35,18 +35,21 @@ class Change:
     """``d_i+ = M_i d_i + B_i x``: landmark errors after a correction by those before, and by some of the body.
 
     Args:
+        slot: (n,) the landmarks, ascending.
         columns: (c,) of the body.
         B: (n, 3, c).
         M: (n, 3, 3); None is the identity.
     """
 
+    slot: IntArray
     columns: IntArray
     B: Array
     M: Array | None = None
 
     def only(self, slot: IntArray) -> Change:
         """The change of some of the landmarks."""
-        return Change(self.columns, self.B[slot], None if self.M is None else self.M[slot])
+        at = np.searchsorted(self.slot, slot)
+        return Change(slot, self.columns, self.B[at], None if self.M is None else self.M[at])
 
 
 @dataclass(frozen=True)
@@ -115,10 +118,11 @@ class CameraCoordinates:
         q_after = np.where(in_image[:, None], image(np.where(in_image[:, None], y_after, _AHEAD)), q + step)
         return se3.apply(se3.inverse(self._T_cam_imu(after) @ after[self.pose]), q_after), in_image
 
-    def change(self, before: View, after: View, in_image: BoolArray, turned: Array) -> Change:
+    def change(self, slot: IntArray, before: View, after: View, in_image: BoolArray, turned: Array) -> Change:
         """``M`` and ``B`` of eq. (7').
 
         Args:
+            slot: (n,) the landmarks.
             before, after: The views before and after a correction.
             in_image: (n,) which landmarks count by their images.
             turned: (6, 6) how the error of the pose before becomes that after.
@@ -133,7 +137,7 @@ class CameraCoordinates:
         by_camera = [J, -J @ se3.skew(before.q_linear), minus_one, se3.skew(after.q_linear)]
         B = np.concatenate(by_camera, axis=-1) @ np.concatenate([before.by_columns, by_after])
         back = after.R_linear.T
-        return Change(self.columns, back @ B, back @ J @ before.R_linear)
+        return Change(slot, self.columns, back @ B, back @ J @ before.R_linear)
 
     @cached_property
     def columns(self) -> IntArray:

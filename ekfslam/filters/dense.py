@@ -217,22 +217,11 @@ class DenseGaussian(Gaussian):
         P[size:, size:].reshape(n, 3, n, 3)[block, :, block, :] += covariance
         self._P = P
 
-    def transform_landmarks(self, M: Array | None, B: Array, columns: IntArray) -> None:
-        b, P, n = self.body, self._P, self.landmarks
-        if M is None:
-            # d+ = d + B a, hence P+ = P + B Z^T + Z B^T with Z = P_a + B P_aa / 2.
-            wide = np.zeros((len(P), len(columns)))
-            wide[b:] = B.reshape(-1, len(columns))
-            add_product(P, wide, P[:, columns] + 0.5 * wide @ P[np.ix_(columns, columns)])
-            return
-        B = B.reshape(3 * n, len(columns))
-        rows = (M @ P[b:].reshape(n, 3, len(P))).reshape(3 * n, len(P))
-        rows += B @ P[columns]
-        P_mm = (M @ rows[:, b:].T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
-        P_mm += B @ rows[:, columns].T
-        P[b:, :b] = rows[:, :b]
-        P[:b, b:] = P[b:, :b].T
-        np.multiply(P_mm + P_mm.T, 0.5, out=P[b:, b:])
+    def transform_landmarks(self, slot: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
+        if len(slot) == self.landmarks:
+            transform_part(self._P, slice(self.body, None), M, B, columns)
+        else:
+            transform_part(self._P, self._columns(slot), M, B, columns)
 
     def transform_body(self, at: slice, A: Array) -> None:
         transform(self._P, at, A)
@@ -251,6 +240,25 @@ def transform(P: Array, at: slice, A: Array) -> None:
     P[:, at] = P[at].T
     P_xx = A @ P[at, at]
     P[at, at] = 0.5 * (P_xx + P_xx.T)
+
+
+def transform_part(P: Array, own: IntArray | slice, M: Array | None, B: Array, columns: IntArray) -> None:
+    """``d_i <- M_i d_i + B_i x`` in place, for symmetric P: d_i (n of them) has the columns ``own`` (3n,)."""
+    n, B = len(B), B.reshape(-1, len(columns))
+    if M is None and isinstance(own, slice):
+        # d+ = d + B a, hence P+ = P + B Z^T + Z B^T with Z = P_a + B P_aa / 2.
+        wide = np.zeros((len(P), len(columns)))
+        wide[own] = B
+        add_product(P, wide, P[:, columns] + 0.5 * wide @ P[np.ix_(columns, columns)])
+        return
+    rows = B @ P[columns]
+    rows += P[own] if M is None else (M @ P[own].reshape(n, 3, len(P))).reshape(3 * n, len(P))
+    right = rows[:, own] if M is None else (M @ rows[:, own].T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
+    right = right + (B @ rows[:, columns].T if M is not None else rows[:, columns] @ B.T)
+    P[own] = rows
+    P[:, own] = rows.T
+    block = np.ix_(own, own) if not isinstance(own, slice) else (own, own)
+    P[block] = 0.5 * (right + right.T)
 
 
 def add_square(P: Array, A: Array, sign: float) -> None:

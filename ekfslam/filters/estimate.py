@@ -33,14 +33,17 @@ class Moved:
     Args:
         values: Of the blocks.
         position_m: (n, 3) landmarks.
-        in_image, before: (n,) which of them were moved by their images, eq. (7'), and how these were before; None: all
-            were moved in xyz.
+        awake, asleep: Slots of those that were moved in the camera, eq. (7'), and of all others, moved in world.
+        in_image: Which of the former (k,) by their images.
+        before: How the camera had them before; None: none was moved in it.
     """
 
     values: dict[str, Array]
     position_m: Array
-    in_image: BoolArray | None = None
-    before: View | None = None
+    awake: IntArray
+    asleep: IntArray
+    in_image: BoolArray
+    before: View | None
 
 
 class Estimate:
@@ -227,25 +230,38 @@ class Estimate:
         return correction[: self.gaussian.seen], correction[self.gaussian.body :].reshape(-1, 3)
 
     def retracted(self, correction: Array) -> Moved:
-        """Blocks and landmarks after a correction (b+3n,); the estimate stays."""
+        """Blocks and landmarks after a correction (b+3n,); the estimate stays.
+
+        Landmarks that are awake move in the camera that was updated last. Those that are asleep move in world: their
+        images are of no account, and would lose digits far from the camera.
+        """
         x, d = self.parts(correction)
-        after, positions = self.model.retract(self.values, correction), self.table.position_m
-        if (camera := self._camera) is None:
-            return Moved(after, self.variant.retract_landmarks(self.T_imu_world, positions, correction[:6], d))
-        before = camera.view(self.values, positions, self.values[camera.pose], positions)
-        return Moved(after, *camera.retract(before, after, x, d), before)
+        after, positions = self.model.retract(self.values, correction), self.table.position_m.copy()
+        camera, asleep = self._camera, self.table.asleep.astype(bool)
+        awake, others = np.flatnonzero(~asleep), np.flatnonzero(asleep)
+        if camera is None:
+            awake, others = others[:0], np.arange(len(positions))
+        before, in_image = None, np.empty(0, dtype=bool)
+        if len(others):
+            positions[others] = self.variant.retract_landmarks(
+                self.T_imu_world, positions[others], correction[:6], d[others]
+            )
+        if camera is not None:
+            before = camera.view(self.values, positions[awake], self.values[camera.pose], positions[awake])
+            positions[awake], in_image = camera.retract(before, after, x, d[awake])
+        return Moved(after, positions, awake, others, in_image, before)
 
     def retract(self, correction: Array) -> None:
         """Move the mean, and re-express the covariance where the variant does."""
         moved = self.retracted(correction)
-        change = self._change(moved, self.variant.turned)
-        self.variant.transport(self.gaussian, self.model, self.values, moved.values, change)
+        changes = self._changes(moved, self.variant.turned)
+        self.variant.transport(self.gaussian, self.model, self.values, moved.values, changes)
         self.values, self.table.position_m = moved.values, moved.position_m
         self.coordinates = self.coordinates + correction[: len(self.coordinates)]
 
     def carried_back(self, rows: Rows, moved: Moved) -> Rows:
         """Rows taken where a correction leads, in the errors at the estimate."""
-        change = self._change(moved, self.variant.derivative).only(rows.slot)
+        change = self._changes(moved, self.variant.derivative)[0].only(rows.slot)
         return self.variant.carry_back(rows, self.model, self.values, moved.values, change)
 
     @property
@@ -253,18 +269,20 @@ class Estimate:
         """Coordinates of landmarks in the last updated camera; None: they count by their positions in world."""
         return None if self.updated_pose is None else self._cameras.get(self.updated_pose)
 
-    def _change(self, moved: Moved, turned: Callable[[Array, Array], Array]) -> Change:
-        """How errors of landmarks change where a correction leads."""
+    def _changes(self, moved: Moved, turned: Callable[[Array, Array], Array]) -> tuple[Change, ...]:
+        """How errors of landmarks change where a correction leads; landmarks that can be seen come first."""
         positions, values, after, camera = self.table.position_m, self.values, moved.values, self._camera
-        if camera is None or moved.before is None or moved.in_image is None:
-            return self.variant.change(self.model, values, moved.position_m - positions)
+        others, awake = moved.asleep, moved.awake
+        in_world = self.variant.change(self.model, values, others, moved.position_m[others] - positions[others])
+        if camera is None or moved.before is None:
+            return (in_world,)
         T, T_after, before = values[camera.pose], after[camera.pose], moved.before
+        positions_after = moved.position_m[awake]
         if self.variant.first_estimates:
-            T_first = self.T_predicted if camera.pose == "pose" else self.T_predicted_before
-            before, then = (
-                camera.view(at, m, T_first, self.table.initial_m)
-                for at, m in ((values, positions), (after, moved.position_m))
-            )
+            T_first, initial = self.T_predicted_before, self.table.initial_m[awake]
+            T_first = self.T_predicted if camera.pose == "pose" else T_first
+            before = camera.view(values, positions[awake], T_first, initial)
+            then = camera.view(after, positions_after, T_first, initial)
         else:
-            then = camera.view(after, moved.position_m, T_after, moved.position_m)
-        return camera.change(before, then, moved.in_image, turned(T, T_after))
+            then = camera.view(after, positions_after, T_after, positions_after)
+        return camera.change(awake, before, then, moved.in_image, turned(T, T_after)), in_world

@@ -189,10 +189,11 @@ class Gaussian(ABC):
         """Append landmarks with ``d = G x + w``, eq. (5): G (n, 3, seen), covariance (n, 3, 3) of w."""
 
     @abstractmethod
-    def transform_landmarks(self, M: Array | None, B: Array, columns: IntArray) -> None:
-        """``d_i <- M_i d_i + B_i x``: landmark errors in other coordinates.
+    def transform_landmarks(self, slot: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
+        """``d_i <- M_i d_i + B_i x``: errors of some landmarks (n,) in other coordinates.
 
         Args:
+            slot: (n,) ascending.
             M: (n, 3, 3); None is the identity.
             B: (n, 3, c) by some of the body, x.
             columns: (c,) of x.

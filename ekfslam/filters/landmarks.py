@@ -21,6 +21,7 @@ _INTS = (
     "first_step",
     "last_step",
     "last_observation",
+    "asleep",
 )
 
 
@@ -54,6 +55,7 @@ class LandmarkTable:
         log_row: (n,) row of the landmark in the log.
         first_step, last_step: (n,) frames of the log with the first and the last accepted observation.
         last_observation: (n,) place of the last accepted observation in the log.
+        asleep: (n,) 1 where it is out of view: it will not be seen before it is woken.
         stay_until: (n,) frame up to which the landmark stays without being seen.
         position_m, initial_m: (n, 3) estimate, and the one at landmark initialisation.
         seen_rows: (n, d) rows of the last accepted observation.
@@ -71,7 +73,7 @@ class LandmarkTable:
         return self._rows
 
     id, first_frame, last_frame, observations, misses = (_column(name) for name in _INTS[:5])
-    log_row, stay_until, first_step, last_step, last_observation = (_column(name) for name in _INTS[5:])
+    log_row, stay_until, first_step, last_step, last_observation, asleep = (_column(name) for name in _INTS[5:])
     position_m, initial_m = _columns(0, 3), _columns(3, 6)
     evidence = _columns(6, 8)
 

@@ -10,9 +10,11 @@ The iterated update (``iterations > 1``) goes with ``standard`` and ``invariant`
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
 from ekfslam.filters.coordinates import Change
 from ekfslam.filters.gaussian import Gaussian, Rows
@@ -61,18 +63,21 @@ class Standard:
         """The same (6, 6) for rows of an iterated update: the derivative of ``exp(xi^) T``."""
         return np.asarray(se3.left_jacobian(se3.log(after @ se3.inverse(before))), dtype=float)
 
-    def change(self, model: Model, before: Values, moved_m: Array) -> Change:
-        """Errors of landmarks in xyz after a correction that moved them by ``moved_m`` (n, 3): here they stay."""
-        return Change(np.empty(0, dtype=np.int64), np.empty((len(moved_m), 3, 0)))
+    def change(self, model: Model, before: Values, slot: IntArray, moved_m: Array) -> Change:
+        """Errors of landmarks (n,) in xyz after a correction that moved them by ``moved_m`` (n, 3): here they stay."""
+        return Change(slot, np.empty(0, dtype=np.int64), np.empty((len(moved_m), 3, 0)))
 
-    def transport(self, gaussian: Gaussian, model: Model, before: Values, after: Values, change: Change) -> None:
+    def transport(
+        self, gaussian: Gaussian, model: Model, before: Values, after: Values, changes: Iterable[Change]
+    ) -> None:
         """Re-express the covariance after a correction that changed errors of landmarks: ``P <- G P G^T``.
 
-        G has M and B of the change, and `turned` of each pose: 3x3 blocks, and a rank beyond them which is the number
-        of the change's columns.
+        G has M and B of the changes, and `turned` of each pose: 3x3 blocks, and a rank beyond them which is the number
+        of the changes' columns.
         """
-        if len(change.columns):
-            gaussian.transform_landmarks(change.M, change.B, change.columns)
+        for change in changes:
+            if len(change.columns) and len(change.slot):
+                gaussian.transform_landmarks(change.slot, change.M, change.B, change.columns)
 
     def carry_back(self, rows: Rows, model: Model, before: Values, after: Values, change: Change) -> Rows:
         """Rows taken at a corrected state in the errors before the correction, for an iterated update: the chain rule.
@@ -142,19 +147,21 @@ class Invariant(Standard):
 
     derivative = turned
 
-    def change(self, model: Model, before: Values, moved_m: Array) -> Change:
+    def change(self, model: Model, before: Values, slot: IntArray, moved_m: Array) -> Change:
         """Of landmarks in xyz: new errors by rotations, of the pose and (where it is in the state) of the camera."""
         start = model.layout["pose"].start + 3
         columns, by = np.arange(start, start + 3), se3.skew(moved_m) @ before["pose"][:3, :3].T
         calibration = model.calibration
         if calibration is None or not len(calibration.turns_camera):
-            return Change(columns, by)
+            return Change(slot, columns, by)
         by_camera = calibration.landmarks_by_rotation(model.rig, before["calibration"], before["pose"], moved_m)
         columns = np.concatenate([columns, model.layout["calibration"].start + calibration.turns_camera])
-        return Change(columns, np.concatenate([by, by_camera], axis=-1))
+        return Change(slot, columns, np.concatenate([by, by_camera], axis=-1))
 
-    def transport(self, gaussian: Gaussian, model: Model, before: Values, after: Values, change: Change) -> None:
-        super().transport(gaussian, model, before, after, change)
+    def transport(
+        self, gaussian: Gaussian, model: Model, before: Values, after: Values, changes: Iterable[Change]
+    ) -> None:
+        super().transport(gaussian, model, before, after, changes)
         for name in model.layout.poses:
             gaussian.transform_body(model.layout[name], self.turned(before[name], after[name]))
 
