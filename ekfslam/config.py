@@ -175,9 +175,11 @@ class FilterConfig:
         iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. Not for ``fej``, nor for ``xyz``, where
             they take the depth of landmarks at the wrong point and make all distances too short.
         retire: ``unseen`` marginalises a landmark when it is out of view, ``never`` keeps all; ``auto`` is ``never``
-            for a sequence of at most 300 landmarks some of which come back, else ``unseen``.
+            for a sequence of at most 1500 landmarks some of which come back, else ``unseen``.
         retire_after: Frames without a sighting after which ``unseen`` applies. By default 1, or 10 in a sequence some
             of whose landmarks come back.
+        dormant: With ``unseen``, so many landmarks out of view stay in the state, those seen last. By default 0, or
+            1500 where ``auto`` has chosen ``unseen`` although landmarks come back.
         revive: A retired landmark that is seen again comes back with its exact mean, covariance and cross-covariance,
             together with up to this many retired landmarks that were seen nearest to it in time. -1 starts it afresh.
         gate_probability: Chi-square gate on each observation, once against the prediction and (joint filter) once
@@ -201,6 +203,7 @@ class FilterConfig:
     iterations: int = field(default=1, metadata=_whole(1))
     retire: Retire = field(default="auto", metadata=_one_of(Retire))
     retire_after: int | None = field(default=None, metadata=_whole(1))
+    dormant: int | None = field(default=None, metadata=_whole(0))
     revive: int = field(default=100, metadata=_whole(-1))
     gate_probability: float = field(default=0.999, metadata=_PROBABILITY)
     split_after: int | None = field(default=None, metadata=_whole(0))

@@ -157,8 +157,9 @@ def step(rng):
 
 @pytest.mark.parametrize("certain", [False, True], ids=["uncertain", "certain"])
 @pytest.mark.parametrize("considered", [0, 12])
+@pytest.mark.parametrize("naps", [False, True], ids=["awake", "naps"])
 @pytest.mark.parametrize("form", FORMS)
-def test_all_verbs_over_many_frames(form, considered, certain):
+def test_all_verbs_over_many_frames(form, considered, certain, naps):
     """Landmarks come, are seen in part and shuffled, and leave; coordinates change; all is compared in every frame."""
     rng = np.random.default_rng(considered + certain)
     body = np.diag(rng.uniform(0.01, 0.1, BODY)) * (not certain)
@@ -179,7 +180,13 @@ def test_all_verbs_over_many_frames(form, considered, certain):
         np.testing.assert_allclose([solution.done.nis, solution.done.log_det], [nis, log_det], atol=1e-9)
         if naive.n:
             slots = rng.permutation(naive.n)[: max(3, naive.n - 2)]
-            condition(rng, gaussian, naive, slots, out=[[], [1], [0, 2]][frame % 3])
+            if naps:
+                slots = rng.permutation(naive.n)[: max(1, naive.n - 3)]
+                asleep = rng.random(naive.n) < 0.7
+                asleep[slots] = False
+                gaussian.rest(asleep)
+                same(gaussian, naive)
+            condition(rng, gaussian, naive, slots, out=[[], [1], [0, 2]][frame % 3] if len(slots) > 2 else [])
             same(gaussian, naive)
             which = np.flatnonzero(rng.random(naive.n) < 0.6) if frame % 2 else np.arange(naive.n)
             M = None if frame % 4 < 2 else np.eye(3) + 0.1 * rng.normal(size=(len(which), 3, 3))
@@ -195,8 +202,11 @@ def test_all_verbs_over_many_frames(form, considered, certain):
             gaussian.augment(G, C[:new]), naive.augment(G, C[:new])
         if naive.n > 7:
             stay = rng.random(naive.n) < 0.7
+            stay[:3] = True
             stay[0] = frame < 15  # one landmark outlives all others
             gaussian.marginalise(stay), naive.marginalise(stay)
+        if naps and naive.n:
+            gaussian.rest(rng.random(naive.n) < 0.3)
         if considered and frame % 5 == 0:
             gaussian.clone(POSE, slice(BODY, BODY + 6)), naive.clone(POSE, slice(BODY, BODY + 6))
         same(gaussian, naive)

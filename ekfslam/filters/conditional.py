@@ -28,8 +28,9 @@ from scipy.linalg import blas, lapack
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import InnovationError
 from ekfslam.filters.dense import transform, transform_part
+from ekfslam.filters.dormant import Dormant
 from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, full_correction, share_of
-from ekfslam.filters.window import Window
+from ekfslam.filters.window import Push, Window
 
 
 @dataclass(frozen=True)
@@ -143,24 +144,23 @@ class ConditionalGaussian(Gaussian):
     Args:
         body: (body, body) covariance before there are landmarks.
         seen: Leading body columns that observations depend on.
-
-    Attributes:
-        window: What the columns of X are.
     """
 
     def __init__(self, body: Array, seen: int) -> None:
         self.body, self.seen, self.considered = len(body), seen, 0
         self._P = np.array(body, dtype=float)
+        # Of awake landmarks: K_i, S_i, and their slots; of all landmarks, which of these they are, or -1.
         self._K, self._S = np.empty((0, 3, len(body))), np.empty((0, 3, 3))
+        self._slot = self._row = np.empty(0, dtype=np.int64)
         self._P_c, self._P_cc = np.empty((0, len(body))), np.empty((0, 0))
-        self.window = Window(len(body))
+        self._window, self._dormant = Window(len(body)), Dormant(len(body))
         self._root: Array | None = None
 
     # --- what it is ---------------------------------------------------------------------------------------------------
 
     @property
     def landmarks(self) -> int:
-        return len(self._K)
+        return len(self._row)
 
     @property
     def width(self) -> int:
@@ -183,23 +183,43 @@ class ConditionalGaussian(Gaussian):
         P[:b, b:] = P[b:, :b].T
         return P
 
+    def _conditional(self, slot: IntArray) -> tuple[Array, IntArray, IntArray]:
+        """K (k, 3, n_X) of landmarks at the slots (k,), and which are asleep: at which places, as which there."""
+        K, row = np.empty((len(slot), 3, self.width)), self._row[slot]
+        awake, asleep = np.flatnonzero(row >= 0), np.flatnonzero(row < 0)
+        K[awake] = self._K[row[awake]]
+        which = np.empty(0, dtype=np.int64)
+        if len(asleep):
+            order = np.argsort(self._dormant.slot)
+            which = order[np.searchsorted(self._dormant.slot, slot[asleep], sorter=order)]
+            K[asleep] = self._dormant.K.reshape(-1, 3, self.width)[which]
+        return K, asleep, which
+
     def landmark_blocks(self, slot: IntArray | None = None) -> Array:
-        K, S = (self._K, self._S) if slot is None else (self._K[slot], self._S[slot])
-        k = len(K)
-        return (K.reshape(3 * k, -1) @ self._P).reshape(k, 3, -1) @ K.swapaxes(1, 2) + S
+        slot = np.arange(self.landmarks) if slot is None else slot
+        K, asleep, which = self._conditional(slot)
+        k = len(slot)
+        S = np.empty((k, 3, 3))
+        awake = np.delete(np.arange(k), asleep)
+        S[awake], S[asleep] = self._S[self._row[slot[awake]]], self._dormant.blocks(which)
+        return (K.reshape(3 * k, self.width) @ self._P).reshape(k, 3, self.width) @ K.swapaxes(1, 2) + S
 
     def covariance_of(self, slot: IntArray) -> Array:
         b, k = self.body, len(slot)
-        K = self._K[slot].reshape(3 * k, self.width)
+        conditional, asleep, which = self._conditional(slot)
+        K = conditional.reshape(3 * k, self.width)
         P = np.empty((b + 3 * k, b + 3 * k))
         P[:b, :b] = self.body_covariance
         KP = K @ self._P
         P[b:, : b - self.considered] = KP[:, : b - self.considered]
         P[b:, b - self.considered : b] = K @ self._P_c.T
+        at, own = _columns(3 * asleep), _columns(3 * which)
+        P[b + at, b - self.considered : b] += self._dormant.cross[:, own].T
         P[:b, b:] = P[b:, :b].T
-        P_mm, own = KP @ K.T, np.arange(k)
-        P_mm = _symmetric(P_mm)
-        P_mm.reshape(k, 3, k, 3)[own, :, own, :] += self._S[slot]
+        P_mm = _symmetric(KP @ K.T)
+        awake = np.delete(np.arange(k), asleep)
+        P_mm.reshape(k, 3, k, 3)[awake, :, awake, :] += self._S[self._row[slot[awake]]]
+        P_mm[np.ix_(at, at)] += _symmetric(self._dormant.covariance(own)[:, own])
         P[b:, b:] = P_mm
         return P
 
@@ -211,12 +231,13 @@ class ConditionalGaussian(Gaussian):
             self._root = _pivoted_root(self._P) if failed else F
         return self._root
 
-    # --- what changes the body ----------------------------------------------------------------------------------------
+    # --- what changes X -----------------------------------------------------------------------------------------------
 
     def consider(self, columns: int) -> int:
         start = self.body
         self._P_c = np.concatenate([self._P_c, np.zeros((columns, self.width))])
         self._P_cc = np.pad(self._P_cc, (0, columns))
+        self._dormant.cross = np.pad(self._dormant.cross, ((0, columns), (0, 0)))
         self.body, self.considered = start + columns, self.considered + columns
         return start
 
@@ -224,39 +245,71 @@ class ConditionalGaussian(Gaussian):
         first = self.body - self.considered
         at = slice(to.start - first, to.stop - first)
         self._P_cc[at] = self._P_c[:, source].T
-        self._P_c[at] = self._P[source]
+        self._P_c[at], self._dormant.cross[at] = self._P[source], 0.0
         self._P_cc[:, at] = self._P_cc[at].T
         self._P_cc[at, at] = self._P[source, source]
 
     def propagate(self, Phi: Array, Q: Array) -> None:
-        move = self.window.propagate(Phi, Q)
-        b, joined = len(Phi), move.promoted
-        K_joined = self._K[joined].reshape(-1, self.width)
-        A = np.concatenate([Phi @ self._P[:b], self._P[move.kept], K_joined @ self._P])
-        P = np.concatenate([A[:, :b] @ Phi.T, A[:, move.kept], A @ K_joined.T], axis=1)
+        joined, leaving = self._window.cut()
+        if len(joined):
+            self._promote(joined)
+        if len(leaving):
+            self._drop(leaving)
+        push = self._window.push(Phi, Q)
+        b, kept = len(Phi), np.concatenate([push.pushed, np.arange(len(Phi), self.width)])
+        A = np.concatenate([Phi @ self._P[:b], self._P[kept]])
+        P = np.concatenate([A[:, :b] @ Phi.T, A[:, kept]], axis=1)
         P[:b, :b] += Q
-        _add_blocks(P, len(P) - 3 * len(joined), self._S[joined])
-        self._P = _symmetric(P)
-        P_c = self._P_c
-        self._P_c = np.concatenate([P_c[:, :b] @ Phi.T, P_c[:, move.kept], P_c @ K_joined.T], axis=1)
-        K = np.zeros((self.landmarks, 3, len(P)))
-        K[..., move.carried_to] = self._K[..., move.carried_from]
-        K[..., b : b + len(move.kept)] = self._K[..., move.kept]
-        _promote(K, joined, self.window.promoted[joined])
-        self._S[joined] = 0.0
-        self._K, self._root = K, None
+        self._P, self._root = _symmetric(P), None
+        self._P_c = np.concatenate([self._P_c[:, :b] @ Phi.T, self._P_c[:, kept]], axis=1)
+        self._K, self._dormant.K = (_pushed(K, push, kept, b) for K in (self._K, self._dormant.K))
+
+    def _promote(self, rows: IntArray) -> None:
+        """Some awake landmarks become columns of X."""
+        self._window.promote(rows)
+        self._join(self._K[rows].reshape(-1, self.width), np.zeros((3 * len(rows),) * 2))
+        _add_blocks(self._P, self.width - 3 * len(rows), self._S[rows])
+        _promote(self._K, rows, self._window.promoted[rows])
+        self._S[rows] = 0.0
+        self._dormant.K = np.pad(self._dormant.K, ((0, 0), (0, 3 * len(rows))))
+
+    def _join(self, K: Array, S: Array, cross: Array | float = 0.0) -> None:
+        """``K x + eps`` (m,) become the last columns of X; no landmark depends on them yet.
+
+        Args:
+            K: (m, n_X).
+            S: (m, m) covariance of eps.
+            cross: (considered, m) of what is considered with eps.
+        """
+        KP = K @ self._P
+        self._P = np.block([[self._P, KP.T], [KP, _symmetric(KP @ K.T + S)]])
+        self._P_c = np.concatenate([self._P_c, self._P_c @ K.T + cross], axis=1)
+        self._K = np.pad(self._K, ((0, 0), (0, 0), (0, len(K))))
+        self._root = None
+
+    def _drop(self, leaving: IntArray) -> None:
+        """Columns of X, on which no landmark that is awake depends, leave it."""
+        if self._dormant.columns_leave(self._P, self._P_c, leaving):
+            self._window.refer(slice(0, self.body - self.considered))
+        kept = np.delete(np.arange(self.width), leaving)
+        self._window.keep(kept)
+        self._K, self._P_c = self._K[..., kept], self._P_c[:, kept]
+        self._P, self._root = self._P[np.ix_(kept, kept)], None
 
     def transform_body(self, at: slice, A: Array) -> None:
         transform(self._P, at, A)
+        inverse = np.linalg.inv(A)
         self._P_c[:, at] = self._P_c[:, at] @ A.T
-        self._K[..., at] = self._K[..., at] @ np.linalg.inv(A)
+        self._K[..., at] = self._K[..., at] @ inverse
+        self._dormant.K[:, at] = self._dormant.K[:, at] @ inverse
         self._root = None
 
     # --- conditioning -------------------------------------------------------------------------------------------------
 
     def project(self, rows: Rows, frame: int, ids: IntArray) -> ConditionalProjection:
         k, d = rows.residual.shape
-        S_H = self._S[rows.slot] @ rows.H_m.swapaxes(1, 2)
+        row = self._row[rows.slot]
+        S_H = self._S[row] @ rows.H_m.swapaxes(1, 2)
         R = rows.H_m @ S_H
         R[:, np.arange(d), np.arange(d)] += rows.variance
         try:
@@ -264,7 +317,7 @@ class ConditionalGaussian(Gaussian):
         except np.linalg.LinAlgError:
             raise InnovationError(frame, ids) from None
         L_inverse = np.linalg.inv(L)
-        B = (L_inverse @ rows.H_m) @ self._K[rows.slot]
+        B = (L_inverse @ rows.H_m) @ self._K[row]
         B[..., : self.seen] += L_inverse @ rows.H_x
         F = self.root
         T = (B.reshape(k * d, self.width) @ F).reshape(k, d, F.shape[1])
@@ -309,7 +362,9 @@ class ConditionalGaussian(Gaussian):
         """(body+3n,) of the mean."""
         x, at = solution.x, solution.at
         b = self.body - self.considered
-        d = (self._K.reshape(-1, self.width) @ x).reshape(-1, 3)
+        d = np.empty((self.landmarks, 3))
+        d[self._slot] = (self._K.reshape(-1, self.width) @ x).reshape(-1, 3)
+        d[self._dormant.slot] = (self._dormant.K @ x).reshape(-1, 3)
         left = solution.left
         if at.G.shape[1]:
             d[at.rows.slot[left]] += (at.G[left] @ solution.residual[left][..., None])[..., 0]
@@ -324,45 +379,94 @@ class ConditionalGaussian(Gaussian):
             self._P_c = self._P_c - blas.dtrsm(1.0, solution.U, along @ solution.T, side=1, lower=0) @ W.T
         self._P, self._root = W @ W.T, None
         if at.G.shape[1]:
-            slot, G = at.rows.slot[left], at.G[left]
-            self._K[slot] -= G @ at.B[left]
-            self._S[slot] = _symmetric(self._S[slot] - G @ G.swapaxes(1, 2))
-            self.window.refer(np.flatnonzero(at.rows.H_x[left].any(axis=(0, 1))))
+            row, G = self._row[at.rows.slot[left]], at.G[left]
+            self._K[row] -= G @ at.B[left]
+            self._S[row] = _symmetric(self._S[row] - G @ G.swapaxes(1, 2))
+            self._window.refer(np.flatnonzero(at.rows.H_x[left].any(axis=(0, 1))))
 
     # --- landmarks ----------------------------------------------------------------------------------------------------
 
     def augment(self, G: Array, covariance: Array) -> None:
         K = np.zeros((len(G), 3, self.width))
         K[..., : self.seen] = G
-        self._K = np.concatenate([self._K, K])
-        self._S = np.concatenate([self._S, covariance])
-        self.window.augment(len(G))
-        self.window.refer(np.flatnonzero(G.any(axis=(0, 1))))
+        self._append(self.landmarks + np.arange(len(G)), K, covariance)
+        self._window.augment(len(G))
+        self._window.refer(np.flatnonzero(G.any(axis=(0, 1))))
 
-    def transform_landmarks(self, slot: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
-        promoted = self.window.promoted
-        is_promoted = promoted[slot] >= 0
-        if is_promoted.any():
-            own = _columns(promoted[slot[is_promoted]])
-            M_own, B_own = None if M is None else M[is_promoted], B[is_promoted]
-            transform_part(self._P, own, M_own, B_own, columns)
-            P_c = self._P_c[:, own]
-            if M_own is not None:
-                P_c = (M_own @ P_c.T.reshape(len(B_own), 3, len(P_c))).reshape(len(own), len(P_c)).T
-            self._P_c[:, own] = P_c + self._P_c[:, columns] @ B_own.reshape(len(own), -1).T
-        if M is not None:
-            self._K[slot] = M @ self._K[slot]
-            self._S[slot] = _symmetric(M @ self._S[slot] @ M.swapaxes(1, 2))
-        self._K[slot[:, None, None], np.arange(3)[:, None], columns] += B
-        own = slot[is_promoted]
-        _promote(self._K, own, promoted[own])
-        self.window.refer(columns)
-        self._root = None
+    def _append(self, slot: IntArray, K: Array, S: Array) -> None:
+        """Landmarks (n,) at the slots, new ones or others, are awake."""
+        before = len(self._slot)
+        self._K, self._S = np.concatenate([self._K, K]), np.concatenate([self._S, S])
+        self._slot = np.concatenate([self._slot, slot])
+        new = int((slot >= self.landmarks).sum())
+        self._row = np.concatenate([self._row, np.full(new, -1)])
+        self._row[slot] = before + np.arange(len(slot))
+
+    def rest(self, asleep: BoolArray) -> None:
+        if (wakes := ~asleep & (self._row < 0)).any():
+            self._wake(wakes[self._dormant.slot])
+        if (tires := asleep & (self._row >= 0)).any():
+            rows = np.sort(self._row[tires])
+            self._dormant.append(self._slot[rows], self._K[rows], self._S[rows])
+            self._forget(rows)
+
+    def _wake(self, which: BoolArray) -> None:
+        slot = self._dormant.slot[which]
+        self._join(*self._dormant.wake(which))
+        self._append(slot, np.zeros((len(slot), 3, self.width)), np.zeros((len(slot), 3, 3)))
+        self._window.augment(len(slot), promoted=True)
+        rows = self._row[slot]
+        _promote(self._K, rows, self._window.promoted[rows])
+
+    def _forget(self, rows: IntArray) -> None:
+        """Landmarks are awake no more."""
+        gone = np.zeros(len(self._slot), dtype=bool)
+        gone[rows] = True
+        leaving = self._window.forget(gone)
+        self._K, self._S, self._slot = self._K[~gone], self._S[~gone], self._slot[~gone]
+        self._row[:] = -1
+        self._row[self._slot] = np.arange(len(self._slot))
+        if len(leaving):
+            self._drop(leaving)
 
     def marginalise(self, stay: BoolArray) -> None:
-        kept = self.window.marginalise(stay)
-        self._K, self._S = self._K[stay][..., kept], self._S[stay]
-        self._P, self._P_c, self._root = self._P[np.ix_(kept, kept)], self._P_c[:, kept], None
+        self._dormant.leave(stay[self._dormant.slot])
+        self._forget(np.flatnonzero(~stay[self._slot]))
+        new = np.cumsum(stay) - 1
+        self._slot, self._dormant.slot = new[self._slot], new[self._dormant.slot]
+        self._row = self._row[stay]
+
+    def transform_landmarks(self, slot: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
+        row = self._row[slot]
+        awake = np.flatnonzero(row >= 0)
+        if len(awake):
+            M_awake = None if M is None else M[awake]
+            self._transform_awake(row[awake], M_awake, B[awake], columns)
+        if len(awake) < len(slot):
+            asleep = np.flatnonzero(row < 0)
+            which = self._conditional(slot[asleep])[2]
+            self._dormant.transform(_columns(3 * which), None if M is None else M[asleep], B[asleep], columns)
+        self._window.refer(columns)
+
+    def _transform_awake(self, row: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
+        """The same for landmarks that are awake."""
+        first = self._window.promoted[row]
+        is_promoted = first >= 0
+        if is_promoted.any():
+            own = _columns(first[is_promoted])
+            M_own, B_own = None if M is None else M[is_promoted], B[is_promoted]
+            transform_part(self._P, own, M_own, B_own, columns)
+            self._root = None
+            P_c, flat = self._P_c[:, own], B_own.reshape(len(own), -1)
+            if M_own is not None:
+                P_c = (M_own @ P_c.T.reshape(len(B_own), 3, len(P_c))).reshape(len(own), len(P_c)).T
+            self._P_c[:, own] = P_c + self._P_c[:, columns] @ flat.T
+            self._dormant.transform_promoted(own, M_own, flat, columns)
+        if M is not None:
+            self._K[row] = M @ self._K[row]
+            self._S[row] = _symmetric(M @ self._S[row] @ M.swapaxes(1, 2))
+        self._K[row[:, None, None], np.arange(3)[:, None], columns] += B
+        _promote(self._K, row[is_promoted], first[is_promoted])
 
     def replace(self, P: Array) -> None:
         b = self.body - self.considered
@@ -371,8 +475,17 @@ class ConditionalGaussian(Gaussian):
         self._P, self._P_c = P[np.ix_(kept, kept)], P[b : self.body, kept]
         self._P_cc, self._root = P[b : self.body, b : self.body].copy(), None
         self._K, self._S = np.zeros((n, 3, len(kept))), np.zeros((n, 3, 3))
-        self.window = Window(b, n)
-        _promote(self._K, np.arange(n), self.window.promoted)
+        self._slot, self._row = np.arange(n), np.arange(n)
+        self._window, self._dormant = Window(b, n), Dormant(len(kept), self.considered)
+        _promote(self._K, self._row, self._window.promoted)
+
+
+def _pushed(K: Array, push: Push, kept: IntArray, body: int) -> Array:
+    """K (..., n_X) after a propagation."""
+    new = np.zeros((*K.shape[:-1], body + len(kept)))
+    new[..., push.carried_to] = K[..., push.carried_from]
+    new[..., body:] = K[..., kept]
+    return new
 
 
 def _symmetric(blocks: Array) -> Array:

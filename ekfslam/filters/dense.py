@@ -226,6 +226,9 @@ class DenseGaussian(Gaussian):
     def transform_body(self, at: slice, A: Array) -> None:
         transform(self._P, at, A)
 
+    def rest(self, asleep: BoolArray) -> None:
+        pass  # here it would save nothing
+
     def marginalise(self, stay: BoolArray) -> None:
         kept = np.flatnonzero(np.concatenate([np.ones(self.body, dtype=bool), np.repeat(stay, 3)]))
         self._P = self._P[kept].take(kept, axis=1)

@@ -204,6 +204,10 @@ class Gaussian(ABC):
         """``x_at <- A x_at`` for some body columns, with invertible A."""
 
     @abstractmethod
+    def rest(self, asleep: BoolArray) -> None:
+        """Which landmarks (n,) are asleep from now on: they are not seen before they wake. P stays as it is."""
+
+    @abstractmethod
     def marginalise(self, stay: BoolArray) -> None:
         """Drop the rows and columns of landmarks that do not stay (n,): exact marginalisation."""
 

@@ -173,10 +173,9 @@ class JointEKF(Estimate):
             InnovationError: The innovation covariance is not positive definite.
         """
         # 1. Landmarks out of view leave, those that come back return.
-        if self.config.retire != "never":
-            self._retire(lifecycle.out_of_view(self.table, ids, frame, self.config.retire_after or 1), may_return=True)
-            if self.revival is not None and (returning := self.retired.among(ids)):
-                self._revive(frame, returning)
+        self._rest(frame, ids)
+        if self.revival is not None and (returning := self.retired.among(ids)):
+            self._revive(frame, returning)
         # 2. What cannot be used at all.
         rows = self.sensor.rows(measured)
         reason = self.sensor.screen(measured, self.config.min_depth_m)
@@ -208,6 +207,16 @@ class JointEKF(Estimate):
         likelihood = self._log_likelihood + log_density(found.done.nis, found.done.log_det, found.dof)
         self._log_likelihood = 0.0
         return FrameReport(frame, ids, reason, found.done.nis, found.dof, split, likelihood, found.innovations)
+
+    def _rest(self, frame: int, ids: IntArray) -> None:
+        """Of landmarks out of view some sleep, and the others retire."""
+        out = lifecycle.out_of_view(self.table, ids, frame, self.config.retire_after or 1)
+        limit = None if self.config.retire == "never" else self.config.dormant or 0
+        asleep = lifecycle.at_rest(out, self.table, limit)
+        stay = ~out | asleep
+        self._retire(~stay, may_return=True)
+        self.table.asleep[:] = asleep[stay]
+        self.gaussian.rest(asleep[stay])
 
     def _retire(self, gone: BoolArray, may_return: bool = False) -> None:
         """Marginalise landmarks (n,): drop their rows and columns, keep their last estimate."""

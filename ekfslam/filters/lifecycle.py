@@ -138,6 +138,15 @@ def _first_steps(log: Log, rows: IntArray) -> IntArray:
     return log.frame[first][rows]
 
 
+def at_rest(out: BoolArray, table: LandmarkTable, limit: int | None) -> BoolArray:
+    """Which of the landmarks out of view (n,) stay in the state, asleep: the last seen, up to a limit; None: all."""
+    stay = out.copy()
+    if limit is not None and (excess := int(out.sum()) - limit) > 0:
+        slot = np.flatnonzero(out)
+        stay[slot[np.argsort(table.last_frame[slot], kind="stable")[:excess]]] = False
+    return stay
+
+
 def out_of_view(table: LandmarkTable, ids: IntArray, frame: int, after: int) -> BoolArray:
     """Which landmarks (n,) have not been seen for ``after`` frames, and are not now, where ``ids`` are."""
     unseen_for = frame - np.maximum(table.last_frame, table.stay_until)

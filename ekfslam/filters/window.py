@@ -12,23 +12,21 @@ _BODY, _LANDMARK = 0, -1
 
 
 @dataclass(frozen=True)
-class Move:
-    """How the columns of X change in a propagation: body, then former columns that are kept, then new ones.
+class Push:
+    """What becomes of the columns of X in a propagation; those behind the body stay.
 
     Args:
         carried_from, carried_to: (c,) body columns on which landmarks depend, whose values are in the body afterwards.
-        kept: (n,) columns before the propagation that stay as they were; those of the body join the window.
-        promoted: (p,) slots of landmarks that join X.
+        pushed: (p,) those whose values are not: copies of them stay, right behind the body.
     """
 
     carried_from: IntArray
     carried_to: IntArray
-    kept: IntArray
-    promoted: IntArray
+    pushed: IntArray
 
 
 class Window:
-    """The columns of X, and what landmarks depend on.
+    """The columns of X, and what awake landmarks depend on.
 
     Args:
         body: Number of body columns.
@@ -46,48 +44,48 @@ class Window:
         self._since = np.zeros(promoted, dtype=np.int64)  # the oldest group that a landmark may depend on
         self._is_referenced = np.zeros(body, dtype=bool)
 
-    def refer(self, columns: BoolArray | IntArray) -> None:
+    def refer(self, columns: BoolArray | IntArray | slice) -> None:
         """Some landmark depends on these body columns from now on."""
         self._is_referenced[columns] = True
 
-    def augment(self, landmarks: int) -> None:
-        """New landmarks, which depend on the body alone."""
-        self.promoted = np.concatenate([self.promoted, np.full(landmarks, -1)])
+    def augment(self, landmarks: int, promoted: bool = False) -> None:
+        """New landmarks, which depend on the body alone, or are the last columns of X."""
+        first = len(self._group) + 3 * np.arange(landmarks) if promoted else np.full(landmarks, -1)
+        self.promoted = np.concatenate([self.promoted, first])
         self._since = np.concatenate([self._since, np.full(landmarks, self._groups + 1)])
+        if promoted:
+            self._group = np.concatenate([self._group, np.full(3 * landmarks, _LANDMARK)])
 
-    def propagate(self, Phi: Array, Q: Array) -> Move:
+    def promote(self, which: IntArray) -> None:
+        """Some landmarks become the last columns of X."""
+        self.promoted[which] = len(self._group) + 3 * np.arange(len(which))
+        self._group = np.concatenate([self._group, np.full(3 * len(which), _LANDMARK)])
+
+    def keep(self, columns: IntArray) -> None:
+        """Only some columns of X are left."""
+        new = np.full(len(self._group), -1)
+        new[columns] = np.arange(len(columns))
+        is_promoted = self.promoted >= 0
+        self.promoted[is_promoted] = new[self.promoted[is_promoted]]
+        self._group = self._group[columns]
+
+    def forget(self, gone: BoolArray) -> IntArray:
+        """Landmarks that are gone (n,) leave; returns their columns, which are still there."""
+        own = self.promoted[gone & (self.promoted >= 0)]
+        self.promoted, self._since = self.promoted[~gone], self._since[~gone]
+        return (own[:, None] + np.arange(3)).ravel()
+
+    def push(self, Phi: Array, Q: Array) -> Push:
         """``x+ = Phi x + w`` on the body, w with covariance Q."""
         carried_from, carried_to, pushed = self._split(Phi, Q)
         if len(pushed):
             self._groups += 1
-        group = np.concatenate([np.full(len(pushed), self._groups), self._group[self._body :]])
-        column = np.concatenate([pushed, np.arange(self._body, len(self._group))])
-        oldest, joined = self._cut(group)
-        stays = (group == _LANDMARK) | (group >= oldest)
-        kept, group = column[stays], group[stays]
-        self._move(np.concatenate([np.arange(self._body), kept]), moved=slice(self._body, None))
-        self.promoted[joined] = self._body + len(kept) + 3 * np.arange(len(joined))
-        own = np.full(3 * len(joined), _LANDMARK)
-        self._group = np.concatenate([np.full(self._body, _BODY), group, own])
+            group, b = np.full(len(pushed), self._groups), self._body
+            self._group = np.concatenate([self._group[:b], group, self._group[b:]])
+            self.promoted[self.promoted >= 0] += len(pushed)
         self._is_referenced[:] = False
         self._is_referenced[carried_to] = True
-        return Move(carried_from, carried_to, kept, joined)
-
-    def marginalise(self, stay: BoolArray) -> IntArray:
-        """Landmarks that do not stay (n,) leave; returns the columns of X that are left."""
-        gone = self.promoted[~stay & (self.promoted >= 0)]
-        kept = np.delete(np.arange(len(self._group)), (gone[:, None] + np.arange(3)).ravel())
-        self.promoted, self._since = self.promoted[stay], self._since[stay]
-        self._group = self._group[kept]
-        self._move(kept)
-        return kept
-
-    def _move(self, kept: IntArray, moved: slice = slice(None)) -> None:
-        """Landmarks that are promoted have other columns where only those ``kept`` are left."""
-        new = np.full(int(kept.max(initial=0)) + 1, -1)
-        new[kept[moved]] = np.arange(len(kept))[moved]
-        is_promoted = self.promoted >= 0
-        self.promoted[is_promoted] = new[self.promoted[is_promoted]]
+        return Push(carried_from, carried_to, pushed)
 
     def _split(self, Phi: Array, Q: Array) -> tuple[IntArray, IntArray, IntArray]:
         """Body columns on which landmarks depend: those whose values stay in the body, where, and those that leave."""
@@ -101,15 +99,17 @@ class Window:
         carried = np.flatnonzero(self._is_referenced & (to >= 0))
         return carried, to[carried], np.flatnonzero(self._is_referenced & (to < 0))
 
-    def _cut(self, group: IntArray) -> tuple[int, IntArray]:
-        """The oldest group that stays, so that X is smallest, and the landmarks that are promoted for it."""
+    def cut(self) -> tuple[IntArray, IntArray]:
+        """Landmarks to promote, and columns that may leave then, so that X becomes smallest."""
+        group = self._group[self._body :]
         numbers, widths = np.unique(group[group != _LANDMARK], return_counts=True)
         free = np.flatnonzero(self.promoted < 0)
         since = np.sort(self._since[free])
         # With the first c groups dropped: landmarks that may depend on the newest of these must be promoted.
         needed = np.searchsorted(since, numbers, side="right")
-        size = np.concatenate([[0], 3 * needed]) + widths.sum() - np.concatenate([[0], np.cumsum(widths)])
-        c = int(size.argmin())
-        if c == 0:
-            return 0, np.empty(0, dtype=np.int64)
-        return int(numbers[c - 1]) + 1, free[self._since[free] <= numbers[c - 1]]
+        size = np.concatenate([[0], 3 * needed]) - np.concatenate([[0], np.cumsum(widths)])
+        if not (c := int(size.argmin())):
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        newest = numbers[c - 1]
+        leaving = (self._group <= newest) & (self._group > _BODY)
+        return free[self._since[free] <= newest], np.flatnonzero(leaving)

@@ -48,8 +48,8 @@ from ekfslam.models.sensors.base import DelayedSensor, Sensor
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
 
-# What "auto" keeps in the state when landmarks come back: beyond this a dense covariance is no longer cheap.
-AUTO_NEVER_LIMIT = 300
+# How many landmarks "auto" keeps in the state when landmarks come back: their covariance takes 160 MB.
+DORMANT_LIMIT = 1500
 
 
 @dataclass(frozen=True)
@@ -203,10 +203,13 @@ def resolve(config: Config, sequence: Sequence) -> Config:
     retire, retire_after = config.filter.retire, config.filter.retire_after
     come_back = _landmarks_come_back(sequence)
     if retire == "auto":
-        retire = "never" if come_back and len(sequence.observations.ids) <= AUTO_NEVER_LIMIT else "unseen"
+        retire = "never" if come_back and len(sequence.observations.ids) <= DORMANT_LIMIT else "unseen"
     if retire_after is None:
         retire_after = 10 if come_back else 1
-    settings = dataclasses.replace(config.filter, retire=retire, retire_after=retire_after)
+    dormant = config.filter.dormant
+    if dormant is None:
+        dormant = DORMANT_LIMIT if come_back and config.filter.retire == "auto" else 0
+    settings = dataclasses.replace(config.filter, retire=retire, retire_after=retire_after, dormant=dormant)
     return dataclasses.replace(config, filter=settings)
 
 
@@ -218,8 +221,9 @@ def _with_form(config: Config, sequence: Sequence, model: Model) -> Config:
     # What has a clone stays for a frame: as its clone.
     moving = (block for block in layout.blocks if block.is_seen and (block.per_frame or block.clones))
     group = sum(block.size for block in moving if block.name not in layout.clones)
-    stay = len(sequence) if settings.retire == "never" else settings.retire_after or 1
-    cheaper = is_conditional_cheaper(sequence.observations, len(sequence), layout.body, group, stay)
+    kept = len(sequence.observations.ids) if settings.retire == "never" else settings.dormant or 0
+    stay = settings.retire_after or 1
+    cheaper = is_conditional_cheaper(sequence.observations, len(sequence), layout.body, group, stay, kept)
     form: CovarianceForm = "conditional" if cheaper else "dense"
     return dataclasses.replace(config, filter=dataclasses.replace(settings, covariance_form=form))
 

@@ -16,7 +16,9 @@ from ekfslam.data.sequence import Observations
 _COST = 2.0
 
 
-def is_conditional_cheaper(observations: Observations, frames: int, body: int, group: int, stay: int) -> bool:
+def is_conditional_cheaper(
+    observations: Observations, frames: int, body: int, group: int, stay: int, kept: int
+) -> bool:
     """Whether the conditional form takes fewer operations, over all frames.
 
     Args:
@@ -24,7 +26,8 @@ def is_conditional_cheaper(observations: Observations, frames: int, body: int, g
         frames: Number of frames.
         body: Number of body columns.
         group: How many of them observations depend on and each frame changes.
-        stay: Frames that a landmark stays in the state after it was seen last.
+        stay: Frames that a landmark is awake after it was seen last.
+        kept: How many stay in the state beyond that.
     """
     _, place = np.unique(observations.landmark, return_inverse=True)
     first, last = np.full(place.max(initial=-1) + 1, frames), np.full(place.max(initial=-1) + 1, -1)
@@ -35,9 +38,10 @@ def is_conditional_cheaper(observations: Observations, frames: int, body: int, g
     dense, conditional = np.zeros(len(chosen)), np.zeros(len(chosen))
     for i, frame in enumerate(chosen.tolist()):
         age = np.sort(frame - first[(first < frame) & (last + stay > frame)])
+        asleep = min(kept, int(((first < frame) & (last + stay <= frame)).sum()))
         n, k = body + _smallest_window(age, group), seen[frame]
         conditional[i] = 12.0 * k * n**2 + 2.7 * n**3
-        dense[i] = 2.3 * (3.0 * k) ** 3 + 3.0 * k * (body + 3.0 * len(age)) ** 2
+        dense[i] = 2.3 * (3.0 * k) ** 3 + 3.0 * k * (body + 3.0 * (len(age) + asleep)) ** 2
     return bool(_COST * conditional.sum() < dense.sum())
 
 
