@@ -68,7 +68,8 @@ class Setup:
     def change(self, turned):
         values, m, in_image = self.after(self.x, self.d)
         before, after = self.values["previous_pose"], values["previous_pose"]
-        return self.camera.change(self.view(self.values, self.m), self.view(values, m), in_image, turned(before, after))
+        views = self.view(self.values, self.m), self.view(values, m)
+        return self.camera.change(np.arange(len(m)), *views, in_image, turned(before, after))
 
 
 everywhere = pytest.mark.parametrize("T", POSES.values(), ids=POSES.keys())
@@ -124,7 +125,7 @@ def test_gauge_directions_are_carried_along(T, calibration):
 
     T_first, m_first = se3.exp(0.1 * STEP) @ s.values["previous_pose"], s.m + 0.1
     views = (s.camera.view(v, p, T_first, m_first) for v, p in ((s.values, s.m), (values, m)))
-    change = s.camera.change(*views, in_image, np.eye(6))
+    change = s.camera.change(np.arange(len(m)), *views, in_image, np.eye(6))
     N = gauge_directions(T_first, m_first)
     carried = change.M @ N[6:].reshape(-1, 3, 6) + change.B[..., :6] @ N[:6]
     np.testing.assert_allclose(carried, N[6:].reshape(-1, 3, 6), atol=1e-11 * scale)
@@ -140,7 +141,7 @@ def test_the_covariance_is_carried_by_the_dense_product(variant, calibration):
     root = s.rng.normal(size=(layout.body + 3 * n,) * 2)
     P = root @ root.T
     ekf.P = P.copy()
-    s.variant.transport(ekf.gaussian, s.model, s.values, values, change)
+    s.variant.transport(ekf.gaussian, s.model, s.values, values, [change])
     G = np.eye(len(P))
     for name in ("pose", "previous_pose"):
         if variant == "invariant":

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ekfslam.errors import InnovationError
+from ekfslam.filters import dormant
 from ekfslam.filters.conditional import ConditionalGaussian
 from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.gaussian import Rows
@@ -159,8 +160,9 @@ def step(rng):
 @pytest.mark.parametrize("considered", [0, 12])
 @pytest.mark.parametrize("naps", [False, True], ids=["awake", "naps"])
 @pytest.mark.parametrize("form", FORMS)
-def test_all_verbs_over_many_frames(form, considered, certain, naps):
+def test_all_verbs_over_many_frames(form, considered, certain, naps, monkeypatch):
     """Landmarks come, are seen in part and shuffled, and leave; coordinates change; all is compared in every frame."""
+    monkeypatch.setattr(dormant, "_WAITING", 20)
     rng = np.random.default_rng(considered + certain)
     body = np.diag(rng.uniform(0.01, 0.1, BODY)) * (not certain)
     gaussian, naive = form(body, SEEN), Naive(body)

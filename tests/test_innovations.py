@@ -5,8 +5,9 @@ import pytest
 
 from ekfslam.config import Config
 from ekfslam.data.simulate import builtin
+from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.gates import diagonal
-from ekfslam.filters.gaussian import Gaussian, Rows
+from ekfslam.filters.gaussian import Rows
 from ekfslam.filters.innovations import innovations_of, whitened
 from ekfslam.runner import run
 
@@ -19,7 +20,7 @@ def prior(request):
     rng = np.random.default_rng(request.param)
     size = BODY + 3 * LANDMARKS
     A = rng.normal(size=(size, size))
-    gaussian = Gaussian(np.zeros((BODY, BODY)), SEEN)
+    gaussian = DenseGaussian(np.zeros((BODY, BODY)), SEEN)
     gaussian.replace(A @ A.T)
     slot = rng.permutation(LANDMARKS)[:6]
     rows = Rows(
@@ -50,14 +51,15 @@ def test_equals_the_joint_innovation_covariance_written_out(prior, taken_out):
     accepted = rows.only(kept)
     H, S, r = dense(gaussian, accepted)
     J, inverse = H[:, :6], np.linalg.inv(S)
-    S_own = gaussian.variances(accepted) + diagonal(accepted.variance)
 
-    done = gaussian.condition(rows, 0, rows.slot)
+    projection = gaussian.project(rows, 0, rows.slot)
+    S_own = projection.variances[kept] + diagonal(accepted.variance)
+    solution = gaussian.solve(projection, 0, rows.slot)
     if taken_out:
-        out = rows.corrected(done.correction[:SEEN], done.correction[BODY:].reshape(-1, 3)).only(~kept)
-        done = done - gaussian.condition(out, 0, out.slot, sign=-1.0)
+        solution = solution.without(~kept)
+    done = solution.done
     left = accepted.corrected(done.correction[:SEEN], done.correction[BODY:].reshape(-1, 3))
-    found = innovations_of(gaussian, accepted.slot, accepted, S_own, left.residual)
+    found = innovations_of(solution, accepted.slot, accepted, S_own, left.residual)
 
     np.testing.assert_allclose(found.score, J.T @ inverse @ r, atol=1e-9)
     np.testing.assert_allclose(found.information, J.T @ inverse @ J, atol=1e-9)

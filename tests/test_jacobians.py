@@ -9,7 +9,7 @@ from reference import CAMERA, T_CAM_IMU, jacobian_of_pi, small_world, stereo_mat
 
 from ekfslam.config import FilterConfig
 from ekfslam.data.sequence import Noise
-from ekfslam.filters.gaussian import Gaussian
+from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import camera as cam
@@ -55,10 +55,11 @@ def retract_invariant(T, m, xi, d):
 def transport_invariant(P, T, T_after, moved):
     """P (b+3n, b+3n) carried along by a correction that moves landmarks by ``moved`` (n, 3)."""
     model = model_of(RIG, RIG.noise, T, np.eye(6), coordinates="xyz")
-    gaussian = Gaussian(np.eye(6), 6)
+    gaussian = DenseGaussian(np.eye(6), 6)
     gaussian.replace(P.copy())
     variant, before = VARIANTS["invariant"], {"pose": T}
-    variant.transport(gaussian, model, before, {"pose": T_after}, variant.change(model, before, moved))
+    change = variant.change(model, before, np.arange(len(moved)), moved)
+    variant.transport(gaussian, model, before, {"pose": T_after}, [change])
     return gaussian.P
 
 

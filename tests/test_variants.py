@@ -175,7 +175,8 @@ def derivatives(variant, T, T_after, m, m_after):
     H_x[:, :6], H_m[:, 6:] = np.eye(6), np.eye(3)
     rows = Rows(np.arange(n), H_x, H_m, np.zeros((n, 9)), np.ones((n, 9)))
     before = {"pose": T}
-    back = variant.carry_back(rows, model, before, {"pose": T_after}, variant.change(model, before, m_after - m))
+    change = variant.change(model, before, np.arange(n), m_after - m)
+    back = variant.carry_back(rows, model, before, {"pose": T_after}, change)
     return back.H_x[0, :6], back.H_x[:, 6:, 3:], back.H_m[:, 6:], back.H_x[:, 6:, :3]
 
 
