@@ -425,7 +425,7 @@ def test_map_is_consistent():
         at = np.searchsorted(world.truth.landmark, found.id)
         d = world.truth.position_m[at] - found.position_m
         landmark.append(np.einsum("ni,nij,nj->n", d, np.linalg.inv(found.landmark_covariance), d).mean())
-    low, high = chi2_bounds(6, 0.98, len(drives))
+    low, high = chi2_bounds(6, 0.999, len(drives))
     assert low < np.mean(pose) < high
     assert 2.4 < np.mean(landmark) < 3.8
 
