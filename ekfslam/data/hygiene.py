@@ -242,10 +242,10 @@ def disparity_jumps(sequence: Sequence, noise: Noise, sigma: float) -> IntArray:
     """Ids (n,) of tracks that a frame sees together with another right image of their points than the frame before.
 
     The velocities say how the depth of a point changes, and so its disparity; a track jumps by what its disparity
-    changes otherwise, in standard deviations of both disparities and of the velocities, beyond what it does in the
-    intervals beside. Traffic does so over many frames, a stereo match that was made anew does it once. Where the median
-    of a frame's tracks jumps by more than ``sigma``, all that are seen across are affected. Tracks with less than
-    ``sigma`` deviations of disparity cannot tell, and at least `_COMPANY` must.
+    changes otherwise, in standard deviations of both disparities and of the velocities, beyond twice what it does in
+    the intervals beside. Traffic does so over many frames, a stereo match that was made anew does it once. Where the
+    median of a frame's tracks jumps by more than ``sigma``, all that are seen across are affected. Tracks with less
+    than ``sigma`` deviations of disparity cannot tell, nor can those of two frames, and at least `_COMPANY` must.
     """
     o, camera = sequence.observations, sequence.camera
     earlier, later = successive(o)
@@ -268,7 +268,10 @@ def disparity_jumps(sequence: Sequence, noise: Noise, sigma: float) -> IntArray:
     goes_on = b[:-1] == a[1:]
     after, before = np.zeros((2, len(jump)))
     after[:-1], before[1:] = np.where(goes_on, jump[1:], 0.0), np.where(goes_on, jump[:-1], 0.0)
-    beyond = jump - np.maximum(before, after)
+    has_beside = np.zeros(len(jump), dtype=bool)
+    has_beside[:-1] |= goes_on
+    has_beside[1:] |= goes_on
+    at, beyond = at[has_beside], (jump - 2.0 * np.maximum(before, after))[has_beside]
     together = np.bincount(at, minlength=1)[at] >= _COMPANY
     frames = np.unique(at[together & (_median_by(at, beyond[:, None])[:, 0] > sigma)])
     return np.unique(o.landmark[later[np.isin(o.frame[later], frames)]])
