@@ -348,7 +348,9 @@ def with_doubled_disparities(world, frame):
 def test_tracks_are_dropped_whose_disparities_jump_together(frame, speed_error):
     world = small_world(sigma_px=0.3, sigma_v=0.05, sigma_w=0.002)
     noise = dataclasses.replace(world.noise, twist_std=np.hypot(world.noise.twist_std, np.repeat([speed_error, 0], 3)))
-    twist = world.twist + speed_error * np.random.default_rng(1).standard_normal(world.twist.shape) * ([1] * 3 + [0] * 3)
+    twist = world.twist + speed_error * np.random.default_rng(1).standard_normal(world.twist.shape) * (
+        [1] * 3 + [0] * 3
+    )
     world, rule = dataclasses.replace(world, twist=twist), only(disparity_jump_sigma=3.0)
     assert not any(clean_tracks(world, noise, rule)[1].counts.values())
     jumped, ids = with_doubled_disparities(world, frame)
