@@ -76,11 +76,9 @@ def gain(sequence):
 
 @pytest.mark.slow
 def test_full_slam_gains_on_the_drives_with_dense_tracks(drives):
-    """On 09_26_drive_0027 alone it loses to dead reckoning, which the sign of lateral velocities has made better."""
     gains = [drive["dead-reckoning"]["ate_m"] / drive["full"]["ate_m"] for drive in drives]
-    assert sum(g > 1 for g in gains) >= 6
-    assert np.median(gains) >= 1.25
-    assert min(gains) > 1 / 1.5
+    assert min(gains) > 1
+    assert np.median(gains) >= 1.5
 
 
 @pytest.mark.slow
