@@ -145,6 +145,9 @@ class HygieneConfig:
             that it was.
         max_depth_error: Tracks are dropped whose depth is never known better than this, as a share of the depth.
         min_observations: Tracks, or pieces of tracks that were cut, with fewer observations are dropped.
+        disparity_jump_sigma: Tracks are dropped as a whole that are seen across a frame in which the disparities of
+            most tracks jump, by more than so many sigmas, away from what the velocities say: the right images are of
+            other points than before, and nobody knows which are right.
 
     There is no rule for an id that is seen twice in one frame. Nobody can know which of the two is meant, so a
     `Sequence` refuses it with a `DuplicateObservationError`.
@@ -158,6 +161,7 @@ class HygieneConfig:
     reused_id_sigma: float = field(default=3.0, metadata=_FINITE)
     max_depth_error: float = field(default=0.0, metadata=_FINITE)
     min_observations: int = field(default=0, metadata=_whole(0))
+    disparity_jump_sigma: float = field(default=3.0, metadata=_FINITE)
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ FIGURES = (
 AS_REPORTED = ekfslam.Config().with_overrides(
     {
         "noise": {"model": "white"},
-        "hygiene": {"restart_at_repeats": False, "min_disparity_sigma": 2.0**0.5},
+        "hygiene": {"restart_at_repeats": False, "min_disparity_sigma": 2.0**0.5, "disparity_jump_sigma": 0.0},
         "filter": {"gate_probability": 1.0, "split_after": 0},
     }
 )

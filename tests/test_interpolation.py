@@ -10,9 +10,11 @@ from recordings import ece276a_fields, write_npz
 from ekfslam.cli import main
 from ekfslam.data.interpolation import SHORTEST, interpolated_intervals, known_intervals, stretches
 from ekfslam.data.readers import open_sequence, read_sequence, write_sequence
+from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.evaluation.consistency import measured_truth, pose_nees
 from ekfslam.evaluation.relative import relative_pose_nees
 from ekfslam.evaluation.summary import summarise
+from ekfslam.models.noise import GAP_STD
 from ekfslam.storage.archive import read_archive, write_archive
 
 
@@ -129,7 +131,7 @@ def test_no_nees_is_taken_of_them(tmp_path):
     poses = truth.T_world_imu.copy()
     poses[31:41, 0, 3] += 100.0
     wrong = dataclasses.replace(truth, T_world_imu=poses)
-    measured = measured_truth(wrong, sequence.interpolated)
+    measured = measured_truth(wrong, sequence.interpolated, sequence.time_s)
     np.testing.assert_array_equal(measured.frame, np.delete(np.arange(200), np.arange(31, 41)))
     np.testing.assert_array_equal(
         pose_nees(result, measured)[1], np.delete(pose_nees(result, truth)[1], np.arange(31, 41))
@@ -145,3 +147,18 @@ def test_no_nees_is_taken_of_them(tmp_path):
     write_archive(tmp_path / "a.h5", dataclasses.replace(sequence, truth=wrong), {"full": result})
     archive = read_archive(tmp_path / "a.h5")
     assert summarise(archive, archive.results["full"]) == found
+
+
+def test_a_first_pose_within_a_stretch_is_trusted_less():
+    sequence = dataclasses.replace(synthetic_sequence(), attributes={"interpolated": "1-12"})
+    noise = TruthNoise(0.001, 0.002, 0.003, 0.1, position_m=0.01)
+    truth = dataclasses.replace(sequence.truth, noise=noise)
+    found = measured_truth(truth, sequence.interpolated, sequence.time_s).noise
+    invented_s = sequence.time_s[12] - sequence.time_s[0]
+    assert found.first_position_m == pytest.approx(np.hypot(0.1, GAP_STD[0] * invented_s))
+    assert dataclasses.replace(found, first_position_m=0.1) == noise
+    for later in ("2-12", "20-30"):
+        other = dataclasses.replace(sequence, attributes={"interpolated": later})
+        assert measured_truth(truth, other.interpolated, other.time_s).noise == noise
+    exact = dataclasses.replace(truth, noise=None)
+    assert measured_truth(exact, sequence.interpolated, sequence.time_s).noise is None

@@ -12,7 +12,13 @@ from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
 from ekfslam.data.simulate import CAMERA, T_CAM_IMU
 from ekfslam.geometry import se3
 
-RAW = HygieneConfig(min_disparity_sigma=0.0, max_row_mismatch_sigma=0.0, restart_at_repeats=False, reused_id_sigma=0.0)
+RAW = HygieneConfig(
+    min_disparity_sigma=0.0,
+    max_row_mismatch_sigma=0.0,
+    restart_at_repeats=False,
+    reused_id_sigma=0.0,
+    disparity_jump_sigma=0.0,
+)
 STEP_S = 0.1
 NOISE = Noise.isotropic(0.1, 0.01, 0.5)
 COMPANY = range(100, 106)  # landmarks that are seen in every frame

@@ -80,11 +80,9 @@ def gain(sequence):
 @pytest.mark.slow
 @pytest.mark.xdist_group("drives")
 def test_full_slam_gains_on_the_drives_with_dense_tracks(drives):
-    """On 09_26_drive_0027 alone it loses to dead reckoning, which the sign of lateral velocities has made better."""
     gains = [drive["dead-reckoning"]["ate_m"] / drive["full"]["ate_m"] for drive in drives]
-    assert sum(g > 1 for g in gains) >= len(drives) - 1
-    assert np.median(gains) >= 1.25
-    assert min(gains) > 1 / 1.5
+    assert min(gains) > 1
+    assert np.median(gains) >= 1.5
 
 
 @pytest.mark.slow
@@ -136,4 +134,4 @@ def test_noise_added_to_the_velocities_is_filtered_out(opened, name):
     for seed in seeds(2, 1):
         noise = np.repeat([0.5, 0.05], 3) * np.random.default_rng(seed).standard_normal(clean.twist.shape)
         gains.append(gain(dataclasses.replace(clean, twist=clean.twist + noise)))
-    assert np.median(gains) >= 2.0
+    assert np.median(gains) >= 3.0

@@ -25,7 +25,7 @@ from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
 
 # The rules in the order in which they are applied, with the key of ``[hygiene]`` that switches each. The index of a
-# rule is its code in `HygieneReport.rule`.
+# rule is its code in `HygieneReport.rule`, also in archives: what is new comes last.
 _SWITCHES: dict[str, str] = {
     "repeated frame": "restart_at_repeats",
     "jump": "jump_sigma",
@@ -34,9 +34,10 @@ _SWITCHES: dict[str, str] = {
     "row mismatch": "max_row_mismatch_sigma",
     "depth": "max_depth_error",
     "too short": "min_observations",
+    "disparity jump": "disparity_jump_sigma",
 }
 RULES: tuple[str, ...] = tuple(_SWITCHES)
-REPEATED_FRAME, JUMP, REUSED_ID, DISPARITY, ROW_MISMATCH, DEPTH, TOO_SHORT = range(len(RULES))
+REPEATED_FRAME, JUMP, REUSED_ID, DISPARITY, ROW_MISMATCH, DEPTH, TOO_SHORT, DISPARITY_JUMP = range(len(RULES))
 
 # Standard deviation that white noise of 1 px gives to what `jumps` compares.
 _JUMP_STD = 2.0
@@ -152,6 +153,10 @@ def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tup
     if config.min_observations:
         track = np.searchsorted(kept.ids, kept.landmark)
         drop(TOO_SHORT, np.bincount(track)[track] < config.min_observations)
+    if config.disparity_jump_sigma:
+        # Asked of the tracks as they were recorded: where far ones have lost observations, the jump is not seen.
+        jumped = disparity_jumps(sequence, noise, config.disparity_jump_sigma)
+        drop(DISPARITY_JUMP, np.isin(own, jumped))
 
     if not rows:
         return kept, HygieneReport.empty(len(sequence.observations))
@@ -231,6 +236,45 @@ def reused_ids(sequence: Sequence, observations: Observations, noise: Noise, sig
     allowed += drift + turn * reach**2 + (noise.misalignment_rad * way) ** 2
     found[later] = np.linalg.norm(apart[1] - apart[0], axis=1) > sigma * np.sqrt(allowed)
     return found
+
+
+def disparity_jumps(sequence: Sequence, noise: Noise, sigma: float) -> IntArray:
+    """Ids (n,) of tracks that a frame sees together with another right image of their points than the frame before.
+
+    The velocities say how the depth of a point changes, and so its disparity; a track jumps by what its disparity
+    changes otherwise, in standard deviations of both disparities and of the velocities, beyond twice what it does in
+    the intervals beside. Traffic does so over many frames, a stereo match that was made anew does it once. Where the
+    median of a frame's tracks jumps by more than ``sigma``, all that are seen across are affected. Tracks with less
+    than ``sigma`` deviations of disparity cannot tell, nor can those of two frames, and at least `_COMPANY` must.
+    """
+    o, camera = sequence.observations, sequence.camera
+    earlier, later = successive(o)
+    beside = o.frame[later] - o.frame[earlier] == 1
+    earlier, later = earlier[beside], later[beside]
+    disparity, std = _disparity(o), float(np.hypot(noise.pixel_std_px[0], noise.pixel_std_px[2]))
+    tells = (disparity[earlier] > sigma * std) & (disparity[later] > 0)
+    a, b = earlier[tells], later[tells]
+    at = o.frame[b]
+    tau = np.diff(sequence.time_s, prepend=sequence.time_s[0])[at]
+    points = cam.triangulate(camera, cam.rectified_rows(o.pixels_px[a], noise.pixel_std_px)[0])
+    C = sequence.T_cam_imu
+    depth = se3.apply(C @ motion.increment(sequence.twist[at], tau) @ se3.inverse(C), points)[:, 2]
+    in_front = depth > 0
+    a, b, at, tau, depth = a[in_front], b[in_front], at[in_front], tau[in_front], depth[in_front]
+    expected = camera.fu_px * camera.baseline_m / depth
+    by_velocity = expected / depth * tau * np.linalg.norm(noise.velocity_std[:3])
+    jump = np.abs(disparity[b] - expected) / np.hypot(np.sqrt(2.0) * std, by_velocity)
+    # Pairs are in the order of tracks and then of frames.
+    goes_on = b[:-1] == a[1:]
+    after, before = np.zeros((2, len(jump)))
+    after[:-1], before[1:] = np.where(goes_on, jump[1:], 0.0), np.where(goes_on, jump[:-1], 0.0)
+    has_beside = np.zeros(len(jump), dtype=bool)
+    has_beside[:-1] |= goes_on
+    has_beside[1:] |= goes_on
+    at, beyond = at[has_beside], (jump - 2.0 * np.maximum(before, after))[has_beside]
+    together = np.bincount(at, minlength=1)[at] >= _COMPANY
+    frames = np.unique(at[together & (_median_by(at, beyond[:, None])[:, 0] > sigma)])
+    return np.unique(o.landmark[later[np.isin(o.frame[later], frames)]])
 
 
 def _is_slow(observations: Observations, limit_px: float) -> NDArray[np.bool_]:

@@ -17,11 +17,13 @@ from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.interpolation import stretches
 from ekfslam.data.sequence import Truth
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.evaluation.trajectory import match_landmarks
 from ekfslam.filters.result import Landmarks, Result
 from ekfslam.geometry import se3
+from ekfslam.models.noise import GAP_STD
 
 
 def pose_error(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
@@ -50,10 +52,23 @@ def nees(error: Array, covariance: Array) -> Array:
     return np.where(definite, np.sum(whitened**2, axis=-1), np.nan)
 
 
-def measured_truth(truth: Truth, interpolated: BoolArray) -> Truth:
-    """The truth of the frames that no interpolated interval (T,) leads to: of the others nothing should be judged."""
-    kept = ~interpolated[truth.frame]
-    return dataclasses.replace(truth, frame=truth.frame[kept], T_world_imu=truth.T_world_imu[kept])
+def measured_truth(truth: Truth, interpolated: BoolArray, time_s: Array) -> Truth:
+    """The truth of the frames that no interpolated interval (T,) leads to: of the others nothing should be judged.
+
+    All poses are judged from the first one on. Where the recording begins with such a stretch, the first position is
+    invented, too: beside its noise it may err by what speeds across gaps err by until the stretch ends.
+
+    Args:
+        truth: Of a recording.
+        interpolated: (T,) its interpolated intervals.
+        time_s: (T,) its stamps.
+    """
+    kept, noise = ~interpolated[truth.frame], truth.noise
+    if noise is not None and interpolated[1:2].any():
+        invented_s = float(time_s[stretches(interpolated)[0][1]] - time_s[0])
+        first_m = float(np.hypot(noise.first_position_m, GAP_STD[0] * invented_s))
+        noise = dataclasses.replace(noise, first_position_m=first_m)
+    return dataclasses.replace(truth, frame=truth.frame[kept], T_world_imu=truth.T_world_imu[kept], noise=noise)
 
 
 def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Array:

@@ -65,9 +65,9 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
     covariance is not singular, and takes the truth as exact. ``pose_nees_with_truth_noise_mean`` allows for the noise
     that the truth states. So do ``pose_nees_x_mean`` and its like (1 expected), each of a single axis of the error
     ``xi``, and ``pose_nees_relative_100_mean`` and its like (6 expected), of the motion over so many frames, or metres
-    of true path. All of these leave interpolated stretches out. ``nis_per_dof`` (1 expected) is the sum of NIS over the
-    sum of degrees of freedom, ``total_s`` the sum of the time spent on the frames. None stands where truth is missing
-    or the value is undefined.
+    of true path. All of these leave interpolated stretches out, and trust a first pose within one less. ``nis_per_dof``
+    (1 expected) is the sum of NIS over the sum of degrees of freedom, ``total_s`` the sum of the time spent on the
+    frames. None stands where truth is missing or the value is undefined.
     """
     summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _ROWS)
     truth = sequence.truth
@@ -101,7 +101,7 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
 
 def _pose_consistency(result: Result, truth: Truth, interpolated: BoolArray) -> dict[str, float | None]:
     """The part of `summarise` that compares pose errors with their covariance."""
-    measured = measured_truth(truth, interpolated)
+    measured = measured_truth(truth, interpolated, result.time_s)
     found = {
         "pose_nees_mean": _mean(pose_nees(result, measured)[1]),
         "pose_nees_with_truth_noise_mean": _mean(pose_nees(result, measured, with_truth_noise=True)[1]),
