@@ -134,4 +134,4 @@ def test_noise_added_to_the_velocities_is_filtered_out(opened, name):
     for seed in seeds(2, 1):
         noise = np.repeat([0.5, 0.05], 3) * np.random.default_rng(seed).standard_normal(clean.twist.shape)
         gains.append(gain(dataclasses.replace(clean, twist=clean.twist + noise)))
-    assert np.median(gains) >= 3.0
+    assert np.median(gains) >= (3.0 if WHOLE else 2.0)
