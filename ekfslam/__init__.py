@@ -63,59 +63,15 @@ Glossary:
 - *standard deviation*: of a Gaussian error, always one sigma.
 """
 
-from importlib.metadata import version
+# Names are imported when they are first used, so that `import ekfslam` takes no time: they stand in `__init__.pyi`.
+import lazy_loader as _lazy
 
-from ekfslam.config import (
-    MODES,
-    VARIANTS,
-    CalibrationConfig,
-    Config,
-    FilterConfig,
-    HygieneConfig,
-    NoiseConfig,
-    PosteriorConfig,
-    TruthConfig,
-)
-from ekfslam.data.readers import open_sequence, write_sequence
-from ekfslam.data.sequence import Sequence
-from ekfslam.errors import EkfslamError
-from ekfslam.filters.result import Result
-from ekfslam.reports import Comparison, check, check_consistency, compare
-from ekfslam.runner import run
-from ekfslam.smoother.posterior import Posterior, posterior, smooth
-from ekfslam.storage.archive import read_archive, write_archive
-from ekfslam.studies.study import LEVELS, Study
-from ekfslam.studies.tuning import TunedNoise, tune
+_from_stub, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
 
-__version__ = version("ekfslam")
 
-__all__ = [
-    "LEVELS",
-    "MODES",
-    "VARIANTS",
-    "CalibrationConfig",
-    "Comparison",
-    "Config",
-    "EkfslamError",
-    "FilterConfig",
-    "HygieneConfig",
-    "NoiseConfig",
-    "Posterior",
-    "PosteriorConfig",
-    "Result",
-    "Sequence",
-    "Study",
-    "TruthConfig",
-    "TunedNoise",
-    "check",
-    "check_consistency",
-    "compare",
-    "open_sequence",
-    "posterior",
-    "read_archive",
-    "run",
-    "smooth",
-    "tune",
-    "write_archive",
-    "write_sequence",
-]
+def __getattr__(name: str) -> object:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("ekfslam")
+    return _from_stub(name)
