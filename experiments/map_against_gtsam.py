@@ -180,7 +180,13 @@ def batch(graph: Any, start: Any, tolerance: float) -> tuple[Any, int, float]:
 
 
 def incremental(
-    result: Result, factors: Factors, threshold: float, landmark_std_m: float | None = None
+    result: Result,
+    factors: Factors,
+    threshold: float,
+    landmark_std_m: float | None = None,
+    *,
+    skip: int = RELINEARISE_SKIP,
+    pose_covariance: bool = False,
 ) -> tuple[Any, Array]:
     """iSAM2, frame by frame: its values after the last frame, and the seconds (T,) of each update.
 
@@ -189,6 +195,8 @@ def incremental(
         factors: Its `factors_of`.
         threshold: Beyond which change (metres and radians alike) a variable is linearised again.
         landmark_std_m: Of a prior on every landmark about its first guess; none by default.
+        skip: It looks for such variables at every so many updates.
+        pose_covariance: Whether to ask for the covariance of the last pose in every frame.
 
     Raises:
         RuntimeError: iSAM2 met a system that it could not solve.
@@ -196,7 +204,7 @@ def incremental(
     log = log_of(result)
     parameters = gtsam.ISAM2Params()
     parameters.setRelinearizeThreshold(threshold)
-    parameters.relinearizeSkip = RELINEARISE_SKIP
+    parameters.relinearizeSkip = skip
     isam = gtsam.ISAM2(parameters)
 
     measured = se3.inverse(motion.increment(log.twist, log.tau_s))
@@ -227,6 +235,8 @@ def incremental(
         begin = perf_counter()
         isam.update(graph, values)
         T_world_imu = isam.calculateEstimatePose3(X(k)).matrix()
+        if pose_covariance:
+            isam.marginalCovariance(X(k))
         seconds[k] = perf_counter() - begin
     return isam.calculateEstimate(), seconds
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import wraps
-from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ParamSpec
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
@@ -140,9 +141,11 @@ def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure with a palette of 256 colours: a third of the size or less, without a visible difference."""
     # The default median cut sacrifices rare colours, here a thin trajectory; this method keeps all within 20 of 255.
     # Means (kmeans) then give large areas their exact colour: the grey of bounds must not turn blue.
-    buffer = BytesIO()
-    figure.savefig(buffer, dpi=DPI)
-    picture = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
+    figure.set_dpi(DPI)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    picture = drawn.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
     picture.save(path, dpi=(DPI, DPI), optimize=True)
 
 

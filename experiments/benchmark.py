@@ -1,0 +1,240 @@
+"""How long a frame takes: both forms of the covariance, and the joint filter against GTSAM's iSAM2.
+
+Three tables, each from runs that take turns (A B A B ...) on one BLAS thread, so that what else the machine does hits
+all alike:
+
+- *Observations a frame*: `builtin:city` with 30 to 1000; dense and conditional form, the same filter to rounding.
+- *Laps*: a ring of 40 m radius, driven three times. Landmarks out of view sleep, and come back exactly.
+- *The race*: total seconds of the joint filter on the UTIAS drives, with white noise as GTSAM's factors have it, and
+  with the automatic model. Beside it iSAM2 (relinearizeSkip 10, Cauchy) on the very observations that the filter
+  accepted, without and with the covariance of its last pose in every frame. Building its factors is not counted.
+
+    python experiments/benchmark.py [--data DIR] [--out DIR] [--repeat N] [--quick]
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from common import UTIAS, argument_parser, has_recordings, trajectory_errors, write
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullLocator
+from threadpoolctl import threadpool_limits
+
+import ekfslam
+from ekfslam.data.sequence import Sequence
+from ekfslam.data.simulate import builtin
+from ekfslam.evaluation.tables import document, markdown_table, number
+from ekfslam.figures.style import BAND_ALPHA, VARIANTS, styled
+
+OBSERVATIONS = (30, 60, 120, 250, 500, 1000)
+FORMS = ("dense", "conditional")
+DENSE_LIMIT = 500  # beyond it the dense form runs once, and over fewer frames
+WHITE: dict[str, dict[str, Any]] = {"noise": {"model": "white"}, "filter": {"relative_frames": 0}}
+AUTOMATIC: dict[str, dict[str, Any]] = {"filter": {"relative_frames": 0}}
+
+
+def in_turn(tasks: Mapping[str, Callable[[], Any]], repeat: int) -> dict[str, list[Any]]:
+    """What each task returned, each time; they take turns."""
+    found: dict[str, list[Any]] = {name: [] for name in tasks}
+    with threadpool_limits(1, user_api="blas"):
+        for _ in range(repeat):
+            for name, task in tasks.items():
+                found[name].append(task())
+    return found
+
+
+def city(observations: int, frames: int) -> Sequence:
+    """A city in which about so many landmarks are seen in each frame."""
+    tracks, density = int(1.1 * observations), max(4.0, observations / 12.0)
+    return builtin(f"city?frames={frames}&max_tracks={tracks}&landmarks_per_m={density}")
+
+
+def of_form(form: str) -> dict[str, Any]:
+    """Settings of one form of the covariance."""
+    return {"filter": {"covariance_form": form, "relative_frames": 0}}
+
+
+def milliseconds(sequence: Sequence, settings: dict[str, Any]) -> np.ndarray:
+    """Of each frame of a run in mode full."""
+    return ekfslam.run(sequence, "full", ekfslam.Config().with_overrides(settings)).ms_per_frame
+
+
+def by_observations(repeat: int, sizes: tuple[int, ...]) -> list[dict[str, Any]]:
+    """Milliseconds a frame against what a frame sees."""
+    rows = []
+    for size in sizes:
+        sequence = city(size, 60 if size <= DENSE_LIMIT else 30)
+        tasks = {form: partial(milliseconds, sequence, of_form(form)) for form in ("auto", *FORMS)}
+        found = {form: np.concatenate([ms[10:] for ms in all_ms]) for form, all_ms in in_turn(tasks, repeat).items()}
+        row: dict[str, Any] = {"observations": float(np.bincount(sequence.observations.frame)[10:].mean())}
+        for form, ms in found.items():
+            row[form] = {"median": float(np.median(ms)), "p95": float(np.percentile(ms, 95)), "max": float(ms.max())}
+        rows.append(row)
+        print(row, flush=True)
+    return rows
+
+
+def by_laps(laps: int = 3) -> list[dict[str, Any]]:
+    """Seconds a lap, and the longest frame of each, on a ring whose landmarks come back."""
+    frames = int(laps * 2 * np.pi * 40.0 / 8.0 / 0.1)
+    sequence = builtin(f"loop?radius_m=40&landmarks=394&landmark_offset_m=16&frames={frames}")
+    settings: dict[str, dict[str, Any]] = {
+        "never retired, dense": {"retire": "never", "covariance_form": "dense"},
+        "asleep out of view": {"retire": "never", "covariance_form": "conditional"},
+        "retired, from the batch problem": {"retire": "unseen", "retire_after": 10},
+    }
+    rows = []
+    tasks = {
+        name: partial(milliseconds, sequence, {"filter": {**own, "relative_frames": 0}})
+        for name, own in settings.items()
+    }
+    for name, (ms,) in in_turn(tasks, 1).items():
+        each = np.array_split(ms, laps)
+        row = {"name": name, "laps_s": [float(lap.sum()) / 1e3 for lap in each], "median_ms": float(np.median(ms))}
+        rows.append({**row, "max_ms": [float(lap.max()) for lap in each]})
+        print(rows[-1], flush=True)
+    return rows
+
+
+def race(data: Path, files: tuple[str, ...], repeat: int) -> list[dict[str, Any]]:
+    """Total seconds of the filter, and of iSAM2 on what it accepted."""
+    from map_against_gtsam import RELINEARISE, factors_of, incremental, open_set
+
+    def seconds_of_isam(result: ekfslam.Result, factors: Any, pose_covariance: bool = False) -> np.ndarray:
+        # A weak prior on every landmark: without it a landmark behind a camera leaves the system singular.
+        options = {"skip": 10, "pose_covariance": pose_covariance}
+        return 1e3 * incremental(result, factors, RELINEARISE, 1000.0, **options)[1]  # type: ignore[arg-type]
+
+    rows = []
+    for file in files:
+        sequence = open_set(data, file)
+        settings = {**WHITE, "posterior": {"kernel": "cauchy"}}
+        white = ekfslam.run(sequence, "full", ekfslam.Config().with_overrides(settings))
+        factors = factors_of(white, ekfslam.PosteriorConfig(kernel="cauchy"))
+        isam = partial(seconds_of_isam, white, factors)
+        runs = in_turn(
+            {
+                "white": partial(milliseconds, sequence, WHITE),
+                "automatic": partial(milliseconds, sequence, AUTOMATIC),
+                "iSAM2": isam,
+                "iSAM2 with covariance": partial(isam, pose_covariance=True),
+            },
+            repeat,
+        )
+        found = {name: [float(ms.sum()) / 1e3 for ms in all_ms] for name, all_ms in runs.items()}
+        row = {"name": sequence.name, "frames": len(sequence), **{name: median(s) for name, s in found.items()}}
+        rows.append({**row, "ate_m": trajectory_errors(sequence, white.T_world_imu)["ate_m"]})
+        print(rows[-1], flush=True)
+    return rows
+
+
+def dgemm_gflops() -> float:
+    """Rate of one thread at 500 x 500 matrices."""
+    A = np.random.default_rng(0).normal(size=(500, 500))
+    with threadpool_limits(1, user_api="blas"):
+        best = np.inf
+        for _ in range(20):
+            begin = perf_counter()
+            A @ A
+            best = min(best, perf_counter() - begin)
+    return 2.0 * 500**3 / best / 1e9
+
+
+@styled
+def figure(rows: list[dict[str, Any]]) -> Figure:
+    """Milliseconds a frame against observations a frame."""
+    drawn = Figure(figsize=(5.0, 3.6))
+    axes = drawn.add_subplot()
+    for form, style in (("dense", VARIANTS["standard"]), ("conditional", VARIANTS["invariant"])):
+        x = [row["observations"] for row in rows]
+        axes.plot(x, [row[form]["median"] for row in rows], **style, label=f"{form} form")
+        lower, upper = ([row[form][key] for row in rows] for key in ("median", "p95"))
+        axes.fill_between(x, lower, upper, color=style["color"], alpha=BAND_ALPHA, linewidth=0)
+    axes.set(xscale="log", yscale="log", xlabel="observations a frame", ylabel="time a frame (ms), median to 95 %")
+    axes.set_xticks(OBSERVATIONS[: len(rows)], [str(size) for size in OBSERVATIONS[: len(rows)]])
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.legend()
+    return drawn
+
+
+def tables(found: dict[str, Any]) -> str:
+    """All three as Markdown."""
+    sizes = [
+        [
+            number(row["observations"], ".0f"),
+            *(f"{row[form]['median']:.1f} ({row[form]['p95']:.1f})" for form in FORMS),
+            f"{row['dense']['median'] / row['conditional']['median']:.2f}",
+            f"{row['dense']['median'] / row['auto']['median']:.2f}",
+        ]
+        for row in found["observations"]
+    ]
+    laps = [
+        [
+            row["name"],
+            *(f"{s:.2f}" for s in row["laps_s"]),
+            f"{row['laps_s'][2] / row['laps_s'][1]:.2f}",
+            f"{max(row['max_ms']) / row['median_ms']:.1f}",
+        ]
+        for row in found["laps"]
+    ]
+    parts = [
+        f"One BLAS thread of {found['machine']}, {found['dgemm_gflops']:.0f} Gflop/s at 500 x 500; runs take turns.",
+        "Milliseconds a frame on `builtin:city`, median (95 %):",
+        markdown_table(["observations", *FORMS, "dense / conditional", "dense / auto"], sizes),
+        "A ring of 40 m radius with 394 landmarks, seconds a lap:",
+        markdown_table(["landmarks out of view", "lap 1", "lap 2", "lap 3", "3 / 2", "longest / median frame"], laps),
+    ]
+    if found["race"]:
+        names = ("white", "automatic", "iSAM2", "iSAM2 with covariance")
+        race_rows = [
+            [
+                row["name"],
+                *(f"{row[name]:.2f}" for name in names),
+                *(f"{row[other] / row['white']:.1f}" for other in names[2:]),
+                *(f"{row[other] / row['automatic']:.1f}" for other in names[2:]),
+            ]
+            for row in found["race"]
+        ]
+        ratios = np.array([[float(cell) for cell in row[5:]] for row in race_rows])
+        race_rows.append(["median", "", "", "", "", *(f"{value:.1f}" for value in np.median(ratios, axis=0))])
+        header = ["drive", *(f"{name} s" for name in names), "iSAM2 / white", "with covariance"]
+        parts += [
+            "Total seconds on the recordings, joint filter (white noise; automatic model) and iSAM2:",
+            markdown_table([*header, "iSAM2 / automatic", "with covariance / automatic"], race_rows),
+        ]
+    return document("Benchmark", *parts)
+
+
+def main() -> None:
+    parser: argparse.ArgumentParser = argument_parser(__doc__, "benchmark", data=True)
+    parser.add_argument("--repeat", type=int, default=3, metavar="N", help="runs of each (default: %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="small sizes only, no recordings")
+    options = parser.parse_args()
+    found: dict[str, Any] = {"machine": platform.machine(), "dgemm_gflops": dgemm_gflops()}
+    sizes = OBSERVATIONS[:3] if options.quick else OBSERVATIONS
+    found["observations"] = by_observations(options.repeat, sizes)
+    found["laps"] = by_laps()
+    found["race"] = []
+    try:
+        import gtsam  # noqa: F401
+    except ModuleNotFoundError:
+        print("no race: GTSAM is missing, pip install 'ekfslam[bench]'", file=sys.stderr)
+    else:
+        if not options.quick and has_recordings(options.data, *UTIAS):
+            found["race"] = race(options.data, UTIAS, options.repeat)
+    write(options.out, "benchmark", found, tables(found), {"benchmark": figure(found["observations"])})
+
+
+if __name__ == "__main__":
+    main()
