@@ -11,16 +11,14 @@ from collections.abc import Sequence as SequenceType
 from pathlib import Path
 from typing import get_args
 
-import h5py
-
-from ekfslam import __version__
+from ekfslam import __version__, hdf5
 from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation, NoiseModel
 from ekfslam.data.interpolation import stretches
 from ekfslam.data.readers import BUILTIN, open_sequence, write_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.data.tracks import inspect_tracks
-from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
+from ekfslam.errors import ConfigError, EkfslamError
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.posterior import save_posterior_figures
@@ -463,13 +461,7 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _is_archive(data: str) -> bool:
-    if data.startswith(BUILTIN) or not Path(data).is_file() or not h5py.is_hdf5(data):
-        return False
-    try:
-        with h5py.File(data) as h5file:
-            return h5file.attrs.get("format") == ARCHIVE_FORMAT
-    except OSError as error:
-        raise ArchiveError(f"{data}: cannot be read: {error}") from None
+    return not data.startswith(BUILTIN) and hdf5.format_of(data) == ARCHIVE_FORMAT
 
 
 def _table(data: Sequence | Archive, landmarks: int | None, results: Mapping[str, Result]) -> str:

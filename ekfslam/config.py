@@ -402,6 +402,21 @@ class Config:
             raise ConfigError(f"{path}: {error}") from None
 
 
+def check_stored(tables: Mapping[str, Any]) -> None:
+    """Raise a `ConfigError` where what a result was stored with breaks today's rules; keys unknown today may stand."""
+    defaults = Config()
+    for setting in dataclasses.fields(Config):
+        settings = tables.get(setting.name, {})
+        _require_table(setting.name, settings)
+        if setting.name == "blocks":
+            _check_blocks(settings)
+            continue
+        for known in dataclasses.fields(type(getattr(defaults, setting.name))):
+            value = settings.get(known.name)
+            if value is not None:
+                known.metadata["rule"].check(f"{setting.name}.{known.name}", value)
+
+
 def _require_table(name: str, value: object) -> None:
     if not isinstance(value, Mapping):
         raise ConfigError(f"[{name}] must be a table, found {value!r}")

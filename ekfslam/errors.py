@@ -30,6 +30,10 @@ class ArchiveError(EkfslamError):
     """A result archive lacks what was asked of it, or has a format version this release cannot read."""
 
 
+class WriteError(ArchiveError):
+    """A file cannot be written; an older one of its name is as it was."""
+
+
 class DataError(EkfslamError):
     """A data set is malformed.
 

@@ -386,7 +386,7 @@ def test_own_form_of_a_newer_version_is_refused_with_both_versions(tmp_path, npz
 def test_sequence_group_without_observations_keeps_the_rest(tmp_path, starry_night):
     sequence = open_sequence(starry_night)
     with h5py.File(tmp_path / "archive.h5", "w") as h5file:
-        write_sequence_group(h5file, sequence, include_observations=False)
+        write_sequence_group(h5file, sequence)
         write_truth_group(h5file, sequence.truth)
         fields = read_sequence_fields(h5file, "archive.h5")
         assert_same(sequence, Sequence(**fields, observations=sequence.observations))

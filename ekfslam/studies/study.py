@@ -108,12 +108,16 @@ CHECKPOINT_S = 5.0
 CHECKPOINT_SHARE = 0.05  # of the time may go into checkpoints of a large study
 
 # Data sets below a level, and below a variant of it.
-_LEVEL: hdf5.Layout = (
+_LEVEL = hdf5.layout(
     ("time", "time", ("T",), "s", "nominal stamps"),
-    ("done", "done", ("runs",), "1", "runs that are in"),
+    ("done", "done", ("runs",), "1", "runs that are in", hdf5.FLAGS),
 )
-_VARIANT: hdf5.Layout = tuple(
-    (name, name, ("runs", *shape), units, frame) for name, (shape, _, units, frame) in FIELDS.items()
+_CHECKS = {float: hdf5.NUMBERS_OR_NONE, int: hdf5.COUNTS, bool: hdf5.FLAGS}
+_VARIANT = hdf5.layout(
+    *(
+        (name, name, ("runs", *shape), units, frame, _CHECKS[kind])
+        for name, (shape, kind, units, frame) in FIELDS.items()
+    )
 )
 
 Record = dict[str, dict[str, NDArray]]  # variant, field, value of one run

@@ -72,7 +72,8 @@ def require_numbers(
     if value.dtype.kind not in ("iu" if np.issubdtype(dtype, np.integer) else "iuf"):
         raise ShapeError(f"expected {np.dtype(dtype).name} numbers, found {value.dtype}", field=name)
     require_shape(value, shape, name)
-    require_finite(value, name)
+    if value.dtype.kind == "f":
+        require_finite(value, name)
     return value.astype(dtype)
 
 
