@@ -12,7 +12,7 @@ import fcntl
 import itertools
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -23,26 +23,47 @@ _counter = itertools.count()
 
 
 def write(path: str | Path, content: str | bytes) -> None:
-    """Write a file, in place of an older one.
+    """`write_all` of one file, into a folder that exists."""
+    write_all({Path(path): content}, make_folders=False)
 
-    The permissions of an older file stay. A symbolic link stays, and what it names is written.
+
+def write_all(contents: Mapping[Path, str | bytes], make_folders: bool = True) -> None:
+    """Write files that belong together, in place of older ones: all are on the disk before the first takes its place.
+
+    Permissions of older files stay. A symbolic link stays, and what it names is written.
+
+    Args:
+        contents: By path; text is encoded in UTF-8.
+        make_folders: Make folders that are missing; they go again where the writing fails.
 
     Raises:
-        WriteError: The target is a folder, a device or protected, its folder is missing, or the disk is full.
+        WriteError: A target is a folder, a device or protected, its folder is missing, or the disk is full.
     """
-    target = _target(path)
-    data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
-    unfinished = target.with_name(f"{_PREFIX}{os.getpid()}.{next(_counter)}{_SUFFIX}")
+    unfinished: dict[Path, Path] = {}
+    made: list[Path] = []
+    path = Path()
     try:
-        _sweep(target.parent)
-        _write_to_disk(unfinished, data, target)
-        unfinished.replace(target)
-        _sync_folder(target.parent)
+        for path, content in contents.items():
+            target = _target(path)
+            if make_folders:
+                made += _make_folder(target.parent)
+            _sweep(target.parent)
+            beside = target.with_name(f"{_PREFIX}{os.getpid()}.{next(_counter)}{_SUFFIX}")
+            unfinished[target] = beside
+            data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+            _write_to_disk(beside, data, target)
+        for target, beside in unfinished.items():
+            beside.replace(target)
+        for folder in {target.parent for target in unfinished}:
+            _sync_folder(folder)
     except OSError as error:
         raise WriteError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
         with suppress(OSError):
-            unfinished.unlink(missing_ok=True)
+            for beside in unfinished.values():
+                beside.unlink(missing_ok=True)
+            for folder in reversed(made):
+                folder.rmdir()  # only empty ones can be
 
 
 def require_writable(path: str | Path) -> None:
@@ -56,18 +77,18 @@ def require_writable(path: str | Path) -> None:
         raise WriteError(f"{path}: cannot be written: the folder {folder} is protected")
 
 
-def make_folder(path: str | Path) -> Path:
-    """Make a folder and those above it where they are missing.
-
-    Raises:
-        WriteError: It cannot be made, or is there and no folder.
-    """
+def is_free(path: str | Path) -> bool:
+    """Whether nothing is lost by writing there: there is no file, or an empty one."""
     path = Path(path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WriteError(f"{path}: the folder cannot be made: {error.strerror or error}") from None
-    return path
+    return not path.exists() or (path.is_file() and path.stat().st_size == 0)
+
+
+def _make_folder(folder: Path) -> list[Path]:
+    """Make a folder and those above it where they are missing; those that were made, from the top."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()][::-1]
+    for path in missing:
+        path.mkdir(exist_ok=True)
+    return missing
 
 
 @contextmanager

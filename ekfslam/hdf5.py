@@ -1,6 +1,6 @@
 """The HDF5 dialect of result archives, studies and recordings.
 
-- A file appears under its name only when it is complete (`creating`).
+- A file is made in memory (`image`) and appears under its name only when it is complete.
 - Its attributes ``format`` and ``format_version`` say what it is; `opened` refuses what it is not, and whatever damage
   shows while it is read becomes one named error.
 - Data sets are declared in layouts, next to the records that they hold. Each has the attributes ``units`` and ``frame``
@@ -11,8 +11,7 @@
   variable length. Files have the newer layout, which carries checksums of all but the arrays. Long arrays of
   recordings, which are passed on, are compressed.
 
-A leaf: readers of data use it as well as archives do, so it imports nothing of the package but the errors and the
-writing of files.
+A leaf: readers of data use it as well as archives do, so it imports nothing of the package but the errors.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ekfslam import files
 from ekfslam.errors import ArchiveError, EkfslamError
 
 _LONG = 10_000  # entries from which compression pays
@@ -57,7 +55,7 @@ def _in(low: float, high: float) -> Callable[[NDArray, Mapping[str, int]], NDArr
 
 
 def _ascends(value: NDArray, _: Mapping[str, int]) -> NDArray:
-    return np.isfinite(value) & (np.diff(value, prepend=-np.inf) > 0)
+    return (np.abs(value) <= _LARGEST) & (np.diff(value, prepend=-np.inf) > 0)
 
 
 NUMBERS = Check("f", "be finite", _in(-_LARGEST, _LARGEST))
@@ -111,21 +109,23 @@ def layout(*rows: tuple[Any, ...]) -> Layout:
     return tuple(Item(*row) for row in rows)
 
 
-@contextmanager
-def creating(path: str | Path, format: str, version: int) -> Iterator[h5py.File]:
-    """A new file of a format and version, which replaces an old one when it is complete.
+def image(format: str, version: int, fill: Callable[[h5py.File], None]) -> bytes:
+    """The bytes of a new file of a format and version, for `ekfslam.files.write`.
 
-    It is made in memory: libhdf5 crashes the interpreter where a disk is full.
+    It is made in memory, since libhdf5 crashes the interpreter where a disk is full.
+
+    Args:
+        format, version: Its attributes.
+        fill: Writes what else is in it.
 
     Raises:
-        WriteError: The file cannot be written.
+        ArchiveError: It would hold what cannot be read again.
     """
-    with h5py.File(str(path), "w", driver="core", backing_store=False, libver="v110") as h5file:
+    with h5py.File("new file", "w", driver="core", backing_store=False, libver="v110") as h5file:
         write_attributes(h5file, {"format": format, "format_version": version})
-        yield h5file
+        fill(h5file)
         h5file.flush()
-        image = h5file.id.get_file_image()
-    files.write(path, image)
+        return bytes(h5file.id.get_file_image())
 
 
 @contextmanager

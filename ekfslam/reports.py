@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import IllPosedError, PosteriorError
@@ -20,12 +21,13 @@ from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.evaluation.verdict import Honesty, innovations_of, judge
 from ekfslam.figures.check import plot_check
 from ekfslam.figures.posterior import plot_map_before_and_after
-from ekfslam.figures.run import save_figure, save_figures
-from ekfslam.figures.study import save_study_figures
+from ekfslam.figures.run import draw_figures
+from ekfslam.figures.study import draw_study_figures
+from ekfslam.figures.style import older_figures, png, pngs
 from ekfslam.filters.result import Result
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
-from ekfslam.storage.archive import open_result, write_archive
+from ekfslam.storage.archive import archive_image, open_result, require_same_origin
 from ekfslam.studies.executors import open_executor
 from ekfslam.studies.study import Study, StudyArchive, run_study
 from ekfslam.studies.summary import study_table, summarise_study
@@ -53,26 +55,37 @@ class Comparison:
         missing = "".join(f"\nNo {mode}: {reason}\n" for mode, reason in self.skipped.items())
         return compare_table(self.summary) + missing
 
-    def save(self, directory: str | Path) -> list[Path]:
+    def save(self, directory: str | Path, force: bool = False) -> list[Path]:
         """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures; returns their paths.
 
+        All are written or none. Figures of an earlier run in the folder go.
+
+        Args:
+            directory: Where to; made if missing.
+            force: Replace an archive of another recording, too.
+
         Raises:
-            ArchiveError: The archive cannot be written.
-            OSError: The directory cannot be written.
+            WriteError: The directory cannot be written, or holds results of another recording.
         """
         directory = Path(directory)
-        directory.mkdir(parents=True, exist_ok=True)
         archive, summary, table = (directory / name for name in ("archive.h5", "summary.json", "summary.md"))
-        write_archive(archive, self.sequence, self.results)
-        _write_json(summary, self.summary)
+        if not force:
+            require_same_origin(archive, self.sequence)
         notes = "".join(f"- {note}\n" for note in self.sequence.notes)
-        table.write_text(self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""), encoding="utf-8")
-        figures = save_figures(directory, self.results, self.sequence.truth, self.sequence.interpolated)
+        figures = draw_figures(self.results, self.sequence.truth, self.sequence.interpolated)
         if "full" in self.results and "smoothed" in self.results:
-            figures.append(directory / "map_before_and_after.png")
             drawn = plot_map_before_and_after(self.results["full"], self.results["smoothed"], self.sequence.truth)
-            save_figure(drawn, figures[-1])
-        return [archive, summary, table, *figures]
+            figures["map_before_and_after"] = drawn
+        contents = {
+            archive: archive_image(self.sequence, self.results),
+            summary: _json(self.summary),
+            table: self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""),
+            **pngs(directory, figures),
+        }
+        older = older_figures(directory)
+        files.write_all(contents)
+        remove_figures(older, contents)
+        return list(contents)
 
 
 def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | None = None) -> Comparison:
@@ -137,15 +150,19 @@ def check_consistency(
         ConfigError: The executor is unknown, not installed or not reachable.
     """
     directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
     archive_path, summary_path, table_path = (directory / name for name in ("study.h5", "summary.json", "table.md"))
+    for path in (archive_path, summary_path, table_path):
+        files.require_writable(path)
     with open_executor(executor, workers) as opened:
         archive = run_study(study, archive_path, opened)
     summary = summarise_study(archive)
-    _write_json(summary_path, summary)
-    table_path.write_text(study_table(summary), encoding="utf-8")
-    paths = [archive_path, summary_path, table_path, *save_study_figures(directory, archive)]
-    return ConsistencyReport(archive, summary, paths)
+    contents = {
+        summary_path: _json(summary),
+        table_path: study_table(summary),
+        **pngs(directory, draw_study_figures(archive)),
+    }
+    files.write_all(contents)
+    return ConsistencyReport(archive, summary, [archive_path, *contents])
 
 
 @dataclass(frozen=True)
@@ -173,6 +190,10 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
         ArchiveError: The archive cannot be read or has no such mode.
         HonestyError: The run has no innovations to judge by: of another mode than full, or of an older release.
     """
+    directory = Path(archive).parent if directory is None else Path(directory)
+    values, table, figure = (directory / name for name in ("check.json", "check.md", "check.png"))
+    for path in (values, table, figure):
+        files.require_writable(path)
     result = open_result(archive, mode)
     innovations_of(result)
     smoothed, skipped = None, ""
@@ -181,14 +202,17 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
     except PosteriorError as error:
         skipped = str(error)
     found = judge(result, smoothed, skipped)
-    directory = Path(archive).parent if directory is None else Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
-    values, table, figure = (directory / name for name in ("check.json", "check.md", "check.png"))
-    _write_json(values, found.values)
-    table.write_text(found.table, encoding="utf-8")
-    save_figure(plot_check(result, found), figure)
+    files.write_all({values: _json(found.values), table: found.table, figure: png(plot_check(result, found))})
     return Check(found, [values, table, figure])
 
 
-def _write_json(path: Path, summary: dict[str, Any]) -> None:
-    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+def remove_figures(older: Iterable[Path], new: Iterable[Path]) -> None:
+    """Remove older figures in whose place there are no new ones, and with ``check.png`` the verdict beside it."""
+    for path in set(older) - set(new):
+        verdict = [path.with_suffix(".md"), path.with_suffix(".json")] if path.name == "check.png" else []
+        for old in (path, *verdict):
+            old.unlink(missing_ok=True)
+
+
+def _json(summary: dict[str, Any]) -> str:
+    return json.dumps(summary, indent=2, allow_nan=False) + "\n"

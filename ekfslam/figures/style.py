@@ -9,6 +9,7 @@ never corrects a pose are grey.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import wraps
 from io import BytesIO
 from pathlib import Path
@@ -20,8 +21,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+from ekfslam import files
 
 DPI = 150
+MADE_BY = "ekfslam"  # in every figure
 
 BLACK, DARK_GREY, GREY = "black", "0.35", "0.60"
 BLUE, SKY_BLUE = "#0072B2", "#56B4E9"
@@ -136,21 +141,40 @@ def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
     ax.yaxis.set_minor_formatter(NullFormatter())
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure with a palette of 256 colours: a third of the size or less, without a visible difference."""
+def png(figure: Figure) -> bytes:
+    """A figure as a file with a palette of 256 colours: a third of the size or less, without a visible difference."""
     # The default median cut sacrifices rare colours, here a thin trajectory; this method keeps all within 20 of 255.
     # Means (kmeans) then give large areas their exact colour: the grey of bounds must not turn blue.
-    buffer = BytesIO()
-    figure.savefig(buffer, dpi=DPI)
-    picture = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
-    picture.save(path, dpi=(DPI, DPI), optimize=True)
+    drawn, packed, made_by = BytesIO(), BytesIO(), PngInfo()
+    figure.savefig(drawn, dpi=DPI)
+    made_by.add_text("Software", MADE_BY)
+    picture = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
+    picture.save(packed, "PNG", dpi=(DPI, DPI), optimize=True, pnginfo=made_by)
+    return packed.getvalue()
+
+
+def pngs(directory: str | Path, figures: Mapping[str, Figure]) -> dict[Path, str | bytes]:
+    """Figures as the files ``<name>.png`` of a folder, for `ekfslam.files.write_all`."""
+    return {Path(directory) / f"{name}.png": png(figure) for name, figure in figures.items()}
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure, see `png`."""
+    files.write(path, png(figure))
 
 
 def save_all(directory: str | Path, figures: Mapping[str, Figure]) -> list[Path]:
     """Write figures as ``<name>.png`` into a folder, made if missing; the paths written."""
-    directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
-    paths = [directory / f"{name}.png" for name in figures]
-    for path, figure in zip(paths, figures.values(), strict=True):
-        save_figure(figure, path)
-    return paths
+    contents = pngs(directory, figures)
+    files.write_all(contents)
+    return list(contents)
+
+
+def older_figures(directory: Path) -> list[Path]:
+    """The figures in a folder that `png` has made."""
+    found = []
+    for path in sorted(directory.glob("*.png")):
+        with suppress(OSError, ValueError, SyntaxError), Image.open(path) as picture:
+            if picture.info.get("Software") == MADE_BY:
+                found.append(path)
+    return found

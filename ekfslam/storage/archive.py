@@ -29,6 +29,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import h5py
@@ -58,7 +59,7 @@ from ekfslam.data.sequence import (
     VelocityFrame,
     validate_noise,
 )
-from ekfslam.errors import ArchiveError, ConfigError, DataError
+from ekfslam.errors import ArchiveError, ConfigError, DataError, WriteError
 from ekfslam.filters.log import Log
 from ekfslam.filters.result import (
     ERROR_CONVENTION,
@@ -209,7 +210,17 @@ def write_archive(path: str | Path, sequence: Sequence | Archive, results: Mappi
     Raises:
         ArchiveError: The file cannot be written, or would hold what cannot be read again (NaN, say).
     """
-    with hdf5.creating(path, FORMAT, FORMAT_VERSION) as h5file:
+    files.write(path, archive_image(sequence, results))
+
+
+def archive_image(sequence: Sequence | Archive, results: Mapping[str, Result]) -> bytes:
+    """What `write_archive` writes.
+
+    Raises:
+        ArchiveError: It would hold what cannot be read again (NaN, say).
+    """
+
+    def fill(h5file: h5py.File) -> None:
         hdf5.write_attributes(h5file, {"source": sequence.source, "error_convention": ERROR_CONVENTION})
         write_sequence_group(h5file, sequence)
         if sequence.truth is not None:
@@ -218,8 +229,34 @@ def write_archive(path: str | Path, sequence: Sequence | Archive, results: Mappi
         for mode, result in results.items():
             _write_result(runs.create_group(mode), result, len(sequence.time_s))
 
+    return hdf5.image(FORMAT, FORMAT_VERSION, fill)
 
-def add_result(path: str | Path, result: Result, of: Result | None = None) -> None:
+
+def require_same_origin(path: str | Path, sequence: Sequence) -> None:
+    """Raise a `WriteError` unless a path is free, or holds an archive of the same recording: of its content, or place.
+
+    Raises:
+        WriteError: It holds something else, or what cannot be read.
+    """
+    if files.is_free(path):
+        return
+    try:
+        with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
+            found = hdf5.attributes(hdf5.subgroup(h5file, "sequence/attributes"))
+            source = str(hdf5.attribute(h5file, "source"))
+    except ArchiveError as error:
+        raise WriteError(f"{path}: exists, and is no archive to be replaced ({error}); --force replaces it") from None
+    checksums = found.get("checksum_sha256"), sequence.attributes.get("checksum_sha256")
+    if checksums[0] != checksums[1] if all(checksums) else source != sequence.source:
+        raise WriteError(f"{path}: exists, and is a result of {source}, not of {sequence.source}; --force replaces it")
+
+
+def add_result(
+    path: str | Path,
+    result: Result,
+    of: Result | None = None,
+    beside: Mapping[Path, str | bytes] = MappingProxyType({}),
+) -> None:
     """Add the result of one more mode to an archive, replacing an older one of that mode.
 
     The archive is read again and rewritten as a whole: it is never seen half written, and of two who add to it at the
@@ -229,6 +266,7 @@ def add_result(path: str | Path, result: Result, of: Result | None = None) -> No
         path: The archive.
         result: To be added.
         of: A run of the archive that the result was made from, which must still be there.
+        beside: Further files that are written with it, see `ekfslam.files.write_all`.
 
     Raises:
         ArchiveError: The archive cannot be read or written, or no longer holds the run.
@@ -238,7 +276,7 @@ def add_result(path: str | Path, result: Result, of: Result | None = None) -> No
         if of is not None and not _is_same_run(archive.results.get(of.mode), of):
             raise ArchiveError(f"{path}: its run {of.mode!r} was replaced meanwhile; start again")
         others = {mode: other for mode, other in archive.results.items() if mode != result.mode}
-        write_archive(path, archive, {**others, result.mode: result})
+        files.write_all({**beside, Path(path): archive_image(archive, {**others, result.mode: result})})
 
 
 def _is_same_run(found: Result | None, run: Result) -> bool:
@@ -288,7 +326,12 @@ def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "
     Raises:
         ArchiveError: The file cannot be written.
     """
-    _write_poses(path, result.time_s, result.T_world_imu, format)
+    files.write(path, trajectory_text(result, format))
+
+
+def trajectory_text(result: Result, format: Literal["tum", "kitti"]) -> str:
+    """What `export_trajectory` writes."""
+    return _pose_text(result.time_s, result.T_world_imu, format)
 
 
 def export_truth(archive: str | Path, path: str | Path, format: Literal["tum", "kitti"]) -> int:
@@ -301,29 +344,31 @@ def export_truth(archive: str | Path, path: str | Path, format: Literal["tum", "
         ArchiveError: As `read_archive`; or there is no true pose, or not of every frame and the format is ``kitti``,
             which has no stamps to say of which; or the file cannot be written.
     """
-    found = read_archive(archive)
-    truth, frames = found.truth, len(found.time_s)
+    poses, text = truth_text(read_archive(archive), str(archive), format)
+    files.write(path, text)
+    return poses
+
+
+def truth_text(archive: Archive, place: str, format: Literal["tum", "kitti"]) -> tuple[int, str]:
+    """What `export_truth` writes of an archive read from a place, and the number of lines; raises as that does."""
+    truth, frames = archive.truth, len(archive.time_s)
     if truth is None or not len(truth.frame):
-        raise ArchiveError(f"{archive}: holds no true pose")
+        raise ArchiveError(f"{place}: holds no true pose")
     if format == "kitti" and len(truth.frame) < frames:
         raise ArchiveError(
-            f"{archive}: holds the true pose of {len(truth.frame)} of {frames} frames; kitti has no stamps to say of "
+            f"{place}: holds the true pose of {len(truth.frame)} of {frames} frames; kitti has no stamps to say of "
             "which, take tum"
         )
-    _write_poses(path, found.time_s[truth.frame], truth.T_world_imu, format)
-    return len(truth.frame)
+    return len(truth.frame), _pose_text(archive.time_s[truth.frame], truth.T_world_imu, format)
 
 
-def _write_poses(path: str | Path, time_s: Array, T: Array, format: Literal["tum", "kitti"]) -> None:
+def _pose_text(time_s: Array, T: Array, format: Literal["tum", "kitti"]) -> str:
     if format == "tum":
         quaternion = Rotation.from_matrix(T[:, :3, :3]).as_quat()  # scalar last, as TUM has it
         rows = np.column_stack([time_s, T[:, :3, 3], quaternion])
     else:
         rows = T[:, :3].reshape(-1, 12)
-    try:
-        np.savetxt(path, rows, fmt="%.17g")
-    except OSError as error:
-        raise ArchiveError(f"{path}: cannot be written: {error}") from None
+    return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows.tolist())
 
 
 def _write_result(group: h5py.Group, result: Result, frames: int) -> None:

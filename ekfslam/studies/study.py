@@ -33,10 +33,11 @@ from types import MappingProxyType
 from typing import Any
 from zlib import crc32
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ekfslam import hdf5
+from ekfslam import files, hdf5
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import VARIANTS, Config, FilterConfig
 from ekfslam.data.sequence import Sequence
@@ -314,7 +315,7 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
 
     Args:
         study: What to run.
-        path: Archive, made if missing; its folder must exist.
+        path: Archive, made if missing, as is its folder.
         executor: Where to run it, see `open_executor`.
         progress: Whether to show a bar on a terminal.
 
@@ -414,7 +415,8 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
         ArchiveError: The file cannot be written.
     """
     study = archive.study
-    with hdf5.creating(path, FORMAT, FORMAT_VERSION) as h5file:
+
+    def fill(h5file: h5py.File) -> None:
         hdf5.write_attributes(
             h5file,
             {
@@ -431,6 +433,8 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
             for variant, values in archive.data[level].items():
                 hdf5.write_fields(group.create_group(variant), _VARIANT, values)
                 group[f"{variant}/joint_nees_per_dof"].attrs["frames"] = _joint_frames(world.frames)
+
+    files.write_all({Path(path): hdf5.image(FORMAT, FORMAT_VERSION, fill)})
 
 
 def read_study(path: str | Path) -> StudyArchive:

@@ -157,7 +157,7 @@ class TunedNoise:
     @property
     def toml(self) -> str:
         """`config` as a TOML file: what of it is not a default."""
-        lines = [f"# Noise of {self.sequence} as `ekfslam tune` found it; give this file to --config."]
+        lines = [toml_heading(self.sequence)]
         for table in ("noise", "tuning"):
             lines += ["", f"[{table}]"]
             for key, value in vars(getattr(self.config, table)).items():
@@ -178,6 +178,11 @@ class TunedNoise:
         headings = ("parameter", "unit", "by differences", "by likelihood", "together")
         fit = f"model {self.model}, log-likelihood {self.log_likelihood:.1f}, {self.runs} runs of {self.frames} frames"
         return document(markdown_table(headings, rows, left=len(headings)), "\n".join([fit, *self.remarks])).rstrip()
+
+
+def toml_heading(sequence: str) -> str:
+    """The first line of `TunedNoise.toml` for a recording of some name."""
+    return f"# Noise of {sequence} as `ekfslam tune` found it; give this file to --config."
 
 
 _NO_PART = "the likelihood does not depend on it where tracks err; not refined"

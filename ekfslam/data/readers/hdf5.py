@@ -22,7 +22,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ekfslam import hdf5
+from ekfslam import files, hdf5
 from ekfslam.data.noise import Noise
 from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
 from ekfslam.data.sequence import Observations, Sequence, Truth
@@ -76,10 +76,29 @@ def write_sequence(sequence: Sequence, path: str | Path) -> None:
     Raises:
         ArchiveError: The file cannot be written.
     """
-    with hdf5.creating(path, FORMAT, FORMAT_VERSION) as h5file:
+    files.write(path, sequence_image(sequence))
+
+
+def sequence_image(sequence: Sequence) -> bytes:
+    """What `write_sequence` writes."""
+
+    def fill(h5file: h5py.File) -> None:
         write_sequence_group(h5file, sequence, sequence.observations)
         if sequence.truth is not None:
             write_truth_group(h5file, sequence.truth)
+
+    return hdf5.image(FORMAT, FORMAT_VERSION, fill)
+
+
+def is_recording_of(path: str | Path, sequence: Sequence) -> bool:
+    """Whether a file of `write_sequence` holds a recording of the same name and the same further facts."""
+    try:
+        with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
+            name = hdf5.attribute(hdf5.subgroup(h5file, "sequence"), "name")
+            facts = hdf5.facts(hdf5.subgroup(h5file, "sequence/attributes"))
+    except ArchiveError:
+        return False
+    return (name, facts) == (sequence.name, dict(sequence.attributes))
 
 
 def read_sequence(path: str | Path) -> Sequence:

@@ -71,6 +71,15 @@ def rows_of(lines: Iterable[str], comment: str | None = "#") -> Iterable[tuple[i
             yield number, content
 
 
+def first_line(path: Path) -> str:
+    """The first line of a file; empty if there is none, or it is no text."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            return file.readline(1 << 16).rstrip("\n")
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
 def first_row(path: Path) -> str:
     """The first line of a file that holds more than a comment, without it; empty if there is none, or no file."""
     try:
