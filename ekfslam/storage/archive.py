@@ -246,9 +246,14 @@ def require_same_origin(path: str | Path, sequence: Sequence) -> None:
             source = str(hdf5.attribute(h5file, "source"))
     except ArchiveError as error:
         raise WriteError(f"{path}: exists, and is no archive to be replaced ({error}); --force replaces it") from None
-    checksums = found.get("checksum_sha256"), sequence.attributes.get("checksum_sha256")
-    if checksums[0] != checksums[1] if all(checksums) else source != sequence.source:
-        raise WriteError(f"{path}: exists, and is a result of {source}, not of {sequence.source}; --force replaces it")
+    key = "checksum_sha256"
+    same_content = (
+        found[key] == sequence.attributes[key] if {key} <= found.keys() & sequence.attributes.keys() else None
+    )
+    if same_content is None:
+        same_content = source == sequence.source and found == dict(sequence.attributes)
+    if not same_content:
+        raise WriteError(f"{path}: exists, and is a result of another recording ({source}); --force replaces it")
 
 
 def add_result(
