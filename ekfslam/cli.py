@@ -28,6 +28,7 @@ from ekfslam.figures.posterior import draw_posterior_figures
 from ekfslam.figures.run import save_figures
 from ekfslam.figures.style import older_figures, pngs
 from ekfslam.filters.result import Result
+from ekfslam.limits import DEFAULT_GB, reading_up_to
 from ekfslam.models.build import build
 from ekfslam.models.noise import velocity_noise
 from ekfslam.reports import check, check_consistency, compare, remove_figures
@@ -57,7 +58,8 @@ def main(arguments: SequenceType[str] | None = None) -> int:
     command: Callable[[argparse.Namespace], None] = options.command
     _prepare_output()
     try:
-        command(options)
+        with reading_up_to(options.read_limit):
+            command(options)
         sys.stdout.flush()
     except BrokenPipeError:
         # The reader of our output (head, less) has gone; that is not an error.
@@ -113,6 +115,13 @@ def _parser() -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         sub.set_defaults(command=command)
+        sub.add_argument(
+            "--read-limit",
+            type=float,
+            default=DEFAULT_GB,
+            metavar="GB",
+            help="how many gigabytes of numbers a file may hold; more is refused unread (default: %(default)s)",
+        )
         return sub
 
     sub = add(

@@ -16,7 +16,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.special import gammaincinv
 
-from ekfslam.errors import ConfigError
+from ekfslam.errors import ConfigError, UnknownFormatError
+from ekfslam.limits import require_file
 
 Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
 Variant = Literal["invariant", "fej", "standard"]
@@ -396,9 +397,12 @@ class Config:
             ConfigError: The file is missing, is not TOML, or holds something unknown.
         """
         try:
+            require_file(path, is_text=True)
             text = Path(path).read_text(encoding="utf-8")
             return Config().with_overrides(tomllib.loads(text))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, ConfigError) as error:
+        except UnknownFormatError as error:  # names the file
+            raise ConfigError(str(error)) from None
+        except (OSError, ValueError, RecursionError, ConfigError) as error:  # ValueError: no UTF-8, no TOML
             raise ConfigError(f"{path}: {error}") from None
 
 

@@ -11,12 +11,15 @@
   variable length. Files have the newer layout, which carries checksums of all but the arrays. Long arrays of
   recordings, which are passed on, are compressed.
 
-A leaf: readers of data use it as well as archives do, so it imports nothing of the package but the errors.
+A leaf: readers of data use it as well as archives do, so it imports nothing of the package but the errors and
+limits.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from operator import attrgetter
@@ -27,8 +30,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ekfslam.errors import ArchiveError, EkfslamError
+from ekfslam.errors import ArchiveError, EkfslamError, UnknownFormatError
+from ekfslam.limits import Budget, require_file
 
+# What h5py, zlib and json raise where a file is damaged.
+_DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError, MemoryError, zlib.error)
 _LONG = 10_000  # entries from which compression pays
 _MOST_OBJECTS = 100_000  # of a file: one of ours has some hundreds
 _LARGEST = 1e100  # a number whose square and cube are still numbers
@@ -139,6 +145,7 @@ def opened(
         EkfslamError: Of type ``error``: it is missing, has another format, or turns out damaged while it is open.
     """
     try:
+        require_file(path)
         # Files are replaced as a whole and never changed, so that they need no locks.
         with h5py.File(str(path), "r", locking=False) as h5file:
             _inspect(h5file, error)
@@ -151,7 +158,9 @@ def opened(
                     f"{path}: has format version {version_of(h5file)}, this release reads up to version {version}"
                 )
             yield h5file
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError) as problem:  # h5py at damage
+    except UnknownFormatError as problem:
+        raise error(str(problem)) from None
+    except _DAMAGE as problem:
         raise error(f"{path}: damaged or no HDF5 file ({problem}); expected format {format!r}") from None
 
 
@@ -162,16 +171,17 @@ def format_of(path: str | Path) -> str:
     try:
         with h5py.File(str(path), "r", locking=False) as h5file:
             return str(plain(h5file.attrs.get("format", "")))
-    except (OSError, RuntimeError, ValueError, TypeError, LookupError):  # damaged; who opens it will say how
+    except _DAMAGE:  # who opens it will say how
         return ""
 
 
 def _inspect(h5file: h5py.File, error: type[EkfslamError]) -> None:
     """Refuse what no file of ours has, all over a file, before anything is read."""
+    budget = Budget(h5file.filename, error)
     waiting, seen = [h5file], {h5py.h5o.get_info(h5file.id).addr}
     while waiting:
         group = waiting.pop()
-        _inspect_attributes(group, error)
+        _inspect_attributes(group, budget)
         for name in group:
             place = _place(group, name)
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
@@ -190,14 +200,40 @@ def _inspect(h5file: h5py.File, error: type[EkfslamError]) -> None:
                 raise error(f"{place} has its data in another file (external or virtual storage)")
             if item.shape is None or not _is_known(item.dtype):
                 raise error(f"{place} is empty or of an unknown type")
-            _inspect_attributes(item, error)
+            _inspect_attributes(item, budget)
+            _inspect_size(item, place, budget)
 
 
-def _inspect_attributes(item: h5py.Group | h5py.Dataset, error: type[EkfslamError]) -> None:
+def _inspect_attributes(item: h5py.Group | h5py.Dataset, budget: Budget) -> None:
     for name in item.attrs:
         attribute = item.attrs.get_id(name)
-        if attribute.get_space().get_simple_extent_type() == h5py.h5s.NULL or not _is_known(attribute.dtype):
-            raise error(f"{item.file.filename}: {_spoken(item, name)} is empty or of an unknown type")
+        space, dtype = attribute.get_space(), attribute.dtype
+        if space.get_simple_extent_type() == h5py.h5s.NULL or not _is_known(dtype):
+            raise budget.error(f"{item.file.filename}: {_spoken(item, name)} is empty or of an unknown type")
+        budget.take(space.get_simple_extent_npoints() * dtype.itemsize, _spoken(item, name))
+
+
+def _inspect_size(dataset: h5py.Dataset, place: str, budget: Budget) -> None:
+    """Refuse a data set that claims more than may be read, or more than the file has of it."""
+    size = math.prod(dataset.shape) * dataset.dtype.itemsize
+    budget.take(size, dataset.name.strip("/"))
+    if dataset.chunks is None:
+        if dataset.id.get_storage_size() < size:
+            raise budget.error(f"{place} claims {size} bytes, of which the file has {dataset.id.get_storage_size()}")
+        return
+    chunk = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    budget.take(chunk, f"a part of {dataset.name.strip('/')}")
+    filters = [
+        dataset.id.get_create_plist().get_filter(i)[0] for i in range(dataset.id.get_create_plist().get_nfilters())
+    ]
+    if not set(filters) <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}:
+        raise budget.error(f"{place} is compressed in a way that no file of this format is")
+    for part in dataset.iter_chunks():
+        skipped, stored = dataset.id.read_direct_chunk(tuple(s.start for s in part))
+        if h5py.h5z.FILTER_DEFLATE in filters and not skipped:
+            stored = zlib.decompressobj().decompress(stored, chunk + 8)
+        if len(stored) > chunk + 4:  # a checksum
+            raise budget.error(f"{place} has parts that become larger than the {chunk} bytes that they claim")
 
 
 def _is_known(dtype: np.dtype) -> bool:

@@ -47,6 +47,7 @@ from ekfslam.errors import (
 )
 from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import project
+from ekfslam.limits import Budget
 
 
 @pytest.fixture
@@ -282,7 +283,7 @@ def test_mat_files_of_either_byte_order_and_every_number_type_are_parsed():
                 + struct.pack(order + "I2s2x", 2 << 16 | 1, dtype.encode())
                 + element(order, kind, values),
             )
-        variables = parse_mat(content)
+        variables = parse_mat(content, Budget("a.mat"))
         assert list(variables) == ["u1", "i2", "f4", "f8"]
         for value in variables.values():
             np.testing.assert_array_equal(value, [[0, 2, 4], [1, 3, 5]])

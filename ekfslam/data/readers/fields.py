@@ -29,7 +29,9 @@ def checksum(*paths: Path) -> str:
     """SHA-256 of the contents of files in their order, hexadecimal."""
     digest = hashlib.sha256()
     for path in paths:
-        digest.update(path.read_bytes())
+        with path.open("rb") as file:
+            while part := file.read(1 << 20):
+                digest.update(part)
     return digest.hexdigest()
 
 
@@ -74,7 +76,7 @@ def require_numbers(
     require_shape(value, shape, name)
     if value.dtype.kind == "f":
         require_finite(value, name)
-    return value.astype(dtype)
+    return value.astype(dtype, copy=False)
 
 
 def flat_observations(dense: Array, frame_axis: int, field: str) -> Observations:
