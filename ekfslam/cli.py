@@ -31,6 +31,7 @@ from ekfslam.filters.result import Result
 from ekfslam.limits import DEFAULT_GB, reading_up_to
 from ekfslam.models.build import build
 from ekfslam.models.noise import velocity_noise
+from ekfslam.names import components, printable
 from ekfslam.reports import check, check_consistency, compare, remove_figures
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
@@ -66,7 +67,7 @@ def main(arguments: SequenceType[str] | None = None) -> int:
         _forget_output()
     except (EkfslamError, OSError, MemoryError) as error:
         _forget_output()
-        message = " ".join(str(error).split()) or "there is not enough memory"
+        message = printable(" ".join(str(error).split())) or "there is not enough memory"
         print(f"ekfslam: error: {message}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -358,7 +359,8 @@ def _compare(options: argparse.Namespace) -> None:
         raise ConfigError("--truth belongs to one recording, but several are given; compare them one by one")
     # Everything is read before anything is run: a mistyped last name should not cost the first hour.
     sequences = [_open(options, data) for data in options.data]
-    folders = [options.out / name for name in _folders(sequences)]
+    # Recordings of the same name do not overwrite each other.
+    folders = [options.out / name for name in components(sequence.name for sequence in sequences)]
     for sequence, folder in zip(sequences, folders, strict=True):
         files.require_writable(folder / "archive.h5")
         if not options.force:
@@ -369,15 +371,6 @@ def _compare(options: argparse.Namespace) -> None:
         comparison = compare(sequence, options.modes, config)
         paths = comparison.save(folder, options.force)
         print(f"\n{comparison.table}\nwritten to {folder}: {', '.join(path.name for path in paths)}")
-
-
-def _folders(sequences: list[Sequence]) -> list[str]:
-    """A folder name for each sequence; recordings of the same name do not overwrite each other."""
-    folders: list[str] = []
-    for sequence in sequences:
-        same = sum(other.name == sequence.name for other in sequences[: len(folders)])
-        folders.append(f"{sequence.name}-{same + 1}" if same else sequence.name)
-    return folders
 
 
 def _run(options: argparse.Namespace) -> None:
@@ -516,7 +509,7 @@ def _export(options: argparse.Namespace) -> None:
     archive = read_archive(options.archive)
     modes = list(archive.results)
     mode = options.mode or ("full" if "full" in modes or not modes else modes[0])
-    path = options.out or options.archive.with_suffix(f".{mode}.{options.format}.txt")
+    path = options.out or options.archive.with_suffix(f".{components([mode])[0]}.{options.format}.txt")
     files.require_writable(path)
     _require_ours(options, path, lambda path: len(first_line(path).split()) == (8 if options.format == "tum" else 12))
     if mode == TRUTH:

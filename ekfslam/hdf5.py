@@ -11,8 +11,7 @@
   variable length. Files have the newer layout, which carries checksums of all but the arrays. Long arrays of
   recordings, which are passed on, are compressed.
 
-A leaf: readers of data use it as well as archives do, so it imports nothing of the package but the errors and
-limits.
+A leaf: readers of data use it as well as archives do, so it imports nothing of the package but other leaves.
 """
 
 from __future__ import annotations
@@ -32,6 +31,7 @@ from numpy.typing import NDArray
 
 from ekfslam.errors import ArchiveError, EkfslamError, UnknownFormatError
 from ekfslam.limits import Budget, require_file
+from ekfslam.names import printable
 
 # What h5py, zlib and json raise where a file is damaged.
 _DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError, MemoryError, zlib.error)
@@ -184,6 +184,8 @@ def _inspect(h5file: h5py.File, error: type[EkfslamError]) -> None:
         _inspect_attributes(group, budget)
         for name in group:
             place = _place(group, name)
+            if name != printable(name):
+                raise error(f"{place} has a name that cannot be printed")
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                 raise error(f"{place} is a link, which no file of this format has")
             item = group[name]
@@ -206,6 +208,8 @@ def _inspect(h5file: h5py.File, error: type[EkfslamError]) -> None:
 
 def _inspect_attributes(item: h5py.Group | h5py.Dataset, budget: Budget) -> None:
     for name in item.attrs:
+        if name != printable(name):
+            raise budget.error(f"{item.file.filename}: {_spoken(item, name)} has a name that cannot be printed")
         attribute = item.attrs.get_id(name)
         space, dtype = attribute.get_space(), attribute.dtype
         if space.get_simple_extent_type() == h5py.h5s.NULL or not _is_known(dtype):
@@ -398,13 +402,14 @@ def json_table(item: h5py.Group | h5py.Dataset, name: str) -> dict[str, Any]:
 
 def fixed_text(text: str) -> np.bytes_:
     """Text in HDF5's form of fixed length."""
-    return np.bytes_(text.encode())
+    return np.bytes_(text.encode(errors="backslashreplace"))
 
 
 def plain(value: Any) -> Any:
-    """A stored scalar as a plain Python value."""
+    """A stored scalar as a plain Python value; of text, control characters but the end of a line are written out."""
     value = value.item() if isinstance(value, np.generic) else value
-    return value.decode(errors="replace") if isinstance(value, bytes) else value
+    value = value.decode(errors="replace") if isinstance(value, bytes) else value
+    return printable(value, keep="\n") if isinstance(value, str) else value
 
 
 def texts(values: Any) -> tuple[str, ...]:

@@ -121,7 +121,12 @@ def test_hdf5_that_claims_more_than_it_has_is_refused_unread(recording, kind):
         else:
             h5file[name] = np.ones((count, 4))
             h5file["sequence"].attrs.create("name", np.zeros(80_000_000, dtype="S8"))
-    words = {"unwritten": "of which the file has 0", "unwritten chunks": "damaged", "filter": "compressed in a way", "bomb": "become larger"}
+    words = {
+        "unwritten": "of which the file has 0",
+        "unwritten chunks": "damaged",
+        "filter": "compressed in a way",
+        "bomb": "become larger",
+    }
     words |= {"chunk": "a part of .* claims 1.6 GB", "attribute": "claims 0.64 GB"}
     with little_memory(), pytest.raises(EkfslamError, match=words[kind]):
         open_sequence(recording)

@@ -31,6 +31,7 @@ from ekfslam.errors import (
 )
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.names import printable
 
 VelocityFrame = Literal["imu", "level"]
 
@@ -122,7 +123,7 @@ class Sequence:
     """One recording of a stereo rig with body velocities.
 
     Args:
-        name: Short name, used for folders and titles.
+        name: Short name, used for folders and titles; what cannot be printed is written out (``\\x1b``).
         source: File or built-in world it came from, used in error messages.
         time_s: (T,) strictly increasing stamps.
         twist: (T, 6) measured velocities ``[v; w]`` in ``velocity_frame``; ``twist[k]`` drives ``(t[k-1], t[k]]``.
@@ -159,6 +160,7 @@ class Sequence:
                 raise
             raise type(error)(error.message, source=self.source, field=error.field, index=error.index) from None
         object.__setattr__(self, "T_cam_imu", _frozen(se3.nearest_rigid(self.T_cam_imu)))
+        object.__setattr__(self, "name", printable(self.name))
 
     def __len__(self) -> int:
         return len(self.time_s)

@@ -19,11 +19,13 @@ from typing import Any, ParamSpec
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from ekfslam import files
+from ekfslam.names import components
 
 DPI = 150
 MADE_BY = "ekfslam"  # in every figure
@@ -123,14 +125,24 @@ def marker_of(name: str) -> Style:
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorator: draw with the settings `RC`, whatever the caller's own are."""
+    """Decorator: draw with the settings `RC`, whatever the caller's own are, and all names as they are."""
 
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with mpl.rc_context(dict(RC)):
-            return draw(*args, **kwargs)
+            figure = draw(*args, **kwargs)
+        for text in _written(figure):
+            text.set_parse_math(False)  # a "$" in a name begins no formula
+        return figure
 
     return drawn
+
+
+def _written(figure: Figure) -> list[Text]:
+    """Titles, legends and texts of a figure; the numbers of its axes may be formulas."""
+    legends = [*figure.legends, *(ax.get_legend() for ax in figure.axes)]
+    in_legends = [text for legend in legends if legend is not None for text in legend.get_texts()]
+    return [*figure.texts, *in_legends, *(text for ax in figure.axes for text in (ax.title, *ax.texts))]
 
 
 def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
@@ -155,7 +167,8 @@ def png(figure: Figure) -> bytes:
 
 def pngs(directory: str | Path, figures: Mapping[str, Figure]) -> dict[Path, str | bytes]:
     """Figures as the files ``<name>.png`` of a folder, for `ekfslam.files.write_all`."""
-    return {Path(directory) / f"{name}.png": png(figure) for name, figure in figures.items()}
+    safe = components(figures)
+    return {Path(directory) / f"{name}.png": png(drawn) for name, drawn in zip(safe, figures.values(), strict=True)}
 
 
 def save_figure(figure: Figure, path: Path) -> None:

@@ -73,6 +73,7 @@ from ekfslam.filters.result import (
     WhitenedInnovations,
 )
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.names import printable
 from ekfslam.storage.checks import COVARIANCES, RIGID, require_agreement
 
 FORMAT = "ekfslam-archive"
@@ -414,6 +415,7 @@ def _sequence_fields(h5file: h5py.File) -> dict[str, Any]:
     try:
         found = read_sequence_fields(h5file, h5file.filename)
         found.pop("observations", None)
+        found["name"] = printable(found["name"])
         no_index = np.empty(0, dtype=np.int64)
         none = Observations(no_index, no_index, np.empty((0, 4)))
         with spelled_as_in(h5file.filename, SPELLING):
@@ -435,7 +437,7 @@ def _read_result(h5file: h5py.File, mode: str, sequence: Mapping[str, Any]) -> R
     noise = _read_noise(group)
     return Result(
         mode=mode,
-        sequence_name=str(hdf5.attribute(group, "sequence_name")),
+        sequence_name=printable(str(hdf5.attribute(group, "sequence_name"))),
         **fields[""],
         landmarks=Landmarks(**fields["landmarks"]),
         innovation=Innovation(**fields["innovation"]),

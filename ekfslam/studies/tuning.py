@@ -57,6 +57,7 @@ from ekfslam.models.build import found_attributes, noise_of, optional_blocks, re
 from ekfslam.models.noise import NOISY_FROM, VelocityNoise, velocity_noise, with_drift, with_error
 from ekfslam.models.sensors.base import BEHIND_CAMERA, GATE, MOVING
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.names import printable
 from ekfslam.progress import progress
 
 # Of wrong matches: how many there are, and how far off they may be.
@@ -162,7 +163,7 @@ class TunedNoise:
             lines += ["", f"[{table}]"]
             for key, value in vars(getattr(self.config, table)).items():
                 if value is not None:
-                    lines.append(f"{key} = {json.dumps(value, ensure_ascii=False)}")
+                    lines.append(f"{key} = {_toml_value(value)}")
         return "\n".join(lines) + "\n"
 
     @property
@@ -180,9 +181,15 @@ class TunedNoise:
         return document(markdown_table(headings, rows, left=len(headings)), "\n".join([fit, *self.remarks])).rstrip()
 
 
+def _toml_value(value: float | str) -> str:
+    if isinstance(value, float):
+        return repr(value)  # TOML spells inf and nan as Python does
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
 def toml_heading(sequence: str) -> str:
     """The first line of `TunedNoise.toml` for a recording of some name."""
-    return f"# Noise of {sequence} as `ekfslam tune` found it; give this file to --config."
+    return f"# Noise of {printable(sequence)} as `ekfslam tune` found it; give this file to --config."
 
 
 _NO_PART = "the likelihood does not depend on it where tracks err; not refined"
