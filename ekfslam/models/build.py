@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.config import CalibrationConfig, Config, CovarianceForm, FilterConfig, LandmarkCoordinates
+from ekfslam.config import CalibrationConfig, Config, CovarianceForm, FilterConfig, LandmarkCoordinates, require_setting
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import WITHOUT_TRACKS, Sequence
@@ -194,6 +194,7 @@ def optional_blocks(settings: Mapping[str, Mapping[str, Any]]) -> tuple[StateBlo
         for key in values:
             if key not in known:
                 raise ConfigError(f"unknown key blocks.{name}.{key}; known: {', '.join(known)}")
+            require_setting(f"blocks.{name}.{key}", values[key], is_scale=key.startswith(("time", "length")))
         chosen.append(OPTIONAL_BLOCKS[name](**values))
     return tuple(chosen)
 

@@ -13,6 +13,8 @@ from typing import Any
 
 from ekfslam.errors import ConfigError
 
+_MOST_WORKERS = 1024
+
 
 class SerialExecutor(Executor):
     """Runs everything at once, in the calling thread."""
@@ -38,8 +40,8 @@ def open_executor(spec: str = "processes", workers: int | None = None) -> Iterat
     Raises:
         ConfigError: Unknown, not installed, not reachable, or no worker.
     """
-    if workers is not None and workers < 1:
-        raise ConfigError(f"workers must be at least 1, found {workers}")
+    if workers is not None and not 1 <= workers <= _MOST_WORKERS:
+        raise ConfigError(f"workers must be at least 1 and at most {_MOST_WORKERS}, found {workers}")
     if spec == "serial":
         yield SerialExecutor()
     elif spec == "processes":

@@ -104,6 +104,7 @@ FIELDS: Mapping[str, tuple[tuple[str | int, ...], type, str, str]] = MappingProx
 
 JOINT_INSTANTS = 4  # equally spaced, the last one at the last frame
 
+MOST_VALUES = 10_000_000  # frames of all runs and variants: an archive of 1.4 GB
 IN_FLIGHT = 256
 CHECKPOINT_S = 5.0
 CHECKPOINT_SHARE = 0.05  # of the time may go into checkpoints of a large study
@@ -159,6 +160,11 @@ class Study:
                 raise ConfigError(f"level {name}: a study needs a prior of the first pose, or NEES is not defined")
         if not self.levels or not self.variants or self.runs < 1 or self.seed < 0:
             raise ConfigError("a study needs a level, a variant, at least one run, and a seed that is not negative")
+        values = self.runs * len(self.variants) * sum(world.frames for world in self.levels.values())
+        if values > MOST_VALUES:
+            raise ConfigError(
+                f"a study of {self.runs} runs is too large: {values:.3g} frames, at most {MOST_VALUES:.3g}"
+            )
 
     @property
     def parameters(self) -> dict[str, Any]:
