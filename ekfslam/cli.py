@@ -387,6 +387,8 @@ def _run(options: argparse.Namespace) -> None:
     print(", ".join(f"{name} {count}" for name, count in result.counts.items()))
     if result.parameters is not None:
         print("\n".join(result.parameters.lines))
+    for remark in result.remarks:
+        print(f"note: {remark}")
     print(f"written to {options.out}")
 
 
@@ -419,6 +421,8 @@ def _info(options: argparse.Namespace) -> None:
             if result.parameters is not None:
                 for line in result.parameters.lines:
                     print(f"{mode}: {line}")
+            for remark in result.remarks:
+                print(f"{mode}: note: {remark}")
             if result.hygiene is not None:
                 for line in result.hygiene.lines(result.config["hygiene"]):
                     print(f"{mode}: hygiene: {line}")

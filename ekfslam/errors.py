@@ -111,6 +111,22 @@ class InnovationError(FilterError):
         )
 
 
+class NonFiniteResultError(FilterError):
+    """An estimate or a covariance has become NaN or infinite: there is no result.
+
+    Args:
+        mode: Of the run.
+        what: Name of the quantity.
+        index: Of its first entry that is no number, such as the frame.
+    """
+
+    def __init__(self, mode: str, what: str, index: int) -> None:
+        self.mode, self.what, self.index = mode, what, index
+        super().__init__(
+            f"{mode}: {what}[{index}] is NaN or infinite; velocities, pixels or noise are beyond what numbers can hold"
+        )
+
+
 class HonestyError(EkfslamError):
     """A result has no innovations to judge its covariance by."""
 

@@ -15,7 +15,7 @@ from typing import Any
 from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
-from ekfslam.errors import IllPosedError, PosteriorError
+from ekfslam.errors import FilterError, IllPosedError, PosteriorError
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.evaluation.verdict import Honesty, innovations_of, judge
@@ -41,7 +41,8 @@ class Comparison:
         sequence: The recording.
         results: Mode to result, in the order asked for.
         summary: The figures of merit as written to ``summary.json``.
-        skipped: Why there is no result of a mode asked for: an ill-posed posterior does not keep the others.
+        skipped: Why there is no result of a mode asked for: an ill-posed posterior, or a filter that cannot go on, does
+            not keep the others.
     """
 
     sequence: Sequence
@@ -52,8 +53,9 @@ class Comparison:
     @property
     def table(self) -> str:
         """The summary as a Markdown table, and what is missing in it."""
-        missing = "".join(f"\nNo {mode}: {reason}\n" for mode, reason in self.skipped.items())
-        return compare_table(self.summary) + missing
+        lines = [f"No {mode}: {reason}" for mode, reason in self.skipped.items()]
+        lines += [f"Note on {mode}: {remark}" for mode, result in self.results.items() for remark in result.remarks]
+        return compare_table(self.summary) + "".join(f"\n{line}\n" for line in lines)
 
     def save(self, directory: str | Path, force: bool = False) -> list[Path]:
         """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures; returns their paths.
@@ -93,19 +95,24 @@ def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | 
 
     Raises:
         ConfigError: Unknown mode.
-        InnovationError: An innovation covariance is not positive definite.
+        FilterError: No mode has a result; otherwise `Comparison.skipped` says which has none, and why.
     """
     results: dict[str, Result] = {}
     skipped: dict[str, str] = {}
     if config is not None:
         sequence = with_truth_noise(sequence, config.truth)
     for mode in modes:
+        if mode == "smoothed" and "full" in skipped:
+            skipped[mode] = skipped["full"]
+            continue
         # The filter that "smoothed" starts from need not run twice.
         known = mode == "smoothed" and "full" in results
         try:
             results[mode] = smooth(results["full"]) if known else run(sequence, mode, config)
-        except IllPosedError as error:
+        except (IllPosedError, FilterError) as error:
             skipped[mode] = str(error)
+    if skipped and not results:
+        raise FilterError("; ".join(f"no {mode}: {reason}" for mode, reason in skipped.items()))
     summary = {
         "sequence": sequence.name,
         "frames": len(sequence),

@@ -8,7 +8,7 @@ import pytest
 from generators import GENERATORS, Valid, case_of
 from oracle import verdict
 
-EACH = 20
+EACH = 14
 
 
 @pytest.fixture(scope="module")
