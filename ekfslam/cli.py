@@ -160,7 +160,7 @@ def _parser() -> argparse.ArgumentParser:
         "simulate many drives and see whether the covariances hold what they promise",
         "consistency --runs 20",
         "consistency --level all --variants invariant standard fej --out results/local/all",
-        "consistency --runs 1000 --executor dask://scheduler:8786",
+        "consistency --runs 1000 --executor tls://scheduler:8786",
     )
     sub.add_argument("--runs", type=int, default=50, metavar="N", help="of each level (default: %(default)s)")
     sub.add_argument(
@@ -182,7 +182,12 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
     sub.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
     sub.add_argument(
-        "--executor", default="processes", metavar="SPEC", help="processes (default), serial, dask://HOST:PORT, or mpi"
+        "--executor",
+        default="processes",
+        metavar="SPEC",
+        help="processes (default), serial, tls://HOST:PORT (a Dask cluster, with the certificates of Dask's "
+        "configuration distributed.comm.tls), dask://HOST:PORT (without: whoever reaches that port runs programs as "
+        "you; for networks of your own only), or mpi",
     )
     sub.add_argument(
         "--out",

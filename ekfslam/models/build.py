@@ -134,8 +134,8 @@ def _require_pixel_noise(sequence: Sequence, noise: Noise) -> None:
     least = float(np.min(noise.pixel_std_px))
     if least < LEAST_PX:
         raise ConfigError(
-            f"{sequence.name}: the recording states a pixel noise of {least:g} px, with which the innovation covariance "
-            f"is singular; give noise.sigma_px, at least {LEAST_PX:g}"
+            f"{sequence.name}: the recording states a pixel noise of {least:g} px, with which innovation "
+            f"covariances are singular; give noise.sigma_px, at least {LEAST_PX:g}"
         )
 
 
