@@ -18,7 +18,7 @@ from ekfslam.evaluation.relative import dead_reckoned_pairs, relative_pairs
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.innovations import collect_innovations
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.loop import FurtherVelocities, one_thread, run_filter
+from ekfslam.filters.loop import FurtherVelocities, one_thread, run_filter, solvable
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.references import References
 from ekfslam.filters.reports import collect
@@ -31,6 +31,7 @@ from ekfslam.smoother.revival import MapRevival
 from ekfslam.studies.automatic import with_track_scale
 
 
+@solvable()
 def run(
     sequence: Sequence, mode: Mode = "full", config: Config | None = None, further: FurtherVelocities | None = None
 ) -> Result:
@@ -45,7 +46,8 @@ def run(
 
     Raises:
         ConfigError: Unknown mode.
-        InnovationError: An innovation covariance is not positive definite.
+        FilterError: The filter cannot go on: an innovation covariance is not positive definite (`InnovationError`), a
+            number is none (`NonFiniteResultError`), or a matrix is singular.
         IllPosedError: The posterior of a smoothed run leaves something undetermined.
     """
     if mode not in MODES:

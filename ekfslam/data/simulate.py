@@ -44,7 +44,7 @@ _FRAMES_PER_CHUNK = 100  # a stretch of road short enough for most landmarks of 
 
 
 # Beyond these a simulation would take hours or more memory than there is, or say nothing.
-_LARGEST = 1e6
+_LEAST, _LARGEST = 1e-12, 1e6
 _MOST = {
     "seed": float("inf"),
     "frames": 100_000,
@@ -106,9 +106,9 @@ class Recording:
     def __post_init__(self) -> None:
         for key, value in numbers_of(self).items():
             most = _MOST.get(key, _LARGEST)
-            if not 0 <= value <= most:
+            if not (value == 0 or _LEAST <= value <= most):
                 raise ConfigError(
-                    f"{self.name}: {key} must be finite and not negative, at most {most:g}, found {value}"
+                    f"{self.name}: {key} must be finite and not negative: 0, or {_LEAST:g} to {most:g}, found {value}"
                 )
             if value == 0 and key in ("frame_period_s", "radius_m"):
                 raise ConfigError(f"{self.name}: {key} must be positive")

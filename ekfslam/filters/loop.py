@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from time import perf_counter
 from typing import NamedTuple, Protocol
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ekfslam.data.sequence import Sequence
+from ekfslam.errors import FilterError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.reports import FrameReport
@@ -34,6 +36,20 @@ class FurtherVelocities(Protocol):
 def one_thread() -> AbstractContextManager[object]:
     """One BLAS thread: with small dense matrices a second one costs three times what it saves."""
     return threadpool_limits(1, user_api="blas")
+
+
+@contextmanager
+def solvable() -> Iterator[None]:
+    """Let a matrix that cannot be inverted or decomposed be a named error; serves as a decorator, too.
+
+    Raises:
+        FilterError: There was one inside.
+    """
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        reason = f"{str(error)[:1].lower()}{str(error)[1:]}"
+        raise FilterError(f"velocities, pixels or their noise are beyond what numbers can hold: {reason}") from error
 
 
 def run_filter(

@@ -50,7 +50,7 @@ from ekfslam.errors import EmptyTracksError
 from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.loop import one_thread, run_filter
+from ekfslam.filters.loop import one_thread, run_filter, solvable
 from ekfslam.filters.reports import FrameReport
 from ekfslam.geometry import se3
 from ekfslam.models.build import found_attributes, noise_of, optional_blocks, resolve, with_automatic_blocks
@@ -197,6 +197,7 @@ _UNSEEN = "the differences see none; not refined"
 _BELOW_FLOOR = "below the errors of the motion that are assumed anyway; not refined"
 
 
+@solvable()
 def tune(
     sequence: Sequence, config: Config | None = None, *, drift: bool = False, observations: int = 15_000
 ) -> TunedNoise:
