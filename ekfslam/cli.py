@@ -46,6 +46,7 @@ from ekfslam.storage.archive import (
     trajectory_text,
     truth_text,
 )
+from ekfslam.storage.checkpoint import Checkpoints
 from ekfslam.studies.study import LEVELS, STUDY_VARIANTS, Study, levels_of
 from ekfslam.studies.tuning import toml_heading, tune
 
@@ -137,6 +138,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), metavar="MODE", help=", ".join(MODES))
     sub.add_argument("--out", type=Path, default=Path("results/local"), metavar="DIR", help="default: %(default)s")
     _add_force(sub)
+    _add_resume(sub)
     _add_data_options(sub)
     _add_filter_options(sub)
 
@@ -151,6 +153,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--mode", choices=MODES, default="full", help="default: %(default)s")
     sub.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="archive to write")
     _add_force(sub)
+    _add_resume(sub)
     _add_data_options(sub)
     _add_filter_options(sub)
 
@@ -289,6 +292,14 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_resume(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on where an interrupted run of the same stopped, to the same bits; its checkpoint lies beside --out",
+    )
+
+
 def _add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace a file that is no earlier result of the same")
 
@@ -373,8 +384,9 @@ def _compare(options: argparse.Namespace) -> None:
     for sequence, folder in zip(sequences, folders, strict=True):
         for note in sequence.notes:
             print(f"{sequence.name}: {note}")
-        comparison = compare(sequence, options.modes, config)
-        paths = comparison.save(folder, options.force)
+        with Checkpoints(folder / "unfinished.checkpoint", options.resume) as checkpoints:
+            comparison = compare(sequence, options.modes, config, checkpoints)
+            paths = comparison.save(folder, options.force)
         print(f"\n{comparison.table}\nwritten to {folder}: {', '.join(path.name for path in paths)}")
 
 
@@ -384,9 +396,10 @@ def _run(options: argparse.Namespace) -> None:
     files.require_writable(options.out)
     if not options.force:
         require_same_origin(options.out, sequence)
-    result = run(sequence, options.mode, config)
-    older = [] if _is_shared(options.out) else older_figures(options.out.parent)
-    files.write_all({options.out: archive_image(sequence, {result.mode: result})})
+    with Checkpoints(options.out.with_name(f"{options.out.name}.checkpoint"), options.resume) as checkpoints:
+        result = run(sequence, options.mode, config, checkpoints=checkpoints)
+        older = [] if _is_shared(options.out) else older_figures(options.out.parent)
+        files.write_all({options.out: archive_image(sequence, {result.mode: result})})
     remove_figures(older, ())
     print(_table(sequence, len(sequence.observations.ids), {result.mode: result}))
     print(", ".join(f"{name} {count}" for name, count in result.counts.items()))

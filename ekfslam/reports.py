@@ -25,9 +25,10 @@ from ekfslam.figures.run import draw_figures
 from ekfslam.figures.study import draw_study_figures
 from ekfslam.figures.style import older_figures, png, pngs
 from ekfslam.filters.result import Result
-from ekfslam.runner import run
+from ekfslam.runner import run, versions
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import archive_image, open_result, require_same_origin
+from ekfslam.storage.checkpoint import Checkpoints, key_of
 from ekfslam.studies.executors import open_executor
 from ekfslam.studies.study import Study, StudyArchive, run_study
 from ekfslam.studies.summary import study_table, summarise_study
@@ -90,27 +91,50 @@ class Comparison:
         return list(contents)
 
 
-def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | None = None) -> Comparison:
+def compare(
+    sequence: Sequence,
+    modes: Iterable[Mode] = MODES,
+    config: Config | None = None,
+    checkpoints: Checkpoints | None = None,
+) -> Comparison:
     """Run several modes with one configuration.
 
+    Args:
+        sequence: The recording.
+        modes: What to run.
+        config: Settings; defaults where None.
+        checkpoints: Where finished modes are kept meanwhile; and beside it, with the ending ``.full``, the state of the
+            joint filter. `Checkpoints.remove` them when the comparison is saved.
+
     Raises:
+        ArchiveError: A checkpoint to go on from is damaged, or of something else.
         ConfigError: Unknown mode.
         FilterError: No mode has a result; otherwise `Comparison.skipped` says which has none, and why.
     """
-    results: dict[str, Result] = {}
-    skipped: dict[str, str] = {}
     if config is not None:
         sequence = with_truth_noise(sequence, config.truth)
+    modes = list(modes)
+    key = "" if checkpoints is None else key_of(sequence, config or Config(), "compare", versions())
+    kept = None if checkpoints is None else checkpoints.found(key)
+    done = {"results": {}, "skipped": {}} if kept is None else kept
+    results: dict[str, Result] = {mode: done["results"][mode] for mode in modes if mode in done["results"]}
+    skipped: dict[str, str] = {mode: done["skipped"][mode] for mode in modes if mode in done["skipped"]}
+    of_filter = None if checkpoints is None else checkpoints.beside(".full")
     for mode in modes:
+        if mode in results or mode in skipped:
+            continue
         if mode == "smoothed" and "full" in skipped:
             skipped[mode] = skipped["full"]
             continue
         # The filter that "smoothed" starts from need not run twice.
         known = mode == "smoothed" and "full" in results
         try:
-            results[mode] = smooth(results["full"]) if known else run(sequence, mode, config)
+            results[mode] = smooth(results["full"]) if known else run(sequence, mode, config, None, of_filter)
         except (IllPosedError, FilterError) as error:
             skipped[mode] = str(error)
+        if checkpoints is not None:
+            checkpoints.keep(key, {"results": results, "skipped": skipped}, always=True)
+    results = {mode: results[mode] for mode in modes if mode in results}
     if skipped and not results:
         raise FilterError("; ".join(f"no {mode}: {reason}" for mode, reason in skipped.items()))
     summary = {
