@@ -8,41 +8,47 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as SequenceType
+from contextlib import suppress
 from pathlib import Path
 from typing import get_args
 
-import h5py
-
-from ekfslam import __version__
+from ekfslam import __version__, files, hdf5
 from ekfslam.config import MODES, VARIANTS, Config, Kernel, Linearisation, NoiseModel
 from ekfslam.data.interpolation import stretches
-from ekfslam.data.readers import BUILTIN, open_sequence, write_sequence
+from ekfslam.data.readers import BUILTIN, open_sequence
+from ekfslam.data.readers.hdf5 import is_recording_of, sequence_image
+from ekfslam.data.readers.text import first_line
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.data.tracks import inspect_tracks
-from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
+from ekfslam.errors import ConfigError, EkfslamError, WriteError
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.evaluation.truth import with_truth_noise
-from ekfslam.figures.posterior import save_posterior_figures
+from ekfslam.figures.posterior import draw_posterior_figures
 from ekfslam.figures.run import save_figures
+from ekfslam.figures.style import older_figures, pngs
 from ekfslam.filters.result import Result
+from ekfslam.limits import DEFAULT_GB, reading_up_to
 from ekfslam.models.build import build
 from ekfslam.models.noise import velocity_noise
-from ekfslam.reports import check, check_consistency, compare
+from ekfslam.names import components, printable
+from ekfslam.reports import check, check_consistency, compare, remove_figures
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT
 from ekfslam.storage.archive import (
     Archive,
     add_result,
-    export_trajectory,
-    export_truth,
+    archive_image,
     open_result,
     read_archive,
-    write_archive,
+    require_same_origin,
+    trajectory_text,
+    truth_text,
 )
+from ekfslam.storage.checkpoint import Checkpoints
 from ekfslam.studies.study import LEVELS, STUDY_VARIANTS, Study, levels_of
-from ekfslam.studies.tuning import tune
+from ekfslam.studies.tuning import toml_heading, tune
 
 DEFAULT_DATA = "builtin:city"
 TRUTH = "truth"  # what `export` takes beside the modes
@@ -52,19 +58,42 @@ def main(arguments: SequenceType[str] | None = None) -> int:
     """Entry point of ``ekfslam``; returns the exit code: 0, or 2 after one line for a user's error."""
     options = _parser().parse_args(arguments)
     command: Callable[[argparse.Namespace], None] = options.command
+    _prepare_output()
     try:
-        command(options)
+        with reading_up_to(options.read_limit):
+            command(options)
         sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of our output (head, less) has gone; that is not an error. Keep the exit from flushing into it.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (EkfslamError, OSError) as error:
-        print(f"ekfslam: error: {' '.join(str(error).split())}", file=sys.stderr)
+        # The reader of our output (head, less) has gone; that is not an error.
+        _forget_output()
+    except (EkfslamError, OSError, MemoryError) as error:
+        _forget_output()
+        message = printable(" ".join(str(error).split())) or "there is not enough memory"
+        print(f"ekfslam: error: {message}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("ekfslam: interrupted", file=sys.stderr)
         return 130
     return 0
+
+
+def _prepare_output() -> None:
+    """Let printing work where there is no output, and where its encoding lacks a character of a name."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the caller
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 (open until the exit)
+        reconfigure = getattr(getattr(sys, name), "reconfigure", None)
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")
+
+
+def _forget_output() -> None:
+    """Keep the exit from flushing into an output that is full or gone."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -88,6 +117,13 @@ def _parser() -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         sub.set_defaults(command=command)
+        sub.add_argument(
+            "--read-limit",
+            type=float,
+            default=DEFAULT_GB,
+            metavar="GB",
+            help="how many gigabytes of numbers a file may hold; more is refused unread (default: %(default)s)",
+        )
         return sub
 
     sub = add(
@@ -101,6 +137,8 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("data", nargs="*", default=[DEFAULT_DATA], metavar="DATA", help=f"default: {DEFAULT_DATA}")
     sub.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), metavar="MODE", help=", ".join(MODES))
     sub.add_argument("--out", type=Path, default=Path("results/local"), metavar="DIR", help="default: %(default)s")
+    _add_force(sub)
+    _add_resume(sub)
     _add_data_options(sub)
     _add_filter_options(sub)
 
@@ -114,6 +152,8 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="DATA", help=f"default: {DEFAULT_DATA}")
     sub.add_argument("--mode", choices=MODES, default="full", help="default: %(default)s")
     sub.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="archive to write")
+    _add_force(sub)
+    _add_resume(sub)
     _add_data_options(sub)
     _add_filter_options(sub)
 
@@ -123,7 +163,7 @@ def _parser() -> argparse.ArgumentParser:
         "simulate many drives and see whether the covariances hold what they promise",
         "consistency --runs 20",
         "consistency --level all --variants invariant standard fej --out results/local/all",
-        "consistency --runs 1000 --executor dask://scheduler:8786",
+        "consistency --runs 1000 --executor tls://scheduler:8786",
     )
     sub.add_argument("--runs", type=int, default=50, metavar="N", help="of each level (default: %(default)s)")
     sub.add_argument(
@@ -145,7 +185,12 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
     sub.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
     sub.add_argument(
-        "--executor", default="processes", metavar="SPEC", help="processes (default), serial, dask://HOST:PORT, or mpi"
+        "--executor",
+        default="processes",
+        metavar="SPEC",
+        help="processes (default), serial, tls://HOST:PORT (a Dask cluster, with the certificates of Dask's "
+        "configuration distributed.comm.tls), dask://HOST:PORT (without: whoever reaches that port runs programs as "
+        "you; for networks of your own only), or mpi",
     )
     sub.add_argument(
         "--out",
@@ -164,6 +209,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("world", nargs="?", default=DEFAULT_DATA, metavar="WORLD", help=f"default: {DEFAULT_DATA}")
     sub.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="recording to write")
+    _add_force(sub)
 
     sub = add(
         "info",
@@ -186,6 +232,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--out", type=Path, metavar="FILE.toml", help="write what was found, for --config of run and compare"
     )
+    _add_force(sub)
     sub.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of the filter; sigmas are ignored")
     sub.add_argument(
         "--model",
@@ -241,7 +288,20 @@ def _parser() -> argparse.ArgumentParser:
         "--mode", help=f"any in the archive (default: full, or else its first), or {TRUTH} for the true poses"
     )
     sub.add_argument("--out", type=Path, metavar="FILE", help="default: ARCHIVE with .MODE.FORMAT.txt")
+    _add_force(sub)
     return parser
+
+
+def _add_resume(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on where an interrupted run of the same stopped, to the same bits; its checkpoint lies beside --out",
+    )
+
+
+def _add_force(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--force", action="store_true", help="replace a file that is no earlier result of the same")
 
 
 def _add_data_options(parser: argparse.ArgumentParser) -> None:
@@ -315,34 +375,44 @@ def _compare(options: argparse.Namespace) -> None:
         raise ConfigError("--truth belongs to one recording, but several are given; compare them one by one")
     # Everything is read before anything is run: a mistyped last name should not cost the first hour.
     sequences = [_open(options, data) for data in options.data]
-    for sequence, folder in zip(sequences, _folders(sequences), strict=True):
+    # Recordings of the same name do not overwrite each other.
+    folders = [options.out / name for name in components(sequence.name for sequence in sequences)]
+    for sequence, folder in zip(sequences, folders, strict=True):
+        files.require_writable(folder / "archive.h5")
+        if not options.force:
+            require_same_origin(folder / "archive.h5", sequence)
+    for sequence, folder in zip(sequences, folders, strict=True):
         for note in sequence.notes:
             print(f"{sequence.name}: {note}")
-        comparison = compare(sequence, options.modes, config)
-        paths = comparison.save(options.out / folder)
-        print(f"\n{comparison.table}\nwritten to {options.out / folder}: {', '.join(path.name for path in paths)}")
-
-
-def _folders(sequences: list[Sequence]) -> list[str]:
-    """A folder name for each sequence; recordings of the same name do not overwrite each other."""
-    folders: list[str] = []
-    for sequence in sequences:
-        same = sum(other.name == sequence.name for other in sequences[: len(folders)])
-        folders.append(f"{sequence.name}-{same + 1}" if same else sequence.name)
-    return folders
+        with Checkpoints(folder / "unfinished.checkpoint", options.resume) as checkpoints:
+            comparison = compare(sequence, options.modes, config, checkpoints)
+            paths = comparison.save(folder, options.force)
+        print(f"\n{comparison.table}\nwritten to {folder}: {', '.join(path.name for path in paths)}")
 
 
 def _run(options: argparse.Namespace) -> None:
     config = _config(options)
     sequence = with_truth_noise(_open(options, options.data), config.truth)
-    result = run(sequence, options.mode, config)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    write_archive(options.out, sequence, {result.mode: result})
+    files.require_writable(options.out)
+    if not options.force:
+        require_same_origin(options.out, sequence)
+    with Checkpoints(options.out.with_name(f"{options.out.name}.checkpoint"), options.resume) as checkpoints:
+        result = run(sequence, options.mode, config, checkpoints=checkpoints)
+        older = [] if _is_shared(options.out) else older_figures(options.out.parent)
+        files.write_all({options.out: archive_image(sequence, {result.mode: result})})
+    remove_figures(older, ())
     print(_table(sequence, len(sequence.observations.ids), {result.mode: result}))
     print(", ".join(f"{name} {count}" for name, count in result.counts.items()))
     if result.parameters is not None:
         print("\n".join(result.parameters.lines))
+    for remark in result.remarks:
+        print(f"note: {remark}")
     print(f"written to {options.out}")
+
+
+def _is_shared(archive: Path) -> bool:
+    """Whether the figures beside an archive need not be its own."""
+    return not archive.exists() or any(path != archive for path in archive.parent.glob("*.h5"))
 
 
 def _consistency(options: argparse.Namespace) -> None:
@@ -352,9 +422,10 @@ def _consistency(options: argparse.Namespace) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
+    files.require_writable(options.out)
     sequence = builtin(options.world.removeprefix(BUILTIN))
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    write_sequence(sequence, options.out)
+    _require_ours(options, options.out, lambda path: is_recording_of(path, sequence))
+    files.write_all({options.out: sequence_image(sequence)})
     print(f"{len(sequence)} frames, {len(sequence.observations)} observations written to {options.out}")
 
 
@@ -368,6 +439,8 @@ def _info(options: argparse.Namespace) -> None:
             if result.parameters is not None:
                 for line in result.parameters.lines:
                     print(f"{mode}: {line}")
+            for remark in result.remarks:
+                print(f"{mode}: note: {remark}")
             if result.hygiene is not None:
                 for line in result.hygiene.lines(result.config["hygiene"]):
                     print(f"{mode}: hygiene: {line}")
@@ -409,18 +482,21 @@ def _info(options: argparse.Namespace) -> None:
 def _tune(options: argparse.Namespace) -> None:
     config = Config.from_toml(options.config) if options.config else Config()
     config = config.with_overrides({"noise": {"model": options.model}})
-    tuned = tune(_open(options, options.data), config, drift=options.drift)
+    sequence = _open(options, options.data)
+    if options.out:
+        files.require_writable(options.out)
+        _require_ours(options, options.out, lambda path: first_line(path) == toml_heading(sequence.name))
+    tuned = tune(sequence, config, drift=options.drift)
     print(tuned.table)
     if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(tuned.toml, encoding="utf-8")
+        files.write_all({options.out: tuned.toml})
         print(f"written to {options.out}")
 
 
 def _plot(options: argparse.Namespace) -> None:
     archive = read_archive(options.archive)
     directory = options.out or options.archive.parent
-    directory.mkdir(parents=True, exist_ok=True)
+    files.require_writable(directory / "map.png")
     for path in save_figures(directory, archive.results, archive.truth, archive.interpolated):
         print(path)
 
@@ -429,15 +505,18 @@ def _posterior(options: argparse.Namespace) -> None:
     full = open_result(options.archive, "full")
     overrides = {"posterior": {"linearisation": options.linearisation, "kernel": options.kernel}}
     config = Config().with_overrides(full.config).with_overrides(overrides).posterior
+    directory = options.out or options.archive.parent
+    for path in (options.archive, directory / "sparsity.png"):
+        files.require_writable(path)
     found = posterior(full, config)
     smoothed = smooth(full, config, found)
-    add_result(options.archive, smoothed)
+    truth = read_archive(options.archive).truth
+    figures = pngs(directory, draw_posterior_figures(full, smoothed, found.information, truth))
+    add_result(options.archive, smoothed, of=full, beside=figures)
     archive = read_archive(options.archive)
     print(_table(archive, None, archive.results))
     print(", ".join(f"{name} {count}" for name, count in smoothed.counts.items()))
-    directory = options.out or options.archive.parent
-    directory.mkdir(parents=True, exist_ok=True)
-    for path in save_posterior_figures(directory, full, smoothed, found.information, archive.truth):
+    for path in figures:
         print(path)
     print(f"{smoothed.mode} written to {options.archive}")
 
@@ -449,27 +528,29 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    modes = list(read_archive(options.archive).results)
+    archive = read_archive(options.archive)
+    modes = list(archive.results)
     mode = options.mode or ("full" if "full" in modes or not modes else modes[0])
-    path = options.out or options.archive.with_suffix(f".{mode}.{options.format}.txt")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = options.out or options.archive.with_suffix(f".{components([mode])[0]}.{options.format}.txt")
+    files.require_writable(path)
+    _require_ours(options, path, lambda path: len(first_line(path).split()) == (8 if options.format == "tum" else 12))
     if mode == TRUTH:
-        poses = export_truth(options.archive, path, options.format)
+        poses, text = truth_text(archive, str(options.archive), options.format)
     else:
         result = open_result(options.archive, mode)
-        poses = len(result.time_s)
-        export_trajectory(result, path, options.format)
+        poses, text = len(result.time_s), trajectory_text(result, options.format)
+    files.write_all({path: text})
     print(f"{poses} poses written to {path}")
 
 
+def _require_ours(options: argparse.Namespace, path: Path, is_ours: Callable[[Path], bool]) -> None:
+    """Raise a `WriteError` where a file would be lost that is no earlier result of the same kind."""
+    if not (options.force or files.is_free(path) or is_ours(path)):
+        raise WriteError(f"{path}: exists, and is no earlier result of the same; --force replaces it")
+
+
 def _is_archive(data: str) -> bool:
-    if data.startswith(BUILTIN) or not Path(data).is_file() or not h5py.is_hdf5(data):
-        return False
-    try:
-        with h5py.File(data) as h5file:
-            return h5file.attrs.get("format") == ARCHIVE_FORMAT
-    except OSError as error:
-        raise ArchiveError(f"{data}: cannot be read: {error}") from None
+    return not data.startswith(BUILTIN) and hdf5.format_of(data) == ARCHIVE_FORMAT
 
 
 def _table(data: Sequence | Archive, landmarks: int | None, results: Mapping[str, Result]) -> str:

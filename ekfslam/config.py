@@ -16,7 +16,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.special import gammaincinv
 
-from ekfslam.errors import ConfigError
+from ekfslam.errors import ConfigError, UnknownFormatError
+from ekfslam.limits import require_file
 
 Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
 Variant = Literal["invariant", "fej", "standard"]
@@ -70,8 +71,8 @@ def _rule(kind: type, words: str = "", holds: Callable[[Any], bool] = lambda _: 
     return {"rule": Rule(kind, words, holds)}
 
 
-def _whole(least: int) -> dict[str, Rule]:
-    return _rule(int, f"be a whole number not below {least}", lambda value: value >= least)
+def _whole(least: int, most: int = 1_000_000) -> dict[str, Rule]:
+    return _rule(int, f"be a whole number not below {least}, nor above {most}", lambda value: least <= value <= most)
 
 
 def _one_of(literal: Any) -> dict[str, Rule]:
@@ -79,14 +80,26 @@ def _one_of(literal: Any) -> dict[str, Rule]:
     return _rule(str, f"be one of {', '.join(names)}", lambda value: value in names)
 
 
+LEAST_PX = 1e-3  # pixel noise with which covariances of landmarks keep digits, whatever they begin with
+
 # No comparison holds for NaN, so the rules refuse it.
 _TEXT, _SWITCH = _rule(str), _rule(bool)
-_NUMBER = _rule(float, "not be NaN", lambda value: not math.isnan(value))
-_POSITIVE = _rule(float, "be positive", lambda value: value > 0)
+_NUMBER = _rule(float, "be a number, not NaN", lambda value: abs(value) <= 1e300 or abs(value) == math.inf)
+# Of any standard deviation, in any unit: its square is a number, and so is what that divides.
+_LEAST, _LARGEST = 1e-12, 1e6
+_POSITIVE = _rule(
+    float, f"be positive, from {1 / _LARGEST:g} to {_LARGEST:g}", lambda value: 1 / _LARGEST <= value <= _LARGEST
+)
 _NOT_NEGATIVE = _rule(float, "not be negative", lambda value: value >= 0)
-_FINITE = _rule(float, "be finite and not negative", lambda value: 0 <= value < math.inf)
+_FINITE = _rule(
+    float,
+    f"be finite and not negative: 0, or from {_LEAST:g} to {_LARGEST:g}",
+    lambda value: value == 0 or _LEAST <= value <= _LARGEST,
+)
 _PIXELS = _rule(
-    float, "be finite and positive, or the innovation covariance is singular", lambda value: 0 < value < math.inf
+    float,
+    f"be finite and positive, from {LEAST_PX:g} to {_LARGEST:g}, or the innovation covariance is singular",
+    lambda value: LEAST_PX <= value <= _LARGEST,
 )
 _PROBABILITY = _rule(float, "be in (0, 1]", lambda value: 0 < value <= 1)
 _BETWEEN_0_AND_1 = _rule(float, "be between 0 and 1", lambda value: 0 < value < 1)
@@ -204,7 +217,7 @@ class FilterConfig:
     variant: Variant = field(default="invariant", metadata=_one_of(Variant))
     landmark_coordinates: LandmarkCoordinates = field(default="image", metadata=_one_of(LandmarkCoordinates))
     covariance_form: CovarianceForm = field(default="auto", metadata=_one_of(CovarianceForm))
-    iterations: int = field(default=1, metadata=_whole(1))
+    iterations: int = field(default=1, metadata=_whole(1, 100))
     retire: Retire = field(default="auto", metadata=_one_of(Retire))
     retire_after: int | None = field(default=None, metadata=_whole(1))
     dormant: int | None = field(default=None, metadata=_whole(0))
@@ -272,7 +285,7 @@ class PosteriorConfig:
     linearisation: Linearisation = field(default="map", metadata=_one_of(Linearisation))
     kernel: Kernel = field(default="huber", metadata=_one_of(Kernel))
     kernel_width: float = field(default=2.8, metadata=_POSITIVE)
-    max_iterations: int = field(default=50, metadata=_whole(1))
+    max_iterations: int = field(default=50, metadata=_whole(1, 10_000))
     tolerance: float = field(default=1e-6, metadata=_BETWEEN_0_AND_1)
 
 
@@ -396,10 +409,33 @@ class Config:
             ConfigError: The file is missing, is not TOML, or holds something unknown.
         """
         try:
+            require_file(path, is_text=True)
             text = Path(path).read_text(encoding="utf-8")
             return Config().with_overrides(tomllib.loads(text))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, ConfigError) as error:
+        except UnknownFormatError as error:  # names the file
+            raise ConfigError(str(error)) from None
+        except (OSError, ValueError, RecursionError, ConfigError) as error:  # ValueError: no UTF-8, no TOML
             raise ConfigError(f"{path}: {error}") from None
+
+
+def require_setting(name: str, value: object, is_scale: bool = False) -> None:
+    """Raise a `ConfigError` unless a value is a finite standard deviation, or a positive time or length."""
+    (_POSITIVE if is_scale else _FINITE)["rule"].check(name, value)
+
+
+def check_stored(tables: Mapping[str, Any]) -> None:
+    """Raise a `ConfigError` where what a result was stored with breaks today's rules; keys unknown today may stand."""
+    defaults = Config()
+    for setting in dataclasses.fields(Config):
+        settings = tables.get(setting.name, {})
+        _require_table(setting.name, settings)
+        if setting.name == "blocks":
+            _check_blocks(settings)
+            continue
+        for known in dataclasses.fields(type(getattr(defaults, setting.name))):
+            value = settings.get(known.name)
+            if value is not None:
+                known.metadata["rule"].check(f"{setting.name}.{known.name}", value)
 
 
 def _require_table(name: str, value: object) -> None:

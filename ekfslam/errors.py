@@ -30,6 +30,14 @@ class ArchiveError(EkfslamError):
     """A result archive lacks what was asked of it, or has a format version this release cannot read."""
 
 
+class WriteError(ArchiveError):
+    """A file cannot be written; an older one of its name is as it was."""
+
+
+class ResumeError(ArchiveError):
+    """A checkpoint is damaged, or belongs to another recording, other settings or another release."""
+
+
 class DataError(EkfslamError):
     """A data set is malformed.
 
@@ -104,6 +112,22 @@ class InnovationError(FilterError):
         super().__init__(
             f"frame {frame}: innovation covariance is not positive definite for landmark ids{_listed(self.ids)}; "
             "check that the pixel noise is positive and the initial covariance positive semi-definite"
+        )
+
+
+class NonFiniteResultError(FilterError):
+    """An estimate or a covariance has become NaN or infinite: there is no result.
+
+    Args:
+        mode: Of the run.
+        what: Name of the quantity.
+        index: Of its first entry that is no number, such as the frame.
+    """
+
+    def __init__(self, mode: str, what: str, index: int) -> None:
+        self.mode, self.what, self.index = mode, what, index
+        super().__init__(
+            f"{mode}: {what}[{index}] is NaN or infinite; velocities, pixels or noise are beyond what numbers can hold"
         )
 
 

@@ -1,67 +1,137 @@
 """The HDF5 dialect of result archives, studies and recordings.
 
-- A file appears under its name only when it is complete (`creating`, `replacing`).
+- A file is made in memory (`image`) and appears under its name only when it is complete.
 - Its attributes ``format`` and ``format_version`` say what it is; `opened` refuses what it is not, and whatever damage
   shows while it is read becomes one named error.
 - Data sets are declared in layouts, next to the records that they hold. Each has the attributes ``units`` and ``frame``
-  (of reference).
-- Text is read in both of HDF5's forms. Recordings, which are passed on, are written compactly: long arrays compressed,
-  text of fixed length (libhdf5 hangs on some damaged files with text of variable length), and the newer file layout,
-  which carries checksums of all but the arrays.
+  (of reference), and a `Check` of its values, which holds for what is written as well as for what is read.
+- `opened` looks at everything in a file before anything is read. It refuses links, data that lie in other files, and
+  types of data that no file of ours has.
+- Text is read in both of HDF5's forms and written with fixed length: libhdf5 hangs on some damaged files with text of
+  variable length. Files have the newer layout, which carries checksums of all but the arrays. Long arrays of
+  recordings, which are passed on, are compressed.
 
-A leaf: readers of data use it as well as archives do, so it imports nothing of the package but the errors.
+A leaf: readers of data use it as well as archives do, so it imports nothing of the package but other leaves.
 """
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator, Mapping
+import math
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
-from ekfslam.errors import ArchiveError, EkfslamError
+from ekfslam.errors import ArchiveError, EkfslamError, UnknownFormatError
+from ekfslam.limits import Budget, require_file
+from ekfslam.names import printable
 
-# Data set, field of the record that it holds (with dots for fields of fields), shape, units, frame. A letter in a shape
-# is a length that data sets share.
-Layout = tuple[tuple[str, str, tuple[str | int, ...], str, str], ...]
-
+# What h5py, zlib and json raise where a file is damaged.
+_DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError, MemoryError, zlib.error)
 _LONG = 10_000  # entries from which compression pays
+_MOST_OBJECTS = 100_000  # of a file: one of ours has some hundreds
+_LARGEST = 1e100  # a number whose square and cube are still numbers
+_MOST = 1 << 62  # a whole number to which one can be added
 
 
-@contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
-    """A name to write a file under that takes the place of ``path`` when it is complete.
+class Check(NamedTuple):
+    """What the values of a data set must be.
+
+    Args:
+        kinds: Of their NumPy types, which decide as what they are read: ``f`` numbers, ``i`` whole numbers, ``b`` truth
+            values, ``S`` text.
+        words: What must hold for each, as it follows "must".
+        holds: Which of them it holds for, given the shared lengths: of the shape of the values, or of its first axes.
+    """
+
+    kinds: str
+    words: str
+    holds: Callable[[NDArray, Mapping[str, int]], NDArray]
+
+
+def _in(low: float, high: float) -> Callable[[NDArray, Mapping[str, int]], NDArray]:
+    return lambda value, _: (value >= low) & (value <= high)  # holds for no NaN
+
+
+def _ascends(value: NDArray, _: Mapping[str, int]) -> NDArray:
+    return (np.abs(value) <= _LARGEST) & (np.diff(value, prepend=-np.inf) > 0)
+
+
+NUMBERS = Check("f", "be finite", _in(-_LARGEST, _LARGEST))
+NUMBERS_OR_NONE = Check("f", "be finite or NaN", lambda value, _: ~(np.abs(value) > _LARGEST))
+NOT_NEGATIVE = Check("f", "be finite and not negative", _in(0, _LARGEST))
+POSITIVE = Check("f", "be finite and positive", _in(1 / _LARGEST, _LARGEST))
+ASCENDING = Check("f", "be finite and ascend", _ascends)
+FLAGS = Check("b", "be a truth value", lambda value, _: np.ones(value.shape, dtype=bool))
+TEXTS = Check("S", "be text", lambda value, _: np.ones(value.shape, dtype=bool))
+
+
+def index_of(length: str, least: int = 0) -> Check:
+    """Whole numbers from ``least`` up to, and without, a shared length."""
+    return Check(
+        "i", f"be an index from {least} to {length} - 1", lambda value, n: (value >= least) & (value < n[length])
+    )
+
+
+def whole(low: int, high: int = _MOST) -> Check:
+    """Whole numbers between two, both included."""
+    return Check("i", f"be a whole number from {low} to {high}", _in(low, high))
+
+
+COUNTS = whole(0)
+
+
+class Item(NamedTuple):
+    """A data set of a layout.
+
+    Args:
+        name: Of the data set below its group.
+        field: Of the record that it holds, with dots for fields of fields.
+        shape: A letter in it is a length that data sets share.
+        units, frame: Its attributes.
+        check: What its values must be.
+    """
+
+    name: str
+    field: str
+    shape: tuple[str | int, ...]
+    units: str
+    frame: str
+    check: Check = NUMBERS
+
+
+Layout = tuple[Item, ...]
+
+
+def layout(*rows: tuple[Any, ...]) -> Layout:
+    """A layout of the arguments of its items."""
+    return tuple(Item(*row) for row in rows)
+
+
+def image(format: str, version: int, fill: Callable[[h5py.File], None]) -> bytes:
+    """The bytes of a new file of a format and version, for `ekfslam.files.write`.
+
+    It is made in memory, since libhdf5 crashes the interpreter where a disk is full.
+
+    Args:
+        format, version: Its attributes.
+        fill: Writes what else is in it.
 
     Raises:
-        ArchiveError: The file cannot be written.
+        ArchiveError: It would hold what cannot be read again.
     """
-    path = Path(path)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield unfinished
-        unfinished.replace(path)
-    except OSError as error:
-        raise ArchiveError(f"{path}: cannot be written: {error}") from None
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
-@contextmanager
-def creating(path: str | Path, format: str, version: int, compact: bool = False) -> Iterator[h5py.File]:
-    """A new file of a format and version, which replaces an old one when it is complete.
-
-    Raises:
-        ArchiveError: The file cannot be written.
-    """
-    with replacing(path) as unfinished, h5py.File(str(unfinished), "w", libver="v110" if compact else None) as h5file:
-        write_attributes(h5file, {"format": format, "format_version": version}, compact)
-        yield h5file
+    with h5py.File("new file", "w", driver="core", backing_store=False, libver="v110") as h5file:
+        write_attributes(h5file, {"format": format, "format_version": version})
+        fill(h5file)
+        h5file.flush()
+        return bytes(h5file.id.get_file_image())
 
 
 @contextmanager
@@ -75,31 +145,135 @@ def opened(
         EkfslamError: Of type ``error``: it is missing, has another format, or turns out damaged while it is open.
     """
     try:
-        with h5py.File(str(path), "r") as h5file:
-            found, stored = plain(h5file.attrs.get("format")), h5file.attrs.get("format_version")
+        require_file(path)
+        # Files are replaced as a whole and never changed, so that they need no locks.
+        with h5py.File(str(path), "r", locking=False) as h5file:
+            _inspect(h5file, error)
+            found = plain(h5file.attrs.get("format"))
             if found != format:
-                raise error(
-                    f"{path}: an HDF5 file of format {found!r} with [{', '.join(h5file)}]; expected format {format!r}"
+                names = ", ".join(list(h5file)[:9])
+                raise error(f"{path}: an HDF5 file of format {found!r} with [{names}]; expected format {format!r}")
+            if version_of(h5file) > version:
+                raise ArchiveError(
+                    f"{path}: has format version {version_of(h5file)}, this release reads up to version {version}"
                 )
-            if not isinstance(stored, np.integer) or stored > version:
-                raise ArchiveError(f"{path}: has format version {stored}, this release reads up to version {version}")
             yield h5file
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as problem:  # what h5py and json raise at damage
+    except UnknownFormatError as problem:
+        raise error(str(problem)) from None
+    except _DAMAGE as problem:
         raise error(f"{path}: damaged or no HDF5 file ({problem}); expected format {format!r}") from None
 
 
-def write_fields(group: h5py.Group, layout: Layout, record: Any, compact: bool = False) -> None:
-    """Write the data sets of a layout from the fields of a record, or the values of a mapping."""
-    for name, field, _, units, frame in layout:
-        value = record[field] if isinstance(record, Mapping) else attrgetter(field)(record)
+def format_of(path: str | Path) -> str:
+    """The attribute ``format`` of an HDF5 file; empty if it has none, or is none."""
+    if not (Path(path).is_file() and h5py.is_hdf5(str(path))):
+        return ""
+    try:
+        with h5py.File(str(path), "r", locking=False) as h5file:
+            return str(plain(h5file.attrs.get("format", "")))
+    except _DAMAGE:  # who opens it will say how
+        return ""
+
+
+def _inspect(h5file: h5py.File, error: type[EkfslamError]) -> None:
+    """Refuse what no file of ours has, all over a file, before anything is read."""
+    budget = Budget(h5file.filename, error)
+    waiting, seen = [h5file], {h5py.h5o.get_info(h5file.id).addr}
+    while waiting:
+        group = waiting.pop()
+        _inspect_attributes(group, budget)
+        for name in group:
+            place = _place(group, name)
+            if name != printable(name):
+                raise error(f"{place} has a name that cannot be printed")
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise error(f"{place} is a link, which no file of this format has")
+            item = group[name]
+            address = h5py.h5o.get_info(item.id).addr
+            if address in seen or len(seen) > _MOST_OBJECTS:
+                raise error(f"{place} is there twice, or one of too many")
+            seen.add(address)
+            if isinstance(item, h5py.Group):
+                waiting.append(item)
+                continue
+            if not isinstance(item, h5py.Dataset):
+                raise error(f"{place} is neither a group nor a data set")
+            if item.is_virtual or item.external:
+                raise error(f"{place} has its data in another file (external or virtual storage)")
+            if item.shape is None or not _is_known(item.dtype):
+                raise error(f"{place} is empty or of an unknown type")
+            _inspect_attributes(item, budget)
+            _inspect_size(item, place, budget)
+
+
+def _inspect_attributes(item: h5py.Group | h5py.Dataset, budget: Budget) -> None:
+    for name in item.attrs:
+        if name != printable(name):
+            raise budget.error(f"{item.file.filename}: {_spoken(item, name)} has a name that cannot be printed")
+        attribute = item.attrs.get_id(name)
+        space, dtype = attribute.get_space(), attribute.dtype
+        if space.get_simple_extent_type() == h5py.h5s.NULL or not _is_known(dtype):
+            raise budget.error(f"{item.file.filename}: {_spoken(item, name)} is empty or of an unknown type")
+        budget.take(space.get_simple_extent_npoints() * dtype.itemsize, _spoken(item, name))
+
+
+def _inspect_size(dataset: h5py.Dataset, place: str, budget: Budget) -> None:
+    """Refuse a data set that claims more than may be read, or more than the file has of it."""
+    size = math.prod(dataset.shape) * dataset.dtype.itemsize
+    budget.take(size, dataset.name.strip("/"))
+    if dataset.chunks is None:
+        if dataset.id.get_storage_size() < size:
+            raise budget.error(f"{place} claims {size} bytes, of which the file has {dataset.id.get_storage_size()}")
+        return
+    chunk = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    budget.take(chunk, f"a part of {dataset.name.strip('/')}")
+    filters = [
+        dataset.id.get_create_plist().get_filter(i)[0] for i in range(dataset.id.get_create_plist().get_nfilters())
+    ]
+    if not set(filters) <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}:
+        raise budget.error(f"{place} is compressed in a way that no file of this format is")
+    for part in dataset.iter_chunks():
+        skipped, stored = dataset.id.read_direct_chunk(tuple(s.start for s in part))
+        if h5py.h5z.FILTER_DEFLATE in filters and not skipped:
+            stored = zlib.decompressobj().decompress(stored, chunk + 8)
+        if len(stored) > chunk + 4:  # a checksum
+            raise budget.error(f"{place} has parts that become larger than the {chunk} bytes that they claim")
+
+
+def _is_known(dtype: np.dtype) -> bool:
+    """Whether a type is one of numbers, truth values or text."""
+    return dtype.kind in "fiubS" or h5py.check_string_dtype(dtype) is not None
+
+
+def write_fields(
+    group: h5py.Group, layout: Layout, record: Any, sizes: Mapping[str, int] | None = None, compact: bool = False
+) -> None:
+    """Write the data sets of a layout from the fields of a record, or the values of a mapping.
+
+    Args:
+        group: To write below.
+        layout: What to write.
+        record: Its fields, or items, are written.
+        sizes: Shared lengths that are known.
+        compact: Compress long arrays.
+
+    Raises:
+        ArchiveError: A value is not what its check asks for: such a file could not be read again.
+    """
+    values = [
+        np.asarray(record[item.field] if isinstance(record, Mapping) else attrgetter(item.field)(record))
+        for item in layout
+    ]
+    _checked(group, layout, values, dict(sizes or {}))
+    for item, value in zip(layout, values, strict=True):
         # HDF5 cannot chunk, hence not compress, an empty array.
         compression = "gzip" if compact and np.size(value) > _LONG else None
-        dataset = group.create_dataset(name, data=value, compression=compression)
-        write_attributes(dataset, {"units": units, "frame": frame}, compact)
+        dataset = group.create_dataset(item.name, data=value, compression=compression)
+        write_attributes(dataset, {"units": item.units, "frame": item.frame})
 
 
 def read_fields(group: h5py.Group, layout: Layout, sizes: Mapping[str, int] | None = None) -> dict[str, Any]:
-    """The data sets of a layout by field, as stored; the first one along a shared length decides it.
+    """The data sets of a layout by field, checked; the first one along a shared length decides it.
 
     Args:
         group: To read from.
@@ -107,23 +281,44 @@ def read_fields(group: h5py.Group, layout: Layout, sizes: Mapping[str, int] | No
         sizes: Shared lengths that are known.
 
     Raises:
-        ArchiveError: A data set is missing or has another shape.
+        ArchiveError: A data set is missing, has another shape or type, or a value is not what its check asks for.
     """
-    fields: dict[str, Any] = {}
-    known = dict(sizes or {})
-    for name, field, shape, _, _ in layout:
-        if not isinstance(group.get(name), h5py.Dataset):
-            raise ArchiveError(f"{_place(group)}/{name} is missing")
-        value = group[name][()]
-        if np.ndim(value) == len(shape):
-            for n, length in zip(shape, np.shape(value), strict=True):
+    values = []
+    for item in layout:
+        if not isinstance(group.get(item.name), h5py.Dataset):
+            raise ArchiveError(f"{_place(group, item.name)} is missing")
+        values.append(group[item.name][()])
+    found = _checked(group, layout, values, dict(sizes or {}))
+    return {item.field: value for item, value in zip(layout, found, strict=True)}
+
+
+_TYPES = {"f": ("fiu", np.float64), "i": ("iu", np.int64), "b": ("biu", np.bool_), "S": ("SO", np.object_)}
+
+
+def _checked(group: h5py.Group, layout: Layout, values: list[Any], known: dict[str, int]) -> list[NDArray]:
+    """The values of a layout in the types of their checks; an `ArchiveError` where one breaks its check."""
+    for item, value in zip(layout, values, strict=True):
+        if np.ndim(value) == len(item.shape):
+            for n, length in zip(item.shape, np.shape(value), strict=True):
                 if isinstance(n, str):
                     known.setdefault(n, length)
-        wanted = tuple(known.get(n, n) if isinstance(n, str) else n for n in shape)
+        wanted = tuple(known.get(n, n) if isinstance(n, str) else n for n in item.shape)
         if np.shape(value) != wanted:
-            raise ArchiveError(f"{_place(group)}/{name} has shape {np.shape(value)}, expected {wanted}")
-        fields[field] = value
-    return fields
+            raise ArchiveError(f"{_place(group, item.name)} has shape {np.shape(value)}, expected {wanted}")
+    found = []
+    for item, value in zip(layout, values, strict=True):
+        kinds, dtype = _TYPES[item.check.kinds]
+        value = np.asarray(value)
+        if value.dtype.kind not in kinds and not (value.dtype.kind == "U" and "S" in kinds):
+            raise ArchiveError(f"{_place(group, item.name)} is of type {value.dtype}, must {item.check.words}")
+        wrong = np.argwhere(~item.check.holds(value, known))
+        if len(wrong):
+            index = tuple(int(i) for i in wrong[0])
+            where = f"[{', '.join(map(str, index))}]" if index else ""
+            shown = f" = {value[index]}" if np.ndim(value[index]) == 0 else ""
+            raise ArchiveError(f"{_place(group, item.name)}{where}{shown}: must {item.check.words}")
+        found.append(value if item.check.kinds == "S" else value.astype(dtype, copy=False))
+    return found
 
 
 def subgroup(group: h5py.Group, name: str) -> h5py.Group:
@@ -137,11 +332,15 @@ def subgroup(group: h5py.Group, name: str) -> h5py.Group:
     return group[name]
 
 
-def write_attributes(item: h5py.Group | h5py.Dataset, values: Mapping[str, Any], compact: bool = False) -> None:
-    """Write attributes; those that are None are left out."""
+def write_attributes(item: h5py.Group | h5py.Dataset, values: Mapping[str, Any]) -> None:
+    """Write attributes, text with fixed length; those that are None are left out."""
     for name, value in values.items():
-        if value is not None:
-            item.attrs[name] = fixed_text(value) if compact and isinstance(value, str) else value
+        if isinstance(value, str):
+            item.attrs[name] = fixed_text(value)
+        elif isinstance(value, tuple) and value and isinstance(value[0], str):
+            item.attrs[name] = np.array([fixed_text(text) for text in value])
+        elif value is not None:
+            item.attrs[name] = value
 
 
 def attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
@@ -160,6 +359,31 @@ def attribute(item: h5py.Group | h5py.Dataset, name: str) -> Any:
     return plain(item.attrs[name])
 
 
+def version_of(item: h5py.Group) -> int:
+    """The attribute ``format_version`` of a file or group.
+
+    Raises:
+        ArchiveError: It is missing, or no whole number.
+    """
+    version = attribute(item, "format_version")
+    if type(version) is not int:
+        raise ArchiveError(f"{item.file.filename}: {_spoken(item, 'format_version')} is no whole number: {version!r}")
+    return version
+
+
+def facts(item: h5py.Group | h5py.Dataset) -> dict[str, str | int | float]:
+    """All attributes, each a text or a finite number.
+
+    Raises:
+        ArchiveError: One is something else.
+    """
+    found = attributes(item)
+    for name, value in found.items():
+        if not (isinstance(value, str) or (isinstance(value, int | float) and abs(value) < np.inf)):
+            raise ArchiveError(f"{item.file.filename}: {_spoken(item, name)} is neither a text nor a finite number")
+    return found
+
+
 def json_table(item: h5py.Group | h5py.Dataset, name: str) -> dict[str, Any]:
     """One attribute that holds a JSON object.
 
@@ -169,7 +393,7 @@ def json_table(item: h5py.Group | h5py.Dataset, name: str) -> dict[str, Any]:
     text = attribute(item, name)
     try:
         table = json.loads(text)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, RecursionError):
         table = None
     if not isinstance(table, dict):
         raise ArchiveError(f"{item.file.filename}: {_spoken(item, name)} is no JSON object: {str(text)[:40]!r}")
@@ -178,13 +402,14 @@ def json_table(item: h5py.Group | h5py.Dataset, name: str) -> dict[str, Any]:
 
 def fixed_text(text: str) -> np.bytes_:
     """Text in HDF5's form of fixed length."""
-    return np.bytes_(text.encode())
+    return np.bytes_(text.encode(errors="backslashreplace"))
 
 
 def plain(value: Any) -> Any:
-    """A stored scalar as a plain Python value."""
+    """A stored scalar as a plain Python value; of text, control characters but the end of a line are written out."""
     value = value.item() if isinstance(value, np.generic) else value
-    return value.decode(errors="replace") if isinstance(value, bytes) else value
+    value = value.decode(errors="replace") if isinstance(value, bytes) else value
+    return printable(value, keep="\n") if isinstance(value, str) else value
 
 
 def texts(values: Any) -> tuple[str, ...]:

@@ -12,20 +12,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
-from ekfslam.errors import IllPosedError, PosteriorError
+from ekfslam.errors import FilterError, IllPosedError, PosteriorError
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.evaluation.verdict import Honesty, innovations_of, judge
 from ekfslam.figures.check import plot_check
 from ekfslam.figures.posterior import plot_map_before_and_after
-from ekfslam.figures.run import save_figure, save_figures
-from ekfslam.figures.study import save_study_figures
+from ekfslam.figures.run import draw_figures
+from ekfslam.figures.study import draw_study_figures
+from ekfslam.figures.style import older_figures, png, pngs
 from ekfslam.filters.result import Result
-from ekfslam.runner import run
+from ekfslam.runner import run, versions
 from ekfslam.smoother.posterior import posterior, smooth
-from ekfslam.storage.archive import open_result, write_archive
+from ekfslam.storage.archive import archive_image, open_result, require_same_origin
+from ekfslam.storage.checkpoint import Checkpoints, key_of
 from ekfslam.studies.executors import open_executor
 from ekfslam.studies.study import Study, StudyArchive, run_study
 from ekfslam.studies.summary import study_table, summarise_study
@@ -39,7 +42,8 @@ class Comparison:
         sequence: The recording.
         results: Mode to result, in the order asked for.
         summary: The figures of merit as written to ``summary.json``.
-        skipped: Why there is no result of a mode asked for: an ill-posed posterior does not keep the others.
+        skipped: Why there is no result of a mode asked for: an ill-posed posterior, or a filter that cannot go on, does
+            not keep the others.
     """
 
     sequence: Sequence
@@ -50,49 +54,89 @@ class Comparison:
     @property
     def table(self) -> str:
         """The summary as a Markdown table, and what is missing in it."""
-        missing = "".join(f"\nNo {mode}: {reason}\n" for mode, reason in self.skipped.items())
-        return compare_table(self.summary) + missing
+        lines = [f"No {mode}: {reason}" for mode, reason in self.skipped.items()]
+        lines += [f"Note on {mode}: {remark}" for mode, result in self.results.items() for remark in result.remarks]
+        return compare_table(self.summary) + "".join(f"\n{line}\n" for line in lines)
 
-    def save(self, directory: str | Path) -> list[Path]:
+    def save(self, directory: str | Path, force: bool = False) -> list[Path]:
         """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures; returns their paths.
 
+        All are written or none. Figures of an earlier run in the folder go.
+
+        Args:
+            directory: Where to; made if missing.
+            force: Replace an archive of another recording, too.
+
         Raises:
-            ArchiveError: The archive cannot be written.
-            OSError: The directory cannot be written.
+            WriteError: The directory cannot be written, or holds results of another recording.
         """
         directory = Path(directory)
-        directory.mkdir(parents=True, exist_ok=True)
         archive, summary, table = (directory / name for name in ("archive.h5", "summary.json", "summary.md"))
-        write_archive(archive, self.sequence, self.results)
-        _write_json(summary, self.summary)
+        if not force:
+            require_same_origin(archive, self.sequence)
         notes = "".join(f"- {note}\n" for note in self.sequence.notes)
-        table.write_text(self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""), encoding="utf-8")
-        figures = save_figures(directory, self.results, self.sequence.truth, self.sequence.interpolated)
+        figures = draw_figures(self.results, self.sequence.truth, self.sequence.interpolated)
         if "full" in self.results and "smoothed" in self.results:
-            figures.append(directory / "map_before_and_after.png")
             drawn = plot_map_before_and_after(self.results["full"], self.results["smoothed"], self.sequence.truth)
-            save_figure(drawn, figures[-1])
-        return [archive, summary, table, *figures]
+            figures["map_before_and_after"] = drawn
+        contents = {
+            archive: archive_image(self.sequence, self.results),
+            summary: _json(self.summary),
+            table: self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""),
+            **pngs(directory, figures),
+        }
+        older = older_figures(directory)
+        files.write_all(contents)
+        remove_figures(older, contents)
+        return list(contents)
 
 
-def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | None = None) -> Comparison:
+def compare(
+    sequence: Sequence,
+    modes: Iterable[Mode] = MODES,
+    config: Config | None = None,
+    checkpoints: Checkpoints | None = None,
+) -> Comparison:
     """Run several modes with one configuration.
 
+    Args:
+        sequence: The recording.
+        modes: What to run.
+        config: Settings; defaults where None.
+        checkpoints: Where finished modes are kept meanwhile; and beside it, with the ending ``.full``, the state of the
+            joint filter. `Checkpoints.remove` them when the comparison is saved.
+
     Raises:
+        ArchiveError: A checkpoint to go on from is damaged, or of something else.
         ConfigError: Unknown mode.
-        InnovationError: An innovation covariance is not positive definite.
+        FilterError: No mode has a result; otherwise `Comparison.skipped` says which has none, and why.
     """
-    results: dict[str, Result] = {}
-    skipped: dict[str, str] = {}
     if config is not None:
         sequence = with_truth_noise(sequence, config.truth)
+    modes = list(modes)
+    key = "" if checkpoints is None else key_of(sequence, config or Config(), "compare", versions())
+    kept = None if checkpoints is None else checkpoints.found(key)
+    done = {"results": {}, "skipped": {}} if kept is None else kept
+    results: dict[str, Result] = {mode: done["results"][mode] for mode in modes if mode in done["results"]}
+    skipped: dict[str, str] = {mode: done["skipped"][mode] for mode in modes if mode in done["skipped"]}
+    of_filter = None if checkpoints is None else checkpoints.beside(".full")
     for mode in modes:
+        if mode in results or mode in skipped:
+            continue
+        if mode == "smoothed" and "full" in skipped:
+            skipped[mode] = skipped["full"]
+            continue
         # The filter that "smoothed" starts from need not run twice.
         known = mode == "smoothed" and "full" in results
         try:
-            results[mode] = smooth(results["full"]) if known else run(sequence, mode, config)
-        except IllPosedError as error:
+            results[mode] = smooth(results["full"]) if known else run(sequence, mode, config, None, of_filter)
+        except (IllPosedError, FilterError) as error:
             skipped[mode] = str(error)
+        if checkpoints is not None:
+            checkpoints.keep(key, {"results": results, "skipped": skipped}, always=True)
+    results = {mode: results[mode] for mode in modes if mode in results}
+    if skipped and not results:
+        raise FilterError("; ".join(f"no {mode}: {reason}" for mode, reason in skipped.items()))
     summary = {
         "sequence": sequence.name,
         "frames": len(sequence),
@@ -137,15 +181,19 @@ def check_consistency(
         ConfigError: The executor is unknown, not installed or not reachable.
     """
     directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
     archive_path, summary_path, table_path = (directory / name for name in ("study.h5", "summary.json", "table.md"))
+    for path in (archive_path, summary_path, table_path):
+        files.require_writable(path)
     with open_executor(executor, workers) as opened:
         archive = run_study(study, archive_path, opened)
     summary = summarise_study(archive)
-    _write_json(summary_path, summary)
-    table_path.write_text(study_table(summary), encoding="utf-8")
-    paths = [archive_path, summary_path, table_path, *save_study_figures(directory, archive)]
-    return ConsistencyReport(archive, summary, paths)
+    contents = {
+        summary_path: _json(summary),
+        table_path: study_table(summary),
+        **pngs(directory, draw_study_figures(archive)),
+    }
+    files.write_all(contents)
+    return ConsistencyReport(archive, summary, [archive_path, *contents])
 
 
 @dataclass(frozen=True)
@@ -173,6 +221,10 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
         ArchiveError: The archive cannot be read or has no such mode.
         HonestyError: The run has no innovations to judge by: of another mode than full, or of an older release.
     """
+    directory = Path(archive).parent if directory is None else Path(directory)
+    values, table, figure = (directory / name for name in ("check.json", "check.md", "check.png"))
+    for path in (values, table, figure):
+        files.require_writable(path)
     result = open_result(archive, mode)
     innovations_of(result)
     smoothed, skipped = None, ""
@@ -181,14 +233,17 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
     except PosteriorError as error:
         skipped = str(error)
     found = judge(result, smoothed, skipped)
-    directory = Path(archive).parent if directory is None else Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
-    values, table, figure = (directory / name for name in ("check.json", "check.md", "check.png"))
-    _write_json(values, found.values)
-    table.write_text(found.table, encoding="utf-8")
-    save_figure(plot_check(result, found), figure)
+    files.write_all({values: _json(found.values), table: found.table, figure: png(plot_check(result, found))})
     return Check(found, [values, table, figure])
 
 
-def _write_json(path: Path, summary: dict[str, Any]) -> None:
-    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+def remove_figures(older: Iterable[Path], new: Iterable[Path]) -> None:
+    """Remove older figures in whose place there are no new ones, and with ``check.png`` the verdict beside it."""
+    for path in set(older) - set(new):
+        verdict = [path.with_suffix(".md"), path.with_suffix(".json")] if path.name == "check.png" else []
+        for old in (path, *verdict):
+            old.unlink(missing_ok=True)
+
+
+def _json(summary: dict[str, Any]) -> str:
+    return json.dumps(summary, indent=2, allow_nan=False) + "\n"

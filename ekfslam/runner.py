@@ -6,11 +6,13 @@ import dataclasses
 import platform
 from importlib.metadata import version
 from time import perf_counter
+from typing import Any
 
 import h5py
 import numpy as np
 import scipy
 
+from ekfslam.arrays import IntArray
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError
@@ -18,21 +20,27 @@ from ekfslam.evaluation.relative import dead_reckoned_pairs, relative_pairs
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.innovations import collect_innovations
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.loop import FurtherVelocities, one_thread, run_filter
+from ekfslam.filters.loop import FurtherVelocities, one_thread, run_filter, solvable
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.references import References
 from ekfslam.filters.reports import collect
 from ekfslam.filters.result import Innovation, Landmarks, Rejections, Result
 from ekfslam.geometry import se3
-from ekfslam.models.build import build
+from ekfslam.models.build import Problem, build
 from ekfslam.progress import progress
 from ekfslam.smoother.posterior import smooth
 from ekfslam.smoother.revival import MapRevival
+from ekfslam.storage.checkpoint import Checkpoints, key_of
 from ekfslam.studies.automatic import with_track_scale
 
 
+@solvable()
 def run(
-    sequence: Sequence, mode: Mode = "full", config: Config | None = None, further: FurtherVelocities | None = None
+    sequence: Sequence,
+    mode: Mode = "full",
+    config: Config | None = None,
+    further: FurtherVelocities | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> Result:
     """Estimate trajectory and map of a sequence.
 
@@ -42,22 +50,25 @@ def run(
             reckoning's poses), ``full`` (joint EKF SLAM) or ``smoothed`` (the posterior of a full run).
         config: Settings; defaults where None.
         further: Velocity measurements of other sensors, for the joint filter (`ekfslam.models.sensors.velocities`).
+        checkpoints: Where the joint filter keeps its state meanwhile, and whether to go on from there, bit for bit.
+            That ``further`` is the same then, the caller must see to.
 
     Raises:
+        ArchiveError: The checkpoint to go on from is damaged, or of something else.
         ConfigError: Unknown mode.
-        InnovationError: An innovation covariance is not positive definite.
+        FilterError: The filter cannot go on: an innovation covariance is not positive definite (`InnovationError`), a
+            number is none (`NonFiniteResultError`), or a matrix is singular.
         IllPosedError: The posterior of a smoothed run leaves something undetermined.
     """
     if mode not in MODES:
         raise ConfigError(f"unknown mode {mode!r}; known: {', '.join(MODES)}")
     if mode == "smoothed":
-        return smooth(run(sequence, "full", config, further))
+        return smooth(run(sequence, "full", config, further, checkpoints))
     if mode == "full":
         config = with_track_scale(config or Config(), sequence)
     problem = build(sequence, config, clean=mode != "dead-reckoning")
     sequence, config, model = problem.sequence, problem.config, problem.model
     account, hygiene = {**problem.account, "model": "; ".join(problem.lines)}, problem.hygiene
-    frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
     counts: dict[str, int] = {}
     reports, landmarks = [], Landmarks.empty()
     log = parameters = pairs = whitened = None
@@ -66,16 +77,9 @@ def run(
 
     with one_thread():
         if mode == "full":
-            revival = MapRevival(model, config.filter) if config.filter.revive >= 0 else None
-            ekf = JointEKF(model, config.filter, revival=revival)
-            T_imu_world, covariance = np.empty((len(sequence), 4, 4)), np.empty((len(sequence), 6, 6))
-            ms = np.empty(len(sequence))
-            references = None if judged is None else References(ekf, *judged)
-            for k, report, ms[k] in run_filter(ekf, sequence, frames, further):
-                T_imu_world[k], covariance[k] = ekf.T_imu_world, ekf.gaussian.body_covariance[:6, :6]
-                reports.append(report)
-                if references is not None:
-                    references.record(k)
+            state = _filtered(problem, judged, further, checkpoints)
+            ekf, references, reports = state["ekf"], state["references"], state["reports"]
+            T_imu_world, covariance, ms = state["T_imu_world"], state["covariance"], state["ms"]
             pairs = None if references is None else references.pairs()
             landmarks, counts, log, parameters = ekf.landmarks(), ekf.counts, ekf.log(), ekf.parameters()
         else:
@@ -87,6 +91,7 @@ def run(
             ms = np.full(len(sequence), 1e3 * (perf_counter() - begin) / len(sequence))
             if mode == "mapping-only":
                 mapper = IndependentLandmarks(model.rig.with_white_pixels(), config.filter, T_imu_world)
+                frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
                 for k, report, taken in run_filter(mapper, sequence, frames):
                     reports.append(report)
                     ms[k] += taken
@@ -123,6 +128,43 @@ def run(
         whitened=whitened,
         attributes={**sequence.attributes, **account, **versions()},
     )
+
+
+def _filtered(
+    problem: Problem,
+    judged: tuple[IntArray, IntArray] | None,
+    further: FurtherVelocities | None,
+    checkpoints: Checkpoints | None,
+) -> dict[str, Any]:
+    """The joint filter after a recording, and what it left frame by frame: the state that checkpoints hold."""
+    sequence, settings = problem.sequence, problem.config.filter
+    count, key, state = len(sequence), "", None
+    if checkpoints is not None:
+        key = key_of(sequence, problem.config, "full", versions())
+        state = checkpoints.found(key)
+    if state is None:
+        revival = MapRevival(problem.model, settings) if settings.revive >= 0 else None
+        ekf = JointEKF(problem.model, settings, revival=revival)
+        state = {
+            "ekf": ekf,
+            "references": None if judged is None else References(ekf, *judged),
+            "T_imu_world": np.zeros((count, 4, 4)),
+            "covariance": np.zeros((count, 6, 6)),
+            "ms": np.zeros(count),
+            "reports": [],
+            "frames": 0,
+        }
+    ekf, references, begin = state["ekf"], state["references"], state["frames"]
+    frames = progress(range(begin, count), f"{sequence.name}: full")
+    for k, report, state["ms"][k] in run_filter(ekf, sequence, frames, further, begun=begin > 0):
+        state["T_imu_world"][k], state["covariance"][k] = ekf.T_imu_world, ekf.gaussian.body_covariance[:6, :6]
+        state["reports"].append(report)
+        if references is not None:
+            references.record(k)
+        state["frames"] = k + 1
+        if checkpoints is not None:
+            checkpoints.keep(key, state)
+    return state
 
 
 def versions() -> dict[str, str]:

@@ -343,7 +343,7 @@ def plot_autocorrelation(sequence: Sequence) -> Figure:
     axes = figure.subplots(1, 2, sharey=True)
     for ax, title, names, rho, count in (
         (axes[0], "pixels, per landmark", ROWS, rho_r, len(r)),
-        (axes[1], "velocities", [f"${name}$" for name in AXES], rho_w, len(w)),
+        (axes[1], "velocities", list(AXES), rho_w, len(w)),
     ):
         bound = 1.96 / np.sqrt(count)
         ax.axhspan(-bound, bound, **BOUNDS, label="95 % of white noise")

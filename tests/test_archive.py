@@ -165,9 +165,9 @@ def test_every_data_set_states_units_and_frame(written):
 
     with h5py.File(written) as h5file:
         h5file.visititems(visit)
-        assert h5file.attrs["error_convention"] == ERROR_CONVENTION
+        assert h5file.attrs["error_convention"].decode() == ERROR_CONVENTION
         assert h5file["runs/full/attributes"].attrs["seed"] == 0
-        assert h5file["runs/full/attributes"].attrs["version_ekfslam"] == "0.1.0"
+        assert h5file["runs/full/attributes"].attrs["version_ekfslam"] == b"0.1.0"
         assert "observations" not in h5file["sequence"]
     assert {"truth/T_world_imu", "runs/full/trajectory/covariance", "runs/full/timing/ms_per_frame"} <= set(names)
 
@@ -286,7 +286,8 @@ def test_kitti_export_holds_the_upper_rows_exactly(results, tmp_path):
 # Files of earlier releases
 
 
-def test_adding_to_an_archive_of_an_earlier_version_keeps_its_runs_readable(with_log, results, tmp_path):
+def test_adding_to_an_archive_of_an_earlier_version_keeps_its_runs_readable(with_log, tmp_path):
+    added = run(builtin("loop?frames=12"), "dead-reckoning")
     path = Path(shutil.copy(with_log, tmp_path / "old.h5"))
     with h5py.File(path, "a") as h5file:
         h5file.attrs["format_version"] = 3
@@ -294,11 +295,11 @@ def test_adding_to_an_archive_of_an_earlier_version_keeps_its_runs_readable(with
             del h5file["runs/full/log"][name]
     before = open_result(path, "full")
     for name in ("first", "second"):
-        add_result(path, dataclasses.replace(results["dead-reckoning"], mode=name))
+        add_result(path, dataclasses.replace(added, mode=name))
         assert_same(open_result(path, "full"), before)
     with h5py.File(path) as h5file:
         assert h5file.attrs["format_version"] == FORMAT_VERSION
-        assert h5file["runs/full"].attrs["format_version"] == 3
+        assert "T_imu_world_departed" in h5file["runs/full/log"], "a file has one version"
 
 
 def test_drift_of_an_earlier_version_is_not_taken_for_pixels(copy):

@@ -32,7 +32,9 @@ def test_every_setting_refuses_another_kind_and_nan(table, setting):
 def test_whole_numbers(name):
     with pytest.raises(ConfigError, match=rf"filter\.{name} must be a whole number, found 2\.5"):
         Config().with_overrides({"filter": {name: 2.5}})
-    with pytest.raises(ConfigError, match=rf"filter\.{name} must be a whole number not below -?\d, found -7"):
+    with pytest.raises(
+        ConfigError, match=rf"filter\.{name} must be a whole number not below -?\d, nor above \d+, found -7"
+    ):
         Config().with_overrides({"filter": {name: -7}})
     assert type(getattr(Config().with_overrides({"filter": {name: 2.0}}).filter, name)) is int
 

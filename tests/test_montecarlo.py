@@ -210,12 +210,12 @@ def test_what_is_no_archive_of_a_study(tmp_path, serial, kind):
 
 def test_every_data_set_has_units_and_frame_and_the_shape_it_promises(serial):
     with h5py.File(serial) as h5file:
-        assert h5file.attrs["format"] == "ekfslam-study"
+        assert h5file.attrs["format"] == b"ekfslam-study"
         assert json.loads(h5file.attrs["study"])["seed"] == 5
         for field, (shape, _, units, frame) in FIELDS.items():
             dataset = h5file["levels/mid/invariant"][field]
             assert dataset.shape == (3, *({"T": 8, "J": 4}.get(n, n) for n in shape))
-            assert (dataset.attrs["units"], dataset.attrs["frame"]) == (units, frame)
+            assert (dataset.attrs["units"].decode(), dataset.attrs["frame"].decode()) == (units, frame)
 
 
 def test_realisations_are_distinct_and_independent_of_what_else_the_study_holds():

@@ -47,6 +47,7 @@ from ekfslam.errors import (
 )
 from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import project
+from ekfslam.limits import Budget
 
 
 @pytest.fixture
@@ -282,7 +283,7 @@ def test_mat_files_of_either_byte_order_and_every_number_type_are_parsed():
                 + struct.pack(order + "I2s2x", 2 << 16 | 1, dtype.encode())
                 + element(order, kind, values),
             )
-        variables = parse_mat(content)
+        variables = parse_mat(content, Budget("a.mat"))
         assert list(variables) == ["u1", "i2", "f4", "f8"]
         for value in variables.values():
             np.testing.assert_array_equal(value, [[0, 2, 4], [1, 3, 5]])
@@ -386,7 +387,7 @@ def test_own_form_of_a_newer_version_is_refused_with_both_versions(tmp_path, npz
 def test_sequence_group_without_observations_keeps_the_rest(tmp_path, starry_night):
     sequence = open_sequence(starry_night)
     with h5py.File(tmp_path / "archive.h5", "w") as h5file:
-        write_sequence_group(h5file, sequence, include_observations=False)
+        write_sequence_group(h5file, sequence)
         write_truth_group(h5file, sequence.truth)
         fields = read_sequence_fields(h5file, "archive.h5")
         assert_same(sequence, Sequence(**fields, observations=sequence.observations))

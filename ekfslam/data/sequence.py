@@ -31,10 +31,16 @@ from ekfslam.errors import (
 )
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.names import printable
 
 VelocityFrame = Literal["imu", "level"]
 
 ROTATION_TOLERANCE = 1e-4  # files print rotations with as few as five digits
+
+# No quantity of a recording is larger, in s, m, m/s, rad/s or px: beyond, a square or a product loses all digits.
+LARGEST = 1e12
+LARGEST_ID = 1 << 62  # pieces of cut tracks count on from the largest
+_LARGEST_VELOCITY, _LARGEST_DISTANCE_M, _LARGEST_PX = 1e6, 1e9, 1e7
 
 # Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
@@ -117,7 +123,7 @@ class Sequence:
     """One recording of a stereo rig with body velocities.
 
     Args:
-        name: Short name, used for folders and titles.
+        name: Short name, used for folders and titles; what cannot be printed is written out (``\\x1b``).
         source: File or built-in world it came from, used in error messages.
         time_s: (T,) strictly increasing stamps.
         twist: (T, 6) measured velocities ``[v; w]`` in ``velocity_frame``; ``twist[k]`` drives ``(t[k-1], t[k]]``.
@@ -154,6 +160,7 @@ class Sequence:
                 raise
             raise type(error)(error.message, source=self.source, field=error.field, index=error.index) from None
         object.__setattr__(self, "T_cam_imu", _frozen(se3.nearest_rigid(self.T_cam_imu)))
+        object.__setattr__(self, "name", printable(self.name))
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -228,29 +235,36 @@ def require_shape(value: ArrayLike, shape: tuple[int | None, ...], name: str) ->
         raise ShapeError(f"expected shape {wanted}, found {' x '.join(map(str, found)) or 'a scalar'}", field=name)
 
 
-def require_finite(value: Array, name: str) -> None:
-    """Raise `NonFiniteError` with the index of the first NaN or infinity."""
-    bad = np.argwhere(~np.isfinite(value))
+def require_finite(value: Array, name: str, largest: float = LARGEST) -> None:
+    """Raise `NonFiniteError` with the index of the first number that is NaN, infinite, or beyond all sense."""
+    bad = np.argwhere(~(np.abs(value) <= largest))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
+        kind = f"larger than {largest:g}" if np.isfinite(np.asarray(value)[index]) else "NaN or infinite"
         raise NonFiniteError(
-            f"{len(bad)} values are NaN or infinite, the first is {value[index]}",
+            f"{len(bad)} values are {kind}, the first is {value[index]}",
             field=name,
             index=index[0] if len(index) == 1 else index or None,
         )
 
 
-def require_rigid(T: Array, name: str, error: type[DataError]) -> None:
-    """Raise ``error`` unless every (..., 4, 4) matrix is a rotation and a translation."""
+def rigid_defect(T: Array) -> Array:
+    """By how much (...) finite (..., 4, 4) are no rotations and translations; 2 and more where they mirror."""
     R = T[..., :3, :3]
     defect = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2))
     bottom = np.abs(T[..., 3, :] - np.array([0, 0, 0, 1])).max(axis=-1)
-    bad = np.argwhere((np.maximum(defect, bottom) > ROTATION_TOLERANCE) | (np.linalg.det(R) < 0))
+    return np.maximum(defect, bottom) + np.where(np.linalg.det(R) < 0, 2.0, 0.0)
+
+
+def require_rigid(T: Array, name: str, error: type[DataError]) -> None:
+    """Raise ``error`` unless every (..., 4, 4) matrix is a rotation and a translation."""
+    defect = rigid_defect(T)
+    bad = np.argwhere(defect > ROTATION_TOLERANCE)
     if len(bad):
         index = tuple(int(i) for i in bad[0])
         raise error(
             f"not a rigid transform: orthogonality defect {defect[index]:.2g}, "
-            f"determinant {np.linalg.det(R[index]):.6g}",
+            f"determinant {np.linalg.det(T[index][:3, :3]):.6g}",
             field=name,
             index=index[0] if len(index) == 1 else index or None,
         )
@@ -259,7 +273,7 @@ def require_rigid(T: Array, name: str, error: type[DataError]) -> None:
 def validate_camera(camera: StereoCamera) -> None:
     """Raise `NonFiniteError` or `CalibrationError` for unusable intrinsics or baseline."""
     values = np.array([camera.fu_px, camera.fv_px, camera.cu_px, camera.cv_px, camera.baseline_m])
-    require_finite(values, "camera (fu, fv, cu, cv, baseline)")
+    require_finite(values, "camera (fu, fv, cu, cv, baseline)", _LARGEST_PX)
     if camera.fu_px <= 0 or camera.fv_px <= 0:
         raise CalibrationError(
             f"intrinsic matrix K is singular or mirrored: fu {camera.fu_px:g}, fv {camera.fv_px:g}", field="K"
@@ -284,7 +298,7 @@ def _validate(sequence: Sequence) -> None:
             index=index,
         )
     require_shape(sequence.twist, (frames, 6), "twist")
-    require_finite(sequence.twist, "twist")
+    require_finite(sequence.twist, "twist", _LARGEST_VELOCITY)
     if sequence.velocity_frame not in get_args(VelocityFrame):
         raise DataError(
             f"expected {' or '.join(get_args(VelocityFrame))}, found {sequence.velocity_frame!r}",
@@ -292,20 +306,20 @@ def _validate(sequence: Sequence) -> None:
         )
     validate_camera(sequence.camera)
     require_shape(sequence.T_cam_imu, (4, 4), "T_cam_imu")
-    require_finite(sequence.T_cam_imu, "T_cam_imu")
+    require_finite(sequence.T_cam_imu, "T_cam_imu", _LARGEST_DISTANCE_M)
     require_rigid(sequence.T_cam_imu, "T_cam_imu", ExtrinsicsError)
     if len(sequence.observations) or sequence.attributes.get("tracks") != WITHOUT_TRACKS["tracks"]:
         _validate_observations(sequence.observations, frames)
     if sequence.truth is not None:
         _validate_truth(sequence.truth, frames)
     if sequence.noise is not None:
-        _validate_noise(sequence.noise)
+        validate_noise(sequence.noise)
 
 
 def _validate_observations(observations: Observations, frames: int) -> None:
     if len(observations) == 0:
         raise EmptyTracksError("there is not one observation", field="observations")
-    require_finite(observations.pixels_px, "observations.pixels_px")
+    require_finite(observations.pixels_px, "observations.pixels_px", _LARGEST_PX)
     outside = (observations.frame < 0) | (observations.frame >= frames)
     if outside.any():
         index = int(np.argmax(outside))
@@ -314,9 +328,7 @@ def _validate_observations(observations: Observations, frames: int) -> None:
             field="observations.frame",
             index=index,
         )
-    if (observations.landmark < 0).any():
-        index = int(np.argmax(observations.landmark < 0))
-        raise ShapeError("landmark ids must not be negative", field="observations.landmark", index=index)
+    _require_ids(observations.landmark, "observations.landmark")
     twice = (np.diff(observations.frame) == 0) & (np.diff(observations.landmark) == 0)
     if twice.any():
         index = int(np.argmax(twice)) + 1
@@ -324,6 +336,15 @@ def _validate_observations(observations: Observations, frames: int) -> None:
             f"landmark {observations.landmark[index]} is observed twice in frame {observations.frame[index]}",
             field="observations",
             index=index,
+        )
+
+
+def _require_ids(landmark: IntArray, name: str) -> None:
+    wrong = (landmark < 0) | (landmark > LARGEST_ID)
+    if wrong.any():
+        index = int(np.argmax(wrong))
+        raise ShapeError(
+            f"landmark ids must be from 0 to {LARGEST_ID}, found {landmark[index]}", field=name, index=index
         )
 
 
@@ -335,20 +356,22 @@ def _validate_truth(truth: Truth, frames: int) -> None:
         )
     if len(truth.frame) and (truth.frame[0] < 0 or truth.frame[-1] >= frames or (np.diff(truth.frame) <= 0).any()):
         raise TruthError(f"frames must ascend within 0..{frames - 1}", field="truth.frame")
-    require_finite(truth.T_world_imu, "truth.T_world_imu")
+    require_finite(truth.T_world_imu, "truth.T_world_imu", _LARGEST_DISTANCE_M)
     require_rigid(truth.T_world_imu, "truth.T_world_imu", TruthError)
     if np.shape(truth.position_m) != (len(truth.landmark), 3):
         raise TruthError(
             f"{len(truth.landmark)} landmarks but positions of shape {np.shape(truth.position_m)}",
             field="truth.position_m",
         )
-    require_finite(truth.position_m, "truth.position_m")
+    _require_ids(truth.landmark, "truth.landmark")
+    require_finite(truth.position_m, "truth.position_m", _LARGEST_DISTANCE_M)
     for name, value in vars(truth.noise).items() if truth.noise is not None else ():
         if not (np.isfinite(value) and value >= 0):
             raise DataError(f"must be finite and not negative, found {value}", field=f"truth.noise.{name}")
 
 
-def _validate_noise(noise: Noise) -> None:
+def validate_noise(noise: Noise) -> None:
+    """Raise a `DataError` for standard deviations of other shapes, or that are none."""
     sizes = {"twist_std": 6, "pixel_std_px": 4, "motion_std": 6, "gap_std": 6}
     optional = {"twist_walk_std": 6, "track_first_px": 3, "track_walk_px": 3}
     for name, size in (sizes | optional).items():
@@ -356,7 +379,7 @@ def _validate_noise(noise: Noise) -> None:
             continue
         value = np.asarray(getattr(noise, name), dtype=float)
         require_shape(value, (size,), f"noise.{name}")
-        require_finite(value, f"noise.{name}")
+        require_finite(value, f"noise.{name}", _LARGEST_VELOCITY)
         if (value < 0).any():
             raise DataError("standard deviations must not be negative", field=f"noise.{name}")
     for name in ("misalignment_rad", "tilt_rad"):

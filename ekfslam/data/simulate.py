@@ -43,6 +43,29 @@ _UNEVENNESS = np.array([0.025, 0.010, 0.004, 0.008])
 _FRAMES_PER_CHUNK = 100  # a stretch of road short enough for most landmarks of a long drive to be out of range
 
 
+# Beyond these a simulation would take hours or more memory than there is, or say nothing.
+_LEAST, _LARGEST = 1e-12, 1e6
+_MOST = {
+    "seed": float("inf"),
+    "frames": 100_000,
+    "frame_period_s": 1e3,
+    "max_tracks": 10_000,
+    "max_range_m": 1e4,
+    "landmarks": 20_000,
+    "landmarks_per_m": 100.0,
+    "radius_m": 1e5,
+    "speed_m_s": 1e3,
+    "sigma_v_m_s": 1e3,
+    "sigma_w_rad_s": 1e3,
+    "sigma_px": 1e3,
+    "initial_position_std_m": 1e4,
+    "initial_rotation_std_rad": 10.0,
+}
+_MOST_IN_VIEW = 20_000_000  # landmarks times frames
+_MOST_STREETS_M = 1e6
+_FASTEST_M_S = 15.0  # in the city
+
+
 @dataclass(frozen=True)
 class Recording:
     """What every world has: sampling, noise, and the limits of the tracker.
@@ -82,8 +105,11 @@ class Recording:
 
     def __post_init__(self) -> None:
         for key, value in numbers_of(self).items():
-            if not 0 <= value < float("inf"):
-                raise ConfigError(f"{self.name}: {key} must be finite and not negative, found {value}")
+            most = _MOST.get(key, _LARGEST)
+            if not (value == 0 or _LEAST <= value <= most):
+                raise ConfigError(
+                    f"{self.name}: {key} must be finite and not negative: 0, or {_LEAST:g} to {most:g}, found {value}"
+                )
             if value == 0 and key in ("frame_period_s", "radius_m"):
                 raise ConfigError(f"{self.name}: {key} must be positive")
         if self.frames < 2:
@@ -91,6 +117,16 @@ class Recording:
         for key in ("loss_probability", "outlier_fraction"):
             if getattr(self, key) > 1:
                 raise ConfigError(f"{self.name}: {key} must be in [0, 1], found {getattr(self, key)}")
+        if self.frames * max(self.in_view, 1.0) > _MOST_IN_VIEW:
+            raise ConfigError(
+                f"{self.name}: {self.frames} frames of about {self.in_view:.0f} landmarks are too many, at most "
+                f"{_MOST_IN_VIEW} together"
+            )
+
+    @property
+    def in_view(self) -> float:
+        """About how many landmarks are within reach of a frame."""
+        return 0.0
 
 
 @dataclass(frozen=True)
@@ -112,6 +148,16 @@ class City(Recording):
     outlier_fraction: float = 0.03
     landmarks_per_m: float = 4.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        length_m = _FASTEST_M_S * self.frames * self.frame_period_s
+        if length_m * max(self.landmarks_per_m, 1.0) > _MOST_STREETS_M * 4.0:
+            raise ConfigError(f"{self.name}: streets of about {length_m:.3g} m have too many landmarks")
+
+    @property
+    def in_view(self) -> float:
+        return 2.0 * self.landmarks_per_m * self.max_range_m
+
 
 @dataclass(frozen=True)
 class Loop(Recording):
@@ -131,6 +177,10 @@ class Loop(Recording):
     landmarks: int = 100
     landmark_offset_m: float = 16.0
     landmark_height_m: float = 4.0
+
+    @property
+    def in_view(self) -> float:
+        return float(self.landmarks)
 
 
 def numbers_of(world: Recording) -> dict[str, int | float]:

@@ -31,7 +31,7 @@ def markdown_table(
     Raises:
         ValueError: A row has more or fewer cells than there are headings.
     """
-    lines = [list(headings), *map(list, rows)]
+    lines = [[cell.replace("|", "\\|").replace("\n", " ") for cell in line] for line in (headings, *rows)]
     if any(len(line) != len(headings) for line in lines):
         raise ValueError(f"every row must have {len(headings)} cells")
     widths = [max(_NARROWEST, *map(len, column)) if padded else 0 for column in zip(*lines, strict=True)]

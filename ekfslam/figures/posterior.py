@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -11,7 +9,7 @@ from matplotlib.figure import Figure
 from ekfslam.arrays import IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.figures.maps import SIGMAS, add_ellipses, dot_size, draw_paths
-from ekfslam.figures.style import LANDMARK_COLOR, save_all, styled
+from ekfslam.figures.style import LANDMARK_COLOR, styled
 from ekfslam.filters.result import Result
 from ekfslam.smoother.sparse.information import JointInformation
 
@@ -77,14 +75,11 @@ def _draw_pattern(ax: Axes, row: IntArray, column: IntArray, size: int) -> None:
     ax.grid(False)
 
 
-def save_posterior_figures(
-    directory: str | Path, before: Result, after: Result, information: JointInformation, truth: Truth | None = None
-) -> list[Path]:
-    """Write ``map_before_and_after.png`` and ``sparsity.png`` into a directory; returns their paths."""
-    return save_all(
-        directory,
-        {
-            "map_before_and_after": plot_map_before_and_after(before, after, truth),
-            "sparsity": plot_sparsity(information),
-        },
-    )
+def draw_posterior_figures(
+    before: Result, after: Result, information: JointInformation, truth: Truth | None = None
+) -> dict[str, Figure]:
+    """``map_before_and_after`` and ``sparsity``, by name."""
+    return {
+        "map_before_and_after": plot_map_before_and_after(before, after, truth),
+        "sparsity": plot_sparsity(information),
+    }

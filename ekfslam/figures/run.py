@@ -155,16 +155,13 @@ def plot_parameters(result: Result) -> Figure:
     return figure
 
 
-def save_figures(
-    directory: str | Path,
-    results: Mapping[str, Result],
-    truth: Truth | None = None,
-    interpolated: BoolArray | None = None,
-) -> list[Path]:
-    """Write the figures that the results allow as PNG into a folder, made if missing; the paths written.
+def draw_figures(
+    results: Mapping[str, Result], truth: Truth | None = None, interpolated: BoolArray | None = None
+) -> dict[str, Figure]:
+    """The figures that the results allow, by name.
 
-    ``map.png`` always, ``errors.png`` with true poses, ``nis.png`` with updates, ``parameters.png`` where more than
-    poses and map was estimated, ``landmarks_<mode>.png`` for every mode with a map.
+    ``map`` always, ``errors`` with true poses, ``nis`` with updates, ``parameters`` where more than
+    poses and map was estimated, ``landmarks_<mode>`` for every mode with a map.
     """
     figures = {"map": plot_map(results, truth)}
     if truth is not None and len(truth.frame):
@@ -176,4 +173,14 @@ def save_figures(
             figures["parameters"] = plot_parameters(result)
         if len(result.landmarks):
             figures[f"landmarks_{mode}"] = plot_landmark_arrows(result, truth)
-    return save_all(directory, figures)
+    return figures
+
+
+def save_figures(
+    directory: str | Path,
+    results: Mapping[str, Result],
+    truth: Truth | None = None,
+    interpolated: BoolArray | None = None,
+) -> list[Path]:
+    """Write the figures of `draw_figures` as PNG into a folder, made if missing; the paths written."""
+    return save_all(directory, draw_figures(results, truth, interpolated))

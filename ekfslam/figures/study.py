@@ -5,14 +5,12 @@ As in `ekfslam.figures.maps`, every function returns a `matplotlib.figure.Figure
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array
 from ekfslam.evaluation.consistency import anees, chi2_bounds, time_average
-from ekfslam.figures.style import BOUNDS, EXPECTED, WIDE_BOUNDS, line_of, log_axis, save_all, style_of, styled
+from ekfslam.figures.style import BOUNDS, EXPECTED, WIDE_BOUNDS, line_of, log_axis, style_of, styled
 from ekfslam.studies.study import StudyArchive
 from ekfslam.studies.summary import BOUND_PROBABILITY
 
@@ -123,13 +121,13 @@ def plot_study_boxes(archive: StudyArchive) -> Figure:
     return figure
 
 
-def save_study_figures(directory: str | Path, archive: StudyArchive) -> list[Path]:
-    """Write ``boxes.png``, and ``nees_<level>.png`` and ``errors_<level>.png`` of every level; the paths written."""
+def draw_study_figures(archive: StudyArchive) -> dict[str, Figure]:
+    """``boxes``, and ``nees_<level>`` and ``errors_<level>`` of every level, by name."""
     figures = {"boxes": plot_study_boxes(archive)}
     for level in archive.study.levels:
         figures[f"nees_{level}"] = plot_study_nees(archive, level)
         figures[f"errors_{level}"] = plot_study_errors(archive, level)
-    return save_all(directory, figures)
+    return figures
 
 
 def _done(archive: StudyArchive, level: str) -> dict[str, dict[str, Array]]:

@@ -9,7 +9,9 @@ never corrects a pose are grey.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import wraps
+from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ParamSpec
@@ -19,10 +21,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+from ekfslam import files
+from ekfslam.names import components
 
 DPI = 150
+MADE_BY = "ekfslam"  # in every figure
 
 BLACK, DARK_GREY, GREY = "black", "0.35", "0.60"
 BLUE, SKY_BLUE = "#0072B2", "#56B4E9"
@@ -119,14 +127,24 @@ def marker_of(name: str) -> Style:
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorator: draw with the settings `RC`, whatever the caller's own are."""
+    """Decorator: draw with the settings `RC`, whatever the caller's own are, and all names as they are."""
 
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with mpl.rc_context(dict(RC)):
-            return draw(*args, **kwargs)
+            figure = draw(*args, **kwargs)
+        for text in _written(figure):
+            text.set_parse_math(False)  # a "$" in a name begins no formula
+        return figure
 
     return drawn
+
+
+def _written(figure: Figure) -> list[Text]:
+    """Titles, legends and texts of a figure; the numbers of its axes may be formulas."""
+    legends = [*figure.legends, *(ax.get_legend() for ax in figure.axes)]
+    in_legends = [text for legend in legends if legend is not None for text in legend.get_texts()]
+    return [*figure.texts, *in_legends, *(text for ax in figure.axes for text in (ax.title, *ax.texts))]
 
 
 def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
@@ -137,23 +155,44 @@ def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
     ax.yaxis.set_minor_formatter(NullFormatter())
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure with a palette of 256 colours: a third of the size or less, without a visible difference."""
+def png(figure: Figure) -> bytes:
+    """A figure as a file with a palette of 256 colours: a third of the size or less, without a visible difference."""
     # The default median cut sacrifices rare colours, here a thin trajectory; this method keeps all within 20 of 255.
     # Means (kmeans) then give large areas their exact colour: the grey of bounds must not turn blue.
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
+    packed, made_by = BytesIO(), PngInfo()
+    made_by.add_text("Software", MADE_BY)
     drawn = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     picture = drawn.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
-    picture.save(path, dpi=(DPI, DPI), optimize=True)
+    picture.save(packed, "PNG", dpi=(DPI, DPI), optimize=True, pnginfo=made_by)
+    return packed.getvalue()
+
+
+def pngs(directory: str | Path, figures: Mapping[str, Figure]) -> dict[Path, str | bytes]:
+    """Figures as the files ``<name>.png`` of a folder, for `ekfslam.files.write_all`."""
+    safe = components(figures)
+    return {Path(directory) / f"{name}.png": png(drawn) for name, drawn in zip(safe, figures.values(), strict=True)}
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure, see `png`."""
+    files.write(path, png(figure))
 
 
 def save_all(directory: str | Path, figures: Mapping[str, Figure]) -> list[Path]:
     """Write figures as ``<name>.png`` into a folder, made if missing; the paths written."""
-    directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
-    paths = [directory / f"{name}.png" for name in figures]
-    for path, figure in zip(paths, figures.values(), strict=True):
-        save_figure(figure, path)
-    return paths
+    contents = pngs(directory, figures)
+    files.write_all(contents)
+    return list(contents)
+
+
+def older_figures(directory: Path) -> list[Path]:
+    """The figures in a folder that `png` has made."""
+    found = []
+    for path in sorted(directory.glob("*.png")):
+        with suppress(OSError, ValueError, SyntaxError), Image.open(path) as picture:
+            if picture.info.get("Software") == MADE_BY:
+                found.append(path)
+    return found

@@ -84,7 +84,7 @@ class ConditionalSolution(Solution):
     def T(self) -> Array:
         """(j d, f) of the rows that are left."""
         T = self.at.T if self.left.all() else self.at.T[self.left]
-        return T.reshape(-1, T.shape[2])
+        return T.reshape(T.shape[0] * T.shape[1], T.shape[2])  # there may be no column
 
     @cached_property
     def u(self) -> Array:

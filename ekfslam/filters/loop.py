@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from time import perf_counter
 from typing import NamedTuple, Protocol
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ekfslam.data.sequence import Sequence
+from ekfslam.errors import FilterError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.reports import FrameReport
@@ -36,23 +38,38 @@ def one_thread() -> AbstractContextManager[object]:
     return threadpool_limits(1, user_api="blas")
 
 
+@contextmanager
+def solvable() -> Iterator[None]:
+    """Let a matrix that cannot be inverted or decomposed be a named error; serves as a decorator, too.
+
+    Raises:
+        FilterError: There was one inside.
+    """
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        reason = f"{str(error)[:1].lower()}{str(error)[1:]}"
+        raise FilterError(f"velocities, pixels or their noise are beyond what numbers can hold: {reason}") from error
+
+
 def run_filter(
     estimator: JointEKF | IndependentLandmarks,
     sequence: Sequence,
     frames: Iterable[int] | None = None,
     further: FurtherVelocities | None = None,
     clock: Callable[[], float] = perf_counter,
+    begun: bool = False,
 ) -> Iterator[Frame]:
     """Feed a recording to an estimator, frame by frame; it can be asked for its state in between.
 
     Args:
-        estimator: As it starts: at the first of the frames.
+        estimator: As it starts: at the first of the frames; or as it was after the frame before the first of them.
         sequence: The recording.
         frames: Successive frames, all by default (or wrapped in a progress bar).
         further: Velocity measurements of other sensors.
         clock: In seconds; by default wall-clock time.
+        begun: Whether the estimator has had frames before.
     """
-    begun = False
     for k in range(len(sequence)) if frames is None else frames:
         begin = clock()
         if isinstance(estimator, JointEKF):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.hygiene import HygieneReport
 from ekfslam.data.noise import Noise
+from ekfslam.errors import NonFiniteResultError
 from ekfslam.filters.log import Log
 from ekfslam.geometry.camera import StereoCamera
 
@@ -24,6 +25,11 @@ ERROR_CONVENTION = (
 # Why a filter rejected an observation; the codes of `Rejections.reason`. Archives hold the codes: "row mismatch", now
 # the business of `ekfslam.data.hygiene`, keeps its place.
 REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera", "moving", "waiting")
+
+
+# Pixel noise below which a linearised update gains more than it should. In both built-in worlds the pose NEES is the
+# same from 0.7 to 0.1 px, twice as large at 0.03 px, ten times at 0.01 px.
+LINEAR_FROM_PX = 0.1
 
 
 @dataclass(frozen=True)
@@ -251,3 +257,39 @@ class Result:
     pairs: PosePairs | None = None
     whitened: WhitenedInnovations | None = None
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, value in self._numbers().items():
+            is_wrong = ~np.isfinite(value)
+            if is_wrong.any():
+                raise NonFiniteResultError(self.mode, name, int(np.argwhere(is_wrong)[0][0]))
+
+    def _numbers(self) -> dict[str, Array]:
+        """Everything in it that must be a finite number."""
+        numbers = {name: getattr(self, name) for name in ("time_s", "T_world_imu", "covariance", "ms_per_frame")}
+        parts: list[tuple[str, Any, tuple[str, ...]]] = [
+            ("landmarks", self.landmarks, ("position_m", "covariance", "initial_position_m")),
+            ("innovation", self.innovation, ("nis",)),
+            ("parameters", self.parameters, ("value", "std", "prior_std")),
+            ("pairs", self.pairs, ("cross",)),
+            ("whitened", self.whitened, ("alone", "score", "information")),
+        ]
+        for part, record, names in parts:
+            if record is not None:
+                numbers |= {f"{part}.{name}": getattr(record, name) for name in names}
+        stated = [value for value in self.attributes.values() if isinstance(value, float)]
+        return numbers | {"attributes": np.array(stated)}
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What must be said of it beside its numbers, one sentence each."""
+        remarks = []
+        if self.mode != "dead-reckoning" and not len(self.landmarks):
+            remarks.append("not one observation was used: the trajectory is that of dead reckoning")
+        finest_px = float(np.min(self.noise.pixel_std_px))
+        if self.mode == "full" and self.noise.track_first_px is None and finest_px < LINEAR_FROM_PX:
+            remarks.append(
+                f"pixel noise of {finest_px:.2g} px is less than the errors of linearisation: the filter's covariances "
+                "are too small, those of the mode smoothed hold"
+            )
+        return tuple(remarks)

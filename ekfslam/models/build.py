@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.config import CalibrationConfig, Config, CovarianceForm, FilterConfig, LandmarkCoordinates
+from ekfslam.config import (
+    LEAST_PX,
+    CalibrationConfig,
+    Config,
+    CovarianceForm,
+    FilterConfig,
+    LandmarkCoordinates,
+    require_setting,
+)
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import WITHOUT_TRACKS, Sequence
@@ -105,6 +113,7 @@ def build(
     noise, account = noise_of(sequence, config), noise_account(sequence, config)
     hygiene = None
     if clean:
+        _require_pixel_noise(sequence, noise)
         observations, hygiene = clean_tracks(sequence, noise, config.hygiene)
         attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
         sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
@@ -119,6 +128,15 @@ def build(
     )
     config = _with_form(config, sequence, model)
     return Problem(sequence, config, model, hygiene, account)
+
+
+def _require_pixel_noise(sequence: Sequence, noise: Noise) -> None:
+    least = float(np.min(noise.pixel_std_px))
+    if least < LEAST_PX:
+        raise ConfigError(
+            f"{sequence.name}: the recording states a pixel noise of {least:g} px, with which innovation "
+            f"covariances are singular; give noise.sigma_px, at least {LEAST_PX:g}"
+        )
 
 
 def model_of(
@@ -194,6 +212,7 @@ def optional_blocks(settings: Mapping[str, Mapping[str, Any]]) -> tuple[StateBlo
         for key in values:
             if key not in known:
                 raise ConfigError(f"unknown key blocks.{name}.{key}; known: {', '.join(known)}")
+            require_setting(f"blocks.{name}.{key}", values[key], is_scale=key.startswith(("time", "length")))
         chosen.append(OPTIONAL_BLOCKS[name](**values))
     return tuple(chosen)
 

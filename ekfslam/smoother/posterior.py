@@ -24,6 +24,7 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.config import Config, FilterConfig, PosteriorConfig
 from ekfslam.errors import PosteriorError
 from ekfslam.filters.log import Log
+from ekfslam.filters.loop import solvable
 from ekfslam.filters.result import Innovation, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
 from ekfslam.models.build import model_of, optional_blocks
@@ -200,6 +201,7 @@ def _config_of(result: Result) -> Config:
     return Config().with_overrides({**result.config, "filter": settings})
 
 
+@solvable()
 def posterior_of_log(
     log: Log,
     model: Model,
@@ -219,6 +221,7 @@ def posterior_of_log(
 
     Raises:
         IllPosedError: Something is undetermined; lists landmark ids or frames.
+        FilterError: A matrix is singular.
     """
     config = config or PosteriorConfig()
     problem = BatchProblem(log, model)
@@ -246,6 +249,7 @@ def posterior_of_log(
     )
 
 
+@solvable()
 def smooth(result: Result, config: PosteriorConfig | None = None, found: Posterior | None = None) -> Result:
     """The posterior of a full run as a `Result` of its own: smoothed trajectory, map, and all their marginals.
 

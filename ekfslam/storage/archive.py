@@ -25,31 +25,41 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import h5py
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ekfslam import hdf5
+from ekfslam import files, hdf5
 from ekfslam.arrays import Array, BoolArray
-from ekfslam.config import HygieneConfig
+from ekfslam.config import HygieneConfig, check_stored
 from ekfslam.data.hygiene import RULES, HygieneReport
 from ekfslam.data.interpolation import known_intervals
+from ekfslam.data.readers.fields import spelled_as_in
 from ekfslam.data.readers.hdf5 import (
+    SPELLING,
     noise_attributes,
     noise_of_attributes,
     read_sequence_fields,
     write_sequence_group,
     write_truth_group,
 )
-from ekfslam.data.sequence import Noise, Sequence, Truth, VelocityFrame
-from ekfslam.errors import ArchiveError, DataError
+from ekfslam.data.sequence import (
+    WITHOUT_TRACKS,
+    Noise,
+    Observations,
+    Sequence,
+    Truth,
+    VelocityFrame,
+    validate_noise,
+)
+from ekfslam.errors import ArchiveError, ConfigError, DataError, WriteError
 from ekfslam.filters.log import Log
 from ekfslam.filters.result import (
     ERROR_CONVENTION,
@@ -63,102 +73,104 @@ from ekfslam.filters.result import (
     WhitenedInnovations,
 )
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.names import printable
+from ekfslam.storage.checks import COVARIANCES, RIGID, require_agreement
 
 FORMAT = "ekfslam-archive"
 FORMAT_VERSION = 4  # 2 added log, 3 hygiene and parameters, 4 state blocks and track errors in the log
 
-# Data sets below /runs/<mode>, fields of `Result` (T frames, M landmarks, R rejections).
-_LAYOUT: hdf5.Layout = (
-    ("trajectory/time", "time_s", ("T",), "s", "clock of the recording"),
-    ("trajectory/T_world_imu", "T_world_imu", ("T", 4, 4), "m (translation)", "world from imu"),
-    ("trajectory/covariance", "covariance", ("T", 6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu"),
-    ("landmarks/id", "landmarks.id", ("M",), "landmark id", "none"),
+# Data sets below /runs/<mode>, fields of `Result` (T frames, M landmarks, R rejections), and what their values must be.
+_LAYOUT = hdf5.layout(
+    ("trajectory/time", "time_s", ("T",), "s", "clock of the recording", hdf5.ASCENDING),
+    ("trajectory/T_world_imu", "T_world_imu", ("T", 4, 4), "m (translation)", "world from imu", RIGID),
+    ("trajectory/covariance", "covariance", ("T", 6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu", COVARIANCES),
+    ("landmarks/id", "landmarks.id", ("M",), "landmark id", "none", hdf5.COUNTS),
     ("landmarks/position", "landmarks.position_m", ("M", 3), "m", "world"),
-    ("landmarks/covariance", "landmarks.covariance", ("M", 3, 3), "m^2", "world"),
+    ("landmarks/covariance", "landmarks.covariance", ("M", 3, 3), "m^2", "world", COVARIANCES),
     ("landmarks/initial_position", "landmarks.initial_position_m", ("M", 3), "m", "world"),
-    ("landmarks/first_frame", "landmarks.first_frame", ("M",), "frame index", "none"),
-    ("landmarks/last_frame", "landmarks.last_frame", ("M",), "frame index", "none"),
-    ("landmarks/observations", "landmarks.observations", ("M",), "count", "none"),
+    ("landmarks/first_frame", "landmarks.first_frame", ("M",), "frame index", "none", hdf5.index_of("T")),
+    ("landmarks/last_frame", "landmarks.last_frame", ("M",), "frame index", "none", hdf5.index_of("T")),
+    ("landmarks/observations", "landmarks.observations", ("M",), "count", "none", hdf5.COUNTS),
     ("innovation/nis", "innovation.nis", ("T",), "1", "none"),
-    ("innovation/dof", "innovation.dof", ("T",), "count", "none"),
-    ("innovation/accepted", "innovation.accepted", ("T",), "count", "none"),
-    ("innovation/rejected", "innovation.rejected", ("T",), "count", "none"),
-    ("rejections/frame", "rejections.frame", ("R",), "frame index", "none"),
-    ("rejections/landmark", "rejections.landmark", ("R",), "landmark id", "none"),
-    ("rejections/reason", "rejections.reason", ("R",), "code, see names", "none"),
-    ("timing/ms_per_frame", "ms_per_frame", ("T",), "ms", "none"),
+    ("innovation/dof", "innovation.dof", ("T",), "count", "none", hdf5.COUNTS),
+    ("innovation/accepted", "innovation.accepted", ("T",), "count", "none", hdf5.COUNTS),
+    ("innovation/rejected", "innovation.rejected", ("T",), "count", "none", hdf5.COUNTS),
+    ("rejections/frame", "rejections.frame", ("R",), "frame index", "none", hdf5.index_of("T")),
+    ("rejections/landmark", "rejections.landmark", ("R",), "landmark id", "none", hdf5.COUNTS),
+    ("rejections/reason", "rejections.reason", ("R",), "code, see names", "none", hdf5.whole(0, len(REASONS) - 1)),
+    ("timing/ms_per_frame", "ms_per_frame", ("T",), "ms", "none", hdf5.NOT_NEGATIVE),
 )
 
 
 # The same below /runs/<mode>/log, fields of `Log` (K observations of d rows, N velocity measurements, B body columns).
 _POSE = "m (translation)"
 _COORDINATES = "see ekfslam.filters.log"
-_LOG_LAYOUT: hdf5.Layout = (
-    ("initial_covariance", "initial_covariance", (6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu"),
+_LOG_LAYOUT = hdf5.layout(
+    ("initial_covariance", "initial_covariance", (6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu", COVARIANCES),
     ("twist", "twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "that of the velocities"),
-    ("tau", "tau_s", ("T",), "s", "none"),
-    ("T_imu_world_predicted", "T_predicted", ("T", 4, 4), _POSE, "imu from world"),
-    ("T_imu_world_linear", "T_linear", ("T", 4, 4), _POSE, "imu from world"),
-    ("T_imu_world_updated", "T_updated", ("T", 4, 4), _POSE, "imu from world"),
-    ("landmark_id", "id", ("M",), "landmark id", "none"),
+    ("tau", "tau_s", ("T",), "s", "none", hdf5.NOT_NEGATIVE),
+    ("T_imu_world_predicted", "T_predicted", ("T", 4, 4), _POSE, "imu from world", RIGID),
+    ("T_imu_world_linear", "T_linear", ("T", 4, 4), _POSE, "imu from world", RIGID),
+    ("T_imu_world_updated", "T_updated", ("T", 4, 4), _POSE, "imu from world", RIGID),
+    ("landmark_id", "id", ("M",), "landmark id", "none", hdf5.COUNTS),
     ("first_position", "first_position_m", ("M", 3), "m", "world"),
-    ("frame", "frame", ("K",), "frame index", "none"),
-    ("landmark", "landmark", ("K",), "row of landmark_id", "none"),
+    ("frame", "frame", ("K",), "frame index", "none", hdf5.index_of("T")),
+    ("landmark", "landmark", ("K",), "row of landmark_id", "none", hdf5.index_of("M")),
     ("rows", "rows", ("K", "d"), "px, (uL, v, uR) or (u, v, disparity)", "image"),
-    ("variance", "variance", ("K", "d"), "px^2", "image"),
+    ("variance", "variance", ("K", "d"), "px^2", "image", hdf5.POSITIVE),
     ("linear_position", "position_m", ("K", 3), "m", "world"),
 )
-_LOG_LAYOUT_4: hdf5.Layout = (
+_LOG_LAYOUT_4 = hdf5.layout(
     ("imu_twist", "imu_twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "imu"),
     ("seen_twist", "seen_twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "imu"),
-    ("T_imu_world_departed", "T_departed", ("T", 4, 4), _POSE, "imu from world"),
-    ("T_imu_world_linear_before", "T_linear_before", ("T", 4, 4), _POSE, "imu from world"),
+    ("T_imu_world_departed", "T_departed", ("T", 4, 4), _POSE, "imu from world", RIGID),
+    ("T_imu_world_linear_before", "T_linear_before", ("T", 4, 4), _POSE, "imu from world", RIGID),
     ("departed", "departed", ("T", "B"), _COORDINATES, "imu"),
     ("linear", "linear", ("T", "B"), _COORDINATES, "imu"),
     ("updated", "updated", ("T", "B"), _COORDINATES, "imu"),
     ("up", "up", ("T", "U"), "1", "world"),
-    ("previous", "previous", ("K",), "observation, -1: none", "none"),
-    ("velocity_frame", "velocity_frame", ("N",), "frame index", "none"),
-    ("velocity_axis", "velocity_axis", ("N",), "axis, 0 to 5", "none"),
+    ("previous", "previous", ("K",), "observation, -1: none", "none", hdf5.index_of("K", least=-1)),
+    ("velocity_frame", "velocity_frame", ("N",), "frame index", "none", hdf5.index_of("T")),
+    ("velocity_axis", "velocity_axis", ("N",), "axis, 0 to 5", "none", hdf5.whole(0, 5)),
     ("velocity_value", "velocity_value", ("N",), "m/s or rad/s", "that of the velocities"),
-    ("velocity_std", "velocity_std", ("N",), "m/s or rad/s", "that of the velocities"),
-    ("velocity_is_biased", "velocity_is_biased", ("N",), "truth value", "none"),
+    ("velocity_std", "velocity_std", ("N",), "m/s or rad/s", "that of the velocities", hdf5.NOT_NEGATIVE),
+    ("velocity_is_biased", "velocity_is_biased", ("N",), "truth value", "none", hdf5.FLAGS),
 )
 
 
 # The same, of logs since there are interpolated intervals; without it none is.
-_LOG_GAPS: hdf5.Layout = (("is_gap", "is_gap", ("T",), "truth value", "none"),)
+_LOG_GAPS = hdf5.layout(("is_gap", "is_gap", ("T",), "truth value", "none", hdf5.FLAGS))
 
 # The same below /runs/<mode>/whitened, fields of `WhitenedInnovations` (N observations of d rows).
-_WHITENED_LAYOUT: hdf5.Layout = (
-    ("frame", "frame", ("N",), "frame index", "none"),
-    ("landmark", "landmark", ("N",), "row of log/landmark_id", "none"),
+_WHITENED_LAYOUT = hdf5.layout(
+    ("frame", "frame", ("N",), "frame index", "none", hdf5.index_of("T")),
+    ("landmark", "landmark", ("N",), "row of log/landmark_id", "none", hdf5.index_of("M")),
     ("alone", "alone", ("N", "d"), "1", "image"),
-    ("apart", "apart", ("N", "d"), "1", "image"),
+    ("apart", "apart", ("N", "d"), "1", "image", hdf5.NUMBERS_OR_NONE),
     ("score", "score", ("T", 6), "1/m (rho 0-2), 1/rad (theta 3-5)", "imu"),
-    ("information", "information", ("T", 6, 6), "1/m^2, 1/(m rad), 1/rad^2 (rho 0-2, theta 3-5)", "imu"),
+    ("information", "information", ("T", 6, 6), "1/m^2, 1/(m rad), 1/rad^2 (rho 0-2, theta 3-5)", "imu", COVARIANCES),
 )
 
 # The same below /runs/<mode>/parameters, fields of `Parameters` (P of them).
-_PARAMETERS_LAYOUT: hdf5.Layout = (
+_PARAMETERS_LAYOUT = hdf5.layout(
     ("value", "value", ("T", "P"), "see attribute unit of the group", "imu"),
-    ("std", "std", ("T", "P"), "see attribute unit of the group", "imu"),
-    ("prior_std", "prior_std", ("P",), "see attribute unit of the group", "imu"),
+    ("std", "std", ("T", "P"), "see attribute unit of the group", "imu", hdf5.NOT_NEGATIVE),
+    ("prior_std", "prior_std", ("P",), "see attribute unit of the group", "imu", hdf5.NOT_NEGATIVE),
 )
 
 # The same below /runs/<mode>/pairs, fields of `PosePairs` (N of them).
-_PAIRS_LAYOUT: hdf5.Layout = (
-    ("first", "first", ("N",), "frame index", "none"),
-    ("second", "second", ("N",), "frame index", "none"),
+_PAIRS_LAYOUT = hdf5.layout(
+    ("first", "first", ("N",), "frame index", "none", hdf5.index_of("T")),
+    ("second", "second", ("N",), "frame index", "none", hdf5.index_of("T")),
     ("cross", "cross", ("N", 6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu of first, imu of second"),
 )
 
 # The same below /runs/<mode>/hygiene, fields of `HygieneReport` (N findings).
-_HYGIENE_LAYOUT: hdf5.Layout = (
-    ("rule", "rule", ("N",), "code, see names", "none"),
-    ("frame", "frame", ("N",), "frame index", "none"),
-    ("landmark", "landmark", ("N",), "landmark id", "none"),
-    ("continuation", "continuation", ("N",), "landmark id, -1 where dropped", "none"),
+_HYGIENE_LAYOUT = hdf5.layout(
+    ("rule", "rule", ("N",), "code, see names", "none", hdf5.whole(0, len(RULES) - 1)),
+    ("frame", "frame", ("N",), "frame index", "none", hdf5.index_of("T")),
+    ("landmark", "landmark", ("N",), "landmark id", "none", hdf5.COUNTS),
+    ("continuation", "continuation", ("N",), "landmark id, -1 where dropped", "none", hdf5.whole(-1)),
 )
 
 
@@ -191,44 +203,93 @@ class Archive:
         return known_intervals(self.attributes, self.twist)
 
 
-def write_archive(path: str | Path, sequence: Sequence, results: Mapping[str, Result]) -> None:
+def write_archive(path: str | Path, sequence: Sequence | Archive, results: Mapping[str, Result]) -> None:
     """Write the results (mode to `Result`) of one sequence to an HDF5 file, replacing an old one.
 
     The file appears under its name only when it is complete: a run that is killed leaves the old archive or none.
 
     Raises:
-        ArchiveError: The file cannot be written.
+        ArchiveError: The file cannot be written, or would hold what cannot be read again (NaN, say).
     """
-    with hdf5.creating(path, FORMAT, FORMAT_VERSION) as h5file:
+    files.write(path, archive_image(sequence, results))
+
+
+def archive_image(sequence: Sequence | Archive, results: Mapping[str, Result]) -> bytes:
+    """What `write_archive` writes.
+
+    Raises:
+        ArchiveError: It would hold what cannot be read again (NaN, say).
+    """
+
+    def fill(h5file: h5py.File) -> None:
         hdf5.write_attributes(h5file, {"source": sequence.source, "error_convention": ERROR_CONVENTION})
-        write_sequence_group(h5file, sequence, include_observations=False)
+        write_sequence_group(h5file, sequence)
         if sequence.truth is not None:
             write_truth_group(h5file, sequence.truth)
         runs = h5file.create_group("runs", track_order=True)
         for mode, result in results.items():
-            _write_result(runs.create_group(mode), result)
+            _write_result(runs.create_group(mode), result, len(sequence.time_s))
+
+    return hdf5.image(FORMAT, FORMAT_VERSION, fill)
 
 
-def add_result(path: str | Path, result: Result) -> None:
-    """Add the result of one more mode to an archive, replacing an older one of that mode.
-
-    The archive is rewritten beside itself and then renamed: it is never seen half written.
+def require_same_origin(path: str | Path, sequence: Sequence) -> None:
+    """Raise a `WriteError` unless a path is free, or holds an archive of the same recording: of its content, or place.
 
     Raises:
-        ArchiveError: The archive cannot be read or written.
+        WriteError: It holds something else, or what cannot be read.
     """
-    with hdf5.opened(path, FORMAT, FORMAT_VERSION):
-        pass
-    with hdf5.replacing(path) as unfinished:
-        shutil.copyfile(path, unfinished)
-        with h5py.File(str(unfinished), "r+") as h5file:
-            runs, version = h5file["runs"], h5file.attrs["format_version"]
-            if result.mode in runs:
-                del runs[result.mode]
-            for older in runs.values():
-                hdf5.write_attributes(older, {"format_version": older.attrs.get("format_version", version)})
-            h5file.attrs["format_version"] = FORMAT_VERSION
-            _write_result(runs.create_group(result.mode), result)
+    if files.is_free(path):
+        return
+    try:
+        with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
+            found = hdf5.attributes(hdf5.subgroup(h5file, "sequence/attributes"))
+            source = str(hdf5.attribute(h5file, "source"))
+    except ArchiveError as error:
+        raise WriteError(f"{path}: exists, and is no archive to be replaced ({error}); --force replaces it") from None
+    key = "checksum_sha256"
+    same_content = (
+        found[key] == sequence.attributes[key] if {key} <= found.keys() & sequence.attributes.keys() else None
+    )
+    if same_content is None:
+        same_content = source == sequence.source and found == dict(sequence.attributes)
+    if not same_content:
+        raise WriteError(f"{path}: exists, and is a result of another recording ({source}); --force replaces it")
+
+
+def add_result(
+    path: str | Path,
+    result: Result,
+    of: Result | None = None,
+    beside: Mapping[Path, str | bytes] = MappingProxyType({}),
+) -> None:
+    """Add the result of one more mode to an archive, replacing an older one of that mode.
+
+    The archive is read again and rewritten as a whole: it is never seen half written, and of two who add to it at the
+    same time none loses what the other adds.
+
+    Args:
+        path: The archive.
+        result: To be added.
+        of: A run of the archive that the result was made from, which must still be there.
+        beside: Further files that are written with it, see `ekfslam.files.write_all`.
+
+    Raises:
+        ArchiveError: The archive cannot be read or written, or no longer holds the run.
+    """
+    with files.alone(path):
+        archive = read_archive(path)
+        if of is not None and not _is_same_run(archive.results.get(of.mode), of):
+            raise ArchiveError(f"{path}: its run {of.mode!r} was replaced meanwhile; start again")
+        others = {mode: other for mode, other in archive.results.items() if mode != result.mode}
+        files.write_all({**beside, Path(path): archive_image(archive, {**others, result.mode: result})})
+
+
+def _is_same_run(found: Result | None, run: Result) -> bool:
+    return found is not None and all(
+        np.array_equal(getattr(found, name), getattr(run, name))
+        for name in ("time_s", "T_world_imu", "covariance", "ms_per_frame")
+    )
 
 
 def read_archive(path: str | Path) -> Archive:
@@ -240,9 +301,8 @@ def read_archive(path: str | Path) -> Archive:
     """
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         sequence = {"noise": None, **_sequence_fields(h5file), "source": str(hdf5.attribute(h5file, "source"))}
-        calibration = sequence["camera"], sequence["T_cam_imu"]
         modes = hdf5.subgroup(h5file, "runs")
-        return Archive(**sequence, results={mode: _read_result(h5file, mode, *calibration) for mode in modes})
+        return Archive(**sequence, results={mode: _read_result(h5file, mode, sequence) for mode in modes})
 
 
 def open_result(path: str | Path, mode: str) -> Result:
@@ -255,8 +315,7 @@ def open_result(path: str | Path, mode: str) -> Result:
         modes = tuple(hdf5.subgroup(h5file, "runs"))
         if mode not in modes:
             raise ArchiveError(f"{path}: runs/{mode} is missing; this archive holds {', '.join(modes) or 'no run'}")
-        sequence = _sequence_fields(h5file)
-        return _read_result(h5file, mode, sequence["camera"], sequence["T_cam_imu"])
+        return _read_result(h5file, mode, _sequence_fields(h5file))
 
 
 def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "kitti"]) -> None:
@@ -273,7 +332,12 @@ def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "
     Raises:
         ArchiveError: The file cannot be written.
     """
-    _write_poses(path, result.time_s, result.T_world_imu, format)
+    files.write(path, trajectory_text(result, format))
+
+
+def trajectory_text(result: Result, format: Literal["tum", "kitti"]) -> str:
+    """What `export_trajectory` writes."""
+    return _pose_text(result.time_s, result.T_world_imu, format)
 
 
 def export_truth(archive: str | Path, path: str | Path, format: Literal["tum", "kitti"]) -> int:
@@ -286,32 +350,35 @@ def export_truth(archive: str | Path, path: str | Path, format: Literal["tum", "
         ArchiveError: As `read_archive`; or there is no true pose, or not of every frame and the format is ``kitti``,
             which has no stamps to say of which; or the file cannot be written.
     """
-    found = read_archive(archive)
-    truth, frames = found.truth, len(found.time_s)
+    poses, text = truth_text(read_archive(archive), str(archive), format)
+    files.write(path, text)
+    return poses
+
+
+def truth_text(archive: Archive, place: str, format: Literal["tum", "kitti"]) -> tuple[int, str]:
+    """What `export_truth` writes of an archive read from a place, and the number of lines; raises as that does."""
+    truth, frames = archive.truth, len(archive.time_s)
     if truth is None or not len(truth.frame):
-        raise ArchiveError(f"{archive}: holds no true pose")
+        raise ArchiveError(f"{place}: holds no true pose")
     if format == "kitti" and len(truth.frame) < frames:
         raise ArchiveError(
-            f"{archive}: holds the true pose of {len(truth.frame)} of {frames} frames; kitti has no stamps to say of "
+            f"{place}: holds the true pose of {len(truth.frame)} of {frames} frames; kitti has no stamps to say of "
             "which, take tum"
         )
-    _write_poses(path, found.time_s[truth.frame], truth.T_world_imu, format)
-    return len(truth.frame)
+    return len(truth.frame), _pose_text(archive.time_s[truth.frame], truth.T_world_imu, format)
 
 
-def _write_poses(path: str | Path, time_s: Array, T: Array, format: Literal["tum", "kitti"]) -> None:
+def _pose_text(time_s: Array, T: Array, format: Literal["tum", "kitti"]) -> str:
     if format == "tum":
         quaternion = Rotation.from_matrix(T[:, :3, :3]).as_quat()  # scalar last, as TUM has it
         rows = np.column_stack([time_s, T[:, :3, 3], quaternion])
     else:
         rows = T[:, :3].reshape(-1, 12)
-    try:
-        np.savetxt(path, rows, fmt="%.17g")
-    except OSError as error:
-        raise ArchiveError(f"{path}: cannot be written: {error}") from None
+    return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows.tolist())
 
 
-def _write_result(group: h5py.Group, result: Result) -> None:
+def _write_result(group: h5py.Group, result: Result, frames: int) -> None:
+    sizes = {"T": frames, "M": len(result.landmarks)}
     hdf5.write_attributes(
         group,
         {
@@ -322,80 +389,118 @@ def _write_result(group: h5py.Group, result: Result) -> None:
         },
     )
     hdf5.write_attributes(group.create_group("attributes"), result.attributes)
-    hdf5.write_fields(group, _LAYOUT, result)
-    group["rejections/reason"].attrs["names"] = REASONS
+    hdf5.write_fields(group, _LAYOUT, result, sizes)
+    hdf5.write_attributes(group["rejections/reason"], {"names": REASONS})
     if result.parameters is not None:
         parameters = group.create_group("parameters")
         hdf5.write_attributes(parameters, {"name": result.parameters.name, "unit": result.parameters.unit})
-        hdf5.write_fields(parameters, _PARAMETERS_LAYOUT, result.parameters)
+        hdf5.write_fields(parameters, _PARAMETERS_LAYOUT, result.parameters, sizes)
     if result.pairs is not None:
-        hdf5.write_fields(group.create_group("pairs"), _PAIRS_LAYOUT, result.pairs)
+        hdf5.write_fields(group.create_group("pairs"), _PAIRS_LAYOUT, result.pairs, sizes)
     if result.hygiene is not None:
         hygiene = group.create_group("hygiene")
         hdf5.write_attributes(hygiene, {"observations": result.hygiene.observations})
-        hdf5.write_fields(hygiene, _HYGIENE_LAYOUT, result.hygiene)
-        hygiene["rule"].attrs["names"] = RULES
+        hdf5.write_fields(hygiene, _HYGIENE_LAYOUT, result.hygiene, sizes)
+        hdf5.write_attributes(hygiene["rule"], {"names": RULES})
     if result.whitened is not None:
-        hdf5.write_fields(group.create_group("whitened"), _WHITENED_LAYOUT, result.whitened)
+        hdf5.write_fields(group.create_group("whitened"), _WHITENED_LAYOUT, result.whitened, sizes)
     if result.log is not None:
         log = group.create_group("log")
         hdf5.write_attributes(log, {"first_estimates": result.log.first_estimates})
-        hdf5.write_fields(log, (*_LOG_LAYOUT, *_LOG_LAYOUT_4, *_LOG_GAPS), result.log)
+        hdf5.write_fields(log, (*_LOG_LAYOUT, *_LOG_LAYOUT_4, *_LOG_GAPS), result.log, sizes)
 
 
 def _sequence_fields(h5file: h5py.File) -> dict[str, Any]:
-    """Arguments of `Archive` but the results; what is wrong with them is wrong with the archive."""
+    """Arguments of `Archive` but the results, validated as those of `Sequence` are."""
     try:
-        return read_sequence_fields(h5file, h5file.filename)
+        found = read_sequence_fields(h5file, h5file.filename)
+        found.pop("observations", None)
+        found["name"] = printable(found["name"])
+        no_index = np.empty(0, dtype=np.int64)
+        none = Observations(no_index, no_index, np.empty((0, 4)))
+        with spelled_as_in(h5file.filename, SPELLING):
+            Sequence(**{**found, "observations": none, "attributes": {**found["attributes"], **WITHOUT_TRACKS}})
+        return found
     except DataError as error:
         raise ArchiveError(str(error)) from None
 
 
-def _read_result(h5file: h5py.File, mode: str, camera: StereoCamera, T_cam_imu: Array) -> Result:
+def _read_result(h5file: h5py.File, mode: str, sequence: Mapping[str, Any]) -> Result:
     group = hdf5.subgroup(h5file, f"runs/{mode}")
-    version = group.attrs.get("format_version", h5file.attrs["format_version"])
+    version = hdf5.version_of(group if "format_version" in group.attrs else h5file)
     fields: dict[str, dict[str, Any]] = {"": {}, "landmarks": {}, "innovation": {}, "rejections": {}}
-    for field, value in hdf5.read_fields(group, _LAYOUT).items():
+    sizes = {"T": len(sequence["time_s"])}
+    for field, value in hdf5.read_fields(group, _LAYOUT, sizes).items():
         part, _, leaf = field.rpartition(".")
         fields[part][leaf] = value
-    sizes = {"T": len(fields[""]["time_s"]), "M": len(fields["landmarks"]["id"])}
-    # These two have no default, and no result is without.
-    for name in ("noise_twist_std", "noise_pixel_std_px"):
-        hdf5.attribute(group, name)
-    noise = Noise(**noise_of_attributes(group.attrs, "noise_"))
+    sizes["M"] = len(fields["landmarks"]["id"])
+    noise = _read_noise(group)
     return Result(
         mode=mode,
-        sequence_name=str(hdf5.attribute(group, "sequence_name")),
+        sequence_name=printable(str(hdf5.attribute(group, "sequence_name"))),
         **fields[""],
         landmarks=Landmarks(**fields["landmarks"]),
         innovation=Innovation(**fields["innovation"]),
         rejections=Rejections(**fields["rejections"]),
-        counts=hdf5.json_table(group, "counts"),
-        config=_in_todays_terms(hdf5.json_table(group, "config"), noise, version),
+        counts=_read_counts(group),
+        config=_read_config(group, noise, version),
         noise=noise,
-        camera=camera,
-        T_cam_imu=T_cam_imu,
+        camera=sequence["camera"],
+        T_cam_imu=sequence["T_cam_imu"],
         log=_read_log(hdf5.subgroup(group, "log"), sizes, version) if "log" in group else None,
-        hygiene=_read_hygiene(hdf5.subgroup(group, "hygiene")) if "hygiene" in group else None,
+        hygiene=_read_hygiene(hdf5.subgroup(group, "hygiene"), sizes) if "hygiene" in group else None,
         parameters=_read_parameters(hdf5.subgroup(group, "parameters"), sizes) if "parameters" in group else None,
-        pairs=_read_pairs(hdf5.subgroup(group, "pairs"), sizes["T"]) if "pairs" in group else None,
+        pairs=_read_pairs(hdf5.subgroup(group, "pairs"), sizes) if "pairs" in group else None,
         whitened=_read_whitened(hdf5.subgroup(group, "whitened"), sizes) if "whitened" in group else None,
-        attributes=hdf5.attributes(hdf5.subgroup(group, "attributes")),
+        attributes=hdf5.facts(hdf5.subgroup(group, "attributes")),
     )
+
+
+def _read_noise(group: h5py.Group) -> Noise:
+    # These two have no default, and no result is without.
+    for name in ("noise_twist_std", "noise_pixel_std_px"):
+        hdf5.attribute(group, name)
+    noise = Noise(**noise_of_attributes(group.attrs, "noise_"))
+    try:
+        validate_noise(noise)
+    except DataError as error:
+        raise ArchiveError(f"{group.file.filename}: {group.name.strip('/')}: {error}") from None
+    return noise
+
+
+def _read_counts(group: h5py.Group) -> dict[str, int]:
+    counts = hdf5.json_table(group, "counts")
+    if not all(type(count) is int and 0 <= count < 1 << 62 for count in counts.values()):
+        raise ArchiveError(f"{group.file.filename}: attribute counts of {group.name.strip('/')} holds what is no count")
+    return counts
+
+
+def _read_config(group: h5py.Group, noise: Noise, version: int) -> dict[str, Any]:
+    config = hdf5.json_table(group, "config")
+    try:
+        check_stored(config)
+        config = _in_todays_terms(config, noise, version)
+        check_stored(config)
+    except ConfigError as error:
+        raise ArchiveError(f"{group.file.filename}: attribute config of {group.name.strip('/')}: {error}") from None
+    return config
 
 
 def _read_log(group: h5py.Group, sizes: Mapping[str, int], version: int) -> Log:
     is_old = version < 4
+    place = f"{group.file.filename}: {group.name.strip('/')}"
     found = hdf5.read_fields(group, _LOG_LAYOUT if is_old else (*_LOG_LAYOUT, *_LOG_LAYOUT_4), sizes)
     if not is_old:
-        gaps = hdf5.read_fields(group, _LOG_GAPS, {"T": sizes["T"]}) if "is_gap" in group else {}
-        found["is_gap"] = gaps.get("is_gap", np.zeros(sizes["T"])).astype(bool)
+        gaps = hdf5.read_fields(group, _LOG_GAPS, sizes) if "is_gap" in group else {}
+        found["is_gap"] = gaps.get("is_gap", np.zeros(sizes["T"], dtype=bool))
     found["first_estimates"] = bool(hdf5.attribute(group, "first_estimates"))
-    return Log.of_poses_alone(**found) if is_old else Log(**found)
+    log = Log.of_poses_alone(**found) if is_old else Log(**found)
+    require_agreement(vars(log), place)
+    return log
 
 
 def _read_parameters(group: h5py.Group, sizes: Mapping[str, int]) -> Parameters:
-    found = hdf5.read_fields(group, _PARAMETERS_LAYOUT, {"T": sizes["T"]})
+    found = hdf5.read_fields(group, _PARAMETERS_LAYOUT, sizes)
     names, units = (hdf5.texts(group.attrs.get(key, ())) for key in ("name", "unit"))
     if not len(names) == len(units) == len(found["prior_std"]):
         raise ArchiveError(
@@ -405,19 +510,19 @@ def _read_parameters(group: h5py.Group, sizes: Mapping[str, int]) -> Parameters:
     return Parameters(names, units, **found)
 
 
-def _read_pairs(group: h5py.Group, frames: int) -> PosePairs:
-    pairs = PosePairs(**hdf5.read_fields(group, _PAIRS_LAYOUT))
-    if not ((pairs.first >= 0) & (pairs.first < pairs.second) & (pairs.second < frames)).all():
-        raise ArchiveError(f"{group.file.filename}: {group.name.strip('/')} holds frames that are no pair of {frames}")
+def _read_pairs(group: h5py.Group, sizes: Mapping[str, int]) -> PosePairs:
+    pairs = PosePairs(**hdf5.read_fields(group, _PAIRS_LAYOUT, sizes))
+    if not (pairs.first < pairs.second).all():
+        raise ArchiveError(f"{group.file.filename}: {group.name.strip('/')} holds frames that are no pair")
     return pairs
 
 
 def _read_whitened(group: h5py.Group, sizes: Mapping[str, int]) -> WhitenedInnovations:
-    return WhitenedInnovations(**hdf5.read_fields(group, _WHITENED_LAYOUT, {"T": sizes["T"]}))
+    return WhitenedInnovations(**hdf5.read_fields(group, _WHITENED_LAYOUT, sizes))
 
 
-def _read_hygiene(group: h5py.Group) -> HygieneReport:
-    findings = hdf5.read_fields(group, _HYGIENE_LAYOUT)
+def _read_hygiene(group: h5py.Group, sizes: Mapping[str, int]) -> HygieneReport:
+    findings = hdf5.read_fields(group, _HYGIENE_LAYOUT, sizes)
     return HygieneReport(observations=int(hdf5.attribute(group, "observations")), **findings)
 
 

@@ -13,6 +13,8 @@ from typing import Any
 
 from ekfslam.errors import ConfigError
 
+_MOST_WORKERS = 1024
+
 
 class SerialExecutor(Executor):
     """Runs everything at once, in the calling thread."""
@@ -31,15 +33,18 @@ def open_executor(spec: str = "processes", workers: int | None = None) -> Iterat
     """Where to run a study.
 
     Args:
-        spec: ``processes`` on this machine; ``serial``; ``dask://HOST:PORT``, the scheduler of a Dask cluster; ``mpi``,
-            the ranks of ``mpiexec -n N python -m mpi4py.futures -m ekfslam.cli ...``.
+        spec: ``processes`` on this machine; ``serial``; ``tls://HOST:PORT``, the scheduler of a Dask cluster, with the
+            certificates of Dask's configuration ``distributed.comm.tls`` (files, or variables of the environment such
+            as ``DASK_DISTRIBUTED__COMM__TLS__CA_FILE``); ``dask://HOST:PORT``, the same without them: whoever reaches
+            the scheduler's port, or poses as it, runs programs as you, so that this is for networks that only you
+            reach; ``mpi``, the ranks of ``mpiexec -n N python -m mpi4py.futures -m ekfslam.cli ...``.
         workers: Number of processes, by default one per core; Dask has its own number.
 
     Raises:
         ConfigError: Unknown, not installed, not reachable, or no worker.
     """
-    if workers is not None and workers < 1:
-        raise ConfigError(f"workers must be at least 1, found {workers}")
+    if workers is not None and not 1 <= workers <= _MOST_WORKERS:
+        raise ConfigError(f"workers must be at least 1 and at most {_MOST_WORKERS}, found {workers}")
     if spec == "serial":
         yield SerialExecutor()
     elif spec == "processes":
@@ -53,19 +58,33 @@ def open_executor(spec: str = "processes", workers: int | None = None) -> Iterat
             raise _missing(spec, error) from None
         with MPIPoolExecutor(max_workers=workers) as ranks:
             yield ranks
-    elif spec.startswith("dask://"):
-        try:
-            from distributed import Client
-        except ImportError as error:
-            raise _missing(spec, error) from None
-        try:
-            client = Client(spec.replace("dask://", "tcp://"), timeout="10s")
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"executor {spec}: no scheduler there ({error})") from None
-        with client, client.get_executor() as cluster:
+    elif spec.startswith(("dask://", "tls://")):
+        with _dask_client(spec) as client, client.get_executor() as cluster:
             yield cluster
     else:
-        raise ConfigError(f"unknown executor {spec!r}; known: processes, serial, dask://HOST:PORT, mpi")
+        known = "processes, serial, tls://HOST:PORT, dask://HOST:PORT, mpi"
+        raise ConfigError(f"unknown executor {spec!r}; known: {known}")
+
+
+def _dask_client(spec: str) -> Any:
+    """A client of a Dask scheduler, with certificates or without."""
+    try:
+        from distributed import Client
+        from distributed.security import Security
+    except ImportError as error:
+        raise _missing(spec, error) from None
+    security = None
+    if spec.startswith("tls://"):
+        security = Security(require_encryption=True)  # its files are those of Dask's configuration
+        if not all(getattr(security, name) for name in ("tls_ca_file", "tls_client_cert")):
+            raise ConfigError(
+                f"executor {spec}: Dask's configuration has no certificates; set distributed.comm.tls.ca-file, and "
+                "cert and key below distributed.comm.tls.client"
+            )
+    try:
+        return Client(spec.replace("dask://", "tcp://"), timeout="10s", security=security)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise ConfigError(f"executor {spec}: no scheduler there ({error})") from None
 
 
 def _missing(spec: str, error: Exception) -> ConfigError:

@@ -33,10 +33,11 @@ from types import MappingProxyType
 from typing import Any
 from zlib import crc32
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ekfslam import hdf5
+from ekfslam import files, hdf5
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import VARIANTS, Config, FilterConfig
 from ekfslam.data.sequence import Sequence
@@ -103,17 +104,22 @@ FIELDS: Mapping[str, tuple[tuple[str | int, ...], type, str, str]] = MappingProx
 
 JOINT_INSTANTS = 4  # equally spaced, the last one at the last frame
 
+MOST_VALUES = 10_000_000  # frames of all runs and variants: an archive of 1.4 GB
 IN_FLIGHT = 256
 CHECKPOINT_S = 5.0
 CHECKPOINT_SHARE = 0.05  # of the time may go into checkpoints of a large study
 
 # Data sets below a level, and below a variant of it.
-_LEVEL: hdf5.Layout = (
+_LEVEL = hdf5.layout(
     ("time", "time", ("T",), "s", "nominal stamps"),
-    ("done", "done", ("runs",), "1", "runs that are in"),
+    ("done", "done", ("runs",), "1", "runs that are in", hdf5.FLAGS),
 )
-_VARIANT: hdf5.Layout = tuple(
-    (name, name, ("runs", *shape), units, frame) for name, (shape, _, units, frame) in FIELDS.items()
+_CHECKS = {float: hdf5.NUMBERS_OR_NONE, int: hdf5.COUNTS, bool: hdf5.FLAGS}
+_VARIANT = hdf5.layout(
+    *(
+        (name, name, ("runs", *shape), units, frame, _CHECKS[kind])
+        for name, (shape, kind, units, frame) in FIELDS.items()
+    )
 )
 
 Record = dict[str, dict[str, NDArray]]  # variant, field, value of one run
@@ -154,6 +160,11 @@ class Study:
                 raise ConfigError(f"level {name}: a study needs a prior of the first pose, or NEES is not defined")
         if not self.levels or not self.variants or self.runs < 1 or self.seed < 0:
             raise ConfigError("a study needs a level, a variant, at least one run, and a seed that is not negative")
+        values = self.runs * len(self.variants) * sum(world.frames for world in self.levels.values())
+        if values > MOST_VALUES:
+            raise ConfigError(
+                f"a study of {self.runs} runs is too large: {values:.3g} frames, at most {MOST_VALUES:.3g}"
+            )
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -310,7 +321,7 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
 
     Args:
         study: What to run.
-        path: Archive, made if missing; its folder must exist.
+        path: Archive, made if missing, as is its folder.
         executor: Where to run it, see `open_executor`.
         progress: Whether to show a bar on a terminal.
 
@@ -410,7 +421,8 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
         ArchiveError: The file cannot be written.
     """
     study = archive.study
-    with hdf5.creating(path, FORMAT, FORMAT_VERSION) as h5file:
+
+    def fill(h5file: h5py.File) -> None:
         hdf5.write_attributes(
             h5file,
             {
@@ -427,6 +439,8 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
             for variant, values in archive.data[level].items():
                 hdf5.write_fields(group.create_group(variant), _VARIANT, values)
                 group[f"{variant}/joint_nees_per_dof"].attrs["frames"] = _joint_frames(world.frames)
+
+    files.write_all({Path(path): hdf5.image(FORMAT, FORMAT_VERSION, fill)})
 
 
 def read_study(path: str | Path) -> StudyArchive:

@@ -50,13 +50,14 @@ from ekfslam.errors import EmptyTracksError
 from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.loop import one_thread, run_filter
+from ekfslam.filters.loop import one_thread, run_filter, solvable
 from ekfslam.filters.reports import FrameReport
 from ekfslam.geometry import se3
 from ekfslam.models.build import found_attributes, noise_of, optional_blocks, resolve, with_automatic_blocks
 from ekfslam.models.noise import NOISY_FROM, VelocityNoise, velocity_noise, with_drift, with_error
 from ekfslam.models.sensors.base import BEHIND_CAMERA, GATE, MOVING
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.names import printable
 from ekfslam.progress import progress
 
 # Of wrong matches: how many there are, and how far off they may be.
@@ -157,12 +158,12 @@ class TunedNoise:
     @property
     def toml(self) -> str:
         """`config` as a TOML file: what of it is not a default."""
-        lines = [f"# Noise of {self.sequence} as `ekfslam tune` found it; give this file to --config."]
+        lines = [toml_heading(self.sequence)]
         for table in ("noise", "tuning"):
             lines += ["", f"[{table}]"]
             for key, value in vars(getattr(self.config, table)).items():
                 if value is not None:
-                    lines.append(f"{key} = {json.dumps(value, ensure_ascii=False)}")
+                    lines.append(f"{key} = {_toml_value(value)}")
         return "\n".join(lines) + "\n"
 
     @property
@@ -180,11 +181,23 @@ class TunedNoise:
         return document(markdown_table(headings, rows, left=len(headings)), "\n".join([fit, *self.remarks])).rstrip()
 
 
+def _toml_value(value: float | str) -> str:
+    if isinstance(value, float):
+        return repr(value)  # TOML spells inf and nan as Python does
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def toml_heading(sequence: str) -> str:
+    """The first line of `TunedNoise.toml` for a recording of some name."""
+    return f"# Noise of {printable(sequence)} as `ekfslam tune` found it; give this file to --config."
+
+
 _NO_PART = "the likelihood does not depend on it where tracks err; not refined"
 _UNSEEN = "the differences see none; not refined"
 _BELOW_FLOOR = "below the errors of the motion that are assumed anyway; not refined"
 
 
+@solvable()
 def tune(
     sequence: Sequence, config: Config | None = None, *, drift: bool = False, observations: int = 15_000
 ) -> TunedNoise:

@@ -3,7 +3,9 @@ stereo tracks, without ground truth."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 
@@ -22,6 +24,7 @@ from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, validate_came
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import CalibrationError, UnknownFormatError
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.limits import Budget, require_file
 
 FIELDS = ("features", "time_stamps", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
 
@@ -92,14 +95,36 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
 def _load(path: Path) -> dict[str, np.ndarray]:
     expected = f"expected an .npz file with the fields {', '.join(FIELDS)}"
     try:
+        _inspect(path)
         with np.load(path, allow_pickle=False) as file:
             names = file.files
             fields = {name: file[name] for name in FIELDS if name in names} if "features" in names else {}
+    except UnknownFormatError:
+        raise
     except Exception as error:  # a damaged file makes the decoders raise almost anything
         raise UnknownFormatError(f"{path}: damaged .npz file ({error}); {expected}") from None
     if not fields:
         raise UnknownFormatError(f"{path}: an .npz file with the fields [{', '.join(names)}]; {expected}")
     return fields
+
+
+def _inspect(path: Path) -> None:
+    """Refuse arrays that claim more than may be read, or other than they have, before they are decompressed."""
+    require_file(path)
+    budget = Budget(str(path))
+    with ZipFile(path) as archive:
+        for entry in archive.infolist():
+            if entry.filename.removesuffix(".npy") not in FIELDS:
+                continue
+            budget.take(entry.file_size, entry.filename)
+            if entry.compress_type not in (ZIP_STORED, ZIP_DEFLATED):
+                raise ValueError(f"{entry.filename} is compressed in a way that no .npz is")
+            with archive.open(entry) as file:
+                version = np.lib.format.read_magic(file)
+                header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+                shape, _, dtype = header[version](file)
+            if math.prod(shape) * dtype.itemsize > entry.file_size:
+                raise ValueError(f"{entry.filename} claims the shape {shape}, but has {entry.file_size} bytes")
 
 
 def _camera(K: Array, baseline_m: float) -> StereoCamera:

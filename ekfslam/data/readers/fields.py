@@ -29,7 +29,9 @@ def checksum(*paths: Path) -> str:
     """SHA-256 of the contents of files in their order, hexadecimal."""
     digest = hashlib.sha256()
     for path in paths:
-        digest.update(path.read_bytes())
+        with path.open("rb") as file:
+            while part := file.read(1 << 20):
+                digest.update(part)
     return digest.hexdigest()
 
 
@@ -72,8 +74,9 @@ def require_numbers(
     if value.dtype.kind not in ("iu" if np.issubdtype(dtype, np.integer) else "iuf"):
         raise ShapeError(f"expected {np.dtype(dtype).name} numbers, found {value.dtype}", field=name)
     require_shape(value, shape, name)
-    require_finite(value, name)
-    return value.astype(dtype)
+    if value.dtype.kind == "f":
+        require_finite(value, name)
+    return value.astype(dtype, copy=False)
 
 
 def flat_observations(dense: Array, frame_axis: int, field: str) -> Observations:

@@ -22,7 +22,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ekfslam import hdf5
+from ekfslam import files, hdf5
 from ekfslam.data.noise import Noise
 from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
 from ekfslam.data.sequence import Observations, Sequence, Truth
@@ -36,34 +36,34 @@ FORMAT_VERSION = 1
 _INDICES = ("frame index", "landmark id")  # units of whole numbers
 
 # Part of a `Sequence` to data sets below /, fields of the part, shape, units, frame.
-_SEQUENCE: hdf5.Layout = (
+_SEQUENCE = hdf5.layout(
     ("sequence/time", "time_s", ("T",), "s", "clock of the recording"),
     ("sequence/twist", "twist", ("T", 6), "m/s (columns 0-2), rad/s (columns 3-5)", "imu"),
     ("sequence/T_cam_imu", "T_cam_imu", (4, 4), "m (translation)", "cam from imu"),
 )
-_OBSERVATIONS: hdf5.Layout = (
+_OBSERVATIONS = hdf5.layout(
     ("sequence/observations/frame", "frame", ("K",), "frame index", "none"),
     ("sequence/observations/landmark", "landmark", ("K",), "landmark id", "none"),
     ("sequence/observations/pixels", "pixels_px", ("K", 4), "px", "image: uL, vL, uR, vR"),
 )
-_NOISE: hdf5.Layout = (
+_NOISE = hdf5.layout(
     ("sequence/noise/twist_std", "twist_std", (6,), "m/s (0-2), rad/s (3-5)", "imu"),
     ("sequence/noise/pixel_std", "pixel_std_px", (4,), "px", "image: uL, vL, uR, vR"),
 )
-_TRUTH: hdf5.Layout = (
+_TRUTH = hdf5.layout(
     ("truth/frame", "frame", ("F",), "frame index", "none"),
     ("truth/T_world_imu", "T_world_imu", ("F", 4, 4), "m (translation)", "world from imu"),
     ("truth/landmarks/id", "landmark", ("M",), "landmark id", "none"),
     ("truth/landmarks/position", "position_m", ("M", 3), "m", "world"),
 )
-_NOTES: hdf5.Layout = (("sequence/notes", "notes", ("n",), "text", "none"),)
+_NOTES = hdf5.layout(("sequence/notes", "notes", ("n",), "text", "none", hdf5.TEXTS))
 _CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
 _OLD_NOISE = ("drift", "bearing_drift_rad")  # walks of landmarks, before errors of tracks walked in the image
 _TRUTH_NOISE = "noise_"  # before the names of attributes
 _NOISE_FIELDS = tuple(field for _, field, *_ in _NOISE)
 
 _PARTS = {"": _SEQUENCE, "observations.": _OBSERVATIONS, "noise.": _NOISE, "truth.": _TRUTH}
-_SPELLING = {part + field: name for part, layout in _PARTS.items() for name, field, *_ in layout} | {
+SPELLING = {part + field: name for part, layout in _PARTS.items() for name, field, *_ in layout} | {
     "K": "sequence/camera@fu_px, fv_px",
     "baseline": "sequence/camera@baseline_m",
     "observations": "sequence/observations",
@@ -76,10 +76,29 @@ def write_sequence(sequence: Sequence, path: str | Path) -> None:
     Raises:
         ArchiveError: The file cannot be written.
     """
-    with hdf5.creating(path, FORMAT, FORMAT_VERSION, compact=True) as h5file:
-        write_sequence_group(h5file, sequence, include_observations=True)
+    files.write(path, sequence_image(sequence))
+
+
+def sequence_image(sequence: Sequence) -> bytes:
+    """What `write_sequence` writes."""
+
+    def fill(h5file: h5py.File) -> None:
+        write_sequence_group(h5file, sequence, sequence.observations)
         if sequence.truth is not None:
             write_truth_group(h5file, sequence.truth)
+
+    return hdf5.image(FORMAT, FORMAT_VERSION, fill)
+
+
+def is_recording_of(path: str | Path, sequence: Sequence) -> bool:
+    """Whether a file of `write_sequence` holds a recording of the same name and the same further facts."""
+    try:
+        with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
+            name = hdf5.attribute(hdf5.subgroup(h5file, "sequence"), "name")
+            facts = hdf5.facts(hdf5.subgroup(h5file, "sequence/attributes"))
+    except ArchiveError:
+        return False
+    return (name, facts) == (sequence.name, dict(sequence.attributes))
 
 
 def read_sequence(path: str | Path) -> Sequence:
@@ -94,22 +113,28 @@ def read_sequence(path: str | Path) -> Sequence:
         return read_sequence_group(h5file, str(path))
 
 
-def write_sequence_group(h5file: h5py.Group, sequence: Sequence, include_observations: bool) -> None:
-    """Write ``/sequence`` below an open file or group; the truth is left to `write_truth_group`."""
+def write_sequence_group(h5file: h5py.Group, sequence: Any, observations: Observations | None = None) -> None:
+    """Write ``/sequence`` below an open file or group; the truth is left to `write_truth_group`.
+
+    Args:
+        h5file: To write below.
+        sequence: A `Sequence`, or what has its fields but the observations.
+        observations: Of it, where they are to be written.
+    """
     hdf5.write_fields(h5file, _SEQUENCE, sequence, compact=True)
     notes = np.array([hdf5.fixed_text(note) for note in sequence.notes], dtype=np.bytes_)
     hdf5.write_fields(h5file, _NOTES, {"notes": notes}, compact=True)
     group = h5file["sequence"]
     names = {"name": sequence.name, "velocity_frame": sequence.velocity_frame}
-    hdf5.write_attributes(group, names, compact=True)
+    hdf5.write_attributes(group, names)
     hdf5.write_attributes(group.create_group("camera"), {name: getattr(sequence.camera, name) for name in _CAMERA})
-    hdf5.write_attributes(group.create_group("attributes"), sequence.attributes, compact=True)
+    hdf5.write_attributes(group.create_group("attributes"), sequence.attributes)
     if sequence.noise is not None:
         hdf5.write_fields(h5file, _NOISE, sequence.noise, compact=True)
         further = noise_attributes(sequence.noise)
         hdf5.write_attributes(group["noise"], {key: further[key] for key in further if key not in _NOISE_FIELDS})
-    if include_observations:
-        hdf5.write_fields(h5file, _OBSERVATIONS, sequence.observations, compact=True)
+    if observations is not None:
+        hdf5.write_fields(h5file, _OBSERVATIONS, observations, compact=True)
 
 
 def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
@@ -122,7 +147,7 @@ def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
     found = read_sequence_fields(h5file, source)
     if "observations" not in found:
         raise ArchiveError(f"{source}: holds a sequence without its observations")
-    with spelled_as_in(source, _SPELLING):
+    with spelled_as_in(source, SPELLING):
         return Sequence(**found)
 
 
@@ -132,8 +157,8 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
     Raises:
         DataError: A field is missing or malformed; the subclass says how.
     """
-    with spelled_as_in(source, _SPELLING):
-        attributes, camera = _attributes(h5file, "sequence/attributes"), _attributes(h5file, "sequence/camera")
+    with spelled_as_in(source, SPELLING):
+        attributes, camera = hdf5.facts(_group(h5file, "sequence/attributes")), _attributes(h5file, "sequence/camera")
         for name in _CAMERA:
             if not isinstance(camera.get(name), int | float):
                 raise ShapeError("this attribute is missing or no number", field=f"sequence/camera@{name}")
@@ -205,12 +230,16 @@ def _read(h5file: h5py.Group, layout: hdf5.Layout) -> dict[str, Any]:
             tuple(None if isinstance(n, str) else n for n in shape),
             np.int64 if units in _INDICES else np.float64,
         )
-        for name, field, shape, units, _ in layout
+        for name, field, shape, units, *_ in layout
     }
 
 
 def _attributes(h5file: h5py.Group, name: str) -> dict[str, Any]:
     """Attributes of a group that must be there."""
+    return hdf5.attributes(_group(h5file, name))
+
+
+def _group(h5file: h5py.Group, name: str) -> h5py.Group:
     if not isinstance(h5file.get(name), h5py.Group):
         raise ShapeError("this group is missing", field=name)
-    return hdf5.attributes(h5file[name])
+    return h5file[name]

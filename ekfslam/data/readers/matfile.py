@@ -14,25 +14,33 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from ekfslam.limits import Budget
+
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _MATRIX, _COMPRESSED = 14, 15
 _NUMERIC_CLASSES = range(6, 16)  # double, single and the integers; others are cells, structures, text, ...
 _COMPLEX_FLAG = 0x0800
+_MOST_DEFLATED = 1032  # bytes of one compressed byte
 
 
-def parse_mat(content: bytes) -> dict[str, NDArray]:
+def parse_mat(content: bytes, budget: Budget) -> dict[str, NDArray]:
     """Every variable of a file by name; what is not a real numeric array becomes an empty array of objects.
 
+    Args:
+        content: Of the file.
+        budget: What variables may be decompressed to.
+
     Raises:
+        EkfslamError: It claims more than that.
         ValueError, struct.error, zlib.error: The file is damaged.
     """
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise ValueError("the header states no byte order")
     variables = {}
-    for kind, data in _elements(content[128:], order):
+    for kind, data in _elements(memoryview(content)[128:], order):
         if kind == _COMPRESSED:
-            kind, data = next(_elements(zlib.decompress(data), order), (kind, data))
+            kind, data = next(_elements(_inflated(data, order, budget), order), (kind, data))
         if kind != _MATRIX:
             raise ValueError(f"unexpected element of type {kind}")
         name, value = _matrix(data, order)
@@ -40,7 +48,18 @@ def parse_mat(content: bytes) -> dict[str, NDArray]:
     return variables
 
 
-def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+def _inflated(data: memoryview, order: str, budget: Budget) -> memoryview:
+    """A compressed element: as much as its tag claims, and that only if it may."""
+    stream = zlib.decompressobj()
+    tag = stream.decompress(data, 8)
+    _, size = struct.unpack_from(order + "II", tag)
+    budget.take(size, "a compressed variable")
+    if size > _MOST_DEFLATED * (len(data) + 1):
+        raise ValueError(f"a variable claims {size} bytes, which {len(data)} compressed ones cannot hold")
+    return memoryview(tag + stream.decompress(stream.unconsumed_tail, size))
+
+
+def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
     """Type and data of each element."""
     position = 0
     while position < len(data):
@@ -57,13 +76,13 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
             position += -position % 8
 
 
-def _matrix(data: bytes, order: str) -> tuple[str, NDArray]:
+def _matrix(data: memoryview, order: str) -> tuple[str, NDArray]:
     elements = list(_elements(data, order))
     if len(elements) < 3:
         raise ValueError("a matrix without name")
     flags, dimensions, name = (element for _, element in elements[:3])
     (flag,) = struct.unpack_from(order + "I", flags)
-    text = name.decode("latin-1")
+    text = bytes(name).decode("latin-1")
     if flag & 0xFF not in _NUMERIC_CLASSES or flag & _COMPLEX_FLAG:
         return text, np.empty(0, dtype=object)
     shape = [int(size) for size in np.frombuffer(dimensions, order + "i4")]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import stat
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,11 +54,15 @@ class Source:
     @staticmethod
     def at(place: str | Path, extrinsics: Extrinsics, lateral: Lateral) -> Source:
         """The source at a place, whatever is there."""
+        problem = ""
         try:
-            with Path(place).open("rb") as file:
-                return Source(str(place), extrinsics, lateral, file.read(_HEAD_BYTES), "")
-        except OSError as error:
-            return Source(str(place), extrinsics, lateral, b"", str(error.strerror))
+            if stat.S_ISREG(Path(place).stat().st_mode):
+                with Path(place).open("rb") as file:
+                    return Source(str(place), extrinsics, lateral, file.read(_HEAD_BYTES), "")
+            problem = "it is a directory" if Path(place).is_dir() else "it is no regular file"
+        except (OSError, ValueError) as error:
+            problem = str(getattr(error, "strerror", None) or error)
+        return Source(str(place), extrinsics, lateral, b"", problem)
 
 
 @dataclass(frozen=True)

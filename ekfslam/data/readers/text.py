@@ -15,6 +15,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.errors import DataError, LineError, NonFiniteError, UnknownFormatError
+from ekfslam.limits import require_file
 
 Converters = Mapping[int, Callable[[str], float]]
 
@@ -58,8 +59,9 @@ def read_lines(path: Path, expected: str) -> list[str]:
         UnknownFormatError: It cannot be read, or is not text; the message ends with what was ``expected``.
     """
     try:
+        require_file(path, is_text=True)
         return path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, UnknownFormatError) as error:
         raise UnknownFormatError(f"{path}: not a readable text file ({error}); {expected}") from None
 
 
@@ -71,12 +73,23 @@ def rows_of(lines: Iterable[str], comment: str | None = "#") -> Iterable[tuple[i
             yield number, content
 
 
+def first_line(path: Path) -> str:
+    """The first line of a file; empty if there is none, or it is no text."""
+    try:
+        require_file(path)
+        with path.open(encoding="utf-8") as file:
+            return file.readline(1 << 16).rstrip("\n")
+    except (OSError, UnicodeDecodeError, UnknownFormatError):
+        return ""
+
+
 def first_row(path: Path) -> str:
     """The first line of a file that holds more than a comment, without it; empty if there is none, or no file."""
     try:
+        require_file(path, is_text=True)
         with path.open(encoding="utf-8", errors="replace") as file:
             return next((content for _, content in rows_of(file)), "")
-    except OSError:
+    except (OSError, UnknownFormatError):
         return ""
 
 

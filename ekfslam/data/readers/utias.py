@@ -27,6 +27,7 @@ from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import DataError, ShapeError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.limits import Budget, require_file
 
 COLUMN_FIELDS = ("t", "v_vk_vk_i", "w_vk_vk_i", "r_i_vk_i", "theta_vk_i")
 CAMERA_FIELDS = ("fu", "fv", "cu", "cv", "b")
@@ -101,8 +102,9 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
 
 def _load(path: Path) -> dict[str, NDArray]:
     expected = f"expected a .mat file with the fields {', '.join(FIELDS)}"
+    require_file(path)
     try:
-        fields = parse_mat(path.read_bytes())
+        fields = parse_mat(path.read_bytes(), Budget(str(path)))
     except (ValueError, struct.error, zlib.error) as error:
         raise UnknownFormatError(f"{path}: damaged .mat file ({error}); {expected}") from None
     if "y_k_j" not in fields:

@@ -1,0 +1,70 @@
+"""How much a file may claim to hold, before anything of it is allocated, decompressed or read.
+
+A file of some kilobytes can claim gigabytes. Readers ask a `Budget` for what headers claim, all of a file together.
+
+A leaf: it imports nothing of the package but the errors.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+
+from ekfslam.errors import ConfigError, EkfslamError, UnknownFormatError
+
+DEFAULT_GB = 0.5  # more than twice the largest recording known; reading takes about three times as much
+_TEXT_SHARE = 16  # numbers take so many times the memory of their text
+_limit: ContextVar[int] = ContextVar("limit", default=int(DEFAULT_GB * 1e9))
+
+
+@contextmanager
+def reading_up_to(gb: float) -> Iterator[None]:
+    """Let files hold up to so many gigabytes of numbers meanwhile.
+
+    Raises:
+        ConfigError: That is no positive number.
+    """
+    if not 0 < gb <= 1e6:
+        raise ConfigError(f"the limit of reading must be a positive number of gigabytes, found {gb}")
+    token = _limit.set(int(gb * 1e9))
+    try:
+        yield
+    finally:
+        _limit.reset(token)
+
+
+class Budget:
+    """What is left for one file of what may be read.
+
+    Args:
+        source: The file, for messages.
+        error: What to raise when it claims more.
+    """
+
+    def __init__(self, source: str, error: type[EkfslamError] = UnknownFormatError) -> None:
+        self.source, self.error, self.left = source, error, _limit.get()
+
+    def take(self, size: int, what: str) -> None:
+        """Raise an error where a further ``size`` bytes are more than what is left."""
+        self.left -= size
+        if size < 0 or self.left < 0:
+            raise self.error(
+                f"{self.source}: {what} claims {size / 1e9:.3g} GB, more than the {_limit.get() / 1e9:.3g} GB that may "
+                "be read of a file; --read-limit raises this"
+            )
+
+
+def require_file(path: str | Path, is_text: bool = False) -> None:
+    """Raise an `UnknownFormatError` unless this is a regular file that is small enough; a pipe would never end."""
+    try:
+        status = Path(path).stat()
+    except (OSError, ValueError) as error:
+        raise UnknownFormatError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise UnknownFormatError(
+            f"{path}: cannot be read (it is {'a directory' if stat.S_ISDIR(status.st_mode) else 'no regular file'})"
+        )
+    Budget(str(path)).take(status.st_size * (_TEXT_SHARE if is_text else 1), "the text" if is_text else "the file")

@@ -1,0 +1,33 @@
+"""Hostile inputs, reduced: some of every generator; `python tests/fuzz/long.py` tries as many as one likes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from generators import GENERATORS, Valid, case_of
+from oracle import verdict
+
+EACH = 14
+
+
+@pytest.fixture(scope="module")
+def valid() -> Valid:
+    return Valid.prepared()
+
+
+@pytest.mark.parametrize("family", range(len(GENERATORS)), ids=lambda family: GENERATORS[family].__name__)
+def test_every_input_is_taken_or_refused_by_name(valid, tmp_path, monkeypatch, family):
+    monkeypatch.setattr("ekfslam.figures.style.png", lambda figure: b"")
+    for i in range(EACH):
+        seed = family + len(GENERATORS) * i
+        case = case_of(valid, seed)
+        assert verdict(case, tmp_path / "work") == "", (seed, case.arguments)
+
+
+def test_valid_files_are_taken(valid, tmp_path):
+    from generators import Case
+
+    for name, content in valid.recordings.items():
+        assert verdict(Case({name: content}, ["info", name]), tmp_path / "work") == ""
+    assert Path(tmp_path / "work" / "own").exists()

@@ -1,0 +1,290 @@
+"""Archives that somebody else has made or damaged: every wrong value is one named error, before anything uses it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers import synthetic_result, synthetic_sequence
+
+from ekfslam.cli import main
+from ekfslam.config import Config
+from ekfslam.data.simulate import builtin
+from ekfslam.errors import ArchiveError
+from ekfslam.runner import run
+from ekfslam.storage import archive as archive_module
+from ekfslam.storage.archive import add_result, open_result, read_archive, write_archive
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """An archive of a full run with everything in it."""
+    path = tmp_path_factory.mktemp("hostile") / "whole.h5"
+    world = builtin("loop?frames=12")
+    config = Config().with_overrides({"calibration": {"lever_arm_m": 0.01}, "filter": {"relative_frames": 5}})
+    write_archive(path, world, {"full": run(world, "full", config)})
+    return path
+
+
+def data_sets(path: Path) -> list[str]:
+    names: list[str] = []
+    with h5py.File(path) as h5file:
+        h5file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return names
+
+
+def altered(whole: Path, folder: Path, name: str, value: object) -> Path:
+    """A copy with a data set replaced."""
+    path = Path(shutil.copy(whole, folder / "copy.h5"))
+    with h5py.File(path, "a") as h5file:
+        del h5file[name]
+        if value is not None:
+            h5file[name] = value
+    return path
+
+
+def spoilt(value: np.ndarray, entry: float) -> np.ndarray:
+    value = value.copy()
+    value.reshape(-1)[-1] = entry
+    return value
+
+
+def test_every_number_of_an_archive_is_looked_at(whole, tmp_path):
+    names = data_sets(whole)
+    assert {"runs/full/log/frame", "runs/full/parameters/std", "runs/full/whitened/score", "truth/frame"} <= set(names)
+    tried = 0
+    for name in names:
+        with h5py.File(whole) as h5file:
+            value = h5file[name][()]
+        if value.size == 0 or value.dtype.kind not in "iuf":
+            continue
+        entries = [np.nan, np.inf, 1e200] if value.dtype.kind == "f" else [-(1 << 40), (1 << 62) + 1]
+        for entry in entries:
+            if name.endswith("apart") and np.isnan(entry):
+                continue
+            path = altered(whole, tmp_path, name, spoilt(value, entry))
+            with pytest.raises(ArchiveError, match=r"copy\.h5") as caught:
+                read_archive(path)
+                pytest.fail(f"{entry} in {name} is read")
+            assert name.split("/")[-1] in str(caught.value), "the data set is named"
+            tried += 1
+    assert tried > 80
+
+
+@pytest.mark.parametrize(
+    ("name", "entry"),
+    [
+        ("runs/full/log/frame", -1),  # crashed the interpreter
+        ("runs/full/log/frame", 12),
+        ("runs/full/log/landmark", -1),
+        ("runs/full/log/landmark", 1 << 30),
+        ("runs/full/log/previous", 1 << 30),
+        ("runs/full/log/previous", -2),
+        ("runs/full/log/variance", 0.0),
+        ("runs/full/log/variance", -1.0),
+        ("runs/full/log/tau", -0.1),
+        ("runs/full/rejections/reason", 99),
+        ("runs/full/whitened/frame", 12),
+        ("runs/full/whitened/landmark", 1 << 20),
+        ("runs/full/hygiene/rule", 7),
+        ("runs/full/parameters/std", -1.0),
+        ("runs/full/pairs/second", 400),
+        ("runs/full/trajectory/time", 0.0),
+        ("runs/full/trajectory/T_world_imu", 2.0),
+        ("runs/full/trajectory/covariance", -1.0),
+        ("runs/full/landmarks/covariance", -1.0),
+        ("truth/frame", 12),
+        ("truth/frame", -1),
+        ("sequence/time", 0.0),
+    ],
+)
+def test_values_out_of_their_range_are_named(whole, tmp_path, name, entry):
+    with h5py.File(whole) as h5file:
+        value = h5file[name][()]
+    if value.size == 0:
+        value = np.full((1, *value.shape[1:]), entry, dtype=value.dtype)
+        pytest.skip(f"{name} has no entry in this run")
+    path = altered(whole, tmp_path, name, spoilt(value, entry))
+    with pytest.raises(ArchiveError, match=name.split("/")[-1]):
+        read_archive(path)
+
+
+def test_a_covariance_that_is_not_symmetric_is_named(whole, tmp_path):
+    with h5py.File(whole) as h5file:
+        P = h5file["runs/full/trajectory/covariance"][()]
+    P[7, 0, 3] *= 1.01
+    path = altered(whole, tmp_path, "runs/full/trajectory/covariance", P)
+    with pytest.raises(ArchiveError, match=r"covariance\[7\]: must be symmetric and positive semi-definite"):
+        read_archive(path)
+
+
+def test_a_correlation_above_one_is_named(whole, tmp_path):
+    with h5py.File(whole) as h5file:
+        P = h5file["runs/full/trajectory/covariance"][()]
+    P[7, 0, 1] = P[7, 1, 0] = 1.001 * np.sqrt(P[7, 0, 0] * P[7, 1, 1])
+    path = altered(whole, tmp_path, "runs/full/trajectory/covariance", P)
+    with pytest.raises(ArchiveError, match=r"covariance\[7\]"):
+        read_archive(path)
+
+
+def test_fields_of_a_log_that_contradict_each_other_are_named(whole, tmp_path):
+    with h5py.File(whole) as h5file:
+        log = {name: item[()] for name, item in h5file["runs/full/log"].items()}
+    landmark = np.where(log["landmark"] == 3, 2, log["landmark"])
+    with pytest.raises(ArchiveError, match=r"landmark_id\[3\] has no observation"):
+        read_archive(altered(whole, tmp_path, "runs/full/log/landmark", landmark))
+    later = int(np.flatnonzero(log["frame"] == 5)[0])
+    previous = log["previous"].copy()
+    previous[later] = 0
+    with pytest.raises(ArchiveError, match=rf"previous\[{later}\] is no observation of the same landmark"):
+        read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
+    with pytest.raises(ArchiveError, match="up has 2 columns"):
+        read_archive(altered(whole, tmp_path, "runs/full/log/up", np.zeros((12, 2))))
+
+
+@pytest.mark.parametrize("kind", ["text", "empty", "compound", "reference", "variable length"])
+def test_data_of_another_type_are_named(whole, tmp_path, kind):
+    name = "runs/full/log/frame"
+    with h5py.File(whole) as h5file:
+        count = len(h5file[name])
+    path = altered(whole, tmp_path, name, None)
+    with h5py.File(path, "a") as h5file:
+        if kind == "reference":
+            h5file.create_dataset(name, data=[h5file["runs"].ref] * count, dtype=h5py.ref_dtype)
+        elif kind == "variable length":
+            h5file.create_dataset(name, (count,), dtype=h5py.vlen_dtype(np.int64))
+        else:
+            values = {
+                "text": np.full(count, b"1"),
+                "empty": h5py.Empty("i8"),
+                "compound": np.zeros(count, dtype=[("a", "i8"), ("b", "f8")]),
+            }
+            h5file[name] = values[kind]
+    with pytest.raises(ArchiveError, match="runs/full/log/frame is"):
+        read_archive(path)
+
+
+@pytest.mark.parametrize("kind", ["soft", "external", "storage", "virtual", "twice", "cycle", "type"])
+def test_what_leads_out_of_the_file_or_round_in_it_is_refused(whole, tmp_path, kind):
+    name = "runs/full/timing/ms_per_frame"
+    path = altered(whole, tmp_path, name, None)
+    shutil.copy(whole, tmp_path / "other.h5")
+    with h5py.File(path, "a") as h5file:
+        if kind == "soft":
+            h5file[name] = h5py.SoftLink("/runs/full/trajectory/time")
+        elif kind == "external":
+            h5file[name] = h5py.ExternalLink("other.h5", name)
+        elif kind == "storage":
+            secret = tmp_path / "secret"
+            secret.write_bytes(bytes(96))
+            h5file.create_dataset(name, (12,), "f8", external=[(str(secret), 0, 96)])
+        elif kind == "virtual":
+            layout = h5py.VirtualLayout((12,), "f8")
+            layout[:] = h5py.VirtualSource(tmp_path / "other.h5", name, (12,))
+            h5file.create_virtual_dataset(name, layout)
+        elif kind == "twice":
+            h5file[name] = h5file["runs/full/trajectory/time"]
+        elif kind == "cycle":
+            h5file["runs/full/timing/ms_per_frame"] = h5file["runs"]
+        else:
+            h5file[name] = np.dtype("f8")
+    words = {"soft": "is a link", "external": "is a link", "type": "neither"}
+    words |= {"storage": "in another file", "virtual": "in another file", "twice": "twice", "cycle": "twice"}
+    for read in (read_archive, lambda p: open_result(p, "full")):
+        with pytest.raises(ArchiveError, match=words[kind]):
+            read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("config", "{" * 5 + '"a":' * 3, "no JSON object"),
+        ("config", "[" * 100_000, "no JSON object"),
+        ("config", json.dumps({"filter": []}), "must be a table"),
+        ("config", json.dumps({"filter": {"iterations": "many"}}), "iterations must be a whole number"),
+        ("config", json.dumps({"noise": {"sigma_px": float("nan")}}), "sigma_px must be finite"),
+        ("config", json.dumps({"blocks": {"twist": 3}}), "must be a table"),
+        ("counts", json.dumps({"accepted": -1}), "no count"),
+        ("counts", json.dumps({"accepted": "7"}), "no count"),
+        ("counts", h5py.Empty("S4"), "is empty"),
+        ("noise_twist_std", np.full(6, np.nan), "twist_std"),
+        ("noise_pixel_std_px", np.ones(3), "pixel_std_px"),
+        ("noise_track_memory", 7.0, "track_memory"),
+        ("format_version", "four", "format_version of runs/full is no whole number"),
+    ],
+)
+def test_attributes_are_looked_at(whole, tmp_path, name, value, words):
+    path = Path(shutil.copy(whole, tmp_path / "copy.h5"))
+    with h5py.File(path, "a") as h5file:
+        h5file["runs/full"].attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
+    with pytest.raises(ArchiveError, match=words):
+        read_archive(path)
+
+
+@pytest.mark.parametrize("value", [np.ones(3), np.nan, np.inf])
+def test_further_facts_are_texts_and_finite_numbers(whole, tmp_path, value):
+    for group in ("runs/full/attributes", "sequence/attributes"):
+        path = Path(shutil.copy(whole, tmp_path / "copy.h5"))
+        with h5py.File(path, "a") as h5file:
+            h5file[group].attrs["seed"] = value
+        with pytest.raises(ArchiveError, match="attribute seed of"):
+            read_archive(path)
+
+
+def test_text_has_a_fixed_length_everywhere(whole):
+    found: list[str] = []
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        types = [item.attrs.get_id(key).dtype for key in item.attrs]
+        types += [item.dtype] if isinstance(item, h5py.Dataset) else []
+        found.extend(name for dtype in types if dtype.kind == "O")
+
+    with h5py.File(whole) as h5file:
+        h5file.visititems(visit)
+        visit("/", h5file)
+    assert found == []
+
+
+def test_what_could_not_be_read_again_is_not_written(tmp_path):
+    sequence = synthetic_sequence(frames=20, landmarks=20)
+    result = synthetic_result(sequence, "dead-reckoning")
+    result.covariance[3, 2, 2] = -1.0
+    with pytest.raises(ArchiveError, match=r"covariance\[3\]"):
+        write_archive(tmp_path / "a.h5", sequence, {"dead-reckoning": result})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_added_to_an_archive_that_is_not_valid(whole, tmp_path):
+    sequence = synthetic_sequence(frames=12, landmarks=20)
+    path = altered(whole, tmp_path, "runs/full/log/frame", None)
+    before = path.read_bytes()
+    with pytest.raises(ArchiveError, match="log/frame is missing"):
+        add_result(path, synthetic_result(sequence, "dead-reckoning"))
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("command", ["posterior", "check", "info", "plot", "export"])
+def test_the_finding_that_crashed_the_interpreter_is_one_line(whole, tmp_path, capsys, command):
+    with h5py.File(whole) as h5file:
+        frame = h5file["runs/full/log/frame"][()]
+    frame[0] = -1
+    path = altered(whole, tmp_path, "runs/full/log/frame", frame)
+    assert main([command, str(path), *(["--format", "tum"] if command == "export" else [])]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert "runs/full/log/frame[0] = -1: must be an index from 0 to T - 1" in line
+
+
+def test_every_item_of_every_layout_has_a_check_that_can_fail():
+    layouts = [value for name, value in vars(archive_module).items() if name.endswith("LAYOUT") or "_LOG_" in name]
+    assert len(layouts) >= 8
+    for item in (item for layout in layouts for item in layout):
+        bad = {"f": np.nan, "i": -(1 << 40)}.get(item.check.kinds)
+        if bad is None or item.name == "apart":
+            continue
+        shape = tuple(4 if isinstance(n, str) else n for n in item.shape)
+        assert not item.check.holds(np.full(shape, bad), {"T": 4, "M": 4, "K": 4}).all(), item.name
