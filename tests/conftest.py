@@ -7,6 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# How long an example takes says nothing on a machine that has other work to do.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 # The whole form of the slow tests; by default they are reduced: fewer seeds, shorter drives.
 WHOLE = os.environ.get("EKFSLAM_TESTS") == "whole"

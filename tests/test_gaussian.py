@@ -6,7 +6,7 @@ import pytest
 from ekfslam.errors import InnovationError
 from ekfslam.filters import dormant
 from ekfslam.filters.conditional import ConditionalGaussian
-from ekfslam.filters.dense import DenseGaussian
+from ekfslam.filters.dense import DenseGaussian, add_square
 from ekfslam.filters.gaussian import Rows
 from ekfslam.filters.landmarks import LandmarkTable
 
@@ -279,3 +279,12 @@ def test_the_table_keeps_its_columns_aligned():
     assert table.last_frame.tolist() == [0, 8] and table.first_frame.tolist() == [0, 4]
     found = table.snapshot(np.array([1]), 3 * np.eye(3)[None])
     assert found.id.tolist() == [9] and found.covariance[0, 0, 0] == 3 and found.observations.tolist() == [1]
+
+
+@pytest.mark.parametrize("size", [1, 5, 127, 128, 129, 300])
+def test_a_square_is_added_symmetrically(size):
+    rng = np.random.default_rng(size)
+    P, A = np.eye(size), rng.normal(size=(size, 4))
+    add_square(P, A, 1.0)
+    np.testing.assert_allclose(P, np.eye(size) + A @ A.T, atol=1e-13)
+    np.testing.assert_array_equal(P, P.T)

@@ -119,3 +119,10 @@ def test_everything_works_on_stacks():
         np.testing.assert_array_equal(function(T)[1, 4], function(T[1, 4]))
     points = np.random.default_rng(2).normal(size=(4, 5, 3))
     np.testing.assert_allclose(se3.apply(T, points)[3, 1], T[3, 1, :3, :3] @ points[3, 1] + T[3, 1, :3, 3], atol=1e-14)
+
+
+def test_one_vector_has_the_coefficients_of_a_stack():
+    for x in (0.0, 1e-20, 0.3, 2.0, np.nextafter(2.0, 3.0), 9.0):
+        one, stack = se3.phis(np.array([[x]])), se3.phis(np.full((2, 1, 1), x))
+        for a, b in zip(one, stack, strict=True):
+            np.testing.assert_allclose(a, b[0, 0, 0], rtol=1e-15)

@@ -15,6 +15,10 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import InnovationError
 from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, full_correction, share_of
 
+# Rows that are mirrored at once.
+_BLOCK = 128
+_ABOVE = ~np.tri(_BLOCK, dtype=bool)
+
 
 @dataclass(frozen=True)
 class DenseProjection(Projection):
@@ -285,4 +289,8 @@ def _require_order(P: Array) -> None:
 
 
 def _mirror(P: Array) -> None:
-    np.copyto(P, P.T, where=~np.tri(len(P), dtype=bool))
+    for begin in range(0, len(P), _BLOCK):
+        end = begin + _BLOCK
+        P[begin:end, end:] = P[end:, begin:end].T
+        own = P[begin:end, begin:end]
+        np.copyto(own, own.T, where=_ABOVE[: len(own), : len(own)])

@@ -13,7 +13,8 @@ so that each coefficient is smooth at zero: phi_1 = sin(theta)/theta, phi_2 = (1
 
 from __future__ import annotations
 
-from math import factorial
+from math import cos, factorial, sin, sqrt
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from ekfslam.arrays import Array
 _SERIES_LIMIT = 2.0  # below this theta^2 the power series is both accurate and cheap
 _SERIES_TERMS = 10  # the first one left out is 2^10 / 24! < 1e-20
 _SERIES = [np.array([1.0 / factorial(2 * n + k) for k in (4, 5)]) for n in reversed(range(_SERIES_TERMS))]
+_SERIES_OF_ONE = [tuple(both.tolist()) for both in _SERIES]
+_EYE = np.eye(3)
 
 
 def phis(theta_squared: Array) -> tuple[Array, ...]:
@@ -31,6 +34,8 @@ def phis(theta_squared: Array) -> tuple[Array, ...]:
     cosine and sine by the same recurrence the other way round.
     """
     x = np.asarray(theta_squared, dtype=float)
+    if x.shape == (1, 1):
+        return _phis_of_one(x.item())
     small = np.minimum(x, _SERIES_LIMIT)
     both = np.zeros((*small.shape, 2))
     for coefficients in _SERIES:
@@ -46,6 +51,21 @@ def phis(theta_squared: Array) -> tuple[Array, ...]:
     for k in range(4):
         closed.append((1.0 / factorial(k) - closed[k]) / large)
     return tuple(np.where(x <= _SERIES_LIMIT, a, b) for a, b in zip(series, closed, strict=True))
+
+
+def _phis_of_one(x: float) -> tuple[Any, ...]:
+    """The same of a single vector, in plain numbers: a filter asks for it dozens of times a frame."""
+    if x <= _SERIES_LIMIT:
+        phi_4 = phi_5 = 0.0
+        for c_4, c_5 in _SERIES_OF_ONE:
+            phi_4, phi_5 = c_4 - x * phi_4, c_5 - x * phi_5
+        phi_2, phi_3 = 0.5 - x * phi_4, 1.0 / 6.0 - x * phi_5
+        return 1.0 - x * phi_2, 1.0 - x * phi_3, phi_2, phi_3, phi_4, phi_5
+    theta = sqrt(x)
+    closed = [cos(theta), sin(theta) / theta]
+    for k in range(4):
+        closed.append((1.0 / factorial(k) - closed[k]) / x)
+    return tuple(closed)
 
 
 def skew(v: Array) -> Array:
@@ -81,7 +101,7 @@ def so3_exp_and_left_jacobian(theta: Array) -> tuple[Array, Array]:
     _, phi_1, phi_2, phi_3, _, _ = phis(_angle_squared(theta))
     w = skew(theta)
     ww = w @ w
-    return np.eye(3) + phi_1 * w + phi_2 * ww, np.eye(3) + phi_2 * w + phi_3 * ww
+    return _EYE + phi_1 * w + phi_2 * ww, _EYE + phi_2 * w + phi_3 * ww
 
 
 def so3_left_jacobian_inverse(theta: Array) -> Array:
@@ -89,7 +109,7 @@ def so3_left_jacobian_inverse(theta: Array) -> Array:
     theta = np.asarray(theta, dtype=float)
     _, _, phi_2, phi_3, phi_4, _ = phis(_angle_squared(theta))
     w = skew(theta)
-    return np.eye(3) - 0.5 * w + (phi_3 - 2.0 * phi_4) / (2.0 * phi_2) * (w @ w)
+    return _EYE - 0.5 * w + (phi_3 - 2.0 * phi_4) / (2.0 * phi_2) * (w @ w)
 
 
 def so3_log(R: Array) -> Array:
