@@ -125,9 +125,16 @@ def archive(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.fixture
+def drawn_already(monkeypatch) -> None:
+    """Figures take most of the time, and only their sizes matter here."""
+    for place in ("figures.style", "reports"):
+        monkeypatch.setattr(f"ekfslam.{place}.png", lambda figure: b"as large as a figure" * 1500)
+
+
 @pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])
 @pytest.mark.parametrize("size", [0, 5_000])
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, archive, command, size):
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, archive, drawn_already, command, size):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
     arguments = [part.format(folder=tmp_path / "out", archive=here) for part in WRITING[command]]
@@ -143,7 +150,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, arc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])
-def test_a_full_disk_of_any_size(tmp_path, capsys, archive, command):
+def test_a_full_disk_of_any_size(tmp_path, capsys, archive, drawn_already, command):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
     arguments = [part.format(folder=tmp_path / "out", archive=here) for part in WRITING[command]]
