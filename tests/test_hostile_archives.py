@@ -279,6 +279,14 @@ def test_the_finding_that_crashed_the_interpreter_is_one_line(whole, tmp_path, c
     assert "runs/full/log/frame[0] = -1: must be an index from 0 to T - 1" in line
 
 
+@pytest.mark.parametrize("command", ["posterior", "check", "plot", "export"])
+def test_an_archive_without_a_run_is_one_line(whole, tmp_path, capsys, command):
+    path = altered(whole, tmp_path, "runs/full", None)
+    assert main([command, str(path), *(["--format", "tum"] if command == "export" else [])]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main(["info", str(path)]) == 0
+
+
 def test_every_item_of_every_layout_has_a_check_that_can_fail():
     layouts = [value for name, value in vars(archive_module).items() if name.endswith("LAYOUT") or "_LOG_" in name]
     assert len(layouts) >= 8
