@@ -142,6 +142,10 @@ def test_fields_of_a_log_that_contradict_each_other_are_named(whole, tmp_path):
     previous[later] = 0
     with pytest.raises(ArchiveError, match=rf"previous\[{later}\] is no observation of the same landmark"):
         read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
+    before = np.flatnonzero((log["frame"] == 4) & (log["landmark"] != log["landmark"][later]))
+    previous[later] = before[0]  # in the frame before, but another landmark
+    with pytest.raises(ArchiveError, match=rf"previous\[{later}\] is no observation of the same landmark"):
+        read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
     with pytest.raises(ArchiveError, match="up has 2 columns"):
         read_archive(altered(whole, tmp_path, "runs/full/log/up", np.zeros((12, 2))))
 
