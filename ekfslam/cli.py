@@ -21,7 +21,7 @@ from ekfslam.data.readers.text import first_line
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.data.tracks import inspect_tracks
-from ekfslam.errors import ConfigError, EkfslamError, WriteError
+from ekfslam.errors import ArchiveError, ConfigError, EkfslamError, WriteError
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.posterior import draw_posterior_figures
@@ -495,6 +495,8 @@ def _tune(options: argparse.Namespace) -> None:
 
 def _plot(options: argparse.Namespace) -> None:
     archive = read_archive(options.archive)
+    if not archive.results:
+        raise ArchiveError(f"{options.archive}: holds no run")
     directory = options.out or options.archive.parent
     files.require_writable(directory / "map.png")
     for path in save_figures(directory, archive.results, archive.truth, archive.interpolated):

@@ -227,9 +227,10 @@ def _inspect_size(dataset: h5py.Dataset, place: str, budget: Budget) -> None:
         return
     chunk = math.prod(dataset.chunks) * dataset.dtype.itemsize
     budget.take(chunk, f"a part of {dataset.name.strip('/')}")
-    filters = [
-        dataset.id.get_create_plist().get_filter(i)[0] for i in range(dataset.id.get_create_plist().get_nfilters())
-    ]
+    if math.prod(-(-n // m) for n, m in zip(dataset.shape, dataset.chunks, strict=True)) > _MOST_OBJECTS:
+        raise budget.error(f"{place} is in too many parts")
+    plist = dataset.id.get_create_plist()
+    filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
     if not set(filters) <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}:
         raise budget.error(f"{place} is compressed in a way that no file of this format is")
     for part in dataset.iter_chunks():

@@ -16,11 +16,12 @@ from typing import Any
 from matplotlib.figure import Figure
 
 import ekfslam
+from ekfslam import files
 from ekfslam.arrays import Array
 from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.trajectory import absolute_trajectory_error
-from ekfslam.figures.style import save_all
+from ekfslam.figures.style import pngs
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("EKFSLAM_DATA") or ROOT.parent / "shared" / "data")
@@ -99,7 +100,5 @@ def write(
     folder: Path, name: str, values: Any, text: str, figures: Mapping[str, Figure] | None = None, *, indent: int = 2
 ) -> None:
     """Write ``<name>.json``, ``<name>.md`` and the figures as PNG into a folder, made if missing."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.json").write_text(json.dumps(values, indent=indent) + "\n", encoding="utf-8")
-    (folder / f"{name}.md").write_text(text, encoding="utf-8")
-    save_all(folder, figures or {})
+    texts = {folder / f"{name}.json": json.dumps(values, indent=indent) + "\n", folder / f"{name}.md": text}
+    files.write_all({**texts, **pngs(folder, figures or {})})

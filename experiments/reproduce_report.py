@@ -27,6 +27,7 @@ import sys
 from common import REPORT, argument_parser, has_recordings, open_recording, with_aligned
 
 import ekfslam
+from ekfslam import files
 from ekfslam.evaluation.tables import document, markdown_table
 from ekfslam.figures.maps import plot_landmark_arrows, plot_trajectories
 from ekfslam.figures.style import save_all
@@ -78,7 +79,7 @@ def main() -> int:
         "ATE in metres (in brackets: aligned), against KITTI odometry; lateral velocity as stored, as in the report:",
         markdown_table(["recording", "dead reckoning", "extrinsics as stored", "full SLAM"], rows),
     )
-    (parsed.out / "summary.md").write_text(text, encoding="utf-8")
+    files.write(parsed.out / "summary.md", text)
     print(text)
     return 0
 

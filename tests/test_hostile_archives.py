@@ -142,6 +142,10 @@ def test_fields_of_a_log_that_contradict_each_other_are_named(whole, tmp_path):
     previous[later] = 0
     with pytest.raises(ArchiveError, match=rf"previous\[{later}\] is no observation of the same landmark"):
         read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
+    before = np.flatnonzero((log["frame"] == 4) & (log["landmark"] != log["landmark"][later]))
+    previous[later] = before[0]  # in the frame before, but another landmark
+    with pytest.raises(ArchiveError, match=rf"previous\[{later}\] is no observation of the same landmark"):
+        read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
     with pytest.raises(ArchiveError, match="up has 2 columns"):
         read_archive(altered(whole, tmp_path, "runs/full/log/up", np.zeros((12, 2))))
 
@@ -277,6 +281,14 @@ def test_the_finding_that_crashed_the_interpreter_is_one_line(whole, tmp_path, c
     line = capsys.readouterr().err
     assert line.count("\n") == 1
     assert "runs/full/log/frame[0] = -1: must be an index from 0 to T - 1" in line
+
+
+@pytest.mark.parametrize("command", ["posterior", "check", "plot", "export"])
+def test_an_archive_without_a_run_is_one_line(whole, tmp_path, capsys, command):
+    path = altered(whole, tmp_path, "runs/full", None)
+    assert main([command, str(path), *(["--format", "tum"] if command == "export" else [])]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main(["info", str(path)]) == 0
 
 
 def test_every_item_of_every_layout_has_a_check_that_can_fail():

@@ -20,11 +20,12 @@ from ekfslam.cli import main
 from ekfslam.config import Config
 from ekfslam.data.readers import open_sequence
 from ekfslam.data.simulate import builtin
-from ekfslam.errors import ResumeError
+from ekfslam.errors import ArchiveError, ResumeError
 from ekfslam.filters.landmarks import LandmarkTable
 from ekfslam.runner import run
 from ekfslam.storage import checkpoint
 from ekfslam.storage.checkpoint import Checkpoints, image, read
+from ekfslam.studies.journal import Journal, _framed
 
 EVERYTHING = {
     "calibration": {"rotation_deg": 0.3, "lever_arm_m": 0.05, "disparity_px": 0.3},
@@ -289,3 +290,59 @@ def test_an_interruption_keeps_the_checkpoint_and_an_error_does_not(tmp_path, mo
     assert (tmp_path / "a.h5.checkpoint").exists()
     assert main([*arguments, "--resume"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+STUDY = """
+import os, signal, sys
+from test_montecarlo import Study, short
+from ekfslam.studies import study as montecarlo
+from ekfslam.studies.executors import SerialExecutor
+
+true_run, after = montecarlo.run_one, int(sys.argv[2])
+def counted(study, level, run):
+    print(level, run, flush=True)
+    if counted.done == after:
+        os.kill(os.getpid(), signal.SIGKILL)
+    counted.done += 1
+    return true_run(study, level, run)
+counted.done = 0
+montecarlo.run_one = counted
+montecarlo.run_study(Study(short("mid", 6), ("invariant",), runs=6, seed=2), sys.argv[1], SerialExecutor(), False)
+"""
+
+
+def study_process(path: Path, after: int) -> list[str]:
+    """The runs that a process began which is killed in the midst of one."""
+    tests = Path(__file__).parent
+    program = f"import sys; sys.path[:0] = [{str(tests)!r}, {str(tests.parent)!r}]\n{STUDY}"
+    done = subprocess.run([sys.executable, "-c", program, str(path), str(after)], capture_output=True, text=True)
+    assert done.returncode in (0, -9), done.stderr
+    return done.stdout.split("\n")[:-1]
+
+
+def test_a_killed_study_keeps_every_finished_run(tmp_path):
+    assert study_process(tmp_path / "a.h5", 2) == ["mid 0", "mid 1", "mid 2"]
+    assert [path.name for path in tmp_path.iterdir()] == [".a.h5.journal"], "no archive yet: it was too quick"
+    assert study_process(tmp_path / "a.h5", 1) == ["mid 2", "mid 3"]
+    journal = tmp_path / ".a.h5.journal"
+    journal.write_bytes(journal.read_bytes()[:-7])  # as if killed in the midst of writing
+    assert study_process(tmp_path / "a.h5", 99) == [f"mid {i}" for i in range(2, 6)]
+    assert study_process(tmp_path / "b.h5", 99) == [f"mid {i}" for i in range(6)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "b.h5"]
+    same_archives(tmp_path / "a.h5", tmp_path / "b.h5")
+
+
+@pytest.mark.parametrize("kind", ["another study", "level", "run", "short", "long", "no JSON"])
+def test_a_journal_of_something_else_is_a_named_error(tmp_path, kind):
+    blank = {"invariant": {"pose_nees": np.zeros(3), "diverged": np.zeros((), dtype=bool)}}
+    journal = Journal(tmp_path / "a.h5", {"seed": 1}, lambda level: {"mid": blank}[level])
+    journal.append("mid", 0, blank)
+    assert [entry[:2] for entry in journal.entries()] == [("mid", 0)]
+    bad = {"level": b'["x", 1]\n', "run": b'["mid", []]\n', "short": b'["mid", 1]\n1234', "no JSON": b"[" * 100_000}
+    bad["long"] = b'["mid", 1]\n' + bytes(26)
+    if kind == "another study":
+        journal = Journal(tmp_path / "a.h5", {"seed": 2}, lambda level: blank)
+    else:
+        journal._write(_framed(bad[kind]))
+    with pytest.raises(ArchiveError, match=r"a\.h5\.journal"):
+        list(journal.entries())

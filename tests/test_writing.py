@@ -125,9 +125,16 @@ def archive(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.fixture
+def drawn_already(monkeypatch) -> None:
+    """Figures take most of the time, and only their sizes matter here."""
+    for place in ("figures.style", "reports"):
+        monkeypatch.setattr(f"ekfslam.{place}.png", lambda figure: b"as large as a figure" * 1500)
+
+
 @pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])
 @pytest.mark.parametrize("size", [0, 5_000])
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, archive, command, size):
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, archive, drawn_already, command, size):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
     arguments = [part.format(folder=tmp_path / "out", archive=here) for part in WRITING[command]]
@@ -139,6 +146,25 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, arc
         assert main(arguments) == 2
     assert "cannot be written: File too large" in one_line(capsys)
     assert contents(tmp_path) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])
+def test_a_full_disk_of_any_size(tmp_path, capsys, archive, drawn_already, command):
+    here = tmp_path / "full.h5"
+    here.write_bytes(archive.read_bytes())
+    arguments = [part.format(folder=tmp_path / "out", archive=here) for part in WRITING[command]]
+    assert main(arguments) == 0
+    before = contents(tmp_path)
+    largest = max(len(value) for name, value in before.items() if name.startswith("out"))
+    if command == "posterior":
+        largest = len(before["full.h5"])
+    for size in np.geomspace(1, largest - 1, 20).astype(int):
+        capsys.readouterr()
+        with disk_of(int(size)):
+            assert main(arguments) == 2
+        assert "cannot be written: File too large" in one_line(capsys)
+        assert contents(tmp_path) == before
 
 
 def test_a_full_disk_leaves_no_folder_behind(tmp_path, capsys):

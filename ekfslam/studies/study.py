@@ -57,6 +57,7 @@ from ekfslam.geometry import se3
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress as with_progress
 from ekfslam.runner import versions
+from ekfslam.studies.journal import Journal
 
 FORMAT = "ekfslam-study"
 FORMAT_VERSION = 1
@@ -316,8 +317,9 @@ class StudyArchive:
 def run_study(study: Study, path: str | Path, executor: Executor, progress: bool = True) -> StudyArchive:
     """Run what the archive at ``path`` does not hold yet, and keep it up to date meanwhile.
 
-    The archive is replaced as a whole, by renaming: killed at any time, it is valid and at most some seconds old, and
-    the next call goes on from there. A study may be extended by asking for more runs.
+    The archive is replaced as a whole, by renaming: killed at any time, it is valid and at most some seconds old. Runs
+    that it does not hold yet are in a journal beside it. The next call goes on with all of them. A study may be
+    extended by asking for more runs.
 
     Args:
         study: What to run.
@@ -331,24 +333,51 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
     """
     path = Path(path)
     archive = _resume(study, path)
+    decides = {**study.parameters, "runs": None, **versions()}
+    journal = Journal(path, decides, lambda level: _record(study, level))
+    _take_in(archive, journal, path)
     missing = [(level, run) for run in range(study.runs) for level in study.levels if not archive.done[level][run]]
     finished: Any = _completed(study, missing, executor)
     if progress:
         finished = with_progress(finished, "consistency", "run", total=len(missing))
     next_checkpoint = monotonic() + CHECKPOINT_S
     for level, run, record in finished:
-        for variant, values in record.items():
-            for field, value in values.items():
-                archive.data[level][variant][field][run] = value
-        archive.done[level][run] = True
+        journal.append(level, run, record)
+        _put(archive, level, run, record)
         if monotonic() >= next_checkpoint and not archive.complete:
             begin = monotonic()
             write_study(path, archive)
+            journal.remove()
             end = monotonic()
             next_checkpoint = end + max(CHECKPOINT_S, (end - begin) / CHECKPOINT_SHARE)
     if missing:
         write_study(path, archive)
+    journal.remove()
     return archive
+
+
+def _take_in(archive: StudyArchive, journal: Journal, path: Path) -> None:
+    """Put the runs of a journal into the archive and write it: a journal begins with an archive that holds all else."""
+    found = False
+    for level, run, record in journal.entries():
+        if run < archive.study.runs:
+            _put(archive, level, run, record)
+            found = True
+    if found:
+        write_study(path, archive)
+    journal.remove()
+
+
+def _put(archive: StudyArchive, level: str, run: int, record: Mapping[str, Mapping[str, NDArray]]) -> None:
+    for variant, values in record.items():
+        for field, value in values.items():
+            archive.data[level][variant][field][run] = value
+    archive.done[level][run] = True
+
+
+def _record(study: Study, level: str) -> Record:
+    """An empty record of a run."""
+    return {variant: _blank(study.levels[level].frames) for variant in study.variants}
 
 
 def _completed(study: Study, tasks: list[tuple[str, int]], executor: Executor) -> Iterator[tuple[str, int, Record]]:
