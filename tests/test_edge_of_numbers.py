@@ -145,10 +145,10 @@ def test_velocities_just_below_end_in_a_finite_result_or_a_named_error(scale):
 def test_a_filter_that_cannot_go_on_does_not_keep_the_others(tmp_path, monkeypatch):
     true_run = run
 
-    def failing(sequence, mode, config):
+    def failing(sequence, mode, config, *rest, **more):
         if mode in ("full", "smoothed"):
             raise InnovationError(3, [1])
-        return true_run(sequence, mode, config)
+        return true_run(sequence, mode, config, *rest, **more)
 
     monkeypatch.setattr(reports, "run", failing)
     comparison = compare(builtin("city?frames=20"))

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import seeds
 from helpers import run_joint
 from reference import small_world
 from test_variants import gauge_directions
@@ -15,7 +14,6 @@ from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import IllPosedError, PosteriorError
-from ekfslam.evaluation.consistency import chi2_bounds
 from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import CameraJitter, StereoRotation, TwistBias, VisionDrift
@@ -415,7 +413,7 @@ def test_robust_kernel_holds_against_outliers():
 def test_map_is_consistent():
     """Mean NEES of the last pose and of landmarks over 30 drives, linearised at the maximum: 6 and 3 are expected."""
     pose, landmark = [], []
-    for seed in (drives := seeds(30, 10)):
+    for seed in range(30):
         world = builtin(f"loop?frames=100&seed={seed}")
         ekf, _, _ = run_joint(world, rig_of(world), FilterConfig(retire="never"))
         found = posterior_of(ekf, PosteriorConfig(kernel="none"))
@@ -425,8 +423,7 @@ def test_map_is_consistent():
         at = np.searchsorted(world.truth.landmark, found.id)
         d = world.truth.position_m[at] - found.position_m
         landmark.append(np.einsum("ni,nij,nj->n", d, np.linalg.inv(found.landmark_covariance), d).mean())
-    low, high = chi2_bounds(6, 0.999, len(drives))
-    assert low < np.mean(pose) < high
+    assert 4.5 < np.mean(pose) < 8.0
     assert 2.4 < np.mean(landmark) < 3.8
 
 
