@@ -199,8 +199,9 @@ class JointEKF(Estimate):
         self._log.amend(T_updated=self.T_imu_world, updated=self.coordinates)
         # 5. Start new landmarks, eq. (5), or let them wait.
         started = start(self, self._log, self._waiting, frame, ids[new], rows[new])
-        if not found.dof:  # nothing has updated the pose; yet landmarks that are all new have their images here
-            self.updated_pose = "pose" if (self.table.first_step == self.step).all() else None
+        if not found.dof:  # nothing has updated the pose; yet where all that are awake are new, they have images here
+            is_new = (self.table.first_step == self.step) | (self.table.asleep == 1)
+            self.updated_pose = "pose" if is_new.all() else None
         self.retired.start_afresh(ids[new][started])
         reason[np.flatnonzero(new)[~started]] = DISPARITY if self._waiting is None else WAITING
         self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
