@@ -200,8 +200,8 @@ class JointEKF(Estimate):
         # 5. Start new landmarks, eq. (5), or let them wait.
         started = start(self, self._log, self._waiting, frame, ids[new], rows[new])
         if not found.dof:  # nothing has updated the pose; yet where all that are awake are new, they have images here
-            is_new = (self.table.first_step == self.step) | (self.table.asleep == 1)
-            self.updated_pose = "pose" if is_new.all() else None
+            first_step = self.table.first_step[self.table.asleep == 0]
+            self.updated_pose = "pose" if len(first_step) and (first_step == self.step).all() else None
         self.retired.start_afresh(ids[new][started])
         reason[np.flatnonzero(new)[~started]] = DISPARITY if self._waiting is None else WAITING
         self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
