@@ -32,6 +32,7 @@ results: $(READY)
 	$(BIN)/python experiments/real_data.py
 	$(BIN)/python experiments/ablation.py
 	$(BIN)/python experiments/scaling.py
+	$(BIN)/python experiments/benchmark.py
 
 setup: $(READY)
 

@@ -213,7 +213,7 @@ def tables(found: dict[str, Any]) -> str:
             "Total seconds on the recordings, joint filter (white noise; automatic model) and iSAM2:",
             markdown_table([*header, "iSAM2 / automatic", "with covariance / automatic"], race_rows),
         ]
-    return document("Benchmark", *parts)
+    return document("# Benchmark", *parts)
 
 
 def main() -> None:
