@@ -29,7 +29,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import InnovationError
 from ekfslam.filters.dense import transform, transform_part
 from ekfslam.filters.dormant import Dormant
-from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, full_correction, share_of
+from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, share_of
 from ekfslam.filters.window import Push, Window
 
 
@@ -368,8 +368,7 @@ class ConditionalGaussian(Gaussian):
         left = solution.left
         if at.G.shape[1]:
             d[at.rows.slot[left]] += (at.G[left] @ solution.residual[left][..., None])[..., 0]
-        correction = np.concatenate([x[:b], np.zeros(self.considered), d.ravel()])
-        return full_correction(correction, self.body, self.considered)
+        return np.concatenate([x[:b], np.zeros(self.considered), d.ravel()])
 
     def apply(self, solution: Solution) -> None:
         assert isinstance(solution, ConditionalSolution)

@@ -13,7 +13,7 @@ from scipy.linalg import blas, lapack
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import InnovationError
-from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, full_correction, share_of
+from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, share_of
 
 # Rows that are mirrored at once.
 _BLOCK = 128
@@ -72,7 +72,8 @@ class DenseSolution(Solution):
 
     @cached_property
     def done(self) -> Conditioned:
-        correction = full_correction(self.Y @ self.white, self.body, self.considered)
+        correction = self.Y @ self.white
+        correction[self.body - self.considered : self.body] = 0.0
         return Conditioned(correction, float(self.white @ self.white), self.log_det)
 
     def given_others(self) -> Array:

@@ -223,12 +223,6 @@ class Gaussian(ABC):
         self.consider(columns)
 
 
-def full_correction(correction: Array, body: int, considered: int) -> Array:
-    """A correction (body+3n,) that leaves what is considered as it is."""
-    correction[body - considered : body] = 0.0
-    return correction
-
-
 def share_of(blocks: Array, variance: Array) -> Array:
     """``V^1/2 A_i V^1/2`` of blocks (k, d, d) and variances (k, d)."""
     std = np.sqrt(variance)
