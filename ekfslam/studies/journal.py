@@ -82,6 +82,8 @@ class Journal:
         self._write(heading + _framed(json.dumps([level, run]).encode() + b"\n" + b"".join(parts)))
 
     def _write(self, content: bytes) -> None:
+        """Append on the disk; what a full disk took of it is cut off again."""
+        before = self.path.stat().st_size if self.path.is_file() else 0
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("ab") as file:
@@ -89,6 +91,10 @@ class Journal:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
+            if before:
+                os.truncate(self.path, before)
+            elif self.path.is_file():
+                self.remove()
             raise WriteError(f"{self.path}: cannot be written: {error.strerror or error}") from None
 
     def remove(self) -> None:
