@@ -388,7 +388,9 @@ def test_an_executor_that_is_not_installed_says_what_to_install(monkeypatch, spe
 
 
 def test_the_command_writes_everything_and_goes_on_where_it_was(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("ekfslam.cli.levels_of", lambda names: {name: short(name)[name] for name in names})
+    monkeypatch.setattr(
+        "ekfslam.cli.commands.consistency.levels_of", lambda names: {name: short(name)[name] for name in names}
+    )
     call = ["consistency", "--runs", "2", "--level", "low", "mid", "--executor", "serial", "--out", str(tmp_path)]
     assert main(call) == 0
     printed = capsys.readouterr()

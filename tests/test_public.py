@@ -18,9 +18,12 @@ def test_every_public_name_is_there():
         ekfslam.no_such_name  # noqa: B018
 
 
-def test_importing_the_package_imports_nothing_heavy():
-    code = (
-        "import ekfslam, sys; print([name for name in ('numpy', 'scipy', 'matplotlib', 'h5py') if name in sys.modules])"
+@pytest.mark.parametrize("statement", ["import ekfslam", "from ekfslam.cli import main; main(['--help'])"])
+def test_start_up_imports_nothing_heavy(statement):
+    program = (
+        "import atexit, sys\n"
+        "heavy = ('numpy', 'scipy', 'matplotlib', 'h5py')\n"
+        "atexit.register(lambda: print('loaded:', [name for name in heavy if name in sys.modules]))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    done = subprocess.run([sys.executable, "-c", program + statement], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "loaded: []"

@@ -194,7 +194,7 @@ def replaced(kind: str, new: list):
     [
         replaced("object", ["object", "os:_Environ", [], {}]),
         replaced("object", ["object", "subprocess:Popen", [], {}]),
-        replaced("object", ["object", "ekfslam.cli:Config", [], {}]),
+        replaced("object", ["object", "ekfslam.runner:Config", [], {}]),
         replaced("object", ["object", "ekfslam.filters.landmarks:np", [], {}]),
         replaced("object", ["object", "ekfslam.filters.landmarks:Array", [], {}]),
         replaced("array", ["array", 0, 1 << 40, "<f8", [3], [8], True]),

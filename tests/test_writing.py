@@ -92,7 +92,7 @@ def test_what_is_no_place_for_a_file_is_refused_before_the_work(tmp_path, capsys
     os.mkfifo("fifo")
     Path("file").touch()
     before = sorted(path.name for path in tmp_path.iterdir())
-    monkeypatch.setattr("ekfslam.cli.run", lambda *_: pytest.fail("the work was done"))
+    monkeypatch.setattr("ekfslam.cli.commands.run.run", lambda *_: pytest.fail("the work was done"))
     assert main(["run", CITY, *QUICK, "--out", place]) == 2
     assert "cannot be written" in one_line(capsys)
     assert sorted(path.name for path in tmp_path.iterdir()) == before
@@ -233,15 +233,15 @@ def test_two_who_add_to_one_archive_lose_nothing(tmp_path, archive):
 def test_a_posterior_is_not_added_to_another_run(tmp_path, archive, capsys, monkeypatch):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
-    from ekfslam import cli
+    from ekfslam.cli.commands import posterior
 
-    true_smooth = cli.smooth
+    true_smooth = posterior.smooth
 
     def replaced_meanwhile(*arguments):
         assert main(["run", "builtin:city?frames=60", "--variant", "standard", "--out", str(here)]) == 0
         return true_smooth(*arguments)
 
-    monkeypatch.setattr(cli, "smooth", replaced_meanwhile)
+    monkeypatch.setattr(posterior, "smooth", replaced_meanwhile)
     assert main(["posterior", str(here)]) == 2
     assert "its run 'full' was replaced meanwhile" in one_line(capsys)
     assert list(read_archive(here).results) == ["full"]

@@ -1,0 +1,108 @@
+"""The command line: every subcommand is a thin call of the function of the same name in Python.
+
+A subcommand is a file of `ekfslam.cli.commands`, found by itself. The first line of its docstring is its summary,
+``EXAMPLES`` are calls of it, ``add_arguments(parser)`` declares its arguments, ``command(options)`` runs it.
+Only the file of the subcommand that is called is imported: help and mistyped names answer at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import os
+import pkgutil
+import sys
+from collections.abc import Sequence as SequenceType
+from contextlib import suppress
+from pathlib import Path
+
+from ekfslam import __version__
+from ekfslam.cli import commands
+from ekfslam.errors import EkfslamError
+from ekfslam.limits import DEFAULT_GB, reading_up_to
+from ekfslam.names import printable
+
+
+def main(arguments: SequenceType[str] | None = None) -> int:
+    """Entry point of ``ekfslam``; returns the exit code: 0, or 2 after one line for a user's error."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    options = _parser(given[:1]).parse_args(given)
+    _prepare_output()
+    try:
+        with reading_up_to(options.read_limit):
+            options.command(options)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of our output (head, less) has gone; that is not an error.
+        _forget_output()
+    except (EkfslamError, OSError, MemoryError) as error:
+        _forget_output()
+        message = printable(" ".join(str(error).split())) or "there is not enough memory"
+        print(f"ekfslam: error: {message}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("ekfslam: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser(called: SequenceType[str]) -> argparse.ArgumentParser:
+    """The parser of all subcommands, of which only the called one knows its arguments."""
+    parser = argparse.ArgumentParser(
+        prog="ekfslam",
+        description="Visual-inertial EKF-SLAM: dead reckoning, independent landmark mapping, and full joint SLAM.",
+        epilog="DATA is a recording (ECE 276A .npz, UTIAS .mat, ekfslam .h5) or a simulated world: "
+        "builtin:city, builtin:loop, builtin:city?seed=3.",
+    )
+    parser.add_argument("--version", action="version", version=f"ekfslam {__version__}")
+    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+    for module in pkgutil.iter_modules(commands.__path__):
+        summary = _summary(Path(commands.__path__[0]) / f"{module.name}.py")
+        sub = subparsers.add_parser(
+            module.name,
+            help=summary[0].lower() + summary[1:].rstrip("."),
+            description=summary,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if module.name in called:
+            _declare(sub, module.name)
+    return parser
+
+
+def _summary(path: Path) -> str:
+    """The first line of the docstring of a file, which is not run for it."""
+    return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or path.stem).partition("\n")[0]
+
+
+def _declare(parser: argparse.ArgumentParser, name: str) -> None:
+    module = importlib.import_module(f"{commands.__name__}.{name}")
+    parser.set_defaults(command=module.command)
+    parser.epilog = "examples:\n" + "\n".join(f"  ekfslam {example}" for example in module.EXAMPLES)
+    parser.add_argument(
+        "--read-limit",
+        type=float,
+        default=DEFAULT_GB,
+        metavar="GB",
+        help="how many gigabytes of numbers a file may hold; more is refused unread (default: %(default)s)",
+    )
+    module.add_arguments(parser)
+
+
+def _prepare_output() -> None:
+    """Let printing work where there is no output, and where its encoding lacks a character of a name."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the caller
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 (open until the exit)
+        reconfigure = getattr(getattr(sys, name), "reconfigure", None)
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")
+
+
+def _forget_output() -> None:
+    """Keep the exit from flushing into an output that is full or gone."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,59 @@
+"""Simulate many drives and see whether the covariances hold what they promise."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ekfslam.config import VARIANTS
+from ekfslam.reports import check_consistency
+from ekfslam.studies.study import LEVELS, STUDY_VARIANTS, Study, levels_of
+
+EXAMPLES = (
+    "consistency --runs 20",
+    "consistency --level all --variants invariant standard fej --out results/local/all",
+    "consistency --runs 1000 --executor tls://scheduler:8786",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--runs", type=int, default=50, metavar="N", help="of each level (default: %(default)s)")
+    parser.add_argument(
+        "--level",
+        nargs="+",
+        choices=(*LEVELS, "all"),
+        default=["mid"],
+        metavar="NAME",
+        help=f"{', '.join(LEVELS)}, or all (default: mid)",
+    )
+    parser.add_argument(
+        "--variants",
+        nargs="+",
+        choices=STUDY_VARIANTS,
+        default=list(VARIANTS),
+        metavar="VARIANT",
+        help=f"{', '.join(STUDY_VARIANTS)} (default: {' '.join(VARIANTS)})",
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    parser.add_argument(
+        "--executor",
+        default="processes",
+        metavar="SPEC",
+        help="processes (default), serial, tls://HOST:PORT (a Dask cluster, with the certificates of Dask's "
+        "configuration distributed.comm.tls), dask://HOST:PORT (without: whoever reaches that port runs programs as "
+        "you; for networks of your own only), or mpi",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("results/local/consistency"),
+        metavar="DIR",
+        help="default: %(default)s; an interrupted study there goes on",
+    )
+
+
+def command(options: argparse.Namespace) -> None:
+    study = Study(levels_of(options.level), tuple(options.variants), options.runs, options.seed)
+    report = check_consistency(study, options.out, options.executor, options.workers)
+    print(f"{report.table}\nwritten to {options.out}: {', '.join(path.name for path in report.paths)}")

@@ -1,0 +1,79 @@
+"""Say what is in a recording or an archive, and what is wrong with it."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+
+from ekfslam import hdf5
+from ekfslam.cli.options import DEFAULT_DATA, add_data_options, open_data, table
+from ekfslam.config import Config
+from ekfslam.data.interpolation import stretches
+from ekfslam.data.readers import BUILTIN
+from ekfslam.data.tracks import inspect_tracks
+from ekfslam.evaluation.truth import with_truth_noise
+from ekfslam.models.build import build
+from ekfslam.models.noise import velocity_noise
+from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT
+from ekfslam.storage.archive import read_archive
+
+EXAMPLES = ("info 0027.npz", "info results/local/city/archive.h5")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="FILE", help=f"default: {DEFAULT_DATA}")
+    add_data_options(parser)
+
+
+def command(options: argparse.Namespace) -> None:
+    if _is_archive(options.data):
+        archive = read_archive(options.data)
+        print(f"{options.data}: archive of {archive.name}, {len(archive.time_s)} frames, from {archive.source}")
+        print(table(archive, None, archive.results))
+        for mode, result in archive.results.items():
+            print(f"{mode}: " + ", ".join(f"{name} {count}" for name, count in result.counts.items()))
+            if result.parameters is not None:
+                for line in result.parameters.lines:
+                    print(f"{mode}: {line}")
+            for remark in result.remarks:
+                print(f"{mode}: note: {remark}")
+            if result.hygiene is not None:
+                for line in result.hygiene.lines(result.config["hygiene"]):
+                    print(f"{mode}: hygiene: {line}")
+        return
+    given = Config().with_overrides({"truth": dict(options.truth_noise)})
+    sequence = with_truth_noise(open_data(options, options.data), given.truth)
+    camera, truth, noise = sequence.camera, sequence.truth, sequence.noise
+    tracks = inspect_tracks(sequence.observations, sequence.twist)
+    print(f"name          {sequence.name} ({sequence.source})")
+    print(f"frames        {len(sequence)} in {sequence.time_s[-1] - sequence.time_s[0]:.1f} s")
+    print(f"tracks        {tracks.tracks}, {len(sequence.observations)} observations")
+    print(
+        f"camera        fu {camera.fu_px:g} fv {camera.fv_px:g} cu {camera.cu_px:g} cv {camera.cv_px:g} px, "
+        f"baseline {camera.baseline_m:g} m"
+    )
+    if noise is None:
+        v, w = velocity_noise(sequence.twist).texts
+        print(f"noise         not stated; white noise of the velocities, from the data: {v} m/s, {w} rad/s")
+    else:
+        print(f"noise         twist {noise.twist_std} (m/s, rad/s), pixels {noise.pixel_std_px} px")
+    known = "none" if truth is None else f"{len(truth.frame)} poses, {len(truth.landmark)} landmarks"
+    print(f"truth         {known}")
+    if truth is not None:
+        print(f"truth noise   {'none stated: taken as exact' if truth.noise is None else truth.noise.text}")
+    gaps = ", ".join(f"{begin} to {end}" for begin, end in stretches(sequence.interpolated))
+    print(f"gaps          {f'intervals {gaps} are interpolated' if gaps else 'none'}")
+    for key, value in sequence.attributes.items():
+        print(f"{key:13s} {value}")
+    for note in sequence.notes:
+        print(f"note          {note}")
+    problem = build(sequence)
+    assert problem.hygiene is not None
+    for line in problem.lines:
+        print(f"state         {line}")
+    for line in problem.hygiene.lines(dataclasses.asdict(problem.config.hygiene)):
+        print(f"hygiene       {line}")
+
+
+def _is_archive(data: str) -> bool:
+    return not data.startswith(BUILTIN) and hdf5.format_of(data) == ARCHIVE_FORMAT

@@ -1,0 +1,50 @@
+"""Smooth a full run: write the posterior over all poses and landmarks into its archive."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import get_args
+
+from ekfslam import files
+from ekfslam.cli.options import table
+from ekfslam.config import Config, Kernel, Linearisation
+from ekfslam.figures.posterior import draw_posterior_figures
+from ekfslam.figures.style import pngs
+from ekfslam.smoother.posterior import posterior, smooth
+from ekfslam.storage.archive import add_result, open_result, read_archive
+
+EXAMPLES = ("posterior city.h5", "posterior city.h5 --linearisation filtered", "posterior city.h5 --kernel cauchy")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("archive", type=Path, metavar="ARCHIVE", help="as written by run or compare, mode full")
+    parser.add_argument(
+        "--linearisation",
+        choices=get_args(Linearisation),
+        help="map: at the maximum a posteriori; filtered: where the filter linearised (default: as configured, map)",
+    )
+    parser.add_argument(
+        "--kernel", choices=get_args(Kernel), help="robust kernel of map (default: as configured, huber)"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="for the figures; default: the folder of the archive")
+
+
+def command(options: argparse.Namespace) -> None:
+    full = open_result(options.archive, "full")
+    overrides = {"posterior": {"linearisation": options.linearisation, "kernel": options.kernel}}
+    config = Config().with_overrides(full.config).with_overrides(overrides).posterior
+    directory = options.out or options.archive.parent
+    for path in (options.archive, directory / "sparsity.png"):
+        files.require_writable(path)
+    found = posterior(full, config)
+    smoothed = smooth(full, config, found)
+    truth = read_archive(options.archive).truth
+    figures = pngs(directory, draw_posterior_figures(full, smoothed, found.information, truth))
+    add_result(options.archive, smoothed, of=full, beside=figures)
+    archive = read_archive(options.archive)
+    print(table(archive, None, archive.results))
+    print(", ".join(f"{name} {count}" for name, count in smoothed.counts.items()))
+    for path in figures:
+        print(path)
+    print(f"{smoothed.mode} written to {options.archive}")

@@ -1,0 +1,65 @@
+"""Run one mode and write its result archive."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ekfslam import files
+from ekfslam.cli.options import (
+    DEFAULT_DATA,
+    add_data_options,
+    add_filter_options,
+    add_force,
+    add_resume,
+    configured,
+    open_data,
+    table,
+)
+from ekfslam.config import MODES
+from ekfslam.evaluation.truth import with_truth_noise
+from ekfslam.figures.style import older_figures
+from ekfslam.reports import remove_figures
+from ekfslam.runner import run
+from ekfslam.storage.archive import archive_image, require_same_origin
+from ekfslam.storage.checkpoint import Checkpoints
+
+EXAMPLES = (
+    "run --mode full --variant invariant --out city.h5",
+    "run drive.mat --mode mapping-only --config noise.toml --out drive.h5",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="DATA", help=f"default: {DEFAULT_DATA}")
+    parser.add_argument("--mode", choices=MODES, default="full", help="default: %(default)s")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="archive to write")
+    add_force(parser)
+    add_resume(parser)
+    add_data_options(parser)
+    add_filter_options(parser)
+
+
+def command(options: argparse.Namespace) -> None:
+    config = configured(options)
+    sequence = with_truth_noise(open_data(options, options.data), config.truth)
+    files.require_writable(options.out)
+    if not options.force:
+        require_same_origin(options.out, sequence)
+    with Checkpoints(options.out.with_name(f"{options.out.name}.checkpoint"), options.resume) as checkpoints:
+        result = run(sequence, options.mode, config, checkpoints=checkpoints)
+        older = [] if _is_shared(options.out) else older_figures(options.out.parent)
+        files.write_all({options.out: archive_image(sequence, {result.mode: result})})
+    remove_figures(older, ())
+    print(table(sequence, len(sequence.observations.ids), {result.mode: result}))
+    print(", ".join(f"{name} {count}" for name, count in result.counts.items()))
+    if result.parameters is not None:
+        print("\n".join(result.parameters.lines))
+    for remark in result.remarks:
+        print(f"note: {remark}")
+    print(f"written to {options.out}")
+
+
+def _is_shared(archive: Path) -> bool:
+    """Whether the figures beside an archive need not be its own."""
+    return not archive.exists() or any(path != archive for path in archive.parent.glob("*.h5"))
