@@ -19,7 +19,7 @@ from ekfslam.filters.gaussian import Rows
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
-from ekfslam.geometry.image import image, image_jacobian
+from ekfslam.kernels.plain import image, image_jacobian
 from ekfslam.models.build import model_of
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig

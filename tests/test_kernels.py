@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from ekfslam import kernels
-from ekfslam.kernels import plain
+from ekfslam.geometry import se3
+from ekfslam.kernels import plain, pose
 
 compiled = pytest.importorskip("ekfslam.kernels.compiled", reason="there was no compiler")
 
@@ -144,6 +145,26 @@ def test_shapes_that_do_not_agree_are_refused(given):
                 arguments[short] = arguments[short][:-1]
                 with pytest.raises((ValueError, IndexError, np.linalg.LinAlgError)):
                     getattr(compiled, name)(*arguments)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 1.4142, 1.4143, 3.1, np.pi, 5.0])
+@pytest.mark.parametrize("name", ["so3_exp_and_left_jacobian", "exp", "left_jacobian", "inverse", "adjoint"])
+def test_one_pose_is_as_in_a_stack(name, angle):
+    rng = np.random.default_rng(7)
+    axis = rng.normal(size=3)
+    theta = angle * axis / np.linalg.norm(axis)
+    xi = np.concatenate([rng.normal(size=3), theta])
+    given = {"so3_exp_and_left_jacobian": theta, "exp": xi, "left_jacobian": xi}.get(name, se3.exp(xi[None])[0])
+    one, stack = getattr(se3, name)(given), getattr(se3, name)(given[None])
+    for a, b in zip(*((found if isinstance(found, tuple) else (found,)) for found in (one, stack)), strict=True):
+        np.testing.assert_allclose(a, b[0], atol=2e-15, rtol=2e-15)
+    assert name not in ("inverse", "adjoint") or getattr(pose, name)(given.T.copy().T) is not None
+
+
+def test_series_and_closed_form_meet():
+    at = [np.sqrt(2.0) * (1 + side * 1e-12) for side in (-1, 1)]
+    below, above = (se3.left_jacobian(np.array([0.1, 0.2, 0.3, angle, 0.0, 0.0])) for angle in at)
+    np.testing.assert_allclose(below, above, atol=1e-11)
 
 
 @pytest.mark.parametrize(("wanted", "form"), [("plain", "plain"), ("", "compiled")])

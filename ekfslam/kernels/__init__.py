@@ -8,18 +8,11 @@ environment chooses the first one; ``ekfslam info --build`` says which one runs.
 
 from __future__ import annotations
 
-import os
-
 from ekfslam.kernels import plain
+from ekfslam.kernels.chosen import FORM
 
-FORM = "plain"
-if os.environ.get("EKFSLAM_KERNELS", "") != "plain":
-    try:
-        from ekfslam.kernels import compiled as _form
-    except ImportError:  # there was no compiler
-        from ekfslam.kernels import plain as _form  # type: ignore[no-redef]
-    else:
-        FORM = "compiled"
+if FORM == "compiled":
+    from ekfslam.kernels import compiled as _form
 else:
     from ekfslam.kernels import plain as _form  # type: ignore[no-redef]
 

@@ -495,7 +495,176 @@ static PyObject *change_by_image(PyObject *self, PyObject *const *args, Py_ssize
     return finished(&arrays, 0);
 }
 
+/* --- one pose --------------------------------------------------------------------------------------------------- */
+
+/* phi_0 to phi_5 at theta^2, see ekfslam/geometry/se3.py */
+static void phis(double x, double *phi)
+{
+    if (x <= 2.0) {
+        /* 1 / (2n + 4)! and 1 / (2n + 5)!, n from 9 to 0 */
+        double factorial_4 = 1.1240007277776077e+21, factorial_5 = 2.5852016738884978e+22, phi_4 = 0.0, phi_5 = 0.0;
+        for (int n = 9; n >= 0; n--) {
+            phi_4 = 1.0 / factorial_4 - x * phi_4;
+            phi_5 = 1.0 / factorial_5 - x * phi_5;
+            factorial_4 /= (double)((2 * n + 4) * (2 * n + 3));
+            factorial_5 /= (double)((2 * n + 5) * (2 * n + 4));
+        }
+        phi[4] = phi_4;
+        phi[5] = phi_5;
+        phi[2] = 0.5 - x * phi_4;
+        phi[3] = 1.0 / 6.0 - x * phi_5;
+        phi[0] = 1.0 - x * phi[2];
+        phi[1] = 1.0 - x * phi[3];
+    } else {
+        const double theta = sqrt(x);
+        double factorial = 1.0;
+        phi[0] = cos(theta);
+        phi[1] = sin(theta) / theta;
+        for (int k = 0; k < 4; k++) {
+            factorial = k ? factorial * k : 1.0;
+            phi[k + 2] = (1.0 / factorial - phi[k]) / x;
+        }
+    }
+}
+
+static void skew(const double *v, double *out)
+{
+    const double filled[9] = {0.0, -v[2], v[1], v[2], 0.0, -v[0], -v[1], v[0], 0.0};
+    memcpy(out, filled, sizeof filled);
+}
+
+/* Rotation and left Jacobian of a rotation vector. */
+static void rotation(const double *theta, const double *phi, double *R, double *J)
+{
+    double w[9], ww[9];
+    skew(theta, w);
+    multiply(3, 3, 3, w, w, ww);
+    for (int a = 0; a < 9; a++) {
+        const double one = a % 4 == 0;
+        R[a] = one + phi[1] * w[a] + phi[2] * ww[a];
+        J[a] = one + phi[2] * w[a] + phi[3] * ww[a];
+    }
+}
+
+static double angle_squared(const double *theta)
+{
+    return theta[0] * theta[0] + theta[1] * theta[1] + theta[2] * theta[2];
+}
+
+/* so3_exp_and_left_jacobian(theta, R, J) */
+static PyObject *so3_exp_and_left_jacobian(PyObject *self, PyObject *const *args, Py_ssize_t given)
+{
+    Arrays arrays;
+    if (!unpack(args, given, 3, 0, &arrays, NULL))
+        return NULL;
+    double phi[6];
+    phis(angle_squared(DOUBLE(0)), phi);
+    rotation(DOUBLE(0), phi, DOUBLE(1), DOUBLE(2));
+    return finished(&arrays, 0);
+}
+
+/* The transform [R t; 0 1]. */
+static void transform(const double *R, const double *t, double *T)
+{
+    for (int a = 0; a < 3; a++) {
+        for (int b = 0; b < 3; b++)
+            T[4 * a + b] = R[3 * a + b];
+        T[4 * a + 3] = t[a];
+        T[12 + a] = 0.0;
+    }
+    T[15] = 1.0;
+}
+
+/* exp(xi, T) */
+static PyObject *exp_of_tangent(PyObject *self, PyObject *const *args, Py_ssize_t given)
+{
+    Arrays arrays;
+    if (!unpack(args, given, 2, 0, &arrays, NULL))
+        return NULL;
+    double phi[6], R[9], J[9], t[3];
+    phis(angle_squared(DOUBLE(0) + 3), phi);
+    rotation(DOUBLE(0) + 3, phi, R, J);
+    multiply(3, 3, 1, J, DOUBLE(0), t);
+    transform(R, t, DOUBLE(1));
+    return finished(&arrays, 0);
+}
+
+/* inverse(T, out) */
+static PyObject *inverse(PyObject *self, PyObject *const *args, Py_ssize_t given)
+{
+    Arrays arrays;
+    if (!unpack(args, given, 2, 0, &arrays, NULL))
+        return NULL;
+    const double *T = DOUBLE(0);
+    double R[9], t[3];
+    for (int a = 0; a < 3; a++) {
+        for (int b = 0; b < 3; b++)
+            R[3 * a + b] = T[4 * b + a];
+        t[a] = -(R[3 * a] * T[3] + R[3 * a + 1] * T[7] + R[3 * a + 2] * T[11]);
+    }
+    transform(R, t, DOUBLE(1));
+    return finished(&arrays, 0);
+}
+
+/* [A B; 0 A] */
+static void blocks(const double *A, const double *B, double *out)
+{
+    for (int a = 0; a < 3; a++)
+        for (int b = 0; b < 3; b++) {
+            out[6 * a + b] = out[6 * (a + 3) + b + 3] = A[3 * a + b];
+            out[6 * a + b + 3] = B[3 * a + b];
+            out[6 * (a + 3) + b] = 0.0;
+        }
+}
+
+/* adjoint(T, out) */
+static PyObject *adjoint(PyObject *self, PyObject *const *args, Py_ssize_t given)
+{
+    Arrays arrays;
+    if (!unpack(args, given, 2, 0, &arrays, NULL))
+        return NULL;
+    const double *T = DOUBLE(0), t[3] = {T[3], T[7], T[11]};
+    double R[9], moved[9], corner[9];
+    for (int a = 0; a < 9; a++)
+        R[a] = T[4 * (a / 3) + a % 3];
+    skew(t, moved);
+    multiply(3, 3, 3, moved, R, corner);
+    blocks(R, corner, DOUBLE(1));
+    return finished(&arrays, 0);
+}
+
+/* left_jacobian(xi, out) */
+static PyObject *left_jacobian(PyObject *self, PyObject *const *args, Py_ssize_t given)
+{
+    Arrays arrays;
+    if (!unpack(args, given, 2, 0, &arrays, NULL))
+        return NULL;
+    double phi[6], R[9], J[9], corner[9], rho[9], theta[9];
+    double theta_rho[9], rho_theta[9], sandwich[9], a[9], b[9], c[9], d[9];
+    phis(angle_squared(DOUBLE(0) + 3), phi);
+    rotation(DOUBLE(0) + 3, phi, R, J);
+    skew(DOUBLE(0), rho);
+    skew(DOUBLE(0) + 3, theta);
+    multiply(3, 3, 3, theta, rho, theta_rho);
+    multiply(3, 3, 3, rho, theta, rho_theta);
+    multiply(3, 3, 3, theta_rho, theta, sandwich);
+    multiply(3, 3, 3, theta, theta_rho, a);
+    multiply(3, 3, 3, rho_theta, theta, b);
+    multiply(3, 3, 3, sandwich, theta, c);
+    multiply(3, 3, 3, theta, sandwich, d);
+    for (int i = 0; i < 9; i++)
+        corner[i] = 0.5 * rho[i] + phi[3] * (theta_rho[i] + rho_theta[i] + sandwich[i]) +
+                    phi[4] * (a[i] + b[i] - 3.0 * sandwich[i]) + 0.5 * (phi[4] - 3.0 * phi[5]) * (c[i] + d[i]);
+    blocks(J, corner, DOUBLE(1));
+    return finished(&arrays, 0);
+}
+
 static PyMethodDef methods[] = {
+    {"so3_exp_and_left_jacobian", (PyCFunction)(void (*)(void))so3_exp_and_left_jacobian, METH_FASTCALL, NULL},
+    {"exp", (PyCFunction)(void (*)(void))exp_of_tangent, METH_FASTCALL, NULL},
+    {"inverse", (PyCFunction)(void (*)(void))inverse, METH_FASTCALL, NULL},
+    {"adjoint", (PyCFunction)(void (*)(void))adjoint, METH_FASTCALL, NULL},
+    {"left_jacobian", (PyCFunction)(void (*)(void))left_jacobian, METH_FASTCALL, NULL},
     {"moved_by_image", (PyCFunction)(void (*)(void))moved_by_image, METH_FASTCALL, NULL},
     {"change_by_image", (PyCFunction)(void (*)(void))change_by_image, METH_FASTCALL, NULL},
     {"whiten", (PyCFunction)(void (*)(void))whiten, METH_FASTCALL, NULL},

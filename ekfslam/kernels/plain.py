@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.geometry import se3
-from ekfslam.geometry.image import image, image_jacobian
 
 # Smallest share of its variance that an innovation must have besides what all others of the frame say of it.
 LEAST_SHARE = 1e-6
@@ -162,9 +160,25 @@ def change_by_image(before: View, after: View, in_image: BoolArray) -> tuple[Arr
     J_inverse_after = image_jacobian(image(np.where(in_image[:, None], q_after, _AHEAD)))
     J = np.where(in_image[:, None, None], J_inverse_after @ J, np.eye(3))
     minus_one = np.broadcast_to(-np.eye(3), J.shape)
-    by_camera = [J, -J @ se3.skew(q_linear), minus_one, se3.skew(q_linear_after)]
+    # Rows a of A q^ are a x q.
+    by_turn, by_turn_after = np.cross(J, q_linear[:, None]), np.cross(np.eye(3), q_linear_after[:, None])
+    by_camera = [J, -by_turn, minus_one, by_turn_after]
     B = np.concatenate(by_camera, axis=-1) @ np.concatenate([by, by_after])
     return R_after.T @ B, R_after.T @ J @ R
+
+
+def image(q: Array) -> Array:
+    """``(x/z, y/z, 1/z)`` of points (..., 3); its own inverse."""
+    return np.concatenate([q[..., :2], np.ones_like(q[..., 2:])], axis=-1) / q[..., 2:]
+
+
+def image_jacobian(q: Array) -> Array:
+    """Derivative (..., 3, 3) of `image` by the points."""
+    y = image(q)
+    J = np.zeros((*q.shape, 3))
+    J[..., 0, 0] = J[..., 1, 1] = y[..., 2]
+    J[..., 2] = -y * y[..., 2:]
+    return J
 
 
 def _symmetric(blocks: Array) -> Array:
