@@ -49,7 +49,9 @@ def execute(path: Path, namespace: dict[str, Any] | None = None) -> list[Cell]:
 
 def as_markdown(cells: list[Cell]) -> str:
     """The page of a notebook that has run."""
-    parts = [cell.source if cell.kind == "markdown" else f"```python\n{cell.source}\n```\n\n{cell.shown}" for cell in cells]
+    parts = [
+        cell.source if cell.kind == "markdown" else f"```python\n{cell.source}\n```\n\n{cell.shown}" for cell in cells
+    ]
     return "\n\n".join(parts) + "\n"
 
 

@@ -18,7 +18,10 @@ AS_THEY_ARE = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages, and the pictures that pages show from ``results``."""
-    pages = {name: (ROOT / source).read_text(encoding="utf-8") for name, source in AS_THEY_ARE.items()}
+    pages = {
+        name: (ROOT / source).read_text(encoding="utf-8").replace("](docs/", "](")
+        for name, source in AS_THEY_ARE.items()
+    }
     notebook = _beside("notebook")
     pages["tutorial.md"] = notebook.as_markdown(notebook.execute(ROOT / "docs" / "tutorial.ipynb"))
     pages["command_line.md"] = _command_line()
