@@ -44,6 +44,8 @@ _LARGEST_VELOCITY, _LARGEST_DISTANCE_M, _LARGEST_PX = 1e6, 1e9, 1e7
 
 # Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
+# Among the attributes of one whose velocities nobody measured; they are 0 then, and mean nothing.
+WITHOUT_VELOCITIES = {"velocities": "none"}
 
 
 LEVEL_VELOCITIES_NOTE = (
@@ -209,6 +211,11 @@ class Sequence:
     def interpolated(self) -> BoolArray:
         """Which intervals (T,) have velocities, and probably true poses, that were never measured."""
         return known_intervals(self.attributes, self.twist)
+
+    @property
+    def has_velocities(self) -> bool:
+        """Whether its velocities were measured; else only cameras say how the rig moves."""
+        return self.attributes.get("velocities") != WITHOUT_VELOCITIES["velocities"]
 
     @property
     def initial_T_world_imu(self) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.images.pairs import Image
 from ekfslam.frontend.config import FrontEndConfig
 from ekfslam.frontend.opencv import opencv
@@ -27,11 +27,11 @@ def corners(image: Image, config: FrontEndConfig) -> tuple[Array, Array]:
     return np.stack([u, v], axis=1)[order].astype(float), response[v, u][order].astype(float)
 
 
-def away_from(found: Array, taken: Array, distance: float) -> Array:
+def away_from(found: Array, taken: Array, distance: float) -> BoolArray:
     """Which pixels (n, 2) are at least so far from all pixels (m, 2): (n,) truth values."""
     if not len(taken):
         return np.ones(len(found), dtype=bool)
-    squared = ((found[:, None] - taken) ** 2).sum(axis=-1)
+    squared = (found**2).sum(axis=1)[:, None] - 2.0 * found @ taken.T + (taken**2).sum(axis=1)
     return squared.min(axis=1) >= distance**2
 
 
@@ -60,7 +60,11 @@ def spread(found: Array, taken: Array, size: tuple[int, int], wanted: int, bucke
 
 def _cells(pixels: Array, size: tuple[int, int], buckets: tuple[int, int]) -> IntArray:
     """Number of the cell of the grid that each pixel (n, 2) is in."""
-    column, row = (
-        np.clip((pixels[:, i] * buckets[i] / size[i]).astype(np.int64), 0, buckets[i] - 1) for i in range(2)
-    )
+    column, row = (np.clip((pixels[:, i] * buckets[i] / size[i]).astype(np.int64), 0, buckets[i] - 1) for i in range(2))
     return column * buckets[1] + row
+
+
+def eroded(mask: BoolArray, margin: int) -> BoolArray:
+    """A mask (height, width) without what is so close to its edge, or to that of the image."""
+    kernel = np.ones((2 * margin + 1,) * 2, np.uint8)
+    return opencv().erode(mask.astype(np.uint8), kernel, borderValue=0) > 0

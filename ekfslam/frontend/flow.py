@@ -44,9 +44,7 @@ def flow(
     return found, (status.ravel() == 1) & np.isfinite(found).all(axis=1)
 
 
-def returns(
-    source: Image, target: Image, pixels: Array, found: Array, window: int, limit_px: float
-) -> BoolArray:
+def returns(source: Image, target: Image, pixels: Array, found: Array, window: int, limit_px: float) -> BoolArray:
     """Whether features (n, 2) found in the target lead back to where they come from."""
     back, status = flow(target, source, found, pixels, window, 1)
     return status & (np.linalg.norm(back - pixels, axis=1) < limit_px)

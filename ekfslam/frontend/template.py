@@ -30,14 +30,14 @@ def grid(side: int) -> Array:
 def weights(side: int) -> Array:
     """(side^2,) Gaussian weights of the pixels of a patch, which sum to 1."""
     weight = np.exp(-0.5 * (grid(side) ** 2).sum(axis=1) / (side / 4.0) ** 2)
-    return weight / weight.sum()
+    return (weight / weight.sum()).astype(np.float32)
 
 
 def sample(image: Image, pixels: Array, scale: Array, side: int) -> Array:
     """Patches (n, side^2) about pixels (n, 2), bilinear, their pixels ``scale`` (n,) apart; all in one call."""
-    at = (pixels[:, None] + scale[:, None, None] * grid(side)).astype(np.float32)
-    cv2 = opencv()
-    return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+    cv2, offsets = opencv(), grid(side).astype(np.float32)
+    at = pixels.astype(np.float32)[:, None] + scale.astype(np.float32)[:, None, None] * offsets
+    return cv2.remap(image, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ class Templates:
         J = np.stack([T_u, T_v, T, np.ones_like(T)], axis=1)
         JW = J * weights(side)
         normal = JW @ np.swapaxes(J, 1, 2)
-        return Templates(T, np.linalg.solve(normal + _RIDGE * np.eye(4), JW))
+        solver = np.linalg.solve(normal + _RIDGE * np.eye(4), JW.astype(float))
+        return Templates(T, solver.astype(np.float32))
 
     def keep(self, kept: Array) -> Templates:
         """Some of them, by index or mask."""

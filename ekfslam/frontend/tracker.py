@@ -10,14 +10,14 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.images.pairs import Image
 from ekfslam.frontend.config import FrontEndConfig
-from ekfslam.frontend.detect import away_from, corners, spread
+from ekfslam.frontend.detect import away_from, corners, eroded, spread
 from ekfslam.frontend.flow import flow, inside, returns
 from ekfslam.frontend.match import first_pairs
 from ekfslam.frontend.rotation import RightRotation, correction
 from ekfslam.frontend.template import Templates
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera, project, triangulate
-from ekfslam.geometry.stereo_motion import Alignment, agrees, align, linearise, sampled_motion
+from ekfslam.geometry.stereo_motion import Alignment, agrees, align, sampled_motion
 
 LEAST_DISPARITY_PX = 0.5  # with less, a track has no depth to be predicted by
 _AGREE_SHARE = 0.5  # of the points, below which the motion is sampled anew
@@ -50,7 +50,9 @@ class Features:
 
     def and_more(self, others: Features) -> Features:
         """These and others."""
-        pairs = ((getattr(self, name), getattr(others, name)) for name in ("id", "left", "right", "disparity", "strikes"))
+        pairs = (
+            (getattr(self, name), getattr(others, name)) for name in ("id", "left", "right", "disparity", "strikes")
+        )
         return Features(
             *(np.concatenate(pair) for pair in pairs),
             self.patches_left.and_more(others.patches_left),
@@ -80,6 +82,7 @@ class Tracker:
     Args:
         camera: Of the rectified pair.
         config: Settings.
+        valid: Of the left and the right image, which pixels (height, width) show something; None: all.
 
     Attributes:
         rotation: Of the right camera, as known so far.
@@ -88,8 +91,11 @@ class Tracker:
         refused: Corners that were no new feature.
     """
 
-    def __init__(self, camera: StereoCamera, config: FrontEndConfig) -> None:
+    def __init__(
+        self, camera: StereoCamera, config: FrontEndConfig, valid: tuple[BoolArray, BoolArray] | None = None
+    ) -> None:
         self.camera, self.config = camera, config
+        self._valid = None if valid is None else tuple(eroded(mask, config.border) for mask in valid)
         self.rotation = RightRotation(camera, float(np.deg2rad(config.rotation_deg)), config.pixel_std)
         self.losses: Counter[str] = Counter()
         self.withheld, self.refused = 0, 0
@@ -150,8 +156,8 @@ class Tracker:
         size, border = (left.shape[1], left.shape[0]), config.template // 2
         offset = self.rotation.row_offset(aligned_left)
         tests = {
-            "left image": inside(aligned_left, size, border),
-            "right image": inside(aligned_right, size, border),
+            "out of the left image": self._inside(0, aligned_left, size, border),
+            "out of the right image": self._inside(1, aligned_right, size, border),
             "not found": ok & ok_right,
             "not found back": back,
             "unlike first sight": (score_left >= config.template_score[0]) & (score_right >= config.template_score[1]),
@@ -165,6 +171,14 @@ class Tracker:
             kept &= passes
         self._rows_before = self._rows_before[kept]
         self._features = replace(before, left=aligned_left, right=aligned_right).keep(kept)
+
+    def _inside(self, side: int, pixels: Array, size: tuple[int, int], border: float) -> BoolArray:
+        """Which pixels (n, 2) are where the left (0) or right (1) image shows something, off its border."""
+        found = inside(pixels, size, border)
+        if self._valid is not None:
+            u, v = np.round(pixels[found]).astype(np.int64).T
+            found[found] = self._valid[side][v, u]
+        return found
 
     def _predicted(self, features: Features, T_now_before: Array) -> tuple[Array, Array]:
         """Pixels (n, 2) in the left and right image where features should be after a motion."""
@@ -221,14 +235,15 @@ class Tracker:
         """Look for new features where there are too few; how many were found."""
         config, features = self.config, self._features
         taken = np.empty((0, 2)) if features is None else features.left
-        missing = config.features - len(taken)
+        missing, size = config.features - len(taken), (left.shape[1], left.shape[0])
         if features is not None and len(taken) >= config.refill * config.features:
             return 0
         found, _ = corners(left, config)
         found = found[away_from(found, taken, config.spacing) & away_from(found, self._hopeless, 2.0)]
-        size = (left.shape[1], left.shape[0])
+        found = found[self._inside(0, found, size, config.border)]
         found = found[spread(found, taken, size, missing, config.buckets)]
         paired, good = first_pairs(left, right, found, self.rotation.row_offset(found), config)
+        good &= self._inside(1, paired, size, config.template // 2)
         self.refused += int((~good).sum())
         self._hopeless = found[~good]
         new = self._started(found[good], paired[good], left, right)

@@ -16,7 +16,7 @@ from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera, project, rectified_jacobian, triangulate
 
 _ITERATIONS = 12
-_CONVERGED = 1e-7  # m and rad
+_CONVERGED = 1e-5  # m and rad: a thousandth of a pixel
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -63,3 +65,20 @@ def _require_size(found: tuple[int, int], source: str, wanted: tuple[int, int] |
         raise CalibrationError(
             f"the image has {found[0]} x {found[1]} pixels, the calibration {wanted[0]} x {wanted[1]}", source=source
         )
+
+
+@dataclass(frozen=True)
+class PairFiles:
+    """Files of image pairs: `ImageRecording.load` of what lies in folders.
+
+    Args:
+        left, right: Path of each frame's image.
+        size: Width and height that all must have.
+    """
+
+    left: Sequence[Path]
+    right: Sequence[Path]
+    size: tuple[int, int]
+
+    def __call__(self, frame: int) -> tuple[Image, Image]:
+        return read_gray(self.left[frame], self.size), read_gray(self.right[frame], self.size)
