@@ -44,6 +44,8 @@ _LARGEST_VELOCITY, _LARGEST_DISTANCE_M, _LARGEST_PX = 1e6, 1e9, 1e7
 
 # Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
+# Among those of one whose tracks are compared with their first sight in every frame, so that their errors do not walk.
+CHECKED_TRACKS = {"tracks": "checked"}
 # Among the attributes of one whose velocities nobody measured; they are 0 then, and mean nothing.
 WITHOUT_VELOCITIES = {"velocities": "none"}
 
@@ -211,6 +213,11 @@ class Sequence:
     def interpolated(self) -> BoolArray:
         """Which intervals (T,) have velocities, and probably true poses, that were never measured."""
         return known_intervals(self.attributes, self.twist)
+
+    @property
+    def has_checked_tracks(self) -> bool:
+        """Whether errors of its tracks do not walk, see `ekfslam.frontend`."""
+        return self.attributes.get("tracks") == CHECKED_TRACKS["tracks"]
 
     @property
     def has_velocities(self) -> bool:

@@ -67,5 +67,5 @@ class FrontEndConfig:
     samples: int = 200
     rotation_deg: float = 0.1
     rotation_gap: int = 4
-    settling: int = 10
+    settling: int = 20
     seed: int = 0

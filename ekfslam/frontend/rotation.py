@@ -20,7 +20,7 @@ from ekfslam.geometry.stereo_motion import Alignment
 
 # What frames say is worth so much of what it would be worth if their errors were independent. Successive frames see the
 # same features with the same errors: the standard deviation of yaw came out five to ten times too small.
-_INDEPENDENT_SHARE = 0.02
+_INDEPENDENT_SHARE = 0.04
 _ROBUST_PX = 1.0
 _LEAST_POINTS = 10
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.images.pairs import ImageRecording
-from ekfslam.data.sequence import WITHOUT_VELOCITIES, Observations, Sequence
+from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations, Sequence
 from ekfslam.errors import EmptyTracksError
 from ekfslam.frontend.config import FrontEndConfig
 from ekfslam.frontend.opencv import one_thread
@@ -164,4 +164,4 @@ def _account(config: FrontEndConfig, report: TrackReport) -> dict[str, str | int
     names = ("pitch", "yaw", "roll")
     found = {f"right_camera_{name}_px": float(value) for name, value in zip(names, yaw, strict=True)}
     found |= {f"right_camera_{name}_std_px": float(value) for name, value in zip(names, std, strict=True)}
-    return {"front_end": "stereo", **settings, **found}
+    return {**CHECKED_TRACKS, **settings, **found}
