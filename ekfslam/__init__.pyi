@@ -4,15 +4,19 @@ from .config import (
     CalibrationConfig,
     Config,
     FilterConfig,
+    FrontEndConfig,
     HygieneConfig,
     NoiseConfig,
     PosteriorConfig,
     TruthConfig,
 )
-from .data.readers import open_sequence, write_sequence
+from .data.images import ImageRecording, open_images
+from .data.readers import write_sequence
 from .data.sequence import Sequence
 from .errors import EkfslamError
 from .filters.result import Result
+from .frontend.opening import open_sequence
+from .frontend.track import TrackReport, track
 from .reports import Comparison, check, check_consistency, compare
 from .runner import run
 from .smoother.posterior import Posterior, posterior, smooth
@@ -31,23 +35,28 @@ __all__ = [
     "Config",
     "EkfslamError",
     "FilterConfig",
+    "FrontEndConfig",
     "HygieneConfig",
+    "ImageRecording",
     "NoiseConfig",
     "Posterior",
     "PosteriorConfig",
     "Result",
     "Sequence",
     "Study",
+    "TrackReport",
     "TruthConfig",
     "TunedNoise",
     "check",
     "check_consistency",
     "compare",
+    "open_images",
     "open_sequence",
     "posterior",
     "read_archive",
     "run",
     "smooth",
+    "track",
     "tune",
     "write_archive",
     "write_sequence",

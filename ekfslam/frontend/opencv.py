@@ -19,7 +19,7 @@ def opencv() -> Any:
         import cv2
     except ImportError as error:
         raise MissingPackageError(
-            f"tracks are made from images with OpenCV, which cannot be imported ({error}): pip install 'ekfslam[images]'"
+            f"images are tracked with OpenCV, which cannot be imported ({error}): pip install 'ekfslam[images]'"
         ) from None
     return cv2
 

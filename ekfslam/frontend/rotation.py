@@ -46,7 +46,7 @@ class RightRotation:
 
     @property
     def rows(self) -> Array:
-        return np.linalg.solve(self._rows_information, self._rows_vector)
+        return np.asarray(np.linalg.solve(self._rows_information, self._rows_vector), dtype=float)
 
     @property
     def yaw(self) -> float:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
+from ekfslam.config import FrontEndConfig
 from ekfslam.data.images.pairs import ImageRecording
 from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations, Sequence
 from ekfslam.errors import EmptyTracksError
-from ekfslam.frontend.config import FrontEndConfig
 from ekfslam.frontend.opencv import one_thread
 from ekfslam.frontend.rectify import rectification
 from ekfslam.frontend.rotation import correction
@@ -125,7 +125,7 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
         name=recording.name,
         source=recording.source,
         time_s=recording.time_s,
-        twist=recording.twist if has_velocities else np.zeros((len(recording), 6)),
+        twist=np.zeros((len(recording), 6)) if recording.twist is None else recording.twist,
         camera=rectified.camera,
         T_cam_imu=T_cam_imu,
         observations=observations,
@@ -152,13 +152,10 @@ def _prediction(recording: ImageRecording, T_cam_imu: Array, k: int) -> Array | 
 
 def _account(config: FrontEndConfig, report: TrackReport) -> dict[str, str | int | float]:
     """Attributes that say how the tracks were made."""
-    changed = {
-        field.name: getattr(config, field.name)
-        for field in dataclasses.fields(config)
-        if getattr(config, field.name) != field.default
-    }
     settings = {
-        f"frontend_{name}": value if isinstance(value, int | float) else str(value) for name, value in changed.items()
+        f"front_end_{setting.name}": getattr(config, setting.name)
+        for setting in dataclasses.fields(config)
+        if getattr(config, setting.name) != setting.default
     }
     yaw, std = report.rotation_px[-1], report.rotation_std_px[-1]
     names = ("pitch", "yaw", "roll")

@@ -46,14 +46,15 @@ def stereo_odometry(sequence: Sequence) -> Array:
     for k in range(1, len(sequence)):
         (ids, before), (ids_now, now) = observations.at(k - 1), observations.at(k)
         _, i, j = np.intersect1d(ids, ids_now, assume_unique=True, return_indices=True)
-        rows = [rectified_rows(pixels, np.ones(4))[0] for pixels in (before[i], now[j])]
-        has_depth = np.min([row[:, 0] - row[:, 2] for row in rows], axis=0) >= _LEAST_DISPARITY_PX
-        rows = [row[has_depth] for row in rows]
-        if len(rows[0]) < _LEAST_POINTS:
+        rows, rows_now = (rectified_rows(pixels, np.ones(4))[0] for pixels in (before[i], now[j]))
+        disparity = np.minimum(rows[:, 0] - rows[:, 2], rows_now[:, 0] - rows_now[:, 2])
+        rows, rows_now = (some[disparity >= _LEAST_DISPARITY_PX] for some in (rows, rows_now))
+        if len(rows) < _LEAST_POINTS:
             continue
-        found = None if guess is None else align(camera, *rows, guess)
+        found = None if guess is None else align(camera, rows, rows_now, guess)
         if found is None or agrees(found, _AGREE_PX).mean() < _AGREE_SHARE:
-            found = align(camera, *rows, sampled_motion(camera, *rows, generator, _SAMPLES, _AGREE_PX))
+            start = sampled_motion(camera, rows, rows_now, generator, _SAMPLES, _AGREE_PX)
+            found = align(camera, rows, rows_now, start)
         guess = found.T_now_before
         tau_s = float(sequence.time_s[k] - sequence.time_s[k - 1])
         twist[k], is_known[k] = -se3.log(se3.inverse(C) @ guess @ C) / tau_s, True
