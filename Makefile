@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-whole lint results setup clean
+.PHONY: demo test test-whole check lint results setup clean
 
 demo: $(READY)
 	$(BIN)/ekfslam compare builtin:city --out results/local
@@ -16,6 +16,10 @@ test: $(READY)
 # The slow tests at their full length, about an hour on two cores.
 test-whole: $(READY)
 	OPENBLAS_NUM_THREADS=1 EKFSLAM_TESTS=whole $(BIN)/python -m pytest
+
+# Form, types and the fast tests: before every commit.
+check: lint
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow and not data"
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -40,6 +40,7 @@ OBSERVATIONS = (30, 60, 120, 250, 500, 1000)
 FORMS = ("dense", "conditional")
 DENSE_LIMIT = 500  # beyond it the dense form runs once, and over fewer frames
 WHITE: dict[str, dict[str, Any]] = {"noise": {"model": "white"}, "filter": {"relative_frames": 0}}
+XYZ: dict[str, dict[str, Any]] = {**WHITE, "filter": {"relative_frames": 0, "landmark_coordinates": "xyz"}}
 AUTOMATIC: dict[str, dict[str, Any]] = {"filter": {"relative_frames": 0}}
 
 
@@ -125,14 +126,18 @@ def race(data: Path, files: tuple[str, ...], repeat: int) -> list[dict[str, Any]
         runs = in_turn(
             {
                 "white": partial(milliseconds, sequence, WHITE),
+                "white, xyz": partial(milliseconds, sequence, XYZ),
                 "automatic": partial(milliseconds, sequence, AUTOMATIC),
                 "iSAM2": isam,
                 "iSAM2 with covariance": partial(isam, pose_covariance=True),
             },
             repeat,
         )
-        found = {name: [float(ms.sum()) / 1e3 for ms in all_ms] for name, all_ms in runs.items()}
-        row = {"name": sequence.name, "frames": len(sequence), **{name: median(s) for name, s in found.items()}}
+        row = {"name": sequence.name, "frames": len(sequence)}
+        for name, all_ms in runs.items():
+            ms = np.median(all_ms, axis=0)
+            spread = {"median": float(np.median(ms)), "p95": float(np.percentile(ms, 95)), "max": float(ms.max())}
+            row[name] = {"s": median(float(ms.sum()) / 1e3 for ms in all_ms), **spread}
         rows.append({**row, "ate_m": trajectory_errors(sequence, white.T_world_imu)["ate_m"]})
         print(rows[-1], flush=True)
     return rows
@@ -196,24 +201,32 @@ def tables(found: dict[str, Any]) -> str:
         markdown_table(["landmarks out of view", "lap 1", "lap 2", "lap 3", "3 / 2", "longest / median frame"], laps),
     ]
     if found["race"]:
-        names = ("white", "automatic", "iSAM2", "iSAM2 with covariance")
-        race_rows = [
-            [
-                row["name"],
-                *(f"{row[name]:.2f}" for name in names),
-                *(f"{row[other] / row['white']:.1f}" for other in names[2:]),
-                *(f"{row[other] / row['automatic']:.1f}" for other in names[2:]),
-            ]
-            for row in found["race"]
-        ]
-        ratios = np.array([[float(cell) for cell in row[5:]] for row in race_rows])
-        race_rows.append(["median", "", "", "", "", *(f"{value:.1f}" for value in np.median(ratios, axis=0))])
-        header = ["drive", *(f"{name} s" for name in names), "iSAM2 / white", "with covariance"]
-        parts += [
-            "Total seconds on the recordings, joint filter (white noise; automatic model) and iSAM2:",
-            markdown_table([*header, "iSAM2 / automatic", "with covariance / automatic"], race_rows),
-        ]
+        parts += race_tables(found["race"])
     return document("# Benchmark", *parts)
+
+
+def race_tables(rows: list[dict[str, Any]]) -> list[str]:
+    """Total seconds and ratios on the recordings, and the spread of a frame."""
+    ours, theirs = ("white", "white, xyz", "automatic"), ("iSAM2", "iSAM2 with covariance")
+    totals, ratios, spreads = [], [], []
+    for row in rows:
+        pairs = [(them, us) for us in ours for them in theirs]
+        ratios.append([row[them]["s"] / row[us]["s"] for them, us in pairs])
+        totals.append([row["name"], *(f"{row[name]['s']:.2f}" for name in ours + theirs)])
+        totals[-1] += [f"{ratio:.1f}" for ratio in ratios[-1]]
+        spreads.append([row["name"]])
+        for name in ours + theirs:
+            ms = row[name]
+            spreads[-1].append(f"{ms['median']:.1f} ({ms['p95'] / ms['median']:.1f}, {ms['max'] / ms['median']:.1f})")
+    totals.append(["median", *[""] * len(ours + theirs), *(f"{ratio:.1f}" for ratio in np.median(ratios, axis=0))])
+    header = [f"{them} / {us}" for us in ours for them in theirs]
+    return [
+        "Total seconds on the recordings, of the joint filter (white noise with landmarks in image coordinates; the "
+        "same in xyz; automatic model) and of iSAM2, without and with its pose covariance in each frame; and ratios:",
+        markdown_table(["drive", *(f"{name} s" for name in ours + theirs), *header], totals),
+        "A frame: median in ms (95 % and longest in medians):",
+        markdown_table(["drive", *ours, *theirs], spreads),
+    ]
 
 
 def main() -> None:

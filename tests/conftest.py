@@ -25,12 +25,18 @@ def seeds(whole: int, reduced: int) -> range:
 
 @pytest.fixture
 def data_path() -> Callable[[str], Path]:
-    """A function from the name of a recording (``ece276a/0027.npz``) to its path; skips the test where it is absent."""
+    """A function from the name of a recording (``ece276a/0027.npz``) to its path; skips the test where it is absent.
 
-    def find(name: str) -> Path:
-        path = DATA / name
-        if not path.exists():
-            pytest.skip(f"recording {path} is absent; set $EKFSLAM_DATA to the folder of the recordings")
-        return path
+    Where tests decide (``CI`` in the environment), an absent recording is a failure.
+    """
 
-    return find
+    return recording
+
+
+def recording(name: str) -> Path:
+    """The path of a recording, as of `data_path`."""
+    path = DATA / name
+    if not path.exists():
+        missing = f"recording {path} is absent; set $EKFSLAM_DATA to the folder of the recordings"
+        pytest.fail(missing) if os.environ.get("CI") else pytest.skip(missing)
+    return path

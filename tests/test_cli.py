@@ -250,3 +250,10 @@ def test_compare_goes_on_without_a_posterior_that_is_ill_posed(tmp_path, capsys)
     assert "No smoothed: the posterior is ill-posed: velocities without noise" in capsys.readouterr().out
     assert "No smoothed" in (tmp_path / "city" / "summary.md").read_text()
     assert list(read_archive(tmp_path / "city" / "archive.h5").results) == ["dead-reckoning", "mapping-only", "full"]
+
+
+def test_info_says_which_kernels_run(capsys):
+    assert main(["info", "--build"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[:2] in (["kernels", "compiled,"], ["kernels", "plain,"])
+    assert any(line.split()[0] == "BLAS" for line in lines)

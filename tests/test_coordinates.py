@@ -14,11 +14,12 @@ from ekfslam.config import CalibrationConfig, FilterConfig
 from ekfslam.data.sequence import Noise
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError
-from ekfslam.filters.coordinates import CameraCoordinates, image, image_jacobian
+from ekfslam.filters.coordinates import CameraCoordinates
 from ekfslam.filters.gaussian import Rows
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
+from ekfslam.kernels.plain import image, image_jacobian
 from ekfslam.models.build import model_of
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig

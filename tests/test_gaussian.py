@@ -7,6 +7,7 @@ from ekfslam.errors import InnovationError
 from ekfslam.filters import dormant
 from ekfslam.filters.conditional import ConditionalGaussian
 from ekfslam.filters.dense import DenseGaussian, add_square
+from ekfslam.filters.gates import agrees_with_others, most_given_others
 from ekfslam.filters.gaussian import Rows
 from ekfslam.filters.landmarks import LandmarkTable
 
@@ -114,6 +115,10 @@ def same(gaussian, naive, scale=1e-9):
         np.testing.assert_allclose(gaussian.landmark_blocks()[2], gaussian.landmark_blocks(slot)[0])
 
 
+def _by_landmark(gaussian, solution):
+    return solution.done.correction[gaussian.body :].reshape(-1, 3)
+
+
 def condition(rng, gaussian, naive, slots, out):
     """Condition both on rows, of which some are taken out again; everything a solution says is compared."""
     rows, d = rows_of(rng, slots), 3
@@ -127,9 +132,15 @@ def condition(rng, gaussian, naive, slots, out):
     before = gaussian.P.copy()
     solution = gaussian.solve(projection, 0, ids)
     inverse, std = np.linalg.inv(S), np.sqrt(rows.variance)
-    for i, C in enumerate(solution.given_others()):
-        own = slice(i * d, i * d + d)
-        np.testing.assert_allclose(C, inverse[own, own] * np.outer(std[i], std[i]), atol=1e-9)
+    left = rows.corrected(solution.done.correction[: gaussian.seen], _by_landmark(gaussian, solution))
+    bound = most_given_others(left, projection.variances + np.eye(d) * rows.variance[:, :, None])
+    for which in (np.arange(len(slots)), np.arange(len(slots))[::-2][:1]):
+        blocks = solution.given_others(which)
+        for i, C in zip(which, blocks, strict=True):
+            own = slice(i * d, i * d + d)
+            np.testing.assert_allclose(C, inverse[own, own] * np.outer(std[i], std[i]), atol=1e-9)
+        squares, _ = agrees_with_others(left.only(which), blocks)
+        assert (squares <= bound[which] * (1 + 1e-9)).all()
     out = np.isin(np.arange(len(slots)), out)
     if out.any():
         solution = solution.without(out)

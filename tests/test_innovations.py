@@ -8,7 +8,8 @@ from ekfslam.data.simulate import builtin
 from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.gates import diagonal
 from ekfslam.filters.gaussian import Rows
-from ekfslam.filters.innovations import innovations_of, whitened
+from ekfslam.filters.innovations import innovations_of
+from ekfslam.kernels import whitened
 from ekfslam.runner import run
 
 LANDMARKS, SEEN, BODY, D = 7, 12, 15, 3

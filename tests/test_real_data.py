@@ -5,7 +5,7 @@ import functools
 
 import numpy as np
 import pytest
-from conftest import DATA, WHOLE, seeds
+from conftest import WHOLE, recording, seeds
 
 from ekfslam import open_sequence, run, smooth
 from ekfslam.evaluation.summary import summarise
@@ -48,11 +48,9 @@ def drives():
 @functools.cache
 def summaries_of_the_drives():
     """Summaries of full SLAM, smoothed and dead reckoning on the UTIAS drives, each run once."""
-    if not DATA.is_dir():
-        pytest.skip(f"recordings are absent from {DATA}; set $EKFSLAM_DATA")
     found = []
     for name in DRIVES:
-        sequence = open_sequence(DATA / f"utias/2011_{name}_sync_KLT.mat")[:FRAMES]
+        sequence = open_sequence(recording(f"utias/2011_{name}_sync_KLT.mat"))[:FRAMES]
         full = run(sequence, "full")
         results = {"full": full, "smoothed": smooth(full), "dead-reckoning": run(sequence, "dead-reckoning")}
         found.append({mode: summarise(sequence, result) for mode, result in results.items()})

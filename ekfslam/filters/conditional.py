@@ -25,11 +25,12 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import blas, lapack
 
+from ekfslam import kernels
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import InnovationError
 from ekfslam.filters.dense import transform, transform_part
 from ekfslam.filters.dormant import Dormant
-from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, share_of
+from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution
 from ekfslam.filters.window import Push, Window
 
 
@@ -53,10 +54,7 @@ class ConditionalProjection(Projection):
 
     @cached_property
     def variances(self) -> Array:
-        square = self.L @ (self.T @ self.T.swapaxes(1, 2) + np.eye(self.L.shape[1])) @ self.L.swapaxes(1, 2)
-        diagonal = np.arange(self.L.shape[1])
-        square[:, diagonal, diagonal] -= self.rows.variance
-        return square
+        return kernels.own_variances(self.L, self.T, self.rows.variance)
 
     def only(self, which: IntArray) -> ConditionalProjection:
         return ConditionalProjection(self.rows.only(which), self.L[which], self.B[which], self.T[which], self.G[which])
@@ -98,13 +96,6 @@ class ConditionalSolution(Solution):
         return blas.dtrsm(1.0, self.U, self.gaussian.root, side=1, lower=0)
 
     @cached_property
-    def Z(self) -> Array:
-        """(k d, f) ``T U^-1`` of all rows."""
-        T = self.at.T.reshape(-1, self.at.T.shape[2])
-        # A row-major T is LAPACK's T^T, and Z^T = U^-T T^T.
-        return blas.dtrsm(1.0, self.U, T.T, lower=0, trans_a=1).T
-
-    @cached_property
     def x(self) -> Array:
         """(n_X,) correction of X."""
         return self.W @ self.u
@@ -121,12 +112,11 @@ class ConditionalSolution(Solution):
         nis = float((w**2).sum() - self.u @ self.u)
         return Conditioned(self.gaussian.correction(self), nis, log_det)
 
-    def given_others(self) -> Array:
-        k, d = self.w.shape
-        Z = self.Z.reshape(k, d, -1)
-        L_inverse = np.linalg.inv(self.at.L)
-        blocks = L_inverse.swapaxes(1, 2) @ (np.eye(d) - Z @ Z.swapaxes(1, 2)) @ L_inverse
-        return share_of(blocks, self.at.rows.variance)
+    def given_others(self, which: IntArray) -> Array:
+        T = self.at.T[which]
+        # A row-major T is LAPACK's T^T, and Z^T = U^-T T^T.
+        Z = blas.dtrsm(1.0, self.U, T.reshape(-1, T.shape[2]).T, lower=0, trans_a=1).T
+        return kernels.given_others(self.at.L[which], Z.reshape(T.shape), self.at.rows.variance[which])
 
     def without(self, out: BoolArray) -> ConditionalSolution:
         return self.gaussian.solve_left(replace(self, left=self.left & ~out))
@@ -293,7 +283,7 @@ class ConditionalGaussian(Gaussian):
             self._window.refer(slice(0, self.body - self.considered))
         kept = np.delete(np.arange(self.width), leaving)
         self._window.keep(kept)
-        self._K, self._P_c = self._K[..., kept], self._P_c[:, kept]
+        self._K, self._P_c = self._K.take(kept, axis=2), self._P_c[:, kept]
         self._P, self._root = self._P[np.ix_(kept, kept)], None
 
     def transform_body(self, at: slice, A: Array) -> None:
@@ -308,20 +298,13 @@ class ConditionalGaussian(Gaussian):
 
     def project(self, rows: Rows, frame: int, ids: IntArray) -> ConditionalProjection:
         k, d = rows.residual.shape
-        row = self._row[rows.slot]
-        S_H = self._S[row] @ rows.H_m.swapaxes(1, 2)
-        R = rows.H_m @ S_H
-        R[:, np.arange(d), np.arange(d)] += rows.variance
         try:
-            L = np.asarray(np.linalg.cholesky(R), dtype=float)
+            L, B, G = kernels.whiten(self._K, self._S, self._row[rows.slot], rows.H_x, rows.H_m, rows.variance)
         except np.linalg.LinAlgError:
             raise InnovationError(frame, ids) from None
-        L_inverse = np.linalg.inv(L)
-        B = (L_inverse @ rows.H_m) @ self._K[row]
-        B[..., : self.seen] += L_inverse @ rows.H_x
         F = self.root
         T = (B.reshape(k * d, self.width) @ F).reshape(k, d, F.shape[1])
-        return ConditionalProjection(rows, L, B, T, S_H @ L_inverse.swapaxes(1, 2))
+        return ConditionalProjection(rows, L, B, T, G)
 
     def solve(self, projection: Projection, frame: int, ids: IntArray) -> ConditionalSolution:
         assert isinstance(projection, ConditionalProjection)
@@ -378,9 +361,7 @@ class ConditionalGaussian(Gaussian):
             self._P_c = self._P_c - blas.dtrsm(1.0, solution.U, along @ solution.T, side=1, lower=0) @ W.T
         self._P, self._root = W @ W.T, None
         if at.G.shape[1]:
-            row, G = self._row[at.rows.slot[left]], at.G[left]
-            self._K[row] -= G @ at.B[left]
-            self._S[row] = _symmetric(self._S[row] - G @ G.swapaxes(1, 2))
+            kernels.correct(self._K, self._S, self._row[at.rows.slot], at.B, at.G, np.flatnonzero(left))
             self._window.refer(np.flatnonzero(at.rows.H_x[left].any(axis=(0, 1))))
 
     # --- landmarks ----------------------------------------------------------------------------------------------------
@@ -461,10 +442,7 @@ class ConditionalGaussian(Gaussian):
                 P_c = (M_own @ P_c.T.reshape(len(B_own), 3, len(P_c))).reshape(len(own), len(P_c)).T
             self._P_c[:, own] = P_c + self._P_c[:, columns] @ flat.T
             self._dormant.transform_promoted(own, M_own, flat, columns)
-        if M is not None:
-            self._K[row] = M @ self._K[row]
-            self._S[row] = _symmetric(M @ self._S[row] @ M.swapaxes(1, 2))
-        self._K[row[:, None, None], np.arange(3)[:, None], columns] += B
+        kernels.change(self._K, self._S, row, M, B, columns)
         _promote(self._K, row[is_promoted], first[is_promoted])
 
     def replace(self, P: Array) -> None:

@@ -16,6 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ekfslam import kernels
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import Values
@@ -110,12 +111,7 @@ class CameraCoordinates:
         """
         q, xi = before.q, before.by_columns @ x[self.columns]
         step = xi[:3] + q @ se3.skew(xi[3:]).T + d @ before.R_linear.T
-        in_image = self._is_in_image(q)
-        front = np.where(in_image[:, None], q, _AHEAD)
-        y = image(front)
-        y_after = y + (image_jacobian(front) @ step[..., None])[..., 0]
-        in_image &= (y_after[:, 2] > y[:, 2] / _LARGEST_FACTOR) & (y_after[:, 2] < y[:, 2] * _LARGEST_FACTOR)
-        q_after = np.where(in_image[:, None], image(np.where(in_image[:, None], y_after, _AHEAD)), q + step)
+        q_after, in_image = kernels.moved_by_image(q, step, self._is_in_image(q), _LARGEST_FACTOR)
         return se3.apply(se3.inverse(self._T_cam_imu(after) @ after[self.pose]), q_after), in_image
 
     def change(self, slot: IntArray, before: View, after: View, in_image: BoolArray, turned: Array) -> Change:
@@ -127,17 +123,14 @@ class CameraCoordinates:
             in_image: (n,) which landmarks count by their images.
             turned: (6, 6) how the error of the pose before becomes that after.
         """
-        # The image is its own inverse: its derivative at an image is the inverse of that at the point.
-        J = image_jacobian(np.where(in_image[:, None], before.q, _AHEAD))
-        J_inverse_after = image_jacobian(image(np.where(in_image[:, None], after.q, _AHEAD)))
-        J = np.where(in_image[:, None, None], J_inverse_after @ J, np.eye(3))
         by_after = after.by_columns.copy()
         by_after[:, :6] = by_after[:, :6] @ turned
-        minus_one = np.broadcast_to(-np.eye(3), J.shape)
-        by_camera = [J, -J @ se3.skew(before.q_linear), minus_one, se3.skew(after.q_linear)]
-        B = np.concatenate(by_camera, axis=-1) @ np.concatenate([before.by_columns, by_after])
-        back = after.R_linear.T
-        return Change(slot, self.columns, back @ B, back @ J @ before.R_linear)
+        B, M = kernels.change_by_image(
+            (before.q, before.q_linear, before.R_linear, before.by_columns),
+            (after.q, after.q_linear, after.R_linear, by_after),
+            in_image,
+        )
+        return Change(slot, self.columns, B, M)
 
     @cached_property
     def columns(self) -> IntArray:
@@ -162,20 +155,4 @@ class CameraCoordinates:
         return is_ahead & (z > self.min_depth_m) & (z < furthest_m)
 
 
-# Stands for points whose image is not asked for.
-_AHEAD = np.array([0.0, 0.0, 1.0])
 _GIVEN = np.zeros(9)
-
-
-def image(q: Array) -> Array:
-    """``(x/z, y/z, 1/z)`` of points (..., 3); its own inverse."""
-    return np.concatenate([q[..., :2], np.ones_like(q[..., 2:])], axis=-1) / q[..., 2:]
-
-
-def image_jacobian(q: Array) -> Array:
-    """Derivative (..., 3, 3) of `image` by the points."""
-    y = image(q)
-    J = np.zeros((*q.shape, 3))
-    J[..., 0, 0] = J[..., 1, 1] = y[..., 2]
-    J[..., 2] = -y * y[..., 2:]
-    return J

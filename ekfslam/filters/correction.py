@@ -64,14 +64,14 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     some, tried = _gate_alone(e, frame, rows, seen, verdict, gate)
     innovations, solution = FrameInnovations.none(e.sensor.dimension), None
     if len(some):
-        S = tried.variances + gates.diagonal(tried.rows.variance)
         if e.model.has_time_offset and e.tau_s:
             e.imu_twist = _seen_twist(e, frame, tried)
             _, rows = e.observe(slot, measured)
             tried = e.gaussian.project(rows.only(some), frame, e.ids[slot[some]])
+        S = tried.variances + gates.diagonal(tried.rows.variance)
         solution = e.gaussian.solve(tried, frame, e.ids[slot[some]])
         left = tried.rows.corrected(*e.parts(solution.done.correction))
-        verdict[some] = _gate_by_others(e, solution, left, seen, some, gate)
+        verdict[some] = _gate_by_others(e, solution, left, S, seen, some, gate)
         inside = verdict[some] == ACCEPTED
         accepted = tried.rows
         if not inside.all():
@@ -131,19 +131,28 @@ def _own_variance(tried: Projection) -> Array:
     return np.diagonal(tried.variances, axis1=1, axis2=2) + tried.rows.variance
 
 
-def _gate_by_others(e: Estimate, solution: Solution, left: Rows, seen: Seen, some: IntArray, gate: float) -> IntArray:
+def _gate_by_others(
+    e: Estimate, solution: Solution, left: Rows, S: Array, seen: Seen, some: IntArray, gate: float
+) -> IntArray:
     """Verdicts (j,) on landmarks by what all others of the frame say.
 
     Args:
         solution: Of eq. (6) for the rows (j).
         left: The rows with the residuals that the correction leaves.
+        S: (j, d, d) of each by itself, before the conditioning.
         seen: What all landmarks (k,) look like, of which these are ``some`` (j,).
     """
     verdict, judges_motion = np.full(len(some), ACCEPTED), _judges_motion(e) and e.model.has_twist
-    if np.isfinite(gate) or judges_motion:
-        C = solution.given_others()
+    if not (np.isfinite(gate) or judges_motion):
+        return verdict
+    doubtful = np.arange(len(some))
+    if not judges_motion:
+        doubtful = np.flatnonzero(~(gates.most_given_others(left, S) <= gate))
+        left = left.only(doubtful)
+    if len(doubtful):
+        C = solution.given_others(doubtful)
         squares, judged = gates.agrees_with_others(left, C)
-        verdict[squares > gate] = GATE
+        verdict[doubtful[squares > gate]] = GATE
         if judges_motion:
             # Noisy velocities would accuse all tracks of a frame alike: only what others leave counts.
             evidence = gates.evidence_given_others(left, C, _motion(e, seen, some))

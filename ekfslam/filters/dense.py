@@ -13,7 +13,7 @@ from scipy.linalg import blas, lapack
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import InnovationError
-from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution, share_of
+from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution
 
 # Rows that are mirrored at once.
 _BLOCK = 128
@@ -76,11 +76,17 @@ class DenseSolution(Solution):
         correction[self.body - self.considered : self.body] = 0.0
         return Conditioned(correction, float(self.white @ self.white), self.log_det)
 
-    def given_others(self) -> Array:
-        inverse, _ = lapack.dtrtri(self.L, lower=1)
+    def given_others(self, which: IntArray) -> Array:
         k, d = self.shape
-        columns = np.tril(inverse).T.reshape(k, d, k * d)
-        return share_of(columns @ columns.swapaxes(1, 2), self.variance.reshape(k, d))
+        if 3 * len(which) < k:
+            E = np.zeros((k * d, len(which) * d))
+            E[(d * which[:, None] + np.arange(d)).ravel(), np.arange(E.shape[1])] = 1.0
+            columns = blas.dtrsm(1.0, self.L, E, lower=1).T.reshape(len(which), d, k * d)
+        else:
+            inverse, _ = lapack.dtrtri(self.L, lower=1)
+            columns = np.tril(inverse).T.reshape(k, d, k * d)[which]
+        std = np.sqrt(self.variance.reshape(k, d)[which])
+        return (columns @ columns.swapaxes(1, 2)) * (std[:, :, None] * std[:, None, :])
 
     def without(self, out: BoolArray) -> DenseSolution:
         assert self.Q is None

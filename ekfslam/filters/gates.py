@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammaincinv
 
+from ekfslam import kernels
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import InnovationError
 from ekfslam.filters.gaussian import Rows
@@ -12,9 +13,6 @@ from ekfslam.filters.landmarks import LandmarkTable
 
 # Observations of a landmark after which it may be found to move.
 SEEN_TO_MOVE = 3
-
-# Smallest share of an observation's variance that must be left after the update for the second gate to mean anything.
-_LEAST_SHARE = 1e-6
 
 
 def threshold(probability: float, dimension: int) -> float:
@@ -34,13 +32,25 @@ def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> 
         InnovationError: A block of S is not positive definite; names the frame and the landmarks.
     """
     try:
-        L = np.linalg.cholesky(S)
+        return kernels.normalised_squares(S, residual)
     except np.linalg.LinAlgError:
         finite = np.isfinite(S).all(axis=(1, 2), keepdims=True)
         smallest = np.linalg.eigvalsh(np.where(finite, S, 0.0))[:, 0]
         raise InnovationError(frame, ids[smallest <= 0]) from None
-    whitened = np.linalg.solve(L, residual[..., None])[..., 0]
-    return np.einsum("ni,ni->n", whitened, whitened)
+
+
+def most_given_others(left: Rows, S: Array) -> Array:
+    """An upper bound (k,) of the squares of `agrees_with_others`: ``e_i^T V^-1 S_i V^-1 e_i``.
+
+    The others can only make an innovation more certain: ``((S^-1)_ii)^-1 <= S_i``. What passes the gate by this bound
+    needs no solution for all.
+
+    Args:
+        left: The rows with the residuals that the correction leaves.
+        S: (k, d, d) covariances of the innovations by themselves.
+    """
+    y = left.residual / left.variance
+    return np.einsum("ni,nij,nj->n", y, S, y)
 
 
 def agrees_with_others(left: Rows, C: Array) -> tuple[Array, BoolArray]:
@@ -58,12 +68,7 @@ def agrees_with_others(left: Rows, C: Array) -> tuple[Array, BoolArray]:
         The squares, and whether (k,) a landmark can be judged: where C is nothing but rounding, no other landmark says
         anything about it, and its square counts as 0.
     """
-    share, axes = np.linalg.eigh(C)
-    judged = share[:, 0] > _LEAST_SHARE
-    along = np.einsum("nji,nj->ni", axes, left.residual / np.sqrt(left.variance))
-    with np.errstate(over="ignore"):
-        squares = np.divide(along**2, share, out=np.zeros_like(along), where=judged[:, None]).sum(axis=1)
-    return squares, judged
+    return kernels.squares_given_others(C, left.residual, left.variance)
 
 
 def moves_along(

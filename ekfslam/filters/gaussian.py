@@ -10,8 +10,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 
-import numpy as np
-
 from ekfslam.arrays import Array, BoolArray, IntArray
 
 
@@ -85,8 +83,8 @@ class Solution(ABC):
         """What conditioning on the rows does."""
 
     @abstractmethod
-    def given_others(self) -> Array:
-        """``V^1/2 (S^-1)_ii V^1/2`` (k, d, d) of each landmark's rows, in units of their standard deviations.
+    def given_others(self, which: IntArray) -> Array:
+        """``V^1/2 (S^-1)_ii V^1/2`` (j, d, d) of the rows of some landmarks (j,), in their standard deviations.
 
         The innovation of landmark i given those of all *others* has covariance ``((S^-1)_ii)^-1``.
         """
@@ -221,9 +219,3 @@ class Gaussian(ABC):
         self.considered = 0
         self.replace(P)
         self.consider(columns)
-
-
-def share_of(blocks: Array, variance: Array) -> Array:
-    """``V^1/2 A_i V^1/2`` of blocks (k, d, d) and variances (k, d)."""
-    std = np.sqrt(variance)
-    return blocks * (std[:, :, None] * std[:, None, :])

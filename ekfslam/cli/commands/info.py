@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
-from ekfslam import hdf5
+from threadpoolctl import threadpool_info
+
+from ekfslam import hdf5, kernels
 from ekfslam.cli.options import DEFAULT_DATA, add_data_options, open_data, table
 from ekfslam.config import Config
 from ekfslam.data.interpolation import stretches
@@ -14,6 +16,7 @@ from ekfslam.data.tracks import inspect_tracks
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.models.build import build
 from ekfslam.models.noise import velocity_noise
+from ekfslam.runner import versions
 from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT
 from ekfslam.storage.archive import read_archive
 
@@ -22,10 +25,14 @@ EXAMPLES = ("info 0027.npz", "info results/local/city/archive.h5")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="FILE", help=f"default: {DEFAULT_DATA}")
+    parser.add_argument("--build", action="store_true", help="say instead which form of the kernels runs, and on what")
     add_data_options(parser)
 
 
 def command(options: argparse.Namespace) -> None:
+    if options.build:
+        _print_build()
+        return
     if _is_archive(options.data):
         archive = read_archive(options.data)
         print(f"{options.data}: archive of {archive.name}, {len(archive.time_s)} frames, from {archive.source}")
@@ -77,3 +84,13 @@ def command(options: argparse.Namespace) -> None:
 
 def _is_archive(data: str) -> bool:
     return not data.startswith(BUILTIN) and hdf5.format_of(data) == ARCHIVE_FORMAT
+
+
+def _print_build() -> None:
+    how = "compiled, C" if kernels.FORM == "compiled" else "plain, NumPy: not compiled, or EKFSLAM_KERNELS=plain is set"
+    print(f"kernels       {how}")
+    for name, version in versions().items():
+        print(f"{name.removeprefix('version_'):13s} {version}")
+    for library in threadpool_info():
+        if library["user_api"] == "blas":
+            print(f"BLAS          {library['internal_api']} {library['version']}, {library['num_threads']} threads")
