@@ -8,11 +8,11 @@ from pathlib import Path
 
 from ekfslam import files
 from ekfslam.config import VARIANTS, Config
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import WriteError
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.filters.result import Result
+from ekfslam.frontend.opening import open_sequence
 from ekfslam.storage.archive import Archive
 
 DEFAULT_DATA = "builtin:city"
@@ -92,7 +92,10 @@ def configured(options: argparse.Namespace) -> Config:
 
 
 def open_data(options: argparse.Namespace, data: str) -> Sequence:
-    return open_sequence(data, extrinsics=options.extrinsics, lateral=options.lateral, truth=options.truth)
+    settings = Config.from_toml(options.config).front_end if getattr(options, "config", None) else None
+    return open_sequence(
+        data, extrinsics=options.extrinsics, lateral=options.lateral, truth=options.truth, front_end=settings
+    )
 
 
 def require_ours(options: argparse.Namespace, path: Path, is_ours: Callable[[Path], bool]) -> None:

@@ -11,7 +11,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import FrontEndConfig
 from ekfslam.data.images.pairs import Image
 from ekfslam.frontend.detect import corners, eroded, spread, without
-from ekfslam.frontend.features import Features, follow
+from ekfslam.frontend.features import Features, Followed, follow
 from ekfslam.frontend.flow import inside
 from ekfslam.frontend.match import first_pairs
 from ekfslam.frontend.rotation import RightRotation, correction
@@ -23,6 +23,7 @@ from ekfslam.geometry.stereo_motion import Alignment, agrees, align, sampled_mot
 LEAST_DISPARITY_PX = 0.5  # with less, a track has no depth to be predicted by
 _LEAST_DEPTH_M = 0.1
 _AGREE_SHARE = 0.5  # of the points, below which the motion is sampled anew
+_FOUND_SHARE = 0.4  # of the features, below which another prediction is tried
 _FEW = 0.5  # share of the wanted features, below which new ones do not wait
 _L, _R = slice(0, 2), slice(2, 4)  # pixels of the left and the right image
 
@@ -84,7 +85,7 @@ class Tracker:
         motion, reported = None, np.empty(0, dtype=bool)
         guess = self._motion if prediction is None else prediction
         if self._images is not None:
-            rows = self._follow(left, right, guess)
+            rows = self._follow(left, right, prediction)
             motion, reported = self._agree(rows, guess)
             self._calibrate(reported, motion)
         fresh = self._refill(left, right)
@@ -99,15 +100,34 @@ class Tracker:
         v = 0.5 * (features.left[:, 1] + right[:, 1])
         return np.stack([features.left[:, 0], v, right[:, 0]], axis=1)
 
-    def _follow(self, left: Image, right: Image, guess: Array | None) -> Array:
-        """Find the features in the new images, drop those that are lost; rows (n, 3) before of the others."""
-        config, before = self.config, self._features
+    def _follow(self, left: Image, right: Image, prediction: Array | None) -> Array:
+        """Find the features in the new images, drop those that are lost; rows (n, 3) before of the others.
+
+        Where most are lost, the prediction may be wrong: then the last motion is tried, and none.
+        """
+        before, config = self._features, self.config
         assert before is not None and self._images is not None
         rows = self.rows(before)
-        expected = self._predicted(before, rows, np.eye(4) if guess is None else guess)
-        levels = config.levels + (guess is None)
-        now = follow(before, self._images, (left, right), expected, levels, config)
-        size, border = (left.shape[1], left.shape[0]), config.template // 2
+        best: tuple[Followed, BoolArray, dict[str, int]] | None = None
+        guesses = [guess for guess in (prediction, self._motion) if guess is not None]
+        for guess in (*guesses, None):
+            levels = config.levels + (guess is None)
+            expected = self._predicted(before, rows, np.eye(4) if guess is None else guess)
+            now = follow(before, self._images, (left, right), expected, levels, config)
+            kept, losses = self._tested(now, (left.shape[1], left.shape[0]))
+            if best is None or kept.sum() > best[1].sum():
+                best = now, kept, losses
+            if kept.sum() >= _FOUND_SHARE * len(rows):
+                break
+        assert best is not None
+        now, kept, losses = best
+        self.losses.update(losses)
+        self._features = replace(before, left=now.left, right=now.right).keep(kept)
+        return rows[kept]
+
+    def _tested(self, now: Followed, size: tuple[int, int]) -> tuple[BoolArray, dict[str, int]]:
+        """Which features (n,) pass all tests, and how many fail, by the first test that they fail."""
+        config, border = self.config, self.config.template // 2
         is_alike = (now.score_left >= config.template_score_left) & (now.score_right >= config.template_score_right)
         row_error = now.left[:, 1] - now.right[:, 1] - self.rotation.row_offset(now.left)
         tests = {
@@ -120,12 +140,11 @@ class Tracker:
             "rows differ": np.abs(row_error) < config.row_limit,
             "no depth": now.left[:, 0] - now.right[:, 0] >= LEAST_DISPARITY_PX,
         }
-        kept = np.ones(len(rows), dtype=bool)
+        kept, losses = np.ones(len(row_error), dtype=bool), {}
         for reason, passes in tests.items():
-            self.losses[reason] += int((kept & ~passes).sum())
+            losses[reason] = int((kept & ~passes).sum())
             kept &= passes
-        self._features = replace(before, left=now.left, right=now.right).keep(kept)
-        return rows[kept]
+        return kept, losses
 
     def _inside(self, side: int, pixels: Array, size: tuple[int, int], border: float) -> BoolArray:
         """Which pixels (n, 2) are where the left (0) or right (1) image shows something, off its border."""
