@@ -330,15 +330,15 @@ class FrontEndConfig:
     template_score_left: float = field(default=0.8, metadata=_BETWEEN_0_AND_1)
     template_score_right: float = field(default=0.7, metadata=_BETWEEN_0_AND_1)
     template_shift: float = field(default=2.0, metadata=_POSITIVE)
-    pixel_std: float = field(default=0.3, metadata=_PIXELS)
+    pixel_std: float = field(default=0.2, metadata=_PIXELS)
     kernel: float = field(default=2.0, metadata=_POSITIVE)
     residual_limit: float = field(default=2.0, metadata=_POSITIVE)
     strikes: int = field(default=2, metadata=_whole(1))
     residual_drop: float = field(default=10.0, metadata=_POSITIVE)
     samples: int = field(default=200, metadata=_whole(1, 100_000))
-    rotation_deg: float = field(default=0.1, metadata=_POSITIVE)
+    rotation_deg: float = field(default=0.2, metadata=_POSITIVE)
     rotation_gap: int = field(default=4, metadata=_whole(1, 100))
-    settling: int = field(default=20, metadata=_whole(0))
+    settling: int = field(default=30, metadata=_whole(0))
     seed: int = field(default=0, metadata=_whole(0))
 
 
