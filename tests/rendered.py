@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -155,8 +154,3 @@ def recording(frames: int, distorted: bool, rotation_rad: np.ndarray, seed: int 
         T_cam_imu=T_CAM_BODY,
         truth=Truth(np.arange(frames), T_world_body),
     )
-
-
-def with_velocities(made: ImageRecording) -> ImageRecording:
-    """The same recording with its true velocities."""
-    return dataclasses.replace(made, twist=drive(len(made)))
