@@ -102,7 +102,7 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
     observations, single = _observations(seen, rotation, rectified.camera, config.settling)
     if not len(observations):
         raise EmptyTracksError(
-            "no feature is seen in both images of two frames: are left and right swapped, or is max_disparity too small?",
+            "no feature is seen in both images of two frames: is left right, or max_disparity too small?",
             source=recording.source,
         )
     report = TrackReport(

@@ -109,7 +109,7 @@ def align(
     found = linearise(camera, before_px, now_px, T_now_before, before_px, std_px, scale)
     for _ in range(_ITERATIONS):
         # A whisper of a prior keeps the step finite where too few points are left.
-        xi = np.linalg.solve(found.information + 1e-6 * np.eye(6), found.gradient(found.H))
+        xi: Array = np.linalg.solve(found.information + 1e-6 * np.eye(6), found.gradient(found.H)).astype(float)
         T = se3.exp(xi) @ found.T_now_before
         found = linearise(camera, before_px, now_px, T, found.true_px, std_px, scale)
         if np.abs(xi).max() < _CONVERGED:
