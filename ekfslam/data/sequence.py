@@ -44,6 +44,8 @@ _LARGEST_VELOCITY, _LARGEST_DISTANCE_M, _LARGEST_PX = 1e6, 1e9, 1e7
 
 # Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
+# Among the attributes of one whose velocities nobody measured; they are 0 then, and mean nothing.
+WITHOUT_VELOCITIES = {"velocities": "none"}
 
 
 LEVEL_VELOCITIES_NOTE = (
@@ -77,7 +79,7 @@ class Observations:
             )
         order = np.lexsort((landmark, frame))
         for name, value in (("frame", frame), ("landmark", landmark), ("pixels_px", pixels)):
-            object.__setattr__(self, name, _frozen(value[order]))
+            object.__setattr__(self, name, frozen(value[order]))
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -113,9 +115,9 @@ class Truth:
 
     def __post_init__(self) -> None:
         for name, dtype in (("frame", np.int64), ("landmark", np.int64)):
-            object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=dtype)))
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=dtype)))
         for name in ("T_world_imu", "position_m"):
-            object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=float)))
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
 
 
 @dataclass(frozen=True)
@@ -152,14 +154,14 @@ class Sequence:
 
     def __post_init__(self) -> None:
         for name in ("time_s", "twist", "T_cam_imu"):
-            object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=float)))
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
         try:
             _validate(self)
         except DataError as error:
             if error.source:
                 raise
             raise type(error)(error.message, source=self.source, field=error.field, index=error.index) from None
-        object.__setattr__(self, "T_cam_imu", _frozen(se3.nearest_rigid(self.T_cam_imu)))
+        object.__setattr__(self, "T_cam_imu", frozen(se3.nearest_rigid(self.T_cam_imu)))
         object.__setattr__(self, "name", printable(self.name))
 
     def __len__(self) -> int:
@@ -211,6 +213,11 @@ class Sequence:
         return known_intervals(self.attributes, self.twist)
 
     @property
+    def has_velocities(self) -> bool:
+        """Whether its velocities were measured; else only cameras say how the rig moves."""
+        return self.attributes.get("velocities") != WITHOUT_VELOCITIES["velocities"]
+
+    @property
     def initial_T_world_imu(self) -> Array:
         """(4, 4) pose that estimates start from: the true first pose where it is known, identity elsewhere."""
         if self.truth is not None and len(self.truth.frame) and self.truth.frame[0] == 0:
@@ -218,7 +225,7 @@ class Sequence:
         return np.eye(4)
 
 
-def _frozen(array: NDArray) -> NDArray:
+def frozen(array: NDArray) -> NDArray:
     """The array, read-only, so that a frozen dataclass is frozen all through."""
     view = array.view()
     view.flags.writeable = False
@@ -282,21 +289,26 @@ def validate_camera(camera: StereoCamera) -> None:
         raise CalibrationError(f"stereo baseline must be positive, found {camera.baseline_m:g} m", field="baseline")
 
 
-def _validate(sequence: Sequence) -> None:
-    frames = len(sequence.time_s)
-    require_shape(sequence.time_s, (None,), "time_s")
-    if frames == 0:
+def validate_stamps(time_s: Array) -> None:
+    """Raise a `DataError` unless these are stamps (T,) of at least one frame that increase strictly."""
+    require_shape(time_s, (None,), "time_s")
+    if len(time_s) == 0:
         raise ShapeError("the sequence has no frames", field="time_s")
-    require_finite(sequence.time_s, "time_s")
-    steps = np.diff(sequence.time_s)
+    require_finite(time_s, "time_s")
+    steps = np.diff(time_s)
     if (steps <= 0).any():
         index = int(np.argmax(steps <= 0)) + 1
         kind = "duplicates" if steps[index - 1] == 0 else "is before"
         raise StampError(
-            f"stamp {sequence.time_s[index]:.6f} s {kind} its predecessor {sequence.time_s[index - 1]:.6f} s",
+            f"stamp {time_s[index]:.6f} s {kind} its predecessor {time_s[index - 1]:.6f} s",
             field="time_s",
             index=index,
         )
+
+
+def _validate(sequence: Sequence) -> None:
+    frames = len(sequence.time_s)
+    validate_stamps(sequence.time_s)
     require_shape(sequence.twist, (frames, 6), "twist")
     require_finite(sequence.twist, "twist", _LARGEST_VELOCITY)
     if sequence.velocity_frame not in get_args(VelocityFrame):
@@ -311,7 +323,7 @@ def _validate(sequence: Sequence) -> None:
     if len(sequence.observations) or sequence.attributes.get("tracks") != WITHOUT_TRACKS["tracks"]:
         _validate_observations(sequence.observations, frames)
     if sequence.truth is not None:
-        _validate_truth(sequence.truth, frames)
+        validate_truth(sequence.truth, frames)
     if sequence.noise is not None:
         validate_noise(sequence.noise)
 
@@ -348,7 +360,8 @@ def _require_ids(landmark: IntArray, name: str) -> None:
         )
 
 
-def _validate_truth(truth: Truth, frames: int) -> None:
+def validate_truth(truth: Truth, frames: int) -> None:
+    """Raise a `DataError` for true poses or landmarks of other shapes, or of other frames than these."""
     require_shape(truth.frame, (None,), "truth.frame")
     if np.shape(truth.T_world_imu) != (len(truth.frame), 4, 4):
         raise TruthError(

@@ -116,10 +116,10 @@ class TruthReader:
     read: Callable[[Path, Sequence], Poses]
 
 
-def discovered(kind: type[Entry]) -> tuple[Entry, ...]:
-    """The entries of a kind in all files of this folder, in the order of the files' names."""
-    package = importlib.import_module(__package__)
-    modules = [importlib.import_module(f"{__package__}.{file.name}") for file in pkgutil.iter_modules(package.__path__)]
+def discovered(kind: type[Entry], folder: str = __package__) -> tuple[Entry, ...]:
+    """The entries of a kind in all files of a package, by default this one, in the order of the files' names."""
+    package = importlib.import_module(folder)
+    modules = [importlib.import_module(f"{folder}.{file.name}") for file in pkgutil.iter_modules(package.__path__)]
     entries = [value for module in modules for value in vars(module).values() if isinstance(value, kind)]
     return tuple(dict.fromkeys(entries))
 
