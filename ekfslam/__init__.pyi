@@ -9,10 +9,20 @@ from .config import (
     PosteriorConfig,
     TruthConfig,
 )
-from .data.readers import open_sequence, write_sequence
-from .data.sequence import Sequence
+from .data.noise import Noise
+from .data.readers import (
+    Reader,
+    Source,
+    attach_truth,
+    open_kitti_raw,
+    open_sequence,
+    write_sequence,
+)
+from .data.sequence import Observations, Sequence, Truth
+from .data.velocities import attach_velocities
 from .errors import EkfslamError
 from .filters.result import Result
+from .geometry.camera import StereoCamera
 from .reports import Comparison, check, check_consistency, compare
 from .runner import run
 from .smoother.posterior import Posterior, posterior, smooth
@@ -32,17 +42,26 @@ __all__ = [
     "EkfslamError",
     "FilterConfig",
     "HygieneConfig",
+    "Noise",
     "NoiseConfig",
+    "Observations",
     "Posterior",
     "PosteriorConfig",
+    "Reader",
     "Result",
     "Sequence",
+    "Source",
+    "StereoCamera",
     "Study",
+    "Truth",
     "TruthConfig",
     "TunedNoise",
+    "attach_truth",
+    "attach_velocities",
     "check",
     "check_consistency",
     "compare",
+    "open_kitti_raw",
     "open_sequence",
     "posterior",
     "read_archive",

@@ -18,14 +18,12 @@ from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, require_rigid
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import CalibrationError, ExtrinsicsError, ShapeError, UnknownFormatError
 from ekfslam.geometry import se3
-from ekfslam.geometry.camera import StereoCamera
+from ekfslam.geometry.camera import R_CAM_BODY, StereoCamera
 
 FIELDS = ("v_t", "w_t", "timestamps", "features", "K_l", "K_r", "extL_T_imu", "extR_T_imu")
 EXPECTED = f"expected an .npy file with a dictionary of {', '.join(FIELDS)}"
 IMAGE_FIELDS = ("cam_imgs_L", "cam_imgs_R")
 
-# Axes forward, left, up to the optical axes right, down, forward.
-R_OPTICAL_REGULAR = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 _EXTRINSICS_NOTE = (
     "The stored extL_T_imu is a pose of the left camera with axes forward, left, up: T_cam_imu = oTr inv(extL_T_imu) "
     "is used, and the distance of both cameras as the baseline."
@@ -105,7 +103,7 @@ def extrinsics_of(fields: dict[str, Any]) -> tuple[Array, Array]:
     Raises:
         DataError: A pose is missing or not rigid, or both cameras are at one place.
     """
-    optical = se3.transform(R_OPTICAL_REGULAR, np.zeros(3))
+    optical = se3.transform(R_CAM_BODY, np.zeros(3))
     left, right = (require_numbers(fields, name, (4, 4)) for name in ("extL_T_imu", "extR_T_imu"))
     for name, pose in (("extL_T_imu", left), ("extR_T_imu", right)):
         require_rigid(pose, name, ExtrinsicsError)

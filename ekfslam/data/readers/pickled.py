@@ -1,7 +1,7 @@
 """A pickled dictionary of NumPy arrays in an .npy file, read without running anything that the file names.
 
-``numpy.save`` of a dictionary pickles it. `pickle` calls whatever a file asks for; here a file may ask for arrays, their
-types, scalars and plain containers, and nothing else. Every operation of the file is looked at before the first runs,
+``numpy.save`` of a dictionary pickles it. `pickle` calls whatever a file asks for; here a file may ask for arrays,
+their types, scalars and plain containers, and nothing else. Every operation of the file is looked at before the first runs,
 so that none claims more memory than the file has bytes.
 """
 
@@ -27,13 +27,15 @@ _MOST_OPERATIONS = 2_000_000  # a recording has some hundred, and ten for every 
 _KINDS = "biuf"
 
 # All that pickles of arrays and containers consist of.
-_ALLOWED = frozenset(
-    "PROTO FRAME STOP MARK POP POP_MARK NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG1 FLOAT BINFLOAT "
-    "STRING BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 "
-    "BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 READONLY_BUFFER "
-    "EMPTY_LIST APPEND APPENDS LIST EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_DICT DICT SETITEM SETITEMS "
-    "GET BINGET LONG_BINGET PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL REDUCE BUILD".split()
-)
+_NUMBERS = {"NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG1", "FLOAT", "BINFLOAT"}
+_TEXTS = {"STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"}
+_BYTES = {"BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"}
+_LISTS = {"EMPTY_LIST", "APPEND", "APPENDS", "LIST", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"}
+_DICTIONARIES = {"EMPTY_DICT", "DICT", "SETITEM", "SETITEMS"}
+_MEMO = {"GET", "BINGET", "LONG_BINGET", "PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"}
+_CALLS = {"GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD"}
+_FRAMES = {"PROTO", "FRAME", "STOP", "MARK", "POP", "POP_MARK"}
+_ALLOWED = _NUMBERS | _TEXTS | _BYTES | _LISTS | _DICTIONARIES | _MEMO | _CALLS | _FRAMES
 
 
 def read_pickled(path: Path, expected: str) -> dict[str, Any]:
@@ -80,9 +82,7 @@ def _unpickled(data: memoryview) -> Any:
 
 def _inspect(content: bytes) -> None:
     """Refuse operations that arrays and containers do not need, too many of them, and places beyond all that exist."""
-    count = 0
-    for operation, argument, _ in pickletools.genops(content):
-        count += 1
+    for count, (operation, argument, _) in enumerate(pickletools.genops(content), start=1):
         if operation.name not in _ALLOWED:
             raise pickle.UnpicklingError(f"the operation {operation.name} is not that of arrays and containers")
         if count > _MOST_OPERATIONS:
