@@ -223,7 +223,7 @@ def test_every_damaged_byte_is_a_named_error(tmp_path):
     path = tmp_path / "damaged.npy"
     refused = 0
     rng = np.random.default_rng(1)
-    for _ in range(300):
+    for _ in range(100):
         damaged = bytearray(content)
         damaged[rng.integers(0, len(content))] = rng.integers(0, 256)
         path.write_bytes(damaged)
@@ -231,7 +231,7 @@ def test_every_damaged_byte_is_a_named_error(tmp_path):
             open_sequence(path)
         except (UnknownFormatError, DataError):
             refused += 1
-    assert refused > 30
+    assert refused > 10
 
 
 def test_npy_beyond_the_limit_is_refused_unread(npy):

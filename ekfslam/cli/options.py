@@ -10,7 +10,8 @@ from ekfslam import files
 from ekfslam.config import VARIANTS, Config
 from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence
-from ekfslam.errors import WriteError
+from ekfslam.data.velocities import attach_velocities
+from ekfslam.errors import ConfigError, WriteError
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.filters.result import Result
 from ekfslam.storage.archive import Archive
@@ -33,6 +34,23 @@ def add_force(parser: argparse.ArgumentParser) -> None:
 def add_data_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--truth", type=Path, metavar="FILE", help="true poses: KITTI odometry or TUM text")
     parser.add_argument(
+        "--frames",
+        type=_stretch,
+        metavar="A:B",
+        help="frames A to B - 1 alone, like a slice in Python",
+    )
+    parser.add_argument(
+        "--velocities",
+        type=Path,
+        metavar="FILE",
+        help="velocities from elsewhere: text of time vx vy vz wx wy wz (s, m/s, rad/s), or another recording",
+    )
+    parser.add_argument(
+        "--velocity-frame",
+        choices=("imu", "level"),
+        help="frame of --velocities (default: as the file says, otherwise imu)",
+    )
+    parser.add_argument(
         "--extrinsics",
         choices=("corrected", "as-stored"),
         default="corrected",
@@ -53,6 +71,13 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
         help="standard deviations of the truth in place of those that its format states: roll_deg, pitch_deg, yaw_deg, "
         "first_position_m, stamp_s, position_m, attitude_deg",
     )
+
+
+def _stretch(text: str) -> slice:
+    begin, colon, end = text.partition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(f"expected A:B, found {text!r}")
+    return slice(*(int(bound) if bound.strip() else None for bound in (begin, end)))  # argparse reports a ValueError
 
 
 def _setting(text: str) -> tuple[str, float]:
@@ -92,7 +117,18 @@ def configured(options: argparse.Namespace) -> Config:
 
 
 def open_data(options: argparse.Namespace, data: str) -> Sequence:
-    return open_sequence(data, extrinsics=options.extrinsics, lateral=options.lateral, truth=options.truth)
+    sequence = open_sequence(data, extrinsics=options.extrinsics, lateral=options.lateral, truth=options.truth)
+    return with_options(sequence, options)
+
+
+def with_options(sequence: Sequence, options: argparse.Namespace) -> Sequence:
+    """A recording with the velocities and the frames that were asked for."""
+    if options.velocities is not None:
+        frame, lateral = options.velocity_frame, options.lateral
+        sequence = attach_velocities(sequence, options.velocities, velocity_frame=frame, lateral=lateral)
+    elif options.velocity_frame is not None:
+        raise ConfigError("--velocity-frame says how to take --velocities, which are not given")
+    return sequence if options.frames is None else sequence[options.frames]
 
 
 def require_ours(options: argparse.Namespace, path: Path, is_ours: Callable[[Path], bool]) -> None:

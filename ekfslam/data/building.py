@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, IntArray
 from ekfslam.data.dense import flat_observations
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import (
@@ -81,7 +81,7 @@ def _observations(
     if frame is None or landmark is None:
         raise ShapeError("frame and landmark belong together", field="landmark" if landmark is None else "frame")
     require_shape(pixels, (None, 4), "pixels_px")
-    numbers = []
+    numbers: list[IntArray] = []
     for name, value in (("frame", frame), ("landmark", landmark)):
         whole = _numbers(value, name)
         require_shape(whole, (len(pixels),), name)
@@ -89,7 +89,7 @@ def _observations(
         if (whole != np.round(whole)).any():
             raise ShapeError("not whole numbers", field=name, index=int(np.argmax(whole != np.round(whole))))
         numbers.append(np.asarray(value).astype(np.int64))
-    return Observations(*numbers, pixels), ()
+    return Observations(numbers[0], numbers[1], pixels), ()
 
 
 def _truth(T_world_imu: Array, frames: int) -> Truth | None:

@@ -29,6 +29,7 @@ Recording = TypeVar("Recording", Sequence, ImageRecording)
 COLUMNS = ("time", "vx", "vy", "vz", "wx", "wy", "wz")
 EXPECTED = f"a text file of {' '.join(COLUMNS)} (s, m/s, rad/s; blanks or commas)"
 MAX_GAP_S = 1.0  # over longer, a velocity is not linear in time
+NO_VELOCITIES = "There are no velocities"  # how a note begins that is true no more when there are some
 _FRAME_LINE = re.compile(r"#\s*frame\s*[:=]\s*(\S+)\s*", re.IGNORECASE)
 _SAME = 1e-3  # of a step, by which stamps of the same instants may differ
 _DENSE = 2.0  # samples an interval from which their mean over it is taken
@@ -88,22 +89,27 @@ def attach_velocities(
     """
     if velocity_frame is not None and velocity_frame not in get_args(VelocityFrame):
         raise ConfigError(f"the frame of velocities must be imu or level, found {velocity_frame!r}")
-    found = read_velocities(Path(path), lateral)
+    samples = read_velocities(Path(path), lateral)
     if velocity_frame is not None:
-        found = replace(found, velocity_frame=velocity_frame)
-    found = _on_clock_of(found, recording.time_s, recording.source)
+        samples = replace(samples, velocity_frame=velocity_frame)
+    found: Velocities = _on_clock_of(samples, recording.time_s, recording.source)
     twist, how = resample(found, recording.time_s)
     own = {name: value for name, value in recording.attributes.items() if name not in (*WITHOUT_VELOCITIES, "lateral")}
     gaps = _interpolated_attributes(found, recording.time_s, twist)
+    note = f"Velocities ({found.velocity_frame} frame) from {path}: {how}."
     changes: dict[str, Any] = {
         "twist": twist,
         "velocity_frame": found.velocity_frame,
-        "notes": (*recording.notes, *found.notes, f"Velocities ({found.velocity_frame} frame) from {path}: {how}."),
+        "notes": (
+            *_still_true(recording.notes),
+            *found.notes,
+            f"Velocities ({found.velocity_frame} frame) from {path}: {how}.",
+        ),
         "attributes": {**own, **found.attributes, **gaps},
     }
     if found.T_cam_imu is not None:
-        changes |= _with_extrinsics(recording, found.T_cam_imu)
-    return cast(Recording, replace(recording, **changes))
+        changes |= _with_extrinsics(recording, found.T_cam_imu, changes["notes"])
+    return replace(recording, **changes)
 
 
 def read_velocities(path: Path, lateral: Lateral = "corrected") -> Velocities:
@@ -112,10 +118,12 @@ def read_velocities(path: Path, lateral: Lateral = "corrected") -> Velocities:
     if len(_words(row)) == len(COLUMNS):
         return _of_text(path)
     source = Source.at(path, "corrected", lateral)
-    # A folder of images may be a recording without tracks as well.
-    for reader in (*discovered(Reader), *image_readers()):
-        if reader.recognises(source):
-            return _of_recording(reader.open(source), str(path))
+    tracks = next((reader for reader in discovered(Reader) if reader.recognises(source)), None)
+    if tracks is not None:
+        return _of_recording(tracks.open(source), str(path))
+    images = next((reader for reader in image_readers() if reader.recognises(source)), None)
+    if images is not None:
+        return _of_recording(images.open(source), str(path))
     problem = source.problem or "unknown content"
     raise UnknownFormatError(f"{path}: no velocities ({problem}); {listed(discovered(Reader))}, or {EXPECTED}")
 
@@ -246,9 +254,15 @@ def _interpolated_attributes(found: Velocities, time_s: Array, twist: Array) -> 
     return attributes_of_part({"interpolated": "0-0"}, gaps[sample])
 
 
-def _with_extrinsics(recording: Sequence | ImageRecording, T_cam_imu: Array) -> dict[str, Any]:
+def _still_true(notes: tuple[str, ...]) -> tuple[str, ...]:
+    """Notes of a recording, once it has velocities."""
+    return tuple(note for note in notes if not note.startswith(NO_VELOCITIES))
+
+
+def _with_extrinsics(recording: Sequence | ImageRecording, T_cam_imu: Array, notes: tuple[str, ...]) -> dict[str, Any]:
     """Changes to a recording whose body becomes the IMU of another."""
-    changes: dict[str, Any] = {"T_cam_imu": T_cam_imu}
+    note = "The body is the IMU of the recording that the velocities are from, and T_cam_imu is its own."
+    changes: dict[str, Any] = {"T_cam_imu": T_cam_imu, "notes": (*notes, note)}
     if recording.truth is not None:
         T_old_new = se3.inverse(recording.T_cam_imu) @ T_cam_imu
         changes["truth"] = replace(recording.truth, T_world_imu=recording.truth.T_world_imu @ T_old_new)

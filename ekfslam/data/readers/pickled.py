@@ -1,7 +1,9 @@
 """A pickled dictionary of NumPy arrays in an .npy file, read without running anything that the file names.
 
 ``numpy.save`` of a dictionary pickles it. `pickle` calls whatever a file asks for; here a file may ask for arrays,
-their types, scalars and plain containers, and nothing else. Every operation of the file is looked at before the first runs,
+their types, scalars and plain containers, and nothing else.
+
+Every operation of the file is looked at before the first runs,
 so that none claims more memory than the file has bytes.
 """
 
@@ -88,7 +90,7 @@ def _inspect(content: bytes) -> None:
         if count > _MOST_OPERATIONS:
             raise pickle.UnpicklingError(f"more than {_MOST_OPERATIONS} operations")
         # A memo grows to the largest place that is asked for.
-        if operation.name.endswith("PUT") and not 0 <= int(argument) <= count:
+        if operation.name.endswith("PUT") and not 0 <= int(argument or 0) <= count:
             raise pickle.UnpicklingError(f"a memo of {argument} entries after {count} operations")
 
 
@@ -113,15 +115,14 @@ class _Type:
     __slots__ = ("code", "order")
 
     def __init__(self, code: str) -> None:
-        self.code, self.order = str(code), "="
+        self.code, self.order = str(code), "<"
 
     def __setstate__(self, state: Any) -> None:
         self.order = str(state[1])
 
     @property
     def dtype(self) -> np.dtype:
-        order = self.order if self.order in "<>=" else "="
-        dtype = np.dtype(self.code).newbyteorder(order)
+        dtype = np.dtype(self.code).newbyteorder(">" if self.order == ">" else "<")
         if dtype.kind not in _KINDS:
             raise pickle.UnpicklingError(f"an array of {dtype} instead of numbers")
         return dtype
