@@ -12,6 +12,7 @@ from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.velocities import attach_velocities
 from ekfslam.errors import ConfigError, WriteError
+from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.filters.result import Result
 from ekfslam.storage.archive import Archive
@@ -129,6 +130,12 @@ def with_options(sequence: Sequence, options: argparse.Namespace) -> Sequence:
     elif options.velocity_frame is not None:
         raise ConfigError("--velocity-frame says how to take --velocities, which are not given")
     return sequence if options.frames is None else sequence[options.frames]
+
+
+def print_warnings(sequence: Sequence) -> None:
+    """Say what looks wrong in a recording before it is run."""
+    for line in inspect_sequence(sequence).warnings:
+        print(f"{sequence.name}: warning: {line}", flush=True)
 
 
 def require_ours(options: argparse.Namespace, path: Path, is_ours: Callable[[Path], bool]) -> None:

@@ -100,11 +100,7 @@ def attach_velocities(
     changes: dict[str, Any] = {
         "twist": twist,
         "velocity_frame": found.velocity_frame,
-        "notes": (
-            *_still_true(recording.notes),
-            *found.notes,
-            f"Velocities ({found.velocity_frame} frame) from {path}: {how}.",
-        ),
+        "notes": (*_still_true(recording.notes), *found.notes, note),
         "attributes": {**own, **found.attributes, **gaps},
     }
     if found.T_cam_imu is not None:
