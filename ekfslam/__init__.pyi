@@ -11,12 +11,21 @@ from .config import (
     TruthConfig,
 )
 from .data.images import ImageRecording, open_images
-from .data.readers import write_sequence
-from .data.sequence import Sequence
+from .data.noise import Noise
+from .data.readers import (
+    Reader,
+    Source,
+    attach_truth,
+    open_kitti_raw,
+    write_sequence,
+)
+from .data.sequence import Observations, Sequence, Truth
+from .data.velocities import attach_velocities
 from .errors import EkfslamError
 from .filters.result import Result
 from .frontend.opening import open_sequence
 from .frontend.track import TrackReport, track
+from .geometry.camera import StereoCamera
 from .reports import Comparison, check, check_consistency, compare
 from .runner import run
 from .smoother.posterior import Posterior, posterior, smooth
@@ -38,19 +47,28 @@ __all__ = [
     "FrontEndConfig",
     "HygieneConfig",
     "ImageRecording",
+    "Noise",
     "NoiseConfig",
+    "Observations",
     "Posterior",
     "PosteriorConfig",
+    "Reader",
     "Result",
     "Sequence",
+    "Source",
+    "StereoCamera",
     "Study",
     "TrackReport",
+    "Truth",
     "TruthConfig",
     "TunedNoise",
+    "attach_truth",
+    "attach_velocities",
     "check",
     "check_consistency",
     "compare",
     "open_images",
+    "open_kitti_raw",
     "open_sequence",
     "posterior",
     "read_archive",

@@ -55,7 +55,11 @@ class Comparison:
     def table(self) -> str:
         """The summary as a Markdown table, and what is missing in it."""
         lines = [f"No {mode}: {reason}" for mode, reason in self.skipped.items()]
-        lines += [f"Note on {mode}: {remark}" for mode, result in self.results.items() for remark in result.remarks]
+        remarks: dict[str, list[str]] = {}
+        for mode, result in self.results.items():
+            for remark in result.remarks:
+                remarks.setdefault(remark, []).append(mode)
+        lines += [f"Note on {', '.join(modes)}: {remark}" for remark, modes in remarks.items()]
         return compare_table(self.summary) + "".join(f"\n{line}\n" for line in lines)
 
     def save(self, directory: str | Path, force: bool = False) -> list[Path]:

@@ -17,6 +17,7 @@ from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError, NoVelocitiesError
 from ekfslam.evaluation.relative import dead_reckoned_pairs, relative_pairs
+from ekfslam.evaluation.sanity import inspect_result, inspect_sequence, sanity_attributes
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.innovations import collect_innovations
 from ekfslam.filters.joint import JointEKF
@@ -71,6 +72,7 @@ def run(
         return smooth(run(sequence, "full", config, further, checkpoints))
     if mode == "full":
         config = with_track_scale(config or Config(), sequence)
+    recording, suspicions = sequence, inspect_sequence(sequence).warnings
     problem = build(sequence, config, clean=mode != "dead-reckoning")
     sequence, config, model = problem.sequence, problem.config, problem.model
     account, hygiene = {**problem.account, "model": "; ".join(problem.lines)}, problem.hygiene
@@ -111,7 +113,7 @@ def run(
         account["log_likelihood"] = float(sum(report.log_likelihood for report in reports))
     if hygiene is not None:
         counts |= hygiene.counts
-    return Result(
+    result = Result(
         mode=mode,
         sequence_name=sequence.name,
         time_s=sequence.time_s,
@@ -133,6 +135,8 @@ def run(
         whitened=whitened,
         attributes={**sequence.attributes, **account, **versions()},
     )
+    lines = (*suspicions, *inspect_result(recording, result, suspicions))
+    return dataclasses.replace(result, attributes={**result.attributes, **sanity_attributes(lines)})
 
 
 def _filtered(

@@ -200,6 +200,43 @@ class Sequence:
             },
         )
 
+    @staticmethod
+    def from_tracks(
+        time_s: ArrayLike,
+        pixels_px: ArrayLike,
+        camera: StereoCamera,
+        *,
+        frame: ArrayLike | None = None,
+        landmark: ArrayLike | None = None,
+        twist: ArrayLike | None = None,
+        T_cam_imu: ArrayLike | None = None,
+        T_world_imu: ArrayLike | None = None,
+        velocity_frame: VelocityFrame = "imu",
+        noise: Noise | None = None,
+        name: str = "tracks",
+    ) -> Sequence:
+        """A recording from plain arrays, with nothing in files.
+
+        Args:
+            time_s: (T,) stamps.
+            pixels_px: (T, M, 4) pixels (uL, vL, uR, vR) of M tracks, NaN where a frame does not see one; or (K, 4) with
+                ``frame`` and ``landmark``.
+            camera: Of the rectified pair.
+            frame, landmark: (K,) frame index and id of each row of pixels.
+            twist: (T, 6) velocities, see `Sequence`; None where nobody measured any.
+            T_cam_imu: (4, 4). By default, and only without velocities: the body is the left camera, its axes forward,
+                left and up.
+            T_world_imu: (T, 4, 4) true poses, NaN where one is unknown.
+            velocity_frame, noise, name: See `Sequence`.
+
+        Raises:
+            DataError: An array is malformed, or does not fit the others; the subclass says how.
+        """
+        from ekfslam.data.building import from_tracks
+
+        arrays = (time_s, pixels_px, frame, landmark, twist, T_cam_imu, T_world_imu)
+        return from_tracks(*arrays, camera=camera, velocity_frame=velocity_frame, noise=noise, name=name)
+
     def between(self, begin_s: float, end_s: float) -> Sequence:
         """The frames whose stamps are in ``[begin_s, end_s)``, on the clock of the recording.
 
@@ -301,6 +338,13 @@ def validate_stamps(time_s: Array) -> None:
     require_shape(time_s, (None,), "time_s")
     if len(time_s) == 0:
         raise ShapeError("the sequence has no frames", field="time_s")
+    largest = float(np.abs(time_s).max())
+    if LARGEST < largest < np.inf:
+        units = {1e14: "milliseconds", 1e17: "microseconds", np.inf: "nanoseconds"}
+        unit = next(name for below, name in units.items() if largest < below)
+        index = int(np.argmax(np.abs(time_s) > LARGEST))
+        text = f"stamp {time_s[index]:g} is no time in seconds, stamps look like {unit} since 1970"
+        raise NonFiniteError(text, field="time_s", index=index)
     require_finite(time_s, "time_s")
     steps = np.diff(time_s)
     if (steps <= 0).any():

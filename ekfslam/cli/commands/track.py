@@ -6,11 +6,12 @@ import argparse
 from pathlib import Path
 
 from ekfslam import files
-from ekfslam.cli.options import add_force, require_ours
+from ekfslam.cli.options import add_force, add_place_options, require_ours
 from ekfslam.config import Config
 from ekfslam.data.images import open_images
 from ekfslam.data.readers.hdf5 import is_recording_of, sequence_image
 from ekfslam.data.readers.truth import attach_truth
+from ekfslam.data.velocities import attach_velocities
 from ekfslam.errors import UnknownFormatError
 from ekfslam.figures.style import png
 from ekfslam.figures.tracks import plot_tracks
@@ -25,13 +26,7 @@ EXAMPLES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("data", metavar="SOURCE", help="folder with stereo images and their calibration")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="recording to write")
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="true poses: KITTI odometry or TUM text")
-    parser.add_argument(
-        "--lateral",
-        choices=("corrected", "as-stored"),
-        default="corrected",
-        help="sign of the lateral velocity of KITTI, stored positive to the right (default: %(default)s)",
-    )
+    add_place_options(parser)
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings in a table [front_end]")
     parser.add_argument("--features", type=int, metavar="N", help="how many are wanted in a frame")
     add_force(parser)
@@ -44,6 +39,9 @@ def command(options: argparse.Namespace) -> None:
     recording = open_images(options.data, lateral=options.lateral)
     if recording is None:
         raise UnknownFormatError(f"{options.data}: there are no stereo images that a source knows")
+    if options.velocities is not None:
+        frame, lateral = options.velocity_frame, options.lateral
+        recording = attach_velocities(recording, options.velocities, velocity_frame=frame, lateral=lateral)
     sequence, report = track(recording, config.front_end)
     if options.truth is not None:
         sequence = attach_truth(sequence, options.truth)
