@@ -45,7 +45,9 @@ def open_sequence(
         DataError: A field is missing or malformed; the subclass says how.
     """
     if velocity_frame is not None and velocities is None:
-        raise ConfigError("velocity_frame says how to take velocities from elsewhere, of which there are none")
+        raise ConfigError(
+            "velocity_frame (--velocity-frame) says how to take velocities (--velocities), of which there are none"
+        )
     images = open_images(source, lateral=lateral)
     if images is None:
         sequence = readers.open_sequence(source, extrinsics=extrinsics, lateral=lateral, truth=truth)
