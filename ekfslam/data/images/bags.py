@@ -30,6 +30,7 @@ from ekfslam.data.images.messages import (
     gray_of,
     matrix_of,
     stamp_of,
+    transform_of,
 )
 from ekfslam.data.images.pairs import Distortion, DistortionModel, Image, ImageRecording, PairCalibration
 from ekfslam.data.images.registry import ImageReader
@@ -205,7 +206,9 @@ def _pair(bag: Bag) -> tuple[Camera, Camera]:
 
 
 def _rank(connection: Any) -> tuple[bool, bool]:
-    return "rect" not in connection.topic, connection.msgtype == COMPRESSED
+    return "rect" not in connection.topic.removesuffix("/compressed").rsplit("/", 1)[
+        -1
+    ], connection.msgtype == COMPRESSED
 
 
 def _camera(bag: Bag, stream: Any, info: Any) -> Camera:
@@ -279,9 +282,8 @@ def _velocities(bag: Bag) -> tuple[Velocities | None, str, tuple[str, ...]]:
     # A twist by itself is more likely to be measured than that of an estimate.
     chosen = min(streams, key=lambda connection: (VELOCITIES.index(connection.msgtype), connection.topic))
     others = [connection.topic for connection in streams if connection.topic != chosen.topic]
-    notes = (f"Velocities are those of {printable(chosen.topic)}.",)
-    if others:
-        notes = (*notes, f"Not used: velocities of {printable(', '.join(others))}.")
+    notes = [f"Velocities are those of {printable(chosen.topic)}."]
+    notes += [f"Not used: velocities of {printable(topic)}." for topic in others]
     rows, frame = [], ""
     for message in bag.messages(chosen):
         # With covariance a twist is one level further down.
@@ -299,7 +301,7 @@ def _velocities(bag: Bag) -> tuple[Velocities | None, str, tuple[str, ...]]:
     if (np.diff(table[:, 0]) <= 0).any():
         index = int(np.argmax(np.diff(table[:, 0]) <= 0)) + 1
         raise StampError("the stamp does not increase", field=topic, index=index)
-    return Velocities(str(bag.path), table[:, 0], table[:, 1:], "imu", None, {}, ()), frame, notes
+    return Velocities(str(bag.path), table[:, 0], table[:, 1:], "imu", None, {}, ()), frame, tuple(notes)
 
 
 def _body(bag: Bag, left: Camera, frame: str) -> tuple[Array, str]:
@@ -316,8 +318,6 @@ def _body(bag: Bag, left: Camera, frame: str) -> tuple[Array, str]:
 
 def _transform(bag: Bag, target: str, source: str) -> Array | None:
     """``T_target_source`` (4, 4) through the tree of static transforms; None where nothing connects them."""
-    from ekfslam.data.images.messages import transform_of
-
     edges: dict[str, list[tuple[str, Array]]] = {}
     for connection in bag.connections(TRANSFORMS):
         if connection.topic.lstrip("/") != "tf_static":

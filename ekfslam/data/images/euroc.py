@@ -1,7 +1,7 @@
 """EuRoC MAV and TUM-VI: a folder with ``mav0/cam0 cam1`` (or that of ``mav0`` itself), ``data.csv``, ``sensor.yaml``.
 
-Burri et al., *The EuRoC micro aerial vehicle datasets* (IJRR 2016); Schubert et al., *The TUM VI Benchmark* (IROS 2018).
-Folders of the latter may have the calibration of Kalibr, ``dso/camchain.yaml``, in place of ``sensor.yaml``.
+Burri et al., *The EuRoC micro aerial vehicle datasets* (IJRR 2016). Schubert et al., *The TUM VI Benchmark* (IROS
+2018): its folders may have the calibration of Kalibr, ``dso/camchain.yaml``, in place of ``sensor.yaml``.
 """
 
 from __future__ import annotations
