@@ -37,7 +37,7 @@ from ekfslam.data.images.registry import ImageReader
 from ekfslam.data.readers.fields import spelled_as_in
 from ekfslam.data.readers.registry import Source
 from ekfslam.data.readers.text import first_line
-from ekfslam.data.velocities import Velocities, resample
+from ekfslam.data.velocities import Velocities, is_covered, resample
 from ekfslam.errors import CalibrationError, LostDataError, StampError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import R_CAM_BODY
@@ -148,8 +148,7 @@ def _opened(bag: Bag) -> ImageRecording:
     notes = (*notes, *found, note)
     used = np.ones(len(time_s), dtype=bool)
     if velocities is not None:
-        step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
-        used = (time_s >= velocities.time_s[0] - step) & (time_s <= velocities.time_s[-1] + step)
+        used = is_covered(velocities.time_s, time_s)
         if not used.all():
             notes = (*notes, f"{int((~used).sum())} frames before or after all velocities are left out.")
     chosen = (places[0][in_left[used]], places[1][in_right[used]])

@@ -46,7 +46,6 @@ class Bag:
     def __init__(self, path: Path) -> None:
         try:
             from rosbags import rosbag1, rosbag2
-            from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
             raise MissingPackageError(
                 f"{path}: bags are read by rosbags ({error}): pip install 'ekfslam[bags]'"
@@ -56,7 +55,7 @@ class Bag:
             self.is_ros1 = path.is_file() and _head(path).startswith(ROS1_MAGIC)
             self._reader: Any = rosbag1.Reader(path) if self.is_ros1 else rosbag2.Reader(path)
             self._reader.open()
-            self._types = get_typestore(Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_HUMBLE)
+            self._types = message_types(self.is_ros1)
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
@@ -107,6 +106,16 @@ class Bag:
         """Let go of the file."""
         with contextlib.suppress(Exception):
             self._reader.close()
+
+
+def message_types(is_ros1: bool) -> Any:
+    """The types of messages of a distribution, as rosbags knows them."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    if TRANSFORMS not in types.types:
+        types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+    return types
 
 
 def _head(path: Path) -> bytes:
