@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast, get_args
 
 import numpy as np
 
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.images.pairs import ImageRecording
 from ekfslam.data.images.registry import image_readers
 from ekfslam.data.interpolation import attributes_of_part, interpolation_attributes, known_intervals
@@ -175,7 +175,7 @@ def _on_clock_of(found: Velocities, time_s: Array, source: str) -> Velocities:
     """The samples with their stamps on the clock of the frames."""
     if time_s[0] <= found.time_s[-1] and found.time_s[0] <= time_s[-1]:
         return found
-    step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    step = _step(time_s)
     if min(abs(time_s[0]), abs(found.time_s[0])) > step:
         raise LostDataError(
             f"samples from {found.time_s[0]:.3f} to {found.time_s[-1]:.3f} s have no time in common with {source}, "
@@ -196,19 +196,30 @@ def resample(found: Velocities, time_s: Array) -> tuple[Array, str]:
     stamps, twist = found.time_s, found.twist
     if len(stamps) < 2 or len(time_s) < 2:
         raise LostDataError(f"{len(stamps)} samples for {len(time_s)} frames; two are needed", source=found.source)
-    sample_s, frame_s = float(np.median(np.diff(stamps))), float(np.median(np.diff(time_s)))
-    _require_cover(found, time_s, max(sample_s, frame_s))
+    sample_s, frame_s = _step(stamps), _step(time_s)
+    _require_cover(found, time_s)
+    if sample_s * _DENSE <= frame_s * (1.0 + _SAME):
+        return _means(stamps, twist, time_s), "means of the samples over each interval"
     nearest = np.clip(np.searchsorted(stamps, time_s - 0.5 * sample_s), 0, len(stamps) - 1)
     if (np.abs(stamps[nearest] - time_s) <= _SAME * sample_s).all():
         return twist[nearest], "frames and samples have the same stamps"
-    if sample_s * _DENSE <= frame_s:
-        return _means(stamps, twist, time_s), "means of the samples over each interval"
     return _linear(stamps, twist, time_s), "linear between samples"
 
 
-def _require_cover(found: Velocities, time_s: Array, reach_s: float) -> None:
+def is_covered(stamps: Array, time_s: Array) -> BoolArray:
+    """Which frames (T,) lie within samples (N,), or at most one step outside."""
+    reach_s = _step(stamps, time_s) * (1.0 + _SAME)
+    return (time_s >= stamps[0] - reach_s) & (time_s <= stamps[-1] + reach_s)
+
+
+def _step(*stamps: Array) -> float:
+    """The longest of the median steps."""
+    return max((float(np.median(np.diff(each))) for each in stamps if len(each) > 1), default=0.0)
+
+
+def _require_cover(found: Velocities, time_s: Array) -> None:
     stamps = found.time_s
-    outside = (time_s < stamps[0] - reach_s) | (time_s > stamps[-1] + reach_s)
+    outside = ~is_covered(stamps, time_s)
     if outside.any():
         first = int(np.argmax(outside))
         raise LostDataError(
@@ -216,6 +227,7 @@ def _require_cover(found: Velocities, time_s: Array, reach_s: float) -> None:
             f"{stamps[-1]:.3f} s; the first is frame {first} at {time_s[first]:.3f} s",
             source=found.source,
         )
+    reach_s = _step(stamps, time_s)
     for k in np.flatnonzero(np.diff(stamps) > max(MAX_GAP_S, 2.0 * reach_s)):
         within = (time_s > stamps[k]) & (time_s < stamps[k + 1])
         if within.any():

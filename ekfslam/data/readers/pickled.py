@@ -51,7 +51,11 @@ def read_pickled(path: Path, expected: str) -> dict[str, Any]:
     try:
         content = path.read_bytes()
         Budget(str(path)).take(len(content), "the pickled dictionary")
-        found = _unpickled(memoryview(content)[_header_end(content) :])
+        stream = io.BytesIO(content)
+        begin = _header_end(stream)
+        _inspect(stream)
+        stream.seek(begin)
+        found = _plain(_Restricted(stream).load())
     except (ValueError, TypeError, AttributeError, KeyError, IndexError, EOFError, OverflowError) as error:
         raise UnknownFormatError(f"{path}: damaged .npy file ({_clean(error)}); {expected}") from None
     except pickle.UnpicklingError as error:
@@ -65,9 +69,8 @@ def _clean(error: Exception) -> str:
     return printable(str(error))[:200]
 
 
-def _header_end(content: bytes) -> int:
+def _header_end(stream: io.BytesIO) -> int:
     """Where the header of the .npy ends, which must announce one object."""
-    stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
     shape, _, dtype = header(stream)
@@ -76,15 +79,9 @@ def _header_end(content: bytes) -> int:
     return stream.tell()
 
 
-def _unpickled(data: memoryview) -> Any:
-    content = bytes(data)
-    _inspect(content)
-    return _plain(_Restricted(io.BytesIO(content)).load())
-
-
-def _inspect(content: bytes) -> None:
+def _inspect(stream: io.BytesIO) -> None:
     """Refuse operations that arrays and containers do not need, too many of them, and places beyond all that exist."""
-    for count, (operation, argument, _) in enumerate(pickletools.genops(content), start=1):
+    for count, (operation, argument, _) in enumerate(pickletools.genops(stream), start=1):
         if operation.name not in _ALLOWED:
             raise pickle.UnpicklingError(f"the operation {operation.name} is not that of arrays and containers")
         if count > _MOST_OPERATIONS:
