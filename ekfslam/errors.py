@@ -22,6 +22,19 @@ class ConfigError(EkfslamError):
     """A configuration file or override names an unknown key or a value out of range."""
 
 
+class MissingPackageError(EkfslamError):
+    """An optional package is not installed.
+
+    Args:
+        package: Its name.
+        extra: The extra of this project that installs it.
+        what: What needs it.
+    """
+
+    def __init__(self, package: str, extra: str, what: str) -> None:
+        super().__init__(f"{what} needs the package {package}, which is not installed: pip install 'ekfslam[{extra}]'")
+
+
 class UnknownFormatError(EkfslamError):
     """A file is missing, unreadable, truncated, or of a format that no reader knows."""
 

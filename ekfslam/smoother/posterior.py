@@ -31,6 +31,7 @@ from ekfslam.models.build import model_of, optional_blocks
 from ekfslam.models.model import Model
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
+from ekfslam.shown import Card, Shown, count, figure
 from ekfslam.smoother.optimise import maximise
 from ekfslam.smoother.problem import BatchProblem
 from ekfslam.smoother.sparse.information import JointInformation
@@ -38,8 +39,8 @@ from ekfslam.smoother.sparse.information import JointInformation
 DENSE_LIMIT = 20_000  # columns of a dense covariance: 3.2 GB
 
 
-@dataclass(frozen=True)
-class Posterior:
+@dataclass(frozen=True, repr=False)
+class Posterior(Shown):
     """A Gaussian over all poses and all landmarks.
 
     Landmarks go by their row in ``id``, which is the order of the filter's `Landmarks`; frames by their number,
@@ -66,6 +67,18 @@ class Posterior:
     information: JointInformation
     values: Mapping[str, Array]
     problem: BatchProblem
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show; computes nothing."""
+        frames, landmarks = len(self.T_world_imu), len(self.id)
+        facts = {
+            "of": f"{count(frames, 'pose')}, {count(landmarks, 'landmark')}, {count(len(self.weight), 'observation')}",
+            "other blocks": ", ".join(self.values) or "none",
+            "cost": f"{figure(self.costs[0])} to {figure(self.cost)} in {count(len(self.costs) - 1, 'iteration')}",
+        }
+        further = (".pose_covariance", ".landmark_covariance", ".joint_covariance(frames=[-1], landmarks=[0, 1])")
+        title = "at the maximum a posteriori" if self.linearisation == "map" else "linearised as filtered"
+        return Card(title, facts, further)
 
     @property
     def cost(self) -> float:

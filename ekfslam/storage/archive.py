@@ -74,6 +74,7 @@ from ekfslam.filters.result import (
 )
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.names import printable
+from ekfslam.shown import Card, Shown, count
 from ekfslam.storage.checks import COVARIANCES, RIGID, require_agreement
 
 FORMAT = "ekfslam-archive"
@@ -174,8 +175,8 @@ _HYGIENE_LAYOUT = hdf5.layout(
 )
 
 
-@dataclass(frozen=True)
-class Archive:
+@dataclass(frozen=True, repr=False)
+class Archive(Shown):
     """What an archive holds: the sequence without its observations, and the results of its modes.
 
     Args:
@@ -197,6 +198,12 @@ class Archive:
     notes: tuple[str, ...]
     attributes: Mapping[str, str | int | float]
     results: Mapping[str, Result]
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        facts = {mode: count(len(result.landmarks), "landmark") for mode, result in self.results.items()}
+        title = f"{self.name}, {count(len(self.time_s), 'frame')}, {count(len(facts), 'run')}"
+        return Card(title, facts, tuple(f"archive.results[{mode!r}]" for mode in list(facts)[:1]))
 
     @cached_property
     def interpolated(self) -> BoolArray:

@@ -48,15 +48,16 @@ from ekfslam.evaluation.consistency import (
     nees,
     pose_error,
     time_average,
-    world_axes_covariance,
 )
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.filters.result import ERROR_CONVENTION
 from ekfslam.geometry import se3
+from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress as with_progress
 from ekfslam.runner import versions
+from ekfslam.shown import Card, Shown, count
 from ekfslam.studies.journal import Journal
 
 FORMAT = "ekfslam-study"
@@ -129,8 +130,8 @@ Record = dict[str, dict[str, NDArray]]  # variant, field, value of one run
 _ONE_RUN_AT_A_TIME = threading.Lock()
 
 
-@dataclass(frozen=True)
-class Study:
+@dataclass(frozen=True, repr=False)
+class Study(Shown):
     """What to simulate and what to compare on it.
 
     Args:
@@ -166,6 +167,13 @@ class Study:
             raise ConfigError(
                 f"a study of {self.runs} runs is too large: {values:.3g} frames, at most {MOST_VALUES:.3g}"
             )
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        filters = self.runs * len(self.levels) * len(self.variants)
+        facts = {"levels": ", ".join(self.levels), "variants": ", ".join(self.variants), "seed": str(self.seed)}
+        title = f"{count(self.runs, 'run')} of each level, {count(filters, 'filter')} in all"
+        return Card(title, facts, ('run_study(study, "study.h5", executor)',))
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -290,8 +298,8 @@ def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str,
     return record
 
 
-@dataclass(frozen=True)
-class StudyArchive:
+@dataclass(frozen=True, repr=False)
+class StudyArchive(Shown):
     """A study and what is there of its runs.
 
     Args:
@@ -303,6 +311,16 @@ class StudyArchive:
     study: Study
     done: Mapping[str, BoolArray]
     data: Mapping[str, Mapping[str, Mapping[str, NDArray]]]
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        runs = self.study.runs
+        facts = {level: f"{int(done.sum())} of {count(runs, 'run')}" for level, done in self.done.items()}
+        facts["variants"] = ", ".join(self.study.variants)
+        title = "complete" if self.complete else "not complete"
+        return Card(
+            title, facts, ("study_table(summarise_study(archive))", 'archive.data[level][variant]["pose_nees"]')
+        )
 
     @property
     def complete(self) -> bool:
