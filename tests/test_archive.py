@@ -22,11 +22,11 @@ from ekfslam.storage import archive as archive_module
 from ekfslam.storage.archive import (
     FORMAT_VERSION,
     add_result,
-    export_trajectory,
     open_result,
     read_archive,
     write_archive,
 )
+from ekfslam.storage.exports import export_trajectory
 
 MODES = ("full", "dead-reckoning", "mapping-only")
 

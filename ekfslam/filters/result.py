@@ -304,7 +304,7 @@ class Result(Shown):
             facts["NIS / dof"] = f"{figure(float(innovation.nis.sum()) / dof)} (1 expected)"
         facts["time"] = f"{figure(float(np.median(self.ms_per_frame)))} ms a frame"
         facts |= {f"remark {i}": remark for i, remark in enumerate(self.remarks, 1)}
-        further = (".map()", ".plot()", ".errors(sequence)", '.to_dataframe("landmarks")')
+        further: tuple[str, ...] = (".map()", ".plot()", ".errors(sequence)", '.to_dataframe("landmarks")')
         further += ("ekfslam.posterior(result)",) if self.log is not None else ()
         return Card(f"{self.mode} on {self.sequence_name}", facts, further)
 
@@ -315,8 +315,8 @@ class Result(Shown):
         """(T, 3, 3) covariance of the position error of the IMU along the axes of world, m^2.
 
         ``covariance`` is of ``xi``, whose axes are those of the IMU: an error ``xi`` moves the IMU by ``-R rho``
-        to first order, R being the rotation of ``T_world_imu``. So this is ``R P_rho R^T``. It holds for every variant, since
-        stored covariances are of the same ``xi`` whatever variant has run. That of a landmark needs no such call:
+        to first order, R being the rotation of ``T_world_imu``. So this is ``R P_rho R^T``. It holds for every
+        variant: stored covariances are of the same ``xi`` whatever variant has run. Landmarks need no such call:
         ``landmarks.covariance`` is along the axes of world already.
         """
         return world_axes_covariance(self.T_world_imu, self.covariance)[0]

@@ -42,6 +42,7 @@ from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import VARIANTS, Config, FilterConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import Loop, simulate
+from ekfslam.dimensions import Shape, fixed_length
 from ekfslam.errors import ArchiveError, ConfigError, FilterError
 from ekfslam.evaluation.consistency import (
     joint_nees,
@@ -61,7 +62,7 @@ from ekfslam.shown import Card, Shown, count
 from ekfslam.studies.journal import Journal
 
 FORMAT = "ekfslam-study"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 2 added coordinates of all dimensions
 
 ITERATIONS = 3
 ITERATED_SUFFIX = "-iterated"
@@ -88,7 +89,7 @@ LEVELS: Mapping[str, Loop] = MappingProxyType(
 
 # Per run: shape after (runs,), type, units, what it is. T is the number of frames, J the number of instants at which
 # the joint NEES is taken.
-FIELDS: Mapping[str, tuple[tuple[str | int, ...], type, str, str]] = MappingProxyType(
+FIELDS: Mapping[str, tuple[Shape, type, str, str]] = MappingProxyType(
     {
         "pose_nees": (("T",), float, "1", "xi, 6 degrees of freedom"),
         "orientation_nees": (("T",), float, "1", "theta of xi, 3 degrees of freedom"),
@@ -97,9 +98,14 @@ FIELDS: Mapping[str, tuple[tuple[str | int, ...], type, str, str]] = MappingProx
         "joint_nees_per_dof": (("J",), float, "1", "xi and all landmarks, divided by 6 + 3n"),
         "nis": (("T",), float, "1", "innovations of the frame"),
         "nis_dof": (("T",), int, "1", "degrees of freedom of nis"),
-        "position_error": (("T", 3), float, "m", "estimate minus truth, world axes"),
-        "rotation_error": (("T", 3), float, "rad", "log(R_estimate R_truth^T), world axes"),
-        "three_sigma": (("T", 6), float, "m (0-2), rad (3-5)", "bounds of position and rotation error, world axes"),
+        "position_error": (("T", "xyz"), float, "m", "estimate minus truth, world axes"),
+        "rotation_error": (("T", "xyz"), float, "rad", "log(R_estimate R_truth^T), world axes"),
+        "three_sigma": (
+            ("T", "error"),
+            float,
+            "m (0-2), rad (3-5)",
+            "bounds of position and rotation error, world axes",
+        ),
         "diverged": ((), bool, "1", "stopped with an error, not finite, or left the ring altogether"),
     }
 )
@@ -239,7 +245,7 @@ def _blank(frames: int, runs: tuple[int, ...] = ()) -> dict[str, NDArray]:
     sizes = {"T": frames, "J": JOINT_INSTANTS}
     return {
         name: np.full(
-            (*runs, *(sizes[n] if isinstance(n, str) else n for n in shape)), np.nan if kind is float else 0, dtype=kind
+            (*runs, *(sizes.get(n) or fixed_length(n) or 0 for n in shape)), np.nan if kind is float else 0, dtype=kind
         )
         for name, (shape, kind, _, _) in FIELDS.items()
     }
@@ -482,9 +488,10 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
         for level, world in study.levels.items():
             group = h5file.create_group(f"levels/{level}")
             hdf5.write_attributes(group, {"world": json.dumps(dataclasses.asdict(world))})
-            hdf5.write_fields(group, _LEVEL, {"time": archive.time_s(level), "done": archive.done[level]})
+            along = {"time": archive.time_s(level), "instant": np.array(_joint_frames(world.frames))}
+            hdf5.write_fields(group, _LEVEL, {"time": along["time"], "done": archive.done[level]})
             for variant, values in archive.data[level].items():
-                hdf5.write_fields(group.create_group(variant), _VARIANT, values)
+                hdf5.write_fields(group.create_group(variant), _VARIANT, values, coordinates=along)
                 group[f"{variant}/joint_nees_per_dof"].attrs["frames"] = _joint_frames(world.frames)
 
     files.write_all({Path(path): hdf5.image(FORMAT, FORMAT_VERSION, fill)})
@@ -511,8 +518,15 @@ def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
         for level, world in study.levels.items():
             group = hdf5.subgroup(h5file, f"levels/{level}")
             sizes = {"runs": study.runs, "T": world.frames, "J": JOINT_INSTANTS}
-            done[level] = hdf5.read_fields(group, _LEVEL, sizes)["done"]
-            data[level] = {v: hdf5.read_fields(hdf5.subgroup(group, v), _VARIANT, sizes) for v in study.variants}
+            found = hdf5.read_fields(group, _LEVEL, sizes)
+            done[level], along = (
+                found["done"],
+                {"time": found["time"], "instant": np.array(_joint_frames(world.frames))},
+            )
+            data[level] = {
+                variant: hdf5.read_fields(hdf5.subgroup(group, variant), _VARIANT, sizes, along)
+                for variant in study.variants
+            }
         found_versions = {
             key: str(value) for key, value in hdf5.attributes(h5file).items() if key.startswith("version_")
         }

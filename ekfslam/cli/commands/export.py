@@ -9,7 +9,8 @@ from ekfslam import files
 from ekfslam.cli.options import add_force, require_ours
 from ekfslam.data.readers.text import first_line
 from ekfslam.names import components
-from ekfslam.storage.archive import open_result, read_archive, trajectory_text, truth_text
+from ekfslam.storage.archive import open_result, read_archive
+from ekfslam.storage.exports import trajectory_text, truth_text
 
 TRUTH = "truth"  # what `export` takes beside the modes
 EXAMPLES = (
