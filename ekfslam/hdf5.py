@@ -287,10 +287,7 @@ def write_fields(
     Raises:
         ArchiveError: A value is not what its check asks for: such a file could not be read again.
     """
-    values = [
-        np.asarray(record[item.field] if isinstance(record, Mapping) else attrgetter(item.field)(record))
-        for item in layout
-    ]
+    values = [value_of(item, record) for item in layout]
     _checked(group, layout, values, dict(sizes or {}))
     made = [
         _create(group, item.name, value, {"units": item.units, "frame": item.frame})
@@ -305,6 +302,11 @@ def write_fields(
                 scales[place] = _scale(group, place, name, dataset.shape[i], coordinates)
             if place != item.name:
                 dataset.dims[i].attach_scale(scales[place])
+
+
+def value_of(item: Item, record: Any) -> NDArray:
+    """What a record, or a mapping, has for an item of a layout."""
+    return np.asarray(record[item.field] if isinstance(record, Mapping) else attrgetter(item.field)(record))
 
 
 def _create(group: h5py.Group, name: str, value: NDArray, attributes: Mapping[str, Any]) -> h5py.Dataset:

@@ -81,7 +81,7 @@ FORMAT = "ekfslam-archive"
 FORMAT_VERSION = 5
 
 # Data sets below /runs/<mode>, fields of `Result` (T frames, M landmarks, R rejections), and what their values must be.
-_LAYOUT = hdf5.layout(
+LAYOUT = hdf5.layout(
     ("trajectory/time", "time_s", ("T",), "s", "clock of the recording", hdf5.ASCENDING),
     ("trajectory/T_world_imu", "T_world_imu", ("T", "row", "column"), "m (translation)", "world from imu", RIGID),
     (
@@ -364,7 +364,7 @@ def _write_result(group: h5py.Group, result: Result, frames: int) -> None:
         },
     )
     hdf5.write_attributes(group.create_group("attributes"), result.attributes)
-    hdf5.write_fields(group, _LAYOUT, result, sizes, stamps)
+    hdf5.write_fields(group, LAYOUT, result, sizes, stamps)
     hdf5.write_attributes(group["rejections/reason"], {"names": REASONS})
     if result.parameters is not None:
         parameters = group.create_group("parameters")
@@ -406,7 +406,7 @@ def _read_result(h5file: h5py.File, mode: str, sequence: Mapping[str, Any]) -> R
     version = hdf5.version_of(group if "format_version" in group.attrs else h5file)
     fields: dict[str, dict[str, Any]] = {"": {}, "landmarks": {}, "innovation": {}, "rejections": {}}
     sizes, stamps = {"T": len(sequence["time_s"])}, _stamps(group)
-    for field, value in hdf5.read_fields(group, _LAYOUT, sizes, stamps).items():
+    for field, value in hdf5.read_fields(group, LAYOUT, sizes, stamps).items():
         part, _, leaf = field.rpartition(".")
         fields[part][leaf] = value
     sizes["M"] = len(fields["landmarks"]["id"])
