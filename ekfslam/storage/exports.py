@@ -27,9 +27,11 @@ from ekfslam.geometry import motion, se3
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.smoother.posterior import Posterior, posterior
 from ekfslam.storage.archive import Archive, read_archive
-from ekfslam.storage.tables import TABLES, columns, covariance_columns
+from ekfslam.storage.tables import columns, covariance_columns
 
 MADE_BY = "ekfslam"  # in files that have room for a remark
+_PLY = f"ply\nformat binary_little_endian 1.0\ncomment {MADE_BY}: landmarks in world, m and m^2\n"
+_G2O = f"# {MADE_BY}: "
 
 
 def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "kitti"]) -> None:
@@ -122,8 +124,7 @@ def ply_bytes(result: Result) -> bytes:
     for name, value in properties.items():
         vertex[name] = value
     declared = "".join(f"property {types[value.dtype.kind][0]} {name}\n" for name, value in properties.items())
-    head = f"ply\nformat binary_little_endian 1.0\ncomment {MADE_BY}: landmarks in world, m and m^2\n"
-    return (head + f"element vertex {len(landmarks)}\n{declared}end_header\n").encode("ascii") + vertex.tobytes()
+    return (_PLY + f"element vertex {len(landmarks)}\n{declared}end_header\n").encode("ascii") + vertex.tobytes()
 
 
 def _colours(covariance: Array) -> NDArray:
@@ -138,8 +139,8 @@ def g2o_text(result: Result) -> str:
 
     - ``EDGE_SE3:QUAT``: the motion of a step, eq. (1), by the velocities that moved the filter. Its information is
       that of eq. (2) for white velocity noise; the error is g2o's own, translation and vector part of the quaternion.
-    - ``EDGE_SE3_TRACKXYZ``: a landmark in the camera, triangulated from one observation, with the information
-      ``A^T V^-1 A`` of its rows there, eq. (4).
+    - ``EDGE_SE3_TRACKXYZ``: a landmark in the frame of the IMU, triangulated from one observation, with the
+      information ``A^T V^-1 A`` of its rows there, eq. (4). The camera is in no edge: some programs read no offset.
     - ``FIX``: the first pose.
 
     It is the textbook model. Where the run estimates velocities or has errors of tracks, which have memory, a graph of
@@ -155,8 +156,8 @@ def g2o_text(result: Result) -> str:
 
 def _graph(result: Result, log: Log) -> Iterator[str]:
     frames = len(result.time_s)
-    yield f"# {MADE_BY}: {' '.join(result.sequence_name.split())}, vertices 0 to {frames - 1} are poses of the IMU"
-    yield f"PARAMS_SE3OFFSET 0 {_numbers(_position_and_quaternion(se3.inverse(result.T_cam_imu)))}"
+    yield f"{_G2O}{' '.join(result.sequence_name.split())}, vertices 0 to {frames - 1} are poses of the IMU"
+    yield f"PARAMS_SE3OFFSET 0 {_numbers(_position_and_quaternion(np.eye(4)))}"
     for k, row in enumerate(_position_and_quaternion(result.T_world_imu)):
         yield f"VERTEX_SE3:QUAT {k} {_numbers(row)}"
     yield "FIX 0"
@@ -176,14 +177,14 @@ def _graph(result: Result, log: Log) -> Iterator[str]:
 
 
 def _triangulated(result: Result, log: Log) -> tuple[Array, Array]:
-    """Points (K, 3) of the observations in the camera, m, and their information (K, 3, 3)."""
+    """Points (K, 3) of the observations in the frame of the IMU, m, and their information (K, 3, 3)."""
     rig = Rig(result.camera, result.T_cam_imu, result.noise)
     q = rig.invert(log.rows)
     first = np.zeros(log.landmarks, dtype=np.int64)
     first[log.landmark[::-1]] = np.arange(len(log.landmark))[::-1]
     variance = np.where((log.previous >= 0)[:, None], log.variance[first[log.landmark]], log.variance)
-    A = rig.jacobian(q)
-    return q, np.swapaxes(A, 1, 2) @ (A / variance[:, :, None])
+    A = rig.jacobian(q) @ result.T_cam_imu[:3, :3]
+    return se3.apply(se3.inverse(result.T_cam_imu), q), np.swapaxes(A, 1, 2) @ (A / variance[:, :, None])
 
 
 def _position_and_quaternion(T: Array) -> Array:
@@ -224,11 +225,13 @@ class Export(NamedTuple):
         ending: Of its files.
         words: What it holds.
         write: The content of the file of a result.
+        begins: How such a file begins, where that tells it from others.
     """
 
     ending: str
     words: str
     write: Callable[[Result], str | bytes]
+    begins: bytes = b""
 
 
 def is_export(path: Path, format: str) -> bool:
@@ -243,31 +246,23 @@ def is_export(path: Path, format: str) -> bool:
                 return "made_by.npy" in archive.namelist()
     except (OSError, zipfile.BadZipFile):
         return False
-    begins = {
-        "ply": b"ply\nformat binary_little_endian 1.0\ncomment " + MADE_BY.encode(),
-        "g2o": b"# " + MADE_BY.encode(),
-    }
-    begins |= {
-        "csv": b"time_s,",
-        "csv-landmarks": b"id,x_m,",
-        "csv-innovation": b"time_s,",
-        "csv-rejections": b"frame,",
-    }
-    return begin.startswith(begins[format])
+    return begin.startswith(EXPORTS[format].begins)
 
 
-def _csv(table: str) -> Export:
-    return Export(f"{table}.csv", f"table {table}", lambda result: csv_text(result, table))
+def _csv(table: str, begins: bytes) -> Export:
+    return Export(f"{table}.csv", f"table {table}", lambda result: csv_text(result, table), begins)
 
 
 EXPORTS: Mapping[str, Export] = MappingProxyType(
     {
         "tum": Export("tum.txt", "poses: time tx ty tz qx qy qz qw", lambda result: trajectory_text(result, "tum")),
         "kitti": Export("kitti.txt", "poses: twelve entries", lambda result: trajectory_text(result, "kitti")),
-        "csv": _csv("trajectory"),
-        **{f"csv-{table}": _csv(table) for table in TABLES if table != "trajectory"},
-        "ply": Export("ply", "landmarks with covariances", ply_bytes),
-        "g2o": Export("g2o", "poses, landmarks and measurements as a graph", g2o_text),
+        "csv": _csv("trajectory", b"time_s,x_m,"),
+        "csv-landmarks": _csv("landmarks", b"id,x_m,"),
+        "csv-innovation": _csv("innovation", b"time_s,nis,"),
+        "csv-rejections": _csv("rejections", b"frame,time_s,"),
+        "ply": Export("ply", "landmarks with covariances", ply_bytes, _PLY.encode()),
+        "g2o": Export("g2o", "poses, landmarks and measurements as a graph", g2o_text, _G2O.encode()),
         "information": Export("information.npz", "joint information matrix, sparse", information_bytes),
     }
 )

@@ -118,12 +118,12 @@ CHECKPOINT_S = 5.0
 CHECKPOINT_SHARE = 0.05  # of the time may go into checkpoints of a large study
 
 # Data sets below a level, and below a variant of it.
-_LEVEL = hdf5.layout(
+LEVEL_LAYOUT = hdf5.layout(
     ("time", "time", ("T",), "s", "nominal stamps"),
     ("done", "done", ("runs",), "1", "runs that are in", hdf5.FLAGS),
 )
 _CHECKS = {float: hdf5.NUMBERS_OR_NONE, int: hdf5.COUNTS, bool: hdf5.FLAGS}
-_VARIANT = hdf5.layout(
+VARIANT_LAYOUT = hdf5.layout(
     *(
         (name, name, ("runs", *shape), units, frame, _CHECKS[kind])
         for name, (shape, kind, units, frame) in FIELDS.items()
@@ -489,9 +489,9 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
             group = h5file.create_group(f"levels/{level}")
             hdf5.write_attributes(group, {"world": json.dumps(dataclasses.asdict(world))})
             along = {"time": archive.time_s(level), "instant": np.array(_joint_frames(world.frames))}
-            hdf5.write_fields(group, _LEVEL, {"time": along["time"], "done": archive.done[level]})
+            hdf5.write_fields(group, LEVEL_LAYOUT, {"time": along["time"], "done": archive.done[level]})
             for variant, values in archive.data[level].items():
-                hdf5.write_fields(group.create_group(variant), _VARIANT, values, coordinates=along)
+                hdf5.write_fields(group.create_group(variant), VARIANT_LAYOUT, values, coordinates=along)
                 group[f"{variant}/joint_nees_per_dof"].attrs["frames"] = _joint_frames(world.frames)
 
     files.write_all({Path(path): hdf5.image(FORMAT, FORMAT_VERSION, fill)})
@@ -518,13 +518,13 @@ def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
         for level, world in study.levels.items():
             group = hdf5.subgroup(h5file, f"levels/{level}")
             sizes = {"runs": study.runs, "T": world.frames, "J": JOINT_INSTANTS}
-            found = hdf5.read_fields(group, _LEVEL, sizes)
+            found = hdf5.read_fields(group, LEVEL_LAYOUT, sizes)
             done[level], along = (
                 found["done"],
                 {"time": found["time"], "instant": np.array(_joint_frames(world.frames))},
             )
             data[level] = {
-                variant: hdf5.read_fields(hdf5.subgroup(group, variant), _VARIANT, sizes, along)
+                variant: hdf5.read_fields(hdf5.subgroup(group, variant), VARIANT_LAYOUT, sizes, along)
                 for variant in study.variants
             }
         found_versions = {

@@ -47,11 +47,12 @@ def command(options: argparse.Namespace) -> None:
     path = options.out or options.archive.with_suffix(f".{components([mode])[0]}.{export.ending}")
     files.require_writable(path)
     require_ours(options, path, lambda path: is_export(path, options.format))
+    content: str | bytes
     if mode == TRUTH:
         if options.format not in ("tum", "kitti"):
             raise ArchiveError(f"{options.archive}: the truth is written as tum or kitti, not as {options.format}")
-        poses, content = truth_text(archive, str(options.archive), options.format)
-        found = f"{poses} poses"
+        poses, text = truth_text(archive, str(options.archive), options.format)
+        found, content = f"{poses} poses", text
     else:
         content = export.write(open_result(options.archive, mode))
         found = f"{len(archive.time_s)} poses" if export.words.startswith("poses:") else export.words

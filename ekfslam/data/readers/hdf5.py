@@ -58,6 +58,8 @@ _TRUTH = hdf5.layout(
     ("truth/landmarks/position", "position_m", ("M", "xyz"), "m", "world"),
 )
 _NOTES = hdf5.layout(("sequence/notes", "notes", ("n",), "text", "none", hdf5.TEXTS))
+LAYOUT = (*_SEQUENCE, *_NOTES, *_NOISE, *_TRUTH)  # of an archive, too
+OBSERVATIONS_LAYOUT = _OBSERVATIONS
 _CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
 _OLD_NOISE = ("drift", "bearing_drift_rad")  # walks of landmarks, before errors of tracks walked in the image
 _TRUTH_NOISE = "noise_"  # before the names of attributes
