@@ -12,6 +12,7 @@ from .config import (
 from .data.readers import open_sequence, write_sequence
 from .data.sequence import Sequence
 from .errors import EkfslamError
+from .filters.live import LiveEKF
 from .filters.result import Result
 from .reports import Comparison, check, check_consistency, compare
 from .runner import run
@@ -32,6 +33,7 @@ __all__ = [
     "EkfslamError",
     "FilterConfig",
     "HygieneConfig",
+    "LiveEKF",
     "NoiseConfig",
     "Posterior",
     "PosteriorConfig",

@@ -144,6 +144,28 @@ class NonFiniteResultError(FilterError):
         )
 
 
+class LateError(EkfslamError):
+    """A message, or a question, is about a time that is over.
+
+    Args:
+        what: ``velocity``, ``image`` or ``pose``.
+        stamp_s: Its stamp.
+        least_s: It must be later than this; None: nothing has been taken in yet.
+    """
+
+    def __init__(self, what: str, stamp_s: float, least_s: float | None) -> None:
+        self.what, self.stamp_s, self.least_s = what, stamp_s, least_s
+        known = "no image has been taken in yet" if least_s is None else f"the filter is at {least_s:.6f} s"
+        super().__init__(f"{what} at {stamp_s:.6f} s comes too late: {known}")
+
+
+class MissingVelocityError(EkfslamError):
+    """No velocity has come that could lead to a stamp."""
+
+    def __init__(self, stamp_s: float) -> None:
+        super().__init__(f"no velocity has come yet that could lead to {stamp_s:.6f} s")
+
+
 class HonestyError(EkfslamError):
     """A result has no innovations to judge its covariance by."""
 
