@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-whole check lint docs lower-bounds wheel results setup clean
+.PHONY: demo test test-whole check lint docs archive-page lower-bounds wheel results setup clean
 
 demo: $(READY)
 	$(BIN)/ekfslam compare builtin:city --out results/local
@@ -50,6 +50,10 @@ results: $(READY)
 	$(BIN)/python experiments/ablation.py
 	$(BIN)/python experiments/scaling.py
 	$(BIN)/python experiments/benchmark.py
+
+# The page on the archive format, from the code.
+archive-page: $(READY)
+	$(BIN)/python docs/make_archive.py
 
 setup: $(READY)
 

@@ -184,18 +184,6 @@ def invariant_landmark_error(m_hat: Array, m_true: Array, T_world_imu_est: Array
     return e_i - np.cross(m_hat, e_theta)
 
 
-def world_axes_covariance(T_world_imu: Array, covariance: Array) -> tuple[Array, Array]:
-    """Covariances (T, 3, 3) of position (m^2) and rotation error (rad^2), both along world axes.
-
-    As ``T_world_imu = T_hat exp(-xi)``, an error ``xi = [rho; theta]`` moves the IMU by ``-R rho`` to first order and
-    turns it by ``-R theta`` in world, with R the rotation of ``T_world_imu`` (T, 4, 4). ``covariance`` (T, 6, 6) is of
-    ``xi``.
-    """
-    R = T_world_imu[:, :3, :3]
-    R_transposed = np.swapaxes(R, 1, 2)
-    return R @ covariance[:, :3, :3] @ R_transposed, R @ covariance[:, 3:, 3:] @ R_transposed
-
-
 @dataclass(frozen=True)
 class RunAverage:
     """Average of independent runs, each of which counts once.

@@ -13,12 +13,13 @@ from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.sequence import Truth
-from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_nees, world_axes_covariance
+from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_nees
 from ekfslam.figures.maps import plot_landmark_arrows, plot_map
 from ekfslam.figures.style import BAND_ALPHA, BOUNDS, EXPECTED, PRIOR, ZERO, log_axis, save_all, style_of, styled
 from ekfslam.figures.style import save_figure as save_figure  # one of `save_figures` by itself
 from ekfslam.filters.result import Result
 from ekfslam.geometry import se3
+from ekfslam.geometry.motion import world_axes_covariance
 
 _BAND_SIGMAS = 3.0
 _NIS_PROBABILITY = 0.95

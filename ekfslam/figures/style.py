@@ -155,25 +155,32 @@ def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
     ax.yaxis.set_minor_formatter(NullFormatter())
 
 
-def png(figure: Figure) -> bytes:
-    """A figure as a file with a palette of 256 colours: a third of the size or less, without a visible difference."""
-    # The default median cut sacrifices rare colours, here a thin trajectory; this method keeps all within 20 of 255.
-    # Means (kmeans) then give large areas their exact colour: the grey of bounds must not turn blue.
+def png(figure: Figure, packed: bool = False) -> bytes:
+    """A figure as a file.
+
+    Args:
+        figure: Drawn at `DPI`.
+        packed: With a palette of 256 colours: a third of the size or less, without a visible difference, but finding it
+            takes as long as drawing. For what is kept for good.
+    """
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    packed, made_by = BytesIO(), PngInfo()
+    content, made_by = BytesIO(), PngInfo()
     made_by.add_text("Software", MADE_BY)
-    drawn = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    picture = drawn.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
-    picture.save(packed, "PNG", dpi=(DPI, DPI), optimize=True, pnginfo=made_by)
-    return packed.getvalue()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    if packed:
+        # The default median cut sacrifices rare colours, here a thin trajectory; this keeps all within 20 of 255.
+        # Means (kmeans) then give large areas their exact colour: the grey of bounds must not turn blue.
+        picture = picture.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
+    picture.save(content, "PNG", dpi=(DPI, DPI), optimize=packed, pnginfo=made_by)
+    return content.getvalue()
 
 
-def pngs(directory: str | Path, figures: Mapping[str, Figure]) -> dict[Path, str | bytes]:
-    """Figures as the files ``<name>.png`` of a folder, for `ekfslam.files.write_all`."""
-    safe = components(figures)
-    return {Path(directory) / f"{name}.png": png(drawn) for name, drawn in zip(safe, figures.values(), strict=True)}
+def pngs(directory: str | Path, figures: Mapping[str, Figure], packed: bool = False) -> dict[Path, str | bytes]:
+    """Figures as the files ``<name>.png`` of a folder, for `ekfslam.files.write_all`; see `png`."""
+    names = (Path(directory) / f"{name}.png" for name in components(figures))
+    return {path: png(drawn, packed) for path, drawn in zip(names, figures.values(), strict=True)}
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -181,9 +188,9 @@ def save_figure(figure: Figure, path: Path) -> None:
     files.write(path, png(figure))
 
 
-def save_all(directory: str | Path, figures: Mapping[str, Figure]) -> list[Path]:
-    """Write figures as ``<name>.png`` into a folder, made if missing; the paths written."""
-    contents = pngs(directory, figures)
+def save_all(directory: str | Path, figures: Mapping[str, Figure], packed: bool = False) -> list[Path]:
+    """Write figures as ``<name>.png`` into a folder, made if missing; the paths written. See `png`."""
+    contents = pngs(directory, figures, packed)
     files.write_all(contents)
     return list(contents)
 

@@ -14,6 +14,7 @@ from ekfslam.cli.options import (
     add_resume,
     configured,
     open_data,
+    print_warnings,
 )
 from ekfslam.config import MODES
 from ekfslam.errors import ConfigError
@@ -54,6 +55,7 @@ def command(options: argparse.Namespace) -> None:
     for sequence, folder in zip(sequences, folders, strict=True):
         for note in sequence.notes:
             print(f"{sequence.name}: {note}")
+        print_warnings(sequence)
         with Checkpoints(folder / "unfinished.checkpoint", options.resume) as checkpoints:
             comparison = compare(sequence, options.modes, config, checkpoints)
             paths = comparison.save(folder, options.force)
