@@ -27,7 +27,7 @@ def test_the_tutorial_runs():
     assert cells[-1].shown.endswith('<pre class="shown">True</pre>')
     assert np.abs(names["error_m"]).max() < 1.0
     joint_m, alone_m = (
-        float(x) for x in re.findall(r"([0-9.]+) m", next(c.shown for c in cells if "apart" in c.source))[1:]
+        float(x) for x in re.findall(r"([0-9.]+) m", next(c.shown for c in cells if "apart =" in c.source))[1:]
     )
     assert 0.0 < joint_m < alone_m
     assert names["mine"].noise is not None and len(names["mine"].landmarks) > 100
