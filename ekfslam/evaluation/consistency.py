@@ -35,6 +35,21 @@ def pose_error(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
     return se3.log(se3.inverse(T_world_imu_true) @ T_world_imu_est)
 
 
+def world_axes_errors(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
+    """Estimate minus truth along world axes, (n, 4, 4) twice to (n, 6): position, m, and ``log(R_est R_true^T)``, rad.
+
+    `world_axes_covariance` has their covariances.
+    """
+    R_error = T_world_imu_est[:, :3, :3] @ np.swapaxes(T_world_imu_true[:, :3, :3], 1, 2)
+    return np.hstack([T_world_imu_est[:, :3, 3] - T_world_imu_true[:, :3, 3], se3.so3_log(R_error)])
+
+
+def world_axes_std(T_world_imu: Array, covariance: Array) -> Array:
+    """Standard deviations (T, 6) of `world_axes_errors`, m and rad: roots of the diagonals of the covariances."""
+    variance = [np.diagonal(c, axis1=1, axis2=2) for c in world_axes_covariance(T_world_imu, covariance)]
+    return np.sqrt(np.maximum(np.hstack(variance), 0.0))
+
+
 def nees(error: Array, covariance: Array) -> Array:
     """Normalised estimation error squared ``e^T P^-1 e``: (..., n) and (..., n, n) to (...).
 
