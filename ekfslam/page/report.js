@@ -3,7 +3,7 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 const SIGMAS = 2; // of ellipses
-const MOST_ELLIPSES = 600; // of landmarks in a view
+const MOST_ELLIPSES = 350; // of landmarks in a view
 const tip = element("div", { class: "tip", hidden: "" }, document.body);
 
 function element(name, attributes, parent, text) {
@@ -143,7 +143,7 @@ function plot(parent, title, words, spec) {
       drawn("line", { class: "rule", x1: left, x2: width - right, y1: Y(y), y2: Y(y) }, svg);
       drawn("text", { class: "axis", x: left - 7, y: Y(y) + 4, "text-anchor": "end" }, svg).textContent = short(y);
     }
-    for (const x of ticks(x0, x1, Math.max(2, width / 110)))
+    for (const x of ticks(x0, x1, Math.max(3, width / 110)).filter((x) => X(x) < width - right - 22))
       drawn("text", { class: "axis", x: X(x), y: height - 7, "text-anchor": "middle" }, svg).textContent = short(x);
     drawn("text", { class: "axis", x: width - right, y: height - 7, "text-anchor": "end" }, svg).textContent = spec.xUnit || "s";
     for (const b of bands) {

@@ -138,12 +138,14 @@ def _section(number: int, recording: Recording, is_alone: bool) -> str:
         f"{recording.length_m:.0f} m" if recording.length_m >= 10 else f"{recording.length_m:.2f} m",
         f"truth of {_count(len(archive.truth.frame), 'pose')}" if archive.truth is not None else "no truth",
     ]
-    notes = [*remarks_of(recording), *archive.notes]
+    notes = _list([*remarks_of(recording), *archive.notes])
+    if notes:
+        notes = f"<details><summary>Notes on the recording</summary><div>{notes}</div></details>"
     heading = "" if is_alone else f"<h2>{escape(recording.name)}</h2>"
     return f"""<section id="recording-{number}">
 {heading}
 {_facts(facts)}
-{_list(notes, "notes")}
+{notes}
 <div class="cards">{"".join(_card(run) for run in recording.runs if _is_judged(run, recording))}</div>
 <p class="notes">{_JUDGED} {escape(BLIND)}</p>
 <noscript><p class="notes">A script in this page draws its plots; this browser does not run it.</p></noscript>
