@@ -53,6 +53,7 @@ _ROWS = (
     ("ms_per_frame_max", "ms/frame max", ".2f"),
     ("total_s", "total [s]", ".2f"),
 )
+KEYS = tuple(key for key, _, _ in _ROWS)  # of a summary, in the order of the table
 
 
 def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float | int | None]:
@@ -69,7 +70,7 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
     (1 expected) is the sum of NIS over the sum of degrees of freedom, ``total_s`` the sum of the time spent on the
     frames. None stands where truth is missing or the value is undefined.
     """
-    summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _ROWS)
+    summary: dict[str, float | int | None] = dict.fromkeys(KEYS)
     truth = sequence.truth
     if truth is not None:
         summary["landmark_rmse_m"] = landmark_rmse(result.landmarks, truth)

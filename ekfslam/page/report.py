@@ -235,9 +235,10 @@ def _overview(recordings: Sequence[Recording]) -> str:
         name = f'<a href="#recording-{i}">{escape(recording.name)}</a>'
         cells = "".join(f"<td>{escape(column[row + 1])}</td>" for column in columns)
         rows.append(f'<tr><th scope="row">{name}</th><th scope="row">{escape(run.label)}</th>{cells}</tr>')
-    head = "".join(f'<th scope="col">{escape(column[0])}</th>' for column in columns)
+    headings = ["recording", "run", *(column[0] for column in columns)]
+    head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in headings)
     return f"""<section><h2>All runs</h2>
-<div class="wide"><table class="names"><thead><tr><th scope="col">recording</th><th scope="col">run</th>{head}</tr></thead>
+<div class="wide"><table class="names"><thead><tr>{head}</tr></thead>
 <tbody>{"".join(rows)}</tbody></table></div></section>"""
 
 
