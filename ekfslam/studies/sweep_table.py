@@ -98,7 +98,7 @@ def table_image(table: SweepTable) -> bytes:
             else np.array([text.encode() for text in values.tolist()], dtype="S")
             for name, values in table.columns.items()
         }
-        hdf5.write_fields(group, layout, stored, compact=True)
+        hdf5.write_fields(group, layout, stored)
 
     return hdf5.image(FORMAT, FORMAT_VERSION, fill)
 
