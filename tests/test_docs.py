@@ -84,3 +84,15 @@ def test_quoted_files_exist(page):
     quoted = re.findall(r"(?:experiments|results|tests|ekfslam|docs)/[\w/.-]*\w", text)
     missing = [name for name in quoted if not (ROOT / name).exists() and "local" not in name and "NAME" not in name]
     assert not missing
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
+def test_links_of_the_top_folder_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)#]+)", (ROOT / page).read_text(encoding="utf-8"))
+    assert links and not [link for link in links if not (ROOT / link).exists()]
+
+
+def test_every_page_is_in_the_navigation():
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    pages = [path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")]
+    assert not [name for name in pages if f": {name}\n" not in navigation]
