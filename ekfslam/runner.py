@@ -15,7 +15,7 @@ import scipy
 from ekfslam.arrays import IntArray
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
-from ekfslam.errors import ConfigError
+from ekfslam.errors import ConfigError, NoVelocitiesError
 from ekfslam.evaluation.relative import dead_reckoned_pairs, relative_pairs
 from ekfslam.evaluation.sanity import inspect_result, inspect_sequence, sanity_attributes
 from ekfslam.filters.dead_reckoning import dead_reckon
@@ -57,12 +57,17 @@ def run(
     Raises:
         ArchiveError: The checkpoint to go on from is damaged, or of something else.
         ConfigError: Unknown mode.
+        NoVelocitiesError: Dead reckoning of a recording without velocities.
         FilterError: The filter cannot go on: an innovation covariance is not positive definite (`InnovationError`), a
             number is none (`NonFiniteResultError`), or a matrix is singular.
         IllPosedError: The posterior of a smoothed run leaves something undetermined.
     """
     if mode not in MODES:
         raise ConfigError(f"unknown mode {mode!r}; known: {', '.join(MODES)}")
+    if mode == "dead-reckoning" and not sequence.has_velocities:
+        raise NoVelocitiesError(
+            f"{sequence.name}: nobody measured velocities, so there is no dead reckoning; the other modes go by vision"
+        )
     if mode == "smoothed":
         return smooth(run(sequence, "full", config, further, checkpoints))
     if mode == "full":

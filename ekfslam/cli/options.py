@@ -8,13 +8,12 @@ from pathlib import Path
 
 from ekfslam import files
 from ekfslam.config import VARIANTS, Config
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence
-from ekfslam.data.velocities import attach_velocities
-from ekfslam.errors import ConfigError, WriteError
+from ekfslam.errors import WriteError
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.filters.result import Result
+from ekfslam.frontend.opening import open_sequence
 from ekfslam.storage.archive import Archive
 
 DEFAULT_DATA = "builtin:city"
@@ -32,14 +31,25 @@ def add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace a file that is no earlier result of the same")
 
 
-def add_data_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="true poses: KITTI odometry or TUM text")
+def add_no_figures(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--no-figures", action="store_true", help="draw none, which saves time")
+
+
+def add_executor(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
     parser.add_argument(
-        "--frames",
-        type=_stretch,
-        metavar="A:B",
-        help="frames A to B - 1 alone, like a slice in Python",
+        "--executor",
+        default="processes",
+        metavar="SPEC",
+        help="processes (default), serial, tls://HOST:PORT (a Dask cluster, with the certificates of Dask's "
+        "configuration distributed.comm.tls), dask://HOST:PORT (without: whoever reaches that port runs programs as "
+        "you; for networks of your own only), or mpi",
     )
+
+
+def add_place_options(parser: argparse.ArgumentParser) -> None:
+    """What belongs to a recording, but lies elsewhere."""
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="true poses: KITTI odometry or TUM text")
     parser.add_argument(
         "--velocities",
         type=Path,
@@ -52,16 +62,26 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
         help="frame of --velocities (default: as the file says, otherwise imu)",
     )
     parser.add_argument(
-        "--extrinsics",
-        choices=("corrected", "as-stored"),
-        default="corrected",
-        help="how to read cam_T_imu of .npz recordings (default: %(default)s)",
-    )
-    parser.add_argument(
         "--lateral",
         choices=("corrected", "as-stored"),
         default="corrected",
         help="sign of the lateral velocity of KITTI, stored positive to the right (default: %(default)s)",
+    )
+
+
+def add_data_options(parser: argparse.ArgumentParser) -> None:
+    add_place_options(parser)
+    parser.add_argument(
+        "--frames",
+        type=_stretch,
+        metavar="A:B",
+        help="frames A to B - 1 alone, like a slice in Python",
+    )
+    parser.add_argument(
+        "--extrinsics",
+        choices=("corrected", "as-stored"),
+        default="corrected",
+        help="how to read cam_T_imu of .npz recordings (default: %(default)s)",
     )
     parser.add_argument(
         "--truth-noise",
@@ -118,17 +138,16 @@ def configured(options: argparse.Namespace) -> Config:
 
 
 def open_data(options: argparse.Namespace, data: str) -> Sequence:
-    sequence = open_sequence(data, extrinsics=options.extrinsics, lateral=options.lateral, truth=options.truth)
-    return with_options(sequence, options)
-
-
-def with_options(sequence: Sequence, options: argparse.Namespace) -> Sequence:
-    """A recording with the velocities and the frames that were asked for."""
-    if options.velocities is not None:
-        frame, lateral = options.velocity_frame, options.lateral
-        sequence = attach_velocities(sequence, options.velocities, velocity_frame=frame, lateral=lateral)
-    elif options.velocity_frame is not None:
-        raise ConfigError("--velocity-frame says how to take --velocities, which are not given")
+    settings = Config.from_toml(options.config).front_end if getattr(options, "config", None) else None
+    sequence = open_sequence(
+        data,
+        extrinsics=options.extrinsics,
+        lateral=options.lateral,
+        truth=options.truth,
+        velocities=options.velocities,
+        velocity_frame=options.velocity_frame,
+        front_end=settings,
+    )
     return sequence if options.frames is None else sequence[options.frames]
 
 

@@ -32,6 +32,7 @@ from ekfslam.errors import (
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.names import printable
+from ekfslam.shown import Card, Shown, count, figure
 
 VelocityFrame = Literal["imu", "level"]
 
@@ -44,6 +45,8 @@ _LARGEST_VELOCITY, _LARGEST_DISTANCE_M, _LARGEST_PX = 1e6, 1e9, 1e7
 
 # Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
+# Among those of one whose tracks are compared with their first sight in every frame, so that their errors do not walk.
+CHECKED_TRACKS = {"tracks": "checked"}
 # Among the attributes of one whose velocities nobody measured; they are 0 then, and mean nothing.
 WITHOUT_VELOCITIES = {"velocities": "none"}
 
@@ -120,8 +123,8 @@ class Truth:
             object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
 
 
-@dataclass(frozen=True)
-class Sequence:
+@dataclass(frozen=True, repr=False)
+class Sequence(Shown):
     """One recording of a stereo rig with body velocities.
 
     Args:
@@ -166,6 +169,27 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        seconds, seen = float(self.time_s[-1] - self.time_s[0]), self.observations
+        per_frame = figure(len(seen) / len(self))
+        truth = self.truth
+        known = (
+            "none"
+            if truth is None
+            else count(len(truth.frame), "pose")
+            + (f", {count(len(truth.landmark), 'landmark')}" if len(truth.landmark) else "")
+        )
+        facts = {
+            "source": self.source,
+            "frames": f"{len(self)}, {figure(seconds)} s",
+            "tracks": f"{count(len(seen.ids), 'landmark')}, {per_frame} a frame",
+            "truth": known,
+            "noise": "not stated" if self.noise is None else "stated",
+        }
+        facts |= {"notes": count(len(self.notes), "sentence") + " in .notes"} if self.notes else {}
+        return Card(self.name, facts, ("ekfslam.run(sequence)", "sequence[100:300]", "sequence.between(10.0, 20.0)"))
 
     def __getitem__(self, frames: slice) -> Sequence:
         """A stretch of successive frames as a recording of its own, ``sequence[100:300]``; frames count from 0 again.
@@ -248,6 +272,11 @@ class Sequence:
     def interpolated(self) -> BoolArray:
         """Which intervals (T,) have velocities, and probably true poses, that were never measured."""
         return known_intervals(self.attributes, self.twist)
+
+    @property
+    def has_checked_tracks(self) -> bool:
+        """Whether errors of its tracks do not walk, see `ekfslam.frontend`."""
+        return self.attributes.get("tracks") == CHECKED_TRACKS["tracks"]
 
     @property
     def has_velocities(self) -> bool:

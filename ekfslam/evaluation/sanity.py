@@ -219,14 +219,15 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]
 
 
 def _pairs(sequence: Sequence) -> tuple[IntArray, IntArray]:
-    """Observations of successive frames with depth, while the rig moves; a part of them, evenly."""
+    """Observations of successive frames with depth, while the rig moves and is measured; a part of them, evenly."""
     observations = sequence.observations
     earlier, later = successive(observations)
     pixels = observations.pixels_px
     beside = observations.frame[later] - observations.frame[earlier] == 1
     near = pixels[earlier, 0] - pixels[earlier, 2] > _LEAST_DISPARITY_PX
     moves = (pixels[later] != pixels[earlier]).any(axis=1)
-    chosen = np.flatnonzero(beside & near & moves)
+    measured = ~sequence.interpolated[observations.frame[later]]
+    chosen = np.flatnonzero(beside & near & moves & measured)
     chosen = chosen[:: max(1, len(chosen) // _PAIRS)]
     return earlier[chosen], later[chosen]
 

@@ -5,34 +5,37 @@ from __future__ import annotations
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.config import FrontEndConfig
 from ekfslam.data.images.pairs import Image
-from ekfslam.frontend.config import FrontEndConfig
 from ekfslam.frontend.opencv import opencv
 
 
-def corners(image: Image, config: FrontEndConfig) -> tuple[Array, Array]:
-    """Corners by the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994), strongest first.
+def corners(image: Image, free: BoolArray, config: FrontEndConfig) -> Array:
+    """Corners by the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994).
+
+    Args:
+        image: In which to look.
+        free: (height, width) where a feature may be.
+        config: Settings.
 
     Returns:
-        Pixels (n, 2) and eigenvalues (n,).
+        Pixels (n, 2), strongest first.
     """
     cv2 = opencv()
     response = cv2.cornerMinEigenVal(image, config.corner_block)
     largest = cv2.dilate(response, np.ones((config.spacing + 1, config.spacing + 1), np.uint8))
-    is_corner = (response == largest) & (response > config.corner_quality * float(response.max()))
-    margin = np.zeros(image.shape, dtype=bool)
-    margin[config.border : -config.border, config.border : -config.border] = True
-    v, u = np.nonzero(is_corner & margin)
-    order = np.argsort(-response[v, u], kind="stable")
-    return np.stack([u, v], axis=1)[order].astype(float), response[v, u][order].astype(float)
+    is_corner = (response == largest) & (response > config.corner_quality * float(response.max())) & free
+    at = np.flatnonzero(is_corner)
+    at = at[np.argsort(-response.ravel()[at], kind="stable")]
+    return np.stack([at % image.shape[1], at // image.shape[1]], axis=1).astype(float)
 
 
-def away_from(found: Array, taken: Array, distance: float) -> BoolArray:
-    """Which pixels (n, 2) are at least so far from all pixels (m, 2): (n,) truth values."""
-    if not len(taken):
-        return np.ones(len(found), dtype=bool)
-    squared = (found**2).sum(axis=1)[:, None] - 2.0 * found @ taken.T + (taken**2).sum(axis=1)
-    return squared.min(axis=1) >= distance**2
+def without(free: BoolArray, pixels: Array, radius: int) -> BoolArray:
+    """Where features may be (height, width) off pixels (n, 2) that are taken."""
+    disc = np.zeros(free.shape, dtype=np.uint8)
+    for u, v in np.round(pixels).astype(np.int64).tolist():
+        opencv().circle(disc, (u, v), radius, 1, -1)
+    return free & (disc == 0)
 
 
 def spread(found: Array, taken: Array, size: tuple[int, int], wanted: int, buckets: tuple[int, int]) -> IntArray:

@@ -52,4 +52,4 @@ def returns(source: Image, target: Image, pixels: Array, found: Array, window: i
 
 def inside(pixels: Array, size: tuple[int, int], border: float) -> BoolArray:
     """Which pixels (n, 2) are in an image of this width and height, and so far from its border."""
-    return ((pixels >= border) & (pixels <= np.array(size) - 1 - border)).all(axis=1)
+    return np.all((pixels >= border) & (pixels <= np.array(size) - 1 - border), axis=1)

@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
+from ekfslam.config import FrontEndConfig
 from ekfslam.data.images.pairs import Image
-from ekfslam.frontend.config import FrontEndConfig
 from ekfslam.frontend.flow import flow, inside, returns
 from ekfslam.frontend.opencv import opencv
-
-_NEIGHBOURS = 2  # px beside the best match that belong to its peak
 
 
 def match_along_row(
@@ -41,15 +39,13 @@ def match_along_row(
         best = int(np.argmax(score))
         found[i, 0] += begin + best + half - u
         found[i, 1] -= row_offset[i]
-        good[i] = score[best] >= config.match_score and score[best] > _second(score, best) + config.match_margin
+        good[i] = score[best] >= config.match_score and score[best] > _second(score, best, half) + config.match_margin
     return found, good
 
 
-def _second(score: Array, best: int) -> float:
-    """The largest local maximum besides the best one; -1 where there is none."""
-    is_peak = np.r_[True, score[1:] > score[:-1]] & np.r_[score[:-1] >= score[1:], True]
-    is_peak[max(best - _NEIGHBOURS, 0) : best + _NEIGHBOURS + 1] = False
-    return float(score[is_peak].max(initial=-1.0))
+def _second(score: Array, best: int, half: int) -> float:
+    """The largest score besides those of patches that overlap half of the best one; -1 where there is none."""
+    return float(max(score[: max(best - half, 0)].max(initial=-1.0), score[best + half + 1 :].max(initial=-1.0)))
 
 
 def first_pairs(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekfslam.arrays import Array, BoolArray
+from ekfslam.arrays import Array, BoolArray, Float32Array
 from ekfslam.data.images.pairs import Distortion, Image, PairCalibration
 from ekfslam.errors import CalibrationError
 from ekfslam.frontend.opencv import opencv
@@ -30,7 +30,7 @@ class Rectification:
 
     camera: StereoCamera
     T_rectified_left: Array
-    maps: tuple[Array, Array] | None
+    maps: tuple[Float32Array, Float32Array] | None
     valid: tuple[BoolArray, BoolArray] | None
 
     def apply(self, left: Image, right: Image) -> tuple[Image, Image]:
@@ -122,6 +122,6 @@ def _distorted(xy: Array, lens: Distortion) -> Array:
     return equidistant(xy, lens.coefficients) if lens.model == "equidistant" else xy
 
 
-def _shows(pixels: Array, size: tuple[int, int]) -> BoolArray:
+def _shows(pixels: Float32Array, size: tuple[int, int]) -> BoolArray:
     """Which pixels (height, width) of a map (height, width, 2) are inside the image that is read."""
-    return ((pixels >= 0) & (pixels <= np.array(size) - 1)).all(axis=-1)
+    return np.all((pixels >= 0) & (pixels <= np.array(size) - 1), axis=-1)

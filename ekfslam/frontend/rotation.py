@@ -20,7 +20,7 @@ from ekfslam.geometry.stereo_motion import Alignment
 
 # What frames say is worth so much of what it would be worth if their errors were independent. Successive frames see the
 # same features with the same errors: the standard deviation of yaw came out five to ten times too small.
-_INDEPENDENT_SHARE = 0.02
+_INDEPENDENT_SHARE = 0.04
 _ROBUST_PX = 1.0
 _LEAST_POINTS = 10
 
@@ -46,7 +46,7 @@ class RightRotation:
 
     @property
     def rows(self) -> Array:
-        return np.linalg.solve(self._rows_information, self._rows_vector)
+        return np.asarray(np.linalg.solve(self._rows_information, self._rows_vector), dtype=float)
 
     @property
     def yaw(self) -> float:
@@ -85,17 +85,15 @@ class RightRotation:
         """
         if len(before_px) < _LEAST_POINTS:
             return
-        by_yaw = np.zeros((len(before_px), 3))
-        by_yaw[:, 2] = yaw_shape(self._camera, now_px[:, 2])
-        by_yaw -= alignment.B[:, :, 2] * yaw_shape(self._camera, before_px[:, 2])[:, None]
-        r = np.where(np.isfinite(alignment.residual_px), alignment.residual_px, 0.0)
-        W, H = alignment.W, alignment.H
-        WH, Wy = W @ H, (W @ by_yaw[..., None])[..., 0]
-        cross, gradient = np.einsum("ni,nij->j", by_yaw, WH), np.einsum("nij,ni->j", WH, r)
-        solved = np.linalg.solve(alignment.information + 1e-6 * np.eye(6), np.stack([cross, gradient], axis=1))
-        information = float((by_yaw * Wy).sum() - cross @ solved[:, 0])
+        by_yaw = np.zeros((len(before_px), 3, 1))
+        by_yaw[:, 2, 0] = yaw_shape(self._camera, now_px[:, 2])
+        by_yaw[..., 0] -= alignment.B[:, :, 2] * yaw_shape(self._camera, before_px[:, 2])[:, None]
+        cross = np.einsum("nij,nik,nkl->jl", by_yaw, alignment.W, alignment.H)[0]
+        own = np.einsum("nij,nik,nkl->jl", by_yaw, alignment.W, by_yaw)[0, 0]
+        solved = np.linalg.solve(alignment.information + 1e-6 * np.eye(6), cross)
+        information = float(own - cross @ solved)
         # residual(yaw) = r + by_yaw d, hence the minus.
-        vector = -float((Wy * r).sum() - cross @ solved[:, 1])
+        vector = -float(alignment.gradient(by_yaw)[0] - solved @ alignment.gradient(alignment.H))
         yaw = self.yaw
         self._yaw_information += _INDEPENDENT_SHARE * information
         self._yaw_vector += _INDEPENDENT_SHARE * (information * yaw + vector)

@@ -8,11 +8,11 @@ stored matrix (4, pixels) a feature and iteration gives them. The scale s of a p
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
-from ekfslam.arrays import Array
-from ekfslam.data.images.pairs import Image
+from ekfslam.arrays import Array, BoolArray, Float32Array, IntArray
 from ekfslam.frontend.opencv import opencv
 
 _ITERATIONS = 8
@@ -20,22 +20,26 @@ _CONVERGED_PX = 0.005
 _RIDGE = 1e-6
 
 
-def grid(side: int) -> Array:
-    """Offsets (side^2, 2) of the pixels of a patch from its centre, row by row."""
+@cache
+def grid(side: int) -> Float32Array:
+    """Offsets (side^2, 2) of the pixels of a patch from its centre, row by row, float32."""
     offsets = np.arange(side) - side // 2
     v, u = np.meshgrid(offsets, offsets, indexing="ij")
-    return np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
+    return np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32)
 
 
-def weights(side: int) -> Array:
+@cache
+def weights(side: int) -> Float32Array:
     """(side^2,) Gaussian weights of the pixels of a patch, which sum to 1."""
     weight = np.exp(-0.5 * (grid(side) ** 2).sum(axis=1) / (side / 4.0) ** 2)
     return (weight / weight.sum()).astype(np.float32)
 
 
-def sample(image: Image, pixels: Array, scale: Array, side: int) -> Array:
+def sample(image: Float32Array, pixels: Array, scale: Array, side: int) -> Float32Array:
     """Patches (n, side^2) about pixels (n, 2), bilinear, their pixels ``scale`` (n,) apart; all in one call."""
-    cv2, offsets = opencv(), grid(side).astype(np.float32)
+    cv2, offsets = opencv(), grid(side)
+    if not len(pixels):
+        return np.empty((0, side**2), dtype=np.float32)
     at = pixels.astype(np.float32)[:, None] + scale.astype(np.float32)[:, None, None] * offsets
     return cv2.remap(image, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
@@ -49,11 +53,11 @@ class Templates:
         solver: (n, 4, side^2) least squares solution for ``(g d_u, g d_v, g, b)``.
     """
 
-    patch: Array
-    solver: Array
+    patch: Float32Array
+    solver: Float32Array
 
     @staticmethod
-    def of(image: Image, pixels: Array, side: int) -> Templates:
+    def of(image: Float32Array, pixels: Array, side: int) -> Templates:
         """Patches about pixels (n, 2)."""
         wide = sample(image, pixels, np.ones(len(pixels)), side + 2).reshape(-1, side + 2, side + 2)
         T = wide[:, 1:-1, 1:-1].reshape(len(pixels), side**2)
@@ -65,7 +69,7 @@ class Templates:
         solver = np.linalg.solve(normal + _RIDGE * np.eye(4), JW.astype(float))
         return Templates(T, solver.astype(np.float32))
 
-    def keep(self, kept: Array) -> Templates:
+    def keep(self, kept: IntArray | BoolArray) -> Templates:
         """Some of them, by index or mask."""
         return Templates(self.patch[kept], self.solver[kept])
 
@@ -73,7 +77,7 @@ class Templates:
         """These and others."""
         return Templates(np.concatenate([self.patch, others.patch]), np.concatenate([self.solver, others.solver]))
 
-    def align(self, image: Image, pixels: Array, scale: Array) -> tuple[Array, Array]:
+    def align(self, image: Float32Array, pixels: Array, scale: Array) -> tuple[Array, Array]:
         """Bring features back to their patches.
 
         Args:
@@ -102,7 +106,7 @@ class Templates:
         return pixels, np.where(fails, -1.0, score)
 
 
-def correlation(a: Array, b: Array, weight: Array) -> Array:
+def correlation(a: Float32Array, b: Float32Array, weight: Float32Array) -> Array:
     """Weighted, normalised cross-correlation (n,) of patches (n, side^2)."""
     a, b = a - (a @ weight)[:, None], b - (b @ weight)[:, None]
     norm = np.sqrt((a * a) @ weight * ((b * b) @ weight))

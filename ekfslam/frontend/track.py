@@ -8,15 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
+from ekfslam.config import FrontEndConfig
 from ekfslam.data.images.pairs import ImageRecording
-from ekfslam.data.sequence import WITHOUT_VELOCITIES, Observations, Sequence
+from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations, Sequence
 from ekfslam.errors import EmptyTracksError
-from ekfslam.frontend.config import FrontEndConfig
 from ekfslam.frontend.opencv import one_thread
 from ekfslam.frontend.rectify import rectification
 from ekfslam.frontend.rotation import correction
-from ekfslam.frontend.tracker import Tracker
+from ekfslam.frontend.tracker import Seen, Tracker
 from ekfslam.geometry import motion, se3
+from ekfslam.geometry.camera import StereoCamera
 from ekfslam.progress import progress
 
 
@@ -30,6 +31,7 @@ class TrackReport:
         losses: How many tracks ended, by reason; the others were there at the end.
         withheld: Observations that did not move as the rig, and were not reported.
         refused: Corners without a match in the right image.
+        single: Tracks that one frame alone saw, which are left out.
         rotation_px: (T, 3) pitch, yaw and roll of the right camera as known after each frame, times the focal length.
         rotation_std_px: (T, 3) their standard deviations.
     """
@@ -41,6 +43,7 @@ class TrackReport:
     losses: dict[str, int]
     withheld: int
     refused: int
+    single: int
     rotation_px: Array
     rotation_std_px: Array
 
@@ -62,7 +65,7 @@ class TrackReport:
             f"a track lasts {middle:.0f} frames (median; 10 %: {shortest:.0f}, 90 %: {longest:.0f}).",
             f"{ended} tracks ended before the last frame: {reasons}.",
             f"{self.refused} corners had no match in the right image; {self.withheld} observations did not move as the "
-            "rig and are left out.",
+            f"rig, and {self.single} tracks were seen once: both are left out.",
             f"The right camera is rotated against the calibration by {found} found from the tracks and taken out.",
         )
 
@@ -96,37 +99,63 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
             vectors.append(tracker.rotation.vector)
             stds.append(tracker.rotation.std)
     rotation, std = np.array(vectors), np.array(stds)
-    # Causal with a start: what is known of the rotation after a second is used for the frames before, too.
-    used = np.maximum(np.arange(len(seen)), min(config.settling, len(seen) - 1))
-    pixels = [
-        np.hstack([frame.left, frame.right + correction(rectified.camera, rotation[used[k]], frame.right)])
-        for k, frame in enumerate(seen)
-    ]
-    ids = np.concatenate([frame.id for frame in seen])
-    if not len(ids):
-        raise EmptyTracksError("not one feature is seen in both images of a pair", source=recording.source)
-    observations = Observations(
-        np.repeat(np.arange(len(seen)), [len(frame.id) for frame in seen]), ids, np.vstack(pixels)
-    )
-    lengths = np.unique(ids, return_counts=True)[1]
+    observations, single = _observations(seen, rotation, rectified.camera, config.settling)
+    if not len(observations):
+        raise EmptyTracksError(
+            "no feature is seen in both images of two frames: is left right, or max_disparity too small?",
+            source=recording.source,
+        )
     report = TrackReport(
         len(seen),
-        len(lengths),
-        len(ids),
-        lengths,
-        {reason: n for reason, n in tracker.losses.items() if n},
+        len(observations.ids),
+        len(observations),
+        np.unique(observations.landmark, return_counts=True)[1],
+        {reason: count for reason, count in tracker.losses.items() if count},
         tracker.withheld,
         tracker.refused,
+        single,
         rotation,
         std,
     )
-    has_velocities = recording.twist is not None
-    sequence = Sequence(
+    return _sequence(recording, rectified.camera, T_cam_imu, observations, report, config), report
+
+
+def _observations(seen: list[Seen], rotation: Array, camera: StereoCamera, settling: int) -> tuple[Observations, int]:
+    """Observations with the rotation of the right camera taken out, and how many tracks one frame alone saw.
+
+    Causal with a start: what is known of the rotation after the first frames is used for these, too.
+
+    Args:
+        seen: By frame.
+        rotation: (T, 3) of the right camera as known after each frame, px.
+        camera: Of the rectified pair.
+        settling: Frames at the start.
+    """
+    frame = np.repeat(np.arange(len(seen)), [len(found.id) for found in seen])
+    ids = np.concatenate([found.id for found in seen])
+    left, right = (np.vstack([getattr(found, side) for found in seen]) for side in ("left", "right"))
+    used = np.maximum(frame, min(settling, len(seen) - 1))
+    pixels = np.hstack([left, right + correction(camera, rotation[used], right)])
+    _, inverse, counts = np.unique(ids, return_inverse=True, return_counts=True)
+    twice = counts[inverse] > 1
+    return Observations(frame[twice], ids[twice], pixels[twice]), int((~twice).sum())
+
+
+def _sequence(
+    recording: ImageRecording,
+    camera: StereoCamera,
+    T_cam_imu: Array,
+    observations: Observations,
+    report: TrackReport,
+    config: FrontEndConfig,
+) -> Sequence:
+    """The recording with tracks instead of images."""
+    return Sequence(
         name=recording.name,
         source=recording.source,
         time_s=recording.time_s,
-        twist=recording.twist if has_velocities else np.zeros((len(recording), 6)),
-        camera=rectified.camera,
+        twist=np.zeros((len(recording), 6)) if recording.twist is None else recording.twist,
+        camera=camera,
         T_cam_imu=T_cam_imu,
         observations=observations,
         truth=recording.truth,
@@ -135,11 +164,10 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
         notes=(*recording.notes, *report.lines),
         attributes={
             **recording.attributes,
-            **({} if has_velocities else WITHOUT_VELOCITIES),
+            **(WITHOUT_VELOCITIES if recording.twist is None else {}),
             **_account(config, report),
         },
     )
-    return sequence, report
 
 
 def _prediction(recording: ImageRecording, T_cam_imu: Array, k: int) -> Array | None:
@@ -152,16 +180,13 @@ def _prediction(recording: ImageRecording, T_cam_imu: Array, k: int) -> Array | 
 
 def _account(config: FrontEndConfig, report: TrackReport) -> dict[str, str | int | float]:
     """Attributes that say how the tracks were made."""
-    changed = {
-        field.name: getattr(config, field.name)
-        for field in dataclasses.fields(config)
-        if getattr(config, field.name) != field.default
-    }
     settings = {
-        f"frontend_{name}": value if isinstance(value, int | float) else str(value) for name, value in changed.items()
+        f"front_end_{setting.name}": getattr(config, setting.name)
+        for setting in dataclasses.fields(config)
+        if getattr(config, setting.name) != setting.default
     }
     yaw, std = report.rotation_px[-1], report.rotation_std_px[-1]
     names = ("pitch", "yaw", "roll")
     found = {f"right_camera_{name}_px": float(value) for name, value in zip(names, yaw, strict=True)}
     found |= {f"right_camera_{name}_std_px": float(value) for name, value in zip(names, std, strict=True)}
-    return {"front_end": "stereo", **settings, **found}
+    return {**CHECKED_TRACKS, **settings, **found}

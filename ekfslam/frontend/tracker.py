@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.config import FrontEndConfig
 from ekfslam.data.images.pairs import Image
-from ekfslam.frontend.config import FrontEndConfig
-from ekfslam.frontend.detect import away_from, corners, eroded, spread
-from ekfslam.frontend.flow import flow, inside, returns
+from ekfslam.frontend.detect import corners, eroded, spread, without
+from ekfslam.frontend.features import Features, Followed, follow
+from ekfslam.frontend.flow import inside
 from ekfslam.frontend.match import first_pairs
 from ekfslam.frontend.rotation import RightRotation, correction
 from ekfslam.frontend.template import Templates
@@ -20,44 +21,11 @@ from ekfslam.geometry.camera import StereoCamera, project, triangulate
 from ekfslam.geometry.stereo_motion import Alignment, agrees, align, sampled_motion
 
 LEAST_DISPARITY_PX = 0.5  # with less, a track has no depth to be predicted by
+_LEAST_DEPTH_M = 0.1
 _AGREE_SHARE = 0.5  # of the points, below which the motion is sampled anew
-
-
-@dataclass(frozen=True)
-class Features:
-    """What is tracked.
-
-    Args:
-        id: (n,) of the tracks.
-        left, right: (n, 2) pixels, right ones as seen, without the correction of the camera's rotation.
-        disparity: (n,) at first sight.
-        strikes: (n,) how many frames in a row they did not move as the rig.
-        patches_left, patches_right: Of first sight.
-    """
-
-    id: IntArray
-    left: Array
-    right: Array
-    disparity: Array
-    strikes: IntArray
-    patches_left: Templates
-    patches_right: Templates
-
-    def keep(self, kept: Array) -> Features:
-        """Some of them, by index or mask."""
-        arrays = (self.id, self.left, self.right, self.disparity, self.strikes)
-        return Features(*(array[kept] for array in arrays), self.patches_left.keep(kept), self.patches_right.keep(kept))
-
-    def and_more(self, others: Features) -> Features:
-        """These and others."""
-        pairs = (
-            (getattr(self, name), getattr(others, name)) for name in ("id", "left", "right", "disparity", "strikes")
-        )
-        return Features(
-            *(np.concatenate(pair) for pair in pairs),
-            self.patches_left.and_more(others.patches_left),
-            self.patches_right.and_more(others.patches_right),
-        )
+_FOUND_SHARE = 0.4  # of the features, below which another prediction is tried
+_FEW = 0.5  # share of the wanted features, below which new ones do not wait
+_L, _R = slice(0, 2), slice(2, 4)  # pixels of the left and the right image
 
 
 @dataclass(frozen=True)
@@ -102,7 +70,7 @@ class Tracker:
         self._features: Features | None = None
         self._images: tuple[Image, Image] | None = None
         self._motion: Array | None = None
-        self._next_id = 0
+        self._next_id = self._waited = 0
         self._hopeless = np.empty((0, 2))
         self._past: deque[tuple[IntArray, Array, Array, Array]] = deque(maxlen=config.rotation_gap)
         self._generator = np.random.default_rng(config.seed)
@@ -114,19 +82,17 @@ class Tracker:
             left, right: Rectified images (height, width).
             prediction: (4, 4) motion ``T_now_before`` of the camera; that of the last interval where None.
         """
-        motion = None
-        reported = np.empty(0, dtype=bool)
-        if self._images is not None and self._features is not None:
-            self._follow(left, right, prediction)
-            motion, reported = self._agree(prediction)
+        motion, reported = None, np.empty(0, dtype=bool)
+        guess = self._motion if prediction is None else prediction
+        if self._images is not None:
+            rows = self._follow(left, right, prediction)
+            motion, reported = self._agree(rows, guess)
             self._calibrate(reported, motion)
         fresh = self._refill(left, right)
-        self._images = (left, right)
-        features = self._features
-        assert features is not None
-        seen = np.concatenate([reported, np.ones(fresh, dtype=bool)])
-        self._motion = motion
-        return Seen(features.id[seen], features.left[seen], features.right[seen], motion)
+        self._images, self._motion = (left, right), motion
+        assert self._features is not None
+        seen = self._features.keep(np.concatenate([reported, np.ones(fresh, dtype=bool)]))
+        return Seen(seen.id, seen.left, seen.right, motion)
 
     def rows(self, features: Features) -> Array:
         """Rows (n, 3) of features, the rotation of the right camera taken out."""
@@ -134,43 +100,51 @@ class Tracker:
         v = 0.5 * (features.left[:, 1] + right[:, 1])
         return np.stack([features.left[:, 0], v, right[:, 0]], axis=1)
 
-    def _follow(self, left: Image, right: Image, prediction: Array | None) -> None:
-        """Find the features in the new images; drop those that are lost."""
-        config, before = self.config, self._features
+    def _follow(self, left: Image, right: Image, prediction: Array | None) -> Array:
+        """Find the features in the new images, drop those that are lost; rows (n, 3) before of the others.
+
+        Where most are lost, the prediction may be wrong: then the last motion is tried, and none.
+        """
+        before, config = self._features, self.config
         assert before is not None and self._images is not None
-        self._rows_before = self.rows(before)
-        motion = prediction if prediction is not None else self._motion
-        levels = config.levels if motion is not None else config.levels + 1
-        guess_left, guess_right = self._predicted(before, np.eye(4) if motion is None else motion)
-        found, ok = flow(self._images[0], left, before.left, guess_left, config.window, levels)
-        back = returns(self._images[0], left, before.left, found, config.window, config.backward_limit)
-        # Where the left feature went beside its prediction, the right one did.
-        seen, ok_right = flow(
-            self._images[1], right, before.right, guess_right + (found - guess_left), config.window, 1
-        )
-        images = left.astype(np.float32), right.astype(np.float32)
-        scale = np.clip((found[:, 0] - seen[:, 0]) / before.disparity, 0.25, 4.0)
-        aligned_left, score_left = before.patches_left.align(images[0], found, scale)
-        aligned_right, score_right = before.patches_right.align(images[1], seen, scale)
-        shift = np.maximum(*(np.linalg.norm(a - b, axis=1) for a, b in ((aligned_left, found), (aligned_right, seen))))
-        size, border = (left.shape[1], left.shape[0]), config.template // 2
-        offset = self.rotation.row_offset(aligned_left)
+        rows = self.rows(before)
+        best: tuple[Followed, BoolArray, dict[str, int]] | None = None
+        guesses = [guess for guess in (prediction, self._motion) if guess is not None]
+        for guess in (*guesses, None):
+            levels = config.levels + (guess is None)
+            expected = self._predicted(before, rows, np.eye(4) if guess is None else guess)
+            now = follow(before, self._images, (left, right), expected, levels, config)
+            kept, losses = self._tested(now, (left.shape[1], left.shape[0]))
+            if best is None or kept.sum() > best[1].sum():
+                best = now, kept, losses
+            if kept.sum() >= _FOUND_SHARE * len(rows):
+                break
+        assert best is not None
+        now, kept, losses = best
+        self.losses.update(losses)
+        self._features = replace(before, left=now.left, right=now.right).keep(kept)
+        return rows[kept]
+
+    def _tested(self, now: Followed, size: tuple[int, int]) -> tuple[BoolArray, dict[str, int]]:
+        """Which features (n,) pass all tests, and how many fail, by the first test that they fail."""
+        config, border = self.config, self.config.template // 2
+        is_alike = (now.score_left >= config.template_score_left) & (now.score_right >= config.template_score_right)
+        row_error = now.left[:, 1] - now.right[:, 1] - self.rotation.row_offset(now.left)
         tests = {
-            "out of the left image": self._inside(0, aligned_left, size, border),
-            "out of the right image": self._inside(1, aligned_right, size, border),
-            "not found": ok & ok_right,
-            "not found back": back,
-            "unlike first sight": (score_left >= config.template_score[0]) & (score_right >= config.template_score[1]),
-            "aligned too far": shift <= config.template_shift,
-            "rows differ": np.abs(aligned_left[:, 1] - aligned_right[:, 1] - offset) < config.row_limit,
-            "no depth": aligned_left[:, 0] - aligned_right[:, 0] >= LEAST_DISPARITY_PX,
+            "out of the left image": self._inside(0, now.left, size, border),
+            "out of the right image": self._inside(1, now.right, size, border),
+            "not found": now.is_found,
+            "not found back": now.is_found_back,
+            "unlike first sight": is_alike,
+            "aligned too far": now.shift <= config.template_shift,
+            "rows differ": np.abs(row_error) < config.row_limit,
+            "no depth": now.left[:, 0] - now.right[:, 0] >= LEAST_DISPARITY_PX,
         }
-        kept = np.ones(len(found), dtype=bool)
+        kept, losses = np.ones(len(row_error), dtype=bool), {}
         for reason, passes in tests.items():
-            self.losses[reason] += int((kept & ~passes).sum())
+            losses[reason] = int((kept & ~passes).sum())
             kept &= passes
-        self._rows_before = self._rows_before[kept]
-        self._features = replace(before, left=aligned_left, right=aligned_right).keep(kept)
+        return kept, losses
 
     def _inside(self, side: int, pixels: Array, size: tuple[int, int], border: float) -> BoolArray:
         """Which pixels (n, 2) are where the left (0) or right (1) image shows something, off its border."""
@@ -180,39 +154,37 @@ class Tracker:
             found[found] = self._valid[side][v, u]
         return found
 
-    def _predicted(self, features: Features, T_now_before: Array) -> tuple[Array, Array]:
+    def _predicted(self, features: Features, rows: Array, T_now_before: Array) -> tuple[Array, Array]:
         """Pixels (n, 2) in the left and right image where features should be after a motion."""
-        q = se3.apply(T_now_before, triangulate(self.camera, self._rows_before))
-        ahead = q[:, 2] > 0.5
-        z = project(self.camera, np.where(ahead[:, None], q, (0.0, 0.0, 1.0)))
-        left = np.where(ahead[:, None], z[:, :2], features.left)
-        moved = left - np.stack([self._rows_before[:, 0], self._rows_before[:, 1]], axis=1)
-        right = np.where(ahead[:, None], z[:, 2:] - self._rows_before[:, [2, 1]], moved) + features.right
-        return features.left + moved, right
+        q = se3.apply(T_now_before, triangulate(self.camera, rows))
+        is_ahead = q[:, 2:] > _LEAST_DEPTH_M
+        z = project(self.camera, np.where(is_ahead, q, (0.0, 0.0, 1.0)))
+        left, right = (np.where(is_ahead, z[:, at] - rows[:, to], 0.0) for at, to in ((_L, [0, 1]), (_R, [2, 1])))
+        return features.left + left, features.right + right
 
-    def _agree(self, prediction: Array | None) -> tuple[Array, BoolArray]:
-        """The rig's motion, and which features move with it; drop those that do not for too long."""
+    def _agree(self, rows: Array, guess: Array | None) -> tuple[Array, BoolArray]:
+        """The rig's motion from rows (n, 3) before, and which features move with it; drop those that do not."""
         config, features = self.config, self._features
         assert features is not None
-        now = self.rows(features)
-        found = self._aligned(now, prediction if prediction is not None else self._motion)
+        found = self._aligned(rows, self.rows(features), guess)
         worst = np.abs(found.residual_px).max(axis=1, initial=0.0)
-        still = worst <= config.residual_limit
-        strikes = np.where(still, 0, features.strikes + 1)
+        is_still = worst <= config.residual_limit
+        strikes = np.where(is_still, 0, features.strikes + 1)
         dropped = (worst > config.residual_drop) | (strikes >= config.strikes)
         self.losses["not moving as the rig"] += int(dropped.sum())
-        self.withheld += int((~still & ~dropped).sum())
+        self.withheld += int((~is_still & ~dropped).sum())
         self._features = replace(features, strikes=strikes).keep(~dropped)
-        return found.T_now_before, still[~dropped]
+        return found.T_now_before, is_still[~dropped]
 
-    def _aligned(self, now: Array, guess: Array | None) -> Alignment:
-        config, before = self.config, self._rows_before
+    def _aligned(self, before: Array, now: Array, guess: Array | None) -> Alignment:
+        """Rows of two frames brought together: from a guess, or where few agree, from the best of samples."""
+        camera, config = self.camera, self.config
         if guess is not None:
-            found = align(self.camera, before, now, guess, config.pixel_std, config.kernel)
-            if agrees(found, config.residual_limit).mean() >= _AGREE_SHARE:
+            found = align(camera, before, now, guess, config.pixel_std, config.kernel)
+            if agrees(found, config.residual_limit).sum() >= _AGREE_SHARE * len(now):
                 return found
-        start = sampled_motion(self.camera, before, now, self._generator, config.samples, config.residual_limit)
-        return align(self.camera, before, now, start, config.pixel_std, config.kernel)
+        start = sampled_motion(camera, before, now, self._generator, config.samples, config.residual_limit)
+        return align(camera, before, now, start, config.pixel_std, config.kernel)
 
     def _calibrate(self, reported: BoolArray, T_now_before: Array) -> None:
         """Learn the rotation of the right camera from this frame, and from this one and one some frames before."""
@@ -236,12 +208,14 @@ class Tracker:
         config, features = self.config, self._features
         taken = np.empty((0, 2)) if features is None else features.left
         missing, size = config.features - len(taken), (left.shape[1], left.shape[0])
-        if features is not None and len(taken) >= config.refill * config.features:
+        waits = self._waited + 1 < config.refill_every and len(taken) >= _FEW * config.features
+        if features is not None and (waits or len(taken) >= config.refill * config.features):
+            self._waited += 1
             return 0
-        found, _ = corners(left, config)
-        found = found[away_from(found, taken, config.spacing) & away_from(found, self._hopeless, 2.0)]
-        found = found[self._inside(0, found, size, config.border)]
-        found = found[spread(found, taken, size, missing, config.buckets)]
+        self._waited = 0
+        free = without(without(self._free(left), taken, config.spacing), self._hopeless, 1)
+        found = corners(left, free, config)
+        found = found[spread(found, taken, size, missing, (config.bucket_columns, config.bucket_rows))]
         paired, good = first_pairs(left, right, found, self.rotation.row_offset(found), config)
         good &= self._inside(1, paired, size, config.template // 2)
         self.refused += int((~good).sum())
@@ -251,6 +225,15 @@ class Tracker:
             self.rotation.observe_rows(new.left, new.right)
         self._features = new if features is None else features.and_more(new)
         return len(new.id)
+
+    def _free(self, image: Image) -> BoolArray:
+        """Where features may be: (height, width)."""
+        if self._valid is not None:
+            return self._valid[0]
+        margin = self.config.border
+        free = np.zeros(image.shape, dtype=bool)
+        free[margin:-margin, margin:-margin] = True
+        return free
 
     def _started(self, left_px: Array, right_px: Array, left: Image, right: Image) -> Features:
         count, side = len(left_px), self.config.template

@@ -60,7 +60,9 @@ def command(options: argparse.Namespace) -> None:
         f"camera        fu {camera.fu_px:g} fv {camera.fv_px:g} cu {camera.cu_px:g} cv {camera.cv_px:g} px, "
         f"baseline {camera.baseline_m:g} m"
     )
-    if noise is None:
+    if not sequence.has_velocities:
+        print("velocities    nobody measured any: the twist is a walk that starts from stereo odometry")
+    elif noise is None:
         v, w = velocity_noise(sequence.twist).texts
         print(f"noise         not stated; white noise of the velocities, from the data: {v} m/s, {w} rad/s")
     else:

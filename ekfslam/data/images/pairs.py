@@ -31,7 +31,7 @@ from ekfslam.names import printable
 Image = NDArray[np.uint8]
 DistortionModel = Literal["none", "radtan", "equidistant"]
 
-# How many coefficients a model may have: radtan as OpenCV orders them (k1 k2 p1 p2 [k3 [k4 k5 k6]]), equidistant k1..k4.
+# How many coefficients a model may have.
 _COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
 _LARGEST_SIDE_PX = 1 << 15  # what OpenCV can remap
 

@@ -74,6 +74,8 @@ def open_sequence(
 
 
 def _open(source: Source) -> Sequence:
+    from ekfslam.data.images.registry import image_readers  # which imports the registry of this package
+
     readers = discovered(Reader)
     reader = next((reader for reader in readers if reader.recognises(source)), None)
     if reader is not None:
@@ -81,4 +83,4 @@ def _open(source: Source) -> Sequence:
     problem = f"cannot be read ({source.problem})" if source.problem else "unknown content"
     if not source.head and not source.problem:
         problem = "empty file"
-    raise UnknownFormatError(f"{source.place}: {problem}; {listed(readers)}")
+    raise UnknownFormatError(f"{source.place}: {problem}; {listed((*readers, *image_readers()))}")

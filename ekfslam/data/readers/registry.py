@@ -13,10 +13,10 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 from ekfslam.arrays import Array
 from ekfslam.data.sequence import Sequence
@@ -124,7 +124,15 @@ def discovered(kind: type[Entry], folder: str = __package__) -> tuple[Entry, ...
     return tuple(dict.fromkeys(entries))
 
 
-def listed(entries: tuple[Reader, ...] | tuple[TruthReader, ...]) -> str:
+class Expected(Protocol):
+    """What a source can be of."""
+
+    @property
+    def expected(self) -> str:
+        """What a file or folder of it is called in messages, with its article."""
+
+
+def listed(entries: Iterable[Expected]) -> str:
     """What the formats of readers are called, as one clause that begins with "expected"."""
     *others, last = (entry.expected for entry in entries)
     return f"expected {', '.join(others)} or {last}" if others else f"expected {last}"
