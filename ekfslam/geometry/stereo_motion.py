@@ -10,7 +10,7 @@ at both ends, and a track keeps an error c of its disparity in both. The true ro
     S = s^2 (I + B B^T) + s_c^2 k k^T
     z_true = z_before + (s^2 B^T - s_c^2 e k^T) S^-1 r
 
-Derivatives at ``z_before`` itself would go along with its noise, and bias whatever shows in small changes of depth.
+Derivatives are those at ``z_true``: at ``z_before`` they would go along with the noise that they are multiplied with.
 """
 
 from __future__ import annotations
