@@ -22,6 +22,7 @@ from .data.readers import (
 from .data.sequence import Observations, Sequence, Truth
 from .data.velocities import attach_velocities
 from .errors import EkfslamError
+from .filters.live import LiveEKF
 from .filters.result import Result
 from .frontend.opening import open_sequence
 from .frontend.track import TrackReport, track
@@ -47,6 +48,7 @@ __all__ = [
     "FrontEndConfig",
     "HygieneConfig",
     "ImageRecording",
+    "LiveEKF",
     "Noise",
     "NoiseConfig",
     "Observations",

@@ -31,6 +31,22 @@ def add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace a file that is no earlier result of the same")
 
 
+def add_no_figures(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--no-figures", action="store_true", help="draw none, which saves time")
+
+
+def add_executor(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    parser.add_argument(
+        "--executor",
+        default="processes",
+        metavar="SPEC",
+        help="processes (default), serial, tls://HOST:PORT (a Dask cluster, with the certificates of Dask's "
+        "configuration distributed.comm.tls), dask://HOST:PORT (without: whoever reaches that port runs programs as "
+        "you; for networks of your own only), or mpi",
+    )
+
+
 def add_place_options(parser: argparse.ArgumentParser) -> None:
     """What belongs to a recording, but lies elsewhere."""
     parser.add_argument("--truth", type=Path, metavar="FILE", help="true poses: KITTI odometry or TUM text")

@@ -32,6 +32,7 @@ from ekfslam.errors import (
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.names import printable
+from ekfslam.shown import Card, Shown, count, figure
 
 VelocityFrame = Literal["imu", "level"]
 
@@ -122,8 +123,8 @@ class Truth:
             object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
 
 
-@dataclass(frozen=True)
-class Sequence:
+@dataclass(frozen=True, repr=False)
+class Sequence(Shown):
     """One recording of a stereo rig with body velocities.
 
     Args:
@@ -168,6 +169,27 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        seconds, seen = float(self.time_s[-1] - self.time_s[0]), self.observations
+        per_frame = figure(len(seen) / len(self))
+        truth = self.truth
+        known = (
+            "none"
+            if truth is None
+            else count(len(truth.frame), "pose")
+            + (f", {count(len(truth.landmark), 'landmark')}" if len(truth.landmark) else "")
+        )
+        facts = {
+            "source": self.source,
+            "frames": f"{len(self)}, {figure(seconds)} s",
+            "tracks": f"{count(len(seen.ids), 'landmark')}, {per_frame} a frame",
+            "truth": known,
+            "noise": "not stated" if self.noise is None else "stated",
+        }
+        facts |= {"notes": count(len(self.notes), "sentence") + " in .notes"} if self.notes else {}
+        return Card(self.name, facts, ("ekfslam.run(sequence)", "sequence[100:300]", "sequence.between(10.0, 20.0)"))
 
     def __getitem__(self, frames: slice) -> Sequence:
         """A stretch of successive frames as a recording of its own, ``sequence[100:300]``; frames count from 0 again.
