@@ -24,7 +24,7 @@ from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera, project, rectified_jacobian, triangulate
 
 _ITERATIONS = 12
-_CONVERGED = 1e-5  # m and rad: a thousandth of a pixel
+_CONVERGED = 1e-4  # m and rad of a step, after which the next would be far smaller
 _LEAST_DEPTH_M = 0.1
 TRACK_STD_PX = 0.3  # s_c
 _FITS = 9.0  # mean square of a point's rows, in variances
