@@ -112,6 +112,10 @@ class FilterError(EkfslamError):
     """A filter cannot go on."""
 
 
+class NoVelocitiesError(FilterError):
+    """Dead reckoning is asked for, but nobody measured velocities."""
+
+
 class InnovationError(FilterError):
     """The innovation covariance S is not positive definite.
 

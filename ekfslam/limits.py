@@ -36,6 +36,11 @@ def reading_up_to(gb: float) -> Iterator[None]:
         _limit.reset(token)
 
 
+def limit_gb() -> float:
+    """How many gigabytes of numbers a file may hold here, for `reading_up_to` in another process."""
+    return _limit.get() / 1e9
+
+
 class Budget:
     """What is left for one file of what may be read.
 

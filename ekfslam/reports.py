@@ -7,15 +7,18 @@ simulations with their truth. `check`: the same of one run without truth, from i
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
-from ekfslam.errors import FilterError, IllPosedError, PosteriorError
+from ekfslam.errors import EkfslamError, FilterError, IllPosedError, PosteriorError
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.evaluation.verdict import Honesty, innovations_of, judge
@@ -30,7 +33,7 @@ from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import archive_image, open_result, require_same_origin
 from ekfslam.storage.checkpoint import Checkpoints, key_of
-from ekfslam.studies.executors import open_executor
+from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed, open_executor
 from ekfslam.studies.study import Study, StudyArchive, run_study
 from ekfslam.studies.summary import study_table, summarise_study
 
@@ -68,10 +71,14 @@ class Comparison(Shown):
     def table(self) -> str:
         """The summary as a Markdown table, and what is missing in it."""
         lines = [f"No {mode}: {reason}" for mode, reason in self.skipped.items()]
-        lines += [f"Note on {mode}: {remark}" for mode, result in self.results.items() for remark in result.remarks]
+        remarks: dict[str, list[str]] = {}
+        for mode, result in self.results.items():
+            for remark in result.remarks:
+                remarks.setdefault(remark, []).append(mode)
+        lines += [f"Note on {', '.join(modes)}: {remark}" for remark, modes in remarks.items()]
         return compare_table(self.summary) + "".join(f"\n{line}\n" for line in lines)
 
-    def save(self, directory: str | Path, force: bool = False) -> list[Path]:
+    def save(self, directory: str | Path, force: bool = False, figures: bool = True) -> list[Path]:
         """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures; returns their paths.
 
         All are written or none. Figures of an earlier run in the folder go.
@@ -79,6 +86,7 @@ class Comparison(Shown):
         Args:
             directory: Where to; made if missing.
             force: Replace an archive of another recording, too.
+            figures: Draw figures, too.
 
         Raises:
             WriteError: The directory cannot be written, or holds results of another recording.
@@ -88,20 +96,24 @@ class Comparison(Shown):
         if not force:
             require_same_origin(archive, self.sequence)
         notes = "".join(f"- {note}\n" for note in self.sequence.notes)
-        figures = draw_figures(self.results, self.sequence.truth, self.sequence.interpolated)
-        if "full" in self.results and "smoothed" in self.results:
-            drawn = plot_map_before_and_after(self.results["full"], self.results["smoothed"], self.sequence.truth)
-            figures["map_before_and_after"] = drawn
+        drawn = self._figures() if figures else {}
         contents = {
             archive: archive_image(self.sequence, self.results),
             summary: _json(self.summary),
             table: self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""),
-            **pngs(directory, figures),
+            **pngs(directory, drawn),
         }
         older = older_figures(directory)
         files.write_all(contents)
         remove_figures(older, contents)
         return list(contents)
+
+    def _figures(self) -> dict[str, Figure]:
+        figures = draw_figures(self.results, self.sequence.truth, self.sequence.interpolated)
+        if "full" in self.results and "smoothed" in self.results:
+            drawn = plot_map_before_and_after(self.results["full"], self.results["smoothed"], self.sequence.truth)
+            figures["map_before_and_after"] = drawn
+        return figures
 
 
 def compare(
@@ -157,6 +169,71 @@ def compare(
         "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
     }
     return Comparison(sequence, results, summary, skipped)
+
+
+def compare_into(
+    sequence: Sequence,
+    folder: Path,
+    modes: Iterable[Mode] = MODES,
+    config: Config | None = None,
+    *,
+    resume: bool = False,
+    force: bool = False,
+    figures: bool = True,
+) -> str:
+    """Compare modes on a recording, with checkpoints, and save all into a folder; what there is to say of it.
+
+    Raises:
+        ArchiveError: The folder holds results of another recording, cannot be written, or has a damaged checkpoint.
+        FilterError: No mode has a result.
+    """
+    with Checkpoints(folder / "unfinished.checkpoint", resume) as checkpoints:
+        comparison = compare(sequence, modes, config, checkpoints)
+        paths = comparison.save(folder, force, figures)
+    notes = "".join(f"{sequence.name}: {note}\n" for note in sequence.notes)
+    return f"{notes}\n{comparison.table}\nwritten to {folder}: {', '.join(path.name for path in paths)}"
+
+
+def compare_all(
+    recordings: Mapping[Path, Sequence],
+    executor: Executor,
+    modes: Iterable[Mode] = MODES,
+    config: Config | None = None,
+    **options: bool,
+) -> Iterator[str]:
+    """`compare_into` of many recordings at once, by folder; what there is to say of each, as they finish.
+
+    Args:
+        recordings: Folder to recording.
+        executor: Where to run them, see `open_executor`.
+        modes, config, options: As of `compare_into`.
+
+    Raises:
+        EkfslamError: Of recordings that cannot be compared, at the end, when all others are saved.
+    """
+    modes, failed = tuple(modes), []
+
+    def submit(folder: Path) -> Future[tuple[str, str]]:
+        return executor.submit(_compared, recordings[folder], folder, modes, config, options)
+
+    for folder, (said, failure) in completed(recordings, submit):
+        if failure:
+            failed.append(f"{folder.name}: {failure}")
+        else:
+            yield said
+    if failed:
+        raise FilterError("; ".join(failed))
+
+
+def _compared(
+    sequence: Sequence, folder: Path, modes: Iterable[Mode], config: Config | None, options: Mapping[str, bool]
+) -> tuple[str, str]:
+    """In a worker: what there is to say, or why there is nothing."""
+    with ONE_RUN_AT_A_TIME:
+        try:
+            return compare_into(sequence, folder, modes, config, **options), ""
+        except EkfslamError as error:
+            return "", str(error)
 
 
 @dataclass(frozen=True)

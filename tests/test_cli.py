@@ -1,6 +1,7 @@
 """The command line as a user meets it: what it writes, and one clear line with exit code 2 for every mistake."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -10,8 +11,10 @@ import pytest
 from recordings import ece276a_fields, utias_fields, write_mat, write_npz
 from test_metrics import SUMMARY_KEYS
 
+from ekfslam import reports
 from ekfslam.cli import main
 from ekfslam.data.readers import open_sequence
+from ekfslam.errors import FilterError
 from ekfslam.storage.archive import read_archive
 
 CITY = "builtin:city?frames=40"
@@ -242,6 +245,38 @@ def test_the_sign_of_the_lateral_velocity_is_a_flag(tmp_path, capsys):
         assert main(["info", str(npz), *flags]) == 0
         assert f"lateral       {found}" in capsys.readouterr().out
     assert "lateral" in failure(capsys, "info", CITY, "--lateral", "as-stored")
+
+
+def test_many_recordings_are_compared_in_processes_as_one_by_one(tmp_path, capsys):
+    worlds = [f"builtin:loop?frames=8&seed={seed}" for seed in (1, 2)]
+    quick = ["--modes", "dead-reckoning", "full", "--no-figures"]
+    assert main(["compare", *worlds, *quick, "--workers", "2", "--out", str(tmp_path / "all")]) == 0
+    assert capsys.readouterr().out.count("written to") == 2
+    for i, world in enumerate(worlds):
+        assert main(["compare", world, *quick, "--out", str(tmp_path / "one")]) == 0
+        alone = next((tmp_path / "one").glob("*/archive.h5"))
+        together = sorted((tmp_path / "all").glob("*/archive.h5"))[i]
+        runs = [read_archive(path).results["full"] for path in (alone, together)]
+        np.testing.assert_array_equal(runs[0].T_world_imu, runs[1].T_world_imu)
+        assert not list(together.parent.glob("*.png"))
+        shutil.rmtree(tmp_path / "one")
+
+
+def test_one_recording_that_fails_does_not_keep_the_others(tmp_path, capsys, monkeypatch):
+    true_compare = reports.compare_into
+
+    def failing(sequence, folder, *arguments, **options):
+        if sequence.attributes["seed"] == 1:
+            raise FilterError("lost its way")
+        return true_compare(sequence, folder, *arguments, **options)
+
+    monkeypatch.setattr(reports, "compare_into", failing)
+    worlds = [f"builtin:loop?frames=8&seed={seed}" for seed in (1, 2)]
+    call = ["compare", *worlds, "--modes", "dead-reckoning", "--no-figures", "--executor", "serial"]
+    assert main([*call, "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr()
+    assert said.out.count("written to") == 1
+    assert said.err == "ekfslam: error: loop: lost its way\n"
 
 
 def test_compare_goes_on_without_a_posterior_that_is_ill_posed(tmp_path, capsys):

@@ -23,6 +23,7 @@ from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.evaluation.trajectory import match_landmarks
 from ekfslam.filters.result import Landmarks, Result
 from ekfslam.geometry import se3
+from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.noise import GAP_STD
 
 
@@ -33,6 +34,21 @@ def pose_error(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
     ``log(T_world_imu_true T_world_imu_est^-1) = -Ad(T_world_imu_est) xi`` exactly, and NEES does not see a linear map.
     """
     return se3.log(se3.inverse(T_world_imu_true) @ T_world_imu_est)
+
+
+def world_axes_errors(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
+    """Estimate minus truth along world axes, (n, 4, 4) twice to (n, 6): position, m, and ``log(R_est R_true^T)``, rad.
+
+    `world_axes_covariance` has their covariances.
+    """
+    R_error = T_world_imu_est[:, :3, :3] @ np.swapaxes(T_world_imu_true[:, :3, :3], 1, 2)
+    return np.hstack([T_world_imu_est[:, :3, 3] - T_world_imu_true[:, :3, 3], se3.so3_log(R_error)])
+
+
+def world_axes_std(T_world_imu: Array, covariance: Array) -> Array:
+    """Standard deviations (T, 6) of `world_axes_errors`, m and rad: roots of the diagonals of the covariances."""
+    variance = [np.diagonal(c, axis1=1, axis2=2) for c in world_axes_covariance(T_world_imu, covariance)]
+    return np.sqrt(np.maximum(np.hstack(variance), 0.0))
 
 
 def nees(error: Array, covariance: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,7 @@ _ROWS = (
     ("ms_per_frame_max", "ms/frame max", ".2f"),
     ("total_s", "total [s]", ".2f"),
 )
+KEYS = tuple(key for key, _, _ in _ROWS)  # of a summary, in the order of the table
 
 
 def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float | int | None]:
@@ -69,7 +70,7 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, float |
     (1 expected) is the sum of NIS over the sum of degrees of freedom, ``total_s`` the sum of the time spent on the
     frames. None stands where truth is missing or the value is undefined.
     """
-    summary: dict[str, float | int | None] = dict.fromkeys(key for key, _, _ in _ROWS)
+    summary: dict[str, float | int | None] = dict.fromkeys(KEYS)
     truth = sequence.truth
     if truth is not None:
         summary["landmark_rmse_m"] = landmark_rmse(result.landmarks, truth)
@@ -129,11 +130,17 @@ def compare_table(summary: Mapping[str, Any]) -> str:
     the table reads as well on a terminal.
     """
     modes = summary["modes"]
-    rows = []
-    for key, heading, spec in _ROWS:
-        values = [mode.get(key) for mode in modes.values()]  # older summaries lack some
-        if any(value is not None for value in values):
-            rows.append([heading, *(number(value, spec) for value in values)])
     landmarks = "" if summary["landmarks"] is None else f", {summary['landmarks']} landmarks"
     title = f"**{summary['sequence']}**: {summary['frames']} frames{landmarks}"
-    return document(title, markdown_table(["", *modes], rows, padded=True))
+    return document(title, markdown_table(["", *modes], merit_rows(modes.values()), padded=True))
+
+
+def merit_rows(summaries: Iterable[Mapping[str, Any]]) -> list[list[str]]:
+    """Rows of a table with one column a summary: the heading, then the values as text; none without any value."""
+    rows = []
+    summaries = list(summaries)
+    for key, heading, spec in _ROWS:
+        values = [summary.get(key) for summary in summaries]  # older summaries lack some
+        if any(value is not None for value in values):
+            rows.append([heading, *(number(value, spec) for value in values)])
+    return rows

@@ -46,13 +46,13 @@ def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figur
     of the landmarks; the legend says how many landmarks lie outside it. Ellipses longer than a tenth (poses:
     half) of the view's diagonal are left out; the legend says of how many landmarks.
     """
-    mapper = _mapper(results)
+    mapper = map_of(results)
     paths = [result.T_world_imu[:, :2, 3] for result in results.values()]
     if truth is not None and len(truth.frame):
         paths.append(truth.T_world_imu[:, :2, 3])
     landmarks = mapper.landmarks
     points = landmarks.position_m[:, :2]
-    ax, outside = _top_down_axes(np.concatenate(paths), points)
+    ax, outside = map_axes(np.concatenate(paths), points)
     if len(landmarks):
         # The more there are, the fainter, or a dense map would be one blot.
         alpha = float(np.clip(20.0 / np.sqrt(len(landmarks)), 0.15, 0.8))
@@ -78,7 +78,7 @@ def plot_trajectories(results: Mapping[str, Result], truth: Truth | None = None)
     paths = {mode: result.T_world_imu for mode, result in results.items()}
     if truth is not None and len(truth.frame):
         paths["truth"] = truth.T_world_imu
-    ax, _ = _top_down_axes(np.concatenate([T[:, :2, 3] for T in paths.values()]), np.empty((0, 2)))
+    ax, _ = map_axes(np.concatenate([T[:, :2, 3] for T in paths.values()]), np.empty((0, 2)))
     draw_paths(ax, results, truth)
     for name, T in paths.items():
         ends = T[[0, -1]]
@@ -107,7 +107,7 @@ def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
     landmarks = result.landmarks
     start, end = landmarks.initial_position_m[:, :2], landmarks.position_m[:, :2]
     path = result.T_world_imu[:, :2, 3]
-    ax, outside = _top_down_axes(path, end)
+    ax, outside = map_axes(path, end)
     dot = dot_size(len(landmarks))
     arrows = np.stack([start, end], axis=1)[~outside]
     ax.add_collection(LineCollection(list(arrows), colors=LANDMARK_COLOR, linewidths=0.5, alpha=0.6), autolim=False)
@@ -126,7 +126,7 @@ def _first(results: Mapping[str, Result]) -> Result:
     return next(iter(results.values()))
 
 
-def _mapper(results: Mapping[str, Result]) -> Result:
+def map_of(results: Mapping[str, Result]) -> Result:
     """The result whose map is shown: full, else the last one with landmarks, else any."""
     with_map = [result for result in results.values() if len(result.landmarks)]
     return results.get("full") or (with_map or list(results.values()))[-1]
@@ -143,7 +143,7 @@ def _spread(length: int, count: int) -> IntArray:
     return np.unique(np.linspace(0, length - 1, count).astype(int))
 
 
-def _top_down_axes(path: Array, points: Array) -> tuple[Axes, BoolArray]:
+def map_axes(path: Array, points: Array) -> tuple[Axes, BoolArray]:
     """Equal-aspect axes of a new figure around all of path and the bulk of points, and which points are outside."""
     bulk = np.percentile(points, [2, 98], axis=0) if len(points) else path[:0]
     shown = np.concatenate([path, bulk])

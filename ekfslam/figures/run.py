@@ -13,15 +13,21 @@ from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.sequence import Truth
-from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_nees
+from ekfslam.evaluation.consistency import (
+    chi2_bounds,
+    measured_truth,
+    pose_nees,
+    world_axes_errors,
+    world_axes_std,
+)
 from ekfslam.figures.maps import plot_landmark_arrows, plot_map
 from ekfslam.figures.style import BAND_ALPHA, BOUNDS, EXPECTED, PRIOR, ZERO, log_axis, save_all, style_of, styled
 from ekfslam.figures.style import save_figure as save_figure  # one of `save_figures` by itself
 from ekfslam.filters.result import Result
-from ekfslam.geometry import se3
 from ekfslam.geometry.motion import world_axes_covariance
 
 _BAND_SIGMAS = 3.0
+_IN_DEGREES = np.repeat([1.0, np.rad2deg(1.0)], 3)  # of three positions and three rotations
 _NIS_PROBABILITY = 0.95
 _LOG_RATIO = 20.0  # largest over smallest NIS per dof from which a logarithmic axis shows more
 
@@ -51,11 +57,8 @@ def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolA
     for column, (title, result) in zip(axes.T, columns.items(), strict=True):
         color = style_of(result.mode)["color"]
         T_est, time_s = result.T_world_imu[truth.frame], result.time_s - result.time_s[0]
-        position = T_est[:, :3, 3] - truth.T_world_imu[:, :3, 3]
-        rotation = se3.so3_log(T_est[:, :3, :3] @ np.swapaxes(truth.T_world_imu[:, :3, :3], 1, 2))
-        errors = np.hstack([position, np.degrees(rotation)])
-        position_std, rotation_std = (np.sqrt(np.diagonal(c, axis1=1, axis2=2)) for c in world_error_covariance(result))
-        bands = _BAND_SIGMAS * np.hstack([position_std, np.degrees(rotation_std)])
+        errors = _IN_DEGREES * world_axes_errors(T_est, truth.T_world_imu)
+        bands = _BAND_SIGMAS * _IN_DEGREES * world_axes_std(result.T_world_imu, result.covariance)
         for i, ax in enumerate(column):
             ax.fill_between(time_s, -bands[:, i], bands[:, i], color=color, alpha=BAND_ALPHA, linewidth=0)
             for side in (-1, 1):

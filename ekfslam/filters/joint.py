@@ -144,8 +144,10 @@ class JointEKF(Estimate):
     def _measure_velocities(self, twist: Array, also: VelocityRows | None) -> None:
         """Condition on velocity measurements; the first one of the IMU starts the twist."""
         model, std = self.model, self.model.noise.twist_std
-        rows = [VelocityRows.of_imu(twist, std), *([] if also is None else [also])]
-        self._log.measured(VelocityRows.concatenate(rows))
+        is_used = model.measures_twist or not self._is_twist_known
+        rows = [*([VelocityRows.of_imu(twist, std)] if is_used else []), *([] if also is None else [also])]
+        if rows:
+            self._log.measured(VelocityRows.concatenate(rows))
         if not self._is_twist_known:
             self.gaussian.propagate(*model.twist_from_measurement(std))
             self.values = {**self.values, "twist": model.unbiased(np.asarray(twist, dtype=float), self.values)}

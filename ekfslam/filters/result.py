@@ -36,6 +36,8 @@ REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera"
 
 # Pixel noise below which a linearised update gains more than it should. In both built-in worlds the pose NEES is the
 # same from 0.7 to 0.1 px, twice as large at 0.03 px, ten times at 0.01 px.
+# Attribute of results that keeps what looked wrong in a recording and a run, see `ekfslam.evaluation.sanity`.
+SANITY, SANITY_SEPARATOR = "sanity", " | "
 LINEAR_FROM_PX = 0.1
 
 
@@ -443,4 +445,5 @@ class Result(Shown):
                 f"pixel noise of {finest_px:.2g} px is less than the errors of linearisation: the filter's covariances "
                 "are too small, those of the mode smoothed hold"
             )
-        return tuple(remarks)
+        kept = str(self.attributes.get(SANITY, ""))
+        return (*remarks, *(kept.split(SANITY_SEPARATOR) if kept else ()))

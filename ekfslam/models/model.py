@@ -160,6 +160,11 @@ class Model:
         return any(isinstance(block, Twist) for block in self.blocks)
 
     @cached_property
+    def measures_twist(self) -> bool:
+        """Whether the recording's velocities measure the twist in every interval, and not only start it."""
+        return all(block.is_measured for block in self.blocks if isinstance(block, Twist))
+
+    @cached_property
     def has_velocity_blocks(self) -> bool:
         """Whether the velocities of the IMU depend on blocks, and are not simply those measured."""
         kinds = (type(block) for block in self.blocks)

@@ -1,4 +1,4 @@
-"""Where a Monte Carlo study runs: processes of this machine, the calling thread, a Dask cluster, or MPI ranks."""
+"""Where studies and sweeps run: processes of this machine, the calling thread, a Dask cluster, or MPI ranks."""
 
 from __future__ import annotations
 
@@ -6,14 +6,45 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 from ekfslam.errors import ConfigError
 
 _MOST_WORKERS = 1024
+IN_FLIGHT = 256  # tasks handed to an executor at a time
+
+# BLAS threads are limited for the process as a whole: a worker that runs several threads (Dask) takes turns.
+ONE_RUN_AT_A_TIME = threading.Lock()
+
+Task = TypeVar("Task")
+Outcome = TypeVar("Outcome")
+
+
+def completed(tasks: Iterable[Task], submit: Callable[[Task], Future[Outcome]]) -> Iterator[tuple[Task, Outcome]]:
+    """Tasks and their results as they come, with a bounded number handed to the executor at a time.
+
+    Args:
+        tasks: What to do.
+        submit: Hands a task to an executor.
+    """
+    remaining, pending = iter(tasks), dict[Future[Outcome], Task]()
+    try:
+        while True:
+            task = next(remaining, None) if len(pending) < IN_FLIGHT else None
+            if task is not None:
+                pending[submit(task)] = task
+            elif not pending:
+                return
+            # While there is more to hand out, only look: an executor in this process has finished by now.
+            finished, _ = wait(pending, timeout=None if task is None else 0, return_when=FIRST_COMPLETED)
+            for future in finished:
+                yield pending.pop(future), future.result()
+    finally:
+        for future in pending:
+            future.cancel()
 
 
 class SerialExecutor(Executor):

@@ -23,9 +23,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import threading
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -59,6 +58,7 @@ from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress as with_progress
 from ekfslam.runner import versions
 from ekfslam.shown import Card, Shown, count
+from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed
 from ekfslam.studies.journal import Journal
 
 FORMAT = "ekfslam-study"
@@ -113,7 +113,6 @@ FIELDS: Mapping[str, tuple[Shape, type, str, str]] = MappingProxyType(
 JOINT_INSTANTS = 4  # equally spaced, the last one at the last frame
 
 MOST_VALUES = 10_000_000  # frames of all runs and variants: an archive of 1.4 GB
-IN_FLIGHT = 256
 CHECKPOINT_S = 5.0
 CHECKPOINT_SHARE = 0.05  # of the time may go into checkpoints of a large study
 
@@ -131,9 +130,6 @@ VARIANT_LAYOUT = hdf5.layout(
 )
 
 Record = dict[str, dict[str, NDArray]]  # variant, field, value of one run
-
-# BLAS threads are limited for the process as a whole: a worker that runs several threads (Dask) takes turns.
-_ONE_RUN_AT_A_TIME = threading.Lock()
 
 
 @dataclass(frozen=True, repr=False)
@@ -235,7 +231,7 @@ def run_one(study: Study, level: str, run: int) -> Record:
         part of a recording, and from the frame at which a filter stops.
     """
     world = realisation(study, level, run)
-    with _ONE_RUN_AT_A_TIME, one_thread(), np.errstate(all="ignore"):
+    with ONE_RUN_AT_A_TIME, one_thread(), np.errstate(all="ignore"):
         sequence = simulate(world)
         return {variant: evaluate(sequence, world, filter_config(world, variant)) for variant in study.variants}
 
@@ -361,11 +357,11 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
     journal = Journal(path, decides, lambda level: _record(study, level))
     _take_in(archive, journal, path)
     missing = [(level, run) for run in range(study.runs) for level in study.levels if not archive.done[level][run]]
-    finished: Any = _completed(study, missing, executor)
+    finished: Any = completed(missing, lambda task: executor.submit(run_one, study, *task))
     if progress:
         finished = with_progress(finished, "consistency", "run", total=len(missing))
     next_checkpoint = monotonic() + CHECKPOINT_S
-    for level, run, record in finished:
+    for (level, run), record in finished:
         journal.append(level, run, record)
         _put(archive, level, run, record)
         if monotonic() >= next_checkpoint and not archive.complete:
@@ -402,26 +398,6 @@ def _put(archive: StudyArchive, level: str, run: int, record: Mapping[str, Mappi
 def _record(study: Study, level: str) -> Record:
     """An empty record of a run."""
     return {variant: _blank(study.levels[level].frames) for variant in study.variants}
-
-
-def _completed(study: Study, tasks: list[tuple[str, int]], executor: Executor) -> Iterator[tuple[str, int, Record]]:
-    """Results as they come, with a bounded number of tasks handed to the executor at a time."""
-    remaining = iter(tasks)
-    pending: dict[Future[Record], tuple[str, int]] = {}
-    left = len(tasks)
-    try:
-        while left:
-            task = next(remaining, None) if len(pending) < IN_FLIGHT else None
-            if task is not None:
-                pending[executor.submit(run_one, study, *task)] = task
-            # While there is more to hand out, only look: an executor in this process has finished by now.
-            finished, _ = wait(pending, timeout=None if task is None else 0, return_when=FIRST_COMPLETED)
-            for future in finished:
-                left -= 1
-                yield *pending.pop(future), future.result()
-    finally:
-        for future in pending:
-            future.cancel()
 
 
 def _resume(study: Study, path: Path) -> StudyArchive:

@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from ekfslam import files
 from ekfslam.cli.options import (
     DEFAULT_DATA,
     add_data_options,
+    add_executor,
     add_filter_options,
     add_force,
+    add_no_figures,
     add_resume,
     configured,
     open_data,
+    print_warnings,
 )
 from ekfslam.config import MODES
 from ekfslam.errors import ConfigError
 from ekfslam.names import components
-from ekfslam.reports import compare
+from ekfslam.reports import compare_all
 from ekfslam.storage.archive import require_same_origin
-from ekfslam.storage.checkpoint import Checkpoints
+from ekfslam.studies.executors import open_executor
 
 EXAMPLES = (
     "compare",
     "compare 0027.npz --truth poses/07.txt --out results/local",
+    "compare drives/*.mat --workers 8 --no-figures",
     "compare a.mat b.mat --modes dead-reckoning full --sigma-v 0.5 --sigma-w 0.05",
 )
 
@@ -35,6 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("results/local"), metavar="DIR", help="default: %(default)s")
     add_force(parser)
     add_resume(parser)
+    add_no_figures(parser)
+    add_executor(parser)
     add_data_options(parser)
     add_filter_options(parser)
 
@@ -51,10 +58,12 @@ def command(options: argparse.Namespace) -> None:
         files.require_writable(folder / "archive.h5")
         if not options.force:
             require_same_origin(folder / "archive.h5", sequence)
-    for sequence, folder in zip(sequences, folders, strict=True):
-        for note in sequence.notes:
-            print(f"{sequence.name}: {note}")
-        with Checkpoints(folder / "unfinished.checkpoint", options.resume) as checkpoints:
-            comparison = compare(sequence, options.modes, config, checkpoints)
-            paths = comparison.save(folder, options.force)
-        print(f"\n{comparison.table}\nwritten to {folder}: {', '.join(path.name for path in paths)}")
+    for sequence in sequences:
+        print_warnings(sequence)
+    recordings = dict(zip(folders, sequences, strict=True))
+    where = "serial" if len(recordings) == 1 and options.executor == "processes" else options.executor
+    workers = options.workers or min(len(recordings), os.cpu_count() or 1)
+    chosen = {"resume": options.resume, "force": options.force, "figures": not options.no_figures}
+    with open_executor(where, workers) as executor:
+        for said in compare_all(recordings, executor, options.modes, config, **chosen):
+            print(said)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ekfslam.cli.options import add_executor
 from ekfslam.config import VARIANTS
 from ekfslam.reports import check_consistency
 from ekfslam.studies.study import LEVELS, STUDY_VARIANTS, Study, levels_of
@@ -35,15 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"{', '.join(STUDY_VARIANTS)} (default: {' '.join(VARIANTS)})",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
-    parser.add_argument(
-        "--executor",
-        default="processes",
-        metavar="SPEC",
-        help="processes (default), serial, tls://HOST:PORT (a Dask cluster, with the certificates of Dask's "
-        "configuration distributed.comm.tls), dask://HOST:PORT (without: whoever reaches that port runs programs as "
-        "you; for networks of your own only), or mpi",
-    )
+    add_executor(parser)
     parser.add_argument(
         "--out",
         type=Path,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import get_args
 
 from ekfslam import files
-from ekfslam.cli.options import table
+from ekfslam.cli.options import add_no_figures, table
 from ekfslam.config import Config, Kernel, Linearisation
 from ekfslam.figures.posterior import draw_posterior_figures
 from ekfslam.figures.style import pngs
@@ -27,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--kernel", choices=get_args(Kernel), help="robust kernel of map (default: as configured, huber)"
     )
+    add_no_figures(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="for the figures; default: the folder of the archive")
 
 
@@ -40,7 +41,8 @@ def command(options: argparse.Namespace) -> None:
     found = posterior(full, config)
     smoothed = smooth(full, config, found)
     truth = read_archive(options.archive).truth
-    figures = pngs(directory, draw_posterior_figures(full, smoothed, found.information, truth))
+    drawn = {} if options.no_figures else draw_posterior_figures(full, smoothed, found.information, truth)
+    figures = pngs(directory, drawn)
     add_result(options.archive, smoothed, of=full, beside=figures)
     archive = read_archive(options.archive)
     print(table(archive, None, archive.results))

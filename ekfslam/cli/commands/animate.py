@@ -1,0 +1,42 @@
+"""Make a moving map of an archive: gif, or mp4 where ffmpeg is installed."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ekfslam.cli.options import add_force, require_ours
+from ekfslam.errors import ArchiveError
+from ekfslam.figures.animation import FORMATS, write_animation
+from ekfslam.storage.archive import read_archive
+
+EXAMPLES = ("animate city.h5", "animate city.h5 --modes full --out drive.mp4 --pictures 600 --per-second 30")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("archive", type=Path, metavar="ARCHIVE", help="as written by run or compare")
+    parser.add_argument("--modes", nargs="+", metavar="MODE", help="to show (default: all)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="*.gif or *.mp4; default: drive.gif beside it")
+    parser.add_argument("--pictures", type=int, default=200, metavar="N", help="at most (default: %(default)s)")
+    parser.add_argument("--per-second", type=int, default=20, metavar="N", help="default: %(default)s")
+    add_force(parser)
+
+
+def command(options: argparse.Namespace) -> None:
+    archive = read_archive(options.archive)
+    modes = options.modes or list(archive.results)
+    missing = [mode for mode in modes if mode not in archive.results]
+    if missing or not modes:
+        raise ArchiveError(f"{options.archive}: holds no run {', '.join(missing)}".rstrip())
+    path = options.out or options.archive.parent / "drive.gif"
+    require_ours(options, path, _is_animation)
+    results = {mode: archive.results[mode] for mode in modes}
+    write_animation(path, results, archive.truth, pictures=options.pictures, per_second=options.per_second)
+    print(path)
+
+
+def _is_animation(path: Path) -> bool:
+    """Whether a file is what its ending says; nothing tells whose it is."""
+    with path.open("rb") as file:
+        head = file.read(12)
+    return path.suffix in FORMATS and (head.startswith(b"GIF8") or head[4:8] == b"ftyp")

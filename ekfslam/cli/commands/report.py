@@ -1,0 +1,27 @@
+"""Make one web page of archives: maps, errors, consistency, verdicts and settings, side by side."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ekfslam.cli.options import add_force, require_ours
+from ekfslam.page.report import is_report, write_report
+
+EXAMPLES = (
+    "report results/local/city/archive.h5",
+    "report results/*/archive.h5 --out report.html --title 'All drives'",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("archive", nargs="+", type=Path, metavar="ARCHIVE", help="as written by run or compare")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="default: report.html in the first archive's folder")
+    parser.add_argument("--title", default="", metavar="TEXT", help="heading; default: the names of the recordings")
+    add_force(parser)
+
+
+def command(options: argparse.Namespace) -> None:
+    path = options.out or options.archive[0].parent / "report.html"
+    require_ours(options, path, is_report)
+    print(write_report(options.archive, path, options.title))

@@ -1,0 +1,71 @@
+"""Run recordings x modes x variants x settings x seeds, and put one row a run into a table."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ekfslam import files
+from ekfslam.cli.options import add_executor
+from ekfslam.errors import ConfigError
+from ekfslam.figures.style import pngs
+from ekfslam.figures.sweep import plot_sweep
+from ekfslam.studies.executors import open_executor
+from ekfslam.studies.sweep import Sweep, run_sweep
+from ekfslam.studies.sweep_table import SHOWN, SweepTable, read_table
+
+EXAMPLES = (
+    "sweep study.toml",
+    "sweep study.toml --executor tls://scheduler:8786 --out results/local/all",
+    "sweep --table --out results/local/all --figures ate_m nis_per_dof",
+    "sweep --table --out results/local/all --plot ate_m noise.sigma_px",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("study", nargs="?", type=Path, metavar="STUDY.toml", help="recordings, modes, variants, ...")
+    parser.add_argument("--table", action="store_true", help="run nothing: show what --out holds already")
+    parser.add_argument(
+        "--figures", nargs="+", default=list(SHOWN), metavar="COLUMN", help=f"to show (default: {' '.join(SHOWN)})"
+    )
+    parser.add_argument(
+        "--plot",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("FIGURE", "SETTING"),
+        help="draw a column against another; may be given several times",
+    )
+    add_executor(parser)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("results/local/sweep"),
+        metavar="DIR",
+        help="default: %(default)s; an interrupted sweep there goes on",
+    )
+
+
+def command(options: argparse.Namespace) -> None:
+    path = options.out / "sweep.h5"
+    if options.table:
+        table = read_table(path)
+    elif options.study is None:
+        raise ConfigError("sweep needs a STUDY.toml, or --table")
+    else:
+        sweep = Sweep.from_toml(options.study)
+        files.require_writable(path)
+        with open_executor(options.executor, options.workers) as executor:
+            table = run_sweep(sweep, path, executor)
+    _show(options, table)
+
+
+def _show(options: argparse.Namespace, table: SweepTable) -> None:
+    shown = table.markdown(options.figures)
+    try:
+        figures = {f"{figure}-{setting}": plot_sweep(table, figure, setting) for figure, setting in options.plot}
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    contents = {options.out / "sweep.md": shown, **pngs(options.out, figures)}
+    files.write_all(contents)
+    print(f"{shown}\nwritten to {options.out}: {', '.join(['sweep.h5', *(path.name for path in contents)])}")

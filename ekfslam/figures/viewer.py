@@ -1,0 +1,154 @@
+"""Archives for the Rerun viewer (rerun.io): poses that move, maps and errors in three dimensions.
+
+/world/truth, /world/<mode>/path      lines
+/world/<mode>/imu                     the pose over time, with the camera's image plane and a 2-sigma ellipsoid
+/world/<mode>/landmarks               points with their standard deviation as radius, and ellipsoids
+/errors/<mode>, /nis/<mode>           scalars over time
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from scipy.spatial.transform import Rotation
+
+from ekfslam import files
+from ekfslam.arrays import Array
+from ekfslam.errors import ConfigError
+from ekfslam.evaluation.consistency import world_axes_errors
+from ekfslam.figures.maps import SIGMAS
+from ekfslam.figures.style import LANDMARK_COLOR, style_of
+from ekfslam.filters.result import Result
+from ekfslam.geometry import se3
+from ekfslam.storage.archive import Archive
+
+_ELLIPSOIDS = 2000  # of landmarks: more are slow to draw
+
+
+def write_viewer_file(archive: Archive, path: str | Path) -> None:
+    """Write an archive as a file that Rerun opens (``.rrd``), as a whole or not at all.
+
+    Raises:
+        ConfigError: Rerun is not installed.
+        WriteError: The file cannot be written.
+    """
+    files.require_writable(path)
+    recording = _new_recording(archive.name)
+    memory = recording.memory_recording()
+    log_archive(archive, recording)
+    recording.flush()
+    files.write_all({Path(path): memory.drain_as_bytes()})
+
+
+def show_archive(archive: Archive) -> None:
+    """Open the viewer, which has to be on this machine, and show an archive in it.
+
+    Raises:
+        ConfigError: Rerun is not installed, or its viewer cannot be started.
+    """
+    recording = _new_recording(archive.name)
+    try:
+        recording.spawn()
+    except (RuntimeError, OSError) as error:
+        raise ConfigError(f"the viewer of Rerun cannot be started: {error}") from None
+    log_archive(archive, recording)
+    recording.flush()
+
+
+def log_archive(archive: Archive, recording: Any) -> None:
+    """Send an archive to a recording stream of Rerun.
+
+    Args:
+        archive: What to show.
+        recording: ``rerun.RecordingStream``.
+    """
+    rr = _rerun()
+    time_s = archive.time_s - archive.time_s[0]
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    if archive.truth is not None and len(archive.truth.frame):
+        lines = rr.LineStrips3D([archive.truth.T_world_imu[:, :3, 3]], colors=[(128, 128, 128)], labels=["truth"])
+        recording.log("world/truth", lines, static=True)
+    for mode, result in archive.results.items():
+        part = rr.escape_entity_path_part(mode)
+        color = _bytes(style_of(mode)["color"])
+        recording.log(
+            f"world/{part}/path", rr.LineStrips3D([result.T_world_imu[:, :3, 3]], colors=[color]), static=True
+        )
+        _log_pose(recording, f"world/{part}/imu", result, time_s, color)
+        if len(result.landmarks):
+            _log_landmarks(recording, f"world/{part}/landmarks", result)
+        _log_scalars(recording, part, archive, result, time_s)
+
+
+def _log_pose(recording: Any, place: str, result: Result, time_s: Array, color: tuple[int, ...]) -> None:
+    """The IMU over time: axes, the ellipsoid of its position, and the camera's image plane."""
+    rr = _rerun()
+    T = result.T_world_imu
+    moves = rr.Transform3D.columns(
+        translation=T[:, :3, 3], quaternion=Rotation.from_matrix(T[:, :3, :3]).as_quat().astype(np.float32)
+    )
+    when = [rr.TimeColumn("time", duration=time_s)]
+    recording.send_columns(place, indexes=when, columns=moves)
+    axes, turns = _ellipsoids(result.covariance[:, :3, :3])  # rho is along the axes of the IMU
+    columns = rr.Ellipsoids3D.columns(centers=np.zeros((len(T), 3)), half_sizes=axes, quaternions=turns)
+    recording.log(f"{place}/ellipsoid", rr.Ellipsoids3D.from_fields(colors=[color]), static=True)
+    recording.send_columns(f"{place}/ellipsoid", indexes=when, columns=columns)
+    T_imu_cam, camera = se3.inverse(result.T_cam_imu), result.camera
+    placed = rr.Transform3D(translation=T_imu_cam[:3, 3], mat3x3=T_imu_cam[:3, :3])
+    focal, centre = [camera.fu_px, camera.fv_px], [camera.cu_px, camera.cv_px]
+    size = [2 * camera.cu_px, 2 * camera.cv_px]  # archives do not hold the size of images
+    pinhole = rr.Pinhole(focal_length=focal, principal_point=centre, resolution=size, image_plane_distance=1.0)
+    recording.log(f"{place}/camera", placed, pinhole, static=True)
+
+
+def _log_landmarks(recording: Any, place: str, result: Result) -> None:
+    rr = _rerun()
+    landmarks, color = result.landmarks, _bytes(LANDMARK_COLOR)
+    position = landmarks.position_m
+    recording.log(place, rr.Points3D(position, colors=[color], radii=[rr.Radius.ui_points(1.5)]), static=True)
+    some = np.unique(np.linspace(0, len(landmarks) - 1, min(_ELLIPSOIDS, len(landmarks))).astype(int))
+    axes, turns = _ellipsoids(landmarks.covariance[some])
+    drawn = rr.Ellipsoids3D(centers=position[some], half_sizes=axes, quaternions=turns, colors=[color])
+    recording.log(f"{place}/ellipsoids", drawn, static=True)
+
+
+def _log_scalars(recording: Any, part: str, archive: Archive, result: Result, time_s: Array) -> None:
+    rr = _rerun()
+    truth, innovation = archive.truth, result.innovation
+    if truth is not None and len(truth.frame):
+        error = world_axes_errors(result.T_world_imu[truth.frame], truth.T_world_imu)[:, :3]
+        when = [rr.TimeColumn("time", duration=time_s[truth.frame])]
+        columns = rr.Scalars.columns(scalars=np.linalg.norm(error, axis=1))
+        recording.send_columns(f"errors/{part}", indexes=when, columns=columns)
+    seen = innovation.dof > 0
+    if seen.any():
+        when = [rr.TimeColumn("time", duration=time_s[seen])]
+        columns = rr.Scalars.columns(scalars=innovation.nis[seen] / innovation.dof[seen])
+        recording.send_columns(f"nis/{part}", indexes=when, columns=columns)
+
+
+def _ellipsoids(covariance: Array) -> tuple[Array, Array]:
+    """Half axes (n, 3) of `SIGMAS` and quaternions (n, 4), scalar last, of covariances (n, 3, 3)."""
+    values, vectors = np.linalg.eigh(covariance)
+    vectors = vectors * np.sign(np.linalg.det(vectors))[:, None, None]
+    turns = Rotation.from_matrix(vectors).as_quat()
+    return (SIGMAS * np.sqrt(np.maximum(values, 0.0))).astype(np.float32), turns.astype(np.float32)
+
+
+def _bytes(color: Any) -> tuple[int, ...]:
+    return tuple(round(255 * value) for value in to_rgb(color))
+
+
+def _new_recording(name: str) -> Any:
+    return _rerun().RecordingStream(f"ekfslam {name}")
+
+
+def _rerun() -> Any:
+    try:
+        import rerun
+    except ImportError as error:
+        raise ConfigError(f"the viewer needs Rerun ({error}); it comes with: pip install 'ekfslam[viewer]'") from None
+    return rerun

@@ -1,0 +1,296 @@
+"""`write_report`: archives as one web page that needs nothing else, on a desk or a telephone, in daylight or dark.
+
+Tables and words are HTML; plots are drawn by ``report.js`` from numbers in the page. Names from files are text, never
+markup. A content security policy lets the page run its own script alone, and load nothing.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from ekfslam import files
+from ekfslam.config import Config
+from ekfslam.errors import ArchiveError
+from ekfslam.evaluation.honesty import BLIND
+from ekfslam.evaluation.summary import merit_rows
+from ekfslam.evaluation.verdict import Honesty
+from ekfslam.names import components, printable
+from ekfslam.page.content import PART, Recording, Run, plotted, recordings_of, remarks_of
+from ekfslam.runner import versions
+from ekfslam.storage.archive import Archive, read_archive
+
+MOST_ARCHIVES = 32
+_GENERATOR = '<meta name="generator" content="ekfslam report">'
+_JUDGED = "Verdicts are by innovations alone, without truth; <code>ekfslam check</code> adds the smoother."
+_KEY_FIGURES = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_dof", "landmark_rmse_m")
+
+
+def write_report(archives: Sequence[str | Path], path: str | Path, title: str = "") -> Path:
+    """Write one HTML page of archives.
+
+    Args:
+        archives: As written by run or compare. Those of the same recording are shown together.
+        path: Of the page; its folder is made if missing.
+        title: Heading; by default the names of the recordings.
+
+    Returns:
+        The path.
+
+    Raises:
+        ArchiveError: There is none, there are too many, or one cannot be read or holds no run.
+        WriteError: The page cannot be written.
+    """
+    files.require_writable(path)
+    files.write_all({Path(path): report_page(read_archives(archives), title)})
+    return Path(path)
+
+
+def read_archives(paths: Sequence[str | Path]) -> dict[str, Archive]:
+    """Archives by labels that tell them apart, made of their folders' and files' names.
+
+    Raises:
+        ArchiveError: There is none, there are too many, or one cannot be read or holds no run.
+    """
+    if not 1 <= len(paths) <= MOST_ARCHIVES:
+        raise ArchiveError(f"a report is of 1 to {MOST_ARCHIVES} archives, found {len(paths)}")
+    found = {}
+    for label, path in zip(_labels([Path(path) for path in paths]), paths, strict=True):
+        found[label] = read_archive(path)
+        if not found[label].results:
+            raise ArchiveError(f"{path}: holds no run")
+    return found
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """The shortest ends of the paths that differ."""
+    parts = [(*path.resolve().parts[1:-1], path.stem) for path in paths]
+    ends = parts
+    for length in range(1, max(map(len, parts)) + 1):
+        ends = [part[-length:] for part in parts]
+        if len(set(ends)) == len(ends):
+            break
+    return components(PART.join(end) for end in ends)
+
+
+def is_report(path: Path) -> bool:
+    """Whether a file is a page of `write_report`."""
+    with path.open("rb") as file:
+        return _GENERATOR.encode() in file.read(4096)
+
+
+def report_page(archives: Mapping[str, Archive], title: str = "") -> str:
+    """The text of a page of archives by label."""
+    recordings = recordings_of(archives)
+    title = printable(title) or _title([recording.name for recording in recordings])
+    style = _file("report.css") + _colors(recordings)
+    script = _file("report.js")
+    data = json.dumps([plotted(recording) for recording in recordings], allow_nan=False).replace("<", "\\u003c")
+    policy = f"default-src 'none'; style-src '{_digest(style)}'; script-src '{_digest(script)}'; img-src data:"
+    body = "\n".join(_section(i, recording, len(recordings) == 1) for i, recording in enumerate(recordings))
+    runs = sum(len(recording.runs) for recording in recordings)
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+{_GENERATOR}
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
+<title>{escape(title)}</title>
+<style>{style}</style>
+</head>
+<body>
+<header>
+<p class="kind">ekfslam report</p>
+<h1>{escape(title)}</h1>
+{_facts([_count(len(recordings), "recording"), _count(len(archives), "archive"), _count(runs, "run")])}
+</header>
+<main>
+{_overview(recordings) if len(recordings) > 1 else ""}
+{body}
+</main>
+<footer>Made by ekfslam {escape(versions()["version_ekfslam"])}. This page loads nothing from elsewhere.</footer>
+<script type="application/json" id="data">{data}</script>
+<script>{script}</script>
+</body>
+</html>
+"""
+
+
+def _title(names: Sequence[str]) -> str:
+    different = list(dict.fromkeys(names))
+    more = f" and {len(different) - 3} more" if len(different) > 3 else ""
+    return ", ".join(different[:3]) + more
+
+
+def _section(number: int, recording: Recording, is_alone: bool) -> str:
+    archive, time_s = recording.archive, recording.archive.time_s
+    facts = [
+        _count(len(time_s), "frame"),
+        f"{time_s[-1] - time_s[0]:.1f} s",
+        f"{recording.length_m:.0f} m" if recording.length_m >= 10 else f"{recording.length_m:.2f} m",
+        f"truth of {_count(len(archive.truth.frame), 'pose')}" if archive.truth is not None else "no truth",
+    ]
+    notes = _list([*remarks_of(recording), *archive.notes])
+    if notes:
+        notes = f"<details><summary>Notes on the recording</summary><div>{notes}</div></details>"
+    heading = "" if is_alone else f"<h2>{escape(recording.name)}</h2>"
+    return f"""<section id="recording-{number}">
+{heading}
+{_facts(facts)}
+{notes}
+<div class="cards">{"".join(_card(run) for run in recording.runs if _is_judged(run, recording))}</div>
+<p class="notes">{_JUDGED} {escape(BLIND)}</p>
+<noscript><p class="notes">A script in this page draws its plots; this browser does not run it.</p></noscript>
+<div class="plots" data-recording="{number}"></div>
+<h3>Figures of merit</h3>
+{_table(["", *(run.label for run in recording.runs)], merit_rows(run.summary for run in recording.runs))}
+<h3>Runs in detail</h3>
+{"".join(_detail(run) for run in recording.runs)}
+</section>"""
+
+
+def _facts(facts: Iterable[str]) -> str:
+    return f'<p class="facts">{" · ".join(facts)}</p>'
+
+
+def _is_judged(run: Run, recording: Recording) -> bool:
+    """Whether a card says something of a run: by its innovations, or because no other run has any."""
+    return isinstance(run.honesty, Honesty) or (
+        run is recording.runs[-1] and not any(isinstance(other.honesty, Honesty) for other in recording.runs)
+    )
+
+
+def _card(run: Run) -> str:
+    """Verdict of a run, and its key figures."""
+    honesty = run.honesty
+    if isinstance(honesty, Honesty):
+        kind = "good" if not honesty.causes else "bad" if honesty.factor >= 2 else "fair"
+        head, _, why = honesty.verdict.partition("; cause: ")
+        head, _, also = head.partition(". Also: ")
+        items = [part for part in why.replace(". Also: ", "; ").split("; ") if part] + (
+            also.split("; ") if also else []
+        )
+    else:
+        kind, head, items = "none", honesty.partition(": ")[2] or honesty, []
+    figures = "".join(
+        f"<div><dt>{escape(heading)}</dt><dd>{escape(value)}</dd></div>"
+        for heading, value in merit_rows([{key: run.summary[key] for key in _KEY_FIGURES}])
+    )
+    return f"""<article class="card {kind}">
+<h3>{escape(run.label)}</h3>
+<p class="verdict">{escape(head[:1].upper() + head[1:])}</p>
+{_list(items, "causes")}
+<dl>{figures}</dl>
+</article>"""
+
+
+def _detail(run: Run) -> str:
+    result = run.result
+    hygiene = () if result.hygiene is None else result.hygiene.lines(result.config["hygiene"])
+    blocks = [
+        ("Remarks", _list(result.remarks)),
+        ("Counts", _pairs(result.counts)),
+        ("Track hygiene", _list(hygiene)),
+        ("Estimated besides poses and map", _list(() if result.parameters is None else result.parameters.lines)),
+        ("Configuration", _configuration(result.config)),
+        (
+            "Noise that was assumed",
+            _pairs({key: value for key, value in vars(result.noise).items() if value is not None}),
+        ),
+        ("Attributes", _pairs(result.attributes)),
+    ]
+    shown = "".join(f"<h4>{heading}</h4>{content}" for heading, content in blocks if content)
+    return f"<details><summary>{escape(run.label)}</summary><div>{shown}</div></details>"
+
+
+def _configuration(config: Mapping[str, Any]) -> str:
+    """Settings that are not today's defaults, then all of them."""
+    default, changed, all_of_it = Config(), {}, {}
+    for table, settings in config.items():
+        if not isinstance(settings, Mapping):
+            continue
+        for key, value in settings.items():
+            name = f"{table}.{key}"
+            all_of_it[name] = value
+            if value != getattr(getattr(default, table, None), key, None):
+                changed[name] = value
+    own = _pairs(changed) if changed else "<p>Every setting has its default.</p>"
+    return f"{own}<details><summary>all settings</summary>{_pairs(all_of_it)}</details>"
+
+
+def _overview(recordings: Sequence[Recording]) -> str:
+    """A table of all runs of several recordings."""
+    runs = [(i, recording, run) for i, recording in enumerate(recordings) for run in recording.runs]
+    columns = merit_rows({key: run.summary[key] for key in _KEY_FIGURES} for _, _, run in runs)
+    rows = []
+    for row, (i, recording, run) in enumerate(runs):
+        name = f'<a href="#recording-{i}">{escape(recording.name)}</a>'
+        cells = "".join(f"<td>{escape(column[row + 1])}</td>" for column in columns)
+        rows.append(f'<tr><th scope="row">{name}</th><th scope="row">{escape(run.label)}</th>{cells}</tr>')
+    headings = ["recording", "run", *(column[0] for column in columns)]
+    head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in headings)
+    return f"""<section><h2>All runs</h2>
+<div class="wide"><table class="names"><thead><tr>{head}</tr></thead>
+<tbody>{"".join(rows)}</tbody></table></div></section>"""
+
+
+def _table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in headings)
+    body = "".join(
+        f'<tr><th scope="row">{escape(row[0])}</th>{"".join(f"<td>{escape(cell)}</td>" for cell in row[1:])}</tr>'
+        for row in rows
+    )
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _list(items: Iterable[str], kind: str = "") -> str:
+    shown = "".join(f"<li>{escape(printable(item))}</li>" for item in items)
+    return f'<ul class="{kind}">{shown}</ul>' if shown else ""
+
+
+def _pairs(values: Mapping[str, Any]) -> str:
+    shown = "".join(
+        f"<div><dt>{escape(printable(str(key)))}</dt><dd>{escape(_spoken(value))}</dd></div>"
+        for key, value in values.items()
+    )
+    return f'<dl class="pairs">{shown}</dl>' if shown else ""
+
+
+def _spoken(value: Any) -> str:
+    if value is None:
+        return "default"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if hasattr(value, "tolist"):
+        return _spoken(value.tolist())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_spoken, value))
+    return printable(str(value))
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'' if number == 1 else 's'}".replace(",", " ")
+
+
+def _colors(recordings: Sequence[Recording]) -> str:
+    """Colours of runs as variables of the style: ``--run-<recording>-<run>``."""
+    named = "".join(
+        f"--run-{i}-{j}:{run.color};" for i, recording in enumerate(recordings) for j, run in enumerate(recording.runs)
+    )
+    return f"\n:root{{{named}}}\n"
+
+
+def _file(name: str) -> str:
+    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"

@@ -1,0 +1,367 @@
+"""Sweeps: recordings x seeds x variants x settings x modes, one row of figures of merit a run, in one table.
+
+    sweep = Sweep.from_toml("study.toml")
+    with open_executor("processes") as executor:
+        table = run_sweep(sweep, "sweep.h5", executor)
+
+A study is a TOML file. Whatever stands in a list is tried, each with each:
+
+    recordings = ["builtin:city?frames=300", { data = "0027.npz", truth = "poses/07.txt" }]
+    modes = ["dead-reckoning", "full"]
+    variants = ["invariant", "standard"]
+    seeds = [0, 1, 2]            # of built-in worlds; a recording is run once
+
+    [settings.noise]             # tables and keys of a configuration, see `ekfslam.config`
+    sigma_px = [1.0, 2.0, 4.0]
+
+A run is known by all that decides its numbers, the content of its recording and the versions of the software included.
+So an interrupted sweep goes on, and a study may be extended: what is there already is not run again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+import json
+import math
+import tomllib
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ekfslam.config import MODES, VARIANTS, Config
+from ekfslam.data.readers import BUILTIN, open_sequence
+from ekfslam.errors import ArchiveError, ConfigError, EkfslamError, UnknownFormatError
+from ekfslam.evaluation.summary import KEYS, summarise
+from ekfslam.evaluation.truth import with_truth_noise
+from ekfslam.limits import DEFAULT_GB, limit_gb, reading_up_to, require_file
+from ekfslam.names import printable
+from ekfslam.progress import progress as with_progress
+from ekfslam.runner import run, versions
+from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed
+from ekfslam.studies.journal import Journal
+from ekfslam.studies.sweep_table import SweepTable, read_table, write_table
+
+MOST_RUNS = 100_000
+_ERROR_BYTES = 400
+_KEYS = ("recordings", "modes", "variants", "seeds", "settings")
+_RECORDING_KEYS = ("data", "name", "truth", "extrinsics", "lateral")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording of a sweep.
+
+    Args:
+        data: Path, or ``builtin:NAME``.
+        name: In the table.
+        truth, extrinsics, lateral: As of `ekfslam.open_sequence`.
+    """
+
+    data: str
+    name: str
+    truth: str | None = None
+    extrinsics: str = "corrected"
+    lateral: str = "corrected"
+
+    @property
+    def is_simulated(self) -> bool:
+        return self.data.startswith(BUILTIN)
+
+    def with_seed(self, seed: int) -> Recording:
+        """The built-in world with a seed of its own."""
+        return dataclasses.replace(self, data=f"{self.data}{'&' if '?' in self.data else '?'}seed={seed}")
+
+    @cached_property
+    def content(self) -> str:
+        """What decides its numbers: digests of its files, or the name of the world.
+
+        Raises:
+            UnknownFormatError: A file is missing.
+        """
+        if self.is_simulated:
+            return self.data
+        return " ".join([self.extrinsics, self.lateral, *(_digest(Path(p)) for p in (self.data, self.truth) if p)])
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run of a sweep: a recording, a mode, and a configuration that differs from the default in ``overrides``."""
+
+    recording: Recording
+    seed: int | None
+    mode: str
+    overrides: Mapping[str, Mapping[str, Any]]
+
+    @cached_property
+    def config(self) -> Config:
+        return Config().with_overrides(self.overrides)
+
+    @cached_property
+    def key(self) -> str:
+        """What decides its numbers, as 64 hexadecimal digits."""
+        facts = [self.recording.content, self.mode, dataclasses.asdict(self.config), versions()]
+        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What to run.
+
+    Args:
+        recordings: On what.
+        modes, variants: Of `MODES` and `VARIANTS`.
+        seeds: Of built-in worlds; none: their own.
+        settings: Table to key to the values to try.
+
+    Raises:
+        ConfigError: There is nothing to run, too much, or something unknown.
+    """
+
+    recordings: tuple[Recording, ...]
+    modes: tuple[str, ...] = ("full",)
+    variants: tuple[str, ...] = ("invariant",)
+    seeds: tuple[int, ...] = ()
+    settings: Mapping[str, Mapping[str, tuple[Any, ...]]] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for what, values, known in (("mode", self.modes, MODES), ("variant", self.variants, VARIANTS)):
+            for value in values:
+                if value not in known:
+                    raise ConfigError(f"unknown {what} {value!r} of a sweep; known: {', '.join(known)}")
+        if not all(type(seed) is int and seed >= 0 for seed in self.seeds):
+            raise ConfigError(f"seeds of a sweep must be whole numbers, not negative, found {list(self.seeds)}")
+        choices = [values for table in self.settings.values() for values in table.values()]
+        seeded = sum(max(len(self.seeds), 1) if recording.is_simulated else 1 for recording in self.recordings)
+        count = seeded * len(self.modes) * len(self.variants) * math.prod(map(len, choices))
+        if not 1 <= count <= MOST_RUNS:
+            raise ConfigError(f"a sweep is of 1 to {MOST_RUNS} runs, found {count}")
+        names = [recording.name for recording in self.recordings]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"recordings of a sweep need different names, found {', '.join(names)}")
+        keys = [task.key for task in self.tasks]
+        if len(set(keys)) < len(keys):
+            raise ConfigError("a sweep holds the same run twice: a value or recording stands in it twice")
+
+    @cached_property
+    def tasks(self) -> tuple[Task, ...]:
+        """All runs, the mode changing fastest."""
+        names = [(table, key) for table, values in self.settings.items() for key in values]
+        choices = [self.settings[table][key] for table, key in names]
+        found = []
+        for recording in self.recordings:
+            for seed in self.seeds if recording.is_simulated and self.seeds else (None,):
+                seeded = recording if seed is None else recording.with_seed(seed)
+                for variant, values in itertools.product(self.variants, itertools.product(*choices)):
+                    overrides: dict[str, dict[str, Any]] = {"filter": {"variant": variant}}
+                    for (table, key), value in zip(names, values, strict=True):
+                        _put(overrides, table, key, value)
+                    found += [Task(seeded, seed, mode, overrides) for mode in self.modes]
+        return tuple(found)
+
+    @staticmethod
+    def from_toml(path: str | Path) -> Sweep:
+        """The sweep of a file; paths in it are relative to its folder.
+
+        Raises:
+            ConfigError: The file is missing, is not TOML, or holds something unknown.
+        """
+        try:
+            require_file(path, is_text=True)
+            found = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+            return _parsed(found, Path(path).parent)
+        except UnknownFormatError as error:  # names the file
+            raise ConfigError(str(error)) from None
+        except (OSError, ValueError, RecursionError, ConfigError) as error:  # ValueError: no UTF-8, no TOML
+            raise ConfigError(f"{path}: {error}") from None
+
+
+def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool = True) -> SweepTable:
+    """Run what the table at ``path`` does not hold yet.
+
+    Every finished run is at once in a journal beside the table. The table is written at the end, and where the sweep is
+    interrupted by anything but a kill. A run that a filter cannot finish is a row with an error and no figures.
+
+    Args:
+        sweep: What to run.
+        path: HDF5 file of the table, made if missing.
+        executor: Where to run it, see `ekfslam.studies.executors.open_executor`.
+        progress: Whether to show a bar with the time left, on a terminal.
+
+    Raises:
+        ArchiveError: ``path`` holds runs that this sweep does not ask for, or cannot be written.
+    """
+    path = Path(path)
+    tasks = {task.key: task for task in sweep.tasks}
+    done = _taken_up(path, tasks)
+    journal = Journal(path, "sweep", lambda key: _blank())
+    for key, _, record in journal.entries():
+        _require_wanted(path, key, tasks)
+        done[key] = record["run"]
+    missing = [task for key, task in tasks.items() if key not in done]
+    finished: Any = completed(missing, lambda task: executor.submit(run_task, task, limit_gb()))
+    if progress:
+        finished = with_progress(finished, "sweep", "run", total=len(missing))
+    try:
+        for task, record in finished:
+            journal.append(task.key, 0, {"run": record})
+            done[task.key] = record
+    finally:
+        table = _table(sweep, done)
+        if len(table):
+            write_table(path, table)
+            journal.remove()
+    return table
+
+
+def run_task(task: Task, read_gb: float = DEFAULT_GB) -> dict[str, NDArray]:
+    """Figures of merit of one run, in the order of `KEYS`, NaN where there is none; and why the run failed, if so.
+
+    Args:
+        task: What to run.
+        read_gb: See `ekfslam.limits.reading_up_to`.
+    """
+    record = _blank()["run"]
+    try:
+        with ONE_RUN_AT_A_TIME, reading_up_to(read_gb):
+            sequence = with_truth_noise(_opened(task.recording), task.config.truth)
+            result = run(sequence, task.mode, task.config)  # type: ignore[arg-type]
+            found = summarise(sequence, result)
+        record["figures"][:] = [np.nan if found[key] is None else found[key] for key in KEYS]
+    except EkfslamError as error:
+        record["error"] = np.array(printable(str(error)).encode()[:_ERROR_BYTES], dtype=record["error"].dtype)
+    return record
+
+
+@lru_cache(maxsize=2)
+def _opened(recording: Recording) -> Any:
+    """A recording, kept for the next run on it in the same process."""
+    options: dict[str, Any] = {"extrinsics": recording.extrinsics, "lateral": recording.lateral}
+    return open_sequence(recording.data, truth=recording.truth, **options)
+
+
+def _blank() -> dict[str, dict[str, NDArray]]:
+    return {"run": {"figures": np.full(len(KEYS), np.nan), "error": np.zeros((), dtype=f"S{_ERROR_BYTES}")}}
+
+
+def _taken_up(path: Path, tasks: Mapping[str, Task]) -> dict[str, Mapping[str, NDArray]]:
+    """The runs that the table of an earlier sweep holds."""
+    done: dict[str, Mapping[str, NDArray]] = {}
+    if not path.exists():
+        return done
+    columns = read_table(path).columns
+    for row, key in enumerate(columns["key"]):
+        _require_wanted(path, key, tasks)
+        record = _blank()["run"]
+        record["figures"][:] = [columns[name][row] if name in columns else np.nan for name in KEYS]
+        record["error"] = np.array(columns["error"][row].encode(), dtype=record["error"].dtype)
+        done[key] = record
+    return done
+
+
+def _require_wanted(path: Path, key: str, tasks: Mapping[str, Task]) -> None:
+    if key not in tasks:
+        raise ArchiveError(
+            f"{path} holds runs of another study, of other recordings or of another release; move it away or choose "
+            "another folder"
+        )
+
+
+def _table(sweep: Sweep, done: Mapping[str, Mapping[str, NDArray]]) -> SweepTable:
+    """The runs that are done, in the order of the sweep."""
+    tasks = [task for task in sweep.tasks if task.key in done]
+    rows = []
+    for task in tasks:
+        record = done[task.key]
+        facts = {"recording": task.recording.name, "seed": task.seed, "mode": task.mode, **_settings(task.config)}
+        figures = dict(zip(KEYS, record["figures"].tolist(), strict=True))
+        rows.append({"key": task.key, **facts, **figures, "error": record["error"].item().decode(errors="replace")})
+    swept = ["recording", "mode", "filter.variant", *(["seed"] if sweep.seeds else [])]
+    swept += [f"{table}.{key}" for table, values in sweep.settings.items() for key in values]
+    return SweepTable.of_rows(rows, tuple(swept), len(sweep.tasks))
+
+
+def _settings(config: Config) -> dict[str, Any]:
+    """Every setting that a run may depend on, by ``table.key``."""
+    return {
+        f"{table}.{name}": value
+        for table, values in dataclasses.asdict(config).items()
+        if table != "tuning"
+        for name, value in _flat(values)
+    }
+
+
+def _flat(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{key}.{name}", inner) for name, inner in _flat(value))
+        else:
+            yield key, value
+
+
+def _put(overrides: dict[str, dict[str, Any]], table: str, key: str, value: Any) -> None:
+    """Set a key of a table; of a state block, ``blocks.<name>``, too."""
+    first, _, block = table.partition(".")
+    settings = overrides.setdefault(first, {})
+    (settings.setdefault(block, {}) if block else settings)[key] = value
+
+
+def _parsed(found: Mapping[str, Any], folder: Path) -> Sweep:
+    for key in found:
+        if key not in _KEYS:
+            raise ConfigError(f"unknown key {key!r}; known: {', '.join(_KEYS)}")
+    for key in _KEYS[:4]:
+        if not isinstance(found.get(key, []), list):
+            raise ConfigError(f"{key} must be a list, found {found[key]!r}")
+    settings: dict[str, dict[str, tuple[Any, ...]]] = {}
+    if not isinstance(found.get("settings", {}), dict):
+        raise ConfigError("[settings] must hold tables")
+    for table, values in found.get("settings", {}).items():
+        if not isinstance(values, dict):
+            raise ConfigError(f"[settings.{table}] must be a table, found {values!r}")
+        for key, value in values.items():
+            if isinstance(value, dict):  # of a state block
+                settings.setdefault(f"{table}.{key}", {}).update({k: _listed(v) for k, v in value.items()})
+            else:
+                settings.setdefault(table, {})[key] = _listed(value)
+    given = {key: tuple(found[key]) for key in ("modes", "variants", "seeds") if key in found}
+    recordings = tuple(_recording(entry, folder) for entry in found.get("recordings", []))
+    return Sweep(recordings, settings=settings, **given)
+
+
+def _listed(value: Any) -> tuple[Any, ...]:
+    return tuple(value) if isinstance(value, list) else (value,)
+
+
+def _recording(entry: Any, folder: Path) -> Recording:
+    given = {"data": entry} if isinstance(entry, str) else entry
+    if not isinstance(given, dict) or not all(isinstance(value, str) for value in given.values()):
+        raise ConfigError(f"a recording is a path, or a table of texts with data, found {entry!r}")
+    for key in given:
+        if key not in _RECORDING_KEYS:
+            raise ConfigError(f"unknown key {key!r} of a recording; known: {', '.join(_RECORDING_KEYS)}")
+    if "data" not in given:
+        raise ConfigError(f"a recording has no data: {entry!r}")
+    data, truth = given["data"], given.get("truth")
+    is_simulated = data.startswith(BUILTIN)
+    name = printable(given.get("name", data.removeprefix(BUILTIN) if is_simulated else Path(data).stem))
+    place = data if is_simulated else str((folder / data).resolve())
+    paths = {"data": place, "name": name, "truth": None if truth is None else str((folder / truth).resolve())}
+    return Recording(**{**given, **paths})
+
+
+@lru_cache(maxsize=256)
+def _digest(path: Path) -> str:
+    """Digest of a file, or of the names and sizes in a folder."""
+    if path.is_dir():
+        listed = [f"{p.relative_to(path)} {p.stat().st_size}" for p in sorted(path.rglob("*")) if p.is_file()]
+        return hashlib.sha256("\n".join(listed).encode()).hexdigest()
+    require_file(path)
+    return hashlib.sha256(path.read_bytes()).hexdigest()

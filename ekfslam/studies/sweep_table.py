@@ -1,0 +1,174 @@
+"""The table of a sweep: one row a run, every setting and figure of merit a column, in HDF5 and Parquet.
+
+/           attributes format, format_version, swept (names of columns), runs asked for, versions
+/table      a data set a column: numbers (NaN where there is none) or text
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from ekfslam import files, hdf5
+from ekfslam.errors import ArchiveError, ConfigError
+from ekfslam.evaluation.summary import KEYS
+from ekfslam.evaluation.tables import document, markdown_table, significant
+from ekfslam.runner import versions
+
+FORMAT, FORMAT_VERSION = "ekfslam-sweep", 1
+SHOWN = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_dof", "landmark_rmse_m", "total_s")
+
+
+@dataclass(frozen=True)
+class SweepTable:
+    """What a sweep has found.
+
+    Args:
+        columns: Name to values (n,): numbers as floats, NaN for none; all else as text, empty for none.
+        swept: Names of the columns that tell the runs apart.
+        asked: How many runs there shall be.
+    """
+
+    columns: Mapping[str, NDArray]
+    swept: tuple[str, ...]
+    asked: int
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    @staticmethod
+    def of_rows(rows: Sequence[Mapping[str, Any]], swept: tuple[str, ...], asked: int) -> SweepTable:
+        """A table of rows; a column that one of them lacks is empty there."""
+        names = dict.fromkeys(name for row in rows for name in row)
+        return SweepTable({name: _column([row.get(name) for row in rows]) for name in names}, swept, asked)
+
+    def column(self, name: str) -> NDArray:
+        """A column by name.
+
+        Raises:
+            ConfigError: There is none of that name.
+        """
+        if name not in self.columns:
+            raise ConfigError(f"the sweep has no column {name!r}; it has {', '.join(self.columns)}")
+        return self.columns[name]
+
+    def markdown(self, figures: Sequence[str] = SHOWN) -> str:
+        """A Markdown table of what tells runs apart and of some figures of merit, then the errors.
+
+        Raises:
+            ConfigError: There is no such column.
+        """
+        told = [name for name in self.swept if len(set(self.column(name).tolist())) > 1] or list(self.swept[:1])
+        shown = [
+            name for name in figures if self.column(name).dtype.kind != "f" or np.isfinite(self.column(name)).any()
+        ]
+        rows = [
+            [*(_spoken(self.column(name)[i]) for name in told), *(_figure(self.column(name)[i]) for name in shown)]
+            for i in range(len(self))
+        ]
+        failed = [(row, text) for row, text in enumerate(self.columns.get("error", [])) if text]
+        lines = "\n".join(f"- {', '.join(rows[row][: len(told)])}: {text}" for row, text in failed)
+        head = f"{len(self)} of {self.asked} runs" + (f", {len(failed)} without a result:\n\n{lines}" if failed else "")
+        return document(markdown_table([*told, *shown], rows, left=len(told), padded=True), head)
+
+
+def table_image(table: SweepTable) -> bytes:
+    """What `write_table` writes as HDF5.
+
+    Raises:
+        ArchiveError: It would hold what cannot be read again.
+    """
+
+    def fill(h5file: h5py.File) -> None:
+        facts = {"swept": json.dumps(table.swept), "runs": table.asked, **versions()}
+        hdf5.write_attributes(h5file, facts)
+        group = h5file.create_group("table", track_order=True)
+        layout = hdf5.layout(*(_item(name, values.dtype.kind) for name, values in table.columns.items()))
+        stored = {
+            name: values
+            if values.dtype.kind == "f"
+            else np.array([text.encode() for text in values.tolist()], dtype="S")
+            for name, values in table.columns.items()
+        }
+        hdf5.write_fields(group, layout, stored)
+
+    return hdf5.image(FORMAT, FORMAT_VERSION, fill)
+
+
+def write_table(path: str | Path, table: SweepTable) -> list[Path]:
+    """Write a table as HDF5, and beside it as Parquet where ``pyarrow`` is installed; the paths written.
+
+    Raises:
+        WriteError: It cannot be written.
+    """
+    path = Path(path)
+    contents: dict[Path, str | bytes] = {path: table_image(table)}
+    parquet = _parquet(table)
+    if parquet is not None:
+        contents[path.with_suffix(".parquet")] = parquet
+    files.write_all(contents)
+    return list(contents)
+
+
+def read_table(path: str | Path) -> SweepTable:
+    """The table of a sweep.
+
+    Raises:
+        ArchiveError: The file is missing or damaged, or holds something else.
+    """
+    with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
+        group = hdf5.subgroup(h5file, "table")
+        items = [_item(name, "f" if group[name].dtype.kind == "f" else "S") for name in group]
+        found = hdf5.read_fields(group, hdf5.layout(*items))
+        columns = {
+            name: value if value.dtype.kind == "f" else np.array(hdf5.texts(value), dtype=object)
+            for name, value in found.items()
+        }
+        swept = json.loads(str(hdf5.attribute(h5file, "swept")))
+        missing = [name for name in ("key", "error", *swept, *KEYS) if name not in columns]
+        if missing:
+            raise ArchiveError(f"{path}: table/{missing[0]} is missing")
+        return SweepTable(columns, tuple(swept), int(hdf5.attribute(h5file, "runs")))
+
+
+def _item(name: str, kind: str) -> tuple[Any, ...]:
+    check = hdf5.NUMBERS_OR_NONE if kind == "f" else hdf5.TEXTS
+    return name, name, ("n",), "see the name", "none", check
+
+
+def _parquet(table: SweepTable) -> bytes | None:
+    """The table as Parquet, None where ``pyarrow`` is not installed."""
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        return None
+    packed = BytesIO()
+    columns = {name: values.tolist() for name, values in table.columns.items()}
+    parquet.write_table(pyarrow.table(columns), packed)
+    return packed.getvalue()
+
+
+def _column(values: Sequence[Any]) -> NDArray:
+    """Numbers and truth values as floats, if there is nothing else; all else as text."""
+    if all(value is None or isinstance(value, int | float) for value in values):
+        return np.array([np.nan if value is None else float(value) for value in values])
+    return np.array(["" if value is None else str(value) for value in values], dtype=object)
+
+
+def _spoken(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _figure(value: Any) -> str:
+    if isinstance(value, float):
+        return significant(value if np.isfinite(value) else None)
+    return str(value)

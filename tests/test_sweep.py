@@ -1,0 +1,245 @@
+"""Sweeps: the table of a product of choices, killed and resumed, extended, on processes and Dask, read back."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from ekfslam.cli import main
+from ekfslam.config import Config
+from ekfslam.data.readers import open_sequence
+from ekfslam.errors import ArchiveError, ConfigError
+from ekfslam.evaluation.summary import KEYS, summarise
+from ekfslam.figures.sweep import plot_sweep
+from ekfslam.runner import run
+from ekfslam.studies import sweep as sweeps
+from ekfslam.studies.executors import SerialExecutor, open_executor
+from ekfslam.studies.sweep import Recording, Sweep, run_sweep
+from ekfslam.studies.sweep_table import SweepTable, read_table, table_image
+
+CLOCK = ("ms_per_frame_median", "ms_per_frame_max", "total_s")  # of the wall: never the same twice
+STUDY = """
+recordings = ["builtin:city?frames=8", { data = "builtin:loop?frames=8", name = "ring" }]
+modes = ["dead-reckoning", "full"]
+variants = ["invariant", "standard"]
+seeds = [3, 4]
+[settings.noise]
+sigma_px = [1.0, 2.0]
+[settings.filter]
+gate_probability = 0.99
+"""
+
+
+@pytest.fixture
+def study(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    return path
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> SweepTable:
+    folder = tmp_path_factory.mktemp("sweep")
+    (folder / "study.toml").write_text(STUDY)
+    return run_sweep(Sweep.from_toml(folder / "study.toml"), folder / "sweep.h5", SerialExecutor())
+
+
+def assert_same(table: SweepTable, other: SweepTable) -> None:
+    assert list(table.columns) == list(other.columns)
+    assert (table.swept, table.asked) == (other.swept, other.asked)
+    for name, values in table.columns.items():
+        if name not in CLOCK:
+            np.testing.assert_array_equal(values, other.columns[name], name)
+
+
+def test_a_row_is_what_a_run_by_hand_gives(undisturbed):
+    assert len(undisturbed) == undisturbed.asked == 2 * 2 * 2 * 2 * 2
+    columns = undisturbed.columns
+    wanted = itertools.product(
+        ["city?frames=8", "ring"], [3, 4], ["invariant", "standard"], [1.0, 2.0], ["dead-reckoning", "full"]
+    )
+    names = ("recording", "seed", "filter.variant", "noise.sigma_px", "mode")
+    assert list(zip(*(columns[name] for name in names), strict=True)) == list(wanted)
+    assert (columns["filter.gate_probability"] == 0.99).all()
+    row = 13
+    config = Config().with_overrides(
+        {"filter": {"variant": "standard", "gate_probability": 0.99}, "noise": {"sigma_px": 1.0}}
+    )
+    assert [columns[name][row] for name in names] == ["city?frames=8", 4, "standard", 1.0, "full"]
+    sequence = open_sequence("builtin:city?frames=8&seed=4")
+    by_hand = summarise(sequence, run(sequence, "full", config))
+    for key in set(KEYS) - set(CLOCK):
+        value = np.nan if by_hand[key] is None else by_hand[key]
+        np.testing.assert_array_equal(columns[key][row], value, key)
+    assert not any(columns["error"])
+
+
+KILLED = """
+import os, signal, sys
+from ekfslam.studies import sweep as sweeps
+from ekfslam.studies.executors import SerialExecutor
+
+true_run, left = sweeps.run_task, int(sys.argv[3])
+def counted(task, limit):
+    global left
+    print(task.key, flush=True)
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    left -= 1
+    return true_run(task, limit)
+sweeps.run_task = counted
+sweeps.run_sweep(sweeps.Sweep.from_toml(sys.argv[1]), sys.argv[2], SerialExecutor(), False)
+"""
+
+
+def test_killed_twice_and_resumed_it_equals_an_undisturbed_one(study, tmp_path, undisturbed, monkeypatch):
+    path = tmp_path / "sweep.h5"
+    monkeypatch.setenv("PYTHONPATH", str(Path(sweeps.__file__).parents[2]))
+    begun = []
+    for after in (5, 9):
+        call = [sys.executable, "-c", KILLED, str(study), str(path), str(after)]
+        done = subprocess.run(call, capture_output=True, text=True, env={**os.environ}, timeout=120)
+        assert done.returncode == -9, done.stderr
+        begun.append(done.stdout.split())
+    assert not path.exists()
+    assert begun[1][0] == begun[0][-1], "the run in whose midst it was killed begins anew, no other does"
+    assert not set(begun[0][:-1]) & set(begun[1])
+    assert len(begun[1]) == 10
+    assert_same(run_sweep(Sweep.from_toml(study), path, SerialExecutor()), undisturbed)
+    assert_same(read_table(path), undisturbed)
+    assert sorted(p.name for p in tmp_path.iterdir() if p.suffix != ".parquet") == ["study.toml", "sweep.h5"]
+
+
+@pytest.mark.slow
+def test_two_dask_workers_give_the_same_table(study, tmp_path, undisturbed):
+    distributed = pytest.importorskip("distributed", reason="pip install ekfslam[cluster]")
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        open_executor(cluster.scheduler_address.replace("tcp://", "dask://")) as executor,
+    ):
+        assert_same(run_sweep(Sweep.from_toml(study), tmp_path / "sweep.h5", executor), undisturbed)
+
+
+def test_an_interrupted_sweep_has_a_table_and_an_extended_one_runs_what_is_new(tmp_path, monkeypatch):
+    small = Sweep((Recording("builtin:loop?frames=8", "loop"),), modes=("dead-reckoning",), seeds=(1, 2))
+    path, ran = tmp_path / "sweep.h5", []
+
+    def interrupted(task, limit):
+        if len(ran) == 1:
+            raise KeyboardInterrupt
+        ran.append(task.seed)
+        return true_run(task, limit)
+
+    true_run = sweeps.run_task
+    with monkeypatch.context() as patch:
+        patch.setattr(sweeps, "run_task", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run_sweep(small, path, SerialExecutor())
+    assert (len(read_table(path)), read_table(path).asked) == (1, 2)
+    monkeypatch.setattr(sweeps, "run_task", lambda task, limit: (ran.append(task.seed), true_run(task))[1])
+    larger = Sweep(small.recordings, modes=("dead-reckoning",), seeds=(1, 2, 3))
+    assert len(run_sweep(larger, path, SerialExecutor())) == 3
+    assert ran == [1, 2, 3]
+    with pytest.raises(ArchiveError, match="another study"):
+        run_sweep(small, path, SerialExecutor())
+
+
+def test_a_run_that_fails_is_a_row_that_says_why(tmp_path):
+    """A recording that cannot be opened fails alone; the table says so."""
+    (tmp_path / "none.npz").write_bytes(b"nothing")
+    (tmp_path / "s.toml").write_text('recordings = ["none.npz", "builtin:loop?frames=8"]\nmodes = ["dead-reckoning"]')
+    table = run_sweep(Sweep.from_toml(tmp_path / "s.toml"), tmp_path / "sweep.h5", SerialExecutor())
+    assert ["none.npz" in text for text in table.columns["error"]] == [True, False]
+    assert np.isfinite(table.columns["ate_m"]).tolist() == [False, True]
+    assert "1 without a result" in table.markdown()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("recordings = []", "1 to 100000 runs, found 0"),
+        ('recordings = ["builtin:city"]\nmode = ["full"]', "unknown key 'mode'"),
+        ('recordings = ["builtin:city"]\nmodes = ["fast"]', "unknown mode 'fast'"),
+        ('recordings = ["builtin:city"]\nmodes = "full"', "modes must be a list"),
+        ('recordings = ["builtin:city"]\nseeds = [-1]', "whole numbers"),
+        ('recordings = ["builtin:city", "builtin:city"]', "different names"),
+        ('recordings = ["builtin:city"]\nmodes = ["full", "full"]', "same run twice"),
+        ('recordings = [{ file = "x" }]', "unknown key 'file'"),
+        ('recordings = ["builtin:city"]\n[settings.noise]\nsigma = [1.0]', "unknown key noise.sigma"),
+        ('recordings = ["builtin:city"]\n[settings]\nnoise = 1', r"\[settings.noise\] must be a table"),
+        ('recordings = ["nowhere.npz"]', "nowhere.npz"),
+        ("recordings = [", "s.toml"),
+    ],
+)
+def test_a_study_that_makes_no_sense_is_a_named_error(tmp_path, text, words):
+    (tmp_path / "s.toml").write_text(text)
+    with pytest.raises(ConfigError, match=words):
+        Sweep.from_toml(tmp_path / "s.toml")
+
+
+def test_settings_of_blocks_are_swept(tmp_path):
+    (tmp_path / "s.toml").write_text(
+        'recordings = ["builtin:loop?frames=8"]\n[settings.blocks.twist_bias]\nsigma_v_m_s = [0.01, 0.1]'
+    )
+    sweep = Sweep.from_toml(tmp_path / "s.toml")
+    assert [task.config.blocks["twist_bias"]["sigma_v_m_s"] for task in sweep.tasks] == [0.01, 0.1]
+
+
+def test_the_table_is_read_as_it_was_written_and_refuses_damage(tmp_path, undisturbed):
+    path = tmp_path / "sweep.h5"
+    path.write_bytes(table_image(undisturbed))
+    assert_same(read_table(path), undisturbed)
+    with h5py.File(path, "a") as h5file:
+        del h5file["table/ate_m"]
+    with pytest.raises(ArchiveError, match="table/ate_m is missing"):
+        read_table(path)
+
+
+def test_parquet_holds_the_same(tmp_path, undisturbed):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    sweeps.write_table(tmp_path / "sweep.h5", undisturbed)
+    found = parquet.read_table(tmp_path / "sweep.parquet").to_pydict()
+    assert list(found) == list(undisturbed.columns)
+    np.testing.assert_array_equal(found["ate_m"], undisturbed.columns["ate_m"])
+    assert found["mode"] == undisturbed.columns["mode"].tolist()
+
+
+def test_any_figure_against_any_setting(undisturbed):
+    figure = plot_sweep(undisturbed, "ate_m", "noise.sigma_px")
+    (ax,) = figure.axes
+    assert len(ax.lines) == 2 * 2 * 2  # recordings, modes, variants
+    columns = undisturbed.columns
+    chosen = (columns["recording"] == "ring") & (columns["mode"] == "full") & (columns["filter.variant"] == "standard")
+    mean = [columns["ate_m"][chosen & (columns["noise.sigma_px"] == px)].mean() for px in (1.0, 2.0)]
+    line = next(line for line in ax.lines if line.get_label() == "ring, full, standard")
+    np.testing.assert_allclose(line.get_ydata(), mean)
+    assert [text.get_text() for text in plot_sweep(undisturbed, "ate_m", "mode").axes[0].get_xticklabels()] == [
+        "dead-reckoning",
+        "full",
+    ]
+    with pytest.raises(ConfigError, match="no column 'ate'"):
+        plot_sweep(undisturbed, "ate", "mode")
+    with pytest.raises(ValueError, match="no number"):
+        plot_sweep(undisturbed, "mode", "noise.sigma_px")
+
+
+def test_command(tmp_path, capsys):
+    study, out = tmp_path / "s.toml", tmp_path / "out"
+    study.write_text('recordings = ["builtin:loop?frames=8"]\nmodes = ["dead-reckoning"]\nseeds = [1, 2]')
+    assert main(["sweep", str(study), "--out", str(out), "--executor", "serial", "--plot", "ate_m", "seed"]) == 0
+    assert "2 of 2 runs" in capsys.readouterr().out
+    assert {"sweep.h5", "sweep.md", "ate_m-seed.png"} <= {path.name for path in out.iterdir()}
+    assert main(["sweep", "--table", "--out", str(out), "--figures", "ate_m"]) == 0
+    shown = capsys.readouterr().out
+    assert "| seed |" in shown
+    assert "ms_per" not in shown
+    assert main(["sweep", "--out", str(out)]) == 2
+    assert main(["sweep", "--table", "--out", str(out), "--figures", "nothing"]) == 2
+    assert "no column 'nothing'" in capsys.readouterr().err
