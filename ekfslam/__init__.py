@@ -5,6 +5,7 @@
     sequence = ekfslam.open_sequence("builtin:city")
     result = ekfslam.run(sequence, mode="full")
     result.T_world_imu, result.covariance, result.landmarks.position_m
+    result.map(sequence), result.to_dataframe("landmarks")
     everything = ekfslam.posterior(result)   # smoothed: all poses, all landmarks, any block of their covariance
 
 Conventions, everywhere:
@@ -13,7 +14,7 @@ Conventions, everywhere:
   car), ``cam`` (left optical frame: x right, y down, z forward). The report's inverse IMU pose is ``T_imu_world``.
 - Tangent vectors are translation first: twist ``u = [v; w]`` (m/s, rad/s, IMU frame), pose error ``xi = [rho; theta]``.
 - Errors: ``T_imu_world = exp(xi^) T_hat``, landmark ``m = m_hat + d`` (world, metres). Covariances are of ``(xi, d)``,
-  whatever variant of the filter runs.
+  whatever variant of the filter runs. `Result.position_covariance_world` is along the axes of world.
 - ``twist[k]`` at stamp ``t[k]`` drives the interval ``(t[k-1], t[k]]``.
 - ``V`` is pixel noise, ``R`` a rotation. Units stand in names where a reader could doubt (``_s``, ``_px``, ``_m``).
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from ekfslam.data.simulate import Loop, simulate
 from ekfslam.evaluation.consistency import chi2_bounds
+from ekfslam.geometry.motion import world_axes_covariance
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "experiments" / "examples"
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
@@ -94,3 +99,63 @@ def test_study(tmp_path):
         low, high = chi2_bounds(3, 0.999, 8)
         assert low < numbers(lines[f"{level}, invariant"])[0] < high
         assert numbers(lines[f"{level}, standard"])[0] > low
+
+
+def test_live_queue(tmp_path):
+    lines = printed("live_queue", tmp_path)
+    out_of_order, late = numbers(lines["messages out of order"])
+    assert out_of_order > 0 and late == 0
+    images, landmarks = numbers(lines["images in the map"])
+    assert images == 40 and landmarks > 20
+    assert numbers(lines["error of the last position"])[0] < 0.3
+
+
+class Message(SimpleNamespace):
+    """A message of ROS: every field is there when it is first set."""
+
+    def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        setattr(self, name, Message())
+        return getattr(self, name)
+
+
+def test_ros2_node(tmp_path):
+    """The node without ROS: messages as ROS has them go in, and poses come out whose covariance holds."""
+    spec = importlib.util.spec_from_file_location("ros2_node", EXAMPLES / "ros2_node.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    published, heard = [], {}
+    node = SimpleNamespace(
+        create_publisher=lambda kind, topic, depth: SimpleNamespace(publish=published.append),
+        create_subscription=lambda kind, topic, callback, depth: heard.update({topic: callback}),
+    )
+    slam = module.Slam(node, Message, Message, Message)
+    world = simulate(Loop(frames=40))
+    for k, t in enumerate(world.time_s.tolist()):
+        velocities, tracks = Message(), Message()
+        velocities.header.stamp = tracks.header.stamp = Message(sec=int(t), nanosec=round(1e9 * (t % 1.0)))
+        for part, values in (("linear", world.twist[k, :3]), ("angular", world.twist[k, 3:])):
+            setattr(velocities.twist, part, Message(**dict(zip("xyz", values.tolist(), strict=True))))
+        ids, pixels = world.observations.at(k)
+        points = np.zeros(len(ids), module.TRACK)
+        points["id"] = ids
+        for name, column in zip(("uL", "vL", "uR", "vR"), pixels.T, strict=True):
+            points[name] = column
+        tracks.data = points.tobytes()
+        heard["velocities"](velocities)
+        heard["tracks"](tracks)
+    assert len(published) > 30 and slam.live.counts.taken_in > 30
+    last, T_true = published[-1].pose, world.truth.T_world_imu[-1]
+    error = np.array([last.pose.position.x, last.pose.position.y, last.pose.position.z]) - T_true[:3, 3]
+    P = np.array(last.covariance).reshape(6, 6)
+    assert error @ np.linalg.solve(P[:3, :3], error) < 16.3  # 99.9 % of three degrees of freedom
+    assert published[-1].header.frame_id == "map"
+    T, covariance = slam.live.pose()[1:3]
+    position, rotation = world_axes_covariance(T[None], covariance[None])
+    np.testing.assert_allclose(P[:3, :3], position[0], atol=1e-12)
+    np.testing.assert_allclose(P[3:, 3:], rotation[0], atol=1e-12)
+    if importlib.util.find_spec("rclpy") is None:
+        command = [sys.executable, EXAMPLES / "ros2_node.py"]
+        alone = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
+        assert alone.returncode == 1 and alone.stderr.startswith("this node needs ROS 2")

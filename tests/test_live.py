@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -207,3 +208,12 @@ def test_messages_that_cannot_be_right_are_named_and_leave_everything_as_it_was(
     assert (live.counts.velocities, live.counts.images, live.counts.taken_in) == (1, 1, 1)
     with pytest.raises(ConfigError, match="delay_s"):
         LiveEKF(filter_of(problem), delay_s=-1.0)
+
+
+def test_the_page_on_live_use_runs():
+    page = (Path(__file__).resolve().parents[1] / "docs" / "live.md").read_text(encoding="utf-8")
+    code = page.partition("```python\n")[2].partition("```")[0]
+    found: dict = {}
+    exec(compile(code, "live.md", "exec"), found)
+    assert found["live"].counts.taken_in == 1 and found["live"].ekf.ids.tolist() == [7]
+    assert found["now"].time_s == 0.1 and found["now"].T_world_imu[0, 3] == pytest.approx(1.0, abs=1e-3)

@@ -101,7 +101,7 @@ def _attitude_std(T_world_imu: Array, covariance: Array) -> Array:
         ],
         axis=1,
     )
-    return np.sqrt(np.einsum("tij,tjk,tik->ti", E, covariance[:, 3:, 3:], E))
+    return np.sqrt(np.maximum(np.einsum("tij,tjk,tik->ti", E, covariance[:, 3:, 3:], E), 0.0))
 
 
 def _truth(of: Any) -> Truth | None:

@@ -334,7 +334,7 @@ class Result(Shown):
     @property
     def position_std_world_m(self) -> Array:
         """(T, 3) standard deviations of the position along x, y, z of world."""
-        return np.sqrt(np.diagonal(self.position_covariance_world, axis1=1, axis2=2))
+        return np.sqrt(np.maximum(np.diagonal(self.position_covariance_world, axis1=1, axis2=2), 0.0))
 
     def between(self, begin_s: float, end_s: float) -> Result:
         """The frames whose stamps are in ``[begin_s, end_s)`` on the clock of the recording, as a result of its own.
