@@ -77,9 +77,9 @@ def animated(results: Mapping[str, Result], truth: Truth | None, pictures: int) 
     figure, update = _moving_map(results, truth)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # places everything that does not move
-    still = canvas.copy_from_bbox(figure.bbox)  # type: ignore[attr-defined]
+    still = canvas.copy_from_bbox(figure.bbox)
     for k in np.unique(np.linspace(0, frames - 1, min(pictures, frames)).astype(int)):
-        canvas.restore_region(still)  # type: ignore[attr-defined]
+        canvas.restore_region(still)
         for artist in update(int(k)):
             figure.draw_artist(artist)
         yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
@@ -164,8 +164,10 @@ def _ellipses(
         edgecolors=color,
         linewidths=0.8,
     )
+    figure = ax.get_figure()
+    assert figure is not None
     found.axes = ax
-    found.set_figure(ax.get_figure())
+    found.set_figure(figure)
     found.set_clip_box(ax.bbox)
     return found
 

@@ -14,7 +14,7 @@ from functools import wraps
 from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ParamSpec
+from typing import Any, Literal, ParamSpec
 
 import matplotlib as mpl
 import numpy as np
@@ -109,6 +109,7 @@ SERIES: tuple[Style, ...] = tuple(
 )
 
 P = ParamSpec("P")
+Format = Literal["png", "svg", "pdf"]  # of files
 
 
 def style_of(name: str) -> Style:
@@ -170,10 +171,20 @@ def png(figure: Figure) -> bytes:
     return packed.getvalue()
 
 
-def pngs(directory: str | Path, figures: Mapping[str, Figure]) -> dict[Path, str | bytes]:
-    """Figures as the files ``<name>.png`` of a folder, for `ekfslam.files.write_all`."""
-    safe = components(figures)
-    return {Path(directory) / f"{name}.png": png(drawn) for name, drawn in zip(safe, figures.values(), strict=True)}
+def vector(figure: Figure, format: Literal["svg", "pdf"]) -> bytes:
+    """A figure as lines and text, the same bytes each time; text stays text."""
+    packed = BytesIO()
+    named = {"Creator": MADE_BY, "Date" if format == "svg" else "CreationDate": None}
+    with mpl.rc_context({**RC, "svg.fonttype": "none", "svg.hashsalt": MADE_BY, "pdf.fonttype": 42}):
+        figure.savefig(packed, format=format, metadata=named)
+    return packed.getvalue()
+
+
+def pngs(directory: str | Path, figures: Mapping[str, Figure], format: Format = "png") -> dict[Path, str | bytes]:
+    """Figures as the files ``<name>.<format>`` of a folder, for `ekfslam.files.write_all`; by default PNG."""
+    paths = [Path(directory) / f"{name}.{format}" for name in components(figures)]
+    drawn = (png(figure) if format == "png" else vector(figure, format) for figure in figures.values())
+    return dict(zip(paths, drawn, strict=True))
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -181,9 +192,9 @@ def save_figure(figure: Figure, path: Path) -> None:
     files.write(path, png(figure))
 
 
-def save_all(directory: str | Path, figures: Mapping[str, Figure]) -> list[Path]:
-    """Write figures as ``<name>.png`` into a folder, made if missing; the paths written."""
-    contents = pngs(directory, figures)
+def save_all(directory: str | Path, figures: Mapping[str, Figure], format: Format = "png") -> list[Path]:
+    """Write figures as ``<name>.<format>`` into a folder, made if missing; the paths written."""
+    contents = pngs(directory, figures, format)
     files.write_all(contents)
     return list(contents)
 

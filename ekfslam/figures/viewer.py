@@ -1,9 +1,9 @@
 """Archives for the Rerun viewer (rerun.io): poses that move, maps and errors in three dimensions.
 
-    /world/truth, /world/<mode>/path      lines
-    /world/<mode>/imu                     the pose over time, with the camera's image plane and a 2-sigma ellipsoid
-    /world/<mode>/landmarks               points with their standard deviation as radius, and ellipsoids
-    /errors/<mode>, /nis/<mode>           scalars over time
+/world/truth, /world/<mode>/path      lines
+/world/<mode>/imu                     the pose over time, with the camera's image plane and a 2-sigma ellipsoid
+/world/<mode>/landmarks               points with their standard deviation as radius, and ellipsoids
+/errors/<mode>, /nis/<mode>           scalars over time
 """
 
 from __future__ import annotations
@@ -43,6 +43,12 @@ def write_viewer_file(archive: Archive, path: str | Path) -> None:
     files.write_all({Path(path): memory.drain_as_bytes()})
 
 
+def is_viewer_file(path: Path) -> bool:
+    """Whether a file is one of Rerun."""
+    with path.open("rb") as file:
+        return file.read(3) == b"RRF"
+
+
 def show_archive(archive: Archive) -> None:
     """Open the viewer, which has to be on this machine, and show an archive in it.
 
@@ -74,7 +80,9 @@ def log_archive(archive: Archive, recording: Any) -> None:
     for mode, result in archive.results.items():
         part = rr.escape_entity_path_part(mode)
         color = _bytes(style_of(mode)["color"])
-        recording.log(f"world/{part}/path", rr.LineStrips3D([result.T_world_imu[:, :3, 3]], colors=[color]), static=True)
+        recording.log(
+            f"world/{part}/path", rr.LineStrips3D([result.T_world_imu[:, :3, 3]], colors=[color]), static=True
+        )
         _log_pose(recording, f"world/{part}/imu", result, time_s, color)
         if len(result.landmarks):
             _log_landmarks(recording, f"world/{part}/landmarks", result)
