@@ -61,7 +61,7 @@ def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figur
     if len(landmarks):
         # The more there are, the fainter, or a dense map would be one blot.
         alpha = float(np.clip(20.0 / np.sqrt(len(landmarks)), 0.5, 0.8))
-        some = _spread(len(landmarks), _ELLIPSES)
+        some = spread(len(landmarks), _ELLIPSES)
         covariance = landmarks.covariance[some, :2, :2]
         left_out = add_ellipses(ax, points[some], covariance, LANDMARK_COLOR, alpha, 0.6, share=0.1)
         left_out += len(landmarks) - len(some)
@@ -71,7 +71,7 @@ def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figur
         ax.plot(*points.T, ".", color=LANDMARK_COLOR, markersize=size, markeredgewidth=0, label=label, zorder=1.5)
     draw_paths(ax, results, truth)
     for mode, result in results.items():
-        some = _spread(len(result.time_s), _MARKS)
+        some = spread(len(result.time_s), _MARKS)
         covariance, _ = world_axes_covariance(result.T_world_imu[some], result.covariance[some])
         color, xy = style_of(mode)["color"], result.T_world_imu[some, :2, 3]
         add_ellipses(ax, xy, covariance[:, :2, :2], color, 1.0, 1.0, share=0.5)
@@ -181,7 +181,7 @@ def _figure_of(ax: Axes) -> Figure:
     return figure
 
 
-def _spread(length: int, count: int) -> IntArray:
+def spread(length: int, count: int) -> IntArray:
     """At most ``count`` indices spread over ``length``, first and last included."""
     return np.unique(np.linspace(0, length - 1, count).astype(int))
 
