@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-whole check lint results setup clean
+.PHONY: demo test test-whole check lint results archive-page setup clean
 
 demo: $(READY)
 	$(BIN)/ekfslam compare builtin:city --out results/local
@@ -37,6 +37,10 @@ results: $(READY)
 	$(BIN)/python experiments/ablation.py
 	$(BIN)/python experiments/scaling.py
 	$(BIN)/python experiments/benchmark.py
+
+# The page on the archive format, from the code.
+archive-page: $(READY)
+	$(BIN)/python docs/make_archive.py
 
 setup: $(READY)
 

@@ -4,15 +4,29 @@ from .config import (
     CalibrationConfig,
     Config,
     FilterConfig,
+    FrontEndConfig,
     HygieneConfig,
     NoiseConfig,
     PosteriorConfig,
     TruthConfig,
 )
-from .data.readers import open_sequence, write_sequence
-from .data.sequence import Sequence
+from .data.images import ImageRecording, open_images
+from .data.noise import Noise
+from .data.readers import (
+    Reader,
+    Source,
+    attach_truth,
+    open_kitti_raw,
+    write_sequence,
+)
+from .data.sequence import Observations, Sequence, Truth
+from .data.velocities import attach_velocities
 from .errors import EkfslamError
+from .filters.live import LiveEKF
 from .filters.result import Result
+from .frontend.opening import open_sequence
+from .frontend.track import TrackReport, track
+from .geometry.camera import StereoCamera
 from .reports import Comparison, check, check_consistency, compare
 from .runner import run
 from .smoother.posterior import Posterior, posterior, smooth
@@ -31,23 +45,38 @@ __all__ = [
     "Config",
     "EkfslamError",
     "FilterConfig",
+    "FrontEndConfig",
     "HygieneConfig",
+    "ImageRecording",
+    "LiveEKF",
+    "Noise",
     "NoiseConfig",
+    "Observations",
     "Posterior",
     "PosteriorConfig",
+    "Reader",
     "Result",
     "Sequence",
+    "Source",
+    "StereoCamera",
     "Study",
+    "TrackReport",
+    "Truth",
     "TruthConfig",
     "TunedNoise",
+    "attach_truth",
+    "attach_velocities",
     "check",
     "check_consistency",
     "compare",
+    "open_images",
+    "open_kitti_raw",
     "open_sequence",
     "posterior",
     "read_archive",
     "run",
     "smooth",
+    "track",
     "tune",
     "write_archive",
     "write_sequence",

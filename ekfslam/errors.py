@@ -18,8 +18,25 @@ class EkfslamError(Exception):
     """Base of every error that a user's data, configuration or request can cause."""
 
 
+class MissingPackageError(EkfslamError):
+    """An optional package is not installed; the message says which extra brings it."""
+
+
 class ConfigError(EkfslamError):
     """A configuration file or override names an unknown key or a value out of range."""
+
+
+class MissingPackageError(EkfslamError):
+    """An optional package is not installed.
+
+    Args:
+        package: Its name.
+        extra: The extra of this project that installs it.
+        what: What needs it.
+    """
+
+    def __init__(self, package: str, extra: str, what: str) -> None:
+        super().__init__(f"{what} needs the package {package}, which is not installed: pip install 'ekfslam[{extra}]'")
 
 
 class UnknownFormatError(EkfslamError):
@@ -99,6 +116,10 @@ class FilterError(EkfslamError):
     """A filter cannot go on."""
 
 
+class NoVelocitiesError(FilterError):
+    """Dead reckoning is asked for, but nobody measured velocities."""
+
+
 class InnovationError(FilterError):
     """The innovation covariance S is not positive definite.
 
@@ -129,6 +150,28 @@ class NonFiniteResultError(FilterError):
         super().__init__(
             f"{mode}: {what}[{index}] is NaN or infinite; velocities, pixels or noise are beyond what numbers can hold"
         )
+
+
+class LateError(EkfslamError):
+    """A message, or a question, is about a time that is over.
+
+    Args:
+        what: ``velocity``, ``image`` or ``pose``.
+        stamp_s: Its stamp.
+        least_s: It must be later than this; None: nothing has been taken in yet.
+    """
+
+    def __init__(self, what: str, stamp_s: float, least_s: float | None) -> None:
+        self.what, self.stamp_s, self.least_s = what, stamp_s, least_s
+        known = "no image has been taken in yet" if least_s is None else f"the filter is at {least_s:.6f} s"
+        super().__init__(f"{what} at {stamp_s:.6f} s comes too late: {known}")
+
+
+class MissingVelocityError(EkfslamError):
+    """No velocity has come that could lead to a stamp."""
+
+    def __init__(self, stamp_s: float) -> None:
+        super().__init__(f"no velocity has come yet that could lead to {stamp_s:.6f} s")
 
 
 class HonestyError(EkfslamError):

@@ -29,6 +29,7 @@ from ekfslam.figures.study import draw_study_figures
 from ekfslam.figures.style import older_figures, png, pngs
 from ekfslam.filters.result import Result
 from ekfslam.runner import run, versions
+from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import archive_image, open_result, require_same_origin
 from ekfslam.storage.checkpoint import Checkpoints, key_of
@@ -36,9 +37,12 @@ from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed, open_executo
 from ekfslam.studies.study import Study, StudyArchive, run_study
 from ekfslam.studies.summary import study_table, summarise_study
 
+# Of a summary, as `Comparison` shows them.
+_KEY_FIGURES = {"ate_m": "ATE [m]", "pose_nees_mean": "pose NEES (6)", "nis_per_dof": "NIS / dof (1)", "total_s": "s"}
 
-@dataclass(frozen=True)
-class Comparison:
+
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """What `compare` found.
 
     Args:
@@ -54,11 +58,24 @@ class Comparison:
     summary: dict[str, Any]
     skipped: dict[str, str]
 
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        facts = dict(self.skipped)
+        for mode, found in self.summary["modes"].items():
+            said = [(key, words) for key, words in _KEY_FIGURES.items() if found.get(key) is not None]
+            facts[mode] = ", ".join(f"{words} {found[key]:.3g}" for key, words in said) or "no truth to compare with"
+        of = f"{self.sequence.name}, {count(len(self.sequence), 'frame')}"
+        return Card(of, facts, ("print(comparison.table)", 'comparison.results["full"]', 'comparison.save("out")'))
+
     @property
     def table(self) -> str:
         """The summary as a Markdown table, and what is missing in it."""
         lines = [f"No {mode}: {reason}" for mode, reason in self.skipped.items()]
-        lines += [f"Note on {mode}: {remark}" for mode, result in self.results.items() for remark in result.remarks]
+        remarks: dict[str, list[str]] = {}
+        for mode, result in self.results.items():
+            for remark in result.remarks:
+                remarks.setdefault(remark, []).append(mode)
+        lines += [f"Note on {', '.join(modes)}: {remark}" for remark, modes in remarks.items()]
         return compare_table(self.summary) + "".join(f"\n{line}\n" for line in lines)
 
     def save(self, directory: str | Path, force: bool = False, figures: bool = True) -> list[Path]:

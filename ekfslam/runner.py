@@ -15,8 +15,9 @@ import scipy
 from ekfslam.arrays import IntArray
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
-from ekfslam.errors import ConfigError
+from ekfslam.errors import ConfigError, NoVelocitiesError
 from ekfslam.evaluation.relative import dead_reckoned_pairs, relative_pairs
+from ekfslam.evaluation.sanity import inspect_result, inspect_sequence, sanity_attributes
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.innovations import collect_innovations
 from ekfslam.filters.joint import JointEKF
@@ -56,16 +57,22 @@ def run(
     Raises:
         ArchiveError: The checkpoint to go on from is damaged, or of something else.
         ConfigError: Unknown mode.
+        NoVelocitiesError: Dead reckoning of a recording without velocities.
         FilterError: The filter cannot go on: an innovation covariance is not positive definite (`InnovationError`), a
             number is none (`NonFiniteResultError`), or a matrix is singular.
         IllPosedError: The posterior of a smoothed run leaves something undetermined.
     """
     if mode not in MODES:
         raise ConfigError(f"unknown mode {mode!r}; known: {', '.join(MODES)}")
+    if mode == "dead-reckoning" and not sequence.has_velocities:
+        raise NoVelocitiesError(
+            f"{sequence.name}: nobody measured velocities, so there is no dead reckoning; the other modes go by vision"
+        )
     if mode == "smoothed":
         return smooth(run(sequence, "full", config, further, checkpoints))
     if mode == "full":
         config = with_track_scale(config or Config(), sequence)
+    recording, suspicions = sequence, inspect_sequence(sequence).warnings
     problem = build(sequence, config, clean=mode != "dead-reckoning")
     sequence, config, model = problem.sequence, problem.config, problem.model
     account, hygiene = {**problem.account, "model": "; ".join(problem.lines)}, problem.hygiene
@@ -106,7 +113,7 @@ def run(
         account["log_likelihood"] = float(sum(report.log_likelihood for report in reports))
     if hygiene is not None:
         counts |= hygiene.counts
-    return Result(
+    result = Result(
         mode=mode,
         sequence_name=sequence.name,
         time_s=sequence.time_s,
@@ -128,6 +135,8 @@ def run(
         whitened=whitened,
         attributes={**sequence.attributes, **account, **versions()},
     )
+    lines = (*suspicions, *inspect_result(recording, result, suspicions))
+    return dataclasses.replace(result, attributes={**result.attributes, **sanity_attributes(lines)})
 
 
 def _filtered(

@@ -101,4 +101,4 @@ def write(
 ) -> None:
     """Write ``<name>.json``, ``<name>.md`` and the figures as PNG into a folder, made if missing."""
     texts = {folder / f"{name}.json": json.dumps(values, indent=indent) + "\n", folder / f"{name}.md": text}
-    files.write_all({**texts, **pngs(folder, figures or {})})
+    files.write_all({**texts, **pngs(folder, figures or {}, packed=True)})

@@ -68,7 +68,7 @@ def main() -> int:
             landmark_figure: plot_landmark_arrows(as_reported, truth),
             f"{landmark_figure}_full": plot_landmark_arrows(results["full"], truth),
         }
-        save_all(parsed.out, figures)
+        save_all(parsed.out, figures, packed=True)
 
         as_stored = open_recording(parsed.data, file, extrinsics="as-stored", lateral="as-stored")
         stored = ekfslam.compare(as_stored, ["dead-reckoning"]).summary["modes"]["dead-reckoning"]

@@ -22,11 +22,11 @@ from ekfslam.storage import archive as archive_module
 from ekfslam.storage.archive import (
     FORMAT_VERSION,
     add_result,
-    export_trajectory,
     open_result,
     read_archive,
     write_archive,
 )
+from ekfslam.storage.exports import export_trajectory
 
 MODES = ("full", "dead-reckoning", "mapping-only")
 
@@ -172,7 +172,7 @@ def test_every_data_set_states_units_and_frame(written):
     assert {"truth/T_world_imu", "runs/full/trajectory/covariance", "runs/full/timing/ms_per_frame"} <= set(names)
 
 
-@pytest.mark.parametrize("item", [name for name, *_ in archive_module._LAYOUT] + ["attributes"])
+@pytest.mark.parametrize("item", [name for name, *_ in archive_module.LAYOUT] + ["attributes"])
 def test_missing_data_set_is_named(copy, item):
     with h5py.File(copy, "a") as h5file:
         del h5file[f"runs/full/{item}"]

@@ -81,7 +81,8 @@ def test_without_parameters_it_is_the_sensor_as_given(T):
 def test_new_landmarks_with_parameters(T, c):
     z = seen_rows(T, c, TWIST, points(T, c)) + np.array([0.5, -0.2, 0.3])
     model = Model(RIG, RIG.noise, (Pose(T, np.eye(6)), ALL))
-    positions, G, covariance = model.initialise(Moment(T, T, c, TWIST), z, RIG.variance(z))
+    moment = Moment(T, T, c, TWIST)
+    positions, G, covariance = model.initialise(moment, model.inverted(moment, z)[0], RIG.variance(z))
     np.testing.assert_allclose(positions, sighted(T, c, TWIST, z), rtol=1e-9, atol=1e-9)
     _, H, H_m = linearised(T, c, positions, positions)
     V = np.diag(RIG.variance_px2)

@@ -22,7 +22,8 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.summary import summarise
 from ekfslam.runner import run
-from ekfslam.storage.archive import export_truth, read_archive, write_archive
+from ekfslam.storage.archive import read_archive, write_archive
+from ekfslam.storage.exports import export_truth
 
 ATE = ("evo_ape", "--pose_relation", "trans_part")
 RPE = ("evo_rpe", "--all_pairs", "--pairs_from_reference")

@@ -127,7 +127,7 @@ def test_vector_graphics_are_the_same_each_time(path, tmp_path, format):
     results = {"full": read_archive(path).results["full"]}
     written = []
     for folder in ("a", "b"):
-        (file,) = save_all(tmp_path / folder, {"map": plot_map(results)}, format)
+        (file,) = save_all(tmp_path / folder, {"map": plot_map(results)}, format=format)
         assert file.name == f"map.{format}"
         written.append(file.read_bytes())
     assert written[0] == written[1]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
@@ -64,13 +65,14 @@ def test_figures_are_drawn_in_this_style_whatever_the_settings_of_the_caller(tmp
     assert path == tmp_path / "new" / "empty.png" and path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_files_keep_the_colour_of_large_areas(tmp_path):
+@pytest.mark.parametrize("packed", [False, True])
+def test_files_keep_the_colour_of_large_areas(tmp_path, packed):
     figure = Figure(figsize=(3.0, 2.0))
     ax = figure.subplots()
     ax.axhspan(0.2, 0.8, **style.BOUNDS)
     for name in style.VARIANTS:
         ax.plot(np.random.default_rng(0).random(50), **style.style_of(name))
-    style.save_figure(figure, tmp_path / "a.png")
+    style.save_all(tmp_path, {"a": figure}, packed)
     written = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"))
     grey = np.round(255 * np.array(to_rgb(style.BOUNDS["color"]))).astype(np.uint8)
     assert (written == grey).all(axis=-1).mean() > 0.2

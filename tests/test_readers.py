@@ -218,7 +218,7 @@ def foreign_files(folder):
         "text.npz": "unknown content",
         "other.npz": "poses, scale",
         "pickled.npz": "allow_pickle",
-        "single.npy": "unknown content",
+        "single.npy": "instead of a dictionary",
         "other.mat": "poses",
         "other.h5": "poses",
         "matlab73.mat": "-v7;",

@@ -198,6 +198,10 @@ def test_observations_of_the_filter_by_every_block_and_landmark(T, memory):
     assert_equal_rows(wide(rows, body, rows.slot, 6), -central(residual, size))
 
 
+def new_landmarks(model, moment, z, variance):
+    return model.initialise(moment, model.inverted(moment, z)[0], variance)
+
+
 @kinds
 @poses
 def test_new_landmarks_by_every_block(T, noise):
@@ -207,21 +211,21 @@ def test_new_landmarks_by_every_block(T, noise):
     disparity, variance = noise.track_error is not None, np.array([[0.5, 0.3, 0.7]]) * np.arange(1, 5)[:, None]
     moment = moment_of(model, values, 1.7)
     z = literal_rows({**ERRORS, **values}, m, 1.7, none, TWIST, disparity=disparity) + np.array([0.5, -0.2, 0.3])
-    positions, G, covariance = model.initialise(moment, z, variance)
+    positions, G, covariance = new_landmarks(model, moment, z, variance)
     seen = literal_rows({**ERRORS, **values}, positions, 1.7, none, TWIST, disparity=disparity)
     np.testing.assert_allclose(seen, z, atol=1e-9)
 
     def started(x):
-        return model.initialise(moment_of(model, model.retract(values, x), 1.7), z, variance)[0].ravel()
+        return new_landmarks(model, moment_of(model, model.retract(values, x), 1.7), z, variance)[0].ravel()
 
     full = np.zeros((12, body))
     full[:, : model.layout.seen] = G.reshape(12, -1)
     assert_equal_rows(full, central(started, body))
     for i in range(4):
-        by_row = central(lambda d, i=i: model.initialise(moment, z + d, variance)[0][i], 3)
+        by_row = central(lambda d, i=i: new_landmarks(model, moment, z + d, variance)[0][i], 3)
         expected = by_row @ np.diag(variance[i]) @ by_row.T
         np.testing.assert_allclose(covariance[i], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
-    assert model.has_point(moment, z).all()
+    assert model.inverted(moment, z)[1].all()
 
 
 # --- the rig whose right camera is turned ---------------------------------------------------------------------------
@@ -256,7 +260,7 @@ def test_a_turned_right_camera(noise, psi):
         assert_equal_rows(A[i], central(lambda d, p=point, a=own, f=rows: f(p + d, a), 3))
         assert_equal_rows(B[i], central(lambda d, p=point, a=own, f=rows: f(p, a + d), 3))
     np.testing.assert_allclose(rig.invert(z), q, rtol=1e-9, atol=1e-9)
-    assert rig.has_point(z).all()
+    assert rig.has_depth(rig.invert(z)).all()
 
 
 def test_a_right_camera_that_is_not_turned_is_the_rectified_pair():
@@ -276,11 +280,11 @@ def test_what_is_behind_infinity_has_no_point(noise):
     depth = np.array([10.0, 200.0, 700.0, 2000.0, 1e6])
     q = depth[:, None] * np.array([0.1, 0.05, 1.0])
     z = rig.predict(q)
-    np.testing.assert_array_equal(rig.has_point(z), [True, True, True, False, False])
+    np.testing.assert_array_equal(rig.has_depth(rig.invert(z)), [True, True, True, False, False])
     less = z[:1] * np.ones((3, 1))
     disparity = np.array([1.0, 2.0, 5.0])
     less[:, 2] = disparity if noise.track_error is not None else less[:, 0] - disparity
-    np.testing.assert_array_equal(rig.has_point(less), [False, False, True])
+    np.testing.assert_array_equal(rig.has_depth(rig.invert(less)), [False, False, True])
     model = model_of(Rig(CAMERA, T_CAM_IMU, noise), noise, np.eye(4), P0, blocks=[StereoRotation()])
     ekf = JointEKF(model, OPEN)
     ekf.values = {**ekf.values, "stereo_rotation": psi}

@@ -129,7 +129,7 @@ def archive(tmp_path_factory) -> Path:
 def drawn_already(monkeypatch) -> None:
     """Figures take most of the time, and only their sizes matter here."""
     for place in ("figures.style", "reports"):
-        monkeypatch.setattr(f"ekfslam.{place}.png", lambda figure: b"as large as a figure" * 1500)
+        monkeypatch.setattr(f"ekfslam.{place}.png", lambda *_: b"as large as a figure" * 1500)
 
 
 @pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])

@@ -8,11 +8,12 @@ from pathlib import Path
 
 from ekfslam import files
 from ekfslam.config import VARIANTS, Config
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import WriteError
+from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.filters.result import Result
+from ekfslam.frontend.opening import open_sequence
 from ekfslam.storage.archive import Archive
 
 DEFAULT_DATA = "builtin:city"
@@ -46,19 +47,41 @@ def add_executor(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_data_options(parser: argparse.ArgumentParser) -> None:
+def add_place_options(parser: argparse.ArgumentParser) -> None:
+    """What belongs to a recording, but lies elsewhere."""
     parser.add_argument("--truth", type=Path, metavar="FILE", help="true poses: KITTI odometry or TUM text")
     parser.add_argument(
-        "--extrinsics",
-        choices=("corrected", "as-stored"),
-        default="corrected",
-        help="how to read cam_T_imu of .npz recordings (default: %(default)s)",
+        "--velocities",
+        type=Path,
+        metavar="FILE",
+        help="velocities from elsewhere: text of time vx vy vz wx wy wz (s, m/s, rad/s), or another recording",
+    )
+    parser.add_argument(
+        "--velocity-frame",
+        choices=("imu", "level"),
+        help="frame of --velocities (default: as the file says, otherwise imu)",
     )
     parser.add_argument(
         "--lateral",
         choices=("corrected", "as-stored"),
         default="corrected",
         help="sign of the lateral velocity of KITTI, stored positive to the right (default: %(default)s)",
+    )
+
+
+def add_data_options(parser: argparse.ArgumentParser) -> None:
+    add_place_options(parser)
+    parser.add_argument(
+        "--frames",
+        type=_stretch,
+        metavar="A:B",
+        help="frames A to B - 1 alone, like a slice in Python",
+    )
+    parser.add_argument(
+        "--extrinsics",
+        choices=("corrected", "as-stored"),
+        default="corrected",
+        help="how to read cam_T_imu of .npz recordings (default: %(default)s)",
     )
     parser.add_argument(
         "--truth-noise",
@@ -69,6 +92,13 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
         help="standard deviations of the truth in place of those that its format states: roll_deg, pitch_deg, yaw_deg, "
         "first_position_m, stamp_s, position_m, attitude_deg",
     )
+
+
+def _stretch(text: str) -> slice:
+    begin, colon, end = text.partition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(f"expected A:B, found {text!r}")
+    return slice(*(int(bound) if bound.strip() else None for bound in (begin, end)))  # argparse reports a ValueError
 
 
 def _setting(text: str) -> tuple[str, float]:
@@ -108,7 +138,23 @@ def configured(options: argparse.Namespace) -> Config:
 
 
 def open_data(options: argparse.Namespace, data: str) -> Sequence:
-    return open_sequence(data, extrinsics=options.extrinsics, lateral=options.lateral, truth=options.truth)
+    settings = Config.from_toml(options.config).front_end if getattr(options, "config", None) else None
+    sequence = open_sequence(
+        data,
+        extrinsics=options.extrinsics,
+        lateral=options.lateral,
+        truth=options.truth,
+        velocities=options.velocities,
+        velocity_frame=options.velocity_frame,
+        front_end=settings,
+    )
+    return sequence if options.frames is None else sequence[options.frames]
+
+
+def print_warnings(sequence: Sequence) -> None:
+    """Say what looks wrong in a recording before it is run."""
+    for line in inspect_sequence(sequence).warnings:
+        print(f"{sequence.name}: warning: {line}", flush=True)
 
 
 def require_ours(options: argparse.Namespace, path: Path, is_ours: Callable[[Path], bool]) -> None:

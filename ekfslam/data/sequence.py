@@ -32,6 +32,7 @@ from ekfslam.errors import (
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.names import printable
+from ekfslam.shown import Card, Shown, count, figure
 
 VelocityFrame = Literal["imu", "level"]
 
@@ -44,6 +45,10 @@ _LARGEST_VELOCITY, _LARGEST_DISTANCE_M, _LARGEST_PX = 1e6, 1e9, 1e7
 
 # Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
+# Among those of one whose tracks are compared with their first sight in every frame, so that their errors do not walk.
+CHECKED_TRACKS = {"tracks": "checked"}
+# Among the attributes of one whose velocities nobody measured; they are 0 then, and mean nothing.
+WITHOUT_VELOCITIES = {"velocities": "none"}
 
 
 LEVEL_VELOCITIES_NOTE = (
@@ -77,7 +82,7 @@ class Observations:
             )
         order = np.lexsort((landmark, frame))
         for name, value in (("frame", frame), ("landmark", landmark), ("pixels_px", pixels)):
-            object.__setattr__(self, name, _frozen(value[order]))
+            object.__setattr__(self, name, frozen(value[order]))
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -113,13 +118,13 @@ class Truth:
 
     def __post_init__(self) -> None:
         for name, dtype in (("frame", np.int64), ("landmark", np.int64)):
-            object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=dtype)))
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=dtype)))
         for name in ("T_world_imu", "position_m"):
-            object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=float)))
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
 
 
-@dataclass(frozen=True)
-class Sequence:
+@dataclass(frozen=True, repr=False)
+class Sequence(Shown):
     """One recording of a stereo rig with body velocities.
 
     Args:
@@ -152,18 +157,39 @@ class Sequence:
 
     def __post_init__(self) -> None:
         for name in ("time_s", "twist", "T_cam_imu"):
-            object.__setattr__(self, name, _frozen(np.asarray(getattr(self, name), dtype=float)))
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
         try:
             _validate(self)
         except DataError as error:
             if error.source:
                 raise
             raise type(error)(error.message, source=self.source, field=error.field, index=error.index) from None
-        object.__setattr__(self, "T_cam_imu", _frozen(se3.nearest_rigid(self.T_cam_imu)))
+        object.__setattr__(self, "T_cam_imu", frozen(se3.nearest_rigid(self.T_cam_imu)))
         object.__setattr__(self, "name", printable(self.name))
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        seconds, seen = float(self.time_s[-1] - self.time_s[0]), self.observations
+        per_frame = figure(len(seen) / len(self))
+        truth = self.truth
+        known = (
+            "none"
+            if truth is None
+            else count(len(truth.frame), "pose")
+            + (f", {count(len(truth.landmark), 'landmark')}" if len(truth.landmark) else "")
+        )
+        facts = {
+            "source": self.source,
+            "frames": f"{len(self)}, {figure(seconds)} s",
+            "tracks": f"{count(len(seen.ids), 'landmark')}, {per_frame} a frame",
+            "truth": known,
+            "noise": "not stated" if self.noise is None else "stated",
+        }
+        facts |= {"notes": count(len(self.notes), "sentence") + " in .notes"} if self.notes else {}
+        return Card(self.name, facts, ("ekfslam.run(sequence)", "sequence[100:300]", "sequence.between(10.0, 20.0)"))
 
     def __getitem__(self, frames: slice) -> Sequence:
         """A stretch of successive frames as a recording of its own, ``sequence[100:300]``; frames count from 0 again.
@@ -196,6 +222,43 @@ class Sequence:
             },
         )
 
+    @staticmethod
+    def from_tracks(
+        time_s: ArrayLike,
+        pixels_px: ArrayLike,
+        camera: StereoCamera,
+        *,
+        frame: ArrayLike | None = None,
+        landmark: ArrayLike | None = None,
+        twist: ArrayLike | None = None,
+        T_cam_imu: ArrayLike | None = None,
+        T_world_imu: ArrayLike | None = None,
+        velocity_frame: VelocityFrame = "imu",
+        noise: Noise | None = None,
+        name: str = "tracks",
+    ) -> Sequence:
+        """A recording from plain arrays, with nothing in files.
+
+        Args:
+            time_s: (T,) stamps.
+            pixels_px: (T, M, 4) pixels (uL, vL, uR, vR) of M tracks, NaN where a frame does not see one; or (K, 4) with
+                ``frame`` and ``landmark``.
+            camera: Of the rectified pair.
+            frame, landmark: (K,) frame index and id of each row of pixels.
+            twist: (T, 6) velocities, see `Sequence`; None where nobody measured any.
+            T_cam_imu: (4, 4). By default, and only without velocities: the body is the left camera, its axes forward,
+                left and up.
+            T_world_imu: (T, 4, 4) true poses, NaN where one is unknown.
+            velocity_frame, noise, name: See `Sequence`.
+
+        Raises:
+            DataError: An array is malformed, or does not fit the others; the subclass says how.
+        """
+        from ekfslam.data.building import from_tracks
+
+        arrays = (time_s, pixels_px, frame, landmark, twist, T_cam_imu, T_world_imu)
+        return from_tracks(*arrays, camera=camera, velocity_frame=velocity_frame, noise=noise, name=name)
+
     def between(self, begin_s: float, end_s: float) -> Sequence:
         """The frames whose stamps are in ``[begin_s, end_s)``, on the clock of the recording.
 
@@ -211,6 +274,16 @@ class Sequence:
         return known_intervals(self.attributes, self.twist)
 
     @property
+    def has_checked_tracks(self) -> bool:
+        """Whether errors of its tracks do not walk, see `ekfslam.frontend`."""
+        return self.attributes.get("tracks") == CHECKED_TRACKS["tracks"]
+
+    @property
+    def has_velocities(self) -> bool:
+        """Whether its velocities were measured; else only cameras say how the rig moves."""
+        return self.attributes.get("velocities") != WITHOUT_VELOCITIES["velocities"]
+
+    @property
     def initial_T_world_imu(self) -> Array:
         """(4, 4) pose that estimates start from: the true first pose where it is known, identity elsewhere."""
         if self.truth is not None and len(self.truth.frame) and self.truth.frame[0] == 0:
@@ -218,7 +291,7 @@ class Sequence:
         return np.eye(4)
 
 
-def _frozen(array: NDArray) -> NDArray:
+def frozen(array: NDArray) -> NDArray:
     """The array, read-only, so that a frozen dataclass is frozen all through."""
     view = array.view()
     view.flags.writeable = False
@@ -282,21 +355,33 @@ def validate_camera(camera: StereoCamera) -> None:
         raise CalibrationError(f"stereo baseline must be positive, found {camera.baseline_m:g} m", field="baseline")
 
 
-def _validate(sequence: Sequence) -> None:
-    frames = len(sequence.time_s)
-    require_shape(sequence.time_s, (None,), "time_s")
-    if frames == 0:
+def validate_stamps(time_s: Array) -> None:
+    """Raise a `DataError` unless these are stamps (T,) of at least one frame that increase strictly."""
+    require_shape(time_s, (None,), "time_s")
+    if len(time_s) == 0:
         raise ShapeError("the sequence has no frames", field="time_s")
-    require_finite(sequence.time_s, "time_s")
-    steps = np.diff(sequence.time_s)
+    largest = float(np.abs(time_s).max())
+    if LARGEST < largest < np.inf:
+        units = {1e14: "milliseconds", 1e17: "microseconds", np.inf: "nanoseconds"}
+        unit = next(name for below, name in units.items() if largest < below)
+        index = int(np.argmax(np.abs(time_s) > LARGEST))
+        text = f"stamp {time_s[index]:g} is no time in seconds, stamps look like {unit} since 1970"
+        raise NonFiniteError(text, field="time_s", index=index)
+    require_finite(time_s, "time_s")
+    steps = np.diff(time_s)
     if (steps <= 0).any():
         index = int(np.argmax(steps <= 0)) + 1
         kind = "duplicates" if steps[index - 1] == 0 else "is before"
         raise StampError(
-            f"stamp {sequence.time_s[index]:.6f} s {kind} its predecessor {sequence.time_s[index - 1]:.6f} s",
+            f"stamp {time_s[index]:.6f} s {kind} its predecessor {time_s[index - 1]:.6f} s",
             field="time_s",
             index=index,
         )
+
+
+def _validate(sequence: Sequence) -> None:
+    frames = len(sequence.time_s)
+    validate_stamps(sequence.time_s)
     require_shape(sequence.twist, (frames, 6), "twist")
     require_finite(sequence.twist, "twist", _LARGEST_VELOCITY)
     if sequence.velocity_frame not in get_args(VelocityFrame):
@@ -311,7 +396,7 @@ def _validate(sequence: Sequence) -> None:
     if len(sequence.observations) or sequence.attributes.get("tracks") != WITHOUT_TRACKS["tracks"]:
         _validate_observations(sequence.observations, frames)
     if sequence.truth is not None:
-        _validate_truth(sequence.truth, frames)
+        validate_truth(sequence.truth, frames)
     if sequence.noise is not None:
         validate_noise(sequence.noise)
 
@@ -348,7 +433,8 @@ def _require_ids(landmark: IntArray, name: str) -> None:
         )
 
 
-def _validate_truth(truth: Truth, frames: int) -> None:
+def validate_truth(truth: Truth, frames: int) -> None:
+    """Raise a `DataError` for true poses or landmarks of other shapes, or of other frames than these."""
     require_shape(truth.frame, (None,), "truth.frame")
     if np.shape(truth.T_world_imu) != (len(truth.frame), 4, 4):
         raise TruthError(

@@ -23,6 +23,7 @@ from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.evaluation.trajectory import match_landmarks
 from ekfslam.filters.result import Landmarks, Result
 from ekfslam.geometry import se3
+from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.noise import GAP_STD
 
 
@@ -197,18 +198,6 @@ def invariant_landmark_error(m_hat: Array, m_true: Array, T_world_imu_est: Array
     offset = m_true - (R_error @ m_hat[..., None])[..., 0]
     e_i = (se3.so3_left_jacobian_inverse(e_theta) @ offset[..., None])[..., 0]
     return e_i - np.cross(m_hat, e_theta)
-
-
-def world_axes_covariance(T_world_imu: Array, covariance: Array) -> tuple[Array, Array]:
-    """Covariances (T, 3, 3) of position (m^2) and rotation error (rad^2), both along world axes.
-
-    As ``T_world_imu = T_hat exp(-xi)``, an error ``xi = [rho; theta]`` moves the IMU by ``-R rho`` to first order and
-    turns it by ``-R theta`` in world, with R the rotation of ``T_world_imu`` (T, 4, 4). ``covariance`` (T, 6, 6) is of
-    ``xi``.
-    """
-    R = T_world_imu[:, :3, :3]
-    R_transposed = np.swapaxes(R, 1, 2)
-    return R @ covariance[:, :3, :3] @ R_transposed, R @ covariance[:, 3:, 3:] @ R_transposed
 
 
 @dataclass(frozen=True)

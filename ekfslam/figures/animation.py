@@ -23,10 +23,10 @@ from ekfslam import files
 from ekfslam.arrays import IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.errors import ConfigError
-from ekfslam.evaluation.consistency import world_axes_covariance
 from ekfslam.figures.maps import SIGMAS, dot_size, ellipse_axes, map_axes, map_of
 from ekfslam.figures.style import LANDMARK_COLOR, TRUTH, line_of, style_of, styled
 from ekfslam.filters.result import Result
+from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.progress import progress
 
 FORMATS = (".gif", ".mp4")

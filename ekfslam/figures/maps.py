@@ -17,10 +17,11 @@ from matplotlib.lines import Line2D
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
-from ekfslam.evaluation.consistency import world_axes_covariance, world_axes_std
+from ekfslam.evaluation.consistency import world_axes_std
 from ekfslam.evaluation.trajectory import distance_along
 from ekfslam.figures.style import BAND_ALPHA, FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, line_of, style_of, styled
 from ekfslam.filters.result import Result
+from ekfslam.geometry.motion import world_axes_covariance
 
 SIGMAS = 2.0  # of ellipses
 

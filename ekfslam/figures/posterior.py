@@ -8,11 +8,11 @@ from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.sequence import Truth
-from ekfslam.evaluation.consistency import world_axes_covariance
 from ekfslam.evaluation.tables import MISSING
 from ekfslam.figures.maps import SIGMAS, add_ellipses, dot_size, draw_paths, spread
 from ekfslam.figures.style import LANDMARK_COLOR, style_of, styled
 from ekfslam.filters.result import Result
+from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.smoother.sparse.information import JointInformation
 
 _POSES = 16  # with an ellipse

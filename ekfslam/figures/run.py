@@ -17,7 +17,6 @@ from ekfslam.evaluation.consistency import (
     chi2_bounds,
     measured_truth,
     pose_nees,
-    world_axes_covariance,
     world_axes_errors,
     world_axes_std,
 )
@@ -36,6 +35,7 @@ from ekfslam.figures.style import (
 )
 from ekfslam.figures.style import save_figure as save_figure  # one of `save_figures` by itself
 from ekfslam.filters.result import Result
+from ekfslam.geometry.motion import world_axes_covariance
 
 _BAND_SIGMAS = 3.0
 _IN_DEGREES = np.repeat([1.0, np.rad2deg(1.0)], 3)  # of three positions and three rotations
@@ -199,4 +199,4 @@ def save_figures(
     format: Format = "png",
 ) -> list[Path]:
     """Write the figures of `draw_figures` into a folder, made if missing; the paths written."""
-    return save_all(directory, draw_figures(results, truth, interpolated), format)
+    return save_all(directory, draw_figures(results, truth, interpolated), format=format)

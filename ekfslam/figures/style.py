@@ -156,34 +156,43 @@ def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
     ax.yaxis.set_minor_formatter(NullFormatter())
 
 
-def png(figure: Figure) -> bytes:
-    """A figure as a file with a palette of 256 colours: a third of the size or less, without a visible difference."""
-    # The default median cut sacrifices rare colours, here a thin trajectory; this method keeps all within 20 of 255.
-    # Means (kmeans) then give large areas their exact colour: the grey of bounds must not turn blue.
+def png(figure: Figure, packed: bool = False) -> bytes:
+    """A figure as a file.
+
+    Args:
+        figure: Drawn at `DPI`.
+        packed: With a palette of 256 colours: a third of the size or less, without a visible difference, but finding it
+            takes as long as drawing. For what is kept for good.
+    """
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    packed, made_by = BytesIO(), PngInfo()
+    content, made_by = BytesIO(), PngInfo()
     made_by.add_text("Software", MADE_BY)
-    drawn = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    picture = drawn.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
-    picture.save(packed, "PNG", dpi=(DPI, DPI), optimize=True, pnginfo=made_by)
-    return packed.getvalue()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    if packed:
+        # The default median cut sacrifices rare colours, here a thin trajectory; this keeps all within 20 of 255.
+        # Means (kmeans) then give large areas their exact colour: the grey of bounds must not turn blue.
+        picture = picture.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
+    picture.save(content, "PNG", dpi=(DPI, DPI), optimize=packed, pnginfo=made_by)
+    return content.getvalue()
 
 
 def vector(figure: Figure, format: Literal["svg", "pdf"]) -> bytes:
     """A figure as lines and text, the same bytes each time; text stays text."""
-    packed = BytesIO()
+    content = BytesIO()
     named = {"Creator": MADE_BY, "Date" if format == "svg" else "CreationDate": None}
     with mpl.rc_context({**RC, "svg.fonttype": "none", "svg.hashsalt": MADE_BY, "pdf.fonttype": 42}):
-        figure.savefig(packed, format=format, metadata=named)
-    return packed.getvalue()
+        figure.savefig(content, format=format, metadata=named)
+    return content.getvalue()
 
 
-def pngs(directory: str | Path, figures: Mapping[str, Figure], format: Format = "png") -> dict[Path, str | bytes]:
-    """Figures as the files ``<name>.<format>`` of a folder, for `ekfslam.files.write_all`; by default PNG."""
+def pngs(
+    directory: str | Path, figures: Mapping[str, Figure], packed: bool = False, format: Format = "png"
+) -> dict[Path, str | bytes]:
+    """Figures as the files ``<name>.<format>`` of a folder, for `ekfslam.files.write_all`; see `png` and `vector`."""
     paths = [Path(directory) / f"{name}.{format}" for name in components(figures)]
-    drawn = (png(figure) if format == "png" else vector(figure, format) for figure in figures.values())
+    drawn = (png(figure, packed) if format == "png" else vector(figure, format) for figure in figures.values())
     return dict(zip(paths, drawn, strict=True))
 
 
@@ -192,9 +201,11 @@ def save_figure(figure: Figure, path: Path) -> None:
     files.write(path, png(figure))
 
 
-def save_all(directory: str | Path, figures: Mapping[str, Figure], format: Format = "png") -> list[Path]:
-    """Write figures as ``<name>.<format>`` into a folder, made if missing; the paths written."""
-    contents = pngs(directory, figures, format)
+def save_all(
+    directory: str | Path, figures: Mapping[str, Figure], packed: bool = False, format: Format = "png"
+) -> list[Path]:
+    """Write figures as ``<name>.<format>`` into a folder, made if missing; the paths written. See `pngs`."""
+    contents = pngs(directory, figures, packed, format)
     files.write_all(contents)
     return list(contents)
 

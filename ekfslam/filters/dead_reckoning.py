@@ -14,7 +14,8 @@ def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> 
     """Poses and covariances from the velocities alone, eq. (1) and (2).
 
     Args:
-        sequence: The recording; starts at its `initial_T_world_imu`.
+        sequence: The recording; starts at its `initial_T_world_imu`. Velocities of its own odometry, where nobody
+            measured any, are as good as the walk of the twist says.
         noise: Its velocity noise.
         initial_covariance: (6, 6) of the first pose's error ``xi``.
 
@@ -25,7 +26,10 @@ def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> 
     T_imu_world = motion.integrate(se3.inverse(sequence.initial_T_world_imu), sequence.twist, tau)
     F = motion.error_jacobian(motion.increment(sequence.twist[1:], tau))
     gap_std = np.where(sequence.interpolated[1:, None], noise.gap_std, 0.0)
-    velocity_std = np.hypot(noise.velocity_std, gap_std)
+    own_std = noise.velocity_std
+    if not sequence.has_velocities and noise.twist_walk_std is not None:
+        own_std = noise.twist_walk_std
+    velocity_std = np.hypot(own_std, gap_std)
     Q = motion.process_noise(sequence.twist[1:], tau, velocity_std, noise.misalignment_rad)
     covariance = np.empty((len(sequence), 6, 6))
     covariance[0] = initial_covariance

@@ -6,6 +6,7 @@ A frame is a fixed number of NumPy calls; nothing is as wide as the state but P 
 from __future__ import annotations
 
 from collections.abc import Sequence as SequenceType
+from copy import copy
 
 import numpy as np
 
@@ -14,7 +15,9 @@ from ekfslam.config import CalibrationConfig, FilterConfig
 from ekfslam.errors import ConfigError
 from ekfslam.filters import lifecycle
 from ekfslam.filters.correction import correct
+from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.estimate import Estimate
+from ekfslam.filters.landmarks import LandmarkTable
 from ekfslam.filters.lifecycle import Retired, Revival
 from ekfslam.filters.log import Log
 from ekfslam.filters.logbook import LogBook
@@ -141,8 +144,10 @@ class JointEKF(Estimate):
     def _measure_velocities(self, twist: Array, also: VelocityRows | None) -> None:
         """Condition on velocity measurements; the first one of the IMU starts the twist."""
         model, std = self.model, self.model.noise.twist_std
-        rows = [VelocityRows.of_imu(twist, std), *([] if also is None else [also])]
-        self._log.measured(VelocityRows.concatenate(rows))
+        is_used = model.measures_twist or not self._is_twist_known
+        rows = [*([VelocityRows.of_imu(twist, std)] if is_used else []), *([] if also is None else [also])]
+        if rows:
+            self._log.measured(VelocityRows.concatenate(rows))
         if not self._is_twist_known:
             self.gaussian.propagate(*model.twist_from_measurement(std))
             self.values = {**self.values, "twist": model.unbiased(np.asarray(twist, dtype=float), self.values)}
@@ -283,3 +288,12 @@ class JointEKF(Estimate):
             "reappeared": len(self.retired.reappeared),
             "moving": len(self._moving_ids),
         }
+
+
+def without_landmarks(ekf: JointEKF) -> JointEKF:
+    """The state blocks of a filter as a filter of their own, with an empty log: to look ahead with `predict`."""
+    alone, body = copy(ekf), ekf.model.layout.body
+    alone.gaussian = DenseGaussian(ekf.gaussian.body_covariance[:body, :body].copy(), ekf.model.layout.seen)
+    alone.table, alone.retired = LandmarkTable(ekf.sensor.dimension), Retired()
+    alone._log, alone._reported, alone._moving_ids = LogBook(alone), [], set()
+    return alone

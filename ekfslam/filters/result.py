@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Sequence as SequenceType
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,16 @@ from numpy.typing import NDArray
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.hygiene import HygieneReport
 from ekfslam.data.noise import Noise
-from ekfslam.errors import NonFiniteResultError
+from ekfslam.errors import NonFiniteResultError, ShapeError
 from ekfslam.filters.log import Log
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.geometry.motion import world_axes_covariance
+from ekfslam.shown import Card, Shown, figure
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+    from matplotlib.figure import Figure
 
 ERROR_CONVENTION = (
     "T_imu_world = exp(xi^) T_hat, xi = [rho; theta] translation first; landmark m = m_hat + d in world; "
@@ -29,6 +36,8 @@ REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera"
 
 # Pixel noise below which a linearised update gains more than it should. In both built-in worlds the pose NEES is the
 # same from 0.7 to 0.1 px, twice as large at 0.03 px, ten times at 0.01 px.
+# Attribute of results that keeps what looked wrong in a recording and a run, see `ekfslam.evaluation.sanity`.
+SANITY, SANITY_SEPARATOR = "sanity", " | "
 LINEAR_FROM_PX = 0.1
 
 
@@ -209,8 +218,8 @@ class PosePairs:
         return PosePairs(none, none, np.empty((0, 6, 6)))
 
 
-@dataclass(frozen=True)
-class Result:
+@dataclass(frozen=True, repr=False)
+class Result(Shown):
     """One mode run on one sequence.
 
     Args:
@@ -280,6 +289,150 @@ class Result:
         stated = [value for value in self.attributes.values() if isinstance(value, float)]
         return numbers | {"attributes": np.array(stated)}
 
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        way_m = float(np.linalg.norm(np.diff(self.T_world_imu[:, :3, 3], axis=0), axis=1).sum())
+        seconds = float(self.time_s[-1] - self.time_s[0])
+        last = zip("xyz", self.T_world_imu[-1, :3, 3], self.position_std_world_m[-1], strict=True)
+        innovation, dof = self.innovation, int(self.innovation.dof.sum())
+        facts = {
+            "frames": f"{len(self.time_s)}, {figure(seconds)} s, {figure(way_m)} m",
+            "last position": ", ".join(f"{axis} {value:.2f} +- {std:.2g}" for axis, value, std in last)
+            + " m (1 sigma)",
+            "landmarks": str(len(self.landmarks)),
+        }
+        if dof:
+            facts["observations"] = f"{innovation.accepted.sum()} accepted, {innovation.rejected.sum()} rejected"
+            facts["NIS / dof"] = f"{figure(float(innovation.nis.sum()) / dof)} (1 expected)"
+        facts["time"] = f"{figure(float(np.median(self.ms_per_frame)))} ms a frame"
+        facts |= {f"remark {i}": remark for i, remark in enumerate(self.remarks, 1)}
+        further: tuple[str, ...] = (".map()", ".plot()", ".errors(sequence)", '.to_dataframe("landmarks")')
+        further += ("ekfslam.posterior(result)",) if self.log is not None else ()
+        return Card(f"{self.mode} on {self.sequence_name}", facts, further)
+
+    # --- in the frame that a reader expects ---------------------------------------------------------------------------
+
+    @property
+    def position_covariance_world(self) -> Array:
+        """(T, 3, 3) covariance of the position error of the IMU along the axes of world, m^2.
+
+        ``covariance`` is of ``xi``, whose axes are those of the IMU: an error ``xi`` moves the IMU by ``-R rho``
+        to first order, R being the rotation of ``T_world_imu``. So this is ``R P_rho R^T``. It holds for every
+        variant: stored covariances are of the same ``xi`` whatever variant has run. Landmarks need no such call:
+        ``landmarks.covariance`` is along the axes of world already.
+        """
+        return world_axes_covariance(self.T_world_imu, self.covariance)[0]
+
+    @property
+    def rotation_covariance_world(self) -> Array:
+        """(T, 3, 3) covariance ``R P_theta R^T`` of the rotation error about the axes of world, rad^2.
+
+        The true rotation is ``exp(e^) R`` for an error e, see `position_covariance_world`.
+        """
+        return world_axes_covariance(self.T_world_imu, self.covariance)[1]
+
+    @property
+    def position_std_world_m(self) -> Array:
+        """(T, 3) standard deviations of the position along x, y, z of world."""
+        return np.sqrt(np.diagonal(self.position_covariance_world, axis1=1, axis2=2))
+
+    def between(self, begin_s: float, end_s: float) -> Result:
+        """The frames whose stamps are in ``[begin_s, end_s)`` on the clock of the recording, as a result of its own.
+
+        Estimates stay those of the whole run, and so do ``counts``, ``config`` and ``attributes``. The map has what was
+        seen in these frames. What belongs to the run as a whole goes: log, whitened innovations, findings of hygiene.
+
+        Raises:
+            ShapeError: There are none.
+        """
+        begin, end = np.searchsorted(self.time_s, (begin_s, end_s)).tolist()
+        if begin >= end:
+            raise ShapeError(f"there are no frames from {begin_s:g} s to {end_s:g} s", source=self.sequence_name)
+
+        def cut(record: Any, *names: str) -> dict[str, Any]:
+            return {name: getattr(record, name)[begin:end] for name in names}
+
+        rejections, pairs, parameters = self.rejections, self.pairs, self.parameters
+        rejected = (rejections.frame >= begin) & (rejections.frame < end)
+        known = self.landmarks.only((self.landmarks.first_frame < end) & (self.landmarks.last_frame >= begin))
+        first, last = (np.clip(frame, begin, end - 1) - begin for frame in (known.first_frame, known.last_frame))
+        if pairs is not None:
+            pairs = pairs.only((pairs.first >= begin) & (pairs.second < end))
+            pairs = replace(pairs, first=pairs.first - begin, second=pairs.second - begin)
+        return replace(
+            self,
+            **cut(self, "time_s", "T_world_imu", "covariance", "ms_per_frame"),
+            innovation=Innovation(**cut(self.innovation, *(f.name for f in fields(Innovation)))),
+            landmarks=replace(known, first_frame=first, last_frame=last),
+            rejections=Rejections(
+                rejections.frame[rejected] - begin, rejections.landmark[rejected], rejections.reason[rejected]
+            ),
+            parameters=None if parameters is None else replace(parameters, **cut(parameters, "value", "std")),
+            pairs=pairs,
+            log=None,
+            hygiene=None,
+            whitened=None,
+        )
+
+    # --- shown and handed on: what these need is imported when they are called ----------------------------------------
+
+    def map(self, truth: Any = None) -> Figure:
+        """The map from above with trajectory and ellipses, see `ekfslam.figures.maps.plot_map`.
+
+        Args:
+            truth: `Truth`, or what has one (`Sequence`, `Archive`), to be drawn beside it.
+        """
+        from ekfslam.figures import views
+
+        return views.map_of(self, truth)
+
+    def plot(self, truth: Any = None) -> Figure:
+        """Position and attitude against time with bands of 3 sigma, see `ekfslam.figures.views.plot_trajectory`.
+
+        Args:
+            truth: As in `map`.
+        """
+        from ekfslam.figures import views
+
+        return views.trajectory_of(self, truth)
+
+    def errors(self, truth: Any) -> Figure:
+        """Estimate minus truth against time with bands of 3 sigma, see `ekfslam.figures.run.plot_errors`.
+
+        Args:
+            truth: As in `map`.
+
+        Raises:
+            TruthError: There is none.
+        """
+        from ekfslam.figures import views
+
+        return views.errors_of(self, truth)
+
+    def to_dataframe(self, table: str = "trajectory") -> pandas.DataFrame:
+        """A table for pandas: ``trajectory``, ``landmarks``, ``innovation`` or ``rejections``.
+
+        Columns are those of `ekfslam.storage.tables`; their units stand in their names.
+
+        Raises:
+            MissingPackageError: pandas is not installed.
+            ArchiveError: There is no such table.
+        """
+        from ekfslam.storage import tables
+
+        return tables.dataframe(self, table)
+
+    def to_xarray(self, group: str = "trajectory") -> xarray.Dataset:
+        """What xarray reads of the group of an archive: ``trajectory``, ``landmarks``, ``innovation``, ``rejections``.
+
+        Raises:
+            MissingPackageError: xarray is not installed.
+            ArchiveError: There is no such group.
+        """
+        from ekfslam.storage import tables
+
+        return tables.dataset(self, group)
+
     @property
     def remarks(self) -> tuple[str, ...]:
         """What must be said of it beside its numbers, one sentence each."""
@@ -292,4 +445,5 @@ class Result:
                 f"pixel noise of {finest_px:.2g} px is less than the errors of linearisation: the filter's covariances "
                 "are too small, those of the mode smoothed hold"
             )
-        return tuple(remarks)
+        kept = str(self.attributes.get(SANITY, ""))
+        return (*remarks, *(kept.split(SANITY_SEPARATOR) if kept else ()))

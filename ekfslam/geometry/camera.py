@@ -15,6 +15,9 @@ import numpy as np
 
 from ekfslam.arrays import Array
 
+# Body axes forward, left, up to optical axes right, down, forward.
+R_CAM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
 
 @dataclass(frozen=True)
 class StereoCamera:

@@ -100,3 +100,15 @@ def imu_twist(level_twist: Array, up: Array) -> tuple[Array, Array, Array]:
 def turned_by(twist: Array) -> Array:
     """``[v^; w^]``, velocities (..., 6) to (..., 6, 3): minus their derivative by small angles that turn them."""
     return np.concatenate([se3.skew(twist[..., :3]), se3.skew(twist[..., 3:])], axis=-2)
+
+
+def world_axes_covariance(T_world_imu: Array, covariance: Array) -> tuple[Array, Array]:
+    """Covariances (T, 3, 3) of position (m^2) and rotation error (rad^2), both along world axes.
+
+    As ``T_world_imu = T_hat exp(-xi)``, an error ``xi = [rho; theta]`` moves the IMU by ``-R rho`` to first order and
+    turns it by ``-R theta`` in world, with R the rotation of ``T_world_imu`` (T, 4, 4). ``covariance`` (T, 6, 6) is of
+    ``xi``.
+    """
+    R = T_world_imu[:, :3, :3]
+    R_transposed = np.swapaxes(R, 1, 2)
+    return R @ covariance[:, :3, :3] @ R_transposed, R @ covariance[:, 3:, 3:] @ R_transposed

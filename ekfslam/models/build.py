@@ -52,6 +52,7 @@ from ekfslam.models.noise import (
     velocity_noise,
     with_drift,
 )
+from ekfslam.models.odometry import vision_noise, with_odometry
 from ekfslam.models.sensors.base import DelayedSensor, Sensor
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
@@ -109,6 +110,8 @@ def build(
     Raises:
         ConfigError: An unknown block, or a setting that it does not have.
     """
+    if not sequence.has_velocities:
+        sequence = with_odometry(sequence)
     config = with_automatic_blocks(resolve(config or Config(), sequence), sequence)
     noise, account = noise_of(sequence, config), noise_account(sequence, config)
     hygiene = None
@@ -125,6 +128,7 @@ def build(
         config.calibration,
         (*optional_blocks(config.blocks), *blocks),
         config.filter.landmark_coordinates,
+        sequence.has_velocities,
     )
     config = _with_form(config, sequence, model)
     return Problem(sequence, config, model, hygiene, account)
@@ -147,6 +151,7 @@ def model_of(
     calibration: CalibrationConfig | None = None,
     blocks: SequenceType[StateBlock] = (),
     coordinates: LandmarkCoordinates = FilterConfig.landmark_coordinates,
+    measures_twist: bool = True,
 ) -> Model:
     """The state blocks that a sensor and its noise ask for: which there are, is decided here and nowhere else.
 
@@ -157,6 +162,7 @@ def model_of(
         calibration: What of the sensor's calibration is estimated; None: nothing.
         blocks: Further ones.
         coordinates: Of landmarks: those in the last updated camera need its pose.
+        measures_twist: Whether velocities are measured at all, see `Twist`.
 
     Raises:
         ConfigError: A calibration to estimate, but no stereo rig; a block twice; or one that the sensor has no use for.
@@ -170,7 +176,7 @@ def model_of(
             raise ConfigError(f"calibration: only a stereo rig has parameters to estimate, not {type(sensor).__name__}")
         chosen.append(Calibration(std))
     if noise.twist_walk_std is not None:
-        chosen.append(Twist(noise.twist_walk_std))
+        chosen.append(Twist(noise.twist_walk_std, measures_twist))
     if noise.tilt_rad:
         chosen.append(Up(T_imu_world[:3, :3].T @ np.array([0.0, 0.0, 1.0]), noise.tilt_rad))
     if isinstance(sensor, DelayedSensor):
@@ -251,9 +257,11 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
     """The noise a filter shall assume: what the configuration says, else the sequence, else the data or a default."""
     given = config.noise
     if is_automatic(sequence, config):
-        stated = automatic_noise(sequence.twist, sequence.velocity_frame)
+        stated = automatic_noise(sequence.twist, sequence.velocity_frame, sequence.has_checked_tracks)
     else:
         stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
+    if not sequence.has_velocities:
+        stated = vision_noise(stated, sequence.twist)
     twist, pixels = np.array(stated.twist_std, dtype=float), np.array(stated.pixel_std_px, dtype=float)
     if given.sigma_v_m_s is not None:
         twist[:3] = given.sigma_v_m_s
@@ -274,16 +282,18 @@ def with_automatic_blocks(config: Config, sequence: Sequence) -> Config:
     What the configuration says of a block goes before.
     """
     walks = noise_of(sequence, config).track_error is not None
-    if not (is_automatic(sequence, config) and walks):
+    if not (is_automatic(sequence, config) and (walks or sequence.has_checked_tracks)):
         return config
-    if config.hygiene.min_disparity_sigma is None:
+    if walks and config.hygiene.min_disparity_sigma is None:
         hygiene = dataclasses.replace(config.hygiene, min_disparity_sigma=MIN_DISPARITY_SIGMA)
         config = dataclasses.replace(config, hygiene=hygiene)
     if not config.noise.shared:
         return config
-    shared = {name: {**table, **config.blocks.get(name, {})} for name, table in shared_errors(sequence.twist).items()}
+    tables = shared_errors(sequence.twist if sequence.has_velocities else None, sequence.has_checked_tracks)
+    shared = {name: {**table, **config.blocks.get(name, {})} for name, table in tables.items()}
     calibration = config.calibration
-    if calibration.rotation_deg is None:
+    # Without velocities nothing tells the camera's rotation against the IMU.
+    if calibration.rotation_deg is None and sequence.has_velocities:
         calibration = dataclasses.replace(calibration, rotation_deg=CAMERA_ROTATION_DEG)
     return dataclasses.replace(config, blocks={**config.blocks, **shared}, calibration=calibration)
 

@@ -160,6 +160,11 @@ class Model:
         return any(isinstance(block, Twist) for block in self.blocks)
 
     @cached_property
+    def measures_twist(self) -> bool:
+        """Whether the recording's velocities measure the twist in every interval, and not only start it."""
+        return all(block.is_measured for block in self.blocks if isinstance(block, Twist))
+
+    @cached_property
     def has_velocity_blocks(self) -> bool:
         """Whether the velocities of the IMU depend on blocks, and are not simply those measured."""
         kinds = (type(block) for block in self.blocks)
@@ -414,22 +419,28 @@ class Model:
         """Rows (n, d) of points (n, 3) in the frame of the sensor."""
         return self._sensor_of(moment).predict(q)
 
-    def has_point(self, moment: Moment, rows: Array) -> BoolArray:
-        """Whether (n,) rows (n, d) are those of a point whose depth they show.
+    def inverted(self, moment: Moment, rows: Array) -> tuple[Array, BoolArray]:
+        """Points (n, 3) in the frame of the sensor that rows (n, 3) are those of, and whether (n,) they show its depth.
 
         The sensor's `screen` has judged that of the sensor as given. Where blocks change it, disparities may be less
         than that of a point at infinity.
         """
         sensor = self._sensor_of(moment)
-        if sensor is self.sensor or not len(rows):
-            return np.ones(len(rows), dtype=bool)
+        q = sensor.invert(rows)
+        if sensor is self.sensor:
+            return q, np.ones(len(rows), dtype=bool)
         assert isinstance(sensor, Rig)
-        return sensor.has_point(rows)
+        return q, sensor.has_depth(q)
 
-    def initialise(self, moment: Moment, rows: Array, variance: Array) -> tuple[Array, Array, Array]:
+    def initialise(self, moment: Moment, q: Array, variance: Array) -> tuple[Array, Array, Array]:
         """Eq. (5): positions (n, 3) of new landmarks, G (n, 3, seen), and what the measurement adds (n, 3, 3).
 
         What was seen stays as it is: ``H_x x + H_m d = 0``, hence ``G = -H_m^-1 H_x``.
+
+        Args:
+            moment: Of the first observations.
+            q: (n, 3) points in the frame of the sensor, see `inverted`.
+            variance: (n, 3) of the rows.
         """
         T = moment.T_imu_world
         if self._moves_camera:
@@ -437,7 +448,7 @@ class Model:
         if self.calibration is not None:
             T = self.calibration.delay(moment.calibration, moment.twist) @ T
         sensor = self._sensor_of(moment)
-        positions = se3.apply(se3.inverse(sensor.T_cam_imu @ T), sensor.invert(rows))
+        positions = se3.apply(se3.inverse(sensor.T_cam_imu @ T), q)
         here = self.see(moment.linearised_at(moment.T_imu_world), positions, positions)
         by_rows = np.linalg.inv(here.H_m)
         covariance = (by_rows * variance[:, None, :]) @ by_rows.swapaxes(-1, -2)

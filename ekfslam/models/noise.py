@@ -46,6 +46,8 @@ PIXEL_STD_PX = 0.7
 TRACK_FIRST_PX = np.array([0.1, 0.1, 1.0])
 TRACK_WALK_PX = np.array([0.08, 0.08, 0.06])
 TRACK_FLOW_PX = 3.0
+# Of tracks that are compared with their first sight in every frame: what is left is white, and this small.
+CHECKED_PIXEL_STD_PX = 0.3
 # Disparity below which the constant error of a track leaves no depth, in standard deviations of a measured disparity.
 MIN_DISPARITY_SIGMA = 3.0
 
@@ -130,47 +132,61 @@ def _white(lag_1: Array) -> Array:
     return np.median(np.sqrt(np.maximum(-lag_1, 0.0)).reshape(2, 3), axis=1)
 
 
-def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu") -> Noise:
-    """The noise that a filter shall assume for a recording that states none, from its velocities (T, 6)."""
+def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu", checked: bool = False) -> Noise:
+    """The noise that a filter shall assume for a recording that states none, from its velocities (T, 6).
+
+    Args:
+        twist, velocity_frame: As in the recording.
+        checked: Whether tracks are compared with their first sight, so that their errors are white.
+    """
     found = velocity_noise(twist)
     # Where the white part is below what is there anyway, smoothing the velocities brings nothing.
     walk = None if found.is_clean else np.repeat(found.walk, 3)
     own = np.hypot(found.sampling, VELOCITY_STD)
     return Noise(
         twist_std=own if found.is_clean else np.repeat(found.sigma, 3),
-        pixel_std_px=np.full(4, PIXEL_STD_PX),
+        pixel_std_px=np.full(4, CHECKED_PIXEL_STD_PX if checked else PIXEL_STD_PX),
         twist_walk_std=walk,
         motion_std=np.zeros(6) if found.is_clean else own,
-        track_first_px=TRACK_FIRST_PX,
-        track_walk_px=TRACK_WALK_PX,
+        track_first_px=None if checked else TRACK_FIRST_PX,
+        track_walk_px=None if checked else TRACK_WALK_PX,
         track_flow_px=TRACK_FLOW_PX,
         tilt_rad=TILT_RAD if velocity_frame == "level" else 0.0,
         gap_std=GAP_STD,
     )
 
 
-def shared_errors(twist: Array) -> dict[str, dict[str, float]]:
+def shared_errors(twist: Array | None, checked: bool = False) -> dict[str, dict[str, float]]:
     """Tables ``[blocks.<name>]`` of the errors that all samples or all tracks of a recording share.
 
     - ``twist_bias``: of the unit's class where velocities are clean, a tenth of their noise where it is seen.
-    - ``stereo_rotation``, ``camera_jitter``: the defaults of these blocks.
+    - ``camera_jitter``: the defaults of this block.
+    - ``stereo_rotation``: the same, but not where tracks are checked: the front end takes the rotation out.
     - ``vision_drift``: a tracker's own drift is about 1 % of the way and a few mdeg/m. Where velocities are clean a
       larger, effective value leaves the low frequencies to them, as the long-term accuracy of such a unit deserves.
+      Tracks that are checked do not drift.
+
+    Args:
+        twist: (T, 6) measured velocities; None: there are none.
+        checked: As in `automatic_noise`.
     """
-    found = velocity_noise(twist)
-    if found.is_clean:
-        bias = {"sigma_v_m_s": VELOCITY_BIAS_M_S, "sigma_w_rad_s": float(RATE_BIAS_RAD_S), "time_v_s": 4.0}
-        drift = {"translation_percent": 4.0, "rotation_deg_m": 0.06}
-    else:
-        sigma_v, sigma_w = (BIAS_SHARE * found.sigma).tolist()
-        bias = {"sigma_v_m_s": max(sigma_v, VELOCITY_BIAS_M_S), "sigma_w_rad_s": max(sigma_w, float(RATE_BIAS_RAD_S))}
-        drift = {"translation_percent": 1.0, "rotation_deg_m": 0.004}
-    return {
-        "twist_bias": {**bias, "time_w_s": 20.0 if found.is_clean else 200.0},
-        "stereo_rotation": {},
-        "camera_jitter": {},
-        "vision_drift": drift,
-    }
+    shared: dict[str, dict[str, float]] = {}
+    drift = {"translation_percent": 1.0, "rotation_deg_m": 0.004}
+    if twist is not None:
+        found = velocity_noise(twist)
+        bias = np.array([VELOCITY_BIAS_M_S, RATE_BIAS_RAD_S])
+        if found.is_clean:
+            drift = {"translation_percent": 4.0, "rotation_deg_m": 0.06}
+        else:
+            bias = np.maximum(BIAS_SHARE * found.sigma, bias)
+        shared["twist_bias"] = {"sigma_v_m_s": float(bias[0]), "sigma_w_rad_s": float(bias[1])}
+        shared["twist_bias"] |= {"time_v_s": 4.0, "time_w_s": 20.0} if found.is_clean else {"time_w_s": 200.0}
+    if not checked:
+        shared["stereo_rotation"] = {}
+    shared["camera_jitter"] = {}
+    if not checked:
+        shared["vision_drift"] = drift
+    return shared
 
 
 def with_drift(noise: Noise, drift_px: float) -> Noise:

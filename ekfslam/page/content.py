@@ -21,7 +21,6 @@ from ekfslam.evaluation.consistency import (
     chi2_bounds,
     measured_truth,
     pose_nees,
-    world_axes_covariance,
     world_axes_errors,
     world_axes_std,
 )
@@ -40,6 +39,7 @@ from ekfslam.figures.style import (
     style_of,
 )
 from ekfslam.filters.result import Landmarks, Result
+from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.storage.archive import Archive
 
 POINTS = 1500  # of a series; longer ones are thinned evenly

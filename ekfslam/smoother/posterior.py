@@ -18,6 +18,7 @@ from functools import cached_property
 from time import perf_counter
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, IntArray
@@ -31,15 +32,18 @@ from ekfslam.models.build import model_of, optional_blocks
 from ekfslam.models.model import Model
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
+from ekfslam.shown import Card, Shown, count, figure
 from ekfslam.smoother.optimise import maximise
 from ekfslam.smoother.problem import BatchProblem
+from ekfslam.smoother.rows import State
 from ekfslam.smoother.sparse.information import JointInformation
+from ekfslam.smoother.sparse.matrix import information_matrix
 
 DENSE_LIMIT = 20_000  # columns of a dense covariance: 3.2 GB
 
 
-@dataclass(frozen=True)
-class Posterior:
+@dataclass(frozen=True, repr=False)
+class Posterior(Shown):
     """A Gaussian over all poses and all landmarks.
 
     Landmarks go by their row in ``id``, which is the order of the filter's `Landmarks`; frames by their number,
@@ -55,6 +59,7 @@ class Posterior:
         information: The factorised system.
         values: Estimates of the further state blocks by name: of each frame (T, ...), or of the drive.
         problem: The rows.
+        state: Where they are linearised.
     """
 
     linearisation: str
@@ -66,6 +71,19 @@ class Posterior:
     information: JointInformation
     values: Mapping[str, Array]
     problem: BatchProblem
+    state: State
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show; computes nothing."""
+        frames, landmarks = len(self.T_world_imu), len(self.id)
+        facts = {
+            "of": f"{count(frames, 'pose')}, {count(landmarks, 'landmark')}, {count(len(self.weight), 'observation')}",
+            "other blocks": ", ".join(self.values) or "none",
+            "cost": f"{figure(self.costs[0])} to {figure(self.cost)} in {count(len(self.costs) - 1, 'iteration')}",
+        }
+        further = (".pose_covariance", ".landmark_covariance", ".joint_covariance(frames=[-1], landmarks=[0, 1])")
+        title = "at the maximum a posteriori" if self.linearisation == "map" else "linearised as filtered"
+        return Card(title, facts, further)
 
     @property
     def cost(self) -> float:
@@ -138,6 +156,33 @@ class Posterior:
                 "joint_covariance gives any block of it"
             )
         return self.joint_covariance(frames, np.arange(e.landmarks))
+
+    def information_matrix(self) -> tuple[sp.csc_array, dict[str, Array]]:
+        """The joint information matrix (n, n), sparse: the inverse of the joint covariance of all unknowns.
+
+        Columns are those of all poses, ``xi`` of the first frame first, then of what else each frame has, of the
+        drive, and of all landmarks. What is known for certain of the first frame has no column.
+
+        Returns:
+            The matrix, and arrays (n,) that say of each column: ``kind`` (``pose``, ``landmark`` or the name of a state
+            block), ``frame`` (-1: of none), ``id`` of the landmark (-1: of none), ``axis`` within its block.
+
+        Raises:
+            PosteriorError: What is known for certain of the first pose is no axis of ``xi``.
+        """
+        problem, frames = self.problem, len(self.T_world_imu)
+        is_map = self.linearisation == "map"
+        system = problem.relinearised(self.state, self.weight) if is_map else problem.as_filtered()
+        matrix, kept = information_matrix(system, frames)
+        seen = [("pose", 6), *((block.name, block.size) for block in problem.shared_blocks)]
+        others = [(block.name, block.size) for block in problem.aux_blocks]
+        rows = [(name, k, -1, size) for of_frame in (seen, others) for k in range(frames) for name, size in of_frame]
+        rows += [(block.name, -1, -1, block.size) for block in problem.drive_blocks]
+        rows += [("landmark", -1, landmark, 3) for landmark in self.id.tolist()]
+        kind, frame, landmark, size = (np.array(column) for column in zip(*rows, strict=True))
+        axis = np.concatenate([np.arange(n) for n in size])
+        named = {"kind": kind, "frame": frame, "id": landmark}
+        return matrix, {**{name: np.repeat(value, size)[kept] for name, value in named.items()}, "axis": axis[kept]}
 
     @property
     def log_determinant(self) -> float:
@@ -246,6 +291,7 @@ def posterior_of_log(
         information,
         problem.values(state),
         problem,
+        state,
     )
 
 

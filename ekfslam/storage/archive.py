@@ -30,11 +30,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import h5py
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ekfslam import files, hdf5
 from ekfslam.arrays import Array, BoolArray
@@ -74,20 +73,29 @@ from ekfslam.filters.result import (
 )
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.names import printable
+from ekfslam.shown import Card, Shown, count
 from ekfslam.storage.checks import COVARIANCES, RIGID, require_agreement
 
 FORMAT = "ekfslam-archive"
-FORMAT_VERSION = 4  # 2 added log, 3 hygiene and parameters, 4 state blocks and track errors in the log
+# 2 added log, 3 hygiene and parameters, 4 state blocks and track errors in the log, 5 coordinates of all dimensions
+FORMAT_VERSION = 5
 
 # Data sets below /runs/<mode>, fields of `Result` (T frames, M landmarks, R rejections), and what their values must be.
-_LAYOUT = hdf5.layout(
+LAYOUT = hdf5.layout(
     ("trajectory/time", "time_s", ("T",), "s", "clock of the recording", hdf5.ASCENDING),
-    ("trajectory/T_world_imu", "T_world_imu", ("T", 4, 4), "m (translation)", "world from imu", RIGID),
-    ("trajectory/covariance", "covariance", ("T", 6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu", COVARIANCES),
+    ("trajectory/T_world_imu", "T_world_imu", ("T", "row", "column"), "m (translation)", "world from imu", RIGID),
+    (
+        "trajectory/covariance",
+        "covariance",
+        ("T", "xi", "xi"),
+        "m^2, m rad, rad^2 (rho 0-2, theta 3-5)",
+        "imu",
+        COVARIANCES,
+    ),
     ("landmarks/id", "landmarks.id", ("M",), "landmark id", "none", hdf5.COUNTS),
-    ("landmarks/position", "landmarks.position_m", ("M", 3), "m", "world"),
-    ("landmarks/covariance", "landmarks.covariance", ("M", 3, 3), "m^2", "world", COVARIANCES),
-    ("landmarks/initial_position", "landmarks.initial_position_m", ("M", 3), "m", "world"),
+    ("landmarks/position", "landmarks.position_m", ("M", "xyz"), "m", "world"),
+    ("landmarks/covariance", "landmarks.covariance", ("M", "xyz", "xyz"), "m^2", "world", COVARIANCES),
+    ("landmarks/initial_position", "landmarks.initial_position_m", ("M", "xyz"), "m", "world"),
     ("landmarks/first_frame", "landmarks.first_frame", ("M",), "frame index", "none", hdf5.index_of("T")),
     ("landmarks/last_frame", "landmarks.last_frame", ("M",), "frame index", "none", hdf5.index_of("T")),
     ("landmarks/observations", "landmarks.observations", ("M",), "count", "none", hdf5.COUNTS),
@@ -105,26 +113,35 @@ _LAYOUT = hdf5.layout(
 # The same below /runs/<mode>/log, fields of `Log` (K observations of d rows, N velocity measurements, B body columns).
 _POSE = "m (translation)"
 _COORDINATES = "see ekfslam.filters.log"
+_NAMES_IN_LOG = {"M": "landmark_id", "N": "velocity"}
 _LOG_LAYOUT = hdf5.layout(
-    ("initial_covariance", "initial_covariance", (6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu", COVARIANCES),
-    ("twist", "twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "that of the velocities"),
+    (
+        "initial_covariance",
+        "initial_covariance",
+        ("xi", "xi"),
+        "m^2, m rad, rad^2 (rho 0-2, theta 3-5)",
+        "imu",
+        COVARIANCES,
+    ),
+    ("twist", "twist", ("T", "u"), "m/s (0-2), rad/s (3-5)", "that of the velocities"),
     ("tau", "tau_s", ("T",), "s", "none", hdf5.NOT_NEGATIVE),
-    ("T_imu_world_predicted", "T_predicted", ("T", 4, 4), _POSE, "imu from world", RIGID),
-    ("T_imu_world_linear", "T_linear", ("T", 4, 4), _POSE, "imu from world", RIGID),
-    ("T_imu_world_updated", "T_updated", ("T", 4, 4), _POSE, "imu from world", RIGID),
+    ("T_imu_world_predicted", "T_predicted", ("T", "row", "column"), _POSE, "imu from world", RIGID),
+    ("T_imu_world_linear", "T_linear", ("T", "row", "column"), _POSE, "imu from world", RIGID),
+    ("T_imu_world_updated", "T_updated", ("T", "row", "column"), _POSE, "imu from world", RIGID),
     ("landmark_id", "id", ("M",), "landmark id", "none", hdf5.COUNTS),
-    ("first_position", "first_position_m", ("M", 3), "m", "world"),
+    ("first_position", "first_position_m", ("M", "xyz"), "m", "world"),
     ("frame", "frame", ("K",), "frame index", "none", hdf5.index_of("T")),
     ("landmark", "landmark", ("K",), "row of landmark_id", "none", hdf5.index_of("M")),
     ("rows", "rows", ("K", "d"), "px, (uL, v, uR) or (u, v, disparity)", "image"),
     ("variance", "variance", ("K", "d"), "px^2", "image", hdf5.POSITIVE),
-    ("linear_position", "position_m", ("K", 3), "m", "world"),
+    ("linear_position", "position_m", ("K", "xyz"), "m", "world"),
+    **_NAMES_IN_LOG,
 )
 _LOG_LAYOUT_4 = hdf5.layout(
-    ("imu_twist", "imu_twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "imu"),
-    ("seen_twist", "seen_twist", ("T", 6), "m/s (0-2), rad/s (3-5)", "imu"),
-    ("T_imu_world_departed", "T_departed", ("T", 4, 4), _POSE, "imu from world", RIGID),
-    ("T_imu_world_linear_before", "T_linear_before", ("T", 4, 4), _POSE, "imu from world", RIGID),
+    ("imu_twist", "imu_twist", ("T", "u"), "m/s (0-2), rad/s (3-5)", "imu"),
+    ("seen_twist", "seen_twist", ("T", "u"), "m/s (0-2), rad/s (3-5)", "imu"),
+    ("T_imu_world_departed", "T_departed", ("T", "row", "column"), _POSE, "imu from world", RIGID),
+    ("T_imu_world_linear_before", "T_linear_before", ("T", "row", "column"), _POSE, "imu from world", RIGID),
     ("departed", "departed", ("T", "B"), _COORDINATES, "imu"),
     ("linear", "linear", ("T", "B"), _COORDINATES, "imu"),
     ("updated", "updated", ("T", "B"), _COORDINATES, "imu"),
@@ -135,6 +152,7 @@ _LOG_LAYOUT_4 = hdf5.layout(
     ("velocity_value", "velocity_value", ("N",), "m/s or rad/s", "that of the velocities"),
     ("velocity_std", "velocity_std", ("N",), "m/s or rad/s", "that of the velocities", hdf5.NOT_NEGATIVE),
     ("velocity_is_biased", "velocity_is_biased", ("N",), "truth value", "none", hdf5.FLAGS),
+    **_NAMES_IN_LOG,
 )
 
 
@@ -147,8 +165,16 @@ _WHITENED_LAYOUT = hdf5.layout(
     ("landmark", "landmark", ("N",), "row of log/landmark_id", "none", hdf5.index_of("M")),
     ("alone", "alone", ("N", "d"), "1", "image"),
     ("apart", "apart", ("N", "d"), "1", "image", hdf5.NUMBERS_OR_NONE),
-    ("score", "score", ("T", 6), "1/m (rho 0-2), 1/rad (theta 3-5)", "imu"),
-    ("information", "information", ("T", 6, 6), "1/m^2, 1/(m rad), 1/rad^2 (rho 0-2, theta 3-5)", "imu", COVARIANCES),
+    ("score", "score", ("T", "xi"), "1/m (rho 0-2), 1/rad (theta 3-5)", "imu"),
+    (
+        "information",
+        "information",
+        ("T", "xi", "xi"),
+        "1/m^2, 1/(m rad), 1/rad^2 (rho 0-2, theta 3-5)",
+        "imu",
+        COVARIANCES,
+    ),
+    N="innovation",
 )
 
 # The same below /runs/<mode>/parameters, fields of `Parameters` (P of them).
@@ -162,7 +188,8 @@ _PARAMETERS_LAYOUT = hdf5.layout(
 _PAIRS_LAYOUT = hdf5.layout(
     ("first", "first", ("N",), "frame index", "none", hdf5.index_of("T")),
     ("second", "second", ("N",), "frame index", "none", hdf5.index_of("T")),
-    ("cross", "cross", ("N", 6, 6), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu of first, imu of second"),
+    ("cross", "cross", ("N", "xi", "xi"), "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu of first, imu of second"),
+    N="pair",
 )
 
 # The same below /runs/<mode>/hygiene, fields of `HygieneReport` (N findings).
@@ -171,11 +198,25 @@ _HYGIENE_LAYOUT = hdf5.layout(
     ("frame", "frame", ("N",), "frame index", "none", hdf5.index_of("T")),
     ("landmark", "landmark", ("N",), "landmark id", "none", hdf5.COUNTS),
     ("continuation", "continuation", ("N",), "landmark id, -1 where dropped", "none", hdf5.whole(-1)),
+    N="finding",
 )
 
 
-@dataclass(frozen=True)
-class Archive:
+# Everything below /runs/<mode>, by the group that a layout begins at.
+LAYOUTS: Mapping[str, hdf5.Layout] = MappingProxyType(
+    {
+        "": LAYOUT,
+        "log": (*_LOG_LAYOUT, *_LOG_LAYOUT_4, *_LOG_GAPS),
+        "whitened": _WHITENED_LAYOUT,
+        "parameters": _PARAMETERS_LAYOUT,
+        "pairs": _PAIRS_LAYOUT,
+        "hygiene": _HYGIENE_LAYOUT,
+    }
+)
+
+
+@dataclass(frozen=True, repr=False)
+class Archive(Shown):
     """What an archive holds: the sequence without its observations, and the results of its modes.
 
     Args:
@@ -197,6 +238,12 @@ class Archive:
     notes: tuple[str, ...]
     attributes: Mapping[str, str | int | float]
     results: Mapping[str, Result]
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        facts = {mode: count(len(result.landmarks), "landmark") for mode, result in self.results.items()}
+        title = f"{self.name}, {count(len(self.time_s), 'frame')}, {count(len(facts), 'run')}"
+        return Card(title, facts, tuple(f"archive.results[{mode!r}]" for mode in list(facts)[:1]))
 
     @cached_property
     def interpolated(self) -> BoolArray:
@@ -318,67 +365,8 @@ def open_result(path: str | Path, mode: str) -> Result:
         return _read_result(h5file, mode, _sequence_fields(h5file))
 
 
-def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "kitti"]) -> None:
-    """Write the estimated poses ``T_world_imu`` as text, one line a frame, in 17 digits: every number exactly.
-
-    Both formats hold the pose of the *IMU* in *world*; KITTI's own files hold the left camera in its first frame.
-
-    Args:
-        result: Run to export.
-        path: File to write.
-        format: ``tum``: ``time tx ty tz qx qy qz qw`` (s, m, unit quaternion); ``kitti``: the twelve entries of the
-            upper 3x4 part row by row.
-
-    Raises:
-        ArchiveError: The file cannot be written.
-    """
-    files.write(path, trajectory_text(result, format))
-
-
-def trajectory_text(result: Result, format: Literal["tum", "kitti"]) -> str:
-    """What `export_trajectory` writes."""
-    return _pose_text(result.time_s, result.T_world_imu, format)
-
-
-def export_truth(archive: str | Path, path: str | Path, format: Literal["tum", "kitti"]) -> int:
-    """Write the true poses that an archive holds, as `export_trajectory` does; one line a frame of known pose.
-
-    Returns:
-        The number of lines.
-
-    Raises:
-        ArchiveError: As `read_archive`; or there is no true pose, or not of every frame and the format is ``kitti``,
-            which has no stamps to say of which; or the file cannot be written.
-    """
-    poses, text = truth_text(read_archive(archive), str(archive), format)
-    files.write(path, text)
-    return poses
-
-
-def truth_text(archive: Archive, place: str, format: Literal["tum", "kitti"]) -> tuple[int, str]:
-    """What `export_truth` writes of an archive read from a place, and the number of lines; raises as that does."""
-    truth, frames = archive.truth, len(archive.time_s)
-    if truth is None or not len(truth.frame):
-        raise ArchiveError(f"{place}: holds no true pose")
-    if format == "kitti" and len(truth.frame) < frames:
-        raise ArchiveError(
-            f"{place}: holds the true pose of {len(truth.frame)} of {frames} frames; kitti has no stamps to say of "
-            "which, take tum"
-        )
-    return len(truth.frame), _pose_text(archive.time_s[truth.frame], truth.T_world_imu, format)
-
-
-def _pose_text(time_s: Array, T: Array, format: Literal["tum", "kitti"]) -> str:
-    if format == "tum":
-        quaternion = Rotation.from_matrix(T[:, :3, :3]).as_quat()  # scalar last, as TUM has it
-        rows = np.column_stack([time_s, T[:, :3, 3], quaternion])
-    else:
-        rows = T[:, :3].reshape(-1, 12)
-    return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows.tolist())
-
-
 def _write_result(group: h5py.Group, result: Result, frames: int) -> None:
-    sizes = {"T": frames, "M": len(result.landmarks)}
+    sizes, stamps = {"T": frames, "M": len(result.landmarks)}, {"time": result.time_s}
     hdf5.write_attributes(
         group,
         {
@@ -389,12 +377,13 @@ def _write_result(group: h5py.Group, result: Result, frames: int) -> None:
         },
     )
     hdf5.write_attributes(group.create_group("attributes"), result.attributes)
-    hdf5.write_fields(group, _LAYOUT, result, sizes)
+    hdf5.write_fields(group, LAYOUT, result, sizes, stamps)
     hdf5.write_attributes(group["rejections/reason"], {"names": REASONS})
     if result.parameters is not None:
         parameters = group.create_group("parameters")
         hdf5.write_attributes(parameters, {"name": result.parameters.name, "unit": result.parameters.unit})
-        hdf5.write_fields(parameters, _PARAMETERS_LAYOUT, result.parameters, sizes)
+        names = {"parameter": hdf5.fixed_texts(result.parameters.name)}
+        hdf5.write_fields(parameters, _PARAMETERS_LAYOUT, result.parameters, sizes, {**stamps, **names})
     if result.pairs is not None:
         hdf5.write_fields(group.create_group("pairs"), _PAIRS_LAYOUT, result.pairs, sizes)
     if result.hygiene is not None:
@@ -403,11 +392,11 @@ def _write_result(group: h5py.Group, result: Result, frames: int) -> None:
         hdf5.write_fields(hygiene, _HYGIENE_LAYOUT, result.hygiene, sizes)
         hdf5.write_attributes(hygiene["rule"], {"names": RULES})
     if result.whitened is not None:
-        hdf5.write_fields(group.create_group("whitened"), _WHITENED_LAYOUT, result.whitened, sizes)
+        hdf5.write_fields(group.create_group("whitened"), _WHITENED_LAYOUT, result.whitened, sizes, stamps)
     if result.log is not None:
         log = group.create_group("log")
         hdf5.write_attributes(log, {"first_estimates": result.log.first_estimates})
-        hdf5.write_fields(log, (*_LOG_LAYOUT, *_LOG_LAYOUT_4, *_LOG_GAPS), result.log, sizes)
+        hdf5.write_fields(log, LAYOUTS["log"], result.log, sizes, stamps)
 
 
 def _sequence_fields(h5file: h5py.File) -> dict[str, Any]:
@@ -429,8 +418,8 @@ def _read_result(h5file: h5py.File, mode: str, sequence: Mapping[str, Any]) -> R
     group = hdf5.subgroup(h5file, f"runs/{mode}")
     version = hdf5.version_of(group if "format_version" in group.attrs else h5file)
     fields: dict[str, dict[str, Any]] = {"": {}, "landmarks": {}, "innovation": {}, "rejections": {}}
-    sizes = {"T": len(sequence["time_s"])}
-    for field, value in hdf5.read_fields(group, _LAYOUT, sizes).items():
+    sizes, stamps = {"T": len(sequence["time_s"])}, _stamps(group)
+    for field, value in hdf5.read_fields(group, LAYOUT, sizes, stamps).items():
         part, _, leaf = field.rpartition(".")
         fields[part][leaf] = value
     sizes["M"] = len(fields["landmarks"]["id"])
@@ -447,11 +436,13 @@ def _read_result(h5file: h5py.File, mode: str, sequence: Mapping[str, Any]) -> R
         noise=noise,
         camera=sequence["camera"],
         T_cam_imu=sequence["T_cam_imu"],
-        log=_read_log(hdf5.subgroup(group, "log"), sizes, version) if "log" in group else None,
+        log=_read_log(hdf5.subgroup(group, "log"), sizes, stamps, version) if "log" in group else None,
         hygiene=_read_hygiene(hdf5.subgroup(group, "hygiene"), sizes) if "hygiene" in group else None,
-        parameters=_read_parameters(hdf5.subgroup(group, "parameters"), sizes) if "parameters" in group else None,
+        parameters=_read_parameters(hdf5.subgroup(group, "parameters"), sizes, stamps)
+        if "parameters" in group
+        else None,
         pairs=_read_pairs(hdf5.subgroup(group, "pairs"), sizes) if "pairs" in group else None,
-        whitened=_read_whitened(hdf5.subgroup(group, "whitened"), sizes) if "whitened" in group else None,
+        whitened=_read_whitened(hdf5.subgroup(group, "whitened"), sizes, stamps) if "whitened" in group else None,
         attributes=hdf5.facts(hdf5.subgroup(group, "attributes")),
     )
 
@@ -486,12 +477,18 @@ def _read_config(group: h5py.Group, noise: Noise, version: int) -> dict[str, Any
     return config
 
 
-def _read_log(group: h5py.Group, sizes: Mapping[str, int], version: int) -> Log:
+def _stamps(group: h5py.Group) -> dict[str, Array]:
+    """What other groups of a run have along their dimension ``time``."""
+    time = group.get("trajectory/time")
+    return {"time": time[()]} if isinstance(time, h5py.Dataset) else {}
+
+
+def _read_log(group: h5py.Group, sizes: Mapping[str, int], stamps: Mapping[str, Array], version: int) -> Log:
     is_old = version < 4
     place = f"{group.file.filename}: {group.name.strip('/')}"
-    found = hdf5.read_fields(group, _LOG_LAYOUT if is_old else (*_LOG_LAYOUT, *_LOG_LAYOUT_4), sizes)
+    found = hdf5.read_fields(group, _LOG_LAYOUT if is_old else (*_LOG_LAYOUT, *_LOG_LAYOUT_4), sizes, stamps)
     if not is_old:
-        gaps = hdf5.read_fields(group, _LOG_GAPS, sizes) if "is_gap" in group else {}
+        gaps = hdf5.read_fields(group, _LOG_GAPS, sizes, stamps) if "is_gap" in group else {}
         found["is_gap"] = gaps.get("is_gap", np.zeros(sizes["T"], dtype=bool))
     found["first_estimates"] = bool(hdf5.attribute(group, "first_estimates"))
     log = Log.of_poses_alone(**found) if is_old else Log(**found)
@@ -499,9 +496,9 @@ def _read_log(group: h5py.Group, sizes: Mapping[str, int], version: int) -> Log:
     return log
 
 
-def _read_parameters(group: h5py.Group, sizes: Mapping[str, int]) -> Parameters:
-    found = hdf5.read_fields(group, _PARAMETERS_LAYOUT, sizes)
+def _read_parameters(group: h5py.Group, sizes: Mapping[str, int], stamps: Mapping[str, Array]) -> Parameters:
     names, units = (hdf5.texts(group.attrs.get(key, ())) for key in ("name", "unit"))
+    found = hdf5.read_fields(group, _PARAMETERS_LAYOUT, sizes, {**stamps, "parameter": hdf5.fixed_texts(names)})
     if not len(names) == len(units) == len(found["prior_std"]):
         raise ArchiveError(
             f"{group.file.filename}: the attributes name and unit of {group.name.strip('/')} do not fit "
@@ -517,8 +514,8 @@ def _read_pairs(group: h5py.Group, sizes: Mapping[str, int]) -> PosePairs:
     return pairs
 
 
-def _read_whitened(group: h5py.Group, sizes: Mapping[str, int]) -> WhitenedInnovations:
-    return WhitenedInnovations(**hdf5.read_fields(group, _WHITENED_LAYOUT, sizes))
+def _read_whitened(group: h5py.Group, sizes: Mapping[str, int], stamps: Mapping[str, Array]) -> WhitenedInnovations:
+    return WhitenedInnovations(**hdf5.read_fields(group, _WHITENED_LAYOUT, sizes, stamps))
 
 
 def _read_hygiene(group: h5py.Group, sizes: Mapping[str, int]) -> HygieneReport:

@@ -3,8 +3,9 @@
 Two measures of innovations count, and they ask for different sizes. From one frame to the next the errors of tracks are
 small: their size there is where normalised innovations squared are what they should be. But they persist along tracks,
 so that over many frames they add up to `PERSISTENCE` times as much. Where velocities are clean they bridge the low
-frequencies, and the size of a frame is taken. Where velocities are noisy vision carries the low frequencies alone, and
-what counts is what errors of tracks add up to.
+frequencies, and the size of a frame is taken. Where they are noisy, or nobody measured any, vision carries the low
+frequencies alone, and what counts is what errors of tracks add up to. Errors of tracks that are checked against their
+first sight do not walk.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ def with_track_scale(config: Config, sequence: Sequence) -> Config:
     """
     given = config.noise.track_scale is not None or config.noise.drift is not None
     # A tuned file was found with the walk as it is.
-    if not is_automatic(sequence, config) or given or config.noise.model != "auto":
+    if not is_automatic(sequence, config) or given or config.noise.model != "auto" or sequence.has_checked_tracks:
         return config
     scale = 1.0
-    if not velocity_noise(sequence.twist).is_clean:
+    if not sequence.has_velocities or not velocity_noise(sequence.twist).is_clean:
         scale = PERSISTENCE
     elif len(sequence.observations):
         begin = max(len(sequence) - _FRAMES, 0) // 2

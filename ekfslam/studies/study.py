@@ -41,26 +41,28 @@ from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import VARIANTS, Config, FilterConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import Loop, simulate
+from ekfslam.dimensions import Shape, fixed_length
 from ekfslam.errors import ArchiveError, ConfigError, FilterError
 from ekfslam.evaluation.consistency import (
     joint_nees,
     nees,
     pose_error,
     time_average,
-    world_axes_covariance,
 )
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.filters.result import ERROR_CONVENTION
 from ekfslam.geometry import se3
+from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress as with_progress
 from ekfslam.runner import versions
+from ekfslam.shown import Card, Shown, count
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed
 from ekfslam.studies.journal import Journal
 
 FORMAT = "ekfslam-study"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 2 added coordinates of all dimensions
 
 ITERATIONS = 3
 ITERATED_SUFFIX = "-iterated"
@@ -87,7 +89,7 @@ LEVELS: Mapping[str, Loop] = MappingProxyType(
 
 # Per run: shape after (runs,), type, units, what it is. T is the number of frames, J the number of instants at which
 # the joint NEES is taken.
-FIELDS: Mapping[str, tuple[tuple[str | int, ...], type, str, str]] = MappingProxyType(
+FIELDS: Mapping[str, tuple[Shape, type, str, str]] = MappingProxyType(
     {
         "pose_nees": (("T",), float, "1", "xi, 6 degrees of freedom"),
         "orientation_nees": (("T",), float, "1", "theta of xi, 3 degrees of freedom"),
@@ -96,9 +98,14 @@ FIELDS: Mapping[str, tuple[tuple[str | int, ...], type, str, str]] = MappingProx
         "joint_nees_per_dof": (("J",), float, "1", "xi and all landmarks, divided by 6 + 3n"),
         "nis": (("T",), float, "1", "innovations of the frame"),
         "nis_dof": (("T",), int, "1", "degrees of freedom of nis"),
-        "position_error": (("T", 3), float, "m", "estimate minus truth, world axes"),
-        "rotation_error": (("T", 3), float, "rad", "log(R_estimate R_truth^T), world axes"),
-        "three_sigma": (("T", 6), float, "m (0-2), rad (3-5)", "bounds of position and rotation error, world axes"),
+        "position_error": (("T", "xyz"), float, "m", "estimate minus truth, world axes"),
+        "rotation_error": (("T", "xyz"), float, "rad", "log(R_estimate R_truth^T), world axes"),
+        "three_sigma": (
+            ("T", "error"),
+            float,
+            "m (0-2), rad (3-5)",
+            "bounds of position and rotation error, world axes",
+        ),
         "diverged": ((), bool, "1", "stopped with an error, not finite, or left the ring altogether"),
     }
 )
@@ -110,12 +117,12 @@ CHECKPOINT_S = 5.0
 CHECKPOINT_SHARE = 0.05  # of the time may go into checkpoints of a large study
 
 # Data sets below a level, and below a variant of it.
-_LEVEL = hdf5.layout(
+LEVEL_LAYOUT = hdf5.layout(
     ("time", "time", ("T",), "s", "nominal stamps"),
     ("done", "done", ("runs",), "1", "runs that are in", hdf5.FLAGS),
 )
 _CHECKS = {float: hdf5.NUMBERS_OR_NONE, int: hdf5.COUNTS, bool: hdf5.FLAGS}
-_VARIANT = hdf5.layout(
+VARIANT_LAYOUT = hdf5.layout(
     *(
         (name, name, ("runs", *shape), units, frame, _CHECKS[kind])
         for name, (shape, kind, units, frame) in FIELDS.items()
@@ -125,8 +132,8 @@ _VARIANT = hdf5.layout(
 Record = dict[str, dict[str, NDArray]]  # variant, field, value of one run
 
 
-@dataclass(frozen=True)
-class Study:
+@dataclass(frozen=True, repr=False)
+class Study(Shown):
     """What to simulate and what to compare on it.
 
     Args:
@@ -162,6 +169,13 @@ class Study:
             raise ConfigError(
                 f"a study of {self.runs} runs is too large: {values:.3g} frames, at most {MOST_VALUES:.3g}"
             )
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        filters = self.runs * len(self.levels) * len(self.variants)
+        facts = {"levels": ", ".join(self.levels), "variants": ", ".join(self.variants), "seed": str(self.seed)}
+        title = f"{count(self.runs, 'run')} of each level, {count(filters, 'filter')} in all"
+        return Card(title, facts, ('run_study(study, "study.h5", executor)',))
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -227,7 +241,7 @@ def _blank(frames: int, runs: tuple[int, ...] = ()) -> dict[str, NDArray]:
     sizes = {"T": frames, "J": JOINT_INSTANTS}
     return {
         name: np.full(
-            (*runs, *(sizes[n] if isinstance(n, str) else n for n in shape)), np.nan if kind is float else 0, dtype=kind
+            (*runs, *(sizes.get(n) or fixed_length(n) or 0 for n in shape)), np.nan if kind is float else 0, dtype=kind
         )
         for name, (shape, kind, _, _) in FIELDS.items()
     }
@@ -286,8 +300,8 @@ def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str,
     return record
 
 
-@dataclass(frozen=True)
-class StudyArchive:
+@dataclass(frozen=True, repr=False)
+class StudyArchive(Shown):
     """A study and what is there of its runs.
 
     Args:
@@ -299,6 +313,16 @@ class StudyArchive:
     study: Study
     done: Mapping[str, BoolArray]
     data: Mapping[str, Mapping[str, Mapping[str, NDArray]]]
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        runs = self.study.runs
+        facts = {level: f"{int(done.sum())} of {count(runs, 'run')}" for level, done in self.done.items()}
+        facts["variants"] = ", ".join(self.study.variants)
+        title = "complete" if self.complete else "not complete"
+        return Card(
+            title, facts, ("study_table(summarise_study(archive))", 'archive.data[level][variant]["pose_nees"]')
+        )
 
     @property
     def complete(self) -> bool:
@@ -440,9 +464,10 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
         for level, world in study.levels.items():
             group = h5file.create_group(f"levels/{level}")
             hdf5.write_attributes(group, {"world": json.dumps(dataclasses.asdict(world))})
-            hdf5.write_fields(group, _LEVEL, {"time": archive.time_s(level), "done": archive.done[level]})
+            along = {"time": archive.time_s(level), "instant": np.array(_joint_frames(world.frames))}
+            hdf5.write_fields(group, LEVEL_LAYOUT, {"time": along["time"], "done": archive.done[level]})
             for variant, values in archive.data[level].items():
-                hdf5.write_fields(group.create_group(variant), _VARIANT, values)
+                hdf5.write_fields(group.create_group(variant), VARIANT_LAYOUT, values, coordinates=along)
                 group[f"{variant}/joint_nees_per_dof"].attrs["frames"] = _joint_frames(world.frames)
 
     files.write_all({Path(path): hdf5.image(FORMAT, FORMAT_VERSION, fill)})
@@ -469,8 +494,15 @@ def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
         for level, world in study.levels.items():
             group = hdf5.subgroup(h5file, f"levels/{level}")
             sizes = {"runs": study.runs, "T": world.frames, "J": JOINT_INSTANTS}
-            done[level] = hdf5.read_fields(group, _LEVEL, sizes)["done"]
-            data[level] = {v: hdf5.read_fields(hdf5.subgroup(group, v), _VARIANT, sizes) for v in study.variants}
+            found = hdf5.read_fields(group, LEVEL_LAYOUT, sizes)
+            done[level], along = (
+                found["done"],
+                {"time": found["time"], "instant": np.array(_joint_frames(world.frames))},
+            )
+            data[level] = {
+                variant: hdf5.read_fields(hdf5.subgroup(group, variant), VARIANT_LAYOUT, sizes, along)
+                for variant in study.variants
+            }
         found_versions = {
             key: str(value) for key, value in hdf5.attributes(h5file).items() if key.startswith("version_")
         }

@@ -18,7 +18,7 @@ def valid() -> Valid:
 
 @pytest.mark.parametrize("family", range(len(GENERATORS)), ids=lambda family: GENERATORS[family].__name__)
 def test_every_input_is_taken_or_refused_by_name(valid, tmp_path, monkeypatch, family):
-    monkeypatch.setattr("ekfslam.figures.style.png", lambda figure: b"")
+    monkeypatch.setattr("ekfslam.figures.style.png", lambda *_: b"")
     for i in range(EACH):
         seed = family + len(GENERATORS) * i
         case = case_of(valid, seed)

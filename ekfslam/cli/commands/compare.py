@@ -17,6 +17,7 @@ from ekfslam.cli.options import (
     add_resume,
     configured,
     open_data,
+    print_warnings,
 )
 from ekfslam.config import MODES
 from ekfslam.errors import ConfigError
@@ -57,6 +58,8 @@ def command(options: argparse.Namespace) -> None:
         files.require_writable(folder / "archive.h5")
         if not options.force:
             require_same_origin(folder / "archive.h5", sequence)
+    for sequence in sequences:
+        print_warnings(sequence)
     recordings = dict(zip(folders, sequences, strict=True))
     where = "serial" if len(recordings) == 1 and options.executor == "processes" else options.executor
     workers = options.workers or min(len(recordings), os.cpu_count() or 1)

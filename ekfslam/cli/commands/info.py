@@ -13,6 +13,7 @@ from ekfslam.config import Config
 from ekfslam.data.interpolation import stretches
 from ekfslam.data.readers import BUILTIN
 from ekfslam.data.tracks import inspect_tracks
+from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.models.build import build
 from ekfslam.models.noise import velocity_noise
@@ -59,7 +60,9 @@ def command(options: argparse.Namespace) -> None:
         f"camera        fu {camera.fu_px:g} fv {camera.fv_px:g} cu {camera.cu_px:g} cv {camera.cv_px:g} px, "
         f"baseline {camera.baseline_m:g} m"
     )
-    if noise is None:
+    if not sequence.has_velocities:
+        print("velocities    nobody measured any: the twist is a walk that starts from stereo odometry")
+    elif noise is None:
         v, w = velocity_noise(sequence.twist).texts
         print(f"noise         not stated; white noise of the velocities, from the data: {v} m/s, {w} rad/s")
     else:
@@ -74,6 +77,11 @@ def command(options: argparse.Namespace) -> None:
         print(f"{key:13s} {value}")
     for note in sequence.notes:
         print(f"note          {note}")
+    sanity = inspect_sequence(sequence)
+    for line in sanity.figures:
+        print(f"sanity        {line}")
+    for line in sanity.warnings:
+        print(f"warning       {line}")
     problem = build(sequence)
     assert problem.hygiene is not None
     for line in problem.lines:

@@ -14,6 +14,7 @@ from ekfslam.cli.options import (
     add_resume,
     configured,
     open_data,
+    print_warnings,
     table,
 )
 from ekfslam.config import MODES
@@ -46,6 +47,7 @@ def command(options: argparse.Namespace) -> None:
     files.require_writable(options.out)
     if not options.force:
         require_same_origin(options.out, sequence)
+    print_warnings(sequence)
     with Checkpoints(options.out.with_name(f"{options.out.name}.checkpoint"), options.resume) as checkpoints:
         result = run(sequence, options.mode, config, checkpoints=checkpoints)
         older = [] if _is_shared(options.out) else older_figures(options.out.parent)

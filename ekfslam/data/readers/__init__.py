@@ -3,7 +3,7 @@
 The content, not the name, decides which reader is used. Each format is one file of this folder, which
 `ekfslam.data.readers.registry` finds by itself:
 
-- .npz of the report and its dense, noisy edition (`ece276a`),
+- .npz of the report and later editions of it (`ece276a`), .npy of those from 2025 on (`ece276a_npy`),
 - .mat of UTIAS: KITTI drives and Starry Night (`utias`),
 - ekfslam's own HDF5 form (`hdf5`, entered by `own`),
 - a drive folder of KITTI raw (`kitti_raw`), which has no tracks and serves dead reckoning,
@@ -24,7 +24,17 @@ from ekfslam.data.readers.truth import attach_truth
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError, UnknownFormatError
 
-__all__ = ["BUILTIN", "KittiRaw", "open_kitti_raw", "open_sequence", "read_sequence", "write_sequence"]
+__all__ = [
+    "BUILTIN",
+    "KittiRaw",
+    "Reader",
+    "Source",
+    "attach_truth",
+    "open_kitti_raw",
+    "open_sequence",
+    "read_sequence",
+    "write_sequence",
+]
 
 
 def open_sequence(
@@ -64,6 +74,8 @@ def open_sequence(
 
 
 def _open(source: Source) -> Sequence:
+    from ekfslam.data.images.registry import image_readers  # which imports the registry of this package
+
     readers = discovered(Reader)
     reader = next((reader for reader in readers if reader.recognises(source)), None)
     if reader is not None:
@@ -71,4 +83,4 @@ def _open(source: Source) -> Sequence:
     problem = f"cannot be read ({source.problem})" if source.problem else "unknown content"
     if not source.head and not source.problem:
         problem = "empty file"
-    raise UnknownFormatError(f"{source.place}: {problem}; {listed(readers)}")
+    raise UnknownFormatError(f"{source.place}: {problem}; {listed((*readers, *image_readers()))}")

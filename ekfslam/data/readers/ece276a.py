@@ -1,32 +1,38 @@
-"""The .npz recordings of the report (and of the later, dense and noisy edition): clean or noisy KITTI velocities and
-stereo tracks, without ground truth."""
+"""The .npz recordings of the report and of later editions: KITTI velocities and stereo tracks, without ground truth."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
+from ekfslam.data.dense import flat_observations
 from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.readers.fields import (
     LATERAL_NOTES,
     checksum,
-    flat_observations,
+    require,
     require_numbers,
     spelled_as_in,
     with_lateral,
 )
 from ekfslam.data.readers.registry import Extrinsics, Lateral, Reader
-from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, validate_camera
+from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, require_rigid, validate_camera
 from ekfslam.data.tracks import inspect_tracks
-from ekfslam.errors import CalibrationError, UnknownFormatError
+from ekfslam.errors import CalibrationError, ExtrinsicsError, UnknownFormatError
+from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.limits import Budget, require_file
 
-FIELDS = ("features", "time_stamps", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
+_COMMON = ("features", "time_stamps", "linear_velocity", "K", "b")
+FIELDS = (*_COMMON, "rotational_velocity", "cam_T_imu")
+LATER_FIELDS = (*_COMMON, "angular_velocity", "imu_T_cam")
+_KNOWN = tuple(dict.fromkeys(FIELDS + LATER_FIELDS))
 
 _EXTRINSICS_NOTES: dict[Extrinsics, str] = {
     "corrected": (
@@ -37,10 +43,20 @@ _EXTRINSICS_NOTES: dict[Extrinsics, str] = {
         "the IMU frame."
     ),
 }
+_LATER_NOTE = (
+    "The stored imu_T_cam is a pose in an IMU frame forward, right, down, while the velocities are forward, left, up: "
+    "T_cam_imu = inv(imu_T_cam) diag(1, -1, -1, 1) is used."
+)
+AS_STORED_NOTE = "The lateral velocity is used as stored: nothing is known of a wrong sign in this edition."
+_FLIPPED = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Lateral = "corrected") -> Sequence:
-    """Read ``features`` (4 x M x T, -1 where unseen), velocities (3 x T), stamps (1 x T), ``K``, ``b``, ``cam_T_imu``.
+    """Read ``features`` (4 x M x T, -1 or NaN where unseen), velocities (3 x T), stamps, ``K``, ``b``, extrinsics.
+
+    There are two editions. That of the report has ``rotational_velocity`` and ``cam_T_imu``. The later one, of
+    KITTI-360, has ``angular_velocity`` and ``imu_T_cam``, which is a true camera-to-IMU pose; neither option below
+    means anything for it.
 
     Args:
         path: The .npz file.
@@ -54,42 +70,59 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
     """
     source = str(path)
     fields = _load(path)
-    with spelled_as_in(source, {"time_s": "time_stamps", "T_cam_imu": "cam_T_imu", "baseline": "b"}):
-        time_s = require_numbers(fields, "time_stamps", (1, None))[0]
+    is_later = FIELDS[-1] not in fields and any(name in fields for name in LATER_FIELDS[-2:])
+    turning, stored_name = LATER_FIELDS[-2:] if is_later else FIELDS[-2:]
+    with spelled_as_in(source, {"time_s": "time_stamps", "T_cam_imu": stored_name, "baseline": "b"}):
+        time_s = stamps_of(fields, "time_stamps")
         frames = len(time_s)
-        twist = np.concatenate(
-            [require_numbers(fields, name, (3, frames)) for name in ("linear_velocity", "rotational_velocity")]
-        ).T
-        twist = with_lateral(twist, lateral)
-        camera = _camera(require_numbers(fields, "K", (3, 3)), float(require_numbers(fields, "b", ())))
-        stored = require_numbers(fields, "cam_T_imu", (4, 4))
-        observations = flat_observations(
-            require_numbers(fields, "features", (4, None, frames)), frame_axis=2, field="features"
-        )
+        twist = np.concatenate([require_numbers(fields, name, (3, frames)) for name in ("linear_velocity", turning)]).T
+        camera = camera_of(require_numbers(fields, "K", (3, 3)), float(require_numbers(fields, "b", ())))
+        stored = require_numbers(fields, stored_name, (4, 4))
+        features = require_numbers(fields, "features", (4, None, frames), finite=False)
+        observations, found = flat_observations(features, frame_axis=2, field="features")
+        if is_later:
+            require_rigid(stored, stored_name, ExtrinsicsError)
+            T_cam_imu, used, notes = se3.inverse(stored) @ _FLIPPED, "as-stored", (_LATER_NOTE, AS_STORED_NOTE)
+        else:
+            twist, used = with_lateral(twist, lateral), lateral
+            T_cam_imu = stored if extrinsics == "as-stored" else _with_camera_position(stored)
+            notes = (_EXTRINSICS_NOTES[extrinsics], LATERAL_NOTES[lateral])
         return Sequence(
             name=path.stem,
             source=source,
             time_s=time_s,
             twist=twist,
             camera=camera,
-            T_cam_imu=stored if extrinsics == "as-stored" else _with_camera_position(stored),
+            T_cam_imu=T_cam_imu,
             observations=observations,
             velocity_frame="level",
             notes=(
-                _EXTRINSICS_NOTES[extrinsics],
+                notes[0],
                 LEVEL_VELOCITIES_NOTE,
-                LATERAL_NOTES[lateral],
+                *notes[1:],
+                *found,
                 *interpolation_notes(twist),
                 *inspect_tracks(observations, twist).notes,
             ),
             attributes={
                 "checksum_sha256": checksum(path),
                 "reader": READER.name,
-                "extrinsics": extrinsics,
-                "lateral": lateral,
+                **({} if is_later else {"extrinsics": extrinsics}),
+                "lateral": used,
                 **interpolation_attributes(twist),
             },
         )
+
+
+def stamps_of(fields: Mapping[str, NDArray], name: str) -> Array:
+    """Stamps (T,) that an edition of the data keeps as a row, a column or a vector.
+
+    Raises:
+        DataError: They are missing, no finite numbers, or a table.
+    """
+    shape = require(fields, name).shape
+    vector = (None,) if len(shape) == 1 else (None, 1) if len(shape) == 2 and shape[1] == 1 else (1, None)
+    return require_numbers(fields, name, vector).ravel()
 
 
 def _load(path: Path) -> dict[str, np.ndarray]:
@@ -98,7 +131,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         _inspect(path)
         with np.load(path, allow_pickle=False) as file:
             names = file.files
-            fields = {name: file[name] for name in FIELDS if name in names} if "features" in names else {}
+            fields = {name: file[name] for name in _KNOWN if name in names} if "features" in names else {}
     except UnknownFormatError:
         raise
     except Exception as error:  # a damaged file makes the decoders raise almost anything
@@ -114,7 +147,7 @@ def _inspect(path: Path) -> None:
     budget = Budget(str(path))
     with ZipFile(path) as archive:
         for entry in archive.infolist():
-            if entry.filename.removesuffix(".npy") not in FIELDS:
+            if entry.filename.removesuffix(".npy") not in _KNOWN:
                 continue
             budget.take(entry.file_size, entry.filename)
             if entry.compress_type not in (ZIP_STORED, ZIP_DEFLATED):
@@ -127,7 +160,8 @@ def _inspect(path: Path) -> None:
                 raise ValueError(f"{entry.filename} claims the shape {shape}, but has {entry.file_size} bytes")
 
 
-def _camera(K: Array, baseline_m: float) -> StereoCamera:
+def camera_of(K: Array, baseline_m: float) -> StereoCamera:
+    """The camera of an intrinsic matrix (3, 3); raises a `DataError` for one that is none, or has skew."""
     if abs(np.linalg.det(K)) < 1e-9:
         raise CalibrationError("the intrinsic matrix is singular", field="K")
     pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])

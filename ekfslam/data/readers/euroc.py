@@ -12,7 +12,8 @@ from ekfslam.errors import TruthError, UnknownFormatError
 
 COLUMNS = ("timestamp", "p_RS_R_x", "p_RS_R_y", "p_RS_R_z", "q_RS_w", "q_RS_x", "q_RS_y", "q_RS_z")
 _AS_TUM = [0, 1, 2, 3, 5, 6, 7, 4]  # quaternions w first there, w last in TUM
-_PLACES = ("data.csv", "state_groundtruth_estimate0/data.csv", "mav0/state_groundtruth_estimate0/data.csv")
+_FOLDERS = ("state_groundtruth_estimate0", "mocap0")  # mocap0: TUM-VI
+_PLACES = ("data.csv", *(f"{above}{folder}/data.csv" for above in ("", "mav0/") for folder in _FOLDERS))
 _EXPECTED = "a EuRoC ground-truth csv or its folder"
 
 
@@ -21,7 +22,7 @@ def find_euroc_truth(folder: Path) -> Path | None:
     return next((folder / place for place in _PLACES if (folder / place).is_file()), None)
 
 
-def read_euroc(path: Path, sequence: Sequence) -> Poses:
+def read_euroc(path: Path, sequence: Sequence | None = None) -> Poses:
     """The poses of a csv, or of the csv that belongs to a folder.
 
     The csv holds the pose ``T_R_S`` of the body (the IMU) in the reference frame, stamped in ns, quaternions w first.

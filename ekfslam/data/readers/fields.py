@@ -1,4 +1,4 @@
-"""What the readers share: named fields of a file, checked one by one, and dense tracks made flat."""
+"""What the readers share: named fields of a file, checked one by one."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
 from ekfslam.data.readers.registry import Lateral
-from ekfslam.data.sequence import Observations, require_finite, require_shape
-from ekfslam.errors import DataError, EmptyTracksError, ShapeError
+from ekfslam.data.sequence import require_finite, require_shape
+from ekfslam.errors import DataError, ShapeError
 
 LATERAL_NOTES: dict[Lateral, str] = {
     "corrected": (
@@ -22,7 +22,6 @@ LATERAL_NOTES: dict[Lateral, str] = {
     ),
     "as-stored": "The lateral velocity is used as stored, although it is positive to the right.",
 }
-UNSEEN = -1.0  # what the dense formats write into all four pixels of a track that a frame does not see
 
 
 def checksum(*paths: Path) -> str:
@@ -62,9 +61,13 @@ def require(fields: Mapping[str, Any], name: str) -> NDArray:
 
 
 def require_numbers(
-    fields: Mapping[str, Any], name: str, shape: tuple[int | None, ...], dtype: type = np.float64
+    fields: Mapping[str, Any],
+    name: str,
+    shape: tuple[int | None, ...],
+    dtype: type = np.float64,
+    finite: bool = True,
 ) -> NDArray:
-    """A field of a file as finite numbers of the wanted shape (None stands for any length) and type.
+    """A field of a file as numbers of the wanted shape (None stands for any length) and type, finite by default.
 
     Raises:
         ShapeError: The field is missing, is not numeric (integral where ``dtype`` is) or has another shape.
@@ -74,37 +77,9 @@ def require_numbers(
     if value.dtype.kind not in ("iu" if np.issubdtype(dtype, np.integer) else "iuf"):
         raise ShapeError(f"expected {np.dtype(dtype).name} numbers, found {value.dtype}", field=name)
     require_shape(value, shape, name)
-    if value.dtype.kind == "f":
+    if finite and value.dtype.kind == "f":
         require_finite(value, name)
     return value.astype(dtype, copy=False)
-
-
-def flat_observations(dense: Array, frame_axis: int, field: str) -> Observations:
-    """Observations of a dense 4 x T x M (``frame_axis`` 1) or 4 x M x T (2) array of pixels; the column is the id.
-
-    Raises:
-        ShapeError: Only some of the four pixels are -1.
-        EmptyTracksError: A track is never seen.
-    """
-    missing = dense == UNSEEN
-    seen = ~missing.all(axis=0)
-    partly = np.argwhere(missing.any(axis=0) & seen)
-    if len(partly):
-        position = tuple(int(i) for i in partly[0])
-        row = int(np.argmax(missing[:, position[0], position[1]]))
-        raise ShapeError(
-            f"{len(partly)} observations have some but not all of their four pixels equal to -1 (unseen)",
-            field=field,
-            index=(row, *position),
-        )
-    never = np.flatnonzero(~seen.any(axis=frame_axis - 1))
-    if len(never):
-        raise EmptyTracksError(
-            f"{len(never)} tracks are never seen, the first is track {never[0]}", field=field, index=int(never[0])
-        )
-    first, second = np.nonzero(seen)
-    frame, landmark = (first, second) if frame_axis == 1 else (second, first)
-    return Observations(frame, landmark, dense[:, first, second].T)
 
 
 def with_lateral(level_twist: Array, lateral: Lateral) -> Array:

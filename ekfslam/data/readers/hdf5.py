@@ -27,36 +27,39 @@ from ekfslam.data.noise import Noise
 from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
 from ekfslam.data.sequence import Observations, Sequence, Truth
 from ekfslam.data.truth_noise import TruthNoise
+from ekfslam.dimensions import fixed_length
 from ekfslam.errors import ArchiveError, ShapeError, UnknownFormatError
 from ekfslam.geometry.camera import StereoCamera
 
 FORMAT = "ekfslam-sequence"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 2 added coordinates of all dimensions
 
 _INDICES = ("frame index", "landmark id")  # units of whole numbers
 
 # Part of a `Sequence` to data sets below /, fields of the part, shape, units, frame.
 _SEQUENCE = hdf5.layout(
     ("sequence/time", "time_s", ("T",), "s", "clock of the recording"),
-    ("sequence/twist", "twist", ("T", 6), "m/s (columns 0-2), rad/s (columns 3-5)", "imu"),
-    ("sequence/T_cam_imu", "T_cam_imu", (4, 4), "m (translation)", "cam from imu"),
+    ("sequence/twist", "twist", ("T", "u"), "m/s (columns 0-2), rad/s (columns 3-5)", "imu"),
+    ("sequence/T_cam_imu", "T_cam_imu", ("row", "column"), "m (translation)", "cam from imu"),
 )
 _OBSERVATIONS = hdf5.layout(
     ("sequence/observations/frame", "frame", ("K",), "frame index", "none"),
     ("sequence/observations/landmark", "landmark", ("K",), "landmark id", "none"),
-    ("sequence/observations/pixels", "pixels_px", ("K", 4), "px", "image: uL, vL, uR, vR"),
+    ("sequence/observations/pixels", "pixels_px", ("K", "pixels"), "px", "image: uL, vL, uR, vR"),
 )
 _NOISE = hdf5.layout(
-    ("sequence/noise/twist_std", "twist_std", (6,), "m/s (0-2), rad/s (3-5)", "imu"),
-    ("sequence/noise/pixel_std", "pixel_std_px", (4,), "px", "image: uL, vL, uR, vR"),
+    ("sequence/noise/twist_std", "twist_std", ("u",), "m/s (0-2), rad/s (3-5)", "imu"),
+    ("sequence/noise/pixel_std", "pixel_std_px", ("pixels",), "px", "image: uL, vL, uR, vR"),
 )
 _TRUTH = hdf5.layout(
     ("truth/frame", "frame", ("F",), "frame index", "none"),
-    ("truth/T_world_imu", "T_world_imu", ("F", 4, 4), "m (translation)", "world from imu"),
+    ("truth/T_world_imu", "T_world_imu", ("F", "row", "column"), "m (translation)", "world from imu"),
     ("truth/landmarks/id", "landmark", ("M",), "landmark id", "none"),
-    ("truth/landmarks/position", "position_m", ("M", 3), "m", "world"),
+    ("truth/landmarks/position", "position_m", ("M", "xyz"), "m", "world"),
 )
 _NOTES = hdf5.layout(("sequence/notes", "notes", ("n",), "text", "none", hdf5.TEXTS))
+LAYOUT = (*_SEQUENCE, *_NOTES, *_NOISE, *_TRUTH)  # of an archive, too
+OBSERVATIONS_LAYOUT = _OBSERVATIONS
 _CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
 _OLD_NOISE = ("drift", "bearing_drift_rad")  # walks of landmarks, before errors of tracks walked in the image
 _TRUTH_NOISE = "noise_"  # before the names of attributes
@@ -121,20 +124,19 @@ def write_sequence_group(h5file: h5py.Group, sequence: Any, observations: Observ
         sequence: A `Sequence`, or what has its fields but the observations.
         observations: Of it, where they are to be written.
     """
-    hdf5.write_fields(h5file, _SEQUENCE, sequence, compact=True)
-    notes = np.array([hdf5.fixed_text(note) for note in sequence.notes], dtype=np.bytes_)
-    hdf5.write_fields(h5file, _NOTES, {"notes": notes}, compact=True)
+    hdf5.write_fields(h5file, _SEQUENCE, sequence)
+    hdf5.write_fields(h5file, _NOTES, {"notes": hdf5.fixed_texts(sequence.notes)})
     group = h5file["sequence"]
     names = {"name": sequence.name, "velocity_frame": sequence.velocity_frame}
     hdf5.write_attributes(group, names)
     hdf5.write_attributes(group.create_group("camera"), {name: getattr(sequence.camera, name) for name in _CAMERA})
     hdf5.write_attributes(group.create_group("attributes"), sequence.attributes)
     if sequence.noise is not None:
-        hdf5.write_fields(h5file, _NOISE, sequence.noise, compact=True)
+        hdf5.write_fields(h5file, _NOISE, sequence.noise)
         further = noise_attributes(sequence.noise)
         hdf5.write_attributes(group["noise"], {key: further[key] for key in further if key not in _NOISE_FIELDS})
     if observations is not None:
-        hdf5.write_fields(h5file, _OBSERVATIONS, observations, compact=True)
+        hdf5.write_fields(h5file, _OBSERVATIONS, observations)
 
 
 def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
@@ -188,7 +190,7 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
 
 def write_truth_group(h5file: h5py.Group, truth: Truth) -> None:
     """Write ``/truth`` below an open file or group."""
-    hdf5.write_fields(h5file, _TRUTH, truth, compact=True)
+    hdf5.write_fields(h5file, _TRUTH, truth)
     if truth.noise is not None:
         hdf5.write_attributes(
             h5file["truth"], {_TRUTH_NOISE + name: value for name, value in vars(truth.noise).items()}
@@ -223,15 +225,17 @@ def noise_of_attributes(attributes: Mapping[str, Any], prefix: str = "") -> dict
 
 def _read(h5file: h5py.Group, layout: hdf5.Layout) -> dict[str, Any]:
     """The data sets of a layout by field, as finite numbers; that lengths agree, the record checks that takes them."""
-    return {
+    found = {
         field: require_numbers(
             h5file,
             name,
-            tuple(None if isinstance(n, str) else n for n in shape),
+            tuple(fixed_length(n) for n in shape),
             np.int64 if units in _INDICES else np.float64,
         )
         for name, field, shape, units, *_ in layout
     }
+    hdf5.require_coordinates(h5file, layout)
+    return found
 
 
 def _attributes(h5file: h5py.Group, name: str) -> dict[str, Any]:

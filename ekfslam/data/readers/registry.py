@@ -13,10 +13,10 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 from ekfslam.arrays import Array
 from ekfslam.data.sequence import Sequence
@@ -116,15 +116,23 @@ class TruthReader:
     read: Callable[[Path, Sequence], Poses]
 
 
-def discovered(kind: type[Entry]) -> tuple[Entry, ...]:
-    """The entries of a kind in all files of this folder, in the order of the files' names."""
-    package = importlib.import_module(__package__)
-    modules = [importlib.import_module(f"{__package__}.{file.name}") for file in pkgutil.iter_modules(package.__path__)]
+def discovered(kind: type[Entry], folder: str = __package__) -> tuple[Entry, ...]:
+    """The entries of a kind in all files of a package, by default this one, in the order of the files' names."""
+    package = importlib.import_module(folder)
+    modules = [importlib.import_module(f"{folder}.{file.name}") for file in pkgutil.iter_modules(package.__path__)]
     entries = [value for module in modules for value in vars(module).values() if isinstance(value, kind)]
     return tuple(dict.fromkeys(entries))
 
 
-def listed(entries: tuple[Reader, ...] | tuple[TruthReader, ...]) -> str:
+class Expected(Protocol):
+    """What a source can be of."""
+
+    @property
+    def expected(self) -> str:
+        """What a file or folder of it is called in messages, with its article."""
+
+
+def listed(entries: Iterable[Expected]) -> str:
     """What the formats of readers are called, as one clause that begins with "expected"."""
     *others, last = (entry.expected for entry in entries)
     return f"expected {', '.join(others)} or {last}" if others else f"expected {last}"

@@ -38,7 +38,7 @@ def attach_truth(sequence: Sequence, path: Path) -> Sequence:
         DataError: A drive folder of KITTI raw is malformed; the subclass says how.
     """
     poses = _read(path, sequence)
-    truth = _matched(sequence, poses)
+    truth = truth_of_frames(sequence.time_s, poses)
     frames, known, count = len(sequence), len(truth.frame), len(poses.T_world_imu)
     if known < MIN_COVERAGE * frames:
         spans = ""
@@ -75,16 +75,16 @@ def _span(time_s: Array) -> str:
     return f"{time_s[0]:.3f} to {time_s[-1]:.3f} s"
 
 
-def _matched(sequence: Sequence, poses: Poses) -> Truth:
-    """The poses of the frames that have one."""
+def truth_of_frames(time_s: Array, poses: Poses) -> Truth:
+    """The poses of frames with stamps (T,) that have one: see `attach_truth`."""
     if poses.time_s is None:
-        used = min(len(sequence), len(poses.T_world_imu))
+        used = min(len(time_s), len(poses.T_world_imu))
         return Truth(np.arange(used), poses.T_world_imu[:used], noise=poses.noise)
     # Nearest in both directions, so that no pose serves two frames.
-    row = _nearest(poses.time_s, sequence.time_s)
-    mutual = _nearest(sequence.time_s, poses.time_s)[row] == np.arange(len(sequence))
-    tolerance_s = 0.5 * np.median(np.diff(sequence.time_s)) if len(sequence) > 1 else 0.0
-    frame = np.flatnonzero(mutual & (np.abs(poses.time_s[row] - sequence.time_s) <= tolerance_s))
+    row = _nearest(poses.time_s, time_s)
+    mutual = _nearest(time_s, poses.time_s)[row] == np.arange(len(time_s))
+    tolerance_s = 0.5 * np.median(np.diff(time_s)) if len(time_s) > 1 else 0.0
+    frame = np.flatnonzero(mutual & (np.abs(poses.time_s[row] - time_s) <= tolerance_s))
     return Truth(frame, poses.T_world_imu[row[frame]], noise=poses.noise)
 
 

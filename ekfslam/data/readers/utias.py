@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
+from ekfslam.data.dense import flat_observations
 from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.readers.fields import (
     LATERAL_NOTES,
     checksum,
-    flat_observations,
     require_numbers,
     spelled_as_in,
     with_lateral,
@@ -63,7 +63,7 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
     source = str(path)
     fields = _load(path)
     with spelled_as_in(source, _SPELLING):
-        pixels = require_numbers(fields, "y_k_j", (4, None, None))
+        pixels = require_numbers(fields, "y_k_j", (4, None, None), finite=False)
         frames = pixels.shape[1]
         columns = {name: require_numbers(fields, name, (1 if name == "t" else 3, None)) for name in COLUMN_FIELDS}
         for name, value in columns.items():
@@ -76,8 +76,9 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
         fu, fv, cu, cv, b = (float(require_numbers(fields, name, (1, 1))[0, 0]) for name in CAMERA_FIELDS)
         C = require_numbers(fields, "C_c_v", (3, 3))
         rho = require_numbers(fields, "rho_v_c_v", (3, 1))[:, 0]
-        observations = flat_observations(pixels, frame_axis=1, field="y_k_j")
-        notes = (f"Cut to the {frames} frames of y_k_j: {', '.join(cut)}.",) if cut else ()
+        observations, notes = flat_observations(pixels, frame_axis=1, field="y_k_j")
+        if cut:
+            notes = (f"Cut to the {frames} frames of y_k_j: {', '.join(cut)}.", *notes)
         attributes = {"checksum_sha256": checksum(path), "reader": READER.name}
         noise = _noise(fields)  # stated by Starry Night alone, whose velocities are those of its IMU
         if noise is None:

@@ -139,14 +139,18 @@ class Calibration(StateBlock):
         """
         delay = to_exposure(parameters, twist)
         q, H_x, H_m = linearise(rig, delay @ T_imu_world, positions_m, delay @ T_linear, linear_positions_m)
-        A = rig.jacobian(q)
+        T_cam_linear = rig.T_cam_imu @ delay @ T_linear
         H = np.zeros((len(q), 3, 9))
-        # First estimates here, too: a camera and its landmarks turned about it as one must look the same for good.
-        q_linear = se3.apply(rig.T_cam_imu @ delay @ T_linear, linear_positions_m)
-        moved = np.concatenate([np.broadcast_to(np.eye(3), A.shape), -se3.skew(q_linear)], axis=-1)
-        H[..., _EXTRINSIC] = A @ moved @ se3.left_jacobian(parameters[_EXTRINSIC])
-        H[..., _BASELINE] = rig.by_log_baseline(q)
-        H[..., _DISPARITY] = rig.by_disparity(q)
+        if len(self.extrinsic):
+            # First estimates here, too: a camera and its landmarks turned about it as one must look the same for good.
+            q_linear = se3.apply(T_cam_linear, linear_positions_m)
+            A = H_m @ T_cam_linear[..., :3, :3].swapaxes(-1, -2)
+            moved = np.concatenate([A, -A @ se3.skew(q_linear)], axis=-1)
+            H[..., _EXTRINSIC] = moved @ se3.left_jacobian(parameters[_EXTRINSIC])
+        if _BASELINE in self.free:
+            H[..., _BASELINE] = rig.by_log_baseline(q)
+        if _DISPARITY in self.free:
+            H[..., _DISPARITY] = rig.by_disparity(q)
         H[..., TIME] = -(H_x @ twist[..., None])[..., 0]
         return q, H_x @ se3.adjoint(delay), H[..., self.free], H_m
 

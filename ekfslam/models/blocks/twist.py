@@ -16,9 +16,11 @@ class Twist(StateBlock):
 
     Args:
         walk_std: (6,) standard deviation of their change from one interval to the next.
+        is_measured: Whether the recording's velocities measure them; else these only start them.
     """
 
     walk_std: Array
+    is_measured: bool = True
 
     name = "twist"
     per_frame = True

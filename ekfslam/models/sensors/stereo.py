@@ -123,10 +123,9 @@ class Rig:
                 break
         return cam.triangulate(self.camera, self._in_front(seen))
 
-    def has_point(self, rows: Array) -> BoolArray:
-        """Whether (n,) rows (n, 3) are those of a point in front of the rig, near enough to have a depth."""
-        z = self.invert(rows)[:, 2]
-        return (z > 0) & (z < self.camera.fu_px * self.camera.baseline_m / _NO_DEPTH_PX)
+    def has_depth(self, q: Array) -> BoolArray:
+        """Whether (n,) points (n, 3) of `invert` are in front of the rig, near enough to have a depth."""
+        return (q[:, 2] > 0) & (q[:, 2] < self.camera.fu_px * self.camera.baseline_m / _NO_DEPTH_PX)
 
     @staticmethod
     def _in_front(rows: Array) -> Array:

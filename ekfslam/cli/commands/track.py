@@ -1,0 +1,54 @@
+"""Track features through stereo images and write them as a recording."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ekfslam import files
+from ekfslam.cli.options import add_force, add_place_options, require_ours
+from ekfslam.config import Config
+from ekfslam.data.images import open_images
+from ekfslam.data.readers.hdf5 import is_recording_of, sequence_image
+from ekfslam.data.readers.truth import attach_truth
+from ekfslam.data.velocities import attach_velocities
+from ekfslam.errors import UnknownFormatError
+from ekfslam.figures.style import png
+from ekfslam.figures.tracks import plot_tracks
+from ekfslam.frontend.track import track
+
+EXAMPLES = (
+    "track sequences/06 --out 06.h5",
+    "track sequences/06 --truth poses/06.txt --features 250 --out 06.h5",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("data", metavar="SOURCE", help="folder with stereo images and their calibration")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="recording to write")
+    add_place_options(parser)
+    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings in a table [front_end]")
+    parser.add_argument("--features", type=int, metavar="N", help="how many are wanted in a frame")
+    add_force(parser)
+
+
+def command(options: argparse.Namespace) -> None:
+    config = Config.from_toml(options.config) if options.config else Config()
+    config = config.with_overrides({"front_end": {"features": options.features}})
+    files.require_writable(options.out)
+    recording = open_images(options.data, lateral=options.lateral)
+    if recording is None:
+        raise UnknownFormatError(f"{options.data}: there are no stereo images that a source knows")
+    if options.velocities is not None:
+        frame, lateral = options.velocity_frame, options.lateral
+        recording = attach_velocities(recording, options.velocities, velocity_frame=frame, lateral=lateral)
+    sequence, report = track(recording, config.front_end)
+    if options.truth is not None:
+        sequence = attach_truth(sequence, options.truth)
+    require_ours(options, options.out, lambda path: is_recording_of(path, sequence))
+    picture = options.out.with_suffix(".png")
+    drawn = png(plot_tracks(recording, sequence, report))
+    files.write_all({options.out: sequence_image(sequence), picture: drawn})
+    for line in report.lines:
+        print(line)
+    print(f"{len(sequence)} frames written to {options.out}, drawn in {picture}")

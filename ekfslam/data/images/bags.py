@@ -1,0 +1,347 @@
+"""Bags of ROS 1 and ROS 2, and MCAP: a stereo pair with CameraInfo, and velocities by Odometry or a stamped twist.
+
+They are read by the package rosbags, an extra: ``pip install 'ekfslam[bags]'``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.images.folders import pair_stamps
+from ekfslam.data.images.messages import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    MCAP_MAGIC,
+    ODOMETRY,
+    ROS1_MAGIC,
+    SQLITE_MAGIC,
+    TRANSFORMS,
+    VELOCITIES,
+    Bag,
+    field_of,
+    gray_of,
+    matrix_of,
+    stamp_of,
+    transform_of,
+)
+from ekfslam.data.images.pairs import Distortion, DistortionModel, Image, ImageRecording, PairCalibration
+from ekfslam.data.images.registry import ImageReader
+from ekfslam.data.readers.fields import spelled_as_in
+from ekfslam.data.readers.registry import Source
+from ekfslam.data.readers.text import first_line
+from ekfslam.data.velocities import Velocities, is_covered, resample
+from ekfslam.errors import CalibrationError, LostDataError, StampError, UnknownFormatError
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import R_CAM_BODY
+from ekfslam.names import printable
+
+NAME = "bag"
+_MODELS: dict[str, DistortionModel] = {
+    "plumb_bob": "radtan",
+    "rational_polynomial": "radtan",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A camera of a bag.
+
+    Args:
+        topic: Of its images.
+        connection: Stream of its images.
+        info: Its first CameraInfo.
+        frame: Name of its optical frame.
+    """
+
+    topic: str
+    connection: Any
+    info: Any
+    frame: str
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether its images are those after rectification."""
+        return (
+            "rect" in self.topic.rsplit("/", 1)[-1] or "rect" in self.topic.removesuffix("/compressed").rsplit("/")[-1]
+        )
+
+    @property
+    def projection(self) -> Array:
+        """P (3, 4)."""
+        return matrix_of(self.info, "p", 3)
+
+
+class BagPairs:
+    """`ImageRecording.load` of a bag, which is opened at the first call.
+
+    Args:
+        path: The bag.
+        topics: Of the left and the right images.
+        places: When each image was written, ns, and its stamp, ns: (T, 2) for the left and the right ones.
+        size: Width and height that all must have.
+    """
+
+    def __init__(self, path: Path, topics: tuple[str, str], places: tuple[IntArray, IntArray], size: tuple[int, int]):
+        self.path, self.topics, self.places, self.size = path, topics, places, size
+
+    @cached_property
+    def _bag(self) -> Bag:
+        return Bag(self.path)
+
+    def __call__(self, frame: int) -> tuple[Image, Image]:
+        left, right = (self._image(side, frame) for side in (0, 1))
+        return left, right
+
+    def _image(self, side: int, frame: int) -> Image:
+        written_ns, stamp_ns = self.places[side][frame].tolist()
+        bag, topic = self._bag, self.topics[side]
+        for connection in bag.connections(IMAGE, COMPRESSED):
+            if connection.topic != topic:
+                continue
+            for _, content in bag.raw(connection, written_ns, written_ns + 1):
+                if bag.stamp_ns(content) == stamp_ns:
+                    return gray_of(bag.message(connection, content), f"{self.path}: {printable(topic)}", self.size)
+        raise LostDataError(f"the image at {stamp_ns} ns is gone", source=str(self.path), field=printable(topic))
+
+
+def open_bag(path: Path) -> ImageRecording:
+    """The images of the one stereo pair of a bag, its calibration, and its velocities if it has any.
+
+    The right camera is that whose CameraInfo has a baseline in P. Topics with ``rect`` in their last part are rectified
+    images, whose camera is P; others are as the lens sees them, with K, D and R. The body is the frame of the
+    velocities; ``/tf_static`` says where the camera is in it, otherwise the body is the left camera, its axes forward,
+    left and up.
+
+    Raises:
+        MissingPackageError: rosbags is not installed.
+        UnknownFormatError: The bag is damaged.
+        CalibrationError: There is not exactly one pair of cameras, or a CameraInfo means none.
+        LostDataError: Images have no partner, or a stream is empty.
+        StampError: Stamps do not increase.
+    """
+    bag = Bag(path)
+    try:
+        with spelled_as_in(str(path)):
+            return _opened(bag)
+    finally:
+        bag.close()
+
+
+def _opened(bag: Bag) -> ImageRecording:
+    left, right = _pair(bag)
+    places = tuple(_places(bag, camera) for camera in (left, right))
+    in_left, in_right, notes = pair_stamps(places[0][:, 1], places[1][:, 1], str(bag.path))
+    calibration, R_cam_optical = _calibration(left, right)
+    time_s = places[0][in_left, 1] / 1e9
+    velocities, frame, found = _velocities(bag)
+    T_optical_body, note = _body(bag, left, frame)
+    notes = (*notes, *found, note)
+    used = np.ones(len(time_s), dtype=bool)
+    if velocities is not None:
+        used = is_covered(velocities.time_s, time_s)
+        if not used.all():
+            notes = (*notes, f"{int((~used).sum())} frames before or after all velocities are left out.")
+    chosen = (places[0][in_left[used]], places[1][in_right[used]])
+    twist = None
+    if velocities is not None:
+        twist, how = resample(velocities, time_s[used])
+        notes = (*notes, f"Velocities ({printable(frame)}): {how}.")
+    return ImageRecording(
+        name=bag.path.resolve().stem,
+        source=str(bag.path),
+        time_s=time_s[used],
+        calibration=calibration,
+        load=BagPairs(bag.path, (left.topic, right.topic), chosen, calibration.size),
+        T_cam_imu=se3.transform(R_cam_optical, np.zeros(3)) @ T_optical_body,
+        twist=twist,
+        notes=notes,
+        attributes={"reader": NAME, "topics": printable(f"{left.topic} {right.topic}")},
+    )
+
+
+def _space(topic: str) -> str:
+    """Where a camera's topics are: ``/stereo/left`` of ``/stereo/left/image_raw/compressed``."""
+    return topic.removesuffix("/compressed").rpartition("/")[0]
+
+
+def _pair(bag: Bag) -> tuple[Camera, Camera]:
+    """Left and right camera."""
+    infos = {_space(connection.topic): connection for connection in bag.connections(CAMERA_INFO)}
+    streams: dict[str, Any] = {}
+    for connection in bag.connections(IMAGE, COMPRESSED):
+        space = _space(connection.topic)
+        # Rectified before raw, uncompressed before compressed.
+        if space in infos and (space not in streams or _rank(connection) < _rank(streams[space])):
+            streams[space] = connection
+    if len(streams) > 2:
+        sides = {space: connection for space, connection in streams.items() if "left" in space or "right" in space}
+        streams = sides if len(sides) == 2 else streams
+    if len(streams) != 2:
+        raise CalibrationError(
+            f"expected two cameras with images and CameraInfo, found {len(streams)}: "
+            f"{printable(', '.join(connection.topic for connection in streams.values())) or 'none'}",
+            field="topics",
+        )
+    cameras = [_camera(bag, streams[space], infos[space]) for space in sorted(streams)]
+    shifts = [camera.projection[0, 3] for camera in cameras]
+    rights = [i for i, shift in enumerate(shifts) if shift < 0]
+    if len(rights) != 1 or shifts[1 - rights[0]] != 0:
+        raise CalibrationError(
+            f"expected P[0, 3] to be 0 for the left camera and negative for the right one, found {shifts[0]:g} and "
+            f"{shifts[1]:g}",
+            field="CameraInfo",
+        )
+    return cameras[1 - rights[0]], cameras[rights[0]]
+
+
+def _rank(connection: Any) -> tuple[bool, bool]:
+    return "rect" not in connection.topic.removesuffix("/compressed").rsplit("/", 1)[
+        -1
+    ], connection.msgtype == COMPRESSED
+
+
+def _camera(bag: Bag, stream: Any, info: Any) -> Camera:
+    first = next(bag.messages(info), None)
+    if first is None:
+        raise LostDataError("there is no message", field=printable(info.topic))
+    return Camera(stream.topic, stream, first, str(first.header.frame_id).lstrip("/"))
+
+
+def _places(bag: Bag, camera: Camera) -> IntArray:
+    """When each image was written, ns, and its stamp, ns, in the order of stamps (T, 2)."""
+    found = np.array([(written, bag.stamp_ns(content)) for written, content in bag.raw(camera.connection)])
+    if not len(found):
+        raise LostDataError("there is no message", field=printable(camera.topic))
+    found = found[np.argsort(found[:, 1], kind="stable")].astype(np.int64)
+    twice = np.diff(found[:, 1]) == 0
+    if twice.any():
+        index = int(np.argmax(twice)) + 1
+        raise StampError(f"two images have the stamp {found[index, 1]} ns", field=printable(camera.topic), index=index)
+    return found
+
+
+def _calibration(left: Camera, right: Camera) -> tuple[PairCalibration, Array]:
+    """The pair, and the rotation (3, 3) from the optical frame of the left camera to that of its images."""
+    size = (int(left.info.width), int(left.info.height))
+    if size != (int(right.info.width), int(right.info.height)):
+        raise CalibrationError("the cameras have different sizes", field="CameraInfo")
+    if left.is_rectified != right.is_rectified:
+        raise CalibrationError("images of one camera are rectified, of the other not", field="topics")
+    P_left, P_right = left.projection, right.projection
+    if not P_right[0, 0] > 0:
+        raise CalibrationError("P has no positive focal length", field="CameraInfo")
+    shift = se3.transform(np.eye(3), np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0]))
+    R_left, R_right = (_rotation(camera) for camera in (left, right))
+    if left.is_rectified:
+        return PairCalibration(P_left[:, :3], P_right[:, :3], size, shift), R_left
+    turn_left, turn_right = (se3.transform(R, np.zeros(3)) for R in (R_left, R_right))
+    T_right_left = se3.inverse(turn_right) @ shift @ turn_left
+    K_left, K_right = (matrix_of(camera.info, "k", 3) for camera in (left, right))
+    return PairCalibration(K_left, K_right, size, T_right_left, _lens(left), _lens(right)), np.eye(3)
+
+
+def _rotation(camera: Camera) -> Array:
+    """Optical frame to that of rectified images; all zeros stand for none."""
+    R = matrix_of(camera.info, "r", 3)
+    if not R.any():
+        return np.eye(3)
+    if not np.abs(R @ R.T - np.eye(3)).max() < 1e-4 or np.linalg.det(R) < 0:
+        raise CalibrationError("R is no rotation", field=f"CameraInfo of {printable(camera.topic)}")
+    return Rotation.from_matrix(R).as_matrix()
+
+
+def _lens(camera: Camera) -> Distortion:
+    coefficients = tuple(float(value) for value in field_of(camera.info, "d"))
+    name = str(camera.info.distortion_model)
+    if not any(coefficients):
+        return Distortion()
+    if name not in _MODELS:
+        raise CalibrationError(
+            f"expected the distortion {', '.join(_MODELS)}, found {printable(name)!r}",
+            field=f"CameraInfo of {printable(camera.topic)}",
+        )
+    return Distortion(_MODELS[name], coefficients)
+
+
+def _velocities(bag: Bag) -> tuple[Velocities | None, str, tuple[str, ...]]:
+    """Velocities, the name of their frame, and notes."""
+    streams = bag.connections(*VELOCITIES)
+    if not streams:
+        return None, "", ("There are no velocities.",)
+    # A twist by itself is more likely to be measured than that of an estimate.
+    chosen = min(streams, key=lambda connection: (VELOCITIES.index(connection.msgtype), connection.topic))
+    others = [connection.topic for connection in streams if connection.topic != chosen.topic]
+    notes = [f"Velocities are those of {printable(chosen.topic)}."]
+    notes += [f"Not used: velocities of {printable(topic)}." for topic in others]
+    rows, frame = [], ""
+    for message in bag.messages(chosen):
+        # With covariance a twist is one level further down.
+        twist = message.twist if hasattr(message.twist, "linear") else message.twist.twist
+        name = message.child_frame_id if chosen.msgtype == ODOMETRY else message.header.frame_id
+        frame = frame or str(name).lstrip("/")
+        linear, angular = twist.linear, twist.angular
+        rows.append([stamp_of(message), linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
+    table = np.array(rows, dtype=float).reshape(-1, 7)
+    topic = printable(chosen.topic)
+    if len(table) < 2:
+        raise LostDataError(f"{len(table)} messages; two are needed", field=topic)
+    if not np.isfinite(table).all():
+        raise UnknownFormatError(f"{bag.path}: {topic}: velocities are NaN or infinite")
+    if (np.diff(table[:, 0]) <= 0).any():
+        index = int(np.argmax(np.diff(table[:, 0]) <= 0)) + 1
+        raise StampError("the stamp does not increase", field=topic, index=index)
+    return Velocities(str(bag.path), table[:, 0], table[:, 1:], "imu", None, {}, ()), frame, tuple(notes)
+
+
+def _body(bag: Bag, left: Camera, frame: str) -> tuple[Array, str]:
+    """Body to the optical frame of the left camera (4, 4), and what it is, in words."""
+    if frame and frame == left.frame:
+        return np.eye(4), "The velocities are those of the left optical frame, which is the body."
+    T = _transform(bag, left.frame, frame) if frame else None
+    if T is not None:
+        return T, f"T_cam_imu is that of {printable(frame)} to {printable(left.frame)} in /tf_static."
+    missing = f"/tf_static does not connect {printable(frame)} and {printable(left.frame)}: " if frame else ""
+    note = f"{missing}the body is the left camera, its axes forward, left and up."
+    return se3.transform(R_CAM_BODY, np.zeros(3)), note[0].upper() + note[1:]
+
+
+def _transform(bag: Bag, target: str, source: str) -> Array | None:
+    """``T_target_source`` (4, 4) through the tree of static transforms; None where nothing connects them."""
+    edges: dict[str, list[tuple[str, Array]]] = {}
+    for connection in bag.connections(TRANSFORMS):
+        if connection.topic.lstrip("/") != "tf_static":
+            continue
+        for message in bag.messages(connection):
+            for entry in message.transforms:
+                parent, child = (str(name).lstrip("/") for name in (entry.header.frame_id, entry.child_frame_id))
+                T_parent_child = transform_of(entry.transform)
+                edges.setdefault(parent, []).append((child, T_parent_child))
+                edges.setdefault(child, []).append((parent, se3.inverse(T_parent_child)))
+    reached = {target: np.eye(4)}
+    waiting = [target]
+    while waiting:
+        here = waiting.pop()
+        for there, T_here_there in edges.get(here, ()):
+            if there not in reached:
+                reached[there] = reached[here] @ T_here_there
+                waiting.append(there)
+    return reached.get(source)
+
+
+def _recognises(source: Source) -> bool:
+    if source.head.startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC)):
+        return True
+    return source.path.is_dir() and first_line(source.path / "metadata.yaml").startswith("rosbag2_bagfile_information")
+
+
+IMAGE_READER = ImageReader(NAME, "a bag of ROS 1 or ROS 2, or MCAP", _recognises, lambda source: open_bag(source.path))

@@ -1,0 +1,167 @@
+"""EuRoC MAV and TUM-VI: a folder with ``mav0/cam0 cam1`` (or that of ``mav0`` itself), ``data.csv``, ``sensor.yaml``.
+
+Burri et al., *The EuRoC micro aerial vehicle datasets* (IJRR 2016). Schubert et al., *The TUM VI Benchmark* (IROS
+2018): its folders may have the calibration of Kalibr, ``dso/camchain.yaml``, in place of ``sensor.yaml``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.images.folders import pair_stamps
+from ekfslam.data.images.pairs import Distortion, DistortionModel, ImageRecording, PairCalibration
+from ekfslam.data.images.pixels import PairFiles
+from ekfslam.data.images.registry import ImageReader
+from ekfslam.data.images.yaml import Calibration, read_yaml
+from ekfslam.data.readers.euroc import find_euroc_truth, read_euroc
+from ekfslam.data.readers.fields import checksum, spelled_as_in
+from ekfslam.data.readers.text import line_of, read_lines, rows_of
+from ekfslam.data.readers.truth import truth_of_frames
+from ekfslam.data.sequence import require_rigid
+from ekfslam.errors import CalibrationError, ExtrinsicsError, LineError, LostDataError, StampError
+from ekfslam.geometry import se3
+
+NAME = "euroc_images"
+CAMERAS = ("cam0", "cam1")
+_MODELS: dict[str, DistortionModel] = {
+    "radial-tangential": "radtan",
+    "radtan": "radtan",
+    "equidistant": "equidistant",
+    "none": "none",
+}
+_KALIBR = ("dso/camchain.yaml", "camchain.yaml")
+
+
+def open_euroc(folder: Path) -> ImageRecording:
+    """The images of a recording, its calibration, and its truth where there is any.
+
+    The body is that of ``sensor.yaml``, the IMU. There are no velocities: an IMU measures turning and acceleration.
+
+    Raises:
+        UnknownFormatError: A file is missing or no text.
+        CalibrationError: A key is missing, or a camera is of another model than a pinhole.
+        ExtrinsicsError: A camera's pose is not rigid.
+        LineError, StampError: A line of ``data.csv`` is malformed.
+        LostDataError: An image is missing, or less than 90 % of the images have a partner.
+    """
+    mav = _mav(folder) or folder
+    (left_ns, left), (right_ns, right) = (_images(mav / name) for name in CAMERAS)
+    in_left, in_right, notes = pair_stamps(left_ns, right_ns, str(mav))
+    calibration, T_cam_imu, read = _calibration(mav)
+    time_s = left_ns[in_left] / 1e9
+    files = PairFiles([left[i] for i in in_left], [right[i] for i in in_right], calibration.size)
+    truth, found = None, find_euroc_truth(mav)
+    if found is not None:
+        truth = truth_of_frames(time_s, read_euroc(found))
+        notes = (*notes, f"Truth of {len(truth.frame)} of {len(time_s)} frames from {found.relative_to(mav)}.")
+    return ImageRecording(
+        name=folder.resolve().name if folder.resolve().name != "mav0" else folder.resolve().parent.name,
+        source=str(folder),
+        time_s=time_s,
+        calibration=calibration,
+        load=files,
+        T_cam_imu=T_cam_imu,
+        truth=truth if truth is not None and len(truth.frame) else None,
+        notes=("There are no velocities, only those of turning and accelerations of the IMU.", *notes),
+        attributes={
+            "reader": NAME,
+            "checksum_sha256": checksum(*(mav / name / "data.csv" for name in CAMERAS), *read),
+        },
+    )
+
+
+def _mav(folder: Path) -> Path | None:
+    """The folder of the cameras."""
+    return next((place for place in (folder / "mav0", folder) if (place / CAMERAS[0] / "data.csv").is_file()), None)
+
+
+def _images(camera: Path) -> tuple[IntArray, list[Path]]:
+    """Stamps (ns), which increase, and files of a camera."""
+    path = camera / "data.csv"
+    stamps: list[int] = []
+    files: list[Path] = []
+    there = {entry.name for entry in (camera / "data").iterdir()} if (camera / "data").is_dir() else set()
+    for number, content in rows_of(read_lines(path, "expected stamps and names of images")):
+        words = [word.strip() for word in content.split(",")]
+        if len(words) < 2 or not words[0].isdigit() or int(words[0]) >= 1 << 63:
+            if not stamps and not any(word.isdigit() for word in words):
+                continue  # a header without the mark of a comment
+            raise LineError(f"{content!r} is no stamp in ns and a name", **line_of(path, number))
+        if words[1] not in there:
+            raise LostDataError(f"the image {words[1]} is missing in {camera / 'data'}", **line_of(path, number))
+        stamp = int(words[0])
+        if stamps and stamp <= stamps[-1]:
+            raise StampError("the stamp does not increase", **line_of(path, number))
+        stamps.append(stamp)
+        files.append(camera / "data" / words[1])
+    if not stamps:
+        raise LineError("there are no images", source=str(path), field="line")
+    return np.array(stamps, dtype=np.int64), files
+
+
+def _calibration(mav: Path) -> tuple[PairCalibration, Array, tuple[Path, ...]]:
+    """The pair, ``T_cam_imu`` of its left camera, and the files read."""
+    kalibr = next((place / name for place in (mav, mav.parent) for name in _KALIBR if (place / name).is_file()), None)
+    paths = [mav / name / "sensor.yaml" for name in CAMERAS]
+    if not paths[0].is_file() and kalibr is not None:
+        read = read_yaml(kalibr)
+        cameras = [_camera(read, f"{name}.", "distortion_coeffs") for name in CAMERAS]
+        poses = [_kalibr_pose(read, name) for name in CAMERAS]
+        paths = [kalibr]
+    else:
+        reads = [read_yaml(path) for path in paths]
+        cameras = [_camera(read, "", "distortion_coefficients") for read in reads]
+        poses = [se3.inverse(_pose(read, "T_BS.data" if "T_BS.data" in read else "T_BS")) for read in reads]
+    (K_left, size, lens_left), (K_right, size_right, lens_right) = cameras
+    with spelled_as_in(str(paths[-1])):
+        if size_right != size:
+            raise CalibrationError(f"{size_right} differs from {size} of the left camera", field="resolution")
+        T_right_left = poses[1] @ se3.inverse(poses[0])
+        return PairCalibration(K_left, K_right, size, T_right_left, lens_left, lens_right), poses[0], tuple(paths)
+
+
+def _camera(read: Calibration, prefix: str, coefficients: str) -> tuple[Array, tuple[int, int], Distortion]:
+    """Intrinsic matrix, size and lens of a camera."""
+    if read.word(f"{prefix}camera_model") != "pinhole":
+        raise CalibrationError(
+            f"expected pinhole, found {read.word(f'{prefix}camera_model')!r}",
+            source=str(read.path),
+            field=f"{prefix}camera_model",
+        )
+    fu, fv, cu, cv = read.numbers(f"{prefix}intrinsics", 4)
+    width, height = read.numbers(f"{prefix}resolution", 2)
+    name = read.word(f"{prefix}distortion_model")
+    if name not in _MODELS:
+        raise CalibrationError(
+            f"expected {', '.join(_MODELS)}, found {name!r}", source=str(read.path), field=f"{prefix}distortion_model"
+        )
+    values = () if _MODELS[name] == "none" else tuple(read.numbers(f"{prefix}{coefficients}").tolist())
+    with spelled_as_in(str(read.path), {"distortion": f"{prefix}{coefficients}"}):
+        lens = Distortion(_MODELS[name], values)
+    return np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]]), (int(width), int(height)), lens
+
+
+def _pose(read: Calibration, key: str) -> Array:
+    pose = read.numbers(key, 16).reshape(4, 4)
+    with spelled_as_in(str(read.path)):
+        require_rigid(pose, key, ExtrinsicsError)
+    return se3.nearest_rigid(pose)
+
+
+def _kalibr_pose(read: Calibration, name: str) -> Array:
+    """``T_cam_imu`` of a camera, which Kalibr states for each, or for the second by that of the first."""
+    key = f"{name}.T_cam_imu"
+    if key not in read and f"{name}.T_cn_cnm1" in read:
+        return _pose(read, f"{name}.T_cn_cnm1") @ _kalibr_pose(read, CAMERAS[0])
+    return _pose(read, key)
+
+
+IMAGE_READER = ImageReader(
+    NAME,
+    "a folder of EuRoC or TUM-VI (mav0/cam0 cam1)",
+    lambda source: _mav(source.path) is not None,
+    lambda source: open_euroc(source.path),
+)

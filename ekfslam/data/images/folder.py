@@ -1,0 +1,193 @@
+"""A plain pair of image folders with a calibration of one's own: a folder with ``calibration.toml``, or that file.
+
+::
+
+    left = "left"                       # folders of images, beside this file; those of equal names belong together
+    right = "right"
+    times = "times.txt"                 # a stamp a line, s; or rate_hz = 10.0
+    T_right_left = [[1, 0, 0, -0.54], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+                                        # left optical frame to right optical frame; or baseline_m = 0.54
+    T_cam_imu = [...]                   # optional: IMU to left optical frame
+    velocities = "velocities.csv"       # optional, see `ekfslam.data.velocities`
+
+    [left_camera]
+    intrinsics = [707.0, 707.0, 602.0, 183.0]       # fu, fv, cu, cv in px
+    distortion_model = "radtan"                     # optional: none, radtan, equidistant
+    distortion = [-0.28, 0.07, 0.0, 0.0]
+
+    [right_camera]                      # optional: as the left one
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.data.images.folders import images_in
+from ekfslam.data.images.pairs import Distortion, ImageRecording, PairCalibration
+from ekfslam.data.images.pixels import PairFiles, size_of
+from ekfslam.data.images.registry import ImageReader
+from ekfslam.data.readers.fields import checksum, spelled_as_in
+from ekfslam.data.readers.registry import Source
+from ekfslam.data.readers.text import first_row, parse_table, read_lines
+from ekfslam.data.sequence import require_rigid
+from ekfslam.data.velocities import attach_velocities
+from ekfslam.errors import CalibrationError, DataError, ExtrinsicsError, LostDataError, UnknownFormatError
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import R_CAM_BODY
+
+NAME = "image_folders"
+FILE = "calibration.toml"
+_KEYS = {"left", "right", "times", "rate_hz", "T_right_left", "baseline_m", "T_cam_imu", "velocities"}
+_TABLES = {"left_camera", "right_camera"}
+_CAMERA_KEYS = {"intrinsics", "distortion_model", "distortion"}
+
+
+def open_folder(path: Path) -> ImageRecording:
+    """The images that a calibration describes, see this module.
+
+    Without ``T_cam_imu`` the body is the left camera, its axes forward, left and up.
+
+    Args:
+        path: ``calibration.toml``, or its folder.
+
+    Raises:
+        UnknownFormatError: A file or folder is missing, or the calibration is no TOML.
+        CalibrationError: A key is missing, unknown or malformed.
+        LostDataError: An image has no partner, or no stamp.
+        DataError: A calibration means nothing, or velocities are malformed; the subclass says how.
+    """
+    file = _file_of(path)
+    folder = file.parent
+    values = _parsed(file)
+    left, right = (images_in(folder / _text(values, key, file)) for key in ("left", "right"))
+    alone = sorted({image.stem for image in left} ^ {image.stem for image in right})
+    if alone:
+        raise LostDataError(f"{len(alone)} images have no partner, the first is {alone[0]}", source=str(folder))
+    size = size_of(left[0])
+    with spelled_as_in(str(file)):
+        recording = ImageRecording(
+            name=folder.resolve().name,
+            source=str(path),
+            time_s=_stamps(values, folder, file, len(left)),
+            calibration=_pair(values, size),
+            load=PairFiles(left, right, size),
+            T_cam_imu=_matrix(values, "T_cam_imu") if "T_cam_imu" in values else se3.transform(R_CAM_BODY, np.zeros(3)),
+            notes=_notes(values),
+            attributes={"reader": NAME, "checksum_sha256": checksum(file)},
+        )
+    if "velocities" not in values:
+        return recording
+    return attach_velocities(recording, folder / _text(values, "velocities", file))
+
+
+def _file_of(path: Path) -> Path:
+    return path / FILE if path.is_dir() else path
+
+
+def _notes(values: dict[str, Any]) -> tuple[str, ...]:
+    notes = () if "velocities" in values else ("There are no velocities.",)
+    if "T_cam_imu" in values:
+        return notes
+    return (*notes, "There is no T_cam_imu: the body is the left camera, its axes forward, left and up.")
+
+
+def _parsed(file: Path) -> dict[str, Any]:
+    text = "\n".join(read_lines(file, f"expected {FILE}"))
+    try:
+        values = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise UnknownFormatError(f"{file}: not a TOML file ({error})") from None
+    tables = [("", values, _KEYS | _TABLES)]
+    tables += [(f"{name}.", values[name], _CAMERA_KEYS) for name in _TABLES if isinstance(values.get(name), dict)]
+    for prefix, table, known in tables:
+        for key in table:
+            if key not in known:
+                message = f"unknown key; known: {', '.join(sorted(known))}"
+                raise CalibrationError(message, source=str(file), field=prefix + key)
+    return values
+
+
+def _text(values: dict[str, Any], key: str, file: Path) -> str:
+    if not isinstance(values.get(key), str):
+        raise CalibrationError("expected the name of a file or folder", source=str(file), field=key)
+    return values[key]
+
+
+def _stamps(values: dict[str, Any], folder: Path, file: Path, count: int) -> Array:
+    """Stamps (count,) of the images."""
+    if ("times" in values) == ("rate_hz" in values):
+        raise CalibrationError("expected either times or rate_hz", field="times")
+    if "rate_hz" in values:
+        rate = values["rate_hz"]
+        if not (isinstance(rate, int | float) and 1e-6 < rate < 1e6):
+            raise CalibrationError(f"expected a positive rate, found {rate!r}", field="rate_hz")
+        return np.arange(count) / rate
+    path = folder / _text(values, "times", file)
+    times = parse_table(read_lines(path, "expected a stamp a line"), path, columns=1).values[:, 0]
+    if len(times) != count:
+        raise LostDataError(f"{len(times)} stamps for {count} images", source=str(path))
+    return times
+
+
+def _pair(values: dict[str, Any], size: tuple[int, int]) -> PairCalibration:
+    K_left, lens_left = _camera(values, "left_camera")
+    K_right, lens_right = _camera(values, "right_camera") if "right_camera" in values else (K_left, lens_left)
+    if ("T_right_left" in values) == ("baseline_m" in values):
+        raise CalibrationError("expected either T_right_left or baseline_m", field="T_right_left")
+    if "baseline_m" in values:
+        baseline = values["baseline_m"]
+        if not (isinstance(baseline, int | float) and 0 < baseline < 1e6):
+            raise CalibrationError(f"expected a positive length, found {baseline!r}", field="baseline_m")
+        T_right_left = se3.transform(np.eye(3), np.array([-baseline, 0.0, 0.0]))
+    else:
+        T_right_left = _matrix(values, "T_right_left")
+        require_rigid(T_right_left, "T_right_left", ExtrinsicsError)
+    return PairCalibration(K_left, K_right, size, T_right_left, lens_left, lens_right)
+
+
+def _camera(values: dict[str, Any], name: str) -> tuple[Array, Distortion]:
+    table = values.get(name)
+    if not isinstance(table, dict):
+        raise CalibrationError("this table is missing", field=name)
+    fu, fv, cu, cv = _numbers(table.get("intrinsics"), (4,), f"{name}.intrinsics")
+    model = table.get("distortion_model", "none")
+    coefficients = _numbers(table.get("distortion", []), (None,), f"{name}.distortion")
+    try:
+        lens = Distortion(model, tuple(coefficients.tolist()))
+    except DataError as error:
+        raise CalibrationError(error.message, field=f"{name}.{error.field}") from None
+    return np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]]), lens
+
+
+def _matrix(values: dict[str, Any], key: str) -> Array:
+    return _numbers(values.get(key), (4, 4), key)
+
+
+def _numbers(value: Any, shape: tuple[int | None, ...], name: str) -> Array:
+    """An array of finite numbers of a shape, where None stands for any length."""
+    try:
+        found = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        found = np.full(1, np.nan)
+    fits = len(found.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, found.shape, strict=True))
+    if not fits or not np.isfinite(found).all():
+        wanted = " x ".join("n" if n is None else str(n) for n in shape)
+        raise CalibrationError(f"expected {wanted} numbers", field=name)
+    return found
+
+
+def _recognises(source: Source) -> bool:
+    file = _file_of(source.path)
+    if source.path.is_dir():
+        return file.is_file()
+    return file.suffix == ".toml" and bool(first_row(file)) and b"\x00" not in source.head
+
+
+IMAGE_READER = ImageReader(
+    NAME, f"a folder with {FILE} of a pair of image folders", _recognises, lambda source: open_folder(source.path)
+)

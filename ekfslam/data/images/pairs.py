@@ -1,0 +1,182 @@
+"""What every source of stereo images gives: one validated recording of image pairs, with its calibration.
+
+Sources only read. `ekfslam.frontend` rectifies the pairs and makes tracks of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ekfslam.arrays import Array
+from ekfslam.data.noise import Noise
+from ekfslam.data.sequence import (
+    Truth,
+    VelocityFrame,
+    frozen,
+    require_finite,
+    require_rigid,
+    require_shape,
+    validate_stamps,
+    validate_truth,
+)
+from ekfslam.errors import CalibrationError, DataError, ExtrinsicsError
+from ekfslam.geometry import se3
+from ekfslam.names import printable
+
+Image = NDArray[np.uint8]
+DistortionModel = Literal["none", "radtan", "equidistant"]
+
+# How many coefficients a model may have.
+_COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
+_LARGEST_SIDE_PX = 1 << 15  # what OpenCV can remap
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """How a lens departs from a pinhole.
+
+    Args:
+        model: ``none``, ``radtan`` (radial and tangential, Brown 1966) or ``equidistant`` (Kannala and Brandt 2006).
+        coefficients: ``(k1, k2, p1, p2[, k3[, k4, k5, k6]])`` of radtan, ``(k1, k2, k3, k4)`` of equidistant.
+    """
+
+    model: DistortionModel = "none"
+    coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.model not in get_args(DistortionModel):
+            raise CalibrationError(
+                f"expected {', '.join(get_args(DistortionModel))}, found {self.model!r}", field="distortion"
+            )
+        object.__setattr__(self, "coefficients", tuple(float(value) for value in self.coefficients))
+        allowed = _COEFFICIENTS[self.model]
+        if len(self.coefficients) not in allowed:
+            wanted = " or ".join(map(str, allowed))
+            raise CalibrationError(
+                f"{self.model} has {wanted} coefficients, found {len(self.coefficients)}", field="distortion"
+            )
+        require_finite(np.array(self.coefficients), "distortion")
+
+
+@dataclass(frozen=True)
+class PairCalibration:
+    """Calibration of two cameras, rectified or not.
+
+    Args:
+        K_left, K_right: (3, 3) intrinsic matrices, px.
+        size: Width and height of the images, px; the same for both.
+        T_right_left: (4, 4) left optical frame to right optical frame; the right camera of a rectified pair is at
+            ``-baseline`` along x.
+        distortion_left, distortion_right: Of the lenses.
+
+    Raises:
+        CalibrationError: Intrinsics are singular or mirrored, the size is no size, or the cameras coincide.
+        ExtrinsicsError: ``T_right_left`` is not rigid.
+    """
+
+    K_left: Array
+    K_right: Array
+    size: tuple[int, int]
+    T_right_left: Array
+    distortion_left: Distortion = field(default_factory=Distortion)
+    distortion_right: Distortion = field(default_factory=Distortion)
+
+    def __post_init__(self) -> None:
+        for name in ("K_left", "K_right"):
+            K = np.asarray(getattr(self, name), dtype=float)
+            require_shape(K, (3, 3), name)
+            require_finite(K, name, 1e7)
+            if K[0, 0] <= 0 or K[1, 1] <= 0 or (K[2] != (0, 0, 1)).any() or K[1, 0] != 0:
+                raise CalibrationError("not an intrinsic matrix: upper triangular, positive focal lengths", field=name)
+            object.__setattr__(self, name, frozen(K))
+        size = tuple(int(side) for side in self.size)
+        if len(size) != 2 or not all(0 < side < _LARGEST_SIDE_PX for side in size):
+            raise CalibrationError(f"expected width and height of an image, found {self.size}", field="size")
+        object.__setattr__(self, "size", size)
+        T = np.asarray(self.T_right_left, dtype=float)
+        require_shape(T, (4, 4), "T_right_left")
+        require_finite(T, "T_right_left", 1e9)
+        require_rigid(T, "T_right_left", ExtrinsicsError)
+        if not np.linalg.norm(T[:3, 3]) > 0:
+            raise CalibrationError("the two cameras are at the same place", field="T_right_left")
+        object.__setattr__(self, "T_right_left", frozen(se3.nearest_rigid(T)))
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether rows agree already: no distortion, equal intrinsics without skew, and a shift along x alone."""
+        T = self.T_right_left
+        shifted = np.eye(4)
+        shifted[0, 3] = T[0, 3]
+        return (
+            self.distortion_left.model == self.distortion_right.model == "none"
+            and bool((self.K_left == self.K_right).all())
+            and self.K_left[0, 1] == 0
+            and T[0, 3] < 0
+            and bool(np.abs(T - shifted).max() < 1e-9)
+        )
+
+
+@dataclass(frozen=True)
+class ImageRecording:
+    """One recording of stereo images, with or without body velocities.
+
+    Args:
+        name: Short name, used for folders and titles.
+        source: Where it came from, used in error messages.
+        time_s: (T,) strictly increasing stamps.
+        calibration: Of the pair.
+        load: Left and right image of frame k as (height, width) uint8; raises `UnknownFormatError` or `DataError`. It
+            keeps nothing, may be called in any order, and must not change.
+        T_cam_imu: (4, 4) IMU to the optical frame of the left camera, as it is before rectification.
+        twist: (T, 6) measured velocities ``[v; w]`` in ``velocity_frame``, ``twist[k]`` drives ``(t[k-1], t[k]]``;
+            None where nobody measured any.
+        velocity_frame: See `ekfslam.Sequence`.
+        truth: Ground truth, if there is any.
+        noise: Noise as stated by the source, if it states any.
+        notes: What the reader found and did about it, one sentence each.
+        attributes: Further facts to keep with every result.
+
+    Raises:
+        DataError: A field is malformed; the subclass says how.
+    """
+
+    name: str
+    source: str
+    time_s: Array
+    calibration: PairCalibration
+    load: Callable[[int], tuple[Image, Image]]
+    T_cam_imu: Array
+    twist: Array | None = None
+    velocity_frame: VelocityFrame = "imu"
+    truth: Truth | None = None
+    noise: Noise | None = None
+    notes: tuple[str, ...] = ()
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "T_cam_imu") if self.twist is None else ("time_s", "T_cam_imu", "twist"):
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
+        try:
+            validate_stamps(self.time_s)
+            if self.twist is not None:
+                require_shape(self.twist, (len(self.time_s), 6), "twist")
+                require_finite(self.twist, "twist", 1e6)
+            require_shape(self.T_cam_imu, (4, 4), "T_cam_imu")
+            require_finite(self.T_cam_imu, "T_cam_imu", 1e9)
+            require_rigid(self.T_cam_imu, "T_cam_imu", ExtrinsicsError)
+            if self.truth is not None:
+                validate_truth(self.truth, len(self.time_s))
+        except DataError as error:
+            if error.source:
+                raise
+            raise type(error)(error.message, source=self.source, field=error.field, index=error.index) from None
+        object.__setattr__(self, "T_cam_imu", frozen(se3.nearest_rigid(self.T_cam_imu)))
+        object.__setattr__(self, "name", printable(self.name))
+
+    def __len__(self) -> int:
+        return len(self.time_s)

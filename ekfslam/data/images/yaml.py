@@ -1,0 +1,72 @@
+"""The numbers and words of a calibration in YAML, as cameras are described by EuRoC and Kalibr.
+
+No more of YAML is read than such files hold: lines ``key: value``, blocks below a key by indentation, and lists of
+numbers in brackets or by dashes, over several lines. Nothing of a file is evaluated.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.data.readers.text import read_lines
+from ekfslam.errors import CalibrationError
+
+_KEY = re.compile(r"(\s*)(?:- )?([A-Za-z_][\w.]*)\s*:(?:\s+(.*)|)$")
+_NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What is written below each key of a file, ``cam0.T_cam_imu``, as text.
+
+    Args:
+        path: The file.
+        values: Text by key; keys within blocks follow those of their blocks after a dot.
+    """
+
+    path: Path
+    values: Mapping[str, str]
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def word(self, key: str) -> str:
+        """A word; raises a `CalibrationError` where it is missing."""
+        if key not in self.values:
+            raise CalibrationError("this key is missing", source=str(self.path), field=key)
+        return self.values[key].strip().strip("\"'")
+
+    def numbers(self, key: str, count: int | None = None) -> Array:
+        """Numbers (n,) below a key; raises a `CalibrationError` where they are missing or not ``count``."""
+        found = np.array([float(text) for text in _NUMBER.findall(self.word(key))])
+        if count is not None and len(found) != count:
+            raise CalibrationError(f"expected {count} numbers, found {len(found)}", source=str(self.path), field=key)
+        return found
+
+
+def read_yaml(path: Path) -> Calibration:
+    """The keys of a file.
+
+    Raises:
+        UnknownFormatError: The file is missing or no text.
+    """
+    values: dict[str, str] = {}
+    above: list[tuple[int, str]] = []
+    for raw in read_lines(path, "expected a calibration in YAML"):
+        line = re.sub(r"(^|\s)#.*$", "", raw).rstrip()
+        if not line or line.startswith(("%", "---")):
+            continue
+        match = _KEY.match(line)
+        if match:
+            depth = len(match.group(1))
+            above = [entry for entry in above if entry[0] < depth] + [(depth, match.group(2))]
+            values[".".join(key for _, key in above)] = match.group(3) or ""
+        elif above:
+            values[".".join(key for _, key in above)] += " " + line
+    return Calibration(path, values)

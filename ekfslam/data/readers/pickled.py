@@ -1,0 +1,216 @@
+"""A pickled dictionary of NumPy arrays in an .npy file, read without running anything that the file names.
+
+``numpy.save`` of a dictionary pickles it. `pickle` calls whatever a file asks for; here a file may ask for arrays,
+their types, scalars and plain containers, and nothing else.
+
+Every operation of the file is looked at before the first runs,
+so that none claims more memory than the file has bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import pickletools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ekfslam.errors import UnknownFormatError
+from ekfslam.limits import Budget, require_file
+from ekfslam.names import printable
+
+MAGIC = b"\x93NUMPY"
+_MOST_OPERATIONS = 2_000_000  # a recording has some hundred, and ten for every image
+_KINDS = "biuf"
+
+# All that pickles of arrays and containers consist of.
+_NUMBERS = {"NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG1", "FLOAT", "BINFLOAT"}
+_TEXTS = {"STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"}
+_BYTES = {"BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"}
+_LISTS = {"EMPTY_LIST", "APPEND", "APPENDS", "LIST", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"}
+_DICTIONARIES = {"EMPTY_DICT", "DICT", "SETITEM", "SETITEMS"}
+_MEMO = {"GET", "BINGET", "LONG_BINGET", "PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"}
+_CALLS = {"GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD"}
+_FRAMES = {"PROTO", "FRAME", "STOP", "MARK", "POP", "POP_MARK"}
+_ALLOWED = _NUMBERS | _TEXTS | _BYTES | _LISTS | _DICTIONARIES | _MEMO | _CALLS | _FRAMES
+
+
+def read_pickled(path: Path, expected: str) -> dict[str, Any]:
+    """The dictionary in an .npy file: arrays of numbers, lists of such, or None by name.
+
+    Raises:
+        UnknownFormatError: The file is damaged, claims more than it has, names anything but arrays and containers, or
+            holds no dictionary; the message ends with what was ``expected``.
+    """
+    require_file(path)
+    try:
+        content = path.read_bytes()
+        Budget(str(path)).take(len(content), "the pickled dictionary")
+        stream = io.BytesIO(content)
+        begin = _header_end(stream)
+        _inspect(stream)
+        stream.seek(begin)
+        found = _plain(_Restricted(stream).load())
+    except (ValueError, TypeError, AttributeError, KeyError, IndexError, EOFError, OverflowError) as error:
+        raise UnknownFormatError(f"{path}: damaged .npy file ({_clean(error)}); {expected}") from None
+    except pickle.UnpicklingError as error:
+        raise UnknownFormatError(f"{path}: {_clean(error)}; {expected}") from None
+    if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
+        raise UnknownFormatError(f"{path}: an .npy file that holds no dictionary; {expected}")
+    return found
+
+
+def _clean(error: Exception) -> str:
+    return printable(str(error))[:200]
+
+
+def _header_end(stream: io.BytesIO) -> int:
+    """Where the header of the .npy ends, which must announce one object."""
+    version = np.lib.format.read_magic(stream)
+    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+    shape, _, dtype = header(stream)
+    if dtype != np.dtype(object) or shape != ():
+        raise pickle.UnpicklingError(f"an array of {dtype} with the shape {shape} instead of a dictionary")
+    return stream.tell()
+
+
+def _inspect(stream: io.BytesIO) -> None:
+    """Refuse operations that arrays and containers do not need, too many of them, and places beyond all that exist."""
+    for count, (operation, argument, _) in enumerate(pickletools.genops(stream), start=1):
+        if operation.name not in _ALLOWED:
+            raise pickle.UnpicklingError(f"the operation {operation.name} is not that of arrays and containers")
+        if count > _MOST_OPERATIONS:
+            raise pickle.UnpicklingError(f"more than {_MOST_OPERATIONS} operations")
+        # A memo grows to the largest place that is asked for.
+        if operation.name.endswith("PUT") and not 0 <= int(argument or 0) <= count:
+            raise pickle.UnpicklingError(f"a memo of {argument} entries after {count} operations")
+
+
+class _Known:
+    """Something that a file may call; it has no attributes to be changed."""
+
+    __slots__ = ("_make",)
+
+    def __init__(self, make: Callable[..., Any]) -> None:
+        self._make = make
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._make(*arguments)
+
+    def __setstate__(self, state: Any) -> NoReturn:
+        raise pickle.UnpicklingError("the file changes a function")
+
+
+class _Type:
+    """A type of numbers, or of objects."""
+
+    __slots__ = ("code", "order")
+
+    def __init__(self, code: str) -> None:
+        self.code, self.order = str(code), "<"
+
+    def __setstate__(self, state: Any) -> None:
+        self.order = str(state[1])
+
+    @property
+    def dtype(self) -> np.dtype:
+        dtype = np.dtype(self.code).newbyteorder(">" if self.order == ">" else "<")
+        if dtype.kind not in _KINDS:
+            raise pickle.UnpicklingError(f"an array of {dtype} instead of numbers")
+        return dtype
+
+
+class _Array:
+    """An array; it takes its values when the file sets its state."""
+
+    __slots__ = ("value",)
+
+    def __init__(self) -> None:
+        self.value: Any = None
+
+    def __setstate__(self, state: Any) -> None:
+        _, shape, kind, is_fortran, values = state
+        if kind.code.startswith("O"):
+            # That of a dictionary, as `numpy.save` wraps it, or a ragged list of images.
+            if math.prod(shape) != len(values):
+                raise ValueError(f"{len(values)} objects for the shape {shape}")
+            self.value = values[0] if shape == () else values
+        else:
+            self.value = _numbers(values, kind, shape, "F" if is_fortran else "C")
+
+
+def _numbers(values: Any, kind: _Type, shape: Any, order: Any) -> NDArray:
+    raw = values.encode("latin-1") if isinstance(values, str) else values
+    return np.frombuffer(raw, kind.dtype).reshape(tuple(int(n) for n in shape), order="F" if order == "F" else "C")
+
+
+def _boxed(array: NDArray) -> _Array:
+    box = _Array()
+    box.value = array
+    return box
+
+
+def _known(ndarray: _Known) -> dict[tuple[str, str], _Known]:
+    """What pickles of arrays call, by module and name, for one file."""
+
+    def reconstruct(kind: Any, shape: Any, code: Any) -> _Array:
+        if kind is not ndarray:
+            raise pickle.UnpicklingError("an array of another class than numpy.ndarray")
+        return _Array()
+
+    def from_buffer(values: Any, kind: _Type, shape: Any, order: Any) -> _Array:
+        return _boxed(_numbers(values, kind, shape, order))
+
+    def scalar(kind: _Type, values: Any) -> Any:
+        return _numbers(values, kind, (), "C").item()
+
+    def encode(text: str, encoding: str) -> bytes:
+        return text.encode("latin-1")  # what `pickle` makes of bytes for Python 2
+
+    found = {("numpy", "ndarray"): ndarray, ("numpy", "dtype"): _Known(lambda code, *_: _Type(code))}
+    found["_codecs", "encode"] = _Known(encode)
+    for module in ("numpy.core", "numpy._core"):
+        found[f"{module}.multiarray", "_reconstruct"] = _Known(reconstruct)
+        found[f"{module}.multiarray", "scalar"] = _Known(scalar)
+        found[f"{module}.numeric", "_frombuffer"] = _Known(from_buffer)
+    return found
+
+
+def _no_array(*_: Any) -> NoReturn:
+    raise pickle.UnpicklingError("the file calls numpy.ndarray")
+
+
+class _Restricted(pickle.Unpickler):
+    """An unpickler to which every name is unknown but those of `_known`."""
+
+    def __init__(self, stream: io.BytesIO) -> None:
+        super().__init__(stream, encoding="latin-1")
+        self._names = _known(_Known(_no_array))
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in self._names:
+            raise pickle.UnpicklingError(f"the file asks for {module}.{name}, which is neither array nor container")
+        return self._names[module, name]
+
+    def persistent_load(self, pid: Any) -> NoReturn:
+        raise pickle.UnpicklingError("the file refers to objects outside of it")
+
+
+def _plain(found: Any) -> Any:
+    """A dictionary with its arrays, one level of lists deep."""
+    found = found.value if isinstance(found, _Array) else found
+    if not isinstance(found, dict):
+        return found
+    return {name: _unboxed(value) for name, value in found.items()}
+
+
+def _unboxed(value: Any) -> Any:
+    value = value.value if isinstance(value, _Array) else value
+    if isinstance(value, list | tuple):
+        return [entry.value if isinstance(entry, _Array) else entry for entry in value]
+    return value

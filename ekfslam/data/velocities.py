@@ -1,0 +1,277 @@
+"""Velocities from elsewhere: a text file, or another recording, brought to the stamps of a recording.
+
+Text is one sample a line: seconds, three linear and three angular velocities (m/s, rad/s), with blanks between them as
+in files of TUM, or with commas. A comment line ``# frame: level`` (or ``imu``) says in which frame they are.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar, cast, get_args
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray
+from ekfslam.data.images.pairs import ImageRecording
+from ekfslam.data.images.registry import image_readers
+from ekfslam.data.interpolation import attributes_of_part, interpolation_attributes, known_intervals
+from ekfslam.data.readers.fields import checksum
+from ekfslam.data.readers.registry import Lateral, Reader, Source, discovered, listed
+from ekfslam.data.readers.text import Table, first_row, parse_table, read_lines
+from ekfslam.data.sequence import WITHOUT_VELOCITIES, Sequence, VelocityFrame
+from ekfslam.errors import ConfigError, LostDataError, StampError, UnknownFormatError
+from ekfslam.geometry import se3
+
+Recording = TypeVar("Recording", Sequence, ImageRecording)
+
+COLUMNS = ("time", "vx", "vy", "vz", "wx", "wy", "wz")
+EXPECTED = f"a text file of {' '.join(COLUMNS)} (s, m/s, rad/s; blanks or commas)"
+MAX_GAP_S = 1.0  # over longer, a velocity is not linear in time
+NO_VELOCITIES = "There are no velocities"  # how a note begins that is true no more when there are some
+_FRAME_LINE = re.compile(r"#\s*frame\s*[:=]\s*(\S+)\s*", re.IGNORECASE)
+_SAME = 1e-3  # of a step, by which stamps of the same instants may differ
+_DENSE = 2.0  # samples an interval from which their mean over it is taken
+
+
+@dataclass(frozen=True)
+class Velocities:
+    """Samples of body velocities.
+
+    Args:
+        source: Where they came from.
+        time_s: (N,) stamps, which increase.
+        twist: (N, 6) ``[v; w]`` in ``velocity_frame``.
+        velocity_frame: See `ekfslam.Sequence`.
+        T_cam_imu: (4, 4) extrinsics of the recording that they are from; None: they are from none.
+        attributes: Of that recording, as far as they concern velocities.
+        notes: What was found, one sentence each.
+    """
+
+    source: str
+    time_s: Array
+    twist: Array
+    velocity_frame: VelocityFrame
+    T_cam_imu: Array | None
+    attributes: dict[str, str | int | float]
+    notes: tuple[str, ...]
+
+
+def attach_velocities(
+    recording: Recording,
+    path: str | Path,
+    *,
+    velocity_frame: VelocityFrame | None = None,
+    lateral: Lateral = "corrected",
+) -> Recording:
+    """A recording, of tracks or of images, with the velocities of a file in place of those it had.
+
+    Each frame gets the velocity of its stamp, linear between samples; where samples come at least twice as often as
+    frames, the mean over the interval that ends at the frame. A frame may be one step outside of the samples.
+
+    Of another recording (any that `ekfslam.open_sequence` knows, or one of images), ``T_cam_imu`` comes along, as its
+    velocities are those of its own IMU; the truth is then of that IMU, too. Where the stamps have nothing in common and
+    one of both counts from 0, the first frame and the first sample are taken as the same instant, and a note says so.
+
+    Args:
+        recording: What lacks velocities.
+        path: Text (see this module) or another recording.
+        velocity_frame: In which frame the velocities are; by default as the file says, and ``imu`` where it does not.
+        lateral: How to take the lateral velocity of KITTI, see `ekfslam.open_sequence`.
+
+    Raises:
+        ConfigError: There is no such frame.
+        UnknownFormatError: The file is missing or of unknown content.
+        StampError: Stamps do not increase.
+        LostDataError: Frames lie outside of the samples, or in a gap between them.
+        DataError: The file is malformed; the subclass says how.
+    """
+    if velocity_frame is not None and velocity_frame not in get_args(VelocityFrame):
+        raise ConfigError(f"the frame of velocities must be imu or level, found {velocity_frame!r}")
+    samples = read_velocities(Path(path), lateral)
+    if velocity_frame is not None:
+        samples = replace(samples, velocity_frame=velocity_frame)
+    found: Velocities = _on_clock_of(samples, recording.time_s, recording.source)
+    twist, how = resample(found, recording.time_s)
+    own = {name: value for name, value in recording.attributes.items() if name not in (*WITHOUT_VELOCITIES, "lateral")}
+    gaps = _interpolated_attributes(found, recording.time_s, twist)
+    note = f"Velocities ({found.velocity_frame} frame) from {path}: {how}."
+    changes: dict[str, Any] = {
+        "twist": twist,
+        "velocity_frame": found.velocity_frame,
+        "notes": (*_still_true(recording.notes), *found.notes, note),
+        "attributes": {**own, **found.attributes, **gaps},
+    }
+    if found.T_cam_imu is not None:
+        changes |= _with_extrinsics(recording, found.T_cam_imu, changes["notes"])
+    return replace(recording, **changes)
+
+
+def read_velocities(path: Path, lateral: Lateral = "corrected") -> Velocities:
+    """The samples of a text file or of a recording; see `attach_velocities` for the arguments and errors."""
+    row = first_row(path) if path.is_file() else ""
+    if len(_words(row)) == len(COLUMNS):
+        return _of_text(path)
+    source = Source.at(path, "corrected", lateral)
+    tracks = next((reader for reader in discovered(Reader) if reader.recognises(source)), None)
+    if tracks is not None:
+        return _of_recording(tracks.open(source), str(path))
+    images = next((reader for reader in image_readers() if reader.recognises(source)), None)
+    if images is not None:
+        return _of_recording(images.open(source), str(path))
+    problem = source.problem or "unknown content"
+    raise UnknownFormatError(f"{path}: no velocities ({problem}); {listed(discovered(Reader))}, or {EXPECTED}")
+
+
+def _words(row: str) -> list[str]:
+    return row.replace(",", " ").split()
+
+
+def _of_text(path: Path) -> Velocities:
+    lines = read_lines(path, f"expected {EXPECTED}")
+    rows, stated = list(lines), ""
+    for number, line in enumerate(lines):
+        match = _FRAME_LINE.fullmatch(line.strip())
+        stated = match.group(1) if match else stated
+        # A header names the columns; it may stand there without the mark of a comment.
+        if re.match(r"\s*[A-Za-z_]", line) and not any(row.split("#")[0].strip() for row in rows[:number]):
+            rows[number] = ""
+    if stated and stated not in get_args(VelocityFrame):
+        raise ConfigError(f"{path}: the frame of velocities must be imu or level, found {stated!r}")
+    separator = "," if "," in "".join(row.split("#")[0] for row in rows) else None
+    table = parse_table(rows, path, columns=len(COLUMNS), separator=separator)
+    if not len(table.values):
+        raise UnknownFormatError(f"{path}: holds no velocities; expected {EXPECTED}")
+    _require_increasing(table)
+    frame = cast(VelocityFrame, stated or "imu")
+    notes = () if stated else (f"{path.name} does not say in which frame its velocities are: they are taken as imu.",)
+    attributes: dict[str, str | int | float] = {"velocities_sha256": checksum(path)}
+    return Velocities(str(path), table.values[:, 0], table.values[:, 1:], frame, None, attributes, notes)
+
+
+def _require_increasing(table: Table) -> None:
+    backwards = np.diff(table.values[:, 0]) <= 0
+    if backwards.any():
+        raise StampError("the stamp does not increase", **table.where(int(np.argmax(backwards)) + 1))
+
+
+def _of_recording(recording: Sequence | ImageRecording, path: str) -> Velocities:
+    twist = recording.twist
+    if twist is None or WITHOUT_VELOCITIES.items() <= recording.attributes.items():
+        raise UnknownFormatError(f"{path}: this recording has no velocities")
+    gaps = known_intervals(recording.attributes, twist)
+    attributes = attributes_of_part({}, gaps)
+    attributes |= {name: value for name, value in recording.attributes.items() if name == "lateral"}
+    if "checksum_sha256" in recording.attributes:
+        attributes["velocities_sha256"] = recording.attributes["checksum_sha256"]
+    notes = tuple(f"{recording.name}: {note}" for note in recording.notes if "velocit" in note)
+    return Velocities(
+        path, recording.time_s, twist, recording.velocity_frame, recording.T_cam_imu, dict(attributes), notes
+    )
+
+
+def _on_clock_of(found: Velocities, time_s: Array, source: str) -> Velocities:
+    """The samples with their stamps on the clock of the frames."""
+    if time_s[0] <= found.time_s[-1] and found.time_s[0] <= time_s[-1]:
+        return found
+    step = _step(time_s)
+    if min(abs(time_s[0]), abs(found.time_s[0])) > step:
+        raise LostDataError(
+            f"samples from {found.time_s[0]:.3f} to {found.time_s[-1]:.3f} s have no time in common with {source}, "
+            f"{time_s[0]:.3f} to {time_s[-1]:.3f} s",
+            source=found.source,
+        )
+    note = f"Stamps of {found.source} are on another clock: its first sample is taken as that of the first frame."
+    shifted = found.time_s - (found.time_s[0] - time_s[0])
+    return replace(found, time_s=shifted, notes=(*found.notes, note))
+
+
+def resample(found: Velocities, time_s: Array) -> tuple[Array, str]:
+    """Velocities (T, 6) at the stamps of frames (T,), see `attach_velocities`, and how they were taken, in words.
+
+    Raises:
+        LostDataError: A frame lies outside of the samples by more than a step, or in a gap of more than `MAX_GAP_S`.
+    """
+    stamps, twist = found.time_s, found.twist
+    if len(stamps) < 2 or len(time_s) < 2:
+        raise LostDataError(f"{len(stamps)} samples for {len(time_s)} frames; two are needed", source=found.source)
+    sample_s, frame_s = _step(stamps), _step(time_s)
+    _require_cover(found, time_s)
+    if sample_s * _DENSE <= frame_s * (1.0 + _SAME):
+        return _means(stamps, twist, time_s), "means of the samples over each interval"
+    nearest = np.clip(np.searchsorted(stamps, time_s - 0.5 * sample_s), 0, len(stamps) - 1)
+    if (np.abs(stamps[nearest] - time_s) <= _SAME * sample_s).all():
+        return twist[nearest], "frames and samples have the same stamps"
+    return _linear(stamps, twist, time_s), "linear between samples"
+
+
+def is_covered(stamps: Array, time_s: Array) -> BoolArray:
+    """Which frames (T,) lie within samples (N,), or at most one step outside."""
+    reach_s = _step(stamps, time_s) * (1.0 + _SAME)
+    return (time_s >= stamps[0] - reach_s) & (time_s <= stamps[-1] + reach_s)
+
+
+def _step(*stamps: Array) -> float:
+    """The longest of the median steps."""
+    return max((float(np.median(np.diff(each))) for each in stamps if len(each) > 1), default=0.0)
+
+
+def _require_cover(found: Velocities, time_s: Array) -> None:
+    stamps = found.time_s
+    outside = ~is_covered(stamps, time_s)
+    if outside.any():
+        first = int(np.argmax(outside))
+        raise LostDataError(
+            f"{int(outside.sum())} of {len(time_s)} frames lie outside of the samples from {stamps[0]:.3f} to "
+            f"{stamps[-1]:.3f} s; the first is frame {first} at {time_s[first]:.3f} s",
+            source=found.source,
+        )
+    reach_s = _step(stamps, time_s)
+    for k in np.flatnonzero(np.diff(stamps) > max(MAX_GAP_S, 2.0 * reach_s)):
+        within = (time_s > stamps[k]) & (time_s < stamps[k + 1])
+        if within.any():
+            raise LostDataError(
+                f"samples have a gap of {stamps[k + 1] - stamps[k]:.3f} s, with {int(within.sum())} frames in it",
+                source=found.source,
+                field="time",
+                index=int(k) + 1,
+            )
+
+
+def _linear(stamps: Array, twist: Array, time_s: Array) -> Array:
+    return np.column_stack([np.interp(time_s, stamps, column) for column in twist.T])
+
+
+def _means(stamps: Array, twist: Array, time_s: Array) -> Array:
+    """Mean over each interval of the line through the samples; the first frame has that of its own stamp."""
+    grid = np.union1d(stamps, time_s)
+    values = _linear(stamps, twist, grid)
+    area = 0.5 * (values[1:] + values[:-1]) * np.diff(grid)[:, None]
+    total = np.vstack([np.zeros(6), np.cumsum(area, axis=0)])[np.searchsorted(grid, time_s)]
+    means = np.diff(total, axis=0) / np.diff(time_s)[:, None]
+    return np.vstack([values[np.searchsorted(grid, time_s[0])], means])
+
+
+def _interpolated_attributes(found: Velocities, time_s: Array, twist: Array) -> dict[str, str | int | float]:
+    """Which intervals of frames were never measured: where those of the samples were not."""
+    if "interpolated" not in found.attributes:
+        return dict(interpolation_attributes(twist))
+    gaps = known_intervals(found.attributes, found.twist)
+    sample = np.clip(np.searchsorted(found.time_s, time_s - _SAME), 0, len(found.time_s) - 1)
+    return attributes_of_part({"interpolated": "0-0"}, gaps[sample])
+
+
+def _still_true(notes: tuple[str, ...]) -> tuple[str, ...]:
+    """Notes of a recording, once it has velocities."""
+    return tuple(note for note in notes if not note.startswith(NO_VELOCITIES))
+
+
+def _with_extrinsics(recording: Sequence | ImageRecording, T_cam_imu: Array, notes: tuple[str, ...]) -> dict[str, Any]:
+    """Changes to a recording whose body becomes the IMU of another."""
+    note = "The body is the IMU of the recording that the velocities are from, and T_cam_imu is its own."
+    changes: dict[str, Any] = {"T_cam_imu": T_cam_imu, "notes": (*notes, note)}
+    if recording.truth is not None:
+        T_old_new = se3.inverse(recording.T_cam_imu) @ T_cam_imu
+        changes["truth"] = replace(recording.truth, T_world_imu=recording.truth.T_world_imu @ T_old_new)
+    return changes

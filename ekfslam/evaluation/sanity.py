@@ -1,0 +1,265 @@
+"""Whether a recording makes sense, and a run after it: what looks wrong is named, one line each.
+
+The evidence is the flow of the tracks. From one frame to the next a point that stereo has located moves in the image
+as velocities, stamps and ``T_cam_imu`` predict it. A mistake in one of these has its own signature: with the mistake
+undone the prediction fits, and with nothing else. So each known mistake is undone in turn, and named where the
+prediction errs much less then. Noise of velocities raises no alarm: it has no such remedy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.sequence import WITHOUT_VELOCITIES, Sequence
+from ekfslam.data.tracks import MOVING_M_S, successive
+from ekfslam.evaluation.trajectory import absolute_trajectory_error, distance_along
+from ekfslam.filters.result import SANITY, SANITY_SEPARATOR, Result
+from ekfslam.geometry import camera as cam
+from ekfslam.geometry import motion, se3
+
+_PAIRS = 5000  # observations that are looked at; more say the same
+_LEAST_PAIRS = 60
+_LEAST_DISPARITY_PX = 2.0
+_SHARE_TURNING = 0.2  # of the frames, in which rotations are looked at
+_BETTER = 0.7  # of the error, which a remedy must leave at most; what is right leaves less than any remedy
+_AS_GOOD = 1.3  # times the least error: of remedies that do as well, the first is the likelier
+_NEAREST_M = 0.1
+_BESIDE_PX = 1e4  # a prediction that is further off is behind the camera, or as good as there
+_BEHIND = 0.5  # share of points without depth from which the images look swapped
+_WINDOW = 10  # frames over which the truth's motion is compared
+_LEAST_TURN = np.radians(6.0)
+_OTHER_WAY = 0.3  # of it, from which the truth is another
+_SAME_LENGTH = 0.1
+_REJECTED = 0.4
+_OFF_TRUTH = 0.1  # ATE as a share of the path, from which the truth is another
+
+
+@dataclass(frozen=True)
+class Sanity:
+    """What `inspect_sequence` found.
+
+    Args:
+        figures: What is normal or not a user may judge, one line each.
+        warnings: What looks wrong, one line each.
+    """
+
+    figures: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Remedy:
+    """A mistake undone.
+
+    Args:
+        text: The mistake, in words.
+        undo: From extrinsics (4, 4), velocities (n, 6) and intervals (n,) to what they should have been.
+    """
+
+    text: str
+    undo: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
+
+
+_OPTICAL = se3.transform(cam.R_CAM_BODY, np.zeros(3))
+
+
+def _signs(*signs: float) -> Callable[[Array, Array, Array], tuple[Array, Array, Array]]:
+    return lambda C, u, tau: (C, u * np.array(signs), tau)
+
+
+def _turned(C: Array, u: Array, tau: Array) -> tuple[Array, Array, Array]:
+    """Velocities along right, down, forward as those along forward, left, up."""
+    return C, np.hstack([u[:, :3] @ cam.R_CAM_BODY, u[:, 3:] @ cam.R_CAM_BODY]), tau
+
+
+_DEGREE = np.pi / 180.0
+_REMEDIES = (
+    _Remedy("T_cam_imu looks inverted", lambda C, u, tau: (se3.inverse(C), u, tau)),
+    _Remedy(
+        "T_cam_imu looks like that of a camera with axes forward, left, up: optical axes (right, down, forward) are "
+        "forgotten",
+        lambda C, u, tau: (_OPTICAL @ C, u, tau),
+    ),
+    _Remedy(
+        "T_cam_imu looks inverted, and optical axes (right, down, forward) are forgotten",
+        lambda C, u, tau: (_OPTICAL @ se3.inverse(C), u, tau),
+    ),
+    _Remedy("angular velocities look like deg/s instead of rad/s", _signs(1, 1, 1, _DEGREE, _DEGREE, _DEGREE)),
+    _Remedy("stamps look like milliseconds instead of seconds", lambda C, u, tau: (C, u, 1e-3 * tau)),
+    _Remedy("stamps look like microseconds instead of seconds", lambda C, u, tau: (C, u, 1e-6 * tau)),
+    _Remedy("stamps look like nanoseconds instead of seconds", lambda C, u, tau: (C, u, 1e-9 * tau)),
+    _Remedy("linear velocities look as if they had the wrong sign", _signs(-1, -1, -1, 1, 1, 1)),
+    _Remedy("angular velocities look as if they had the wrong sign", _signs(1, 1, 1, -1, -1, -1)),
+    _Remedy("all velocities look as if they had the wrong sign", _signs(-1, -1, -1, -1, -1, -1)),
+    _Remedy(
+        "velocities look like those along forward, right, down, while T_cam_imu expects forward, left, up",
+        _signs(1, -1, -1, 1, -1, -1),
+    ),
+    _Remedy("velocities look like those along the camera's axes right, down, forward", _turned),
+)
+
+
+def inspect_sequence(sequence: Sequence) -> Sanity:
+    """Figures of a recording, and what looks wrong in it, before anything is run."""
+    figures, warnings = _tracks_in_front(sequence)
+    tau = np.diff(sequence.time_s, prepend=sequence.time_s[:1])
+    if len(sequence) > 1:
+        figures.insert(0, f"median step {np.median(tau[1:]):.4g} s, longest {tau[1:].max():.4g} s")
+    if len(sequence) < 2 or WITHOUT_VELOCITIES.items() <= sequence.attributes.items():
+        return Sanity(tuple(figures), tuple(warnings))
+    speed = np.linalg.norm(sequence.twist[:, :3], axis=1)
+    path = f"path {float(speed @ tau):.4g} m by velocities"
+    if sequence.truth is not None and len(sequence.truth.frame) > 1:
+        path += f", {distance_along(sequence.truth.T_world_imu)[-1]:.4g} m by truth"
+    turning = np.degrees(np.linalg.norm(sequence.twist[:, 3:], axis=1))
+    figures.append(
+        f"speed {np.median(speed):.3g} m/s, at most {speed.max():.3g}; turning at most {turning.max():.3g} deg/s"
+    )
+    figures.append(path)
+    swapped = bool(warnings)
+    flow, suspicion = _inspect_flow(sequence, tau)
+    figures += flow
+    # Depths are wrong where the images are swapped, and velocities where the flow does not fit.
+    if not swapped:
+        warnings += suspicion or _inspect_truth(sequence)
+    return Sanity(tuple(figures), tuple(warnings))
+
+
+def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]) -> tuple[str, ...]:
+    """What looks wrong after a run, one line each.
+
+    Args:
+        sequence: The recording.
+        result: Of any mode.
+        warnings: What `inspect_sequence` said of the recording: the likely cause.
+    """
+    lines = []
+    accepted, rejected = int(result.innovation.accepted.sum()), int(result.innovation.rejected.sum())
+    if rejected > _REJECTED * max(accepted + rejected, 1):
+        cause = warnings[0] if warnings else "tracks, velocities, stamps and T_cam_imu do not fit each other"
+        lines.append(f"{rejected / (accepted + rejected):.0%} of the observations were rejected: {cause}")
+    truth = sequence.truth
+    if truth is None or len(truth.frame) < 2 or warnings or lines:
+        return tuple(lines)
+    path_m = distance_along(truth.T_world_imu)[-1]
+    error_m = absolute_trajectory_error(result.T_world_imu[truth.frame], truth.T_world_imu, align=True)
+    if error_m > _OFF_TRUTH * path_m and result.mode != "dead-reckoning":
+        lines.append(
+            f"the truth looks like that of another recording: the estimate fits the tracks, and is {error_m:.3g} m off "
+            f"a path of {path_m:.3g} m, aligned"
+        )
+    return tuple(lines)
+
+
+def sanity_attributes(lines: tuple[str, ...]) -> dict[str, str]:
+    """Lines as an attribute of a result, which `Result.remarks` gives back; nothing where there are none."""
+    return {SANITY: SANITY_SEPARATOR.join(lines)} if lines else {}
+
+
+def _tracks_in_front(sequence: Sequence) -> tuple[list[str], list[str]]:
+    """A figure and a warning on points without depth."""
+    pixels = sequence.observations.pixels_px
+    if not len(pixels):
+        return [], []
+    behind = float((pixels[:, 0] <= pixels[:, 2]).mean())
+    figures = [f"{1.0 - behind:.1%} of the observations are of points in front of the camera"]
+    if behind < _BEHIND:
+        return figures, []
+    return figures, [f"left and right images look swapped: {behind:.0%} of the disparities are not positive"]
+
+
+def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]:
+    """How far the velocities predict the flow of the tracks, and the mistake whose remedy predicts it."""
+    earlier, later = _pairs(sequence)
+    if len(earlier) < _LEAST_PAIRS:
+        return [], []
+    at = sequence.observations.frame[later]
+    pixels = sequence.observations.pixels_px
+    seen = np.linalg.norm(pixels[later, :2] - pixels[earlier, :2], axis=1)
+    turning = np.linalg.norm(sequence.twist[at, 3:], axis=1)
+    turns = turning >= np.quantile(turning, 1.0 - _SHARE_TURNING)
+    points = cam.triangulate(sequence.camera, cam.rectified_rows(pixels[earlier], np.ones(4))[0])
+
+    def error_px(C: Array, u: Array, tau: Array) -> tuple[float, float]:
+        """Median distance of predicted and seen, along straight stretches and in turns."""
+        moved = se3.apply(C @ motion.increment(u, tau) @ se3.inverse(C), points)
+        return _off(sequence, moved, pixels[later, :2], turns)
+
+    given = sequence.T_cam_imu, sequence.twist[at], tau[at]
+    straight, turn = error_px(*given)
+    figure = (
+        f"tracks move by {np.median(seen):.3g} px a frame; the velocities predict it to {straight:.3g} px, "
+        f"where the rig turns most to {turn:.3g} px"
+    )
+    found = [(sum(error_px(*remedy.undo(*given))), remedy) for remedy in _REMEDIES]
+    least = min(error for error, _ in found)
+    best, remedy = next(entry for entry in found if entry[0] <= _AS_GOOD * least)
+    if best > _BETTER * (straight + turn):
+        return [figure], []
+    off = f"{0.5 * (straight + turn):.3g} px" if straight + turn < _BESIDE_PX else "out of the image"
+    return [figure], [f"{remedy.text}: the flow of the tracks is predicted {off} off, otherwise {0.5 * best:.2g} px"]
+
+
+def _pairs(sequence: Sequence) -> tuple[IntArray, IntArray]:
+    """Observations of successive frames with depth, while the rig moves and is measured; a part of them, evenly."""
+    observations = sequence.observations
+    earlier, later = successive(observations)
+    pixels = observations.pixels_px
+    beside = observations.frame[later] - observations.frame[earlier] == 1
+    near = pixels[earlier, 0] - pixels[earlier, 2] > _LEAST_DISPARITY_PX
+    moves = (pixels[later] != pixels[earlier]).any(axis=1)
+    measured = ~sequence.interpolated[observations.frame[later]]
+    chosen = np.flatnonzero(beside & near & moves & measured)
+    chosen = chosen[:: max(1, len(chosen) // _PAIRS)]
+    return earlier[chosen], later[chosen]
+
+
+def _off(sequence: Sequence, points: Array, seen: Array, turns: BoolArray) -> tuple[float, float]:
+    """Median distance (px) of images of points (n, 3) from those seen (n, 2): along straight stretches, in turns."""
+    ahead = points[:, 2] > _NEAREST_M
+    image = cam.project(sequence.camera, np.where(ahead[:, None], points, 1.0))[:, :2]
+    off = np.where(ahead, np.minimum(np.linalg.norm(image - seen, axis=1), _BESIDE_PX), _BESIDE_PX)
+    parts = [off[part] for part in (~turns, turns) if part.any()]
+    return float(np.median(parts[0])), float(np.median(parts[-1]))
+
+
+def _inspect_truth(sequence: Sequence) -> list[str]:
+    """Whether the truth moves as the velocities do, over stretches of some frames."""
+    truth = sequence.truth
+    if truth is None or len(truth.frame) <= _WINDOW:
+        return []
+    T = se3.inverse(motion.integrate(np.eye(4), sequence.twist, np.diff(sequence.time_s)))[truth.frame]
+    P = truth.T_world_imu
+    step, true_step = (se3.inverse(poses[:-_WINDOW]) @ poses[_WINDOW:] for poses in (T, P))
+    duration = sequence.time_s[truth.frame[_WINDOW:]] - sequence.time_s[truth.frame[:-_WINDOW]]
+    way = _disagreement(step[:, :3, 3], true_step[:, :3, 3], MOVING_M_S * duration)
+    turn = _disagreement(
+        se3.so3_log(step[:, :3, :3]), se3.so3_log(true_step[:, :3, :3]), np.full(len(step), _LEAST_TURN)
+    )
+    if max(way, turn) < _OTHER_WAY:
+        return []
+    lengths, true_lengths = (np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True) for poses in (step, true_step))
+    if way > _OTHER_WAY and _disagreement(lengths, true_lengths, MOVING_M_S * duration) < _SAME_LENGTH:
+        return [
+            f"the truth looks like poses of another body than the IMU: it moves as far as the velocities say, "
+            f"but another way ({way:.0%} of it apart)"
+        ]
+    how = (
+        f"moves another way than the velocities, {way:.0%} of it"
+        if way > turn
+        else f"turns otherwise, {turn:.0%} of it"
+    )
+    return [f"the truth looks like that of another recording: over {_WINDOW} frames it {how} apart"]
+
+
+def _disagreement(found: Array, true: Array, least: Array) -> float:
+    """Median distance of motions (n, d), as a share of the larger one of both, where that exceeds ``least`` (n,)."""
+    larger = np.maximum(np.linalg.norm(found, axis=1), np.linalg.norm(true, axis=1))
+    moving = larger > least
+    if moving.sum() < _WINDOW:
+        return 0.0
+    return float(np.median(np.linalg.norm(found - true, axis=1)[moving] / larger[moving]))

@@ -1,0 +1,294 @@
+"""Live use: velocities and images as they come, at any rates, in any order within a stated delay.
+
+    live = LiveEKF(JointEKF(Rig(camera, T_cam_imu, noise), config, T_world_imu), delay_s=0.2)
+    live.predict(velocities, t)       # from the odometry
+    live.update(ids, pixels, t)       # from the tracker
+    now = live.pose()                 # at the newest stamp: T_world_imu and the covariance of xi
+
+An image is *taken in* when ``delay_s`` has passed on the clock of the stamps: from then on nothing older can come, and
+before the first velocity none is. So
+the filter behind, ``live.ekf``, is that of the recording in order, whatever order the messages came in. Later poses
+follow from it by the velocities that are there.
+
+A velocity at stamp s holds since the one before, as in a recording. Those between two images act as one: the constant
+velocity that leads to the same pose. Its noise is that of the model, whatever the rate of the velocities.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from bisect import bisect_left, bisect_right
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.sequence import require_finite, require_shape
+from ekfslam.errors import ConfigError, DuplicateObservationError, LateError, MissingVelocityError, StampError
+from ekfslam.filters.joint import JointEKF, without_landmarks
+from ekfslam.filters.reports import FrameReport
+from ekfslam.geometry import motion, se3
+
+
+class Pose(NamedTuple):
+    """A pose at one time.
+
+    Args:
+        time_s: Its stamp.
+        T_world_imu: (4, 4) estimate.
+        covariance: (6, 6) of its error ``xi``, see `ekfslam`.
+        is_held: Whether no velocity of the last stretch was there yet, so that the one before was taken.
+    """
+
+    time_s: float
+    T_world_imu: Array
+    covariance: Array
+    is_held: bool
+
+
+class Driven(NamedTuple):
+    """What drives from one stamp to another: the velocity (6,), and whether part of it was held or across a gap."""
+
+    twist: Array
+    is_held: bool
+    is_gap: bool
+
+
+@dataclasses.dataclass
+class LiveCounts:
+    """What has come, and what became of it: nothing is dropped without being counted.
+
+    Args:
+        velocities, images: Messages that were not late.
+        taken_in: Images that the filter has had.
+        late_velocities, late_images: Older than what the filter has had, hence of no use any more.
+        out_of_order: Messages that came after a later one of their kind, and were not late.
+        held: Images to which no velocity led in time, so that the one before was held.
+        gaps: Images to which velocities led that are more than ``gap_s`` apart.
+    """
+
+    velocities: int = 0
+    images: int = 0
+    taken_in: int = 0
+    late_velocities: int = 0
+    late_images: int = 0
+    out_of_order: int = 0
+    held: int = 0
+    gaps: int = 0
+
+
+class _Velocities:
+    """Velocities in the order of their stamps."""
+
+    def __init__(self) -> None:
+        self.stamps: list[float] = []
+        self._twists: list[Array] = []
+
+    def add(self, twist: Array, t: float) -> None:
+        """Put one in its place."""
+        at = bisect_left(self.stamps, t)
+        if at < len(self.stamps) and self.stamps[at] == t:
+            raise StampError(f"there are two velocities at {t:.6f} s", field="t")
+        self.stamps.insert(at, t)
+        self._twists.insert(at, twist)
+
+    def at(self, t: float) -> Driven:
+        """What holds at a stamp."""
+        at = min(bisect_left(self.stamps, t), len(self.stamps) - 1)
+        return Driven(self._twists[at], self.stamps[-1] < t, False)
+
+    def during(self, begin: float, end: float, gap_s: float) -> Driven:
+        """What drives from one stamp to a later one, as one velocity."""
+        if not self.stamps:
+            raise MissingVelocityError(end)
+        stamps, last = self.stamps, len(self.stamps) - 1
+        first, stop = bisect_right(stamps, begin), min(bisect_left(stamps, end), last)
+        pieces = range(min(first, stop), stop + 1)
+        is_gap = any(i > 0 and stamps[i] - stamps[i - 1] > gap_s for i in pieces)
+        twist = self._twists[stop]
+        if len(pieces) > 1:
+            bounds = np.array([begin, *(stamps[i] for i in pieces[:-1]), end])
+            E = np.eye(4)
+            for step in motion.increment(np.array([self._twists[i] for i in pieces]), np.diff(bounds)):
+                E = step @ E
+            twist = -se3.log(E) / (end - begin)
+        return Driven(twist, stamps[last] < end, is_gap)
+
+    def forget(self, before: float) -> None:
+        """Those before a stamp, but for the last of them, which says since when the next one holds."""
+        keep = max(bisect_right(self.stamps, before) - 1, 0)
+        del self.stamps[:keep], self._twists[:keep]
+
+
+class LiveEKF:
+    """The joint filter behind a window of messages, see the module.
+
+    Args:
+        ekf: The filter, as it starts; with a `MapRevival` if landmarks shall come back.
+        delay_s: How much later than a later message one may come. An image waits for so long; 0: no message does.
+        gap_s: Velocities further apart are worth as little as the noise says of gaps.
+        history_s: How far back `pose` can be asked for.
+        late: Whether a message that is too late is an error, or is counted alone.
+
+    Raises:
+        ConfigError: A time is negative.
+
+    Attributes:
+        ekf: The filter after the last image that was taken in: its ``P``, ``ids``, ``positions_m``, ``covariance_of``.
+        counts: `LiveCounts`.
+        time_s: Stamp of that image; None before the first.
+    """
+
+    def __init__(
+        self,
+        ekf: JointEKF,
+        delay_s: float = 0.0,
+        gap_s: float = np.inf,
+        history_s: float = 1.0,
+        late: Literal["raise", "count"] = "raise",
+    ) -> None:
+        if not (delay_s >= 0 and gap_s > 0 and history_s >= 0):
+            raise ConfigError("delay_s and history_s must not be negative, and gap_s must be positive")
+        self.ekf, self.counts = ekf, LiveCounts()
+        self.delay_s, self.gap_s, self.history_s, self.late = delay_s, gap_s, history_s, late
+        self.time_s: float | None = None
+        self._velocities = _Velocities()
+        self._waiting: list[tuple[float, IntArray, Array]] = []
+        self._newest = {"velocity": -np.inf, "image": -np.inf}
+        self._past: list[tuple[float, JointEKF]] = []
+
+    @property
+    def newest_s(self) -> float:
+        """The newest stamp of all messages; minus infinity before the first."""
+        return max(self._newest.values())
+
+    def predict(self, velocities: ArrayLike, t: float) -> list[FrameReport]:
+        """A measured velocity.
+
+        Args:
+            velocities: (6,) ``[v; w]``, m/s and rad/s, which holds since the stamp of the one before.
+            t: Its stamp in s.
+
+        Returns:
+            Reports on the images that were taken in by it.
+
+        Raises:
+            DataError: No six finite numbers, or a stamp that another velocity has.
+            LateError: The filter has had a later image already.
+            FilterError: The filter cannot go on.
+        """
+        twist = np.array(velocities, dtype=float)
+        require_shape(twist, (6,), "velocities")
+        require_finite(twist, "velocities")
+        if not self._in_time("velocity", t):
+            return []
+        self._velocities.add(twist, t)
+        self.counts.velocities += 1
+        return self._arrived("velocity", t)
+
+    def update(self, ids: ArrayLike, pixels: ArrayLike, t: float) -> list[FrameReport]:
+        """An image: what the tracker sees in it.
+
+        Args:
+            ids: (n,) landmark ids, distinct.
+            pixels: (n, 4) rectified pixels (uL, vL, uR, vR), or what else the sensor measures.
+            t: Its stamp in s.
+
+        Returns:
+            Reports on the images that were taken in by it: without a delay on this one.
+
+        Raises:
+            DataError: Shapes do not agree, a number is none, an id occurs twice, or another image has the stamp.
+            LateError: The filter has had a later image already.
+            FilterError: The filter cannot go on.
+        """
+        landmark, measured = np.array(ids, dtype=np.int64).ravel(), np.array(pixels, dtype=float)
+        measured = measured.reshape(0, 4) if not measured.size else measured
+        require_shape(measured, (len(landmark), None), "pixels")
+        require_finite(measured, "pixels")
+        order = np.argsort(landmark, kind="stable")
+        landmark, measured = landmark[order], measured[order]
+        twice = np.flatnonzero(np.diff(landmark) == 0)
+        if len(twice):
+            raise DuplicateObservationError(f"landmark {landmark[twice[0]]} is observed twice", field="ids")
+        if not self._in_time("image", t):
+            return []
+        at = bisect_left(self._waiting, t, key=lambda image: image[0])
+        if at < len(self._waiting) and self._waiting[at][0] == t:
+            raise StampError(f"there are two images at {t:.6f} s", field="t")
+        self._waiting.insert(at, (t, landmark, measured))
+        self.counts.images += 1
+        return self._arrived("image", t)
+
+    def flush(self) -> list[FrameReport]:
+        """Take in all images that wait, since nothing more will come; reports on them.
+
+        Raises:
+            MissingVelocityError: No velocity has come at all.
+            FilterError: The filter cannot go on.
+        """
+        if self._waiting and not self._velocities.stamps:
+            raise MissingVelocityError(self._waiting[0][0])
+        return self._take_in(np.inf)
+
+    def pose(self, t: float | None = None) -> Pose:
+        """The pose at a stamp, by default the newest one, given the images that were taken in until then.
+
+        Args:
+            t: From ``history_s`` before the last image that was taken in.
+
+        Raises:
+            LateError: It is further back, or nothing has been taken in.
+            MissingVelocityError: No velocity has come.
+        """
+        t = self.newest_s if t is None else t
+        at = bisect_right(self._past, t, key=lambda past: past[0]) - 1
+        if at < 0:
+            raise LateError("pose", t, self._past[0][0] if self._past else None)
+        begin, ekf = self._past[at]
+        is_held = False
+        if t > begin:
+            twist, is_held, is_gap = self._velocities.during(begin, t, self.gap_s)
+            ekf = without_landmarks(ekf)
+            ekf.predict(twist, t - begin, is_gap=is_gap or is_held)
+        return Pose(t, ekf.T_world_imu, ekf.gaussian.body_covariance[:6, :6].copy(), is_held)
+
+    def _in_time(self, kind: Literal["velocity", "image"], t: float) -> bool:
+        """Whether a message is of use; counts it, or raises, where it is not."""
+        require_finite(np.array(t, dtype=float), "t")
+        if self.time_s is None or t > self.time_s:
+            return True
+        if kind == "velocity":
+            self.counts.late_velocities += 1
+        else:
+            self.counts.late_images += 1
+        if self.late == "raise":
+            raise LateError(kind, t, self.time_s)
+        return False
+
+    def _arrived(self, kind: str, t: float) -> list[FrameReport]:
+        self.counts.out_of_order += t < self._newest[kind]
+        self._newest[kind] = max(self._newest[kind], t)
+        return self._take_in(self.newest_s - self.delay_s)
+
+    def _take_in(self, until: float) -> list[FrameReport]:
+        """Take in the images up to a stamp, in their order."""
+        reports = []
+        while self._waiting and self._waiting[0][0] <= until and self._velocities.stamps:
+            (t, ids, measured), begin = self._waiting[0], self.time_s
+            driven = self._velocities.at(t) if begin is None else self._velocities.during(begin, t, self.gap_s)
+            del self._waiting[0]
+            self.counts.held += driven.is_held
+            self.counts.gaps += driven.is_gap
+            if begin is None:
+                self.ekf.begin(driven.twist)
+            else:
+                self.ekf.predict(driven.twist, t - begin, is_gap=driven.is_gap or driven.is_held)
+            reports.append(self.ekf.update(self.counts.taken_in, ids, measured))
+            self.counts.taken_in += 1
+            self.time_s = t
+            self._past.append((t, without_landmarks(self.ekf)))
+            self._past = [past for past in self._past if past[0] >= t - self.history_s]
+            self._velocities.forget(self._past[0][0])
+        return reports

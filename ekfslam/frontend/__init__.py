@@ -1,0 +1,6 @@
+"""The front end: from stereo images to tracks. `track` is its entry; OpenCV is imported only when it runs.
+
+`rectify` makes equal pinholes of the pair; `tracker` goes from frame to frame with `detect` (corners), `match` (first
+disparity), `flow` (Lucas-Kanade), `template` (comparison with first sight) and `geometry.stereo_motion` (consensus);
+`rotation` calibrates the right camera meanwhile.
+"""

@@ -1,0 +1,127 @@
+"""Rectification: image pairs of any calibration as if both cameras were equal pinholes side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, Float32Array
+from ekfslam.data.images.pairs import Distortion, Image, PairCalibration
+from ekfslam.errors import CalibrationError
+from ekfslam.frontend.opencv import opencv
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import StereoCamera
+from ekfslam.geometry.lens import equidistant, radtan
+
+_LEAST_COSINE = 0.5  # between the optical axes, and between them and the plane across the baseline
+
+
+@dataclass(frozen=True)
+class Rectification:
+    """How the images of a pair are warped.
+
+    Args:
+        camera: The rectified pair.
+        T_rectified_left: (4, 4) left optical frame to that of the rectified left camera: a rotation.
+        maps: Of the left and the right image, (height, width, 2) float32 pixels to read; None: as they are.
+        valid: Of both, (height, width) which pixels show something; None: all.
+    """
+
+    camera: StereoCamera
+    T_rectified_left: Array
+    maps: tuple[Float32Array, Float32Array] | None
+    valid: tuple[BoolArray, BoolArray] | None
+
+    def apply(self, left: Image, right: Image) -> tuple[Image, Image]:
+        """The rectified pair."""
+        if self.maps is None:
+            return left, right
+        cv2 = opencv()
+        left, right = (
+            cv2.remap(image, m[..., 0], m[..., 1], cv2.INTER_LINEAR)
+            for image, m in zip((left, right), self.maps, strict=True)
+        )
+        return left, right
+
+
+def rectification(calibration: PairCalibration) -> Rectification:
+    """How to rectify a pair.
+
+    The new x axis is along the baseline, the new optical axis is the mean of the two across it (Fusiello, Trucco and
+    Verri, "A compact algorithm for rectification of stereo pairs", MVA 2000). The focal length is the mean of the
+    four, and the principal point puts the middle of both images into the middle.
+
+    Raises:
+        CalibrationError: The cameras look into different directions, or along the baseline.
+    """
+    T, K_left, K_right = calibration.T_right_left, calibration.K_left, calibration.K_right
+    if calibration.is_rectified:
+        K = K_left
+        return Rectification(StereoCamera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], -T[0, 3]), np.eye(4), None, None)
+    R_rectified_left = _rectifying_rotation(T)
+    rotations = R_rectified_left, R_rectified_left @ T[:3, :3].T
+    f = float(np.mean([K[i, i] for K in (K_left, K_right) for i in (0, 1)]))
+    sides = list(
+        zip((K_left, K_right), (calibration.distortion_left, calibration.distortion_right), rotations, strict=True)
+    )
+    width, height = calibration.size
+    middle = np.mean([_direction_of_middle(K, lens, R, calibration.size) for K, lens, R in sides], axis=0)
+    cu, cv = 0.5 * (np.array([width, height]) - 1.0) - f * middle
+    camera = StereoCamera(f, f, float(cu), float(cv), float(np.linalg.norm(T[:3, 3])))
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    rays = np.stack([(u - cu) / f, (v - cv) / f, np.ones(u.shape)], axis=-1)
+    left, right = (_image(rays @ R, K, lens) for K, lens, R in sides)
+    maps = left.astype(np.float32), right.astype(np.float32)
+    return Rectification(
+        camera,
+        se3.transform(R_rectified_left, np.zeros(3)),
+        maps,
+        (_shows(maps[0], calibration.size), _shows(maps[1], calibration.size)),
+    )
+
+
+def _rectifying_rotation(T_right_left: Array) -> Array:
+    """(3, 3) left optical frame to the rectified one."""
+    R_left_right = T_right_left[:3, :3].T
+    x = -R_left_right @ T_right_left[:3, 3]  # position of the right camera in the left one
+    x /= np.linalg.norm(x)
+    if x[0] < 0:
+        raise CalibrationError("the right camera is left of the left one: are they swapped?", field="T_right_left")
+    ahead = np.array([0.0, 0.0, 1.0]) + R_left_right[:, 2]
+    across = ahead - (ahead @ x) * x
+    if R_left_right[2, 2] < _LEAST_COSINE or np.linalg.norm(across) < 2.0 * _LEAST_COSINE:
+        raise CalibrationError("the cameras do not look side by side, so no rows agree", field="T_right_left")
+    z = across / np.linalg.norm(across)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _direction_of_middle(K: Array, lens: Distortion, R: Array, size: tuple[int, int]) -> Array:
+    """(2,) normalised rectified coordinates of the middle of an image, the distortion inverted by Newton's method."""
+    target = (np.linalg.inv(K) @ (*(0.5 * (np.array(size) - 1.0)), 1.0))[:2]
+    xy = target.copy()
+    for _ in range(20):
+        off, step = target - _distorted(xy, lens), 1e-6
+        J = np.stack([(_distorted(xy + d, lens) - _distorted(xy - d, lens)) / (2 * step) for d in step * np.eye(2)], 1)
+        xy = xy + np.linalg.solve(J, off)
+    ray = R @ (*xy, 1.0)
+    return ray[:2] / ray[2]
+
+
+def _image(rays: Array, K: Array, lens: Distortion) -> Array:
+    """Pixels (..., 2) at which a camera images rays (..., 3); those behind it far outside."""
+    ahead = rays[..., 2:] > 1e-3
+    xy = np.where(ahead, rays[..., :2] / np.where(ahead, rays[..., 2:], 1.0), 0.0)
+    bent = np.concatenate([_distorted(xy, lens), np.ones((*xy.shape[:-1], 1))], axis=-1)
+    return np.where(ahead, (bent @ K.T)[..., :2], -1e6)
+
+
+def _distorted(xy: Array, lens: Distortion) -> Array:
+    if lens.model == "radtan":
+        return radtan(xy, lens.coefficients)
+    return equidistant(xy, lens.coefficients) if lens.model == "equidistant" else xy
+
+
+def _shows(pixels: Float32Array, size: tuple[int, int]) -> BoolArray:
+    """Which pixels (height, width) of a map (height, width, 2) are inside the image that is read."""
+    return np.all((pixels >= 0) & (pixels <= np.array(size) - 1), axis=-1)

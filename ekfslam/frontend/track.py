@@ -1,0 +1,192 @@
+"""From images to tracks: `track` makes a `Sequence` of an `ImageRecording`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.config import FrontEndConfig
+from ekfslam.data.images.pairs import ImageRecording
+from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations, Sequence
+from ekfslam.errors import EmptyTracksError
+from ekfslam.frontend.opencv import one_thread
+from ekfslam.frontend.rectify import rectification
+from ekfslam.frontend.rotation import correction
+from ekfslam.frontend.tracker import Seen, Tracker
+from ekfslam.geometry import motion, se3
+from ekfslam.geometry.camera import StereoCamera
+from ekfslam.progress import progress
+
+
+@dataclass(frozen=True)
+class TrackReport:
+    """What became of the features.
+
+    Args:
+        frames, tracks, observations: How many there are.
+        lengths: (tracks,) observations of each track.
+        losses: How many tracks ended, by reason; the others were there at the end.
+        withheld: Observations that did not move as the rig, and were not reported.
+        refused: Corners without a match in the right image.
+        single: Tracks that one frame alone saw, which are left out.
+        rotation_px: (T, 3) pitch, yaw and roll of the right camera as known after each frame, times the focal length.
+        rotation_std_px: (T, 3) their standard deviations.
+    """
+
+    frames: int
+    tracks: int
+    observations: int
+    lengths: IntArray
+    losses: dict[str, int]
+    withheld: int
+    refused: int
+    single: int
+    rotation_px: Array
+    rotation_std_px: Array
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """One sentence each."""
+        shortest, middle, longest = np.percentile(self.lengths, (10, 50, 90))
+        ended = sum(self.losses.values())
+        reasons = ", ".join(f"{reason} {count}" for reason, count in sorted(self.losses.items(), key=lambda p: -p[1]))
+        found = " ".join(
+            f"{name} {value:+.2f} +- {std:.2f} px,"
+            for name, value, std in zip(
+                ("pitch", "yaw", "roll"), self.rotation_px[-1], self.rotation_std_px[-1], strict=True
+            )
+        )
+        return (
+            f"{self.tracks} tracks with {self.observations} observations, "
+            f"{self.observations / self.frames:.0f} a frame; "
+            f"a track lasts {middle:.0f} frames (median; 10 %: {shortest:.0f}, 90 %: {longest:.0f}).",
+            f"{ended} tracks ended before the last frame: {reasons}.",
+            f"{self.refused} corners had no match in the right image; {self.withheld} observations did not move as the "
+            f"rig, and {self.single} tracks were seen once: both are left out.",
+            f"The right camera is rotated against the calibration by {found} found from the tracks and taken out.",
+        )
+
+
+def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tuple[Sequence, TrackReport]:
+    """Track features through the images of a recording.
+
+    Args:
+        recording: Images, calibration, and velocities if there are any.
+        config: Settings; defaults where None.
+
+    Returns:
+        The recording with tracks, whose camera is the rectified pair; and what became of the features. Where nobody
+        measured velocities, its attributes have `WITHOUT_VELOCITIES` and its velocities are 0.
+
+    Raises:
+        MissingPackageError: There is no OpenCV.
+        CalibrationError: The pair cannot be rectified.
+        EmptyTracksError: Not one feature is seen in both images.
+        UnknownFormatError, DataError: An image cannot be read, or has another size.
+    """
+    config = config or FrontEndConfig()
+    rectified = rectification(recording.calibration)
+    T_cam_imu = rectified.T_rectified_left @ recording.T_cam_imu
+    tracker = Tracker(rectified.camera, config, rectified.valid)
+    seen, vectors, stds = [], [], []
+    with one_thread():
+        for k in progress(range(len(recording)), f"{recording.name}: tracking"):
+            left, right = rectified.apply(*recording.load(k))
+            seen.append(tracker.track(left, right, _prediction(recording, T_cam_imu, k)))
+            vectors.append(tracker.rotation.vector)
+            stds.append(tracker.rotation.std)
+    rotation, std = np.array(vectors), np.array(stds)
+    observations, single = _observations(seen, rotation, rectified.camera, config.settling)
+    if not len(observations):
+        raise EmptyTracksError(
+            "no feature is seen in both images of two frames: is left right, or max_disparity too small?",
+            source=recording.source,
+        )
+    report = TrackReport(
+        len(seen),
+        len(observations.ids),
+        len(observations),
+        np.unique(observations.landmark, return_counts=True)[1],
+        {reason: count for reason, count in tracker.losses.items() if count},
+        tracker.withheld,
+        tracker.refused,
+        single,
+        rotation,
+        std,
+    )
+    return _sequence(recording, rectified.camera, T_cam_imu, observations, report, config), report
+
+
+def _observations(seen: list[Seen], rotation: Array, camera: StereoCamera, settling: int) -> tuple[Observations, int]:
+    """Observations with the rotation of the right camera taken out, and how many tracks one frame alone saw.
+
+    Causal with a start: what is known of the rotation after the first frames is used for these, too.
+
+    Args:
+        seen: By frame.
+        rotation: (T, 3) of the right camera as known after each frame, px.
+        camera: Of the rectified pair.
+        settling: Frames at the start.
+    """
+    frame = np.repeat(np.arange(len(seen)), [len(found.id) for found in seen])
+    ids = np.concatenate([found.id for found in seen])
+    left, right = (np.vstack([getattr(found, side) for found in seen]) for side in ("left", "right"))
+    used = np.maximum(frame, min(settling, len(seen) - 1))
+    pixels = np.hstack([left, right + correction(camera, rotation[used], right)])
+    _, inverse, counts = np.unique(ids, return_inverse=True, return_counts=True)
+    twice = counts[inverse] > 1
+    return Observations(frame[twice], ids[twice], pixels[twice]), int((~twice).sum())
+
+
+def _sequence(
+    recording: ImageRecording,
+    camera: StereoCamera,
+    T_cam_imu: Array,
+    observations: Observations,
+    report: TrackReport,
+    config: FrontEndConfig,
+) -> Sequence:
+    """The recording with tracks instead of images."""
+    return Sequence(
+        name=recording.name,
+        source=recording.source,
+        time_s=recording.time_s,
+        twist=np.zeros((len(recording), 6)) if recording.twist is None else recording.twist,
+        camera=camera,
+        T_cam_imu=T_cam_imu,
+        observations=observations,
+        truth=recording.truth,
+        noise=recording.noise,
+        velocity_frame=recording.velocity_frame,
+        notes=(*recording.notes, *report.lines),
+        attributes={
+            **recording.attributes,
+            **(WITHOUT_VELOCITIES if recording.twist is None else {}),
+            **_account(config, report),
+        },
+    )
+
+
+def _prediction(recording: ImageRecording, T_cam_imu: Array, k: int) -> Array | None:
+    """(4, 4) motion of the camera in the interval before frame k, by the measured velocities; None without any."""
+    if recording.twist is None or k == 0:
+        return None
+    tau_s = float(recording.time_s[k] - recording.time_s[k - 1])
+    return T_cam_imu @ motion.increment(recording.twist[k], tau_s) @ se3.inverse(T_cam_imu)
+
+
+def _account(config: FrontEndConfig, report: TrackReport) -> dict[str, str | int | float]:
+    """Attributes that say how the tracks were made."""
+    settings = {
+        f"front_end_{setting.name}": getattr(config, setting.name)
+        for setting in dataclasses.fields(config)
+        if getattr(config, setting.name) != setting.default
+    }
+    yaw, std = report.rotation_px[-1], report.rotation_std_px[-1]
+    names = ("pitch", "yaw", "roll")
+    found = {f"right_camera_{name}_px": float(value) for name, value in zip(names, yaw, strict=True)}
+    found |= {f"right_camera_{name}_std_px": float(value) for name, value in zip(names, std, strict=True)}
+    return {**CHECKED_TRACKS, **settings, **found}

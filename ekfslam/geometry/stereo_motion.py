@@ -1,0 +1,158 @@
+"""How a stereo rig moved between two frames, from the rows of points that both of them see.
+
+Rows are ``(uL, v, uR)`` of a rectified pair, see `ekfslam.geometry.camera`. A point is triangulated in the frame before
+and projected into the frame now, ``h(z) = pi(T_now_before pi^-1(z))``. Rows have white noise w of standard deviation s
+at both ends, and a track keeps an error c of its disparity in both. The true rows before are estimated with the motion
+(orthogonal distance regression: Boggs, Byrd and Schnabel, SIAM J. Sci. Stat. Comput. 1987):
+
+    r = z_now - h(z_true) - B (z_before - z_true) = w_now - B w_before + k c,    B = dh/dz at z_true
+    k = (I - B) e,    e = (0, 0, 1): the row uR
+    S = s^2 (I + B B^T) + s_c^2 k k^T
+    z_true = z_before + (s^2 B^T - s_c^2 e k^T) S^-1 r
+
+Derivatives at ``z_before`` itself would go along with its noise, and bias whatever shows in small changes of depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import StereoCamera, project, rectified_jacobian, triangulate
+
+_ITERATIONS = 12
+_CONVERGED = 1e-5  # m and rad: a thousandth of a pixel
+_LEAST_DEPTH_M = 0.1
+TRACK_STD_PX = 0.3  # s_c
+_FITS = 9.0  # mean square of a point's rows, in variances
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Two frames brought together.
+
+    Args:
+        T_now_before: (4, 4) coordinates of the camera before to those of the camera now.
+        true_px: (n, 3) rows before, as both frames have them.
+        residual_px: (n, 3) r; infinite for points behind the camera.
+        H: (n, 3, 6) derivative of the prediction by xi, ``T_now_before = exp(xi^) T_hat``.
+        B: (n, 3, 3) derivative of the prediction by the rows before.
+        W: (n, 3, 3) robust weights, 1/px^2.
+    """
+
+    T_now_before: Array
+    true_px: Array
+    residual_px: Array
+    H: Array
+    B: Array
+    W: Array
+
+    @property
+    def information(self) -> Array:
+        """(6, 6) information about xi."""
+        return np.einsum("nij,nik,nkl->jl", self.H, self.W, self.H)
+
+    def gradient(self, by: Array) -> Array:
+        """``sum by^T W r`` of derivatives ``by`` (n, 3, p): (p,)."""
+        r = np.where(np.isfinite(self.residual_px), self.residual_px, 0.0)
+        return np.einsum("nij,nik,nk->j", by, self.W, r)
+
+
+def linearise(
+    camera: StereoCamera,
+    before_px: Array,
+    now_px: Array,
+    T_now_before: Array,
+    true_px: Array,
+    std_px: float,
+    scale: float,
+) -> Alignment:
+    """Residuals, derivatives and weights at a motion.
+
+    Args:
+        camera: Of the rectified pair.
+        before_px, now_px: (n, 3) rows with positive disparity.
+        T_now_before: (4, 4) motion.
+        true_px: (n, 3) what the rows before are taken for.
+        std_px: Standard deviation s of one row.
+        scale: Of the Geman-McClure kernel, in standard deviations; its weight is ``(1 + e^2 / scale^2)^-2``.
+    """
+    q_before = triangulate(camera, true_px)
+    q = se3.apply(T_now_before, q_before)
+    is_ahead = q[:, 2] > _LEAST_DEPTH_M
+    q = np.where(is_ahead[:, None], q, (0.0, 0.0, 1.0))
+    A = rectified_jacobian(camera, q)
+    H = np.concatenate([A, -A @ se3.skew(q)], axis=-1)
+    B = A @ T_now_before[:3, :3] @ np.linalg.inv(rectified_jacobian(camera, q_before))
+    r = now_px - project(camera, q)[:, :3] - (B @ (before_px - true_px)[..., None])[..., 0]
+    k, finite = np.array([0.0, 0.0, 1.0]) - B[..., 2], np.where(is_ahead[:, None], r, 0.0)
+    S = std_px**2 * (np.eye(3) + B @ np.swapaxes(B, -1, -2)) + TRACK_STD_PX**2 * k[..., None] * k[..., None, :]
+    W = np.linalg.inv(S)
+    Wr = (W @ finite[..., None])[..., 0]
+    squared = (finite * Wr).sum(axis=1) / 3.0
+    weight = np.where(is_ahead, (1.0 + squared / scale**2) ** -2, 0.0)
+    moved = before_px + std_px**2 * (np.swapaxes(B, -1, -2) @ Wr[..., None])[..., 0]
+    moved[:, 2] -= TRACK_STD_PX**2 * (k * Wr).sum(axis=1)
+    # Of what does not fit at all, the rows say nothing about each other.
+    fits = (squared < _FITS) & (moved[:, 0] - moved[:, 2] > 0.5 * (before_px[:, 0] - before_px[:, 2]))
+    true_px = np.where(fits[:, None], moved, before_px)
+    return Alignment(T_now_before, true_px, np.where(is_ahead[:, None], r, np.inf), H, B, W * weight[:, None, None])
+
+
+def align(
+    camera: StereoCamera, before_px: Array, now_px: Array, T_now_before: Array, std_px: float = 0.2, scale: float = 2.0
+) -> Alignment:
+    """Robust Gauss-Newton from a first guess of the motion; arguments as in `linearise`."""
+    found = linearise(camera, before_px, now_px, T_now_before, before_px, std_px, scale)
+    for _ in range(_ITERATIONS):
+        # A whisper of a prior keeps the step finite where too few points are left.
+        xi: Array = np.linalg.solve(found.information + 1e-6 * np.eye(6), found.gradient(found.H)).astype(float)
+        T = se3.exp(xi) @ found.T_now_before
+        found = linearise(camera, before_px, now_px, T, found.true_px, std_px, scale)
+        if np.abs(xi).max() < _CONVERGED:
+            break
+    return found
+
+
+def sampled_motion(
+    camera: StereoCamera, before_px: Array, now_px: Array, generator: np.random.Generator, samples: int, limit_px: float
+) -> Array:
+    """The motion (4, 4) on which most points agree, of those that three random points each give (RANSAC).
+
+    Source: Fischler and Bolles, CACM 1981; the motion of three points in closed form is Umeyama's, PAMI 1991.
+
+    Args:
+        camera, before_px, now_px: As in `linearise`; fewer than three points give the identity.
+        generator: Of random numbers.
+        samples: How many to try.
+        limit_px: Largest residual of a point that agrees.
+    """
+    count = len(before_px)
+    if count < 3:
+        return np.eye(4)
+    chosen = np.argsort(generator.random((samples, count)), axis=1)[:, :3]
+    q, p = triangulate(camera, before_px), triangulate(camera, now_px)
+    T = _rigid(q[chosen], p[chosen])
+    moved = se3.apply(T[:, None], q)
+    ahead = moved[..., 2] > _LEAST_DEPTH_M
+    predicted = project(camera, np.where(ahead[..., None], moved, (0.0, 0.0, 1.0)))[..., :3]
+    worst = np.abs(now_px - predicted).max(axis=-1)
+    cost = np.where(ahead, np.minimum(worst, limit_px), limit_px).sum(axis=1)
+    return T[int(np.argmin(cost))]
+
+
+def _rigid(q: Array, p: Array) -> Array:
+    """Transforms (s, 4, 4) that bring points q (s, n, 3) onto p in the least squares sense."""
+    q_mean, p_mean = q.mean(axis=1), p.mean(axis=1)
+    U, _, Vt = np.linalg.svd(np.swapaxes(p - p_mean[:, None], 1, 2) @ (q - q_mean[:, None]))
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    R = U @ Vt
+    return se3.transform(R, p_mean - (R @ q_mean[..., None])[..., 0])
+
+
+def agrees(alignment: Alignment, limit_px: float) -> BoolArray:
+    """Which points (n,) move as the rig says: no residual above a limit."""
+    return np.abs(alignment.residual_px).max(axis=-1, initial=0.0) <= limit_px

@@ -1,0 +1,81 @@
+"""Velocities of a recording without any, from its tracks: stereo odometry.
+
+They say how the rig moves from frame to frame, but are no measurements: they come from the observations that the filter
+conditions on anyway. So they start the block `twist`, which then walks unmeasured; they say how far it walks; and they
+stand in where poses are needed before there is a filter (hygiene, mapping-only).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.data.noise import Noise
+from ekfslam.data.sequence import Sequence
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import rectified_rows
+from ekfslam.geometry.stereo_motion import agrees, align, sampled_motion
+
+_LEAST_POINTS, _AGREE_SHARE, _AGREE_PX = 6, 0.5, 2.0
+_LEAST_DISPARITY_PX = 1.0
+_SAMPLES = 200
+# The walk is that of the odometry's velocities, doubled: velocities change most where the odometry is worst.
+_WALK_FACTOR = 2.0
+_LEAST_WALK = np.repeat([0.05, 0.005], 3)
+# What is known of the first velocities beside what the observations say, in steps of the walk: nearly nothing.
+_START_FACTOR = 10.0
+
+
+def with_odometry(sequence: Sequence) -> Sequence:
+    """A recording without velocities with those of its odometry (T, 6), in the frame of the IMU."""
+    return dataclasses.replace(sequence, twist=stereo_odometry(sequence), velocity_frame="imu")
+
+
+def stereo_odometry(sequence: Sequence) -> Array:
+    """Velocities (T, 6) between successive frames from the tracks that both see; the last known ones where too few do.
+
+    Robust Gauss-Newton over the three rows of every point, started at the motion before, or at the best of random
+    three-point motions where most points disagree.
+    """
+    camera, observations, C = sequence.camera, sequence.observations, sequence.T_cam_imu
+    generator = np.random.default_rng(0)
+    twist, is_known = np.zeros((len(sequence), 6)), np.zeros(len(sequence), dtype=bool)
+    guess: Array | None = None
+    for k in range(1, len(sequence)):
+        (ids, before), (ids_now, now) = observations.at(k - 1), observations.at(k)
+        _, i, j = np.intersect1d(ids, ids_now, assume_unique=True, return_indices=True)
+        rows, rows_now = (rectified_rows(pixels, np.ones(4))[0] for pixels in (before[i], now[j]))
+        disparity = np.minimum(rows[:, 0] - rows[:, 2], rows_now[:, 0] - rows_now[:, 2])
+        rows, rows_now = (some[disparity >= _LEAST_DISPARITY_PX] for some in (rows, rows_now))
+        if len(rows) < _LEAST_POINTS:
+            continue
+        found = None if guess is None else align(camera, rows, rows_now, guess)
+        if found is None or agrees(found, _AGREE_PX).mean() < _AGREE_SHARE:
+            start = sampled_motion(camera, rows, rows_now, generator, _SAMPLES, _AGREE_PX)
+            found = align(camera, rows, rows_now, start)
+        guess = found.T_now_before
+        tau_s = float(sequence.time_s[k] - sequence.time_s[k - 1])
+        twist[k], is_known[k] = -se3.log(se3.inverse(C) @ guess @ C) / tau_s, True
+    if not is_known.any():
+        return twist
+    last = np.maximum.accumulate(np.where(is_known, np.arange(len(twist)), 0))
+    first = int(np.argmax(is_known))
+    return twist[np.where(last > 0, last, first)]
+
+
+def vision_noise(noise: Noise, twist: Array) -> Noise:
+    """Noise, with what it says of velocities replaced by a walk of the twist as the odometry (T, 6) has it."""
+    steps = np.diff(twist[1:], axis=0)
+    rms = np.sqrt((steps**2).reshape(-1, 2, 3).mean(axis=(0, 2))) if len(steps) else np.zeros(2)
+    walk = np.maximum(_WALK_FACTOR * np.repeat(rms, 3), _LEAST_WALK)
+    return dataclasses.replace(
+        noise,
+        twist_std=_START_FACTOR * walk,
+        twist_walk_std=walk,
+        motion_std=np.full(6, 1e-6),
+        misalignment_rad=0.0,
+        tilt_rad=0.0,
+        gap_std=np.zeros(6),
+    )

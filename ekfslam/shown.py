@@ -1,0 +1,53 @@
+"""How records show themselves at a prompt and in a notebook: a few lines in place of thousands of numbers."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import NamedTuple
+
+
+class Card(NamedTuple):
+    """What a record says of itself.
+
+    Args:
+        title: What it is, in a few words.
+        facts: Its key figures, by name.
+        further: How to go on, as Python.
+    """
+
+    title: str
+    facts: dict[str, str]
+    further: tuple[str, ...] = ()
+
+
+class Shown:
+    """A record with a short ``repr`` and a table for notebooks, both from `card`."""
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        title, facts, further = self.card()
+        width = max(map(len, (*facts, "go on")))
+        lines = [f"  {name:<{width}}  {text}" for name, text in facts.items()]
+        lines += [f"  {'go on':<{width}}  {'  '.join(further)}"] if further else []
+        return "\n".join([f"{type(self).__name__}: {title}", *lines])
+
+    def _repr_html_(self) -> str:
+        title, facts, further = self.card()
+        cell = '<td style="text-align: left">'
+        rows = "".join(f"<tr>{cell}{escape(name)}</td>{cell}{escape(text)}</td></tr>" for name, text in facts.items())
+        code = " ".join(f"<code>{escape(call)}</code>" for call in further)
+        head = f"<b>{type(self).__name__}</b>: {escape(title)}"
+        return f"<div>{head}<table>{rows}</table>{f'go on: {code}' if code else ''}</div>"
+
+
+def count(number: int, noun: str) -> str:
+    """``1 landmark``, ``12 034 landmarks``."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}".replace(",", " ")
+
+
+def figure(value: float) -> str:
+    """A number with three digits."""
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

@@ -1,0 +1,268 @@
+"""What other programs read: trajectories, tables, point clouds, graphs and the information matrix.
+
+All poses are of the IMU in world. `EXPORTS` has every format of a result by name.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ekfslam import files
+from ekfslam.arrays import Array
+from ekfslam.data.readers.text import first_line
+from ekfslam.errors import ArchiveError
+from ekfslam.filters.log import Log
+from ekfslam.filters.result import Result
+from ekfslam.geometry import motion, se3
+from ekfslam.models.sensors.stereo import Rig
+from ekfslam.smoother.posterior import Posterior, posterior
+from ekfslam.storage.archive import Archive, read_archive
+from ekfslam.storage.tables import columns, covariance_columns
+
+MADE_BY = "ekfslam"  # in files that have room for a remark
+_PLY = f"ply\nformat binary_little_endian 1.0\ncomment {MADE_BY}: landmarks in world, m and m^2\n"
+_G2O = f"# {MADE_BY}: "
+
+
+def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "kitti"]) -> None:
+    """Write the estimated poses ``T_world_imu`` as text, one line a frame, in 17 digits: every number exactly.
+
+    Both formats hold the pose of the *IMU* in *world*; KITTI's own files hold the left camera in its first frame.
+
+    Args:
+        result: Run to export.
+        path: File to write.
+        format: ``tum``: ``time tx ty tz qx qy qz qw`` (s, m, unit quaternion); ``kitti``: the twelve entries of the
+            upper 3x4 part row by row.
+
+    Raises:
+        ArchiveError: The file cannot be written.
+    """
+    files.write(path, trajectory_text(result, format))
+
+
+def trajectory_text(result: Result, format: Literal["tum", "kitti"]) -> str:
+    """What `export_trajectory` writes."""
+    return _pose_text(result.time_s, result.T_world_imu, format)
+
+
+def export_truth(archive: str | Path, path: str | Path, format: Literal["tum", "kitti"]) -> int:
+    """Write the true poses that an archive holds, as `export_trajectory` does; one line a frame of known pose.
+
+    Returns:
+        The number of lines.
+
+    Raises:
+        ArchiveError: As `read_archive`; or there is no true pose, or not of every frame and the format is ``kitti``,
+            which has no stamps to say of which; or the file cannot be written.
+    """
+    poses, text = truth_text(read_archive(archive), str(archive), format)
+    files.write(path, text)
+    return poses
+
+
+def truth_text(archive: Archive, place: str, format: Literal["tum", "kitti"]) -> tuple[int, str]:
+    """What `export_truth` writes of an archive read from a place, and the number of lines; raises as that does."""
+    truth, frames = archive.truth, len(archive.time_s)
+    if truth is None or not len(truth.frame):
+        raise ArchiveError(f"{place}: holds no true pose")
+    if format == "kitti" and len(truth.frame) < frames:
+        raise ArchiveError(
+            f"{place}: holds the true pose of {len(truth.frame)} of {frames} frames; kitti has no stamps to say of "
+            "which, take tum"
+        )
+    return len(truth.frame), _pose_text(archive.time_s[truth.frame], truth.T_world_imu, format)
+
+
+def _pose_text(time_s: Array, T: Array, format: Literal["tum", "kitti"]) -> str:
+    rows = np.column_stack([time_s, _position_and_quaternion(T)]) if format == "tum" else T[:, :3].reshape(-1, 12)
+    return "".join(f"{_numbers(row)}\n" for row in rows)
+
+
+def csv_text(result: Result, table: str = "trajectory") -> str:
+    """A table of `ekfslam.storage.tables` as comma-separated values with a heading; numbers come back bit for bit.
+
+    Raises:
+        ArchiveError: There is no such table.
+    """
+    found, out = columns(result, table), io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(found)
+    writer.writerows(zip(*(values.tolist() for values in found.values()), strict=True))
+    return out.getvalue()
+
+
+def ply_bytes(result: Result) -> bytes:
+    """The landmarks as a point cloud (PLY, binary, little endian), a vertex each.
+
+    Its properties are ``x y z`` (double, m), ``red green blue``, ``id``, ``observations``, and the covariance
+    ``cov_xx`` to ``cov_zz`` (double, m^2). Colours run from blue (1 cm and less) to red (10 m and more) with the
+    logarithm of the largest standard deviation.
+
+    Raises:
+        ArchiveError: An id has no place in a double.
+    """
+    landmarks = result.landmarks
+    if len(landmarks) and landmarks.id.max() > 1 << 53:
+        raise ArchiveError(f"{result.sequence_name}: landmark id {landmarks.id.max()} is too large for PLY")
+    properties: dict[str, NDArray] = dict(zip("xyz", landmarks.position_m.T, strict=True))
+    properties |= dict(zip(("red", "green", "blue"), _colours(landmarks.covariance).T, strict=True))
+    properties |= {"id": landmarks.id.astype(float), "observations": landmarks.observations.astype(np.int32)}
+    properties |= covariance_columns(landmarks.covariance, "cov_{}")
+    types = {"f": ("double", "<f8"), "i": ("int", "<i4"), "u": ("uchar", "u1")}
+    vertex = np.empty(len(landmarks), dtype=[(name, types[value.dtype.kind][1]) for name, value in properties.items()])
+    for name, value in properties.items():
+        vertex[name] = value
+    declared = "".join(f"property {types[value.dtype.kind][0]} {name}\n" for name, value in properties.items())
+    return (_PLY + f"element vertex {len(landmarks)}\n{declared}end_header\n").encode("ascii") + vertex.tobytes()
+
+
+def _colours(covariance: Array) -> NDArray:
+    """Colours (n, 3) of covariances (n, 3, 3): blue at 1 cm, red at 10 m."""
+    std = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 1e-12))
+    share = np.clip((np.log10(std) + 2.0) / 3.0, 0.0, 1.0)[:, None]
+    return np.round((1.0 - share) * np.array([0, 114, 178]) + share * np.array([213, 94, 0])).astype(np.uint8)
+
+
+def g2o_text(result: Result) -> str:
+    """The measurements of a full run as a graph for g2o: poses of the IMU and landmarks, as estimated, and edges.
+
+    - ``EDGE_SE3:QUAT``: the motion of a step, eq. (1), by the velocities that moved the filter. Its information is
+      that of eq. (2) for white velocity noise; the error is g2o's own, translation and vector part of the quaternion.
+    - ``EDGE_SE3_TRACKXYZ``: a landmark in the frame of the IMU, triangulated from one observation, with the
+      information ``A^T V^-1 A`` of its rows there, eq. (4). The camera is in no edge: some programs read no offset.
+    - ``FIX``: the first pose.
+
+    It is the textbook model. Where the run estimates velocities or has errors of tracks, which have memory, a graph of
+    poses and points cannot say so: steps have the noise of measured velocities then, and views that of a first view.
+
+    Raises:
+        ArchiveError: The result has no log: only the mode ``full`` has one.
+    """
+    if result.log is None:
+        raise ArchiveError(f"{result.sequence_name}: mode {result.mode!r} has no log, hence no edges; take mode full")
+    return "".join(f"{line}\n" for line in _graph(result, result.log))
+
+
+def _graph(result: Result, log: Log) -> Iterator[str]:
+    frames = len(result.time_s)
+    yield f"{_G2O}{' '.join(result.sequence_name.split())}, vertices 0 to {frames - 1} are poses of the IMU"
+    yield f"PARAMS_SE3OFFSET 0 {_numbers(_position_and_quaternion(np.eye(4)))}"
+    for k, row in enumerate(_position_and_quaternion(result.T_world_imu)):
+        yield f"VERTEX_SE3:QUAT {k} {_numbers(row)}"
+    yield "FIX 0"
+    for i, row in enumerate(result.landmarks.position_m):
+        yield f"VERTEX_TRACKXYZ {frames + i} {_numbers(row)}"
+    step = _position_and_quaternion(se3.exp(log.tau_s[1:, None] * log.imu_twist[1:]))
+    noise = result.noise
+    std = np.where(log.is_gap[1:, None], np.hypot(noise.velocity_std, noise.gap_std), noise.velocity_std)
+    Q = motion.process_noise(log.imu_twist[1:], log.tau_s[1:], std, noise.misalignment_rad)
+    # The vector part of a quaternion is half the rotation.
+    twice = np.repeat([1.0, 2.0], 3)
+    for k, (row, information) in enumerate(zip(step, twice[:, None] * np.linalg.inv(Q) * twice, strict=True)):
+        yield f"EDGE_SE3:QUAT {k} {k + 1} {_numbers(row)} {_numbers(information[np.triu_indices(6)])}"
+    q, information = _triangulated(result, log)
+    for k, i, row, block in zip(log.frame.tolist(), log.landmark.tolist(), q, information, strict=True):
+        yield f"EDGE_SE3_TRACKXYZ {k} {frames + i} 0 {_numbers(row)} {_numbers(block[np.triu_indices(3)])}"
+
+
+def _triangulated(result: Result, log: Log) -> tuple[Array, Array]:
+    """Points (K, 3) of the observations in the frame of the IMU, m, and their information (K, 3, 3)."""
+    rig = Rig(result.camera, result.T_cam_imu, result.noise)
+    q = rig.invert(log.rows)
+    first = np.zeros(log.landmarks, dtype=np.int64)
+    first[log.landmark[::-1]] = np.arange(len(log.landmark))[::-1]
+    variance = np.where((log.previous >= 0)[:, None], log.variance[first[log.landmark]], log.variance)
+    A = rig.jacobian(q) @ result.T_cam_imu[:3, :3]
+    return se3.apply(se3.inverse(result.T_cam_imu), q), np.swapaxes(A, 1, 2) @ (A / variance[:, :, None])
+
+
+def _position_and_quaternion(T: Array) -> Array:
+    """``x y z qx qy qz qw`` (..., 7) of transforms (..., 4, 4)."""
+    return np.concatenate([T[..., :3, 3], Rotation.from_matrix(T[..., :3, :3]).as_quat()], axis=-1)
+
+
+def _numbers(values: Array) -> str:
+    return " ".join(f"{value:.17g}" for value in values.tolist())
+
+
+def information_bytes(result: Result, found: Posterior | None = None) -> bytes:
+    """The joint information matrix of a full run, for `scipy.sparse.load_npz`.
+
+    Beside what scipy reads, the file has the arrays ``kind``, ``frame``, ``id`` and ``axis`` that say of each column
+    what it is, see `Posterior.information_matrix`, and ``made_by``. No pickle is in it.
+
+    Args:
+        result: A result of mode ``full``.
+        found: Its posterior, if it is known already.
+
+    Raises:
+        PosteriorError: The result has no log, or there is no such matrix.
+    """
+    matrix, named = (found or posterior(result)).information_matrix()
+    texts = {name: value.astype(np.bytes_) if value.dtype.kind == "U" else value for name, value in named.items()}
+    arrays: dict[str, Any] = {name: getattr(matrix, name) for name in ("indices", "indptr", "shape", "data")}
+    arrays |= {**texts, "format": np.bytes_("csc"), "made_by": np.bytes_(MADE_BY)}
+    out = io.BytesIO()
+    np.savez_compressed(out, **arrays)
+    return out.getvalue()
+
+
+class Export(NamedTuple):
+    """A format.
+
+    Args:
+        ending: Of its files.
+        words: What it holds.
+        write: The content of the file of a result.
+        begins: How such a file begins, where that tells it from others.
+    """
+
+    ending: str
+    words: str
+    write: Callable[[Result], str | bytes]
+    begins: bytes = b""
+
+
+def is_export(path: Path, format: str) -> bool:
+    """Whether a file is an earlier export in a format of `EXPORTS`."""
+    if format in ("tum", "kitti"):
+        return len(first_line(path).split()) == (8 if format == "tum" else 12)
+    try:
+        with path.open("rb") as file:
+            begin = file.read(1 << 12)
+        if format == "information":
+            with zipfile.ZipFile(path) as archive:
+                return "made_by.npy" in archive.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+    return begin.startswith(EXPORTS[format].begins)
+
+
+def _csv(table: str, begins: bytes) -> Export:
+    return Export(f"{table}.csv", f"table {table}", lambda result: csv_text(result, table), begins)
+
+
+EXPORTS: Mapping[str, Export] = MappingProxyType(
+    {
+        "tum": Export("tum.txt", "poses: time tx ty tz qx qy qz qw", lambda result: trajectory_text(result, "tum")),
+        "kitti": Export("kitti.txt", "poses: twelve entries", lambda result: trajectory_text(result, "kitti")),
+        "csv": _csv("trajectory", b"time_s,x_m,"),
+        "csv-landmarks": _csv("landmarks", b"id,x_m,"),
+        "csv-innovation": _csv("innovation", b"time_s,nis,"),
+        "csv-rejections": _csv("rejections", b"frame,time_s,"),
+        "ply": Export("ply", "landmarks with covariances", ply_bytes, _PLY.encode()),
+        "g2o": Export("g2o", "poses, landmarks and measurements as a graph", g2o_text, _G2O.encode()),
+        "information": Export("information.npz", "joint information matrix, sparse", information_bytes),
+    }
+)

@@ -1,0 +1,116 @@
+"""Tables of a result: columns for CSV files and pandas, and the groups of an archive for xarray.
+
+Units stand in the names of columns. Covariances are along the axes of world: of the position ``cov_xx_m2``, of the
+rotation about these axes ``rot_cov_xx_rad2`` (`Result.position_covariance_world` says of which errors).
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ekfslam import dimensions, hdf5
+from ekfslam.arrays import Array
+from ekfslam.errors import ArchiveError, MissingPackageError
+from ekfslam.filters.result import REASONS, Result
+from ekfslam.storage.archive import LAYOUT
+
+Columns = dict[str, NDArray]
+
+_XYZ = ("x", "y", "z")
+_UPPER = tuple((i, j) for i in range(3) for j in range(i, 3))
+
+
+def _named(names: tuple[str, ...], values: Array) -> Columns:
+    return dict(zip(names, values.T, strict=True))
+
+
+def covariance_columns(P: Array, name: str = "cov_{}_m2") -> Columns:
+    """The six different entries of covariances (n, 3, 3)."""
+    return {name.format(_XYZ[i] + _XYZ[j]): P[:, i, j] for i, j in _UPPER}
+
+
+def _trajectory(result: Result) -> Columns:
+    T = result.T_world_imu
+    return {
+        "time_s": result.time_s,
+        **_named(("x_m", "y_m", "z_m"), T[:, :3, 3]),
+        **_named(("qx", "qy", "qz", "qw"), Rotation.from_matrix(T[:, :3, :3]).as_quat()),
+        **covariance_columns(result.position_covariance_world),
+        **covariance_columns(result.rotation_covariance_world, "rot_cov_{}_rad2"),
+    }
+
+
+def _landmarks(result: Result) -> Columns:
+    landmarks = result.landmarks
+    return {
+        "id": landmarks.id,
+        **_named(("x_m", "y_m", "z_m"), landmarks.position_m),
+        **covariance_columns(landmarks.covariance),
+        **_named(("initial_x_m", "initial_y_m", "initial_z_m"), landmarks.initial_position_m),
+        "first_frame": landmarks.first_frame,
+        "last_frame": landmarks.last_frame,
+        "observations": landmarks.observations,
+    }
+
+
+def _innovation(result: Result) -> Columns:
+    return {"time_s": result.time_s, **vars(result.innovation)}
+
+
+def _rejections(result: Result) -> Columns:
+    found = result.rejections
+    reason = np.array(REASONS)[found.reason]
+    return {"frame": found.frame, "time_s": result.time_s[found.frame], "landmark": found.landmark, "reason": reason}
+
+
+TABLES: Mapping[str, Callable[[Result], Columns]] = MappingProxyType(
+    {"trajectory": _trajectory, "landmarks": _landmarks, "innovation": _innovation, "rejections": _rejections}
+)
+
+
+def columns(result: Result, table: str) -> Columns:
+    """The columns (n,) of a table by name.
+
+    Raises:
+        ArchiveError: There is no such table.
+    """
+    if table not in TABLES:
+        raise ArchiveError(f"{result.sequence_name}: there is no table {table!r}; known: {', '.join(TABLES)}")
+    return TABLES[table](result)
+
+
+def dataframe(result: Result, table: str) -> Any:
+    """`columns` as a `pandas.DataFrame`; see `Result.to_dataframe`."""
+    return _package("pandas", "to_dataframe").DataFrame(columns(result, table))
+
+
+def dataset(result: Result, group: str) -> Any:
+    """The data sets of a group of an archive as an `xarray.Dataset`; see `Result.to_xarray`."""
+    items = [item for item in LAYOUT if item.place[0] == group]
+    if not items:
+        groups = dict.fromkeys(item.place[0] for item in LAYOUT)
+        raise ArchiveError(f"{result.sequence_name}: there is no group {group!r}; known: {', '.join(groups)}")
+    found: dict[str, Any] = {}
+    for item in items:
+        value = np.asarray(hdf5.value_of(item, result))
+        found[item.place[1]] = (item.dims, value, {"units": item.units, "frame": item.frame})
+        for name, length in zip(item.dims, value.shape, strict=True):
+            along = dimensions.coordinate(name, length, {"time": result.time_s})
+            along = along.astype(str) if along.dtype.kind == "S" else along
+            found.setdefault(name, ((name,), along, {"units": "s" if name == "time" else "1"}))
+    own = {name: found.pop(name) for name in {name for item in items for name in item.dims}}
+    return _package("xarray", "to_xarray").Dataset(found, own)
+
+
+def _package(name: str, what: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise MissingPackageError(name, "tables", what) from None

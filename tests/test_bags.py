@@ -1,0 +1,423 @@
+"""Bags of ROS 1 and ROS 2, and MCAP, written here by rosbags."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image as Pillow
+from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2 import StoragePlugin
+from scipy.spatial.transform import Rotation
+
+from ekfslam.data.images import ImageRecording, open_images
+from ekfslam.data.images.messages import message_types
+from ekfslam.errors import (
+    CalibrationError,
+    EkfslamError,
+    LostDataError,
+    MissingPackageError,
+    StampError,
+    UnknownFormatError,
+)
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import R_CAM_BODY
+
+FRAMES, WIDTH, HEIGHT, BASELINE_M = 5, 10, 6, 0.3
+FIRST_NS, STEP_NS = 1_600_000_000_123_000_000, 100_000_000
+R_LEFT, R_RIGHT = (se3.so3_exp(np.array(w)) for w in ([0.01, -0.02, 0.005], [-0.01, 0.01, 0.02]))
+K = np.array([[400.0, 0, 5], [0, 401.0, 3], [0, 0, 1]])
+P = np.array([[390.0, 0, 5.5, 0], [0, 390.0, 3.5, 0], [0, 0, 1, 0]])
+T_BASE_CAM = se3.transform(R_CAM_BODY.T @ se3.so3_exp(np.array([0.1, 0.05, -0.1])), np.array([1.0, 0.2, 0.5]))
+KINDS = ("ros1", "ros2", "mcap")
+
+
+def picture(frame: int, side: int) -> np.ndarray:
+    return np.full((HEIGHT, WIDTH), 20 * frame + side, dtype=np.uint8)
+
+
+@dataclasses.dataclass
+class Written:
+    """What a bag is to hold: messages by topic; each a type, a stamp (ns) and how to make it of a store of types."""
+
+    topics: dict[str, list[tuple[str, int, Callable[[Any], Any]]]] = dataclasses.field(default_factory=dict)
+
+    def add(self, topic: str, kind: str, stamp_ns: int, make: Callable[[Any], Any]) -> None:
+        self.topics.setdefault(topic, []).append((kind, stamp_ns, make))
+
+
+def header(types: Any, stamp_ns: int, frame: str) -> Any:
+    time = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    kind = types["std_msgs/msg/Header"]
+    return kind(stamp=time, frame_id=frame, **({"seq": 0} if "seq" in kind.__dataclass_fields__ else {}))
+
+
+def vector(types: Any, values: Any) -> Any:
+    x, y, z = (float(value) for value in values)
+    return types["geometry_msgs/msg/Vector3"](x=x, y=y, z=z)
+
+
+def image(
+    stamp_ns: int, side: int, pixels: np.ndarray, encoding: str = "mono8", **changes: Any
+) -> Callable[[Any], Any]:
+    def make(types: Any) -> Any:
+        fields = {
+            "height": pixels.shape[0],
+            "width": pixels.shape[1],
+            "encoding": encoding,
+            "is_bigendian": 0,
+            "step": pixels[0].nbytes,
+            "data": np.frombuffer(pixels.tobytes(), np.uint8),
+            **changes,
+        }
+        return types["sensor_msgs/msg/Image"](header=header(types, stamp_ns, f"optical_{side}"), **fields)
+
+    return make
+
+
+def compressed(stamp_ns: int, side: int, pixels: np.ndarray) -> Callable[[Any], Any]:
+    stream = io.BytesIO()
+    Pillow.fromarray(pixels).save(stream, "png")
+
+    def make(types: Any) -> Any:
+        return types["sensor_msgs/msg/CompressedImage"](
+            header=header(types, stamp_ns, f"optical_{side}"),
+            format="mono8; png compressed",
+            data=np.frombuffer(stream.getvalue(), np.uint8),
+        )
+
+    return make
+
+
+def camera_info(stamp_ns: int, side: int, **changes: Any) -> Callable[[Any], Any]:
+    def make(types: Any) -> Any:
+        kind = types["sensor_msgs/msg/CameraInfo"]
+        projection = P.copy()
+        projection[0, 3] = -side * P[0, 0] * BASELINE_M
+        fields = {
+            "d": np.array([-0.1, 0.01, 0.001, -0.001, 0.0]),
+            "k": K.ravel(),
+            "r": (R_LEFT, R_RIGHT)[side].ravel(),
+            "p": projection.ravel(),
+            **changes,
+        }
+        plain = {"height": HEIGHT, "width": WIDTH, "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0}
+        plain |= {name: fields.pop(name) for name in list(fields) if name not in "dkrp"}
+        if "K" in kind.__dataclass_fields__:
+            fields = {name.upper(): value for name, value in fields.items()}
+        roi = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        return kind(header=header(types, stamp_ns, f"optical_{side}"), roi=roi, **plain, **fields)
+
+    return make
+
+
+def twist(stamp_ns: int, values: Any, frame: str = "base") -> Callable[[Any], Any]:
+    def make(types: Any) -> Any:
+        inner = types["geometry_msgs/msg/Twist"](linear=vector(types, values[:3]), angular=vector(types, values[3:]))
+        return types["geometry_msgs/msg/TwistStamped"](header=header(types, stamp_ns, frame), twist=inner)
+
+    return make
+
+
+def odometry(stamp_ns: int, values: Any) -> Callable[[Any], Any]:
+    def make(types: Any) -> Any:
+        inner = types["geometry_msgs/msg/Twist"](linear=vector(types, values[:3]), angular=vector(types, values[3:]))
+        point = types["geometry_msgs/msg/Point"](x=0.0, y=0.0, z=0.0)
+        turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+        pose = types["geometry_msgs/msg/Pose"](position=point, orientation=turn)
+        return types["nav_msgs/msg/Odometry"](
+            header=header(types, stamp_ns, "odom"),
+            child_frame_id="base",
+            pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+            twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=inner, covariance=np.zeros(36)),
+        )
+
+    return make
+
+
+def transforms(*edges: tuple[str, str, np.ndarray], norm: float = 1.0) -> Callable[[Any], Any]:
+    def make(types: Any) -> Any:
+        entries = []
+        for parent, child, T in edges:
+            x, y, z, w = norm * Rotation.from_matrix(T[:3, :3]).as_quat()
+            turn = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
+            pose = types["geometry_msgs/msg/Transform"](translation=vector(types, T[:3, 3]), rotation=turn)
+            entries.append(
+                types["geometry_msgs/msg/TransformStamped"](
+                    header=header(types, FIRST_NS, parent), child_frame_id=child, transform=pose
+                )
+            )
+        return types["tf2_msgs/msg/TFMessage"](transforms=entries)
+
+    return make
+
+
+def stereo(raw: str = "image_raw", velocities: str = "twist") -> Written:
+    """A pair of five images, velocities that grow linearly, and where the camera is."""
+    bag = Written()
+    for frame in range(FRAMES):
+        stamp = FIRST_NS + frame * STEP_NS
+        for side, name in enumerate(("left", "right")):
+            if raw.endswith("compressed"):
+                message, kind = compressed(stamp, side, picture(frame, side)), "CompressedImage"
+            else:
+                message, kind = image(stamp, side, picture(frame, side)), "Image"
+            bag.add(f"/stereo/{name}/{raw}", f"sensor_msgs/msg/{kind}", stamp, message)
+            bag.add(f"/stereo/{name}/camera_info", "sensor_msgs/msg/CameraInfo", stamp, camera_info(stamp, side))
+    for k in range(-1, 12):
+        stamp = FIRST_NS + k * STEP_NS // 2
+        values = [1.0 + k, 0.0, 0.1, 0.0, 0.0, 0.2 * k]
+        if velocities == "twist":
+            bag.add("/velocity", "geometry_msgs/msg/TwistStamped", stamp, twist(stamp, values))
+        elif velocities == "odometry":
+            bag.add("/odom", "nav_msgs/msg/Odometry", stamp, odometry(stamp, values))
+    half = se3.exp(np.array([0.3, 0.1, 0.0, 0.2, 0.0, 0.1]))
+    edges = (("base", "mast", half), ("mast", "optical_0", se3.inverse(half) @ T_BASE_CAM))
+    bag.add("/tf_static", "tf2_msgs/msg/TFMessage", FIRST_NS, transforms(*edges))
+    return bag
+
+
+def write(folder: Path, bag: Written, kind: str = "ros2") -> Path:
+    """A bag of a kind; the path that a user would give."""
+    is_ros1 = kind == "ros1"
+    store = message_types(is_ros1)
+    path = folder / ("a.bag" if is_ros1 else "bag")
+    plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+    writer = rosbag1.Writer(path) if is_ros1 else rosbag2.Writer(path, version=9, storage_plugin=plugin)
+    with writer:
+        streams = {}
+        queue = []
+        for topic, messages in bag.topics.items():
+            streams[topic] = writer.add_connection(topic, messages[0][0], typestore=store)
+            queue += [(stamp, topic, name, make) for name, stamp, make in messages]
+        for stamp, topic, name, make in sorted(queue, key=lambda entry: entry[:2]):
+            content = make(store.types)
+            data = store.serialize_ros1(content, name) if is_ros1 else store.serialize_cdr(content, name)
+            writer.write(streams[topic], stamp + 7_000_000, data)  # written later than stamped
+    return next(path.glob("*.mcap")) if kind == "mcap" else path
+
+
+def opened(path: Path) -> ImageRecording:
+    found = open_images(path)
+    assert found is not None
+    return found
+
+
+def assert_pictures(found: ImageRecording) -> None:
+    for frame in (3, 0, len(found) - 1):
+        for side, pixels in enumerate(found.load(frame)):
+            np.testing.assert_array_equal(pixels, picture(frame, side))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_raw_pair_with_velocities_and_static_transforms(tmp_path, kind):
+    found = opened(write(tmp_path, stereo(), kind))
+    assert_pictures(found)
+    np.testing.assert_allclose(found.time_s, (FIRST_NS + STEP_NS * np.arange(FRAMES)) / 1e9, atol=1e-9)
+    np.testing.assert_allclose(found.T_cam_imu, se3.inverse(T_BASE_CAM), atol=1e-9)
+    # Two samples an interval: the mean of a line is its value in the middle.
+    np.testing.assert_allclose(found.twist[1:, 0], 2.0 * np.arange(1, FRAMES), atol=1e-6)
+    np.testing.assert_allclose(found.twist[:, 2], 0.1)
+    calibration = found.calibration
+    assert not calibration.is_rectified and calibration.size == (WIDTH, HEIGHT)
+    np.testing.assert_array_equal(calibration.K_left, K)
+    assert calibration.distortion_left.coefficients == (-0.1, 0.01, 0.001, -0.001, 0.0)
+    # A point on the left axis is at the same row of both rectified images, and disparity is fu b / z.
+    q = np.array([0.3, 0.2, 2.0])
+    left = R_LEFT @ q
+    right = R_RIGHT @ se3.apply(calibration.T_right_left, q)
+    np.testing.assert_allclose(left - right, [BASELINE_M, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rectified_and_compressed_images(tmp_path, kind):
+    bag = stereo("image_rect/compressed", velocities="odometry")
+    found = opened(write(tmp_path, bag, kind))
+    assert_pictures(found)
+    assert found.calibration.is_rectified
+    np.testing.assert_array_equal(found.calibration.K_left, P[:, :3])
+    np.testing.assert_allclose(found.calibration.T_right_left[:3, 3], [-BASELINE_M, 0, 0])
+    np.testing.assert_allclose(found.T_cam_imu[:3, :3], R_LEFT @ T_BASE_CAM[:3, :3].T, atol=1e-9)
+    assert any("/odom" in note for note in found.notes)
+
+
+def test_rectified_images_go_before_raw_ones(tmp_path):
+    bag = stereo()
+    for topic, messages in stereo("image_rect").topics.items():
+        bag.topics.setdefault(topic, messages)
+    assert opened(write(tmp_path, bag)).attributes["topics"] == "/stereo/left/image_rect /stereo/right/image_rect"
+
+
+def test_without_velocities_and_transforms_the_body_is_the_camera(tmp_path):
+    bag = stereo(velocities="none")
+    del bag.topics["/tf_static"]
+    found = opened(write(tmp_path, bag))
+    assert found.twist is None and "There are no velocities." in found.notes
+    np.testing.assert_array_equal(found.T_cam_imu, se3.transform(R_CAM_BODY, np.zeros(3)))
+    with_velocities = stereo()
+    del with_velocities.topics["/tf_static"]
+    (tmp_path / "more").mkdir()
+    assert any(
+        "does not connect base and optical_0" in n for n in opened(write(tmp_path / "more", with_velocities)).notes
+    )
+
+
+def test_velocities_of_the_optical_frame_need_no_transform(tmp_path):
+    bag = stereo()
+    bag.topics["/velocity"] = [
+        (name, stamp, twist(stamp, np.arange(6.0), "optical_0")) for name, stamp, _ in bag.topics["/velocity"]
+    ]
+    found = opened(write(tmp_path, bag))
+    np.testing.assert_array_equal(found.T_cam_imu, np.eye(4))
+    np.testing.assert_array_equal(found.twist[2], np.arange(6.0))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "make", "expected"),
+    [
+        ("rgb8", lambda g: np.stack([g, 0 * g, 0 * g], axis=-1), 0.299),
+        ("bgr8", lambda g: np.stack([g, 0 * g, 0 * g], axis=-1), 0.114),
+        ("rgba8", lambda g: np.stack([0 * g, g, 0 * g, g], axis=-1), 0.587),
+        ("mono16", lambda g: g.astype("<u2") * 256 + 9, 1.0),
+    ],
+)
+def test_encodings(tmp_path, encoding, make, expected):
+    bag = stereo()
+    gray = np.full((HEIGHT, WIDTH), 200, np.uint8)
+    name, stamp, _ = bag.topics["/stereo/left/image_raw"][1]
+    bag.topics["/stereo/left/image_raw"][1] = (name, stamp, image(stamp, 0, make(gray), encoding))
+    np.testing.assert_array_equal(opened(write(tmp_path, bag)).load(1)[0], np.round(expected * gray))
+
+
+def test_rows_may_be_padded(tmp_path):
+    bag = stereo()
+    padded = np.zeros((HEIGHT, WIDTH + 6), np.uint8)
+    padded[:, :WIDTH] = 77
+    name, stamp, _ = bag.topics["/stereo/left/image_raw"][1]
+    bag.topics["/stereo/left/image_raw"][1] = (name, stamp, image(stamp, 0, padded, width=WIDTH))
+    np.testing.assert_array_equal(opened(write(tmp_path, bag)).load(1)[0], np.full((HEIGHT, WIDTH), 77))
+
+
+def test_frames_outside_of_all_velocities_are_left_out_with_a_note(tmp_path):
+    bag = stereo()
+    bag.topics["/velocity"] = bag.topics["/velocity"][:6]  # up to the second frame
+    found = opened(write(tmp_path, bag))
+    assert len(found) == 4 and "1 frames before or after all velocities are left out." in found.notes
+
+
+def drop(topic: str) -> Callable[[Written], None]:
+    return lambda bag: bag.topics.pop(topic)
+
+
+def altered(topic: str, number: int, make: Callable[[int], Callable[[Any], Any]]) -> Callable[[Written], None]:
+    def change(bag: Written) -> None:
+        for k in range(len(bag.topics[topic])) if number < 0 else [number]:
+            name, stamp, _ = bag.topics[topic][k]
+            bag.topics[topic][k] = (name, stamp, make(stamp))
+
+    return change
+
+
+def third(bag: Written) -> None:
+    for name in ("image_raw", "camera_info"):
+        bag.topics[f"/stereo/rear/{name}"] = bag.topics[f"/stereo/left/{name}"]
+        bag.topics[f"/rear/left/{name}"] = bag.topics[f"/stereo/left/{name}"]
+
+
+INFO = "/stereo/right/camera_info"
+TURN = np.eye(3)[[1, 0, 2]].ravel()
+BROKEN: list[tuple[Callable[[Written], Any], type[EkfslamError], str]] = [
+    (drop(INFO), CalibrationError, "expected two cameras with images and CameraInfo, found 1: /stereo/left/image_raw"),
+    (drop("/stereo/left/image_raw"), CalibrationError, "found 1: /stereo/right/image_raw"),
+    (third, CalibrationError, "found 4"),
+    (altered(INFO, -1, lambda stamp: camera_info(stamp, 0)), CalibrationError, "P[0, 3]"),
+    (altered(INFO, -1, lambda stamp: camera_info(stamp, 1, width=11)), CalibrationError, "different sizes"),
+    (altered(INFO, -1, lambda stamp: camera_info(stamp, 1, r=TURN)), CalibrationError, "R is no rotation"),
+    (altered(INFO, -1, lambda stamp: camera_info(stamp, 1, k=0 * K.ravel())), CalibrationError, "K_right"),
+    (altered(INFO, -1, lambda stamp: camera_info(stamp, 1, d=np.ones(3))), CalibrationError, "coefficients, found 3"),
+    (altered(INFO, -1, lambda stamp: camera_info(stamp, 1, distortion_model="fov")), CalibrationError, "'fov'"),
+    (altered("/stereo/left/image_raw", 2, lambda s: image(FIRST_NS, 0, picture(0, 0))), StampError, "the stamp"),
+    (altered("/stereo/left/image_raw", -1, lambda s: image(s + 30_000_000, 0, picture(0, 0))), LostDataError, "0 of 5"),
+    (altered("/velocity", 3, lambda s: twist(FIRST_NS, np.zeros(6))), StampError, "/velocity"),
+    (altered("/velocity", 3, lambda s: twist(s, np.full(6, np.nan))), UnknownFormatError, "/velocity"),
+    (lambda bag: bag.topics.update({"/velocity": bag.topics["/velocity"][:1]}), LostDataError, "two are needed"),
+    (
+        altered("/tf_static", 0, lambda s: transforms(("base", "optical_0", T_BASE_CAM), norm=2.0)),
+        CalibrationError,
+        "unit quaternion",
+    ),
+]
+
+
+@pytest.mark.parametrize(("damage", "error", "words"), BROKEN, ids=range(len(BROKEN)))
+def test_broken_messages_are_named(tmp_path, damage, error, words):
+    bag = stereo()
+    damage(bag)
+    path = write(tmp_path, bag)
+    with pytest.raises(error) as caught:
+        open_images(path)
+    assert words in str(caught.value) and str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("message", "error", "words"),
+    [
+        (image(FIRST_NS, 0, picture(0, 0), "bayer_rggb8"), UnknownFormatError, "'bayer_rggb8' are not read"),
+        (image(FIRST_NS, 0, picture(0, 0)[:4]), CalibrationError, "10 x 4 pixels"),
+        (image(FIRST_NS, 0, picture(0, 0), step=3), UnknownFormatError, "steps of 3"),
+        (image(FIRST_NS, 0, picture(0, 0), step=99), UnknownFormatError, "steps of 99"),
+    ],
+)
+def test_broken_images_are_named_when_they_are_loaded(tmp_path, message, error, words):
+    bag = stereo()
+    bag.topics["/stereo/left/image_raw"][0] = ("sensor_msgs/msg/Image", FIRST_NS, message)
+    path = write(tmp_path, bag)
+    found = opened(path)
+    with pytest.raises(error) as caught:
+        found.load(0)
+    assert words in str(caught.value) and str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_bags_are_named_whatever_byte_is_wrong(tmp_path, kind):
+    path = write(tmp_path, stereo(), kind)
+    file = next(path.glob("*.db3")) if path.is_dir() else path
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2])
+    with pytest.raises(EkfslamError, match=str(path)):
+        opened(path).load(FRAMES - 1)
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        damaged = bytearray(content)
+        damaged[rng.integers(16, len(content))] = rng.integers(0, 256)
+        file.write_bytes(damaged)
+        try:
+            opened(path).load(0)
+        except EkfslamError as error:
+            assert str(path) in str(error)
+
+
+def test_a_definition_that_a_bag_brings_is_not_used(tmp_path):
+    """Its types are those that rosbags knows; what a bag says of them is not even parsed."""
+    bag, store = stereo(), message_types(is_ros1=False)
+    path = tmp_path / "bag"
+    with rosbag2.Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, messages in bag.topics.items():
+            definition = "this is [ no definition\n"
+            stream = writer.add_connection(topic, messages[0][0], msgdef=definition, rihs01="RIHS01_" + 64 * "0")
+            for name, stamp, make in messages:
+                writer.write(stream, stamp, store.serialize_cdr(make(store.types), name))
+    assert_pictures(opened(path))
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
+    path = write(tmp_path, stereo())
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(MissingPackageError, match=r"pip install 'ekfslam\[bags\]'"):
+        open_images(path)

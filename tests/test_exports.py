@@ -1,0 +1,202 @@
+"""What other programs read: every export is read back by a reader of its own, and holds what the result holds."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.spatial.transform import Rotation
+
+from ekfslam.cli import main
+from ekfslam.config import Config
+from ekfslam.data.simulate import builtin
+from ekfslam.errors import ArchiveError, MissingPackageError, PosteriorError
+from ekfslam.geometry import se3
+from ekfslam.runner import run
+from ekfslam.smoother.posterior import posterior
+from ekfslam.storage import tables
+from ekfslam.storage.archive import write_archive
+from ekfslam.storage.exports import EXPORTS, csv_text, g2o_text, information_bytes, ply_bytes
+
+
+@pytest.fixture(scope="module")
+def world():
+    return builtin("city?frames=30")
+
+
+@pytest.fixture(scope="module")
+def full(world):
+    return run(world, "full")
+
+
+@pytest.fixture(scope="module")
+def archive(world, full, tmp_path_factory):
+    path = tmp_path_factory.mktemp("exports") / "city.h5"
+    write_archive(path, world, {"full": full})
+    return path
+
+
+@pytest.mark.parametrize("table", list(tables.TABLES))
+def test_pandas_reads_every_table_bit_for_bit(full, table):
+    pandas = pytest.importorskip("pandas")
+    read = pandas.read_csv(io.StringIO(csv_text(full, table)))
+    frame = full.to_dataframe(table)
+    assert len(read) > 20 and list(read.columns) == list(frame.columns)
+    for name, values in tables.columns(full, table).items():
+        np.testing.assert_array_equal(read[name].to_numpy(), values, err_msg=name)
+        np.testing.assert_array_equal(frame[name].to_numpy(), values, err_msg=name)
+
+
+def test_tables_hold_what_the_result_holds(full):
+    found = tables.columns(full, "trajectory")
+    T = full.T_world_imu[7]
+    P = T[:3, :3] @ full.covariance[7, :3, :3] @ T[:3, :3].T
+    np.testing.assert_allclose([found[f"cov_{name}_m2"][7] for name in ("xx", "xy", "zz")], [P[0, 0], P[0, 1], P[2, 2]])
+    quaternion = [found[name][7] for name in ("qx", "qy", "qz", "qw")]
+    np.testing.assert_allclose(Rotation.from_quat(quaternion).as_matrix(), T[:3, :3], atol=1e-12)
+    assert set(tables.columns(full, "rejections")["reason"]) <= {"gate", "disparity", "moving", "waiting"}
+    with pytest.raises(ArchiveError, match="no table 'poses'; known: trajectory, landmarks"):
+        full.to_dataframe("poses")
+
+
+@pytest.mark.parametrize("group", ["trajectory", "landmarks", "innovation", "rejections", "timing"])
+def test_to_xarray_is_what_xarray_reads_of_the_archive(archive, full, group):
+    xarray = pytest.importorskip("xarray")
+    read = xarray.open_dataset(archive, group=f"runs/full/{group}", engine="h5netcdf").load()
+    xarray.testing.assert_equal(full.to_xarray(group), read)
+    assert set(full.to_xarray(group).coords) == set(read.coords)
+
+
+def test_a_missing_package_is_named_with_what_installs_it(full, monkeypatch):
+    def absent(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(tables.importlib, "import_module", absent)
+    with pytest.raises(MissingPackageError, match=r"to_dataframe needs the package pandas.*ekfslam\[tables\]"):
+        full.to_dataframe()
+
+
+def read_ply(content: bytes) -> np.ndarray:
+    head, _, body = content.partition(b"end_header\n")
+    lines = head.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
+    kinds = {"double": "<f8", "int": "<i4", "uchar": "u1"}
+    fields = [(line.split()[2], kinds[line.split()[1]]) for line in lines if line.startswith("property")]
+    return np.frombuffer(body, np.dtype(fields), count)
+
+
+def test_ply_holds_the_map_and_its_covariances(full):
+    vertex, landmarks = read_ply(ply_bytes(full)), full.landmarks
+    assert len(vertex) == len(landmarks) > 50
+    np.testing.assert_array_equal(np.stack([vertex[axis] for axis in "xyz"], axis=-1), landmarks.position_m)
+    np.testing.assert_array_equal(vertex["id"], landmarks.id)
+    np.testing.assert_array_equal(vertex["cov_xy"], landmarks.covariance[:, 0, 1])
+    largest = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
+    assert vertex["red"][largest.argmax()] > vertex["red"][largest.argmin()]
+
+
+def read_g2o(text: str) -> dict[str, np.ndarray]:
+    found: dict[str, list[list[float]]] = {}
+    for line in text.splitlines():
+        tag, *values = line.split()
+        if tag != "#":
+            found.setdefault(tag, []).append([float(value) for value in values])
+    return {tag: np.array(rows) for tag, rows in found.items()}
+
+
+def transforms(rows: np.ndarray) -> np.ndarray:
+    T = np.broadcast_to(np.eye(4), (len(rows), 4, 4)).copy()
+    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(rows[:, 3:7]).as_matrix(), rows[:, :3]
+    return T
+
+
+def squares(error: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    n = error.shape[1]
+    information = np.zeros((len(error), n, n))
+    i, j = np.triu_indices(n)
+    information[:, i, j] = information[:, j, i] = upper
+    return np.einsum("ki,kij,kj->k", error, information, error)
+
+
+def test_errors_of_the_g2o_graph_at_the_truth_are_what_their_information_says(world, full):
+    """As g2o defines its errors: of a step 6 degrees of freedom each, of a view 3."""
+    graph = read_g2o(g2o_text(full))
+    frames = len(full.time_s)
+    np.testing.assert_allclose(transforms(graph["VERTEX_SE3:QUAT"][:, 1:]), full.T_world_imu, atol=1e-12)
+    np.testing.assert_array_equal(graph["VERTEX_TRACKXYZ"][:, 1:], full.landmarks.position_m)
+    T = world.truth.T_world_imu
+    edges = graph["EDGE_SE3:QUAT"]
+    i, j = edges[:, :2].astype(int).T
+    E = se3.inverse(transforms(edges[:, 2:9])) @ se3.inverse(T[i]) @ T[j]
+    quaternion = Rotation.from_matrix(E[:, :3, :3]).as_quat()
+    quaternion *= np.sign(quaternion[:, 3:])
+    step = squares(np.hstack([E[:, :3, 3], quaternion[:, :3]]), edges[:, 9:])
+    assert len(step) == frames - 1
+    assert abs(step.mean() - 6.0) < 4.0 * np.sqrt(12.0 / len(step))
+    offset = transforms(graph["PARAMS_SE3OFFSET"][:, 1:])[0]
+    views = graph["EDGE_SE3_TRACKXYZ"]
+    k, at = views[:, 0].astype(int), views[:, 1].astype(int) - frames
+    m = world.truth.position_m[np.searchsorted(world.truth.landmark, full.landmarks.id[at])]
+    error = se3.apply(se3.inverse(T[k] @ offset), m) - views[:, 3:6]
+    near = views[:, 3] < 25.0  # triangulation of far points is not linear
+    view = squares(error[near], views[near, 6:])
+    assert len(view) > 400
+    assert abs(np.median(view) - 2.37) < 0.4
+
+
+def test_gtsam_reads_the_graph(full, tmp_path):
+    gtsam = pytest.importorskip("gtsam")
+    (tmp_path / "city.g2o").write_text(g2o_text(full))
+    graph, values = gtsam.readG2o(str(tmp_path / "city.g2o"), True)
+    assert graph.size() >= len(full.time_s) - 1
+    for k in (0, 11, len(full.time_s) - 1):
+        np.testing.assert_allclose(values.atPose3(k).matrix(), full.T_world_imu[k], atol=1e-9)
+
+
+@pytest.mark.parametrize("linearisation", ["map", "filtered"])
+@pytest.mark.parametrize("prior", ["known", "some"])
+def test_the_inverse_of_the_information_matrix_is_the_joint_covariance(prior, linearisation):
+    settings = {"posterior": {"linearisation": linearisation}}
+    settings["calibration"] = {"lever_arm_m": 0.01}
+    settings["filter"] = {"variant": "standard", "landmark_coordinates": "xyz"}
+    if prior == "some":
+        settings["filter"] |= {"initial_position_std_m": 0.1, "initial_rotation_std_rad": 0.05}
+    result = run(builtin("city?frames=12"), "full", Config().with_overrides(settings))
+    found = posterior(result)
+    read = np.load(io.BytesIO(information_bytes(result, found)))
+    matrix = sp.load_npz(io.BytesIO(information_bytes(result, found)))
+    assert sp.issparse(matrix) and matrix.nnz < 0.5 * matrix.shape[0] ** 2
+    kind = read["kind"].astype(str)
+    assert {"pose", "landmark", "calibration"} == set(kind) and len(kind) == matrix.shape[0]
+    assert set(read["frame"][kind == "pose"]) == set(range(0 if prior == "some" else 1, 12))
+    np.testing.assert_array_equal(read["id"][kind == "landmark"], np.repeat(found.id, 3))
+    frames = np.unique(read["frame"][kind == "pose"])
+    wanted = found.joint_covariance(frames, np.arange(len(found.id)))
+    own = np.flatnonzero(kind != "calibration")
+    P = np.linalg.inv(matrix.toarray())[np.ix_(own, own)]
+    std = np.sqrt(np.diag(wanted))
+    np.testing.assert_allclose(P / np.outer(std, std), wanted / np.outer(std, std), atol=1e-7)
+
+
+@pytest.mark.parametrize("format", list(EXPORTS))
+def test_every_format_is_written_by_the_command_line_and_replaced_only_by_its_like(archive, tmp_path, capsys, format):
+    out = tmp_path / f"out.{EXPORTS[format].ending}"
+    call = ["export", str(archive), "--format", format, "--out", str(out)]
+    assert main(call) == 0 and main(call) == 0
+    assert out.stat().st_size > 1000 and f"written to {out}" in capsys.readouterr().out
+    out.write_text("something else\n")
+    assert main(call) == 2
+    assert "no earlier result of the same" in capsys.readouterr().err
+
+
+def test_what_has_no_log_has_no_graph(world, archive, capsys):
+    dead = run(world, "dead-reckoning")
+    with pytest.raises(ArchiveError, match="no log, hence no edges"):
+        g2o_text(dead)
+    with pytest.raises(PosteriorError, match="has no log"):
+        information_bytes(dead)
+    assert main(["export", str(archive), "--format", "ply", "--mode", "truth"]) == 2
+    assert "the truth is written as tum or kitti" in capsys.readouterr().err

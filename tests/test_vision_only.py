@@ -1,0 +1,123 @@
+"""Recordings without velocities: the twist walks unmeasured, and covariances hold what they promise."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import seeds
+from scipy.stats import chi2
+
+import ekfslam
+from ekfslam.config import Config
+from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations
+from ekfslam.errors import NoVelocitiesError
+from ekfslam.evaluation.consistency import pose_nees
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
+from ekfslam.geometry import motion, se3
+from ekfslam.models.build import build
+from ekfslam.models.odometry import stereo_odometry
+from ekfslam.models.sensors.velocities import VelocitySource
+from ekfslam.runner import run
+from ekfslam.smoother.posterior import smooth
+
+
+def with_observations(sequence, kept):
+    parts = (getattr(sequence.observations, name)[kept] for name in ("frame", "landmark", "pixels_px"))
+    return dataclasses.replace(sequence, observations=Observations(*parts))
+
+
+def without_velocities(sequence):
+    return dataclasses.replace(
+        sequence, twist=np.zeros_like(sequence.twist), attributes={**sequence.attributes, **WITHOUT_VELOCITIES}
+    )
+
+
+@pytest.mark.slow
+def test_covariances_hold_what_they_promise():
+    """Pose NEES in the middle and at the end of 40 frames, averaged over seeds, against chi-square bounds of 99.8 %.
+
+    The truth's velocities change as a vehicle's do; that they walk is only the model.
+    """
+    runs = seeds(12, 4)
+    per_run = []
+    for seed in runs:
+        sequence = ekfslam.open_sequence(f"builtin:city?seed={seed}&frames=40&outlier_fraction=0")
+        full = run(without_velocities(sequence), "full")
+        found = [pose_nees(result, sequence.truth)[1] for result in (full, smooth(full))]
+        per_run.append([[nees[20], nees[39]] for nees in found])
+    low, high = (chi2.ppf(p, 6 * len(runs)) / len(runs) for p in (0.001, 0.999))
+    mean = np.mean(per_run, axis=0)
+    assert (mean > low).all() and (mean < high).all(), (low, mean, high)
+
+
+def test_odometry_follows_the_truth_and_survives_frames_without_tracks():
+    sequence = ekfslam.open_sequence("builtin:city?frames=40")
+    twist = stereo_odometry(sequence)
+    T = se3.inverse(motion.integrate(np.eye(4), twist, np.diff(sequence.time_s)))
+    assert np.linalg.norm(T[-1][:3, 3] - sequence.truth.T_world_imu[-1][:3, 3]) < 0.5
+    seen = ~np.isin(sequence.observations.frame, (10, 11))
+    gappy = dataclasses.replace(
+        sequence,
+        observations=Observations(
+            sequence.observations.frame[seen],
+            sequence.observations.landmark[seen],
+            sequence.observations.pixels_px[seen],
+        ),
+    )
+    found = stereo_odometry(gappy)
+    np.testing.assert_array_equal(found[10:13], np.tile(found[9], (3, 1)))
+    np.testing.assert_array_equal(found[:10], twist[:10])
+
+
+def test_velocities_are_started_once_and_never_measured():
+    sequence = without_velocities(ekfslam.open_sequence("builtin:city?frames=12&outlier_fraction=0"))
+    problem = build(sequence)
+    assert not problem.model.measures_twist and "twist (6)" in problem.lines[0]
+    ekf = JointEKF(problem.model, problem.config.filter)
+    list(run_filter(ekf, problem.sequence))
+    log = ekf.log()
+    assert set(log.velocity_frame.tolist()) == {1} and len(log.velocity_axis) == 6
+    # What is said of the first velocities is next to nothing beside what the observations say.
+    at = problem.model.layout["twist"]
+    assert (np.sqrt(np.diag(ekf.gaussian.body_covariance)[at]) < 0.2 * problem.model.noise.twist_std).all()
+
+
+def test_wheels_are_measured_where_nothing_else_is():
+    world = ekfslam.open_sequence("builtin:city?frames=30&outlier_fraction=0")
+    sequence = without_velocities(with_observations(world, world.observations.frame < 15))
+    speed = world.twist[:, :1]
+    wheels = VelocitySource(world.time_s, ("v_x",), speed, np.array([0.05]))
+    with_wheels, without = run(sequence, "full", further=wheels), run(sequence, "full")
+    # They measure the speed ahead, and nothing of the other two.
+    gain = np.diag(with_wheels.covariance[-1])[:3] / np.diag(without.covariance[-1])[:3]
+    assert gain[0] < 0.01 and (gain[1:] > 0.9).all()
+
+
+def test_dead_reckoning_is_left_out_of_a_comparison(tmp_path):
+    sequence = without_velocities(ekfslam.open_sequence("builtin:city?frames=8"))
+    found = ekfslam.compare(sequence)
+    assert set(found.results) == {"mapping-only", "full", "smoothed"}
+    assert "nobody measured velocities" in found.skipped["dead-reckoning"]
+    assert "No dead-reckoning: " in found.table
+    found.save(tmp_path)
+    with pytest.raises(NoVelocitiesError):
+        run(sequence, "dead-reckoning")
+    again = ekfslam.read_archive(tmp_path / "archive.h5").results["full"]
+    queried = ekfslam.posterior(again)
+    direct = ekfslam.posterior(found.results["full"])
+    np.testing.assert_allclose(queried.T_world_imu, direct.T_world_imu, atol=1e-9)
+
+
+def test_without_stated_noise_tracks_decide_what_is_believed():
+    sequence = dataclasses.replace(ekfslam.open_sequence("builtin:city?frames=20"), noise=None)
+    walking = build(without_velocities(sequence))
+    names = set(walking.model.layout)
+    assert {"twist", "vision_drift", "stereo_rotation", "camera_jitter"} <= names
+    assert not {"twist_bias", "up", "calibration"} & names
+    checked = without_velocities(dataclasses.replace(sequence, attributes={**sequence.attributes, **CHECKED_TRACKS}))
+    problem = build(checked)
+    assert problem.model.track_error is None and problem.model.noise.pixel_std_px[0] == 0.3
+    assert "camera_jitter" in problem.model.layout and "vision_drift" not in problem.model.layout
+    given = build(checked, Config().with_overrides({"noise": {"sigma_px": 0.6}}))
+    assert given.model.noise.pixel_std_px[0] == 0.6
