@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-whole check lint results archive-page setup clean
+.PHONY: demo test test-whole check lint docs archive-page lower-bounds wheel results setup clean
 
 demo: $(READY)
 	$(BIN)/ekfslam compare builtin:city --out results/local
@@ -25,6 +25,19 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# The documentation as a site in build/site, without a network: no warning, no dead link.
+docs: $(VENV)/.docs
+	OPENBLAS_NUM_THREADS=1 NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "open build/site/index.html"
+
+# Part of the tests, in an environment of its own with the oldest versions that pyproject.toml allows.
+lower-bounds:
+	PYTHON="$(PYTHON)" sh .ci/lower-bounds
+
+# A wheel in build/wheel.
+wheel: $(READY)
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheel .
 
 # What is committed under results/, where it needs recordings only if they are present. About half an hour on two cores.
 results: $(READY)
@@ -46,6 +59,10 @@ setup: $(READY)
 
 $(READY): pyproject.toml .ci/setup
 	PYTHON="$(PYTHON)" VENV="$(VENV)" sh .ci/setup
+	@touch $@
+
+$(VENV)/.docs: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	@touch $@
 
 clean:

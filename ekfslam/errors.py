@@ -18,10 +18,6 @@ class EkfslamError(Exception):
     """Base of every error that a user's data, configuration or request can cause."""
 
 
-class MissingPackageError(EkfslamError):
-    """An optional package is not installed; the message says which extra brings it."""
-
-
 class ConfigError(EkfslamError):
     """A configuration file or override names an unknown key or a value out of range."""
 

@@ -18,9 +18,7 @@ def opencv() -> Any:
     try:
         import cv2
     except ImportError as error:
-        raise MissingPackageError(
-            f"images are tracked with OpenCV, which cannot be imported ({error}): pip install 'ekfslam[images]'"
-        ) from None
+        raise MissingPackageError("opencv-python-headless", "images", f"tracking images ({error})") from None
     return cv2
 
 

@@ -16,9 +16,7 @@ EXAMPLES = ("animate city.h5", "animate city.h5 --modes full --out drive.mp4 --p
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("archive", type=Path, metavar="ARCHIVE", help="as written by run or compare")
     parser.add_argument("--modes", nargs="+", metavar="MODE", help="to show (default: all)")
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE", help="*.gif or *.mp4; default: drive.gif beside the archive"
-    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="*.gif or *.mp4; default: drive.gif beside it")
     parser.add_argument("--pictures", type=int, default=200, metavar="N", help="at most (default: %(default)s)")
     parser.add_argument("--per-second", type=int, default=20, metavar="N", help="default: %(default)s")
     add_force(parser)

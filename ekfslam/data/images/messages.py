@@ -47,9 +47,7 @@ class Bag:
         try:
             from rosbags import rosbag1, rosbag2
         except ImportError as error:
-            raise MissingPackageError(
-                f"{path}: bags are read by rosbags ({error}): pip install 'ekfslam[bags]'"
-            ) from None
+            raise MissingPackageError("rosbags", "bags", f"{path}: reading a bag ({error})") from None
         self.path = path
         with self.named():
             self.is_ros1 = path.is_file() and _head(path).startswith(ROS1_MAGIC)
