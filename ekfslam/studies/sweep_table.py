@@ -131,7 +131,9 @@ def read_table(path: str | Path) -> SweepTable:
         items = [_item(name, "f" if group[name].dtype.kind == "f" else "S") for name in group if name != _ROW]
         found = hdf5.read_fields(group, hdf5.layout(*items))
         columns = {
-            name: value if value.dtype.kind == "f" else np.array([printable(text) for text in hdf5.texts(value)], dtype=object)
+            name: value
+            if value.dtype.kind == "f"
+            else np.array([printable(text) for text in hdf5.texts(value)], dtype=object)
             for name, value in found.items()
         }
         swept = json.loads(str(hdf5.attribute(h5file, "swept")))
