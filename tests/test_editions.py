@@ -135,7 +135,7 @@ def changed(name: str, change: Any) -> Any:
         (changed("extR_T_imu", lambda a: a[:3]), ShapeError, "extR_T_imu"),
         (changed("K_r", lambda a: a * np.array([[1.2], [1.0], [1.0]])), CalibrationError, "K_r"),
     ],
-    ids=str,
+    ids=lambda value: getattr(value, "__name__", value),
 )
 def test_broken_npy_names_file_and_field(tmp_path, world, alter, error, field):
     fields = npy_fields(world)

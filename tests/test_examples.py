@@ -55,6 +55,16 @@ def test_own_reader(tmp_path):
     assert numbers(lines["largest error of a position"])[0] < 0.4
 
 
+def test_own_arrays(tmp_path):
+    lines = printed("own_arrays", tmp_path)
+    assert re.match(r"120 frames, \d{4} observations, attributes {'velocities': 'none'}", lines["built"])
+    assert lines["refused"].startswith("T_cam_imu: velocities mean nothing")
+    assert lines["velocities"] == "frames and samples have the same stamps."
+    for name, frames in (("frames 20:80", 60), ("from 3 to 6 s", 30)):
+        count, error_m = numbers(lines[name])
+        assert count == frames and 0.0 < error_m < 0.5
+
+
 def test_own_sensor(tmp_path):
     lines = printed("own_sensor", tmp_path)
     assert numbers(lines["Jacobian against differences"])[0] < 1e-7

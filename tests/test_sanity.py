@@ -95,6 +95,14 @@ def test_no_false_alarm_on_worlds(data):
     assert inspect_sequence(open_sequence(data)).warnings == ()
 
 
+@pytest.mark.parametrize("noise", ["", "&sigma_px=0.01", "&sigma_v_m_s=2&sigma_w_rad_s=0.3"])
+@pytest.mark.parametrize("name", ["city", "loop"])
+def test_noise_and_few_frames_are_no_mistakes(name, noise):
+    for frames in (3, 20, 40):
+        for seed in range(3):
+            assert inspect_sequence(builtin(f"{name}?frames={frames}&seed={seed}{noise}")).warnings == ()
+
+
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("data", "right"), [("0020", "06"), ("0027", "07"), ("0027_dense_noisy", "07"), ("0042", "01")]

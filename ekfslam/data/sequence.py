@@ -360,13 +360,12 @@ def validate_stamps(time_s: Array) -> None:
     require_shape(time_s, (None,), "time_s")
     if len(time_s) == 0:
         raise ShapeError("the sequence has no frames", field="time_s")
-    largest = float(np.abs(time_s).max())
-    if LARGEST < largest < np.inf:
+    least = float(np.abs(time_s).min())
+    if LARGEST < least < np.inf:
         units = {1e14: "milliseconds", 1e17: "microseconds", np.inf: "nanoseconds"}
-        unit = next(name for below, name in units.items() if largest < below)
-        index = int(np.argmax(np.abs(time_s) > LARGEST))
-        text = f"stamp {time_s[index]:g} is no time in seconds, stamps look like {unit} since 1970"
-        raise NonFiniteError(text, field="time_s", index=index)
+        unit = next(name for below, name in units.items() if least < below)
+        text = f"stamp {time_s[0]:g} is no time in seconds, stamps look like {unit} since 1970"
+        raise NonFiniteError(text, field="time_s", index=0)
     require_finite(time_s, "time_s")
     steps = np.diff(time_s)
     if (steps <= 0).any():

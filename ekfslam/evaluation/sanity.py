@@ -3,7 +3,8 @@
 The evidence is the flow of the tracks. From one frame to the next a point that stereo has located moves in the image
 as velocities, stamps and ``T_cam_imu`` predict it. A mistake in one of these has its own signature: with the mistake
 undone the prediction fits, and with nothing else. So each known mistake is undone in turn, and named where the
-prediction errs much less then. Noise of velocities raises no alarm: it has no such remedy.
+prediction errs much less then. Noise of velocities is no mistake: where a remedy makes velocities small, they must
+still explain more than none at all.
 """
 
 from __future__ import annotations
@@ -26,12 +27,14 @@ _LEAST_PAIRS = 60
 _LEAST_DISPARITY_PX = 2.0
 _SHARE_TURNING = 0.2  # of the frames, in which rotations are looked at
 _BETTER = 0.7  # of the error, which a remedy must leave at most; what is right leaves less than any remedy
+_EXPLAINS = 0.85  # of the error without the velocities that a remedy makes small, which it must leave at most
 _AS_GOOD = 1.3  # times the least error: of remedies that do as well, the first is the likelier
 _NEAREST_M = 0.1
 _BESIDE_PX = 1e4  # a prediction that is further off is behind the camera, or as good as there
 _BEHIND = 0.5  # share of points without depth from which the images look swapped
 _WINDOW = 10  # frames over which the truth's motion is compared
 _LEAST_TURN = np.radians(6.0)
+_SURE = 4.0
 _OTHER_WAY = 0.3  # of it, from which the truth is another
 _SAME_LENGTH = 0.1
 _REJECTED = 0.4
@@ -58,10 +61,12 @@ class _Remedy:
     Args:
         text: The mistake, in words.
         undo: From extrinsics (4, 4), velocities (n, 6) and intervals (n,) to what they should have been.
+        shrinks: Which velocities (6,) become so small by that that their noise may go.
     """
 
     text: str
     undo: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
+    shrinks: tuple[int, ...] = ()
 
 
 _OPTICAL = se3.transform(cam.R_CAM_BODY, np.zeros(3))
@@ -77,6 +82,7 @@ def _turned(C: Array, u: Array, tau: Array) -> tuple[Array, Array, Array]:
 
 
 _DEGREE = np.pi / 180.0
+_TURNING, _ALL = (3, 4, 5), (0, 1, 2, 3, 4, 5)
 _REMEDIES = (
     _Remedy("T_cam_imu looks inverted", lambda C, u, tau: (se3.inverse(C), u, tau)),
     _Remedy(
@@ -88,10 +94,12 @@ _REMEDIES = (
         "T_cam_imu looks inverted, and optical axes (right, down, forward) are forgotten",
         lambda C, u, tau: (_OPTICAL @ se3.inverse(C), u, tau),
     ),
-    _Remedy("angular velocities look like deg/s instead of rad/s", _signs(1, 1, 1, _DEGREE, _DEGREE, _DEGREE)),
-    _Remedy("stamps look like milliseconds instead of seconds", lambda C, u, tau: (C, u, 1e-3 * tau)),
-    _Remedy("stamps look like microseconds instead of seconds", lambda C, u, tau: (C, u, 1e-6 * tau)),
-    _Remedy("stamps look like nanoseconds instead of seconds", lambda C, u, tau: (C, u, 1e-9 * tau)),
+    _Remedy(
+        "angular velocities look like deg/s instead of rad/s", _signs(1, 1, 1, _DEGREE, _DEGREE, _DEGREE), _TURNING
+    ),
+    _Remedy("stamps look like milliseconds instead of seconds", lambda C, u, tau: (C, u, 1e-3 * tau), _ALL),
+    _Remedy("stamps look like microseconds instead of seconds", lambda C, u, tau: (C, u, 1e-6 * tau), _ALL),
+    _Remedy("stamps look like nanoseconds instead of seconds", lambda C, u, tau: (C, u, 1e-9 * tau), _ALL),
     _Remedy("linear velocities look as if they had the wrong sign", _signs(-1, -1, -1, 1, 1, 1)),
     _Remedy("angular velocities look as if they had the wrong sign", _signs(1, 1, 1, -1, -1, -1)),
     _Remedy("all velocities look as if they had the wrong sign", _signs(-1, -1, -1, -1, -1, -1)),
@@ -190,6 +198,12 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]
         return _off(sequence, moved, pixels[later, :2], turns)
 
     given = sequence.T_cam_imu, sequence.twist[at], tau[at]
+
+    def without(remedy: _Remedy) -> float:
+        """The error without the velocities that a remedy makes small."""
+        none = np.where(np.isin(np.arange(6), remedy.shrinks), 0.0, given[1])
+        return sum(error_px(given[0], none, given[2])) if remedy.shrinks else np.inf
+
     straight, turn = error_px(*given)
     figure = (
         f"tracks move by {np.median(seen):.3g} px a frame; the velocities predict it to {straight:.3g} px, "
@@ -198,7 +212,7 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]
     found = [(sum(error_px(*remedy.undo(*given))), remedy) for remedy in _REMEDIES]
     least = min(error for error, _ in found)
     best, remedy = next(entry for entry in found if entry[0] <= _AS_GOOD * least)
-    if best > _BETTER * (straight + turn):
+    if best > _BETTER * (straight + turn) or best > _EXPLAINS * without(remedy):
         return [figure], []
     off = f"{0.5 * (straight + turn):.3g} px" if straight + turn < _BESIDE_PX else "out of the image"
     return [figure], [f"{remedy.text}: the flow of the tracks is predicted {off} off, otherwise {0.5 * best:.2g} px"]
@@ -236,14 +250,14 @@ def _inspect_truth(sequence: Sequence) -> list[str]:
     P = truth.T_world_imu
     step, true_step = (se3.inverse(poses[:-_WINDOW]) @ poses[_WINDOW:] for poses in (T, P))
     duration = sequence.time_s[truth.frame[_WINDOW:]] - sequence.time_s[truth.frame[:-_WINDOW]]
-    way = _disagreement(step[:, :3, 3], true_step[:, :3, 3], MOVING_M_S * duration)
-    turn = _disagreement(
-        se3.so3_log(step[:, :3, :3]), se3.so3_log(true_step[:, :3, :3]), np.full(len(step), _LEAST_TURN)
-    )
+    drift_m, drift_rad = _noise_over_window(sequence)
+    least_m, least_rad = np.maximum(MOVING_M_S * duration, drift_m), np.full(len(step), max(_LEAST_TURN, drift_rad))
+    way = _disagreement(step[:, :3, 3], true_step[:, :3, 3], least_m, drift_m)
+    turn = _disagreement(se3.so3_log(step[:, :3, :3]), se3.so3_log(true_step[:, :3, :3]), least_rad, drift_rad)
     if max(way, turn) < _OTHER_WAY:
         return []
     lengths, true_lengths = (np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True) for poses in (step, true_step))
-    if way > _OTHER_WAY and _disagreement(lengths, true_lengths, MOVING_M_S * duration) < _SAME_LENGTH:
+    if way > _OTHER_WAY and _disagreement(lengths, true_lengths, least_m, drift_m) < _SAME_LENGTH:
         return [
             f"the truth looks like poses of another body than the IMU: it moves as far as the velocities say, "
             f"but another way ({way:.0%} of it apart)"
@@ -256,10 +270,21 @@ def _inspect_truth(sequence: Sequence) -> list[str]:
     return [f"the truth looks like that of another recording: over {_WINDOW} frames it {how} apart"]
 
 
-def _disagreement(found: Array, true: Array, least: Array) -> float:
-    """Median distance of motions (n, d), as a share of the larger one of both, where that exceeds ``least`` (n,)."""
+def _noise_over_window(sequence: Sequence) -> tuple[float, float]:
+    """What white noise of the velocities may add up to over a stretch, m and rad, at most `_SURE` deviations of it."""
+    changes = np.median(np.abs(np.diff(sequence.twist, axis=0)), axis=0)
+    std = changes / (0.6745 * np.sqrt(2.0)) * np.median(np.diff(sequence.time_s)) * np.sqrt(_WINDOW)
+    return _SURE * float(np.linalg.norm(std[:3])), _SURE * float(np.linalg.norm(std[3:]))
+
+
+def _disagreement(found: Array, true: Array, least: Array, noise: float) -> float:
+    """Median distance of motions (n, d), as a share of the larger one of both, where that exceeds ``least`` (n,).
+
+    Half of what noise may add up to does not count.
+    """
     larger = np.maximum(np.linalg.norm(found, axis=1), np.linalg.norm(true, axis=1))
     moving = larger > least
     if moving.sum() < _WINDOW:
         return 0.0
-    return float(np.median(np.linalg.norm(found - true, axis=1)[moving] / larger[moving]))
+    apart = np.maximum(np.linalg.norm(found - true, axis=1)[moving] - 0.5 * noise, 0.0)
+    return float(np.median(apart / larger[moving]))

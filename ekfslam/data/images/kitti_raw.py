@@ -42,10 +42,8 @@ def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> Image
         raise LostDataError(
             f"image {last:010d} has no packet, there are {len(drive)}", source=str(folder), field="oxts"
         )
-    for number in range(first, last + 1):
-        for place, found in zip(_data(folder, pair), (left, right), strict=True):
-            if number not in found:
-                raise LostDataError(f"image {number:010d} is missing", source=str(place), field="images", index=number)
+    for place, found in zip(_data(folder, pair), (left, right), strict=True):
+        _require_all(place, found, first, last)
     part = drive[first : last + 1]
     size = size_of(left[first])
     K = part.camera.matrix[:2, [0, 1, 2]]
@@ -70,6 +68,12 @@ def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> Image
         notes=notes,
         attributes={**attributes, "reader": NAME},
     )
+
+
+def _require_all(folder: Path, found: dict[int, Path], first: int, last: int) -> None:
+    for number in range(first, last + 1):
+        if number not in found:
+            raise LostDataError(f"image {number:010d} is missing", source=str(folder), field="images", index=number)
 
 
 def _data(folder: Path, pair: Pair) -> tuple[Path, Path]:

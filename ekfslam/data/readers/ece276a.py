@@ -22,7 +22,7 @@ from ekfslam.data.readers.fields import (
     with_lateral,
 )
 from ekfslam.data.readers.registry import Extrinsics, Lateral, Reader
-from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, require_rigid, validate_camera
+from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Observations, Sequence, require_rigid, validate_camera
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import CalibrationError, ExtrinsicsError, UnknownFormatError
 from ekfslam.geometry import se3
@@ -96,14 +96,7 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
             T_cam_imu=T_cam_imu,
             observations=observations,
             velocity_frame="level",
-            notes=(
-                notes[0],
-                LEVEL_VELOCITIES_NOTE,
-                *notes[1:],
-                *found,
-                *interpolation_notes(twist),
-                *inspect_tracks(observations, twist).notes,
-            ),
+            notes=(notes[0], LEVEL_VELOCITIES_NOTE, notes[1], *found, *_notes_on(observations, twist)),
             attributes={
                 "checksum_sha256": checksum(path),
                 "reader": READER.name,
@@ -112,6 +105,10 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
                 **interpolation_attributes(twist),
             },
         )
+
+
+def _notes_on(observations: Observations, twist: Array) -> tuple[str, ...]:
+    return (*interpolation_notes(twist), *inspect_tracks(observations, twist).notes)
 
 
 def stamps_of(fields: Mapping[str, NDArray], name: str) -> Array:
