@@ -27,7 +27,7 @@ def test_the_tutorial_runs():
     assert cells[-1].shown.endswith('<pre class="shown">True</pre>')
     assert np.abs(names["error_m"]).max() < 1.0
     joint_m, alone_m = (
-        float(x) for x in re.findall(r"([0-9.]+) m", next(c.shown for c in cells if "apart" in c.source))[1:]
+        float(x) for x in re.findall(r"([0-9.]+) m", next(c.shown for c in cells if "apart =" in c.source))[1:]
     )
     assert 0.0 < joint_m < alone_m
     assert names["mine"].noise is not None and len(names["mine"].landmarks) > 100
@@ -84,3 +84,52 @@ def test_quoted_files_exist(page):
     quoted = re.findall(r"(?:experiments|results|tests|ekfslam|docs)/[\w/.-]*\w", text)
     missing = [name for name in quoted if not (ROOT / name).exists() and "local" not in name and "NAME" not in name]
     assert not missing
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
+def test_links_of_the_top_folder_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)#]+)", (ROOT / page).read_text(encoding="utf-8"))
+    assert links and not [link for link in links if not (ROOT / link).exists()]
+
+
+def test_every_page_is_in_the_navigation():
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    pages = [path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")]
+    assert not [name for name in pages if f": {name}\n" not in navigation]
+
+
+def quotations() -> list:
+    """Paragraphs that cite one file of results: page, file, and the numbers in them."""
+    found = []
+    for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md"))):
+        for paragraph in re.split(r"\n\n|\n(?=[-|] )", page.read_text(encoding="utf-8")):
+            cited = set(re.findall(r"results/[\w/]+\.md", paragraph))
+            numbers = re.findall(r"(?<![\w.])\d+\.\d+(?=x?(?:[^\w.]|\.\s|$))", paragraph)
+            if len(cited) == 1 and numbers:
+                found.append(pytest.param(*cited, numbers, id=f"{page.name}-{numbers[0]}"))
+    return found
+
+
+@pytest.mark.parametrize(("cited", "numbers"), quotations())
+def test_figures_stand_in_the_results_they_cite(cited, numbers):
+    text = (ROOT / cited).read_text(encoding="utf-8")
+    assert not [number for number in numbers if number not in text]
+
+
+def test_the_tables_of_the_pages_stand_in_the_results():
+    table = (ROOT / "results" / "demo" / "city" / "summary.md").read_text(encoding="utf-8")
+    for page in (ROOT / "README.md", DOCS / "start.md"):
+        rows = re.findall(
+            r"^\| (?:ATE|RPE|pose NEES|NIS|landmark RMSE).*", page.read_text(encoding="utf-8"), re.MULTILINE
+        )
+        assert len(rows) >= 4 and not [row for row in rows if "".join(row.split()) not in "".join(table.split())]
+    noise = (DOCS / "noise.md").read_text(encoding="utf-8")
+    study = (ROOT / "results" / "consistency" / "table.md").read_text(encoding="utf-8")
+    assert all(f"| {x}" in study for x in re.findall(r"\d+\.\d+ ± \d+\.\d+", noise))
+    real = (ROOT / "results" / "real_data" / "table.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d\d)_(\d\d)_(\d{4}) \| (\S+) \((\S+)\) \| (.*) \|$", noise, re.MULTILINE)
+    assert len(rows) == 7
+    for month, day, drive, full_m, dead_m, others in rows:
+        found = re.findall(rf"^\| 2011_{month}_{day}_drive_{drive}_sync_KLT \|.*", real, re.MULTILINE)
+        assert re.search(rf"\| {dead_m} \(.*\) \| {full_m} \(", found[0])
+        assert all(f" {value} " in found[1] for value in others.split(" | "))
