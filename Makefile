@@ -50,6 +50,7 @@ results: $(READY)
 	$(BIN)/python experiments/ablation.py
 	$(BIN)/python experiments/scaling.py
 	$(BIN)/python experiments/benchmark.py
+	$(BIN)/python experiments/front_end.py
 
 # The page on the archive format, from the code.
 archive-page: $(READY)

@@ -27,6 +27,7 @@ from .filters.result import Result
 from .frontend.opening import open_sequence
 from .frontend.track import TrackReport, track
 from .geometry.camera import StereoCamera
+from .page.report import write_report
 from .reports import Comparison, check, check_consistency, compare
 from .runner import run
 from .smoother.posterior import Posterior, posterior, smooth
@@ -79,5 +80,6 @@ __all__ = [
     "track",
     "tune",
     "write_archive",
+    "write_report",
     "write_sequence",
 ]

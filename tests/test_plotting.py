@@ -198,6 +198,7 @@ def test_files_are_written_and_small(sequence, results, tmp_path):
     paths = save_figures(tmp_path / "new" / "folder", results, sequence.truth)
     assert [path.name for path in paths] == [
         "map.png",
+        "side.png",
         "errors.png",
         "nis.png",
         "landmarks_mapping-only.png",
@@ -210,7 +211,7 @@ def test_files_are_written_and_small(sequence, results, tmp_path):
 
 def test_only_figures_with_content_are_written(results, tmp_path):
     paths = save_figures(tmp_path, {"dead-reckoning": results["dead-reckoning"]})
-    assert [path.name for path in paths] == ["map.png"]
+    assert [path.name for path in paths] == ["map.png", "side.png"]
 
 
 def test_drawing_leaves_no_global_state_behind(sequence, results):

@@ -27,8 +27,9 @@ def test_maps_share_scale_and_units_and_show_ellipses(world, full):
     for ax in (left, right):
         assert ax.get_aspect() == 1.0
         assert ax.get_xlabel() == "x [m]"
-        (ellipses,) = (child for child in ax.collections if isinstance(child, EllipseCollection))
+        ellipses, of_poses = (child for child in ax.collections if isinstance(child, EllipseCollection))
         assert len(ellipses.get_offsets()) > 5
+        assert len(of_poses.get_offsets()) == 16
         assert " m" in ax.get_title()
 
 

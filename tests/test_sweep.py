@@ -243,3 +243,13 @@ def test_command(tmp_path, capsys):
     assert main(["sweep", "--out", str(out)]) == 2
     assert main(["sweep", "--table", "--out", str(out), "--figures", "nothing"]) == 2
     assert "no column 'nothing'" in capsys.readouterr().err
+
+
+def test_xarray_opens_the_table(tmp_path, undisturbed):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("h5netcdf")
+    (tmp_path / "sweep.h5").write_bytes(table_image(undisturbed))
+    with xarray.open_dataset(tmp_path / "sweep.h5", group="table", engine="h5netcdf") as found:
+        assert found["ate_m"].dims == ("run",)
+        np.testing.assert_array_equal(found["ate_m"], undisturbed.columns["ate_m"])
+        assert set(undisturbed.columns) == set(found.data_vars)

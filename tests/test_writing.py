@@ -314,4 +314,4 @@ def test_figures_of_an_earlier_run_do_not_stay_beside_a_new_archive(tmp_path):
     assert {"map_before_and_after.png", "nis.png", "check.md"} <= {path.name for path in folder.iterdir()}
     assert main([*full, "--modes", "dead-reckoning"]) == 0
     names = {path.name for path in folder.iterdir()}
-    assert names == {"archive.h5", "summary.json", "summary.md", "map.png", "errors.png", "mine.png"}
+    assert names == {"archive.h5", "summary.json", "summary.md", "map.png", "side.png", "errors.png", "mine.png"}

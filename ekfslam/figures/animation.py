@@ -164,9 +164,9 @@ def _ellipses(
         edgecolors=color,
         linewidths=0.8,
     )
-    found.axes = ax
     figure = ax.get_figure()
     assert figure is not None
+    found.axes = ax
     found.set_figure(figure)
     found.set_clip_box(ax.bbox)
     return found

@@ -1,4 +1,4 @@
-"""Figures from above: maps with ellipses, trajectories, and how far landmarks moved.
+"""Maps: from above with ellipses, from the side, trajectories, and how far landmarks moved.
 
 Every function returns a `matplotlib.figure.Figure` and touches no global state, so it works without a display and
 from any thread. Colours and lines are those of `ekfslam.figures.style`.
@@ -7,6 +7,7 @@ from any thread. Colours and lines are those of `ekfslam.figures.style`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,13 +17,17 @@ from matplotlib.lines import Line2D
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
-from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, line_of, style_of, styled
+from ekfslam.evaluation.consistency import world_axes_std
+from ekfslam.evaluation.trajectory import distance_along
+from ekfslam.figures.style import BAND_ALPHA, FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, line_of, style_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.geometry.motion import world_axes_covariance
 
 SIGMAS = 2.0  # of ellipses
 
-_MARKS = 10  # markers and pose ellipses along a trajectory
+_MARKS = 10  # markers, pose ellipses and arrows along a trajectory
+_ELLIPSES = 400  # of landmarks on a map; more are one blot
+_HELD = f"{100 * (1 - np.exp(-(SIGMAS**2) / 2)):.0f} %"  # of a Gaussian in the plane, within an ellipse
 
 
 def ellipse_axes(covariance: Array, sigmas: float) -> tuple[Array, Array, Array]:
@@ -44,7 +49,8 @@ def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figur
 
     Landmarks are those of the full mode, or of the last mode that has any. The view follows trajectories and the bulk
     of the landmarks; the legend says how many landmarks lie outside it. Ellipses longer than a tenth (poses:
-    half) of the view's diagonal are left out; the legend says of how many landmarks.
+    half) of the view's diagonal are left out, and of more than 400 landmarks all but 400; the legend says so. Arrows
+    are along the IMU's x axis.
     """
     mapper = map_of(results)
     paths = [result.T_world_imu[:, :2, 3] for result in results.values()]
@@ -55,20 +61,25 @@ def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figur
     ax, outside = map_axes(np.concatenate(paths), points)
     if len(landmarks):
         # The more there are, the fainter, or a dense map would be one blot.
-        alpha = float(np.clip(20.0 / np.sqrt(len(landmarks)), 0.15, 0.8))
-        left_out = add_ellipses(ax, points, landmarks.covariance[:, :2, :2], LANDMARK_COLOR, alpha, 0.5, share=0.1)
+        alpha = float(np.clip(20.0 / np.sqrt(len(landmarks)), 0.5, 0.8))
+        some = spread(len(landmarks), _ELLIPSES)
+        covariance = landmarks.covariance[some, :2, :2]
+        left_out = add_ellipses(ax, points[some], covariance, LANDMARK_COLOR, alpha, 0.6, share=0.1)
+        left_out += len(landmarks) - len(some)
         uncertain = f", {left_out} without ellipse" if left_out else ""
         label = f"{len(landmarks)} landmarks ({mapper.mode}{_outside_text(outside)}{uncertain})"
         size = dot_size(len(landmarks))
         ax.plot(*points.T, ".", color=LANDMARK_COLOR, markersize=size, markeredgewidth=0, label=label, zorder=1.5)
     draw_paths(ax, results, truth)
     for mode, result in results.items():
-        some = _spread(len(result.time_s), _MARKS)
+        some = spread(len(result.time_s), _MARKS)
         covariance, _ = world_axes_covariance(result.T_world_imu[some], result.covariance[some])
         color, xy = style_of(mode)["color"], result.T_world_imu[some, :2, 3]
         add_ellipses(ax, xy, covariance[:, :2, :2], color, 1.0, 1.0, share=0.5)
+        _add_arrows(ax, result.T_world_imu[some], color)
     _outside_legend(ax)
-    ax.set_title(f"{mapper.sequence_name}: map from above, {SIGMAS:g}-sigma ellipses")
+    drawn = f"{SIGMAS:g}-sigma ellipses ({_HELD} of a Gaussian), arrows along the IMU's x axis"
+    ax.set_title(f"{mapper.sequence_name}: map from above\n{drawn}")
     return _figure_of(ax)
 
 
@@ -81,18 +92,7 @@ def plot_trajectories(results: Mapping[str, Result], truth: Truth | None = None)
     ax, _ = map_axes(np.concatenate([T[:, :2, 3] for T in paths.values()]), np.empty((0, 2)))
     draw_paths(ax, results, truth)
     for name, T in paths.items():
-        ends = T[[0, -1]]
-        arrows = ax.quiver(
-            *ends[:, :2, 3].T,
-            *ends[:, :2, 0].T,
-            color=(TRUTH if name == "truth" else style_of(name))["color"],
-            angles="xy",
-            scale=18,
-            width=0.005,
-            zorder=4,
-            clip_on=False,
-        )
-        arrows.set_in_layout(False)
+        _add_arrows(ax, T[[0, -1]], (TRUTH if name == "truth" else style_of(name))["color"])
     _outside_legend(ax)
     ax.set_title(f"{_first(results).sequence_name}\ntrajectories from above, arrows along the IMU's x axis")
     return _figure_of(ax)
@@ -122,6 +122,50 @@ def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
     return _figure_of(ax)
 
 
+@styled
+def plot_side(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
+    """The drive from the side: height z of world against the distance driven, metres, with bands of 3 sigma.
+
+    Landmarks, those of the map from above, stand where the vehicle was when it saw them last. The view is that of the
+    trajectories and the bulk of the landmarks.
+    """
+    mapper, figure = map_of(results), Figure(figsize=(9.0, 4.2))
+    ax = figure.subplots()
+    landmarks, way = mapper.landmarks, distance_along(mapper.T_world_imu)
+    heights = [result.T_world_imu[:, 2, 3] for result in results.values()]
+    if len(landmarks):
+        z, size = landmarks.position_m[:, 2], dot_size(len(landmarks))
+        label = f"{len(landmarks)} landmarks ({mapper.mode}), where seen last"
+        dots: dict[str, Any] = {"color": LANDMARK_COLOR, "markersize": size, "markeredgewidth": 0, "alpha": 0.6}
+        ax.plot(way[landmarks.last_frame], z, ".", **dots, label=label, zorder=1.5)
+        heights.append(np.percentile(z, [2, 98]))
+    if truth is not None and len(truth.frame):
+        ax.plot(distance_along(truth.T_world_imu), truth.T_world_imu[:, 2, 3], **TRUTH, label="truth", zorder=2)
+        heights.append(truth.T_world_imu[:, 2, 3])
+    for mode, result in results.items():
+        z, driven = result.T_world_imu[:, 2, 3], distance_along(result.T_world_imu)
+        band = 3.0 * world_axes_std(result.T_world_imu, result.covariance)[:, 2]
+        line = line_of(mode)
+        ax.plot(driven, z, **line, label=mode, zorder=3)
+        ax.fill_between(driven, z - band, z + band, color=line["color"], alpha=BAND_ALPHA, linewidth=0)
+    low, high = min(z.min() for z in heights), max(z.max() for z in heights)
+    margin = 0.06 * (high - low) + 0.05
+    ax.set_ylim(low - margin, high + margin)
+    ax.margins(x=0.01)
+    ax.set(xlabel="distance driven [m]", ylabel="z [m]")
+    _outside_legend(ax)
+    ax.set_title(f"{mapper.sequence_name}: from the side, 3-sigma bands")
+    return figure
+
+
+def _add_arrows(ax: Axes, T_world_imu: Array, color: str) -> None:
+    """Arrows along the IMU's x axis, seen from above, at poses (n, 4, 4)."""
+    at, along = T_world_imu[:, :2, 3], T_world_imu[:, :2, 0]
+    size: dict[str, Any] = {"units": "inches", "scale_units": "inches", "scale": 1 / 0.28, "width": 0.022}
+    arrows = ax.quiver(*at.T, *along.T, color=color, angles="xy", zorder=4, clip_on=False, **size)
+    arrows.set_in_layout(False)
+
+
 def _first(results: Mapping[str, Result]) -> Result:
     return next(iter(results.values()))
 
@@ -138,7 +182,7 @@ def _figure_of(ax: Axes) -> Figure:
     return figure
 
 
-def _spread(length: int, count: int) -> IntArray:
+def spread(length: int, count: int) -> IntArray:
     """At most ``count`` indices spread over ``length``, first and last included."""
     return np.unique(np.linspace(0, length - 1, count).astype(int))
 

@@ -6,21 +6,25 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ekfslam.arrays import IntArray
+from ekfslam.arrays import Array, IntArray
 from ekfslam.data.sequence import Truth
-from ekfslam.figures.maps import SIGMAS, add_ellipses, dot_size, draw_paths
-from ekfslam.figures.style import LANDMARK_COLOR, styled
+from ekfslam.evaluation.tables import MISSING
+from ekfslam.figures.maps import SIGMAS, add_ellipses, dot_size, draw_paths, spread
+from ekfslam.figures.style import LANDMARK_COLOR, style_of, styled
 from ekfslam.filters.result import Result
+from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.smoother.sparse.information import JointInformation
 
+_POSES = 16  # with an ellipse
 _CELLS = 500  # across a picture of a sparsity pattern
 
 
 @styled
 def plot_map_before_and_after(before: Result, after: Result, truth: Truth | None = None) -> Figure:
-    """Two maps from above at one scale, landmarks with 2-sigma ellipses: the filter's, and the posterior's.
+    """Two maps from above at one scale, poses and landmarks with 2-sigma ellipses: the filter's, and the posterior's.
 
-    The view is that of the smoothed trajectory's middle half of the drive, where ellipses are large enough to see.
+    The view is that of the smoothed trajectory's middle half of the drive. Where the drive closes a loop, it is the
+    poses before that gain: the filter's last map knows of the loop already, its earlier poses do not.
     """
     path = after.T_world_imu[:, :2, 3]
     quarter = len(path) // 4
@@ -40,12 +44,21 @@ def plot_map_before_and_after(before: Result, after: Result, truth: Truth | None
         add_ellipses(ax, xy, covariance, LANDMARK_COLOR, 0.7, 0.6, share=0.3)
         ax.plot(*xy.T, ".", color=LANDMARK_COLOR, markersize=dot_size(len(xy)), label=f"landmark, {SIGMAS:g} sigma")
         draw_paths(ax, {result.mode: result}, truth)
-        std_m = np.sqrt(np.median(np.trace(covariance, axis1=1, axis2=2))) if len(xy) else np.nan
-        ax.set_title(f"{title}: landmark standard deviation {std_m:.3g} m (median)")
+        some = spread(len(path), _POSES)
+        of_poses, _ = world_axes_covariance(result.T_world_imu, result.covariance)
+        color = style_of(result.mode)["color"]
+        add_ellipses(ax, result.T_world_imu[some, :2, 3], of_poses[some, :2, :2], color, 1.0, 1.0, share=0.5)
+        medians = f"position {_median_std(of_poses[:, :2, :2])} m, landmark {_median_std(covariance)} m"
+        ax.set_title(f"{title}, median standard deviations:\n{medians}")
         ax.set_xlabel("x [m]")
         ax.legend(loc="best")
     axes[0].set_ylabel("y [m]")
     return figure
+
+
+def _median_std(covariance: Array) -> str:
+    """Median of the standard deviations in the plane of covariances (n, 2, 2), as text."""
+    return f"{np.sqrt(np.median(np.trace(covariance, axis1=1, axis2=2))):.3g}" if len(covariance) else MISSING
 
 
 @styled

@@ -20,8 +20,19 @@ from ekfslam.evaluation.consistency import (
     world_axes_errors,
     world_axes_std,
 )
-from ekfslam.figures.maps import plot_landmark_arrows, plot_map
-from ekfslam.figures.style import BAND_ALPHA, BOUNDS, EXPECTED, PRIOR, ZERO, log_axis, save_all, style_of, styled
+from ekfslam.figures.maps import plot_landmark_arrows, plot_map, plot_side
+from ekfslam.figures.style import (
+    BAND_ALPHA,
+    BOUNDS,
+    EXPECTED,
+    PRIOR,
+    ZERO,
+    Format,
+    log_axis,
+    save_all,
+    style_of,
+    styled,
+)
 from ekfslam.figures.style import save_figure as save_figure  # one of `save_figures` by itself
 from ekfslam.filters.result import Result
 from ekfslam.geometry.motion import world_axes_covariance
@@ -164,10 +175,10 @@ def draw_figures(
 ) -> dict[str, Figure]:
     """The figures that the results allow, by name.
 
-    ``map`` always, ``errors`` with true poses, ``nis`` with updates, ``parameters`` where more than
+    ``map`` and ``side`` always, ``errors`` with true poses, ``nis`` with updates, ``parameters`` where more than
     poses and map was estimated, ``landmarks_<mode>`` for every mode with a map.
     """
-    figures = {"map": plot_map(results, truth)}
+    figures = {"map": plot_map(results, truth), "side": plot_side(results, truth)}
     if truth is not None and len(truth.frame):
         figures["errors"] = plot_errors(results, truth, interpolated)
     if any(result.innovation.dof.any() for result in results.values()):
@@ -185,6 +196,7 @@ def save_figures(
     results: Mapping[str, Result],
     truth: Truth | None = None,
     interpolated: BoolArray | None = None,
+    format: Format = "png",
 ) -> list[Path]:
-    """Write the figures of `draw_figures` as PNG into a folder, made if missing; the paths written."""
-    return save_all(directory, draw_figures(results, truth, interpolated))
+    """Write the figures of `draw_figures` into a folder, made if missing; the paths written."""
+    return save_all(directory, draw_figures(results, truth, interpolated), format=format)

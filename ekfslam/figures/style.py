@@ -14,7 +14,7 @@ from functools import wraps
 from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ParamSpec
+from typing import Any, Literal, ParamSpec
 
 import matplotlib as mpl
 import numpy as np
@@ -109,6 +109,7 @@ SERIES: tuple[Style, ...] = tuple(
 )
 
 P = ParamSpec("P")
+Format = Literal["png", "svg", "pdf"]  # of files
 
 
 def style_of(name: str) -> Style:
@@ -177,10 +178,22 @@ def png(figure: Figure, packed: bool = False) -> bytes:
     return content.getvalue()
 
 
-def pngs(directory: str | Path, figures: Mapping[str, Figure], packed: bool = False) -> dict[Path, str | bytes]:
-    """Figures as the files ``<name>.png`` of a folder, for `ekfslam.files.write_all`; see `png`."""
-    names = (Path(directory) / f"{name}.png" for name in components(figures))
-    return {path: png(drawn, packed) for path, drawn in zip(names, figures.values(), strict=True)}
+def vector(figure: Figure, format: Literal["svg", "pdf"]) -> bytes:
+    """A figure as lines and text, the same bytes each time; text stays text."""
+    content = BytesIO()
+    named = {"Creator": MADE_BY, "Date" if format == "svg" else "CreationDate": None}
+    with mpl.rc_context({**RC, "svg.fonttype": "none", "svg.hashsalt": MADE_BY, "pdf.fonttype": 42}):
+        figure.savefig(content, format=format, metadata=named)
+    return content.getvalue()
+
+
+def pngs(
+    directory: str | Path, figures: Mapping[str, Figure], packed: bool = False, format: Format = "png"
+) -> dict[Path, str | bytes]:
+    """Figures as the files ``<name>.<format>`` of a folder, for `ekfslam.files.write_all`; see `png` and `vector`."""
+    paths = [Path(directory) / f"{name}.{format}" for name in components(figures)]
+    drawn = (png(figure, packed) if format == "png" else vector(figure, format) for figure in figures.values())
+    return dict(zip(paths, drawn, strict=True))
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -188,9 +201,11 @@ def save_figure(figure: Figure, path: Path) -> None:
     files.write(path, png(figure))
 
 
-def save_all(directory: str | Path, figures: Mapping[str, Figure], packed: bool = False) -> list[Path]:
-    """Write figures as ``<name>.png`` into a folder, made if missing; the paths written. See `png`."""
-    contents = pngs(directory, figures, packed)
+def save_all(
+    directory: str | Path, figures: Mapping[str, Figure], packed: bool = False, format: Format = "png"
+) -> list[Path]:
+    """Write figures as ``<name>.<format>`` into a folder, made if missing; the paths written. See `pngs`."""
+    contents = pngs(directory, figures, packed, format)
     files.write_all(contents)
     return list(contents)
 

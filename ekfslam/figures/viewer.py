@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ekfslam import files
 from ekfslam.arrays import Array
-from ekfslam.errors import ConfigError
+from ekfslam.errors import ConfigError, MissingPackageError
 from ekfslam.evaluation.consistency import world_axes_errors
 from ekfslam.figures.maps import SIGMAS
 from ekfslam.figures.style import LANDMARK_COLOR, style_of
@@ -32,7 +32,7 @@ def write_viewer_file(archive: Archive, path: str | Path) -> None:
     """Write an archive as a file that Rerun opens (``.rrd``), as a whole or not at all.
 
     Raises:
-        ConfigError: Rerun is not installed.
+        MissingPackageError: Rerun is not installed.
         WriteError: The file cannot be written.
     """
     files.require_writable(path)
@@ -43,11 +43,18 @@ def write_viewer_file(archive: Archive, path: str | Path) -> None:
     files.write_all({Path(path): memory.drain_as_bytes()})
 
 
+def is_viewer_file(path: Path) -> bool:
+    """Whether a file is one of Rerun."""
+    with path.open("rb") as file:
+        return file.read(3) == b"RRF"
+
+
 def show_archive(archive: Archive) -> None:
     """Open the viewer, which has to be on this machine, and show an archive in it.
 
     Raises:
-        ConfigError: Rerun is not installed, or its viewer cannot be started.
+        MissingPackageError: Rerun is not installed.
+        ConfigError: Its viewer cannot be started.
     """
     recording = _new_recording(archive.name)
     try:
@@ -149,6 +156,6 @@ def _new_recording(name: str) -> Any:
 def _rerun() -> Any:
     try:
         import rerun
-    except ImportError as error:
-        raise ConfigError(f"the viewer needs Rerun ({error}); it comes with: pip install 'ekfslam[viewer]'") from None
+    except ImportError:
+        raise MissingPackageError("rerun-sdk", "viewer", "the viewer") from None
     return rerun

@@ -10,7 +10,7 @@ at both ends, and a track keeps an error c of its disparity in both. The true ro
     S = s^2 (I + B B^T) + s_c^2 k k^T
     z_true = z_before + (s^2 B^T - s_c^2 e k^T) S^-1 r
 
-Derivatives at ``z_before`` itself would go along with its noise, and bias whatever shows in small changes of depth.
+Derivatives are those at ``z_true``: at ``z_before`` they would go along with the noise that they are multiplied with.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera, project, rectified_jacobian, triangulate
 
 _ITERATIONS = 12
-_CONVERGED = 1e-5  # m and rad: a thousandth of a pixel
+_CONVERGED = 1e-4  # m and rad of a step, after which the next would be far smaller
 _LEAST_DEPTH_M = 0.1
 TRACK_STD_PX = 0.3  # s_c
 _FITS = 9.0  # mean square of a point's rows, in variances

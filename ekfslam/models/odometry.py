@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from ekfslam.arrays import Array
 from ekfslam.data.noise import Noise
@@ -21,8 +22,9 @@ from ekfslam.geometry.stereo_motion import agrees, align, sampled_motion
 _LEAST_POINTS, _AGREE_SHARE, _AGREE_PX = 6, 0.5, 2.0
 _LEAST_DISPARITY_PX = 1.0
 _SAMPLES = 200
-# The walk is that of the odometry's velocities, doubled: velocities change most where the odometry is worst.
-_WALK_FACTOR = 2.0
+_NEIGHBOURS = 5
+# Of the typical step: velocities change most where they are needed.
+_WALK_FACTOR = 3.0
 _LEAST_WALK = np.repeat([0.05, 0.005], 3)
 # What is known of the first velocities beside what the observations say, in steps of the walk: nearly nothing.
 _START_FACTOR = 10.0
@@ -61,15 +63,27 @@ def stereo_odometry(sequence: Sequence) -> Array:
     if not is_known.any():
         return twist
     last = np.maximum.accumulate(np.where(is_known, np.arange(len(twist)), 0))
-    first = int(np.argmax(is_known))
-    return twist[np.where(last > 0, last, first)]
+    return _without_jumps(twist[np.where(last > 0, last, np.argmax(is_known))])
+
+
+def _without_jumps(twist: Array) -> Array:
+    """Velocities (T, 6) with those that no vehicle has, so far are they from their neighbours, replaced by a median."""
+    middle = median_filter(twist[1:], (_NEIGHBOURS, 1), mode="mirror")
+    jumps = (np.abs(twist[1:] - middle) > _START_FACTOR * _walk(twist)).any(axis=1)
+    found = np.where(jumps[:, None], middle, twist[1:])
+    return np.concatenate([found[:1], found])
+
+
+def _walk(twist: Array) -> Array:
+    """(6,) how far velocities (T, 6) go from one interval to the next, with room for when they change most."""
+    steps = np.abs(np.diff(twist[1:], axis=0)).reshape(-1, 2, 3)
+    typical = 1.4826 * np.median(steps, axis=(0, 2)) if len(steps) else np.zeros(2)
+    return np.maximum(_WALK_FACTOR * np.repeat(typical, 3), _LEAST_WALK)
 
 
 def vision_noise(noise: Noise, twist: Array) -> Noise:
     """Noise, with what it says of velocities replaced by a walk of the twist as the odometry (T, 6) has it."""
-    steps = np.diff(twist[1:], axis=0)
-    rms = np.sqrt((steps**2).reshape(-1, 2, 3).mean(axis=(0, 2))) if len(steps) else np.zeros(2)
-    walk = np.maximum(_WALK_FACTOR * np.repeat(rms, 3), _LEAST_WALK)
+    walk = _walk(twist)
     return dataclasses.replace(
         noise,
         twist_std=_START_FACTOR * walk,

@@ -1,7 +1,7 @@
 """The table of a sweep: one row a run, every setting and figure of merit a column, in HDF5 and Parquet.
 
 /           attributes format, format_version, swept (names of columns), runs asked for, versions
-/table      a data set a column: numbers (NaN where there is none) or text
+/table      a data set a column: numbers (NaN where there is none) or text; run, the dimension of all
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from ekfslam import files, hdf5
 from ekfslam.errors import ArchiveError, ConfigError
 from ekfslam.evaluation.summary import KEYS
 from ekfslam.evaluation.tables import document, markdown_table, significant
+from ekfslam.names import printable
 from ekfslam.runner import versions
 
 FORMAT, FORMAT_VERSION = "ekfslam-sweep", 1
+_RUNS, _ROW = "runs", "run"  # the length that all columns share, and its dimension
 SHOWN = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_dof", "landmark_rmse_m", "total_s")
 
 
@@ -126,10 +128,12 @@ def read_table(path: str | Path) -> SweepTable:
     """
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         group = hdf5.subgroup(h5file, "table")
-        items = [_item(name, "f" if group[name].dtype.kind == "f" else "S") for name in group]
+        items = [_item(name, "f" if group[name].dtype.kind == "f" else "S") for name in group if name != _ROW]
         found = hdf5.read_fields(group, hdf5.layout(*items))
         columns = {
-            name: value if value.dtype.kind == "f" else np.array(hdf5.texts(value), dtype=object)
+            name: value
+            if value.dtype.kind == "f"
+            else np.array([printable(text) for text in hdf5.texts(value)], dtype=object)
             for name, value in found.items()
         }
         swept = json.loads(str(hdf5.attribute(h5file, "swept")))
@@ -141,7 +145,7 @@ def read_table(path: str | Path) -> SweepTable:
 
 def _item(name: str, kind: str) -> tuple[Any, ...]:
     check = hdf5.NUMBERS_OR_NONE if kind == "f" else hdf5.TEXTS
-    return name, name, ("n",), "see the name", "none", check
+    return name, name, (_RUNS,), "see the name", "none", check
 
 
 def _parquet(table: SweepTable) -> bytes | None:

@@ -1,28 +1,56 @@
-"""Draw the figures of an archive."""
+"""Draw the figures of an archive, or show it in the viewer Rerun."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import get_args
 
 from ekfslam import files
+from ekfslam.cli.options import add_force, require_ours
 from ekfslam.errors import ArchiveError
 from ekfslam.figures.run import save_figures
+from ekfslam.figures.style import Format
+from ekfslam.figures.viewer import is_viewer_file, show_archive, write_viewer_file
 from ekfslam.storage.archive import read_archive
 
-EXAMPLES = ("plot city.h5", "plot city.h5 --out figures")
+_OPENED = Path()  # no file: the viewer is opened
+EXAMPLES = (
+    "plot city.h5",
+    "plot city.h5 --out figures --format pdf",
+    "plot city.h5 --viewer",
+    "plot city.h5 --viewer city.rrd",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("archive", type=Path, metavar="ARCHIVE")
     parser.add_argument("--out", type=Path, metavar="DIR", help="default: the folder of the archive")
+    parser.add_argument("--format", choices=get_args(Format), default="png", help="default: %(default)s")
+    parser.add_argument(
+        "--viewer",
+        nargs="?",
+        type=Path,
+        const=_OPENED,
+        metavar="FILE.rrd",
+        help="show it in Rerun instead of drawing figures; with a name, write a file for Rerun",
+    )
+    add_force(parser)
 
 
 def command(options: argparse.Namespace) -> None:
     archive = read_archive(options.archive)
     if not archive.results:
         raise ArchiveError(f"{options.archive}: holds no run")
+    if options.viewer == _OPENED:
+        show_archive(archive)
+        return
+    if options.viewer is not None:
+        require_ours(options, options.viewer, is_viewer_file)
+        write_viewer_file(archive, options.viewer)
+        print(options.viewer)
+        return
     directory = options.out or options.archive.parent
-    files.require_writable(directory / "map.png")
-    for path in save_figures(directory, archive.results, archive.truth, archive.interpolated):
+    files.require_writable(directory / f"map.{options.format}")
+    for path in save_figures(directory, archive.results, archive.truth, archive.interpolated, options.format):
         print(path)

@@ -14,12 +14,12 @@ from ekfslam.data.readers.registry import Source
 from ekfslam.data.readers.text import line_of, parse_numbers, parse_table, read_lines, rows_of
 from ekfslam.errors import CalibrationError, LostDataError, ShapeError, UnknownFormatError
 from ekfslam.geometry import se3
+from ekfslam.geometry.camera import R_CAM_BODY
 
 _PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
 _EXPECTED = "a folder of KITTI odometry (image_0 image_1 calib.txt times.txt)"
 
 # Without velocities there is no IMU: the body is the left camera with axes forward, left, up.
-R_CAM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 def open_kitti_odometry(folder: Path) -> ImageRecording:
