@@ -1,7 +1,6 @@
 """Real recordings, one configuration: noise from the data, truth for nothing but the first pose and the evaluation."""
 
 import dataclasses
-import functools
 
 import numpy as np
 import pytest
@@ -40,14 +39,8 @@ def opened(data_path):
     return open_
 
 
-@pytest.fixture
-def drives():
-    return summaries_of_the_drives()
-
-
-@functools.cache
 def summaries_of_the_drives():
-    """Summaries of full SLAM, smoothed and dead reckoning on the UTIAS drives, each run once."""
+    """Summaries of full SLAM, smoothed and dead reckoning on the UTIAS drives."""
     found = []
     for name in DRIVES:
         sequence = open_sequence(recording(f"utias/2011_{name}_sync_KLT.mat"))[:FRAMES]
@@ -82,27 +75,17 @@ def gain(sequence):
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("drives")
-def test_full_slam_gains_on_the_drives_with_dense_tracks(drives):
+def test_on_the_drives_full_slam_gains_and_its_covariance_is_honest():
+    """6 is expected of the pose's NEES; the truth has the noise that KITTI states. All runs are for one test."""
+    drives = summaries_of_the_drives()
     gains = [drive["dead-reckoning"]["ate_m"] / drive["full"]["ate_m"] for drive in drives]
     assert min(gains) > 1
     assert np.median(gains) >= 1.5
-
-
-@pytest.mark.slow
-@pytest.mark.xdist_group("drives")
-@pytest.mark.parametrize("mode", ["full", "smoothed"])
-def test_the_covariance_is_honest_on_the_drives(drives, mode):
-    """6 is expected of the pose's NEES; the truth has the noise that KITTI states."""
-    nees = np.array([drive[mode]["pose_nees_with_truth_noise_mean"] for drive in drives])
-    assert ((nees > 2.9) & (nees < 12)).sum() >= len(drives) - 2
-    assert nees.max() < 30
-    assert np.median([drive[mode]["pose_nees_relative_100_mean"] for drive in drives]) < 20
-
-
-@pytest.mark.slow
-@pytest.mark.xdist_group("drives")
-def test_innovations_are_as_large_as_stated_on_the_drives(drives):
+    for mode in ("full", "smoothed"):
+        nees = np.array([drive[mode]["pose_nees_with_truth_noise_mean"] for drive in drives])
+        assert ((nees > 2.9) & (nees < 12)).sum() >= len(drives) - 2
+        assert nees.max() < 30
+        assert np.median([drive[mode]["pose_nees_relative_100_mean"] for drive in drives]) < 20
     assert all(0.5 < drive["full"]["nis_per_dof"] < 1.5 for drive in drives)
 
 

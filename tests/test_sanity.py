@@ -183,3 +183,10 @@ def test_a_truth_that_only_a_run_can_judge_is_named():
     (line,) = inspect_result(wrong, result, ())
     assert line.startswith("the truth looks like that of another recording: the estimate fits the tracks")
     assert inspect_result(world, result, ()) == ()
+
+
+def test_drift_of_dead_reckoning_is_no_mistake():
+    """Mapping-only rejects most of what it sees where dead reckoning has drifted."""
+    result = run(open_sequence("builtin:city?frames=300"), "mapping-only")
+    assert result.innovation.rejected.sum() > 0.4 * result.innovation.accepted.sum()
+    assert not any("rejected" in remark for remark in result.remarks)

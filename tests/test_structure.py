@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import WHOLE
 from helpers import run_joint
 
 from ekfslam.config import Config, FilterConfig
@@ -80,7 +81,7 @@ def test_sizes_of_a_camera_jitter_are_found(found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1, 8))
+@pytest.mark.parametrize("seed", range(1, 8 if WHOLE else 4))
 def test_sizes_of_a_camera_jitter_are_found_from_every_seed(seed):
     assert_is_what_was_put_in(choose(world(seed), CONFIG, [SHARED], runs=24))
 

@@ -145,6 +145,8 @@ def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]
         result: Of any mode.
         warnings: What `inspect_sequence` said of the recording: the likely cause.
     """
+    if result.mode in ("dead-reckoning", "mapping-only"):
+        return ()  # their poses drift, so that rejections and distances from the truth are no evidence
     lines = []
     accepted, rejected = int(result.innovation.accepted.sum()), int(result.innovation.rejected.sum())
     if rejected > _REJECTED * max(accepted + rejected, 1):
@@ -155,7 +157,7 @@ def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]
         return tuple(lines)
     path_m = distance_along(truth.T_world_imu)[-1]
     error_m = absolute_trajectory_error(result.T_world_imu[truth.frame], truth.T_world_imu, align=True)
-    if error_m > _OFF_TRUTH * path_m and result.mode != "dead-reckoning":
+    if error_m > _OFF_TRUTH * path_m:
         lines.append(
             f"the truth looks like that of another recording: the estimate fits the tracks, and is {error_m:.3g} m off "
             f"a path of {path_m:.3g} m, aligned"
