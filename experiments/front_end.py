@@ -36,6 +36,7 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.data.velocities import attach_velocities
 from ekfslam.evaluation.summary import summarise
 from ekfslam.evaluation.tables import markdown_table, number
+from ekfslam.figures.maps import plot_map
 from ekfslam.figures.style import line_of, styled
 from ekfslam.frontend.track import TrackReport, track
 from ekfslam.geometry import se3
@@ -79,6 +80,8 @@ def main() -> None:
         "rotation_px": report.rotation_px[-1].tolist(),
     }
     figures = {"errors_of_tracks": plot_errors({name: found[name, "vision's"] for name in ("given KLT", "front end")})}
+    sequence, result = runs["front end, vision alone"]
+    figures["map"] = plot_map({"full": result}, sequence.truth)
     write(options.out, "front_end", values, _text(rows, found, report, ms), figures)
     print(_text(rows, found, report, ms))
 
