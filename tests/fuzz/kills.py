@@ -55,9 +55,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--commands", nargs="+", default=list(COMMANDS), choices=list(COMMANDS))
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
-    for name, arguments in COMMANDS.items():
+    for name in options.commands:
+        arguments = COMMANDS[name]
         with tempfile.TemporaryDirectory() as place:
 
             def fresh(folder: str, place: str = place, name: str = name) -> Path:
