@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -176,6 +178,11 @@ def test_a_run_that_fails_is_a_row_that_says_why(tmp_path):
         ('recordings = ["builtin:city"]\n[settings]\nnoise = 1', r"\[settings.noise\] must be a table"),
         ('recordings = ["nowhere.npz"]', "nowhere.npz"),
         ("recordings = [", "s.toml"),
+        ('recordings = ["builtin:city"]\ncases = 1', r"\[cases\] must hold tables"),
+        ('recordings = ["builtin:city"]\n[cases.a]\nnoise = 1', r"\[cases.a.noise\] must be a table"),
+        ('recordings = ["builtin:city"]\n[cases.a]\nmode = "fast"', "unknown mode 'fast'"),
+        ('recordings = ["builtin:city"]\n[cases.a.noise]\nsigma = 1.0', "unknown key noise.sigma"),
+        ('recordings = ["builtin:city"]\n[cases.a]\n[cases.b]', "same run twice"),
     ],
 )
 def test_a_study_that_makes_no_sense_is_a_named_error(tmp_path, text, words):
@@ -190,6 +197,90 @@ def test_settings_of_blocks_are_swept(tmp_path):
     )
     sweep = Sweep.from_toml(tmp_path / "s.toml")
     assert [task.config.blocks["twist_bias"]["sigma_v_m_s"] for task in sweep.tasks] == [0.01, 0.1]
+
+
+def with_noise(sequence, seed, std=0.1):
+    drawn = std * np.random.default_rng(seed).standard_normal(sequence.twist.shape)
+    return dataclasses.replace(sequence, twist=sequence.twist + drawn)
+
+
+def heard(sequence, result):
+    return float(result.counts["rejected: gate"]) if "rejected: gate" in result.counts else None
+
+
+def speed(sequence, result):
+    return float(sequence.twist[3, 0])
+
+
+def test_cases_are_settings_that_belong_together_each_in_its_mode(tmp_path):
+    (tmp_path / "s.toml").write_text(
+        """
+        recordings = ["builtin:loop?frames=8"]
+        [settings.noise]
+        sigma_px = [1.0, 2.0]
+        [cases."no test"]
+        filter = { moving_sigma = inf, variant = "standard" }
+        [cases.default]
+        [cases.alone]
+        mode = "dead-reckoning"
+        """
+    )
+    path = tmp_path / "sweep.h5"
+    table = run_sweep(Sweep.from_toml(tmp_path / "s.toml"), path, SerialExecutor())
+    assert_same(read_table(path), table)
+    names = ("case", "mode", "filter.variant", "noise.sigma_px", "filter.moving_sigma")
+    rows = [tuple(row.values()) for row in table.rows(*names)]
+    usual = Config().filter.moving_sigma
+    assert rows == [
+        *(("no test", "full", "standard", px, np.inf) for px in (1.0, 2.0)),
+        *(("default", "full", "invariant", px, usual) for px in (1.0, 2.0)),
+        *(("alone", "dead-reckoning", "invariant", px, usual) for px in (1.0, 2.0)),
+    ]
+    assert table.markdown(["ate_m"]).startswith("| case")
+    parts = table.groups("case", "noise.sigma_px")
+    assert list(parts) == [(row[0], row[3]) for row in rows]
+    assert parts["alone", 2.0].rows("nis_per_dof", "mode") == [{"nis_per_dof": None, "mode": "dead-reckoning"}]
+    with pytest.raises(ConfigError, match="no column 'colour'"):
+        table.groups("colour")
+
+
+@pytest.mark.parametrize("where", ["serial", "processes"])
+def test_columns_of_ones_own_and_prepared_recordings(tmp_path, where):
+    world = "builtin:loop?frames=8"
+    ring = Recording(world, "ring", prepare=partial(with_noise, std=0.2))
+    sweep = Sweep((ring,), ("dead-reckoning", "full"), seeds=(1, 2), columns={"speed": speed, "gate": heard})
+    path = tmp_path / "sweep.h5"
+    with open_executor(where, 1) as executor:
+        table = run_sweep(sweep, path, executor)
+    assert not any(table.column("error"))
+    wanted = [with_noise(open_sequence(f"{world}&seed={seed}"), seed, 0.2).twist[3, 0] for seed in (1, 2)]
+    np.testing.assert_array_equal(table.column("speed"), np.repeat(wanted, 2))
+    assert np.isfinite(table.column("gate")).tolist() == [False, True, False, True]
+    assert_same(run_sweep(sweep, path, NeverExecutor()), table)
+    for other in (
+        dataclasses.replace(sweep, columns={"speed": heard, "gate": heard}),
+        dataclasses.replace(sweep, recordings=(dataclasses.replace(ring, prepare=partial(with_noise, std=0.3)),)),
+    ):
+        with pytest.raises(ArchiveError, match="another study"):
+            run_sweep(other, path, SerialExecutor())
+
+
+class NeverExecutor(SerialExecutor):
+    """Of a sweep that has nothing to run."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        raise AssertionError("a run that the table holds is run again")
+
+
+@pytest.mark.parametrize("name", ["ate_m", "a.b", "a/b", "", "seed"])
+def test_a_column_that_hides_another_is_refused(name):
+    with pytest.raises(ConfigError, match="a column of a sweep"):
+        Sweep((Recording("builtin:loop?frames=8", "ring"),), columns={name: speed})
+
+
+def test_a_function_without_source_is_refused():
+    with pytest.raises(ConfigError, match="whose source is unknown"):
+        Sweep((Recording("builtin:loop?frames=8", "ring", prepare=np.add),))
 
 
 def test_the_table_is_read_as_it_was_written_and_refuses_damage(tmp_path, undisturbed):

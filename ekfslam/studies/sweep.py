@@ -1,4 +1,4 @@
-"""Sweeps: recordings x seeds x variants x settings x modes, one row of figures of merit a run, in one table.
+"""Sweeps: recordings x seeds x cases x variants x settings x modes, one row of figures of merit a run, in one table.
 
     sweep = Sweep.from_toml("study.toml")
     with open_executor("processes") as executor:
@@ -14,6 +14,13 @@ A study is a TOML file. Whatever stands in a list is tried, each with each:
     [settings.noise]             # tables and keys of a configuration, see `ekfslam.config`
     sigma_px = [1.0, 2.0, 4.0]
 
+    [cases."no tilt".noise]      # settings that belong together, under a name
+    tilt_deg = 0.0
+    [cases."velocities alone"]
+    mode = "dead-reckoning"
+
+A program may add columns of its own, and change recordings after they are read: see `Sweep` and `Recording`.
+
 A run is known by all that decides its numbers, the content of its recording and the versions of the software included.
 So an interrupted sweep goes on, and a study may be extended: what is there already is not run again.
 """
@@ -22,14 +29,15 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import itertools
 import json
 import math
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +46,11 @@ from numpy.typing import NDArray
 
 from ekfslam.config import MODES, VARIANTS, Config
 from ekfslam.data.readers import BUILTIN, open_sequence
+from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ArchiveError, ConfigError, EkfslamError, UnknownFormatError
 from ekfslam.evaluation.summary import KEYS, summarise
 from ekfslam.evaluation.truth import with_truth_noise
+from ekfslam.filters.result import Result
 from ekfslam.limits import DEFAULT_GB, limit_gb, reading_up_to, require_file
 from ekfslam.names import printable
 from ekfslam.progress import progress as with_progress
@@ -51,8 +61,11 @@ from ekfslam.studies.sweep_table import SweepTable, read_table, write_table
 
 MOST_RUNS = 100_000
 _ERROR_BYTES = 400
-_KEYS = ("recordings", "modes", "variants", "seeds", "settings")
+_KEYS = ("recordings", "modes", "variants", "seeds", "settings", "cases")
 _RECORDING_KEYS = ("data", "name", "truth", "extrinsics", "lateral")
+_TAKEN = ("key", "recording", "seed", "case", "mode", "error", "run", *KEYS)  # names of columns
+
+Column = Callable[[Sequence, Result], float | None]
 
 
 @dataclass(frozen=True)
@@ -63,6 +76,8 @@ class Recording:
         data: Path, or ``builtin:NAME``.
         name: In the table.
         truth, extrinsics, lateral: As of `ekfslam.open_sequence`.
+        prepare: From what was read and the seed, None without seeds, to what is run. For other processes it must be a
+            function of a module, or a `functools.partial` of one. What it draws, it draws from the seed.
     """
 
     data: str
@@ -70,25 +85,48 @@ class Recording:
     truth: str | None = None
     extrinsics: str = "corrected"
     lateral: str = "corrected"
+    prepare: Callable[[Sequence, int | None], Sequence] | None = None
 
     @property
     def is_simulated(self) -> bool:
         return self.data.startswith(BUILTIN)
 
+    @property
+    def is_seeded(self) -> bool:
+        """Whether a seed changes it."""
+        return self.is_simulated or self.prepare is not None
+
     def with_seed(self, seed: int) -> Recording:
-        """The built-in world with a seed of its own."""
+        """The built-in world with a seed of its own; anything else as it is."""
+        if not self.is_simulated:
+            return self
         return dataclasses.replace(self, data=f"{self.data}{'&' if '?' in self.data else '?'}seed={seed}")
 
     @cached_property
     def content(self) -> str:
-        """What decides its numbers: digests of its files, or the name of the world.
+        """What decides its numbers: digests of its files, or the name of the world; and how it is prepared.
 
         Raises:
             UnknownFormatError: A file is missing.
         """
+        prepared = [] if self.prepare is None else [_source(self.prepare)]
         if self.is_simulated:
-            return self.data
-        return " ".join([self.extrinsics, self.lateral, *(_digest(Path(p)) for p in (self.data, self.truth) if p)])
+            return " ".join([self.data, *prepared])
+        files = [_digest(Path(p)) for p in (self.data, self.truth) if p]
+        return " ".join([self.extrinsics, self.lateral, *files, *prepared])
+
+
+@dataclass(frozen=True)
+class Case:
+    """Settings that belong together.
+
+    Args:
+        overrides: Table to key to value; they count more than those of the sweep.
+        mode: The only one it is run in; empty: those of the sweep.
+    """
+
+    overrides: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    mode: str = ""
 
 
 @dataclass(frozen=True)
@@ -97,8 +135,10 @@ class Task:
 
     recording: Recording
     seed: int | None
+    case: str
     mode: str
     overrides: Mapping[str, Mapping[str, Any]]
+    columns: Mapping[str, Column] = dataclasses.field(default_factory=dict)
 
     @cached_property
     def config(self) -> Config:
@@ -107,7 +147,11 @@ class Task:
     @cached_property
     def key(self) -> str:
         """What decides its numbers, as 64 hexadecimal digits."""
-        facts = [self.recording.content, self.mode, dataclasses.asdict(self.config), versions()]
+        facts: list[Any] = [self.recording.content, self.mode, dataclasses.asdict(self.config), versions()]
+        if self.recording.prepare is not None:
+            facts.append(self.seed)
+        if self.columns:
+            facts.append({name: _source(column) for name, column in self.columns.items()})
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
@@ -118,8 +162,10 @@ class Sweep:
     Args:
         recordings: On what.
         modes, variants: Of `MODES` and `VARIANTS`.
-        seeds: Of built-in worlds; none: their own.
+        seeds: Of built-in worlds, and of recordings that are prepared; none: their own.
         settings: Table to key to the values to try.
+        cases: Sets of settings, by names that become the column ``case``.
+        columns: Figures of merit besides those of `summarise`, by name: functions as of `Recording`.
 
     Raises:
         ConfigError: There is nothing to run, too much, or something unknown.
@@ -130,17 +176,24 @@ class Sweep:
     variants: tuple[str, ...] = ("invariant",)
     seeds: tuple[int, ...] = ()
     settings: Mapping[str, Mapping[str, tuple[Any, ...]]] = dataclasses.field(default_factory=dict)
+    cases: Mapping[str, Case] = dataclasses.field(default_factory=dict)
+    columns: Mapping[str, Column] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for what, values, known in (("mode", self.modes, MODES), ("variant", self.variants, VARIANTS)):
+        modes = (*self.modes, *(case.mode for case in self.cases.values() if case.mode))
+        for what, values, known in (("mode", modes, MODES), ("variant", self.variants, VARIANTS)):
             for value in values:
                 if value not in known:
                     raise ConfigError(f"unknown {what} {value!r} of a sweep; known: {', '.join(known)}")
         if not all(type(seed) is int and seed >= 0 for seed in self.seeds):
             raise ConfigError(f"seeds of a sweep must be whole numbers, not negative, found {list(self.seeds)}")
+        for name in self.columns:
+            if name in _TAKEN or not name or set(name) & set("./"):
+                raise ConfigError(f"a column of a sweep cannot have the name {name!r}")
         choices = [values for table in self.settings.values() for values in table.values()]
-        seeded = sum(max(len(self.seeds), 1) if recording.is_simulated else 1 for recording in self.recordings)
-        count = seeded * len(self.modes) * len(self.variants) * math.prod(map(len, choices))
+        seeded = sum(max(len(self.seeds), 1) if recording.is_seeded else 1 for recording in self.recordings)
+        ways = sum(1 if case.mode else len(self.modes) for case in self._cases.values())
+        count = seeded * ways * len(self.variants) * math.prod(map(len, choices))
         if not 1 <= count <= MOST_RUNS:
             raise ConfigError(f"a sweep is of 1 to {MOST_RUNS} runs, found {count}")
         names = [recording.name for recording in self.recordings]
@@ -150,6 +203,10 @@ class Sweep:
         if len(set(keys)) < len(keys):
             raise ConfigError("a sweep holds the same run twice: a value or recording stands in it twice")
 
+    @property
+    def _cases(self) -> Mapping[str, Case]:
+        return self.cases or {"": Case()}
+
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
         """All runs, the mode changing fastest."""
@@ -157,13 +214,18 @@ class Sweep:
         choices = [self.settings[table][key] for table, key in names]
         found = []
         for recording in self.recordings:
-            for seed in self.seeds if recording.is_simulated and self.seeds else (None,):
+            for seed in self.seeds if recording.is_seeded and self.seeds else (None,):
                 seeded = recording if seed is None else recording.with_seed(seed)
-                for variant, values in itertools.product(self.variants, itertools.product(*choices)):
+                for (name, case), variant, values in itertools.product(
+                    self._cases.items(), self.variants, itertools.product(*choices)
+                ):
                     overrides: dict[str, dict[str, Any]] = {"filter": {"variant": variant}}
                     for (table, key), value in zip(names, values, strict=True):
                         _put(overrides, table, key, value)
-                    found += [Task(seeded, seed, mode, overrides) for mode in self.modes]
+                    for table, own in case.overrides.items():
+                        overrides.setdefault(table, {}).update(own)
+                    modes = (case.mode,) if case.mode else self.modes
+                    found += [Task(seeded, seed, name, mode, overrides, self.columns) for mode in modes]
         return tuple(found)
 
     @staticmethod
@@ -201,7 +263,7 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
     path = Path(path)
     tasks = {task.key: task for task in sweep.tasks}
     done = _taken_up(path, tasks)
-    journal = Journal(path, "sweep", lambda key: _blank())
+    journal = Journal(path, "sweep", lambda key: _blank(sweep.columns))
     for key, _, record in journal.entries():
         _require_wanted(path, key, tasks)
         done[key] = record["run"]
@@ -222,33 +284,36 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
 
 
 def run_task(task: Task, read_gb: float = DEFAULT_GB) -> dict[str, NDArray]:
-    """Figures of merit of one run, in the order of `KEYS`, NaN where there is none; and why the run failed, if so.
+    """Figures of merit of one run, those of `KEYS` and then its columns, NaN where there is none; why it failed, if so.
 
     Args:
         task: What to run.
         read_gb: See `ekfslam.limits.reading_up_to`.
     """
-    record = _blank()["run"]
+    record = _blank(task.columns)["run"]
     try:
         with ONE_RUN_AT_A_TIME, reading_up_to(read_gb):
-            sequence = with_truth_noise(_opened(task.recording), task.config.truth)
+            sequence = with_truth_noise(_opened(task.recording, task.seed), task.config.truth)
             result = run(sequence, task.mode, task.config)  # type: ignore[arg-type]
-            found = summarise(sequence, result)
-        record["figures"][:] = [np.nan if found[key] is None else found[key] for key in KEYS]
+            found: dict[str, Any] = dict(summarise(sequence, result))
+            found |= {name: column(sequence, result) for name, column in task.columns.items()}
+        record["figures"][:] = [np.nan if value is None else value for value in found.values()]
     except EkfslamError as error:
         record["error"] = np.array(printable(str(error)).encode()[:_ERROR_BYTES], dtype=record["error"].dtype)
     return record
 
 
 @lru_cache(maxsize=2)
-def _opened(recording: Recording) -> Any:
+def _opened(recording: Recording, seed: int | None) -> Sequence:
     """A recording, kept for the next run on it in the same process."""
     options: dict[str, Any] = {"extrinsics": recording.extrinsics, "lateral": recording.lateral}
-    return open_sequence(recording.data, truth=recording.truth, **options)
+    sequence = open_sequence(recording.data, truth=recording.truth, **options)
+    return sequence if recording.prepare is None else recording.prepare(sequence, seed)
 
 
-def _blank() -> dict[str, dict[str, NDArray]]:
-    return {"run": {"figures": np.full(len(KEYS), np.nan), "error": np.zeros((), dtype=f"S{_ERROR_BYTES}")}}
+def _blank(columns: Mapping[str, Column]) -> dict[str, dict[str, NDArray]]:
+    figures = np.full(len(KEYS) + len(columns), np.nan)
+    return {"run": {"figures": figures, "error": np.zeros((), dtype=f"S{_ERROR_BYTES}")}}
 
 
 def _taken_up(path: Path, tasks: Mapping[str, Task]) -> dict[str, Mapping[str, NDArray]]:
@@ -259,8 +324,9 @@ def _taken_up(path: Path, tasks: Mapping[str, Task]) -> dict[str, Mapping[str, N
     columns = read_table(path).columns
     for row, key in enumerate(columns["key"]):
         _require_wanted(path, key, tasks)
-        record = _blank()["run"]
-        record["figures"][:] = [columns[name][row] if name in columns else np.nan for name in KEYS]
+        own = tasks[key].columns
+        record = _blank(own)["run"]
+        record["figures"][:] = [columns[name][row] if name in columns else np.nan for name in (*KEYS, *own)]
         record["error"] = np.array(columns["error"][row].encode(), dtype=record["error"].dtype)
         done[key] = record
     return done
@@ -280,10 +346,13 @@ def _table(sweep: Sweep, done: Mapping[str, Mapping[str, NDArray]]) -> SweepTabl
     rows = []
     for task in tasks:
         record = done[task.key]
-        facts = {"recording": task.recording.name, "seed": task.seed, "mode": task.mode, **_settings(task.config)}
-        figures = dict(zip(KEYS, record["figures"].tolist(), strict=True))
+        case = {"case": task.case} if sweep.cases else {}
+        told = {"recording": task.recording.name, "seed": task.seed, **case, "mode": task.mode}
+        facts = {**told, **_settings(task.config)}
+        figures = dict(zip((*KEYS, *sweep.columns), record["figures"].tolist(), strict=True))
         rows.append({"key": task.key, **facts, **figures, "error": record["error"].item().decode(errors="replace")})
-    swept = ["recording", "mode", "filter.variant", *(["seed"] if sweep.seeds else [])]
+    swept = ["recording", *(["case"] if sweep.cases else []), "mode", "filter.variant"]
+    swept += ["seed"] if sweep.seeds else []
     swept += [f"{table}.{key}" for table, values in sweep.settings.items() for key in values]
     return SweepTable.of_rows(rows, tuple(swept), len(sweep.tasks))
 
@@ -331,9 +400,23 @@ def _parsed(found: Mapping[str, Any], folder: Path) -> Sweep:
                 settings.setdefault(f"{table}.{key}", {}).update({k: _listed(v) for k, v in value.items()})
             else:
                 settings.setdefault(table, {})[key] = _listed(value)
-    given = {key: tuple(found[key]) for key in ("modes", "variants", "seeds") if key in found}
+    given: dict[str, Any] = {key: tuple(found[key]) for key in ("modes", "variants", "seeds") if key in found}
     recordings = tuple(_recording(entry, folder) for entry in found.get("recordings", []))
-    return Sweep(recordings, settings=settings, **given)
+    return Sweep(recordings, settings=settings, cases=_named_cases(found.get("cases", {})), **given)
+
+
+def _named_cases(found: Any) -> dict[str, Case]:
+    """Cases of a file: tables of tables, and a mode."""
+    if not isinstance(found, dict) or not all(isinstance(case, dict) for case in found.values()):
+        raise ConfigError(f"[cases] must hold tables, found {found!r}")
+    cases = {}
+    for name, case in found.items():
+        tables = {key: value for key, value in case.items() if key != "mode"}
+        for table, values in tables.items():
+            if not isinstance(values, dict):
+                raise ConfigError(f"[cases.{name}.{table}] must be a table, found {values!r}")
+        cases[printable(name)] = Case(tables, case.get("mode", ""))
+    return cases
 
 
 def _listed(value: Any) -> tuple[Any, ...]:
@@ -355,6 +438,16 @@ def _recording(entry: Any, folder: Path) -> Recording:
     place = data if is_simulated else str((folder / data).resolve())
     paths = {"data": place, "name": name, "truth": None if truth is None else str((folder / truth).resolve())}
     return Recording(**{**given, **paths})
+
+
+def _source(function: Any) -> str:
+    """What decides the results of a function, as far as that can be told: its source, and what is bound to it."""
+    if isinstance(function, partial):
+        return f"{_source(function.func)} {function.args!r} {sorted(function.keywords.items())!r}"
+    try:
+        return f"{function.__qualname__} {inspect.getsource(function)}"
+    except (OSError, TypeError, AttributeError):
+        raise ConfigError(f"a sweep takes functions of a module, found {function!r}, whose source is unknown") from None
 
 
 @lru_cache(maxsize=256)

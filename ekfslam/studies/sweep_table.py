@@ -26,6 +26,9 @@ from ekfslam.runner import versions
 
 FORMAT, FORMAT_VERSION = "ekfslam-sweep", 1
 _RUNS, _ROW = "runs", "run"  # the length that all columns share, and its dimension
+_ANY_NUMBER = hdf5.Check(
+    "f", "be numbers", lambda value, _: np.ones(value.shape, dtype=bool)
+)  # a limit may be infinite
 SHOWN = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_dof", "landmark_rmse_m", "total_s")
 
 
@@ -61,6 +64,33 @@ class SweepTable:
         if name not in self.columns:
             raise ConfigError(f"the sweep has no column {name!r}; it has {', '.join(self.columns)}")
         return self.columns[name]
+
+    def groups(self, *names: str) -> dict[tuple[Any, ...], SweepTable]:
+        """The table in parts, one for each choice of values in some columns, in the order in which they come.
+
+        Raises:
+            ConfigError: There is no column of such a name.
+        """
+        rows: dict[tuple[Any, ...], list[int]] = {}
+        for row, values in enumerate(zip(*(self.column(name).tolist() for name in names), strict=True)):
+            rows.setdefault(values, []).append(row)
+        return {values: self._only(chosen) for values, chosen in rows.items()}
+
+    def _only(self, rows: Sequence[int]) -> SweepTable:
+        columns = {name: values[np.asarray(rows, dtype=int)] for name, values in self.columns.items()}
+        return SweepTable(columns, self.swept, len(rows))
+
+    def rows(self, *names: str) -> list[dict[str, Any]]:
+        """Some columns row by row as plain values, ready for JSON; None where there is no number.
+
+        Raises:
+            ConfigError: There is no such column.
+        """
+        columns = [self.column(name).tolist() for name in names]
+        return [
+            {name: None if value != value else value for name, value in zip(names, values, strict=True)}
+            for values in zip(*columns, strict=True)
+        ]
 
     def markdown(self, figures: Sequence[str] = SHOWN) -> str:
         """A Markdown table of what tells runs apart and of some figures of merit, then the errors.
@@ -144,7 +174,7 @@ def read_table(path: str | Path) -> SweepTable:
 
 
 def _item(name: str, kind: str) -> tuple[Any, ...]:
-    check = hdf5.NUMBERS_OR_NONE if kind == "f" else hdf5.TEXTS
+    check = _ANY_NUMBER if kind == "f" else hdf5.TEXTS
     return name, name, (_RUNS,), "see the name", "none", check
 
 
