@@ -7,28 +7,20 @@ made part of the state: once with the velocities as measured, once with the true
 
 which tells what the tracks themselves want.
 
-    python experiments/ablation.py [--data DIR] [--out DIR]
+    python experiments/ablation.py [--data DIR] [--out DIR] [--workers N]
 """
 
 from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
-from common import (
-    DENSE,
-    REPORT,
-    UTIAS,
-    argument_parser,
-    has_recordings,
-    run_with,
-    trajectory_errors,
-    truth_of,
-    write,
-)
-from real_data import RECORDINGS, recording
+from common import DENSE, REPORT, UTIAS, argument_parser, has_recordings, open_recording, swept, truth_of, write
+from real_data import recordings
 
 import ekfslam
 from ekfslam.data.sequence import Sequence
@@ -36,60 +28,62 @@ from ekfslam.evaluation.tables import document, markdown_table, number, plus_min
 from ekfslam.figures.run import plot_parameters
 from ekfslam.geometry import se3
 from ekfslam.models.build import noise_of
+from ekfslam.studies.sweep import Case, Sweep
 
-WITHOUT: dict[str, dict[str, dict[str, Any]]] = {
-    "all of it": {},
-    "no shared errors": {"noise": {"shared": False}},
-    "landmarks in xyz": {"filter": {"landmark_coordinates": "xyz"}},
-    "no tilt": {"noise": {"tilt_deg": 0.0}},
-    "slow tracks stay at repeats": {"hygiene": {"restart_above_px": 7.0}},
-    "no test for moving tracks": {"filter": {"moving_sigma": float("inf")}},
-    "no drift along the way": {"noise": {"drift": 0.0}},
-    "repeated frames not cut": {"hygiene": {"restart_at_repeats": False}},
-    "white noise": {"noise": {"model": "white"}},
-    "white, 0.2 mrad/s": {"noise": {"model": "white", "sigma_w_rad_s": 0.0002}},
+CALIBRATION = {"rotation_deg": 0.5, "lever_arm_m": 0.05, "baseline": 0.02, "disparity_px": 0.5, "time_s": 0.02}
+WITHOUT = {
+    "dead reckoning": Case(mode="dead-reckoning"),
+    "all of it": Case(),
+    "no shared errors": Case({"noise": {"shared": False}}),
+    "landmarks in xyz": Case({"filter": {"landmark_coordinates": "xyz"}}),
+    "no tilt": Case({"noise": {"tilt_deg": 0.0}}),
+    "slow tracks stay at repeats": Case({"hygiene": {"restart_above_px": 7.0}}),
+    "no test for moving tracks": Case({"filter": {"moving_sigma": float("inf")}}),
+    "no drift along the way": Case({"noise": {"drift": 0.0}}),
+    "repeated frames not cut": Case({"hygiene": {"restart_at_repeats": False}}),
+    "white noise": Case({"noise": {"model": "white"}}),
+    "white, 0.2 mrad/s": Case({"noise": {"model": "white", "sigma_w_rad_s": 0.0002}}),
 }
+CALIBRATED = "calibration in the state"
+CASES = {**WITHOUT, CALIBRATED: Case({"calibration": CALIBRATION})}
 SHOWN = "2011_09_30_drive_0020_sync_KLT"  # the recording whose calibration is drawn over time
 HIGHWAY = "2011_10_03_drive_0042_sync_KLT"
-CALIBRATION = {"rotation_deg": 0.5, "lever_arm_m": 0.05, "baseline": 0.02, "disparity_px": 0.5, "time_s": 0.02}
 
-
-Ablation = dict[str, dict[str, float]]  # recording, part left out: ATE in metres
-Calibrations = dict[str, dict[str, dict[str, list[Any]]]]  # recording, motion, parameter: see `estimates`
+Row = dict[str, Any]  # by column
 
 
 def main() -> int:
-    parsed = argument_parser(__doc__, "real_data", data=True).parse_args()
+    parsed = argument_parser(__doc__, "real_data", data=True, workers=True).parse_args()
     if not has_recordings(parsed.data, *UTIAS, *REPORT, DENSE):
         return 0
-    ablation: Ablation = {}
-    calibration: Calibrations = {}
-    figures = {}
-    with_calibration = {"calibration": CALIBRATION}
-    for name in RECORDINGS:
-        sequence = recording(parsed.data, name)
-        row = {
-            "dead reckoning": trajectory_errors(sequence, run_with(sequence, "dead-reckoning", {}).T_world_imu)["ate_m"]
-        }
-        for heading, settings in WITHOUT.items():
-            row[heading] = trajectory_errors(sequence, run_with(sequence, "full", settings).T_world_imu)["ate_m"]
-        calibrated = run_with(sequence, "full", with_calibration)
-        row["calibration in the state"] = trajectory_errors(sequence, calibrated.T_world_imu)["ate_m"]
-        ablation[name] = row
-        print(name, {key: round(value, 2) for key, value in row.items()}, flush=True)
-        if name == SHOWN:
-            figures[f"calibration_{name}"] = plot_parameters(calibrated)
-        calibration[name] = {
-            "measured velocities": estimates(calibrated),
-            "true motion": estimates(run_with(with_true_motion(sequence), "full", with_calibration)),
-        }
-    values = {"ate_m": ablation, "calibration": calibration}
-    write(parsed.out, "ablation", values, markdown(ablation, calibration), figures, indent=1)
+    found = recordings(parsed.data)
+    truly = tuple(dataclasses.replace(one, prepare=partial(with_true_motion, before=one.prepare)) for one in found)
+    measured = swept("ablation", Sweep(found, cases=CASES, columns=ESTIMATES), parsed.workers)
+    true = swept("true_motion", Sweep(truly, cases={CALIBRATED: CASES[CALIBRATED]}, columns=ESTIMATES), parsed.workers)
+    errors: dict[str, Row] = {}
+    for row in measured.rows("recording", "case", "ate_m"):
+        errors.setdefault(row["recording"], {})[row["case"]] = row["ate_m"]
+    calibrated = {"measured velocities": measured.groups("case")[CALIBRATED,], "true motion": true}
+    estimates = {motion: table.rows("recording", *ESTIMATES) for motion, table in calibrated.items()}
+    sequence = open_recording(parsed.data, f"utias/{SHOWN}.mat")
+    shown = ekfslam.run(sequence, "full", ekfslam.Config().with_overrides(CASES[CALIBRATED].overrides))
+    figures = {f"calibration_{SHOWN}": plot_parameters(shown)}
+    write(
+        parsed.out,
+        "ablation",
+        {"ate_m": errors, "calibration": estimates},
+        markdown(errors, estimates),
+        figures,
+        indent=1,
+    )
     return 0
 
 
-def with_true_motion(sequence: Sequence) -> Sequence:
+def with_true_motion(
+    sequence: Sequence, seed: int | None, before: Callable[[Sequence, int | None], Sequence] | None
+) -> Sequence:
     """The recording with velocities that lead from each true pose to the next one, good to 1 cm/s and 0.1 mrad/s."""
+    sequence = sequence if before is None else before(sequence, seed)
     truth = truth_of(sequence)
     assert (np.diff(truth.frame) == 1).all()
     T = truth.T_world_imu
@@ -122,12 +116,14 @@ def with_true_motion(sequence: Sequence) -> Sequence:
     )
 
 
-def estimates(result: ekfslam.Result) -> dict[str, list[Any]]:
-    """Every calibration parameter: estimate, standard deviation, and whether it was observed."""
+def estimate(sequence: Sequence, result: ekfslam.Result, name: str, part: str) -> float | None:
+    """Of a calibration parameter: its last ``value`` or ``std``, or whether it ``is_observed``."""
     parameters = result.parameters
-    assert parameters is not None
-    rows = zip(parameters.name, parameters.value[-1], parameters.std[-1], parameters.is_observed, strict=True)
-    return {name: [float(value), float(std), bool(seen)] for name, value, std, seen in rows}
+    if parameters is None:
+        return None
+    place = list(parameters.name).index(name)
+    values = getattr(parameters, part)
+    return float(values[place] if part == "is_observed" else values[-1, place])
 
 
 # --- Tables ----------------------------------------------------------------------------------------------------------
@@ -140,6 +136,8 @@ SCALE = {
     "disparity offset": ("px", 1.0),
     "time offset": ("ms", 1000.0),
 }
+PARTS = ("value", "std", "is_observed")
+ESTIMATES = {f"{name}, {part}": partial(estimate, name=name, part=part) for name in SCALE for part in PARTS}
 
 
 def remains(drive: dict[str, float], highway: dict[str, float]) -> str:
@@ -156,17 +154,17 @@ def remains(drive: dict[str, float], highway: dict[str, float]) -> str:
     )
 
 
-def markdown(ablation: Ablation, calibration: Calibrations) -> str:
+def markdown(errors: dict[str, Row], calibration: dict[str, list[Row]]) -> str:
     """The report of the experiment."""
-    headings = list(next(iter(ablation.values())))
+    headings = list(next(iter(errors.values())))
     return document(
         "# What each part of the model brings",
         "ATE of full SLAM in metres, unaligned, with one part left out (last column: one added).",
         markdown_table(
             ["set", *headings],
-            ([name, *(number(row[key], ".2f") for key in headings)] for name, row in ablation.items()),
+            ([name, *(number(row[key], ".2f") for key in headings)] for name, row in errors.items()),
         ),
-        remains(ablation[SHOWN], ablation[HIGHWAY]),
+        remains(errors[SHOWN], errors[HIGHWAY]),
         "# What the recordings say about their calibration",
         "Estimates with one standard deviation, all parameters free at once, in units of the table; in brackets where "
         "the standard deviation has not halved: not observable. Standard deviations are those of the filter, which "
@@ -175,30 +173,25 @@ def markdown(ablation: Ablation, calibration: Calibrations) -> str:
         "every drive, which unknown roll and pitch of the vehicle hide otherwise.",
         *(
             block
-            for motion in ("measured velocities", "true motion")
+            for motion, rows in calibration.items()
             for block in (
                 f"## {motion.capitalize()}",
                 markdown_table(
                     ["set", *(f"{name} [{unit}]" for name, (unit, _) in SCALE.items())],
-                    (
-                        [
-                            name,
-                            *(calibration_cell(motions[motion][parameter], SCALE[parameter][1]) for parameter in SCALE),
-                        ]
-                        for name, motions in calibration.items()
-                    ),
+                    ([row["recording"], *(calibration_cell(row, name) for name in SCALE)] for row in rows),
                 ),
             )
         ),
     )
 
 
-def calibration_cell(estimate: list[Any], factor: float) -> str:
-    """One of `estimates` in the unit of the table, in brackets where it was not observed."""
-    value, std, seen = estimate
+def calibration_cell(row: Row, name: str) -> str:
+    """An estimate in the unit of the table, in brackets where it was not observed."""
+    value, std, seen = (row[f"{name}, {part}"] for part in PARTS)
+    factor = SCALE[name][1]
     cell = plus_minus(f"{factor * value:.2g}", f"{factor * std:.1g}")
     return cell if seen else f"({cell})"
 
 
-if __name__ == "__main__":
+if __name__ == "__main__":  # the worker processes import this file
     sys.exit(main())

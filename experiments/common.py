@@ -6,22 +6,25 @@ The recordings are looked for in ``../shared/data`` or ``$EKFSLAM_DATA``; they m
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
-import ekfslam
 from ekfslam import files
 from ekfslam.arrays import Array
 from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.trajectory import absolute_trajectory_error
 from ekfslam.figures.style import pngs
+from ekfslam.studies.executors import open_executor
+from ekfslam.studies.sweep import Recording, Sweep, run_sweep
+from ekfslam.studies.sweep_table import SweepTable
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("EKFSLAM_DATA") or ROOT.parent / "shared" / "data")
@@ -46,11 +49,15 @@ DENSE = "ece276a/0027_dense_noisy.npz"  # of the drive 0027, whose clean edition
 ODOMETRY = {"0020": "06", "0027": "07", "0042": "01", "0027_dense_noisy": "07"}
 
 
-def argument_parser(description: str | None, results: str, *, data: bool = False) -> argparse.ArgumentParser:
-    """A parser with ``--out``, by default the folder ``results`` of `results`, and on request ``--data``."""
+def argument_parser(
+    description: str | None, results: str, *, data: bool = False, workers: bool = False
+) -> argparse.ArgumentParser:
+    """A parser with ``--out``, by default the folder ``results`` of `results`; on request ``--data``, ``--workers``."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     if data:
         parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="default: %(default)s")
+    if workers:
+        parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes, default: %(default)s")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / results, metavar="DIR")
     return parser
 
@@ -63,11 +70,40 @@ def has_recordings(data: Path, *files: str) -> bool:
     return not missing
 
 
-def open_recording(data: Path, file: str, **arguments: Any) -> Sequence:
-    """A recording, with the true poses of KITTI odometry where it has none of its own but they are known."""
+def truth_file(data: Path, file: str) -> Path | None:
+    """The true poses of KITTI odometry, where a recording has none of its own but they are known."""
     poses = ODOMETRY.get(Path(file).stem)
-    truth = None if poses is None else data / "kitti_odometry_poses" / f"{poses}.txt"
-    return open_sequence(data / file, truth=truth, **arguments)
+    return None if poses is None else data / "kitti_odometry_poses" / f"{poses}.txt"
+
+
+def open_recording(data: Path, file: str, **arguments: Any) -> Sequence:
+    """A recording with its `truth_file`."""
+    return open_sequence(data / file, truth=truth_file(data, file), **arguments)
+
+
+def recording(
+    data: Path, file: str, prepare: Callable[[Sequence, int | None], Sequence] | None = None, name: str = ""
+) -> Recording:
+    """The same as a recording of a sweep."""
+    truth = truth_file(data, file)
+    return Recording(str(data / file), name or Path(file).stem, None if truth is None else str(truth), prepare=prepare)
+
+
+def swept(name: str, sweep: Sweep, workers: int) -> SweepTable:
+    """The table of a sweep, which goes on where it was interrupted; says which runs have failed.
+
+    It is kept below ``results/local``. Once the program has changed, it is made anew.
+    """
+    decides = hashlib.sha256("".join(task.key for task in sweep.tasks).encode())
+    for source in sorted((ROOT / "ekfslam").rglob("*.py")):
+        decides.update(source.read_bytes())
+    path = ROOT / "results" / "local" / "sweeps" / f"{name}-{decides.hexdigest()[:12]}.h5"
+    with open_executor("processes", workers) as executor:
+        table = run_sweep(sweep, path, executor)
+    for why, failed in table.groups("error").items():
+        if any(why):
+            print(f"{name}: {why[0]}: {failed.rows(*table.swept)}", file=sys.stderr)
+    return table
 
 
 def truth_of(sequence: Sequence) -> Truth:
@@ -87,13 +123,8 @@ def trajectory_errors(sequence: Sequence, T_world_imu: Array) -> dict[str, float
 
 
 def with_aligned(row: Mapping[str, Any], spec: str = ".2f") -> str:
-    """A cell with an error of `trajectory_errors`, and in brackets what alignment leaves of it; a dash for none."""
+    """A cell with an ATE, and in brackets what alignment leaves of it; a dash for none."""
     return "-" if row["ate_m"] is None else f"{row['ate_m']:{spec}} ({row['ate_aligned_m']:{spec}})"
-
-
-def run_with(sequence: Sequence, mode: Any, settings: Mapping[str, Mapping[str, Any]]) -> ekfslam.Result:
-    """A run with settings ``{table: {key: value}}`` other than the default ones."""
-    return ekfslam.run(sequence, mode, ekfslam.Config().with_overrides(settings))
 
 
 def write(

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,33 +22,31 @@ from common import (
     UTIAS,
     argument_parser,
     has_recordings,
-    open_recording,
-    run_with,
-    trajectory_errors,
+    recording,
+    swept,
     with_aligned,
     write,
 )
 from matplotlib.figure import Figure
 
-import ekfslam
+from ekfslam.arrays import Array
+from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence
-from ekfslam.evaluation.summary import summarise
-from ekfslam.evaluation.tables import MISSING, document, markdown_table, number
+from ekfslam.evaluation.tables import document, markdown_table, number
 from ekfslam.figures.style import ORANGE, REFERENCE, marker_of, styled
 from ekfslam.filters.result import Result
+from ekfslam.studies.sweep import Case, Column, Recording, Sweep
+from ekfslam.studies.sweep_table import SweepTable
 
-# Of full SLAM besides the default one: heading and settings.
-VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
-    "full, standard": {"filter": {"variant": "standard"}},
-    "full, fej": {"filter": {"variant": "fej"}},
-}
-# Of the second table: heading, and which of the counts.
+CASES = {"dead reckoning": Case(mode="dead-reckoning"), "full": Case()}
+VARIANTS = {f"full, {variant}": Case({"filter": {"variant": variant}}) for variant in ("standard", "fej")}
+SMOOTHED = {"smoothed": Case(mode="smoothed")}
+# Headings, and columns of the sweep.
 SHARES = {
     "dropped by hygiene": "dropped by hygiene",
     "gate": "rejected: gate",
     "moves": "rejected: moving",
 }
-# Of the same table: heading, and key of the summary.
 NEES = {
     "pose NEES": "pose_nees_mean",
     "with truth noise": "pose_nees_with_truth_noise_mean",
@@ -57,124 +54,123 @@ NEES = {
 }
 SEEDS, DENSE_SEEDS = range(3), range(6)
 ADDED_STD = np.repeat([0.5, 0.05], 3)  # m/s, rad/s
-CLEAN_DENSE = "0027_dense, clean velocities"
-RECORDINGS = {**{Path(file).stem: file for file in (*UTIAS, *REPORT, DENSE)}, CLEAN_DENSE: DENSE}
+CLEAN_DENSE, CLEAN_EDITION = "0027_dense, clean velocities", "ece276a/0027.npz"
 
-Table = dict[str, dict[str, dict[str, Any]]]  # recording, estimator, figure
-Noisy = dict[str, list[dict[str, Any]]]  # recording, seed, figures
+Runs = dict[tuple[str, str], dict[str, Any]]  # recording and case, column
+Noisy = dict[str, dict[str, Array]]  # recording, figure, by seeds
 
 
 def main() -> int:
-    parser = argument_parser(__doc__, "real_data", data=True)
+    parser = argument_parser(__doc__, "real_data", data=True, workers=True)
     parser.add_argument("--variants", action="store_true", help="the standard and the first-estimates filter, too")
-    parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes, default: %(default)s")
     parsed = parser.parse_args()
     if not has_recordings(parsed.data, *UTIAS, *REPORT, DENSE):
         return 0
-    drives = {Path(file).stem: SEEDS for file in UTIAS}
-    seeds = [(name, seed) for name, some in {**drives, Path(DENSE).stem: DENSE_SEEDS}.items() for seed in some]
-    with ProcessPoolExecutor(parsed.workers, mp_context=get_context("spawn")) as pool:
-        found = {name: pool.submit(as_recorded, parsed.data, name, parsed.variants) for name in RECORDINGS}
-        added = [(name, pool.submit(with_noise_added, parsed.data, name, seed)) for name, seed in seeds]
-        table: Table = {}
-        for name, row in found.items():
-            table[name] = row.result()
-            print(name, {key: round(value["ate_m"], 3) for key, value in table[name].items()}, flush=True)
-        noisy: Noisy = {}
-        for name, run in added:
-            noisy.setdefault(name, []).append(run.result())
-            print(name, noisy[name][-1], flush=True)
-
-    values = {"clean": table, "noise added": noisy}
-    write(parsed.out, "table", values, markdown(table, noisy), {"gain": plot(table, noisy)}, indent=1)
+    cases = {**CASES, **(VARIANTS if parsed.variants else {}), **SMOOTHED}
+    clean = swept("real_data", Sweep(recordings(parsed.data), cases=cases, columns=COLUMNS), parsed.workers)
+    both, edition = ("dead-reckoning", "full"), parsed.data / CLEAN_EDITION
+    drives = tuple(recording(parsed.data, file, with_noise) for file in UTIAS)
+    dense = recording(parsed.data, DENSE, partial(with_noise, edition=edition))
+    noisy = (
+        swept("noise_added", Sweep(drives, both, seeds=tuple(SEEDS)), parsed.workers),
+        swept("noise_added_dense", Sweep((dense,), both, seeds=tuple(DENSE_SEEDS)), parsed.workers),
+    )
+    columns = ("ate_m", "ate_aligned_m", *NEES.values(), "nis_per_dof")
+    values = {
+        "clean": clean.rows("recording", "case", *columns, *COLUMNS),
+        "noise added": [row for table in noisy for row in table.rows("recording", "seed", "mode", *columns)],
+    }
+    runs = {key: part.rows(*columns, *COLUMNS)[0] for key, part in clean.groups("recording", "case").items()}
+    added = {name: of_seeds(part) for table in noisy for (name,), part in table.groups("recording").items()}
+    write(parsed.out, "table", values, markdown(runs, added), {"gain": plot(runs, added)}, indent=1)
     return 0
 
 
-def recording(data: Path, name: str) -> Sequence:
-    """A recording by its name; the dense tracks once with the velocities of the clean edition."""
-    sequence = open_recording(data, RECORDINGS[name])
-    if name != CLEAN_DENSE:
-        return sequence
-    return dataclasses.replace(sequence, twist=open_recording(data, "ece276a/0027.npz").twist)
+def recordings(data: Path) -> tuple[Recording, ...]:
+    """All of them; the dense tracks once more with the velocities of the clean edition."""
+    clean = recording(data, DENSE, partial(with_velocities, edition=data / CLEAN_EDITION), CLEAN_DENSE)
+    return (*(recording(data, file) for file in (*UTIAS, *REPORT, DENSE)), clean)
 
 
-def as_recorded(data: Path, name: str, variants: bool) -> dict[str, dict[str, Any]]:
-    """Figures of every estimator on a recording; without those of a posterior that is ill-posed."""
-    sequence = recording(data, name)
-    full = run_with(sequence, "full", {})
-    results = {"dead reckoning": run_with(sequence, "dead-reckoning", {}), "full": full}
-    for heading, settings in VARIANTS.items() if variants else ():
-        results[heading] = run_with(sequence, "full", settings)
-    try:
-        results["smoothed"] = ekfslam.smooth(full)
-    except ekfslam.EkfslamError as error:
-        print(f"{name}: no smoothed: {error}", file=sys.stderr)
-    return {heading: figures(sequence, result) for heading, result in results.items()}
+def with_velocities(sequence: Sequence, seed: int | None, edition: Path) -> Sequence:
+    """The velocities of another edition of the same frames."""
+    return dataclasses.replace(sequence, twist=open_sequence(edition).twist)
 
 
-def figures(sequence: Sequence, result: Result) -> dict[str, Any]:
-    """Errors of the trajectory, and of full SLAM what became of the observations."""
-    found = summarise(sequence, result)
-    consistency = {name: found[key] for name, key in NEES.items()}
-    return {**trajectory_errors(sequence, result.T_world_imu), **consistency, **statistics(result)}
+def with_noise(sequence: Sequence, seed: int | None, edition: Path | None = None) -> Sequence:
+    """White noise added to the velocities, or to those of another edition."""
+    clean = sequence if edition is None else with_velocities(sequence, seed, edition)
+    noise = ADDED_STD * np.random.default_rng(seed).standard_normal(clean.twist.shape)
+    return dataclasses.replace(clean, twist=clean.twist + noise)
 
 
-def statistics(result: Result) -> dict[str, float]:
-    """What became of the observations, in shares of all, and how large innovations are for their covariance."""
-    counts, innovation = result.counts, result.innovation
+# --- Columns ---------------------------------------------------------------------------------------------------------
+
+
+def share(sequence: Sequence, result: Result, of: str) -> float | None:
+    """Share of the observations that full SLAM counts as so."""
+    counts = result.counts
     if "accepted" not in counts:
-        return {}
-    total = counts["accepted"] + counts["rejected"] + counts["dropped by hygiene"]
-    shares = {name: counts[key] / total for name, key in SHARES.items()}
-    cut = sum(value for key, value in counts.items() if key.startswith("hygiene: "))
-    return {
-        **shares,
-        "cuts": float(cut - counts["dropped by hygiene"]),
-        "moving tracks": float(counts.get("moving", 0)),
-        "track scale": float(result.config["noise"]["track_scale"] or 1.0),
-        "nis_per_dof": float(innovation.nis.sum() / max(innovation.dof.sum(), 1)),
-    }
+        return None
+    return counts[of] / (counts["accepted"] + counts["rejected"] + counts["dropped by hygiene"])
 
 
-def with_noise_added(data: Path, name: str, seed: int) -> dict[str, Any]:
-    """ATE in metres of dead reckoning and full SLAM, and pose NEES of the latter, on velocities with noise added."""
-    sequence = recording(data, name)
-    clean = recording(data, CLEAN_DENSE).twist if name == Path(DENSE).stem else sequence.twist
-    noise = ADDED_STD * np.random.default_rng(seed).standard_normal(clean.shape)
-    spoilt = dataclasses.replace(sequence, twist=clean + noise)
-    found = {mode: figures(spoilt, run_with(spoilt, mode, {})) for mode in ("dead-reckoning", "full")}
-    return {**{mode: row["ate_m"] for mode, row in found.items()}, "nees": found["full"]["with truth noise"]}
+def tracks_cut(sequence: Sequence, result: Result) -> float:
+    """How many tracks hygiene cut."""
+    cut = sum(value for key, value in result.counts.items() if key.startswith("hygiene: "))
+    return float(cut - result.counts.get("dropped by hygiene", 0))
 
+
+def tracks_moving(sequence: Sequence, result: Result) -> float:
+    """How many tracks were found to move."""
+    return float(result.counts.get("moving", 0))
+
+
+def track_scale(sequence: Sequence, result: Result) -> float:
+    """The factor on the walk of track errors that was found."""
+    return float(result.config["noise"]["track_scale"] or 1.0)
+
+
+COLUMNS: dict[str, Column] = {
+    **{heading: partial(share, of=of) for heading, of in SHARES.items()},
+    "tracks cut": tracks_cut,
+    "tracks moving": tracks_moving,
+    "track scale": track_scale,
+}
 
 # --- Tables and figure -----------------------------------------------------------------------------------------------
 
 
-def gain(row: dict[str, dict[str, Any]]) -> float:
+def of_seeds(part: SweepTable) -> dict[str, Array]:
+    """ATE in metres of both modes, the gain, and the pose NEES of full, of one recording seed by seed."""
+    modes = part.groups("mode")
+    drive, full = (modes[mode,].column("ate_m") for mode in ("dead-reckoning", "full"))
+    nees = modes["full",].column(NEES["with truth noise"])
+    return {"dead reckoning": drive, "full": full, "gain": drive / full, "pose NEES": nees}
+
+
+def gain(runs: Runs, name: str) -> float:
     """Dead reckoning's error over that of full SLAM on one recording."""
-    return float(row["dead reckoning"]["ate_m"] / row["full"]["ate_m"])
+    return float(runs[name, "dead reckoning"]["ate_m"] / runs[name, "full"]["ate_m"])
 
 
-def gains(runs: list[dict[str, Any]]) -> list[float]:
-    """The same with noise added, seed by seed."""
-    return [run["dead-reckoning"] / run["full"] for run in runs]
-
-
-def markdown(table: Table, noisy: Noisy) -> str:
+def markdown(runs: Runs, noisy: Noisy) -> str:
     """The report of the experiment."""
-    headings = list(dict.fromkeys(heading for row in table.values() for heading in row))
-    drives = [gain(table[Path(file).stem]) for file in UTIAS]
-    every = [value for name, runs in noisy.items() if name != Path(DENSE).stem for value in gains(runs)]
-    smoothed = [row["smoothed"]["ate_m"] / row["full"]["ate_m"] for row in table.values() if "smoothed" in row]
+    names, headings = (list(dict.fromkeys(column)) for column in zip(*runs, strict=True))
+    drives = [gain(runs, Path(file).stem) for file in UTIAS]
+    every = np.concatenate([found["gain"] for name, found in noisy.items() if name != Path(DENSE).stem])
+    smoothed = [
+        row["ate_m"] / runs[name, "full"]["ate_m"]
+        for (name, case), row in runs.items()
+        if case == "smoothed" and row["ate_m"] is not None
+    ]
     return document(
         "# Recordings, one configuration, noise from the data",
         "ATE in metres, unaligned (in brackets: SE(3)-aligned); gain is dead reckoning's over that of full. "
         "A dash stands where the posterior is ill-posed. Mapping-only has the trajectory of dead reckoning.",
         markdown_table(
             ["set", *headings, "gain"],
-            (
-                [name, *(with_aligned(row[k]) if k in row else MISSING for k in headings), f"{gain(row):.2f}"]
-                for name, row in table.items()
-            ),
+            ([name, *(with_aligned(runs[name, k]) for k in headings), f"{gain(runs, name):.2f}"] for name in names),
         ),
         f"Of the {len(drives)} UTIAS drives {sum(value > 1 for value in drives)} gain, {np.median(drives):.2f}x in "
         f"the median. Smoothed over full: {np.median(smoothed):.2f} in the median over all sets.",
@@ -184,57 +180,53 @@ def markdown(table: Table, noisy: Noisy) -> str:
         "of full, and the factor on the walk of track errors that was found.",
         markdown_table(
             ["set", *(f"full, {name}" for name in NEES), *(f"smoothed, {name}" for name in NEES), "NIS/dof", "factor"],
-            ([name, *honesty_cells(row)] for name, row in table.items()),
+            ([name, *honesty_cells(runs[name, "full"], runs[name, "smoothed"])] for name in names),
         ),
         "## What became of the observations (full)",
         "Shares of all observations that were dropped by hygiene, turned down by the gate and not started afresh, or "
         "belong to tracks found to move; how many tracks hygiene cut and how many were found to move.",
         markdown_table(
             ["set", *SHARES, "tracks cut", "tracks moving"],
-            ([name, *observation_cells(row["full"])] for name, row in table.items()),
+            ([name, *observation_cells(runs[name, "full"])] for name in names),
         ),
         "## Known noise added to the velocities",
         f"0.5 m/s and 0.05 rad/s a sample, {len(SEEDS)} seeds ({len(DENSE_SEEDS)} of the dense tracks); ATE in metres "
         "and pose NEES of full with truth noise, median (smallest to largest).",
         markdown_table(
-            ["set", "dead reckoning", "full", "gain", "pose NEES"],
-            ([name, *noisy_cells(runs)] for name, runs in noisy.items()),
+            ["set", *next(iter(noisy.values()))],
+            (
+                [name, *(f"{np.median(v):.2f} ({min(v):.2f} to {max(v):.2f})" for v in found.values())]
+                for name, found in noisy.items()
+            ),
         ),
         f"Gain over the UTIAS drives and seeds: {np.median(every):.2f} in the median, {min(every):.2f} at the least.",
     )
 
 
-def honesty_cells(row: dict[str, dict[str, Any]]) -> list[str]:
+def honesty_cells(full: dict[str, Any], smoothed: dict[str, Any]) -> list[str]:
     """NEES of full and smoothed, NIS and the factor found."""
-    nees = [number(row.get(mode, {}).get(name), ".1f") for mode in ("full", "smoothed") for name in NEES]
-    return [*nees, f"{row['full']['nis_per_dof']:.2f}", f"{row['full']['track scale']:.2f}"]
+    nees = [number(row[key], ".1f") for row in (full, smoothed) for key in NEES.values()]
+    return [*nees, f"{full['nis_per_dof']:.2f}", f"{full['track scale']:.2f}"]
 
 
 def observation_cells(full: dict[str, Any]) -> list[str]:
     """What full SLAM did with the observations."""
     shares = [f"{full[key]:.1%}" for key in SHARES]
-    tracks = [f"{full[key]:.0f}" for key in ("cuts", "moving tracks")]
+    tracks = [f"{full[key]:.0f}" for key in ("tracks cut", "tracks moving")]
     return [*shares, *tracks]
 
 
-def noisy_cells(runs: list[dict[str, Any]]) -> list[str]:
-    """Errors and gain over the seeds."""
-    values = [[run[mode] for run in runs] for mode in ("dead-reckoning", "full")]
-    columns = (*values, gains(runs), [run["nees"] for run in runs])
-    return [f"{np.median(v):.2f} ({min(v):.2f} to {max(v):.2f})" for v in columns]
-
-
 @styled
-def plot(table: Table, noisy: Noisy) -> Figure:
+def plot(runs: Runs, noisy: Noisy) -> Figure:
     """Gain over dead reckoning, set by set: as recorded, and with noise added."""
     figure = Figure(figsize=(8.0, 4.2))
     ax = figure.subplots()
-    names = list(table)
-    ax.plot([gain(row) for row in table.values()], range(len(names)), **marker_of("full"), label="as recorded")
-    for name, runs in noisy.items():
-        place = np.full(len(runs), names.index(name) + 0.25)
+    names = list(dict.fromkeys(name for name, _ in runs))
+    ax.plot([gain(runs, name) for name in names], range(len(names)), **marker_of("full"), label="as recorded")
+    for name, found in noisy.items():
+        place = np.full(len(found["gain"]), names.index(name) + 0.25)
         label = "noise added, seed by seed" if name in names[:1] else None
-        ax.plot(gains(runs), place, "x", color=ORANGE, label=label)
+        ax.plot(found["gain"], place, "x", color=ORANGE, label=label)
     ax.axvline(1.0, **REFERENCE)
     ax.set_xscale("log")
     ax.set_xticks([0.5, 0.8, 1, 2, 3, 5, 10], ["0.5", "0.8", "1", "2", "3", "5", "10"])
@@ -246,5 +238,5 @@ def plot(table: Table, noisy: Noisy) -> Figure:
     return figure
 
 
-if __name__ == "__main__":
+if __name__ == "__main__":  # the worker processes import this file
     sys.exit(main())

@@ -278,9 +278,19 @@ def test_a_column_that_hides_another_is_refused(name):
         Sweep((Recording("builtin:loop?frames=8", "ring"),), columns={name: speed})
 
 
-def test_a_function_without_source_is_refused():
-    with pytest.raises(ConfigError, match="whose source is unknown"):
-        Sweep((Recording("builtin:loop?frames=8", "ring", prepare=np.add),))
+@pytest.mark.parametrize("prepare", [np.add, partial(with_noise, std=np.ones(6))])
+def test_a_function_without_source_is_refused(prepare):
+    with pytest.raises(ConfigError, match="a sweep takes functions of a module"):
+        Sweep((Recording("builtin:loop?frames=8", "ring", prepare=prepare),))
+
+
+def test_a_function_bound_to_a_function_is_known_by_the_source_of_both():
+    def content(before):
+        return Recording("builtin:loop", "ring", prepare=partial(with_noise, std=partial(speed, result=before))).content
+
+    assert content(heard) == content(heard)
+    assert content(heard) != content(speed)
+    assert " at 0x" not in content(heard)
 
 
 def test_the_table_is_read_as_it_was_written_and_refuses_damage(tmp_path, undisturbed):

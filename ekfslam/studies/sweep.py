@@ -440,14 +440,18 @@ def _recording(entry: Any, folder: Path) -> Recording:
     return Recording(**{**given, **paths})
 
 
-def _source(function: Any) -> str:
+def _source(value: Any) -> str:
     """What decides the results of a function, as far as that can be told: its source, and what is bound to it."""
-    if isinstance(function, partial):
-        return f"{_source(function.func)} {function.args!r} {sorted(function.keywords.items())!r}"
+    if value is None or isinstance(value, str | int | float | Path):
+        return repr(value)
+    if isinstance(value, partial):
+        return json.dumps([_source(part) for part in (value.func, *value.args, *sum(value.keywords.items(), ()))])
     try:
-        return f"{function.__qualname__} {inspect.getsource(function)}"
+        return f"{value.__qualname__} {inspect.getsource(value)}"
     except (OSError, TypeError, AttributeError):
-        raise ConfigError(f"a sweep takes functions of a module, found {function!r}, whose source is unknown") from None
+        raise ConfigError(
+            f"a sweep takes functions of a module, with numbers, texts or functions bound to them, found {value!r}"
+        ) from None
 
 
 @lru_cache(maxsize=256)
