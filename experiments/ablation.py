@@ -119,7 +119,7 @@ def with_true_motion(
 def estimate(sequence: Sequence, result: ekfslam.Result, name: str, part: str) -> float | None:
     """Of a calibration parameter: its last ``value`` or ``std``, or whether it ``is_observed``."""
     parameters = result.parameters
-    if parameters is None:
+    if parameters is None or name not in parameters.name:
         return None
     place = list(parameters.name).index(name)
     values = getattr(parameters, part)

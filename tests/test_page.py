@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import hashlib
+import html
 import json
 import re
 import shutil
@@ -16,12 +17,17 @@ import pytest
 from helpers import synthetic_result, synthetic_sequence
 
 from ekfslam.cli import main
+from ekfslam.data.readers import open_sequence
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.consistency import pose_nees
+from ekfslam.evaluation.verdict import judge
+from ekfslam.filters.result import Innovation
 from ekfslam.page.content import packed, recordings_of, thinned
 from ekfslam.page.report import read_archives, report_page, write_report
+from ekfslam.runner import run
 from ekfslam.storage.archive import read_archive, write_archive
 
+HONEST = "honest as far as the truth of one drive can tell"
 HOSTILE = "</script><script>alert('x')</script><img src=http://evil.example onerror=alert(1)>\x1b[31m"
 
 
@@ -81,6 +87,68 @@ def test_the_page_holds_the_numbers_of_the_archive(archive, page):
     np.testing.assert_allclose(xy, full.landmarks.covariance[:, 0, 1], rtol=1e-5, atol=1e-9)
     for heading in ("ATE [m], unaligned", "pose NEES (6)", "filter.gate_probability", "Track hygiene"):
         assert (heading in page) == (heading != "Track hygiene" or full.hygiene is not None), heading
+
+
+def carded(archive_of, **runs) -> dict[str, tuple[str, list[str]]]:
+    """Kind and words of each run's card, by mode."""
+    found = dataclasses.replace(archive_of, results=runs)
+    (recording,) = recordings_of({"some": found})
+    return {run.label: (run.kind, run.said) for run in recording.runs}
+
+
+def test_every_run_has_a_verdict_from_what_there_is(archive):
+    """Innovations where they were kept, NIS where not, and the truth; words as of `ekfslam check`."""
+    known = read_archive(archive)
+    full = known.results["full"]
+    of_truth = recordings_of({"some": known})[0].runs[-1].agreement
+    to_honest = 6.0 / of_truth.nees
+    honest = dataclasses.replace(full, covariance=full.covariance / to_honest, whitened=None)
+    small = dataclasses.replace(honest, covariance=honest.covariance / 25.0)
+    doubled = dataclasses.replace(
+        honest, innovation=dataclasses.replace(honest.innovation, nis=4.0 * honest.innovation.dof)
+    )
+    bare = dataclasses.replace(honest, innovation=Innovation.empty(len(honest.time_s)))
+    said = carded(known, first=honest, small=small, doubled=doubled, bare=bare)
+    assert said["bare"] == ("good", [HONEST, "pose NEES 6, where one honest drive has 1.2 to 14.4"])
+    assert said["small"][0] == "bad"
+    assert "covariance optimistic by about 5.0x against the truth" in " ".join(said["small"][1])
+    kind, (head, figures, other) = said["doubled"]
+    assert (kind, head) == ("bad", "innovations are about 2.0x larger than expected")
+    assert figures.startswith("NIS 4 \N{PLUS-MINUS SIGN} ")
+    assert other.startswith(HONEST)
+    blind = dataclasses.replace(known, truth=None)
+    assert carded(blind, bare=bare)["bare"][0] == "none"
+    assert "no innovations to judge by" in carded(blind, bare=bare)["bare"][1][0]
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory):
+    """An archive of runs whose innovations were kept."""
+    drive = open_sequence("builtin:loop?frames=60")
+    path = tmp_path_factory.mktemp("judged") / "archive.h5"
+    write_archive(path, drive, {mode: run(drive, mode) for mode in ("mapping-only", "full")})
+    return read_archive(path)
+
+
+def test_evidence_is_that_of_check_and_of_the_truth(judged):
+    page, honesty = report_page({"first": judged}), judge(judged.results["full"])
+    for name, found, _ in honesty.overview[:-1]:
+        row = re.search(rf'<tr><th scope="row">{re.escape(html.escape(name))}[^<]*</th>(.*?)</tr>', page)
+        assert f"<td>{found}</td>" in row[1] or f"<td>{found} (" in row[1], name
+    assert "filter less smoother" not in page
+    assert "pose NEES, with truth noise (6, of one drive 1.2 to 14.4)" in page
+    cards = carded(judged, **judged.results)
+    assert cards["full"][1][0] in honesty.verdict
+    for kind, said in cards.values():
+        assert f'<article class="card {kind}">' in page
+        assert all(html.escape(words[1:]) in page for words in said)
+
+
+def test_of_many_runs_only_those_have_cards_that_innovations_judge(judged):
+    assert report_page({"a": judged}).count("<article") == 2
+    page = report_page({"a": judged, "b": judged, "c": judged})
+    assert page.count("<article") == 3
+    assert re.findall(r"<article[^>]*>\n<h3>([^<]*)</h3>", page) == ["a: full", "b: full", "c: full"]
 
 
 def test_names_from_files_are_text_and_nothing_is_loaded(sequence, tmp_path):

@@ -34,7 +34,7 @@ from ekfslam.evaluation.tables import document, markdown_table, number, plus_min
 from ekfslam.filters.result import Result, WhitenedInnovations
 from ekfslam.smoother.posterior import Posterior
 
-_NOTABLE = 1.3  # factor from which a deviation is worth a word
+NOTABLE = 1.3  # factor from which a deviation is worth a word
 _LEAST_LOW = 1.15  # of the factor, with near certainty
 _PERSISTS, _LEAST_SLOW = 2.0, 1.5  # persistence from which errors of tracks, and those that all share, are called slow
 _LEAST_MEAN, _SURE_OF_MEAN = 0.3, 4.5  # of a constant error: standard deviations of a frame, standard errors
@@ -107,9 +107,9 @@ class Honesty:
         if self.factor > 1 and self.causes:
             worst = self.causes[0]
             where = f" in {_axes(worst.where)}" if worst.is_shared else ""
-            text = f"covariance optimistic by about {self.factor:.1f}x{where}"
+            text = f"{factor_text(self.factor)}{where}"
         elif self.causes:
-            text = f"covariance pessimistic by about {1 / self.factor:.1f}x, as far as innovations can tell"
+            text = f"{factor_text(self.factor)}, as far as innovations can tell"
         else:
             text = "honest as far as innovations can tell"
         if self.causes:
@@ -134,7 +134,7 @@ class Honesty:
         blocks = [
             f"# {self.name}: honesty of the covariance, {self.frames} frames",
             f"**Verdict: {self.verdict}.**",
-            markdown_table(["per degree of freedom, or share", "found", "expected"], self._overview(), padded=True),
+            markdown_table(["per degree of freedom, or share", "found", "expected"], self.overview, padded=True),
             "Errors that the landmarks of a frame share, in standard deviations that the filter expects of them:",
             markdown_table(_SHARED_HEADINGS, self._shared_rows(), padded=True),
             "Errors of single observations, without those, along tracks:",
@@ -145,19 +145,21 @@ class Honesty:
             blocks.append(markdown_table(["block", "from its prior [sigma]", "steps [sigma]"], rows, padded=True))
         return document(*blocks, BLIND)
 
-    def _overview(self) -> list[list[str]]:
+    @property
+    def overview(self) -> list[list[str]]:
+        """What was found and what is expected: three cells a row, the last row on the smoother."""
         rows = [
-            ["NIS", _ratio_text(self.nis), "1"],
-            ["NIS shared by the landmarks of a frame", _ratio_text(self.shared.size), "1"],
-            ["NIS of single observations, without that", _ratio_text(self.tracks.size), "1"],
+            ["NIS", ratio_text(self.nis), "1"],
+            ["NIS shared by the landmarks of a frame", ratio_text(self.shared.size), "1"],
+            ["NIS of single observations, without that", ratio_text(self.tracks.size), "1"],
             ["shared errors against single ones (deviations)", f"{self.agreement:.2f}", "1"],
             ["variance of single ones, without the gate's cut", f"{self.tracks.scale:.3g}", "1"],
-            ["rejected by gates, calm frames", _percent(self.rejections.gate), _percent(self.rejections.expected)],
+            ["rejected by gates, calm frames", percent(self.rejections.gate), percent(self.rejections.expected)],
         ]
-        rows += [[f"rejected: {name}", _percent(share), ""] for name, share in self.rejections.reasons.items()]
+        rows += [[f"rejected: {name}", percent(share), ""] for name, share in self.rejections.reasons.items()]
         if self.smoother is None:
             return [*rows, [f"filter less smoother: {self.smoother_skipped}", number(None), "1"]]
-        return [*rows, ["filter less smoother", _ratio_text(self.smoother.size), "1"]]
+        return [*rows, ["filter less smoother", ratio_text(self.smoother.size), "1"]]
 
     def _shared_rows(self) -> list[list[str]]:
         found = self.shared
@@ -253,14 +255,14 @@ def _causes(
     if small:
         return small[0].factor, small, large
     factor = max(float(np.sqrt((shared.factor**2).mean())), float(tracks.factor.max()), float(np.sqrt(tracks.scale)))
-    return (factor, large, ()) if factor < 1 / _NOTABLE and large else (factor, (), large)
+    return (factor, large, ()) if factor < 1 / NOTABLE and large else (factor, (), large)
 
 
 def _shared_causes(shared: SharedInnovations, tracks: TrackInnovations) -> list[Cause]:
     """Shared errors, beyond what errors of single observations explain: averages over landmarks inherit these."""
     explained = max(1.0, float(np.sqrt(tracks.scale)), _grown(tracks))
     order, mean, factor = shared.order, np.abs(shared.mean), shared.factor / explained
-    large = (factor > _NOTABLE) & (shared.factor_low > _LEAST_LOW * explained)
+    large = (factor > NOTABLE) & (shared.factor_low > _LEAST_LOW * explained)
     constant = (mean > _LEAST_MEAN) & (mean > _SURE_OF_MEAN * shared.mean_error)
     rest = order[(large & ~constant)[order]]
     # An error that is new in each frame shows at once, a slow one only in sums.
@@ -298,11 +300,11 @@ def _track_causes(tracks: TrackInnovations) -> list[Cause]:
     pixels, names, causes = float(np.sqrt(tracks.scale)), ROWS[: len(tracks.factor)], []
     slow = np.flatnonzero(tracks.persistence > _PERSISTS)
     grown = _grown(tracks)
-    if grown > _NOTABLE:
+    if grown > NOTABLE:
         where = tuple(names[i] for i in slow)
         text = f"errors persist along tracks in {_listed(where)}, where the model takes them as new in each frame"
         causes.append(Cause("tracks", where, grown, text))
-    if abs(np.log(pixels)) > np.log(_NOTABLE) and abs(tracks.size.value - 1.0) > SURE * tracks.size.error:
+    if abs(np.log(pixels)) > np.log(NOTABLE) and abs(tracks.size.value - 1.0) > SURE * tracks.size.error:
         word = "larger" if pixels > 1 else "smaller"
         text = f"errors of single observations are about {max(pixels, 1 / pixels):.1f}x {word} than stated"
         if pixels < 1 and len(slow):
@@ -331,12 +333,12 @@ def _rejection_causes(rejections: RejectedShares) -> list[Cause]:
     causes = []
     # Two gates, and a tail that is not quite Gaussian, reject somewhat more than one gate should.
     if rejections.gate > 3.0 * rejections.expected + _LEAST_OUTLIERS:
-        found, expected = _percent(rejections.gate), _percent(rejections.expected)
+        found, expected = percent(rejections.gate), percent(rejections.expected)
         text = f"the gates reject {found} of the observations, where {expected} are expected: outliers"
         causes.append(Cause("outliers", (), 1.0, text))
     moving = rejections.reasons.get("moving", 0.0)
     if moving > _LEAST_MOVING:
-        text = f"{_percent(moving)} of the observations are thrown out as moving along"
+        text = f"{percent(moving)} of the observations are thrown out as moving along"
         causes.append(Cause("moving", (), 1.0, text))
     return causes
 
@@ -366,11 +368,20 @@ def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _percent(share: float) -> str:
+def factor_text(factor: float) -> str:
+    """By how much a covariance is too small or too large, in words; a factor of standard deviations."""
+    if factor > 1:
+        return f"covariance optimistic by about {factor:.1f}x"
+    return f"covariance pessimistic by about {1 / factor:.1f}x"
+
+
+def percent(share: float) -> str:
+    """A share in words."""
     return f"{100 * share:.2g} %"
 
 
-def _ratio_text(found: Ratio) -> str:
+def ratio_text(found: Ratio) -> str:
+    """A ratio and its standard error in words."""
     return plus_minus(f"{found.value:.3g}", f"{found.error:.2g}")
 
 

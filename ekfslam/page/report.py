@@ -20,7 +20,7 @@ from ekfslam.config import Config
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.honesty import BLIND
 from ekfslam.evaluation.summary import merit_rows
-from ekfslam.evaluation.verdict import Honesty
+from ekfslam.evaluation.tables import MISSING
 from ekfslam.names import components, printable
 from ekfslam.page.content import PART, Recording, Run, plotted, recordings_of, remarks_of
 from ekfslam.runner import versions
@@ -28,8 +28,13 @@ from ekfslam.storage.archive import Archive, read_archive
 
 MOST_ARCHIVES = 32
 _GENERATOR = '<meta name="generator" content="ekfslam report">'
-_JUDGED = "Verdicts are by innovations alone, without truth; <code>ekfslam check</code> adds the smoother."
+_JUDGED = (
+    "Verdicts on <i>full</i> are by innovations, without truth; <code>ekfslam check</code> adds the smoother. "
+    "Where there is truth, it has a verdict of its own; one drive is one sample."
+)
 _KEY_FIGURES = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_dof", "landmark_rmse_m")
+_ERRORS = ("ate_m", "t_rel_percent", "landmark_rmse_m")  # those of a card, whose verdict has the others
+_MOST_CARDS = 4  # of all runs; of more, only those that innovations judge have one
 
 
 def write_report(archives: Sequence[str | Path], path: str | Path, title: str = "") -> Path:
@@ -146,10 +151,11 @@ def _section(number: int, recording: Recording, is_alone: bool) -> str:
 {heading}
 {_facts(facts)}
 {notes}
-<div class="cards">{"".join(_card(run) for run in recording.runs if _is_judged(run, recording))}</div>
+<div class="cards">{"".join(map(_card, _carded(recording)))}</div>
 <p class="notes">{_JUDGED} {escape(BLIND)}</p>
 <noscript><p class="notes">A script in this page draws its plots; this browser does not run it.</p></noscript>
 <div class="plots" data-recording="{number}"></div>
+{_evidence(recording)}
 <h3>Figures of merit</h3>
 {_table(["", *(run.label for run in recording.runs)], merit_rows(run.summary for run in recording.runs))}
 <h3>Runs in detail</h3>
@@ -161,35 +167,44 @@ def _facts(facts: Iterable[str]) -> str:
     return f'<p class="facts">{" · ".join(facts)}</p>'
 
 
-def _is_judged(run: Run, recording: Recording) -> bool:
-    """Whether a card says something of a run: by its innovations, or because no other run has any."""
-    return isinstance(run.honesty, Honesty) or (
-        run is recording.runs[-1] and not any(isinstance(other.honesty, Honesty) for other in recording.runs)
-    )
+def _carded(recording: Recording) -> list[Run]:
+    """Runs that have a card: all, or of many those that innovations judge, or the last."""
+    runs = list(recording.runs)
+    if len(runs) <= _MOST_CARDS:
+        return runs
+    return [run for run in runs if not isinstance(run.honesty, str)] or runs[-1:]
 
 
 def _card(run: Run) -> str:
-    """Verdict of a run, and its key figures."""
-    honesty = run.honesty
-    if isinstance(honesty, Honesty):
-        kind = "good" if not honesty.causes else "bad" if honesty.factor >= 2 else "fair"
-        head, _, why = honesty.verdict.partition("; cause: ")
-        head, _, also = head.partition(". Also: ")
-        items = [part for part in why.replace(". Also: ", "; ").split("; ") if part] + (
-            also.split("; ") if also else []
-        )
-    else:
-        kind, head, items = "none", honesty.partition(": ")[2] or honesty, []
+    """Verdicts of a run, their evidence, and its errors."""
+    head, *items = run.said
     figures = "".join(
         f"<div><dt>{escape(heading)}</dt><dd>{escape(value)}</dd></div>"
-        for heading, value in merit_rows([{key: run.summary[key] for key in _KEY_FIGURES}])
+        for heading, value in merit_rows([{key: run.summary[key] for key in _ERRORS}])
     )
-    return f"""<article class="card {kind}">
+    return f"""<article class="card {run.kind}">
 <h3>{escape(run.label)}</h3>
 <p class="verdict">{escape(head[:1].upper() + head[1:])}</p>
-{_list(items, "causes")}
+{_list([*items, *run.result.remarks], "causes")}
 <dl>{figures}</dl>
 </article>"""
+
+
+def _evidence(recording: Recording) -> str:
+    """A table of what the verdicts rest on; what is expected stands beside the name, or beside what was found."""
+    found = [run.evidence for run in recording.runs]
+    rows = []
+    for name in dict.fromkeys(name for evidence in sorted(found, key=len, reverse=True) for name in evidence):
+        expected = {evidence[name][1] for evidence in found if name in evidence}
+        is_common = len(expected) == 1
+        cells = []
+        for evidence in found:
+            value, own = evidence.get(name, (MISSING, ""))
+            cells.append(value if is_common or not own else f"{value} ({own})")
+        common = f" ({expected.pop()})" if is_common and expected != {""} else ""
+        rows.append([f"{name}{common}", *cells])
+    heading = "<h3>Evidence <small>found (expected)</small></h3>"
+    return f"{heading}\n{_table(['', *(run.label for run in recording.runs)], rows)}" if rows else ""
 
 
 def _detail(run: Run) -> str:
