@@ -103,9 +103,8 @@ def stamp_lines() -> list[str]:
     return [str(np.datetime64(int(ns), "ns")).replace("T", " ") for ns in trajectory()[0]]
 
 
-@pytest.fixture
-def drive(tmp_path) -> Path:
-    folder = tmp_path / "2011_09_30" / NAME
+def write_drive(place: Path) -> Path:
+    folder = place / "2011_09_30" / NAME
     (folder / "oxts" / "data").mkdir(parents=True)
     (folder / "oxts" / "timestamps.txt").write_text("\n".join(stamp_lines()) + "\n")
     for k, packet in enumerate(packets()):
@@ -122,6 +121,11 @@ def drive(tmp_path) -> Path:
         + "".join(f"P_rect_{n}: {numbers(np.column_stack([K, K @ t]))}\n" for n, t in OFFSETS_M.items())
     )
     return folder
+
+
+@pytest.fixture
+def drive(tmp_path) -> Path:
+    return write_drive(tmp_path)
 
 
 # What the reader makes of a drive

@@ -63,12 +63,16 @@ def opened(path: Path) -> ImageRecording:
 # KITTI raw
 
 
-@pytest.fixture
-def raw(drive: Path) -> Path:  # noqa: F811
+def write_raw_images(drive: Path) -> Path:  # noqa: F811
     for frame in range(FRAMES):
         for side in (0, 1):
             write_picture(drive / f"image_0{side}/data/{frame:010d}.png", frame, side)
     return drive
+
+
+@pytest.fixture
+def raw(drive: Path) -> Path:  # noqa: F811
+    return write_raw_images(drive)
 
 
 def test_kitti_raw_has_velocities_truth_and_calibration_of_its_packets(raw):
@@ -155,9 +159,8 @@ LEFT_IN_BODY = se3.exp(np.array([0.02, -0.06, 0.01, 0.1, -0.2, 1.5]))
 LEFT_RIGHT = se3.exp(np.array([0.11, 0.001, -0.002, 0.01, -0.02, 0.005]))
 
 
-@pytest.fixture
-def euroc(tmp_path) -> Path:
-    folder = tmp_path / "MH_01_easy"
+def write_euroc(place: Path) -> Path:
+    folder = place / "MH_01_easy"
     for side, pose in enumerate((LEFT_IN_BODY, LEFT_IN_BODY @ LEFT_RIGHT)):
         camera = folder / f"mav0/cam{side}"
         for frame, stamp in enumerate(STAMPS_NS):
@@ -166,6 +169,11 @@ def euroc(tmp_path) -> Path:
         (camera / "data.csv").write_text("\r\n".join(lines) + "\r\n")
         (camera / "sensor.yaml").write_text(sensor_yaml(pose, 458.654 + side))
     return folder
+
+
+@pytest.fixture
+def euroc(tmp_path) -> Path:
+    return write_euroc(tmp_path)
 
 
 def test_euroc(euroc):
@@ -304,15 +312,19 @@ intrinsics = [708.0, 706.0, 602.0, 183.0]
 """
 
 
-@pytest.fixture
-def plain(tmp_path) -> Path:
-    folder = tmp_path / "garden"
+def write_plain(place: Path) -> Path:
+    folder = place / "garden"
     for frame in range(FRAMES):
         for side, name in enumerate(("left", "right")):
             write_picture(folder / name / f"{frame:04d}.png", frame, side)
     np.savetxt(folder / "times.txt", 0.1 * np.arange(FRAMES))
     (folder / "calibration.toml").write_text(TOML)
     return folder
+
+
+@pytest.fixture
+def plain(tmp_path) -> Path:
+    return write_plain(tmp_path)
 
 
 def test_plain_folders(plain):
@@ -383,13 +395,17 @@ def test_other_folders_and_files_are_no_images(tmp_path):
 # Images of the course data
 
 
-@pytest.fixture
-def course(tmp_path) -> Path:
+def write_course(place: Path) -> Path:
     fields = npy_fields(builtin(f"loop?frames={FRAMES}"))
     del fields["features"]
     sides = [[picture(frame, side) for frame in range(FRAMES)] for side in (0, 1)]
-    write_npy(tmp_path / "dataset02_imgs.npy", dict(zip(("cam_imgs_L", "cam_imgs_R"), sides, strict=True)))
-    return write_npy(tmp_path / "dataset02.npy", fields)
+    write_npy(place / "dataset02_imgs.npy", dict(zip(("cam_imgs_L", "cam_imgs_R"), sides, strict=True)))
+    return write_npy(place / "dataset02.npy", fields)
+
+
+@pytest.fixture
+def course(tmp_path) -> Path:
+    return write_course(tmp_path)
 
 
 def test_images_of_the_course_data(course):

@@ -156,11 +156,12 @@ def test_an_interrupted_sweep_has_a_table_and_an_extended_one_runs_what_is_new(t
 def test_a_run_that_fails_is_a_row_that_says_why(tmp_path):
     """A recording that cannot be opened fails alone; the table says so."""
     (tmp_path / "none.npz").write_bytes(b"nothing")
-    (tmp_path / "s.toml").write_text('recordings = ["none.npz", "builtin:loop?frames=8"]\nmodes = ["dead-reckoning"]')
+    study = 'recordings = ["none.npz", "builtin:loop?frames=8"]\nmodes = ["dead-reckoning"]\nseeds = [3, 4]'
+    (tmp_path / "s.toml").write_text(study)
     table = run_sweep(Sweep.from_toml(tmp_path / "s.toml"), tmp_path / "sweep.h5", SerialExecutor())
-    assert ["none.npz" in text for text in table.columns["error"]] == [True, False]
-    assert np.isfinite(table.columns["ate_m"]).tolist() == [False, True]
-    assert "1 without a result" in table.markdown()
+    assert ["none.npz" in text for text in table.columns["error"]] == [True, False, False]
+    assert np.isfinite(table.columns["ate_m"]).tolist() == [False, True, True]
+    assert "1 without a result" in table.markdown() and "nan" not in table.markdown()  # a recording has no seed
 
 
 @pytest.mark.parametrize(

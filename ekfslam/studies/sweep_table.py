@@ -199,7 +199,9 @@ def _column(values: Sequence[Any]) -> NDArray:
 
 
 def _spoken(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return "-" if np.isnan(value) else f"{value:g}"
+    return str(value)
 
 
 def _figure(value: Any) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import re
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 import scipy.io
+from folders import Files, folders, is_text, png
 from recordings import ece276a_fields, utias_fields, write_mat, write_npz
 
 from ekfslam.cli import main
@@ -24,6 +26,7 @@ from ekfslam.config import Config
 from ekfslam.data.readers.hdf5 import sequence_image
 from ekfslam.data.simulate import BUILTIN, builtin, numbers_of
 from ekfslam.errors import EkfslamError
+from ekfslam.storage.exports import EXPORTS
 
 ODD: tuple[Any, ...] = (0, -1, 1, 2, 0.5, 1e-300, 1e-9, 1e9, 1e300, -1e300, np.nan, np.inf, -np.inf, 1 << 31, 1 << 62)
 WORDS = ("", "x", "nan", "inf", "-1", "1e999", "0", "../../x", "\x1b[2J", "é", "$a$", "a|b", "{0}", "9" * 400, "true")
@@ -47,6 +50,7 @@ class Valid:
     recordings: dict[str, bytes]
     archives: dict[str, bytes]
     texts: dict[str, bytes]
+    folders: dict[str, tuple[Files, str]]
 
     @staticmethod
     def prepared() -> Valid:
@@ -67,6 +71,7 @@ class Valid:
                 {"npz": npz, "mat": mat, "night": night, "own": own},
                 {"full": full, "both": Path(archive).read_bytes(), "study": (place / "study.h5").read_bytes()},
                 {"kitti": _kitti(), "tum": _tum(), "euroc": _euroc()},
+                folders(),
             )
 
 
@@ -103,8 +108,9 @@ def _use(rng: np.random.Generator, name: str) -> list[str]:
 
 
 def _use_archive(rng: np.random.Generator, name: str) -> list[str]:
-    command = _pick(rng, ["info"] * 8 + ["export"] * 4 + ["plot", "check", "posterior"])
-    return [command, name, *(["--format", _pick(rng, ("tum", "kitti"))] if command == "export" else [])]
+    command = _pick(rng, ["info"] * 8 + ["export"] * 6 + ["plot", "check", "posterior", "report", "animate"])
+    more = {"export": ["--format", _pick(rng, EXPORTS)], "animate": ["--pictures", "1"]}
+    return [command, name, *more.get(command, [])]
 
 
 def mutated(content: bytes, rng: np.random.Generator, other: bytes = b"") -> bytes:
@@ -337,10 +343,91 @@ def drives(valid: Valid, rng: np.random.Generator) -> Case:
     return Case({"a.h5": content, "c.toml": text.encode()}, ["info", "a.h5"] if rng.random() < 0.2 else run)
 
 
-COMMANDS = ("run", "compare", "info", "simulate", "plot", "check", "posterior", "export", "tune", "consistency", "x")
+def _odd_number(text: bytes, rng: np.random.Generator) -> bytes:
+    """A text with one of its words replaced."""
+    words = re.split(rb"([\s,\[\]=:#\"]+)", text)
+    words[2 * int(rng.integers((len(words) + 1) // 2))] = str(_pick(rng, ODD + WORDS)).encode()
+    return b"".join(words)
+
+
+def files_of_folders(valid: Valid, rng: np.random.Generator) -> Case:
+    """A folder of images, packets or a bag, of which some files are changed, missing, doubled or of another place."""
+    whole, path = valid.folders[_pick(rng, valid.folders)]
+    files = dict(whole)
+    for _ in range(int(rng.integers(1, 4))):
+        names = sorted(files)
+        texts = [name for name in names if is_text(name)]
+        name = _pick(rng, texts if texts and rng.random() < 0.7 else names)
+        kind = rng.integers(12)
+        if kind == 0:
+            del files[name]
+        elif kind == 1:
+            files[name] = files[_pick(rng, names)]
+        elif kind == 2:
+            files[f"{name}{_pick(rng, WORDS).replace('/', '')[:99]}x"] = files[name]
+        elif kind == 3 and name.endswith(".png"):
+            shape = _pick(rng, ((1, 1), (8, 12), (200, 400), (8, 12, 3), (3000, 1), (0, 5), (900, 900)))
+            with contextlib.suppress(SystemError, ValueError):  # no picture has no pixels
+                files[name] = png(np.full(shape, int(rng.integers(256)), np.uint8))
+        elif is_text(name) and kind <= 8:
+            files[name] = _odd_number(files[name], rng)
+        else:
+            files[name] = mutated(files[name], rng, files[_pick(rng, names)])
+        if not files:
+            break
+    command = _pick(rng, ("info", "info", "track", "run", "compare"))
+    out = {"track": "out.h5", "run": "out.h5", "compare": "out"}
+    more = ["--mode", _pick(rng, MODES)] if command == "run" else []
+    return Case(files, [command, path, *(["--out", out[command]] if command in out else []), *more])
+
+
+STUDY = """recordings = ["builtin:city?frames=8", { data = "a", truth = "t.txt" }]
+modes = ["dead-reckoning", "full"]
+variants = ["invariant"]
+seeds = [0]
+[settings.noise]
+sigma_px = [2.0]
+[settings.filter]
+gate_probability = 0.99
+"""
+
+
+def sweeps(valid: Valid, rng: np.random.Generator) -> Case:
+    text = STUDY.encode()
+    for _ in range(int(rng.integers(1, 4))):
+        text = _odd_number(text, rng) if rng.random() < 0.8 else mutated(text, rng)
+    files = {"s.toml": text, "a": valid.recordings["npz"], "t.txt": valid.texts["tum"]}
+    more = ["--plot", "ate_m", _pick(rng, ("mode", "noise.sigma_px", "x"))] if rng.random() < 0.1 else []
+    return Case(files, ["sweep", "s.toml", "--executor", "serial", "--out", "o", *more])
+
+
+def velocities(valid: Valid, rng: np.random.Generator) -> Case:
+    rows = [f"{stamp - 0.05:.6f}" + ",1,0,0,0,0,0.1" for stamp in [*_stamps(), _stamps()[-1] + 0.2]]
+    text = "\n".join((["# frame: imu"] if rng.random() < 0.5 else []) + rows).encode() + b"\n"
+    text = _odd_number(text, rng) if rng.random() < 0.7 else mutated(text, rng)
+    if rng.random() < 0.1:
+        text = valid.recordings[_pick(rng, valid.recordings)]
+    return Case({"a": valid.recordings["npz"], "v.csv": text}, [*_use(rng, "a"), "--velocities", "v.csv"])
+
+
+COMMANDS = (
+    *("run", "compare", "info", "simulate", "plot", "check", "posterior", "export", "tune", "consistency", "x"),
+    *("track", "sweep", "report", "animate"),
+)
 OPTIONS = (
     *("--out", "--mode", "--modes", "--truth", "--config", "--format", "--force", "--sigma-px", "--iterations"),
     *("--runs", "--level", "--variants", "--executor", "--workers", "--seed", "--read-limit", "--truth-noise"),
+    *(
+        "--velocities",
+        "--frames",
+        "--resume",
+        "--no-figures",
+        "--table",
+        "--plot",
+        "--title",
+        "--pictures",
+        "--features",
+    ),
 )
 VALUES = (
     *("a.npz", "a.h5", "full.h5", "c.toml", ".", "..", "/dev/null", "/dev/full", "/dev/zero", "no/where", "a.npz/x"),
@@ -363,7 +450,7 @@ def command_lines(valid: Valid, rng: np.random.Generator) -> Case:
 
 GENERATORS: tuple[Callable[[Valid, np.random.Generator], Case], ...] = (
     *(bytes_of_recordings, bytes_of_archives, fields_of_recordings, items_of_hdf5),
-    *(settings, truths, worlds, drives, command_lines),
+    *(settings, truths, worlds, drives, command_lines, files_of_folders, sweeps, velocities),
 )
 
 

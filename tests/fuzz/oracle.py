@@ -52,6 +52,7 @@ def verdict(case: Case, folder: Path) -> str:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for name, content in case.files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
     out, err = io.StringIO(), io.StringIO()
     here = Path.cwd()
