@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
+import signal
 import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 
@@ -117,6 +119,32 @@ def test_killed_twice_and_resumed_it_equals_an_undisturbed_one(study, tmp_path, 
     assert_same(run_sweep(Sweep.from_toml(study), path, SerialExecutor()), undisturbed)
     assert_same(read_table(path), undisturbed)
     assert sorted(p.name for p in tmp_path.iterdir() if p.suffix != ".parquet") == ["study.toml", "sweep.h5"]
+
+
+@pytest.mark.slow
+def test_the_command_killed_with_its_workers_and_resumed_equals_an_undisturbed_one(study, tmp_path, undisturbed):
+    """SIGKILL of the whole process group, twice, each time when some more runs are done and others are under way."""
+    out, rng = tmp_path / "out", np.random.default_rng(0)
+    journal = out / ".sweep.h5.journal"
+    call = [sys.executable, "-m", "ekfslam", "sweep", str(study), "--workers", "2", "--out", str(out)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(sweeps.__file__).parents[2])}
+
+    def written() -> int:
+        return journal.stat().st_size if journal.exists() else 0
+
+    for _ in range(2):
+        before = written()
+        begun = subprocess.Popen(call, start_new_session=True, stdout=subprocess.DEVNULL, env=environment)
+        deadline = time.monotonic() + 120
+        while written() < before + 3000 and begun.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0.0, 0.05))
+        os.killpg(begun.pid, signal.SIGKILL)
+        assert begun.wait() == -signal.SIGKILL
+        assert written() >= before + 3000
+        assert not (out / "sweep.h5").exists()
+    assert main(["sweep", str(study), "--executor", "serial", "--out", str(out)]) == 0
+    assert_same(read_table(out / "sweep.h5"), undisturbed)
 
 
 @pytest.mark.slow
