@@ -341,23 +341,34 @@ def test_parquet_holds_the_same(tmp_path, undisturbed):
     assert found["mode"] == undisturbed.columns["mode"].tolist()
 
 
-def test_any_figure_against_any_setting(undisturbed):
+def test_any_figure_against_any_setting_in_a_panel_for_each_recording(undisturbed):
     figure = plot_sweep(undisturbed, "ate_m", "noise.sigma_px")
-    (ax,) = figure.axes
-    assert len(ax.lines) == 2 * 2 * 2  # recordings, modes, variants
+    assert [ax.get_title() for ax in figure.axes] == ["city?frames=8", "ring"]
+    assert [len(ax.lines) for ax in figure.axes] == [2 * 2, 2 * 2]  # modes, variants
     columns = undisturbed.columns
     chosen = (columns["recording"] == "ring") & (columns["mode"] == "full") & (columns["filter.variant"] == "standard")
     mean = [columns["ate_m"][chosen & (columns["noise.sigma_px"] == px)].mean() for px in (1.0, 2.0)]
-    line = next(line for line in ax.lines if line.get_label() == "ring, full, standard")
+    line = next(line for line in figure.axes[1].lines if line.get_label() == "full, standard")
     np.testing.assert_allclose(line.get_ydata(), mean)
     assert [text.get_text() for text in plot_sweep(undisturbed, "ate_m", "mode").axes[0].get_xticklabels()] == [
         "dead-reckoning",
         "full",
     ]
+    (ax,) = plot_sweep(undisturbed, "ate_m", "recording").axes
+    assert [text.get_text() for text in ax.get_xticklabels()] == ["city?frames=8", "ring"]
     with pytest.raises(ConfigError, match="no column 'ate'"):
         plot_sweep(undisturbed, "ate", "mode")
     with pytest.raises(ValueError, match="no number"):
         plot_sweep(undisturbed, "mode", "noise.sigma_px")
+
+
+def test_a_figure_has_no_more_lines_than_one_can_tell_apart():
+    rows = [{"recording": "drive", "a": f"a{a}", "b": float(b), "y": 1.0} for a in range(25) for b in range(2)]
+    table = SweepTable.of_rows(rows, ("recording", "a", "b"), len(rows))
+    with pytest.raises(ValueError, match="1 panels with 25 lines of a are more"):
+        plot_sweep(table, "y", "b")
+    (ax,) = plot_sweep(table.where("a", *(f"a{a}" for a in range(24))), "y", "b").axes
+    assert len(ax.lines) == 24
 
 
 def test_command(tmp_path, capsys):
@@ -373,6 +384,16 @@ def test_command(tmp_path, capsys):
     assert main(["sweep", "--out", str(out)]) == 2
     assert main(["sweep", "--table", "--out", str(out), "--figures", "nothing"]) == 2
     assert "no column 'nothing'" in capsys.readouterr().err
+    assert main(["sweep", "--table", "--out", str(out), "--only", "seed=2", "mode=dead-reckoning"]) == 0
+    shown = capsys.readouterr().out
+    assert "1 of 1 runs" in shown
+    assert "sweep.h5" in shown
+    assert main(["sweep", "--table", "--out", str(out), "--only", "seed=3"]) == 2
+    assert "the column seed has no '3'; it has 1, 2" in capsys.readouterr().err
+    assert main(["sweep", "--table", "--out", str(out), "--plot", "mode", "seed"]) == 2
+    found = capsys.readouterr()
+    assert "mode is no number" in found.err
+    assert "2 of 2 runs" in found.out, "the table is shown all the same"
 
 
 def test_xarray_opens_the_table(tmp_path, undisturbed):

@@ -5,46 +5,84 @@ As in `ekfslam.figures.maps`, every function returns a `matplotlib.figure.Figure
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array, IntArray
-from ekfslam.figures.style import BAND_ALPHA, SERIES, styled
+from ekfslam.figures.style import BAND_ALPHA, SERIES, log_axis, styled
 from ekfslam.studies.sweep_table import SweepTable
 
 _MARKERS = "os^Dv<>P"
 _LOG_RATIO = 20.0  # largest over smallest value from which a logarithmic axis shows more
-_MOST_LINES = 24
+_MOST_LINES, _MOST_PANELS = 24, 24
+_PANELS_A_ROW = 3
 
 
 @styled
 def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
     """A column of figures of merit against one of settings: a line for each choice of all else, means over seeds.
 
-    Bands go from the least to the largest seed. Runs without the figure are left out; the title says how many.
+    Every recording has a panel. Bands go from the least to the largest seed. Runs without the figure are left out; the
+    title says how many.
 
     Raises:
         ConfigError: There is no such column.
-        ValueError: The figure is no number, or there are more than 24 lines to draw.
+        ValueError: The figure is no number, or there are more than 24 lines in a panel, or 24 panels.
     """
     y, x = table.column(figure), table.column(setting)
     if y.dtype.kind != "f":
         raise ValueError(f"{figure} is no number")
-    others = [
-        name for name in table.swept if name not in (setting, "seed") and len(set(table.column(name).tolist())) > 1
-    ]
-    choices = list(dict.fromkeys(zip(*(table.column(name).tolist() for name in others), strict=True))) or [()]
-    if len(choices) > _MOST_LINES:
-        raise ValueError(f"{len(choices)} lines of {', '.join(others)} are more than a figure can show: {_MOST_LINES}")
-    drawn = Figure(figsize=(8.0, 4.8 + 0.2 * max(len(choices) - 6, 0)))
-    ax = drawn.subplots()
-    place, names = _places(x)
+    panels = {(): table} if setting == "recording" else table.groups("recording")
+    told = [name for name in table.swept if len(set(table.column(name).tolist())) > 1]
+    others = [name for name in told if name not in (setting, "seed", "recording")]
+    choices = list(table.groups(*others)) if others else [()]
+    if len(choices) > _MOST_LINES or len(panels) > _MOST_PANELS:
+        raise ValueError(
+            f"{len(panels)} panels with {len(choices)} lines of {', '.join(others)} are more than a figure can show: "
+            f"{_MOST_PANELS} with {_MOST_LINES}"
+        )
+    columns = min(len(panels), _PANELS_A_ROW)
+    rows = -(-len(panels) // columns)
+    size = (
+        8.0 if columns == 1 else 1.0 + 4.0 * columns,
+        0.6 + (4.2 if rows == 1 else 3.2 * rows) + 0.09 * len(choices),
+    )
+    drawn = Figure(figsize=size)
+    axes = drawn.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+    names = _names(x)
+    for ax, (name, panel) in zip(axes, panels.items(), strict=False):
+        _draw_panel(ax, panel, figure, setting, others, choices, names)
+        ax.set(title=", ".join(name), xlabel=setting, ylabel=figure)
+    for ax in axes[len(panels) :]:
+        ax.remove()
+    missing = int((~np.isfinite(y)).sum())
+    drawn.suptitle(f"{figure}, {len(y) - missing} runs" + (f", {missing} without it" if missing else ""))
+    if others:
+        handles, labels = axes[0].get_legend_handles_labels()
+        drawn.legend(handles, labels, title=", ".join(others), loc="outside lower center", ncols=min(columns + 1, 3))
+    return drawn
+
+
+def _draw_panel(
+    ax: Axes,
+    table: SweepTable,
+    figure: str,
+    setting: str,
+    others: Sequence[str],
+    choices: Sequence[tuple[Any, ...]],
+    names: Sequence[str],
+) -> None:
+    """The lines of one panel; a choice has the same style in all, and stands in the legend where it has no runs."""
+    parts = table.groups(*others) if others else {(): table}
     for i, choice in enumerate(choices):
+        part = parts.get(choice)
+        x, y = (np.empty(0), np.empty(0)) if part is None else (part.column(setting), part.column(figure))
+        place = np.array([names.index(value) for value in x.tolist()], dtype=float) if names else x
         here = np.isfinite(y) & np.isfinite(place)
-        for name, value in zip(others, choice, strict=True):
-            here &= table.column(name) == value
-        if not here.any():
-            continue
         at, mean, low, high = _over_seeds(place[here], y[here])
         style = SERIES[i % len(SERIES)]
         label = ", ".join(f"{value:g}" if isinstance(value, float) else str(value) for value in choice)
@@ -52,24 +90,15 @@ def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
         if (high > low).any():
             ax.fill_between(at, low, high, color=style["color"], alpha=BAND_ALPHA, linewidth=0)
     if names:
-        ax.set_xticks(range(len(names)), names)
-    shown = y[np.isfinite(y)]
+        ax.set_xticks(range(len(names)), [name or "default" for name in names])
+    shown = table.column(figure)[np.isfinite(table.column(figure))]
     if len(shown) and shown.min() > 0 and shown.max() > _LOG_RATIO * shown.min():
-        ax.set_yscale("log")
-    ax.set(xlabel=setting, ylabel=figure)
-    missing = int((~np.isfinite(y)).sum())
-    ax.set_title(f"{figure} against {setting}, {len(shown)} runs" + (f", {missing} without it" if missing else ""))
-    if others:
-        drawn.legend(title=", ".join(others), loc="outside lower center", ncols=2)
-    return drawn
+        log_axis(ax, (1.0, 2.0, 5.0))
 
 
-def _places(x: Array) -> tuple[Array, list[str]]:
-    """Where values of a setting stand on the axis, and the names of places where they are text."""
-    if x.dtype.kind == "f":
-        return x, []
-    names = list(dict.fromkeys(x.tolist()))
-    return np.array([names.index(name) for name in x.tolist()], dtype=float), [name or "default" for name in names]
+def _names(x: Array) -> list[str]:
+    """The values of a setting that is text, in the order of their places on the axis."""
+    return [] if x.dtype.kind == "f" else list(dict.fromkeys(x.tolist()))
 
 
 def _over_seeds(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:

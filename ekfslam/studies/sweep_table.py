@@ -76,6 +76,18 @@ class SweepTable:
             rows.setdefault(values, []).append(row)
         return {values: self._only(chosen) for values, chosen in rows.items()}
 
+    def where(self, name: str, *values: str) -> SweepTable:
+        """The rows with one of some values in a column, values as `markdown` writes them.
+
+        Raises:
+            ConfigError: There is no such column, or no such value in it.
+        """
+        spoken = [_spoken(value) for value in self.column(name).tolist()]
+        for value in values:
+            if value not in spoken:
+                raise ConfigError(f"the column {name} has no {value!r}; it has {', '.join(dict.fromkeys(spoken))}")
+        return self._only([row for row, value in enumerate(spoken) if value in values])
+
     def _only(self, rows: Sequence[int]) -> SweepTable:
         columns = {name: values[np.asarray(rows, dtype=int)] for name, values in self.columns.items()}
         return SweepTable(columns, self.swept, len(rows))

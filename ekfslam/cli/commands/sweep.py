@@ -18,7 +18,7 @@ EXAMPLES = (
     "sweep study.toml",
     "sweep study.toml --executor tls://scheduler:8786 --out results/local/all",
     "sweep --table --out results/local/all --figures ate_m nis_per_dof",
-    "sweep --table --out results/local/all --plot ate_m noise.sigma_px",
+    "sweep --table --out results/local/all --only mode=full --plot ate_m noise.sigma_px",
 )
 
 
@@ -29,12 +29,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--figures", nargs="+", default=list(SHOWN), metavar="COLUMN", help=f"to show (default: {' '.join(SHOWN)})"
     )
     parser.add_argument(
+        "--only",
+        nargs="+",
+        action="append",
+        default=[],
+        type=_chosen,
+        metavar="COLUMN=VALUE",
+        help="show and draw only these runs: of one column any of the values, of all columns that are named",
+    )
+    parser.add_argument(
         "--plot",
         nargs=2,
         action="append",
         default=[],
         metavar=("FIGURE", "SETTING"),
-        help="draw a column against another; may be given several times",
+        help="draw a column against another, a panel for each recording; may be given several times",
     )
     add_executor(parser)
     parser.add_argument(
@@ -44,6 +53,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="default: %(default)s; an interrupted sweep there goes on",
     )
+
+
+def _chosen(text: str) -> tuple[str, str]:
+    name, separator, value = text.partition("=")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"{text!r} is not COLUMN=VALUE")
+    return name, value
 
 
 def command(options: argparse.Namespace) -> None:
@@ -61,11 +77,18 @@ def command(options: argparse.Namespace) -> None:
 
 
 def _show(options: argparse.Namespace, table: SweepTable) -> None:
+    chosen: dict[str, list[str]] = {}
+    for name, value in (pair for pairs in options.only for pair in pairs):
+        chosen.setdefault(name, []).append(value)
+    for name, values in chosen.items():
+        table = table.where(name, *values)
     shown = table.markdown(options.figures)
     try:
         figures = {f"{figure}-{setting}": plot_sweep(table, figure, setting) for figure, setting in options.plot}
     except ValueError as error:
-        raise ConfigError(str(error)) from None
+        print(shown)
+        raise ConfigError(f"{error}; --only chooses runs") from None
     contents = {options.out / "sweep.md": shown, **pngs(options.out, figures)}
     files.write_all(contents)
-    print(f"{shown}\nwritten to {options.out}: {', '.join(['sweep.h5', *(path.name for path in contents)])}")
+    held = [path.name for path in sorted(options.out.glob("sweep.[hp]*"))]
+    print(f"{shown}\nin {options.out}: {', '.join([*held, *(path.name for path in contents)])}")
