@@ -206,6 +206,8 @@ def test_a_run_that_fails_is_a_row_that_says_why(tmp_path):
         ('recordings = ["builtin:city"]\n[settings.noise]\nsigma = [1.0]', "unknown key noise.sigma"),
         ('recordings = ["builtin:city"]\n[settings]\nnoise = 1', r"\[settings.noise\] must be a table"),
         ('recordings = ["nowhere.npz"]', "nowhere.npz"),
+        ('recordings = [{ data = "builtin:city", frames = "5" }]', "frames of builtin:city: expected A:B, found '5'"),
+        ('recordings = [{ data = "builtin:city", velocities = "nowhere.txt" }]', "nowhere.txt"),
         ("recordings = [", "s.toml"),
         ('recordings = ["builtin:city"]\ncases = 1', r"\[cases\] must hold tables"),
         ('recordings = ["builtin:city"]\n[cases.a]\nnoise = 1', r"\[cases.a.noise\] must be a table"),
@@ -239,6 +241,10 @@ def heard(sequence, result):
 
 def speed(sequence, result):
     return float(sequence.twist[3, 0])
+
+
+def frames(sequence, result):
+    return float(len(sequence))
 
 
 def test_cases_are_settings_that_belong_together_each_in_its_mode(tmp_path):
@@ -292,6 +298,33 @@ def test_columns_of_ones_own_and_prepared_recordings(tmp_path, where):
     ):
         with pytest.raises(ArchiveError, match="another study"):
             run_sweep(other, path, SerialExecutor())
+
+
+def test_a_recording_takes_what_the_command_line_takes(tmp_path):
+    """Velocities from elsewhere and a stretch of frames; they are part of what a run is known by."""
+    world = open_sequence("builtin:loop?frames=12")
+    samples = np.column_stack([world.time_s, 2.0 * world.twist])
+    np.savetxt(tmp_path / "v.txt", samples, header="frame: imu")
+    (tmp_path / "s.toml").write_text(
+        """
+        recordings = [
+            { data = "builtin:loop?frames=12", name = "whole" },
+            { data = "builtin:loop?frames=12", name = "part", frames = "2:9" },
+            { data = "builtin:loop?frames=12", name = "fast", velocities = "v.txt", velocity_frame = "imu" },
+        ]
+        modes = ["dead-reckoning"]
+        """
+    )
+    read = Sweep.from_toml(tmp_path / "s.toml")
+    sweep = dataclasses.replace(read, columns={"speed": speed, "frames": frames})
+    table = run_sweep(sweep, tmp_path / "sweep.h5", SerialExecutor())
+    assert not any(table.column("error"))
+    assert table.column("frames").tolist() == [12, 7, 12]
+    assert table.column("speed")[1] == world.twist[5, 0]
+    assert table.column("speed")[2] == pytest.approx(2.0 * table.column("speed")[0], rel=1e-3)
+    before = read.recordings[2].content
+    np.savetxt(tmp_path / "other.txt", samples * 1.5, header="frame: imu")
+    assert dataclasses.replace(read.recordings[2], velocities=str(tmp_path / "other.txt")).content != before
 
 
 class NeverExecutor(SerialExecutor):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ekfslam import files
 from ekfslam.config import VARIANTS, Config
-from ekfslam.data.sequence import Sequence
+from ekfslam.data.sequence import Sequence, stretch
 from ekfslam.errors import WriteError
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.summary import compare_table, summarise
@@ -95,10 +95,10 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _stretch(text: str) -> slice:
-    begin, colon, end = text.partition(":")
-    if not colon:
-        raise argparse.ArgumentTypeError(f"expected A:B, found {text!r}")
-    return slice(*(int(bound) if bound.strip() else None for bound in (begin, end)))  # argparse reports a ValueError
+    try:
+        return stretch(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _setting(text: str) -> tuple[str, float]:

@@ -478,3 +478,15 @@ def validate_noise(noise: Noise) -> None:
         raise DataError(f"must be positive, found {noise.track_flow_px}", field="noise.track_flow_px")
     if not noise.margin >= 1:
         raise DataError(f"must be at least 1, found {noise.margin}", field="noise.margin")
+
+
+def stretch(text: str) -> slice:
+    """The frames that ``A:B`` names, to take of a sequence; either may be left out, as in Python.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    begin, colon, end = text.partition(":")
+    if not colon:
+        raise ValueError(f"expected A:B, found {text!r}")
+    return slice(*(int(bound) if bound.strip() else None for bound in (begin, end)))

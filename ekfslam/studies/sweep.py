@@ -44,13 +44,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ekfslam.config import MODES, VARIANTS, Config
-from ekfslam.data.readers import BUILTIN, open_sequence
-from ekfslam.data.sequence import Sequence
+from ekfslam.config import MODES, VARIANTS, Config, FrontEndConfig
+from ekfslam.data.readers import BUILTIN
+from ekfslam.data.sequence import Sequence, stretch
 from ekfslam.errors import ArchiveError, ConfigError, EkfslamError, UnknownFormatError
 from ekfslam.evaluation.summary import KEYS, summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.filters.result import Result
+from ekfslam.frontend.opening import open_sequence
 from ekfslam.limits import DEFAULT_GB, limit_gb, reading_up_to, require_file
 from ekfslam.names import printable
 from ekfslam.progress import progress as with_progress
@@ -62,7 +63,8 @@ from ekfslam.studies.sweep_table import SweepTable, read_table, write_table
 MOST_RUNS = 100_000
 _ERROR_BYTES = 400
 _KEYS = ("recordings", "modes", "variants", "seeds", "settings", "cases")
-_RECORDING_KEYS = ("data", "name", "truth", "extrinsics", "lateral")
+_FILES = ("data", "truth", "velocities")  # of a recording
+_RECORDING_KEYS = (*_FILES, "name", "extrinsics", "lateral", "velocity_frame", "frames")
 _TAKEN = ("key", "recording", "seed", "case", "mode", "error", "run", *KEYS)  # names of columns
 
 Column = Callable[[Sequence, Result], float | None]
@@ -75,7 +77,8 @@ class Recording:
     Args:
         data: Path, or ``builtin:NAME``.
         name: In the table.
-        truth, extrinsics, lateral: As of `ekfslam.open_sequence`.
+        truth, extrinsics, lateral, velocities, velocity_frame: As of `ekfslam.open_sequence`.
+        frames: The stretch ``A:B`` of it, empty for all; ``prepare`` comes after.
         prepare: From what was read and the seed, None without seeds, to what is run. For other processes it must be a
             function of a module, or a `functools.partial` of one. What it draws, it draws from the seed.
     """
@@ -85,6 +88,9 @@ class Recording:
     truth: str | None = None
     extrinsics: str = "corrected"
     lateral: str = "corrected"
+    velocities: str | None = None
+    velocity_frame: str | None = None
+    frames: str = ""
     prepare: Callable[[Sequence, int | None], Sequence] | None = None
 
     @property
@@ -110,6 +116,9 @@ class Recording:
             UnknownFormatError: A file is missing.
         """
         prepared = [] if self.prepare is None else [_source(self.prepare)]
+        other = {"velocities": self.velocities and _digest(Path(self.velocities)), "frames": self.frames}
+        other |= {"velocity_frame": self.velocity_frame}
+        prepared += [f"{name} {value}" for name, value in other.items() if value]
         if self.is_simulated:
             return " ".join([self.data, *prepared])
         files = [_digest(Path(p)) for p in (self.data, self.truth) if p]
@@ -293,7 +302,8 @@ def run_task(task: Task, read_gb: float = DEFAULT_GB) -> dict[str, NDArray]:
     record = _blank(task.columns)["run"]
     try:
         with ONE_RUN_AT_A_TIME, reading_up_to(read_gb):
-            sequence = with_truth_noise(_opened(task.recording, task.seed), task.config.truth)
+            sequence = _opened(task.recording, task.seed, task.config.front_end)
+            sequence = with_truth_noise(sequence, task.config.truth)
             result = run(sequence, task.mode, task.config)  # type: ignore[arg-type]
             found: dict[str, Any] = dict(summarise(sequence, result))
             found |= {name: column(sequence, result) for name, column in task.columns.items()}
@@ -304,10 +314,13 @@ def run_task(task: Task, read_gb: float = DEFAULT_GB) -> dict[str, NDArray]:
 
 
 @lru_cache(maxsize=2)
-def _opened(recording: Recording, seed: int | None) -> Sequence:
+def _opened(recording: Recording, seed: int | None, front_end: FrontEndConfig) -> Sequence:
     """A recording, kept for the next run on it in the same process."""
-    options: dict[str, Any] = {"extrinsics": recording.extrinsics, "lateral": recording.lateral}
-    sequence = open_sequence(recording.data, truth=recording.truth, **options)
+    names = ("truth", "extrinsics", "lateral", "velocities", "velocity_frame")
+    options: dict[str, Any] = {name: getattr(recording, name) for name in names}
+    sequence = open_sequence(recording.data, front_end=front_end, **options)
+    if recording.frames:
+        sequence = sequence[stretch(recording.frames)]
     return sequence if recording.prepare is None else recording.prepare(sequence, seed)
 
 
@@ -432,12 +445,16 @@ def _recording(entry: Any, folder: Path) -> Recording:
             raise ConfigError(f"unknown key {key!r} of a recording; known: {', '.join(_RECORDING_KEYS)}")
     if "data" not in given:
         raise ConfigError(f"a recording has no data: {entry!r}")
-    data, truth = given["data"], given.get("truth")
-    is_simulated = data.startswith(BUILTIN)
-    name = printable(given.get("name", data.removeprefix(BUILTIN) if is_simulated else Path(data).stem))
-    place = data if is_simulated else str((folder / data).resolve())
-    paths = {"data": place, "name": name, "truth": None if truth is None else str((folder / truth).resolve())}
-    return Recording(**{**given, **paths})
+    try:
+        stretch(given.get("frames", ":"))
+    except ValueError as error:
+        raise ConfigError(f"frames of {given['data']}: {error}") from None
+    is_simulated = given["data"].startswith(BUILTIN)
+    usual = given["data"].removeprefix(BUILTIN) if is_simulated else Path(given["data"]).stem
+    places = {key: str((folder / given[key]).resolve()) for key in _FILES if key in given}
+    if is_simulated:
+        places["data"] = given["data"]
+    return Recording(**{**given, **places, "name": printable(given.get("name", usual))})
 
 
 def _source(value: Any) -> str:
@@ -461,4 +478,5 @@ def _digest(path: Path) -> str:
         listed = [f"{p.relative_to(path)} {p.stat().st_size}" for p in sorted(path.rglob("*")) if p.is_file()]
         return hashlib.sha256("\n".join(listed).encode()).hexdigest()
     require_file(path)
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
