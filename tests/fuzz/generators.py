@@ -381,14 +381,18 @@ def files_of_folders(valid: Valid, rng: np.random.Generator) -> Case:
     return Case(files, [command, path, *(["--out", out[command]] if command in out else []), *more])
 
 
-STUDY = """recordings = ["builtin:city?frames=8", { data = "a", truth = "t.txt" }]
-modes = ["dead-reckoning", "full"]
+STUDY = """recordings = ["builtin:city?frames=8", { data = "a", truth = "t.txt", frames = "0:9" }]
+modes = ["full"]
 variants = ["invariant"]
 seeds = [0]
 [settings.noise]
 sigma_px = [2.0]
 [settings.filter]
 gate_probability = 0.99
+[cases.a.hygiene]
+restart_at_repeats = false
+[cases.b]
+mode = "dead-reckoning"
 """
 
 
