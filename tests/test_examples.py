@@ -50,6 +50,15 @@ def test_own_filter_loop(tmp_path):
     assert abs(found_m - true_m) < 3.0 * std_m < 3.0 * alone_m
 
 
+def test_sweep(tmp_path):
+    lines = printed("sweep", tmp_path)
+    found = {line: numbers(text)[0] for line, text in lines.items() if " m/s, " in line}
+    assert len(found) == 2 * 3
+    for std_m_s in ("0.2 m/s", "1.0 m/s"):
+        assert found[f"{std_m_s}, full"] < 0.5 < found[f"{std_m_s}, velocities alone"]
+    assert found["1.0 m/s, velocities alone"] > found["0.2 m/s, velocities alone"]
+
+
 def test_own_reader(tmp_path):
     lines = printed("own_reader", tmp_path)
     assert lines["read by"] == "lines"
