@@ -420,6 +420,7 @@ def test_command(tmp_path, capsys):
     assert main(["sweep", "--table", "--out", str(out), "--only", "seed=2", "mode=dead-reckoning"]) == 0
     shown = capsys.readouterr().out
     assert "1 of 1 runs" in shown
+    assert "chosen from 2 of 2 runs" in shown
     assert "sweep.h5" in shown
     assert main(["sweep", "--table", "--out", str(out), "--only", "seed=3"]) == 2
     assert "the column seed has no '3'; it has 1, 2" in capsys.readouterr().err

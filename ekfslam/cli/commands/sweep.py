@@ -77,12 +77,14 @@ def command(options: argparse.Namespace) -> None:
 
 
 def _show(options: argparse.Namespace, table: SweepTable) -> None:
-    chosen: dict[str, list[str]] = {}
+    whole, chosen = table, dict[str, list[str]]()
     for name, value in (pair for pairs in options.only for pair in pairs):
         chosen.setdefault(name, []).append(value)
     for name, values in chosen.items():
         table = table.where(name, *values)
     shown = table.markdown(options.figures)
+    if chosen:
+        shown += f"\nchosen from {len(whole)} of {whole.asked} runs\n"
     try:
         figures = {f"{figure}-{setting}": plot_sweep(table, figure, setting) for figure, setting in options.plot}
     except ValueError as error:
