@@ -143,14 +143,12 @@ ESTIMATES = {f"{name}, {part}": partial(estimate, name=name, part=part) for name
 def remains(drive: dict[str, float], highway: dict[str, float]) -> str:
     """What it was on the two drives where vision used to lose to velocities alone."""
     return (
-        "On 09_30_0020 every estimate that used vision lost to velocities alone because these are level ones: with "
-        f"roll and pitch in the state full SLAM is off by {drive['all of it']:.1f} m, without them "
-        f"by {drive['no tilt']:.1f} m (dead reckoning: {drive['dead reckoning']:.1f} m); with scale, time offset and "
-        f"the rest of the calibration in the state, too, by {drive['calibration in the state']:.1f} m. On the highway "
-        f"it is how much the turn rates are trusted: {highway['white noise']:.1f} m where white noise of 1 mrad/s is "
-        f"assumed, {highway['white, 0.2 mrad/s']:.1f} m with 0.2 mrad/s and all else the same, "
-        f"{highway['all of it']:.1f} m with "
-        "the automatic noise. What is left there is the direction of the first seconds: the aligned error is below 1 m."
+        "On 09_30_0020 velocities are level ones. With roll and pitch in the state full SLAM is off by "
+        f"{drive['all of it']:.1f} m, without them by {drive['no tilt']:.1f} m (dead reckoning: "
+        f"{drive['dead reckoning']:.1f} m). With the calibration in the state, too, it is off by "
+        f"{drive['calibration in the state']:.1f} m. On the highway it matters how far the turn rates are trusted: "
+        f"{highway['white noise']:.1f} m with white noise of 1 mrad/s, {highway['white, 0.2 mrad/s']:.1f} m with "
+        f"0.2 mrad/s and all else the same, {highway['all of it']:.1f} m with the automatic noise."
     )
 
 
