@@ -23,7 +23,7 @@ RECIPES = [("imports", PAGE), *re.findall(r"^## (\d+)\. .*\n([\s\S]*?)(?=^## |\Z
 def cooked(tmp_path_factory):
     """The names of each recipe after it has run, and the folder it ran in."""
     folder = tmp_path_factory.mktemp("recipes")
-    write_kitti(recording(8, distorted=False, rotation_rad=np.zeros(3)), 8, folder / "images")
+    write_kitti(recording(5, distorted=False, rotation_rad=np.zeros(3)), 5, folder / "images")
     known, names, found = dict(OPTIONAL_BLOCKS), {}, {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -55,15 +55,15 @@ def test_settings_studies_and_rejections(cooked):
     found, _ = cooked
     assert len(found["4"]["ate_m"]) == 10 and max(found["4"]["ate_m"].values()) < 0.1
     assert len(found["5"]["rejected"]) == found["5"]["result"].counts["rejected"] > 0
-    assert 1.0 < np.median(found["7"]["nees"]) < 20.0
+    assert 1.0 < np.nanmedian(found["7"]["nees"]) < 20.0
     assert repr(found["7"]["report"]).count("\n") < 6
 
 
 def test_files(cooked):
     found, folder = cooked
-    assert np.loadtxt(folder / "drive.tum").shape == (60, 8)
+    assert np.loadtxt(folder / "drive.tum").shape == (40, 8)
     assert (folder / "drive.ply").read_bytes().startswith(b"ply")
-    assert found["11"]["variance"].sizes == {"time": 60} and len(found["11"]["landmarks"]) > 100
+    assert found["11"]["variance"].sizes == {"time": 40} and len(found["11"]["landmarks"]) > 100
     found["11"]["trajectory"].close()
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert all(variant in page for variant in ekfslam.VARIANTS)
@@ -73,7 +73,7 @@ def test_files(cooked):
 def test_live_and_own_block(cooked):
     found, _ = cooked
     live, truth = found["9"]["live"], found["9"]["sequence"].truth
-    assert live.counts.taken_in == 60 and live.counts.late_images == 0
+    assert live.counts.taken_in == 40 and live.counts.late_images == 0
     assert np.linalg.norm(live.pose().T_world_imu[:3, 3] - truth.T_world_imu[-1, :3, 3]) < 0.3
     biased = found["10"]["biased"].parameters
     assert biased.name == ("bias of w_z",) and abs(biased.value[-1, 0] - 0.03) < 3 * biased.std[-1, 0] < 0.05
