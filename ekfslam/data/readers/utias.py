@@ -68,8 +68,7 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
         (t, v, w, r, theta), cut = _columns(fields, frames)
         twist = np.concatenate([v, w], axis=1)
         fu, fv, cu, cv, b = (float(require_numbers(fields, name, (1, 1))[0, 0]) for name in CAMERA_FIELDS)
-        C = require_numbers(fields, "C_c_v", (3, 3))
-        rho = require_numbers(fields, "rho_v_c_v", (3, 1))[:, 0]
+        C, rho = require_numbers(fields, "C_c_v", (3, 3)), require_numbers(fields, "rho_v_c_v", (3, 1))[:, 0]
         observations, notes = flat_observations(pixels, frame_axis=1, field="y_k_j")
         if cut:
             notes = (f"Cut to the {frames} frames of y_k_j: {', '.join(cut)}.", *notes)
