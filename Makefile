@@ -1,4 +1,4 @@
-# make demo: everything set up, the three modes compared on the embedded data. make test: everything set up, all tests.
+# make demo: everything set up, four modes compared on the embedded data. make test: everything set up, all tests.
 
 PYTHON ?= python3
 VENV := .venv
@@ -58,7 +58,7 @@ archive-page: $(READY)
 
 setup: $(READY)
 
-$(READY): pyproject.toml .ci/setup
+$(READY): pyproject.toml setup.py ekfslam/kernels/_compiled.c .ci/setup
 	PYTHON="$(PYTHON)" VENV="$(VENV)" sh .ci/setup
 	@touch $@
 

@@ -162,8 +162,7 @@ def opened(
     """
     try:
         require_file(path)
-        # Files are replaced as a whole and never changed, so that they need no locks.
-        with h5py.File(str(path), "r", locking=False) as h5file:
+        with _reading(path) as h5file:
             _inspect(h5file, error)
             found = plain(h5file.attrs.get("format"))
             if found != format:
@@ -180,12 +179,24 @@ def opened(
         raise error(f"{path}: damaged or no HDF5 file ({problem}); expected format {format!r}") from None
 
 
+def _reading(path: str | Path) -> h5py.File:
+    """A file, open for reading; also where this process has it open by other means, such as xarray."""
+    try:
+        # Files are replaced as a whole and never changed, so that they need no locks.
+        return h5py.File(str(path), "r", locking=False)
+    except OSError as problem:
+        # HDF5 opens a file a second time only with the locks of the first.
+        if "locking flag" not in str(problem):
+            raise
+        return h5py.File(str(path), "r")
+
+
 def format_of(path: str | Path) -> str:
     """The attribute ``format`` of an HDF5 file; empty if it has none, or is none."""
     if not (Path(path).is_file() and h5py.is_hdf5(str(path))):
         return ""
     try:
-        with h5py.File(str(path), "r", locking=False) as h5file:
+        with _reading(path) as h5file:
             return str(plain(h5file.attrs.get("format", "")))
     except _DAMAGE:  # who opens it will say how
         return ""

@@ -138,7 +138,22 @@ def compare(
     """
     if config is not None:
         sequence = with_truth_noise(sequence, config.truth)
-    modes = list(modes)
+    results, skipped = _run_all(sequence, list(modes), config, checkpoints)
+    if skipped and not results:
+        raise FilterError("; ".join(f"no {mode}: {reason}" for mode, reason in skipped.items()))
+    summary = {
+        "sequence": sequence.name,
+        "frames": len(sequence),
+        "landmarks": len(sequence.observations.ids),
+        "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
+    }
+    return Comparison(sequence, results, summary, skipped)
+
+
+def _run_all(
+    sequence: Sequence, modes: list[Mode], config: Config | None, checkpoints: Checkpoints | None
+) -> tuple[dict[str, Result], dict[str, str]]:
+    """Result of each mode, and why there is none; what a checkpoint holds is not run again."""
     key = "" if checkpoints is None else key_of(sequence, config or Config(), "compare", versions())
     kept = None if checkpoints is None else checkpoints.found(key)
     done = {"results": {}, "skipped": {}} if kept is None else kept
@@ -159,16 +174,7 @@ def compare(
             skipped[mode] = str(error)
         if checkpoints is not None:
             checkpoints.keep(key, {"results": results, "skipped": skipped}, always=True)
-    results = {mode: results[mode] for mode in modes if mode in results}
-    if skipped and not results:
-        raise FilterError("; ".join(f"no {mode}: {reason}" for mode, reason in skipped.items()))
-    summary = {
-        "sequence": sequence.name,
-        "frames": len(sequence),
-        "landmarks": len(sequence.observations.ids),
-        "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
-    }
-    return Comparison(sequence, results, summary, skipped)
+    return {mode: results[mode] for mode in modes if mode in results}, skipped
 
 
 def compare_into(
@@ -236,8 +242,8 @@ def _compared(
             return "", str(error)
 
 
-@dataclass(frozen=True)
-class ConsistencyReport:
+@dataclass(frozen=True, repr=False)
+class ConsistencyReport(Shown):
     """What `check_consistency` found.
 
     Args:
@@ -249,6 +255,11 @@ class ConsistencyReport:
     archive: StudyArchive
     summary: dict[str, Any]
     paths: list[Path]
+
+    def card(self) -> Card:
+        """What ``repr`` and a notebook show."""
+        facts = {"written": ", ".join(path.name for path in self.paths)}
+        return Card(self.archive.card().title, facts, ("print(report.table)", "report.archive"))
 
     @property
     def table(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import platform
+from collections.abc import Mapping
 from importlib.metadata import version
 from time import perf_counter
 from typing import Any
@@ -12,7 +13,7 @@ import h5py
 import numpy as np
 import scipy
 
-from ekfslam.arrays import IntArray
+from ekfslam.arrays import Array, IntArray
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError, NoVelocitiesError
@@ -21,11 +22,12 @@ from ekfslam.evaluation.sanity import inspect_result, inspect_sequence, sanity_a
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.innovations import collect_innovations
 from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.log import Log
 from ekfslam.filters.loop import FurtherVelocities, one_thread, run_filter, solvable
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.references import References
-from ekfslam.filters.reports import collect
-from ekfslam.filters.result import Innovation, Landmarks, Rejections, Result
+from ekfslam.filters.reports import FrameReport, collect
+from ekfslam.filters.result import Innovation, Landmarks, Parameters, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
 from ekfslam.models.build import Problem, build
 from ekfslam.progress import progress
@@ -72,71 +74,113 @@ def run(
         return smooth(run(sequence, "full", config, further, checkpoints))
     if mode == "full":
         config = with_track_scale(config or Config(), sequence)
-    recording, suspicions = sequence, inspect_sequence(sequence).warnings
+    suspicions = inspect_sequence(sequence).warnings
     problem = build(sequence, config, clean=mode != "dead-reckoning")
-    sequence, config, model = problem.sequence, problem.config, problem.model
-    account, hygiene = {**problem.account, "model": "; ".join(problem.lines)}, problem.hygiene
-    counts: dict[str, int] = {}
-    reports, landmarks = [], Landmarks.empty()
-    log = parameters = pairs = whitened = None
-    reach = config.filter.relative_frames
-    judged = relative_pairs(sequence.truth, reach) if sequence.truth is not None and reach else None
-
     with one_thread():
-        if mode == "full":
-            state = _filtered(problem, judged, further, checkpoints)
-            ekf, references, reports = state["ekf"], state["references"], state["reports"]
-            T_imu_world, covariance, ms = state["T_imu_world"], state["covariance"], state["ms"]
-            pairs = None if references is None else references.pairs()
-            landmarks, counts, log, parameters = ekf.landmarks(), ekf.counts, ekf.log(), ekf.parameters()
-        else:
-            begin = perf_counter()
-            T_imu_world, covariance = dead_reckon(sequence, model.noise, config.filter.initial_covariance)
-            if judged is not None:
-                pairs = dead_reckoned_pairs(*judged, se3.inverse(T_imu_world), covariance)
-            # Dead reckoning is computed for all frames at once; each frame bears its share.
-            ms = np.full(len(sequence), 1e3 * (perf_counter() - begin) / len(sequence))
-            if mode == "mapping-only":
-                mapper = IndependentLandmarks(model.rig.with_white_pixels(), config.filter, T_imu_world)
-                frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
-                for k, report, taken in run_filter(mapper, sequence, frames):
-                    reports.append(report)
-                    ms[k] += taken
-                landmarks = mapper.landmarks()
+        estimate = _joint(problem, further, checkpoints) if mode == "full" else _dead_reckoned(problem, mode)
+    result = _result(problem, mode, estimate)
+    lines = (*suspicions, *inspect_result(sequence, result, suspicions))
+    return dataclasses.replace(result, attributes={**result.attributes, **sanity_attributes(lines)})
 
+
+@dataclasses.dataclass(frozen=True)
+class _Estimate:
+    """What a mode has estimated; fields are those of `Result`, but for the direction of the poses.
+
+    Args:
+        T_imu_world: (T, 4, 4).
+        covariance: (T, 6, 6).
+        ms: (T,) time spent on each frame.
+        reports: Of each frame; none without observations.
+    """
+
+    T_imu_world: Array
+    covariance: Array
+    ms: Array
+    pairs: PosePairs | None
+    reports: list[FrameReport] = dataclasses.field(default_factory=list)
+    landmarks: Landmarks = dataclasses.field(default_factory=Landmarks.empty)
+    counts: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    log: Log | None = None
+    parameters: Parameters | None = None
+
+
+def _judged(problem: Problem) -> tuple[IntArray, IntArray] | None:
+    """Pairs of frames whose relative pose the truth judges, if there are any."""
+    truth, reach = problem.sequence.truth, problem.config.filter.relative_frames
+    return relative_pairs(truth, reach) if truth is not None and reach else None
+
+
+def _joint(problem: Problem, further: FurtherVelocities | None, checkpoints: Checkpoints | None) -> _Estimate:
+    """The joint filter's."""
+    state = _filtered(problem, _judged(problem), further, checkpoints)
+    ekf, references = state["ekf"], state["references"]
+    return _Estimate(
+        state["T_imu_world"],
+        state["covariance"],
+        state["ms"],
+        None if references is None else references.pairs(),
+        state["reports"],
+        ekf.landmarks(),
+        ekf.counts,
+        ekf.log(),
+        ekf.parameters(),
+    )
+
+
+def _dead_reckoned(problem: Problem, mode: Mode) -> _Estimate:
+    """The prediction's, and in mode ``mapping-only`` the map on it."""
+    sequence, model, settings = problem.sequence, problem.model, problem.config.filter
+    judged, begin = _judged(problem), perf_counter()
+    T_imu_world, covariance = dead_reckon(sequence, model.noise, settings.initial_covariance)
+    pairs = None if judged is None else dead_reckoned_pairs(*judged, se3.inverse(T_imu_world), covariance)
+    # Dead reckoning is computed for all frames at once; each frame bears its share.
+    ms = np.full(len(sequence), 1e3 * (perf_counter() - begin) / len(sequence))
+    if mode == "dead-reckoning":
+        return _Estimate(T_imu_world, covariance, ms, pairs)
+    mapper, reports = IndependentLandmarks(model.rig.with_white_pixels(), settings, T_imu_world), []
+    frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
+    for k, report, taken in run_filter(mapper, sequence, frames):
+        reports.append(report)
+        ms[k] += taken
+    return _Estimate(T_imu_world, covariance, ms, pairs, reports, mapper.landmarks())
+
+
+def _result(problem: Problem, mode: Mode, estimate: _Estimate) -> Result:
+    sequence, reports = problem.sequence, estimate.reports
+    account: dict[str, Any] = {**problem.account, "model": "; ".join(problem.lines)}
     innovation, rejections = Innovation.empty(len(sequence)), Rejections.empty()
+    counts, whitened = dict(estimate.counts), None
     if reports:
         innovation, rejections, tallies = collect(reports)
         counts = {**tallies, **counts}
         found = [report.innovations for report in reports if report.innovations is not None]
         whitened = collect_innovations(found) if found else None
         account["log_likelihood"] = float(sum(report.log_likelihood for report in reports))
-    if hygiene is not None:
-        counts |= hygiene.counts
-    result = Result(
+    if problem.hygiene is not None:
+        counts |= problem.hygiene.counts
+    return Result(
         mode=mode,
         sequence_name=sequence.name,
         time_s=sequence.time_s,
-        T_world_imu=se3.inverse(T_imu_world),
-        covariance=covariance,
-        landmarks=landmarks,
+        T_world_imu=se3.inverse(estimate.T_imu_world),
+        covariance=estimate.covariance,
+        landmarks=estimate.landmarks,
         innovation=innovation,
         rejections=rejections,
-        ms_per_frame=ms,
+        ms_per_frame=estimate.ms,
         counts=counts,
-        config=dataclasses.asdict(config),
-        noise=model.noise,
+        config=dataclasses.asdict(problem.config),
+        noise=problem.model.noise,
         camera=sequence.camera,
         T_cam_imu=sequence.T_cam_imu,
-        log=log,
-        hygiene=hygiene,
-        parameters=parameters,
-        pairs=pairs,
+        log=estimate.log,
+        hygiene=problem.hygiene,
+        parameters=estimate.parameters,
+        pairs=estimate.pairs,
         whitened=whitened,
         attributes={**sequence.attributes, **account, **versions()},
     )
-    lines = (*suspicions, *inspect_result(recording, result, suspicions))
-    return dataclasses.replace(result, attributes={**result.attributes, **sanity_attributes(lines)})
 
 
 def _filtered(

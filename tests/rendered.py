@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from scipy.ndimage import map_coordinates, zoom
 
 from ekfslam.data.images.pairs import Distortion, ImageRecording, PairCalibration
@@ -154,3 +156,15 @@ def recording(frames: int, distorted: bool, rotation_rad: np.ndarray, seed: int 
         T_cam_imu=T_CAM_BODY,
         truth=Truth(np.arange(frames), T_world_body),
     )
+
+
+def write_kitti(recorded: ImageRecording, frames: int, place: Path) -> Path:
+    """The first frames in a folder as the odometry benchmark has them, with the calibration of ideal lenses."""
+    for side, name in enumerate(("image_0", "image_1")):
+        (place / name).mkdir(parents=True)
+        for k in range(frames):
+            Image.fromarray(recorded.load(k)[side]).save(place / name / f"{k:06d}.png")
+    P = "300 0 199.5 {} 0 300 99.5 0 0 0 1 0"
+    (place / "calib.txt").write_text(f"P0: {P.format(0)}\nP1: {P.format(-300 * BASELINE_M)}\n")
+    (place / "times.txt").write_text("".join(f"{PERIOD_S * k:.1f}\n" for k in range(frames)))
+    return place

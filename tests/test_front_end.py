@@ -23,7 +23,7 @@ from ekfslam.runner import run
 
 cv2 = pytest.importorskip("cv2")
 
-from rendered import BASELINE_M, SIZE, calibrated, drive, recording  # noqa: E402
+from rendered import BASELINE_M, SIZE, calibrated, drive, recording, write_kitti  # noqa: E402
 
 CAMERA = StereoCamera(300.0, 300.0, 199.5, 99.5, BASELINE_M)
 ROTATION_RAD = np.deg2rad([0.10, -0.08, 0.06])
@@ -226,15 +226,7 @@ def test_a_lens_needs_its_coefficients():
 @pytest.fixture
 def folder(room, tmp_path):
     """Three frames as the benchmark stores them; the pixels need not be rectified to be read."""
-    place = tmp_path / "sequence"
-    for side, name in enumerate(("image_0", "image_1")):
-        (place / name).mkdir(parents=True)
-        for k in range(3):
-            Image.fromarray(room.load(k)[side]).save(place / name / f"{k:06d}.png")
-    P = "300 0 199.5 {} 0 300 99.5 0 0 0 1 0"
-    (place / "calib.txt").write_text(f"P0: {P.format(0)}\nP1: {P.format(-300 * BASELINE_M)}\n")
-    (place / "times.txt").write_text("0.0\n0.1\n0.2\n")
-    return place
+    return write_kitti(room, 3, tmp_path / "sequence")
 
 
 def test_a_folder_of_kitti_odometry_is_read(folder, room):

@@ -51,7 +51,7 @@ def test_everything_shows_itself_in_a_few_lines(world, compared, full, tmp_path)
         "Comparison": (compared, ["dead-reckoning", "full", "ATE [m]", "print(comparison.table)"]),
         "Posterior": (posterior(full), ["maximum a posteriori", "60 poses", ".joint_covariance("]),
         "Archive": (read_archive(tmp_path / "a.h5"), ["city", "60 frames", "archive.results["]),
-        "Study": (study, ["3 runs", "large-heading", "invariant"]),
+        "Study": (study, ["3 runs", "large-heading", "invariant", "ekfslam.check_consistency(study"]),
         "StudyArchive": (
             StudyArchive(study, {"mid": np.array([True, False, True])}, {}),
             ["not complete", "2 of 3 runs"],

@@ -1,6 +1,6 @@
 """Live use: velocities and images as they come, at any rates, in any order within a stated delay.
 
-    live = LiveEKF(JointEKF(Rig(camera, T_cam_imu, noise), config, T_world_imu), delay_s=0.2)
+    live = LiveEKF.from_rig(camera, T_cam_imu, noise, delay_s=0.2)
     live.predict(velocities, t)       # from the odometry
     live.update(ids, pixels, t)       # from the tracker
     now = live.pose()                 # at the newest stamp: T_world_imu and the covariance of xi
@@ -18,17 +18,21 @@ from __future__ import annotations
 
 import dataclasses
 from bisect import bisect_left, bisect_right
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, IntArray
+from ekfslam.config import FilterConfig
+from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import require_finite, require_shape
 from ekfslam.errors import ConfigError, DuplicateObservationError, LateError, MissingVelocityError, StampError
 from ekfslam.filters.joint import JointEKF, without_landmarks
 from ekfslam.filters.reports import FrameReport
 from ekfslam.geometry import motion, se3
+from ekfslam.geometry.camera import StereoCamera
+from ekfslam.models.sensors.stereo import Rig
 
 
 class Pose(NamedTuple):
@@ -157,6 +161,33 @@ class LiveEKF:
         self._waiting: list[tuple[float, IntArray, Array]] = []
         self._newest = {"velocity": -np.inf, "image": -np.inf}
         self._past: list[tuple[float, JointEKF]] = []
+
+    @classmethod
+    def from_rig(
+        cls,
+        camera: StereoCamera,
+        T_cam_imu: Array,
+        noise: Noise,
+        T_world_imu: Array | None = None,
+        config: FilterConfig | None = None,
+        **window: Any,
+    ) -> LiveEKF:
+        """The filter of a stereo rig with measured velocities.
+
+        Args:
+            camera: Of the rectified pair.
+            T_cam_imu: (4, 4) IMU to left optical frame.
+            noise: Of velocities and pixels, white.
+            T_world_imu: (4, 4) pose at the start; by default there is the origin of world.
+            config: Settings of the filter; by default landmarks leave the state when they are out of view.
+            window: ``delay_s``, ``gap_s``, ``history_s`` and ``late`` of `LiveEKF`.
+
+        Raises:
+            ConfigError: A time is negative.
+        """
+        settings = FilterConfig(retire="unseen") if config is None else config
+        start = np.eye(4) if T_world_imu is None else T_world_imu
+        return cls(JointEKF(Rig(camera, T_cam_imu, noise), settings, start), **window)
 
     @property
     def newest_s(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from collections.abc import Sequence as SequenceType
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -336,6 +337,17 @@ class Result(Shown):
         """(T, 3) standard deviations of the position along x, y, z of world."""
         return np.sqrt(np.maximum(np.diagonal(self.position_covariance_world, axis1=1, axis2=2), 0.0))
 
+    def frame_at(self, time_s: float) -> int:
+        """The frame whose stamp is nearest to a time on the clock of the recording, s.
+
+        Raises:
+            ShapeError: The time is before the first frame or after the last.
+        """
+        first_s, last_s = self.time_s[[0, -1]].tolist()
+        if not first_s <= time_s <= last_s:
+            raise ShapeError(f"{time_s:g} s is not within {first_s:g} to {last_s:g} s", source=self.sequence_name)
+        return int(np.argmin(np.abs(self.time_s - time_s)))
+
     def between(self, begin_s: float, end_s: float) -> Result:
         """The frames whose stamps are in ``[begin_s, end_s)`` on the clock of the recording, as a result of its own.
 
@@ -432,6 +444,21 @@ class Result(Shown):
         from ekfslam.storage import tables
 
         return tables.dataset(self, group)
+
+    def export(self, path: str | Path, format: str) -> None:
+        """Write it for other programs, see `ekfslam.storage.exports`.
+
+        Args:
+            path: File to write.
+            format: Any of ``EXPORTS``: ``tum`` and ``kitti`` are poses, ``ply`` is the map, ``csv-landmarks`` a table.
+
+        Raises:
+            ArchiveError: There is no such format, it cannot hold this result, or the file cannot be written.
+            PosteriorError: The format is ``information``, and the result has no log.
+        """
+        from ekfslam.storage import exports
+
+        exports.export(self, path, format)
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -46,8 +46,8 @@ DENSE_LIMIT = 20_000  # columns of a dense covariance: 3.2 GB
 class Posterior(Shown):
     """A Gaussian over all poses and all landmarks.
 
-    Landmarks go by their row in ``id``, which is the order of the filter's `Landmarks`; frames by their number,
-    negative ones from the end. Covariances are of the stored errors (see `ekfslam`).
+    Landmarks go by their row in ``id`` (`rows_of`), which is the order of the filter's `Landmarks`; frames by their
+    number, negative ones from the end. Covariances are of the stored errors (see `ekfslam`).
 
     Args:
         linearisation: ``map`` or ``filtered``.
@@ -119,6 +119,19 @@ class Posterior(Shown):
                 start += block.size
         raise PosteriorError(f"there is no state block {name!r}; there are {', '.join(self.values) or 'none'}")
 
+    def rows_of(self, ids: ArrayLike) -> IntArray:
+        """Rows (n,) of landmarks given by their ids; of a track that was split, the row of its last piece.
+
+        Raises:
+            PosteriorError: There is no landmark of such an id.
+        """
+        row = {landmark: i for i, landmark in enumerate(self.id.tolist())}
+        wanted = np.atleast_1d(np.asarray(ids)).tolist()
+        unknown = [landmark for landmark in wanted if landmark not in row]
+        if unknown:
+            raise PosteriorError(f"there is no landmark of id {unknown[0]}; `Posterior.id` has all")
+        return np.array([row[landmark] for landmark in wanted], dtype=np.int64)
+
     def joint_covariance(self, frames: ArrayLike = (), landmarks: ArrayLike = ()) -> Array:
         """Covariance (6a+3b, 6a+3b) of a poses and b landmarks, given by frame and by row, in that order.
 
@@ -127,7 +140,7 @@ class Posterior(Shown):
         """
         e = self.information.elimination
         frame = _checked("frame", frames, e.frames)
-        P = self.information.covariance(frame, _checked("landmark", landmarks, e.landmarks))
+        P = self.information.covariance(frame, _checked("landmark row", landmarks, e.landmarks))
         # Of each frame its pose alone.
         of_poses = (e.width * np.arange(len(frame))[:, None] + np.arange(6)).ravel()
         kept = np.concatenate([of_poses, np.arange(e.width * len(frame), len(P))])

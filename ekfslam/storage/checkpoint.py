@@ -288,6 +288,7 @@ class Checkpoints:
     every_s: float = dataclasses.field(default_factory=lambda: EVERY_S)
 
     def __post_init__(self) -> None:
+        self.path = Path(self.path)  # a string does, too
         self._next = monotonic() + self.every_s
 
     def found(self, key: str) -> dict[str, Any] | None:

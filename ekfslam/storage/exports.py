@@ -34,6 +34,18 @@ _PLY = f"ply\nformat binary_little_endian 1.0\ncomment {MADE_BY}: landmarks in w
 _G2O = f"# {MADE_BY}: "
 
 
+def export(result: Result, path: str | Path, format: str) -> None:
+    """Write a result in any format of `EXPORTS`.
+
+    Raises:
+        ArchiveError: There is no such format, it cannot hold this result, or the file cannot be written.
+        PosteriorError: The format is ``information``, and the result has no log.
+    """
+    if format not in EXPORTS:
+        raise ArchiveError(f"there is no format {format!r}; known: {', '.join(EXPORTS)}")
+    files.write(path, EXPORTS[format].write(result))
+
+
 def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "kitti"]) -> None:
     """Write the estimated poses ``T_world_imu`` as text, one line a frame, in 17 digits: every number exactly.
 

@@ -175,7 +175,7 @@ class Study(Shown):
         filters = self.runs * len(self.levels) * len(self.variants)
         facts = {"levels": ", ".join(self.levels), "variants": ", ".join(self.variants), "seed": str(self.seed)}
         title = f"{count(self.runs, 'run')} of each level, {count(filters, 'filter')} in all"
-        return Card(title, facts, ('run_study(study, "study.h5", executor)',))
+        return Card(title, facts, ('ekfslam.check_consistency(study, "out")',))
 
     @property
     def parameters(self) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from ekfslam.cli.options import DEFAULT_DATA, add_data_options, open_data, table
 from ekfslam.config import Config
 from ekfslam.data.interpolation import stretches
 from ekfslam.data.readers import BUILTIN
+from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.truth import with_truth_noise
@@ -33,25 +34,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def command(options: argparse.Namespace) -> None:
     if options.build:
         _print_build()
-        return
-    if _is_archive(options.data):
-        archive = read_archive(options.data)
-        print(f"{options.data}: archive of {archive.name}, {len(archive.time_s)} frames, from {archive.source}")
-        print(table(archive, None, archive.results))
-        for mode, result in archive.results.items():
-            print(f"{mode}: " + ", ".join(f"{name} {count}" for name, count in result.counts.items()))
-            if result.parameters is not None:
-                for line in result.parameters.lines:
-                    print(f"{mode}: {line}")
-            for remark in result.remarks:
-                print(f"{mode}: note: {remark}")
-            if result.hygiene is not None:
-                for line in result.hygiene.lines(result.config["hygiene"]):
-                    print(f"{mode}: hygiene: {line}")
-        return
-    given = Config().with_overrides({"truth": dict(options.truth_noise)})
-    sequence = with_truth_noise(open_data(options, options.data), given.truth)
-    camera, truth, noise = sequence.camera, sequence.truth, sequence.noise
+    elif _is_archive(options.data):
+        _print_archive(options.data)
+    else:
+        given = Config().with_overrides({"truth": dict(options.truth_noise)})
+        sequence = with_truth_noise(open_data(options, options.data), given.truth)
+        _print_recording(sequence)
+        _print_findings(sequence)
+
+
+def _print_archive(path: str) -> None:
+    archive = read_archive(path)
+    print(f"{path}: archive of {archive.name}, {len(archive.time_s)} frames, from {archive.source}")
+    print(table(archive, None, archive.results))
+    for mode, result in archive.results.items():
+        counts = [f"{name} {count}" for name, count in result.counts.items() if count]
+        lines = [", ".join(counts)] if counts else []
+        lines += result.parameters.lines if result.parameters is not None else ()
+        lines += [f"note: {remark}" for remark in result.remarks]
+        if result.hygiene is not None:
+            lines += [f"hygiene: {line}" for line in result.hygiene.lines(result.config["hygiene"])]
+        for line in lines:
+            print(f"{mode}: {line}")
+
+
+def _print_recording(sequence: Sequence) -> None:
+    """What is in it."""
+    camera, truth = sequence.camera, sequence.truth
     tracks = inspect_tracks(sequence.observations, sequence.twist)
     print(f"name          {sequence.name} ({sequence.source})")
     print(f"frames        {len(sequence)} in {sequence.time_s[-1] - sequence.time_s[0]:.1f} s")
@@ -60,13 +69,7 @@ def command(options: argparse.Namespace) -> None:
         f"camera        fu {camera.fu_px:g} fv {camera.fv_px:g} cu {camera.cu_px:g} cv {camera.cv_px:g} px, "
         f"baseline {camera.baseline_m:g} m"
     )
-    if not sequence.has_velocities:
-        print("velocities    nobody measured any: the twist is a walk that starts from stereo odometry")
-    elif noise is None:
-        v, w = velocity_noise(sequence.twist).texts
-        print(f"noise         not stated; white noise of the velocities, from the data: {v} m/s, {w} rad/s")
-    else:
-        print(f"noise         twist {noise.twist_std} (m/s, rad/s), pixels {noise.pixel_std_px} px")
+    print(_noise_line(sequence))
     known = "none" if truth is None else f"{len(truth.frame)} poses, {len(truth.landmark)} landmarks"
     print(f"truth         {known}")
     if truth is not None:
@@ -75,6 +78,19 @@ def command(options: argparse.Namespace) -> None:
     print(f"gaps          {f'intervals {gaps} are interpolated' if gaps else 'none'}")
     for key, value in sequence.attributes.items():
         print(f"{key:13s} {value}")
+
+
+def _noise_line(sequence: Sequence) -> str:
+    if not sequence.has_velocities:
+        return "velocities    nobody measured any: the twist is a walk that starts from stereo odometry"
+    if sequence.noise is None:
+        v, w = velocity_noise(sequence.twist).texts
+        return f"noise         not stated; white noise of the velocities, from the data: {v} m/s, {w} rad/s"
+    return f"noise         twist {sequence.noise.twist_std} (m/s, rad/s), pixels {sequence.noise.pixel_std_px} px"
+
+
+def _print_findings(sequence: Sequence) -> None:
+    """What is wrong with it, and which model it would get."""
     for note in sequence.notes:
         print(f"note          {note}")
     sanity = inspect_sequence(sequence)

@@ -97,14 +97,19 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
             observations=observations,
             velocity_frame="level",
             notes=(notes[0], LEVEL_VELOCITIES_NOTE, notes[1], *found, *_notes_on(observations, twist)),
-            attributes={
-                "checksum_sha256": checksum(path),
-                "reader": READER.name,
-                **({} if is_later else {"extrinsics": extrinsics}),
-                "lateral": used,
-                **interpolation_attributes(twist),
-            },
+            attributes=_attributes(path, twist, used, None if is_later else extrinsics),
         )
+
+
+def _attributes(path: Path, twist: Array, lateral: str, extrinsics: Extrinsics | None) -> dict[str, str]:
+    """How the file was read; the later edition leaves no choice of extrinsics."""
+    return {
+        "checksum_sha256": checksum(path),
+        "reader": READER.name,
+        **({} if extrinsics is None else {"extrinsics": extrinsics}),
+        "lateral": lateral,
+        **interpolation_attributes(twist),
+    }
 
 
 def _notes_on(observations: Observations, twist: Array) -> tuple[str, ...]:

@@ -65,17 +65,10 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
     with spelled_as_in(source, _SPELLING):
         pixels = require_numbers(fields, "y_k_j", (4, None, None), finite=False)
         frames = pixels.shape[1]
-        columns = {name: require_numbers(fields, name, (1 if name == "t" else 3, None)) for name in COLUMN_FIELDS}
-        for name, value in columns.items():
-            if value.shape[1] < frames:
-                error = TruthError if name in ("r_i_vk_i", "theta_vk_i") else ShapeError
-                raise error(f"{value.shape[1]} columns do not cover the {frames} frames of y_k_j", field=name)
-        cut = [f"{name} ({value.shape[1]})" for name, value in columns.items() if value.shape[1] > frames]
-        t, v, w, r, theta = (value[:, :frames].T for value in columns.values())
+        (t, v, w, r, theta), cut = _columns(fields, frames)
         twist = np.concatenate([v, w], axis=1)
         fu, fv, cu, cv, b = (float(require_numbers(fields, name, (1, 1))[0, 0]) for name in CAMERA_FIELDS)
-        C = require_numbers(fields, "C_c_v", (3, 3))
-        rho = require_numbers(fields, "rho_v_c_v", (3, 1))[:, 0]
+        C, rho = require_numbers(fields, "C_c_v", (3, 3)), require_numbers(fields, "rho_v_c_v", (3, 1))[:, 0]
         observations, notes = flat_observations(pixels, frame_axis=1, field="y_k_j")
         if cut:
             notes = (f"Cut to the {frames} frames of y_k_j: {', '.join(cut)}.", *notes)
@@ -111,6 +104,17 @@ def _load(path: Path) -> dict[str, NDArray]:
     if "y_k_j" not in fields:
         raise UnknownFormatError(f"{path}: a .mat file with the fields [{', '.join(fields)}]; {expected}")
     return fields
+
+
+def _columns(fields: dict[str, NDArray], frames: int) -> tuple[list[Array], list[str]]:
+    """The first ``frames`` columns of each of `COLUMN_FIELDS` as rows (T, n), and which of them had more."""
+    columns = {name: require_numbers(fields, name, (1 if name == "t" else 3, None)) for name in COLUMN_FIELDS}
+    for name, value in columns.items():
+        if value.shape[1] < frames:
+            error = TruthError if name in ("r_i_vk_i", "theta_vk_i") else ShapeError
+            raise error(f"{value.shape[1]} columns do not cover the {frames} frames of y_k_j", field=name)
+    cut = [f"{name} ({value.shape[1]})" for name, value in columns.items() if value.shape[1] > frames]
+    return [value[:, :frames].T for value in columns.values()], cut
 
 
 def _truth(fields: dict[str, NDArray], T_world_imu: Array, tracks: int) -> Truth:
