@@ -234,6 +234,16 @@ def test_every_damaged_byte_is_a_named_error(tmp_path):
     assert refused > 10
 
 
+@pytest.mark.parametrize("old", [b"} ", b"False,"])
+def test_a_header_that_is_no_python_is_refused(npy, old):
+    """NumPy parses the words of such headers once more, as those of Python 2, and fails in other ways."""
+    content = npy.read_bytes()
+    assert old in content[:128]
+    npy.write_bytes(content.replace(old, old[:-1] + b"(", 1))
+    with pytest.raises(UnknownFormatError, match=r"damaged \.npy file \(no header"):
+        open_sequence(npy)
+
+
 def test_npy_beyond_the_limit_is_refused_unread(npy):
     with reading_up_to(1e-6), pytest.raises(UnknownFormatError, match="--read-limit"):
         open_sequence(npy)

@@ -211,6 +211,7 @@ def test_command(archive, tmp_path, capsys):
     assert out.read_text() == "mine"
     with pytest.raises(ArchiveError, match="1 to 32"):
         write_report([], out)
+    assert main(["report", str(archive), "a\0b", "--out", str(tmp_path / "b.html")]) == 2, "no name of a file"
 
 
 def test_the_script_draws_without_an_error(archive, tmp_path):

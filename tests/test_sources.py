@@ -279,6 +279,7 @@ BROKEN_EUROC: list[tuple[Callable[[Path], Any], type[EkfslamError], str]] = [
     (lambda folder: (folder / YAML).unlink(), UnknownFormatError, "cam1/sensor.yaml"),
     (replace(YAML, "camera_model: pinhole", "camera_model: omni"), CalibrationError, "camera_model"),
     (replace(YAML, "camera_model: pinhole", ""), CalibrationError, "camera_model"),
+    (replace(YAML, "resolution: [12", "resolution: [1e999"), CalibrationError, "whole numbers of pixels, found inf"),
     (replace(YAML, "intrinsics: [", "intrinsics: [1, "), CalibrationError, "intrinsics: expected 4 numbers, found 5"),
     (replace(YAML, "radial-tangential", "fov"), CalibrationError, "distortion_model"),
     (replace(YAML, "[-0.28340811, ", "["), CalibrationError, "distortion_coefficients"),

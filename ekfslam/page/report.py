@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib import resources
@@ -75,7 +76,8 @@ def read_archives(paths: Sequence[str | Path]) -> dict[str, Archive]:
 
 def _labels(paths: Sequence[Path]) -> list[str]:
     """The shortest ends of the paths that differ."""
-    parts = [(*path.resolve().parts[1:-1], path.stem) for path in paths]
+    # Not `Path.resolve`, which raises ValueError for what can be no name of a file.
+    parts = [(*Path(os.path.abspath(path)).parts[1:-1], path.stem) for path in paths]  # noqa: PTH100
     ends = parts
     for length in range(1, max(map(len, parts)) + 1):
         ends = [part[-length:] for part in parts]

@@ -133,6 +133,12 @@ def _camera(read: Calibration, prefix: str, coefficients: str) -> tuple[Array, t
         )
     fu, fv, cu, cv = read.numbers(f"{prefix}intrinsics", 4)
     width, height = read.numbers(f"{prefix}resolution", 2)
+    if not (float(width).is_integer() and float(height).is_integer()):
+        raise CalibrationError(
+            f"expected whole numbers of pixels, found {width:g} and {height:g}",
+            source=str(read.path),
+            field=f"{prefix}resolution",
+        )
     name = read.word(f"{prefix}distortion_model")
     if name not in _MODELS:
         raise CalibrationError(

@@ -21,6 +21,7 @@ from ekfslam.data.readers.fields import (
     spelled_as_in,
     with_lateral,
 )
+from ekfslam.data.readers.pickled import npy_header
 from ekfslam.data.readers.registry import Extrinsics, Lateral, Reader
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Observations, Sequence, require_rigid, validate_camera
 from ekfslam.data.tracks import inspect_tracks
@@ -155,9 +156,7 @@ def _inspect(path: Path) -> None:
             if entry.compress_type not in (ZIP_STORED, ZIP_DEFLATED):
                 raise ValueError(f"{entry.filename} is compressed in a way that no .npz is")
             with archive.open(entry) as file:
-                version = np.lib.format.read_magic(file)
-                header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-                shape, _, dtype = header[version](file)
+                shape, dtype = npy_header(file)
             if math.prod(shape) * dtype.itemsize > entry.file_size:
                 raise ValueError(f"{entry.filename} claims the shape {shape}, but has {entry.file_size} bytes")
 

@@ -15,7 +15,8 @@ import pickle
 import pickletools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from tokenize import TokenError
+from typing import IO, Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,11 +70,24 @@ def _clean(error: Exception) -> str:
     return printable(str(error))[:200]
 
 
+def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type that the header of an .npy file claims; the stream stands behind it afterwards.
+
+    Raises:
+        ValueError: There is no such header.
+    """
+    version = np.lib.format.read_magic(stream)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    try:
+        shape, _, dtype = readers[version](stream)
+    except (KeyError, SyntaxError, TokenError) as error:  # of older headers NumPy parses the words themselves
+        raise ValueError(f"no header of an .npy file ({error})") from None
+    return shape, dtype
+
+
 def _header_end(stream: io.BytesIO) -> int:
     """Where the header of the .npy ends, which must announce one object."""
-    version = np.lib.format.read_magic(stream)
-    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
-    shape, _, dtype = header(stream)
+    shape, dtype = npy_header(stream)
     if dtype != np.dtype(object) or shape != ():
         raise pickle.UnpicklingError(f"an array of {dtype} with the shape {shape} instead of a dictionary")
     return stream.tell()
