@@ -89,3 +89,8 @@ def test_error_of_a_ratio_is_its_scatter():
     assert np.mean(errors) == pytest.approx(np.std(found), rel=0.2)
     white = [whiteness.ratio_error(rng.chisquare(dof).astype(float), dof, 20) for _ in range(50)]
     assert np.min(white) >= 0.95 * np.sqrt(2 / dof.sum())
+
+
+def test_lags_beyond_the_series_have_no_covariance():
+    series = np.array([[1.0], [-2.0], [3.0]])
+    np.testing.assert_allclose(whiteness.autocovariance(series, 5)[:, 0], np.array([14.0, -8.0, 3.0, 0, 0, 0]) / 3)

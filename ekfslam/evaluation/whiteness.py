@@ -20,11 +20,12 @@ _LARGEST_SCALE = 100.0  # of variances, that a gate still lets be told
 def autocovariance(series: Array, lags: int) -> Array:
     """Second moments about 0 of samples 0 to ``lags`` apart: (T, n) to (lags+1, n); NaN samples do not count.
 
-    Each is divided by the number of all samples that count, so that the sequence is positive semi-definite.
+    Each is divided by the number of all samples that count, so that the sequence is positive semi-definite. Where the
+    series is shorter than a lag, 0.
     """
     known = np.isfinite(series)
     filled, count = np.where(known, series, 0.0), np.maximum(known.sum(axis=0), 1)
-    shifted = (filled[: len(filled) - lag] * filled[lag:] for lag in range(lags + 1))
+    shifted = (filled[: max(len(filled) - lag, 0)] * filled[lag:] for lag in range(lags + 1))
     return np.array([product.sum(axis=0) / count for product in shifted])
 
 
