@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +22,24 @@ DATA = Path(os.environ.get("EKFSLAM_DATA") or Path(__file__).resolve().parents[2
 def seeds(whole: int, reduced: int) -> range:
     """Seeds of a study: so many in the whole form of the tests, fewer in the reduced one."""
     return range(whole if WHOLE else reduced)
+
+
+def forked(work: Callable[[], object]) -> int:
+    """Exit code of a process that begins as a copy of this one and only works; negative: the signal that ended it.
+
+    For what happens to processes. A new interpreter takes a second to import what is there already.
+    """
+    process = os.fork()
+    if process == 0:
+        code = 1
+        try:
+            with Path(os.devnull).open("w") as nowhere:
+                sys.stdout = sys.stderr = nowhere
+                work()
+            code = 0
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
 
 
 @pytest.fixture
