@@ -174,6 +174,8 @@ def test_objects_come_back_with_what_they_share(tmp_path):
     assert found.keys() == expected.keys()
     assert found["plain"] == expected["plain"]
     assert found["same"] is found["array"]
+    for name in ("array", "view", "turned", "empty", "flags", "fixed"):
+        np.testing.assert_array_equal(found[name], expected[name])
     assert found["array"].flags.f_contiguous and not found["array"].flags.c_contiguous
     found["array"][1, 2] = 99.0
     assert found["view"][0, 1] == 99.0 and found["turned"][2, 1] == 99.0, "views of the same memory"
