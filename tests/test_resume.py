@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import WHOLE, forked, seeds
+from conftest import WHOLE, command, processes, seeds
 from test_archive import assert_same
 from test_montecarlo import short
 
@@ -265,27 +265,24 @@ def same_archives(a: Path, b: Path) -> None:
 
 
 def killed(arguments: list[str], cpu_s: float) -> None:
-    """A command in a process that ends without warning after so much time of its own."""
-
-    def work() -> None:
-        checkpoint.EVERY_S, checkpoint.SHARE = 0.0, 1.0
-        signal.setitimer(signal.ITIMER_PROF, cpu_s)  # its signal kills
-        main(arguments)
-
-    assert forked(work) in (-signal.SIGPROF, 0)
+    """A command that writes checkpoints half of the time."""
+    checkpoint.EVERY_S, checkpoint.SHARE = 0.0, 1.0
+    command(arguments, cpu_s)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["run", "compare"])
+@pytest.mark.xdist_group("processes")
+@pytest.mark.parametrize("name", ["run", "compare"])
 @pytest.mark.parametrize("seed", seeds(4, 1))
-def test_killed_and_resumed_ends_in_the_same_bits(tmp_path, command, seed):
+def test_killed_and_resumed_ends_in_the_same_bits(tmp_path, name, seed):
     out = tmp_path / "out"
-    target = out / "a.h5" if command == "run" else out / "city" / "archive.h5"
-    more = [] if WHOLE or command == "run" else ["--no-figures"]
-    arguments = [command, CITY, *more, "--out", str(target if command == "run" else out)]
+    target = out / "a.h5" if name == "run" else out / "city" / "archive.h5"
+    more = [] if WHOLE or name == "run" else ["--no-figures"]
+    arguments = [name, CITY, *more, "--out", str(target if name == "run" else out)]
     rng = np.random.default_rng(seed)
     for _ in range(3):
-        killed([*arguments, "--resume"], rng.uniform(0.1, 0.5))
+        call = (killed, [*arguments, "--resume"], rng.uniform(0.1, 0.5))
+        assert processes(call)[0] in (-signal.SIGPROF, 0)
     assert not target.exists() and list(out.rglob("*checkpoint*"))
     assert main([*arguments, "--resume"]) == 0
     assert not list(out.rglob("*checkpoint*")) and not list(out.rglob(".ekfslam*"))
@@ -310,8 +307,7 @@ def test_an_interruption_keeps_the_checkpoint_and_an_error_does_not(tmp_path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
-def study_process(path: Path, after: int) -> list[str]:
-    """The runs that a process began which is killed in the midst of one."""
+def study_killed(path: Path, after: int) -> None:
     began, true_run = path.with_name("began"), montecarlo.run_one
 
     def counted(study, level, run):
@@ -321,16 +317,20 @@ def study_process(path: Path, after: int) -> list[str]:
             os.kill(os.getpid(), signal.SIGKILL)
         return true_run(study, level, run)
 
-    def work() -> None:
-        montecarlo.run_one = counted
-        run_study(Study(short("mid", 6), ("invariant",), runs=6, seed=2), path, SerialExecutor(), False)
+    montecarlo.run_one = counted
+    run_study(Study(short("mid", 6), ("invariant",), runs=6, seed=2), path, SerialExecutor(), False)
 
-    assert forked(work) in (0, -signal.SIGKILL)
+
+def study_process(path: Path, after: int) -> list[str]:
+    """The runs that a process began which is killed in the midst of one."""
+    assert processes((study_killed, path, after))[0] in (0, -signal.SIGKILL)
+    began = path.with_name("began")
     lines = began.read_text().splitlines()
     began.unlink()
     return lines
 
 
+@pytest.mark.xdist_group("processes")
 def test_a_killed_study_keeps_every_finished_run(tmp_path):
     assert study_process(tmp_path / "a.h5", 2) == ["mid 0", "mid 1", "mid 2"]
     assert [path.name for path in tmp_path.iterdir()] == [".a.h5.journal"], "no archive yet: it was too quick"
