@@ -21,7 +21,7 @@ from ekfslam.cli import main
 from ekfslam.errors import WriteError
 from ekfslam.storage.archive import read_archive
 
-CITY = "builtin:city?frames=20"
+CITY = "builtin:city?frames=25"
 QUICK = ["--mode", "dead-reckoning"]
 
 
@@ -114,7 +114,17 @@ WRITING = {
     "check": ["check", "{archive}", "--out", "{folder}"],
     "plot": ["plot", "{archive}", "--out", "{folder}"],
     "export": ["export", "{archive}", "--format", "tum", "--out", "{folder}/poses.txt"],
-    "consistency": ["consistency", "--runs", "1", "--executor", "serial", "--out", "{folder}"],
+    "consistency": [
+        "consistency",
+        "--runs",
+        "1",
+        "--variants",
+        "invariant",
+        "--executor",
+        "serial",
+        "--out",
+        "{folder}",
+    ],
 }
 
 
@@ -125,9 +135,17 @@ def archive(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.fixture
+def drawn_already(monkeypatch, undrawn) -> None:
+    """Figures that are nothing but their files."""
+    for place in ("cli.commands.posterior.draw_posterior_figures", "figures.run.draw_figures", "reports.draw_figures"):
+        monkeypatch.setattr(f"ekfslam.{place}", lambda *_, **__: {"one": None, "another": None})
+    monkeypatch.setattr("ekfslam.reports.plot_check", lambda *_: None)
+
+
 @pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])
-@pytest.mark.parametrize("size", [0, 5_000])
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, archive, undrawn, command, size):
+@pytest.mark.parametrize("size", [0, pytest.param(5_000, marks=pytest.mark.slow)])
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, archive, drawn_already, command, size):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
     arguments = [part.format(folder=tmp_path / "out", archive=here) for part in WRITING[command]]
@@ -143,7 +161,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, arc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])
-def test_a_full_disk_of_any_size(tmp_path, capsys, archive, undrawn, command):
+def test_a_full_disk_of_any_size(tmp_path, capsys, archive, drawn_already, command):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
     arguments = [part.format(folder=tmp_path / "out", archive=here) for part in WRITING[command]]
@@ -160,7 +178,7 @@ def test_a_full_disk_of_any_size(tmp_path, capsys, archive, undrawn, command):
         assert contents(tmp_path) == before
 
 
-def test_a_full_disk_leaves_no_folder_behind(tmp_path, capsys):
+def test_a_full_disk_leaves_no_folder_behind(tmp_path, capsys, drawn_already):
     with disk_of(100):
         assert main(["compare", CITY, "--modes", "dead-reckoning", "--out", str(tmp_path / "new" / "deep")]) == 2
     assert list(tmp_path.iterdir()) == []
@@ -169,7 +187,7 @@ def test_a_full_disk_leaves_no_folder_behind(tmp_path, capsys):
 @pytest.mark.slow
 def test_a_full_disk_ends_a_study_with_one_line(tmp_path, capsys):
     arguments = [part.format(folder=tmp_path) for part in WRITING["consistency"]]
-    with disk_of(5_000):
+    with disk_of(1_000):
         assert main(arguments) == 2
     assert "File too large" in one_line(capsys)
     assert contents(tmp_path) == {}
@@ -222,6 +240,7 @@ def test_two_who_add_to_one_archive_lose_nothing(tmp_path, archive):
     assert sorted(read_archive(here).results) == ["as filtered", "full", "smoothed"]
 
 
+@pytest.mark.slow
 def test_a_posterior_is_not_added_to_another_run(tmp_path, archive, capsys, monkeypatch):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
@@ -252,7 +271,7 @@ def test_a_kill_leaves_an_archive_or_none(tmp_path, seed):
 
 
 @pytest.mark.parametrize("kind", ["text", "recording", "another seed", "damaged"])
-def test_what_is_no_earlier_result_of_the_same_needs_force(tmp_path, capsys, undrawn, kind):
+def test_what_is_no_earlier_result_of_the_same_needs_force(tmp_path, capsys, drawn_already, kind):
     out = tmp_path / "city" / "archive.h5"
     out.parent.mkdir()
     if kind == "text":
@@ -260,7 +279,7 @@ def test_what_is_no_earlier_result_of_the_same_needs_force(tmp_path, capsys, und
     elif kind == "recording":
         main(["simulate", CITY, "--out", str(out)])
     else:
-        main(["run", "builtin:city?frames=20&seed=7", *QUICK, "--out", str(out)])
+        main(["run", "builtin:city?frames=25&seed=7", *QUICK, "--out", str(out)])
         if kind == "damaged":
             out.write_bytes(out.read_bytes()[:-100])
     before = out.read_bytes()
@@ -294,6 +313,7 @@ def test_other_files_of_the_user_are_not_overwritten(tmp_path, capsys, archive, 
             assert main([*arguments, "--out", str(notes), *more]) == 0
 
 
+@pytest.mark.slow
 def test_figures_of_an_earlier_run_do_not_stay_beside_a_new_archive(tmp_path, undrawn):
     folder = tmp_path / "city"
     full = ["compare", CITY, "--out", str(tmp_path)]
