@@ -17,7 +17,7 @@ from ekfslam.data.readers import open_sequence
 from ekfslam.errors import FilterError
 from ekfslam.storage.archive import read_archive
 
-CITY = "builtin:city?frames=40"
+CITY = "builtin:city?frames=20"
 
 
 def failure(capsys, *arguments):
@@ -32,7 +32,7 @@ def failure(capsys, *arguments):
     return captured.err.strip().splitlines()[-1]
 
 
-def test_compare_writes_archive_summaries_and_figures(tmp_path, capsys):
+def test_compare_writes_archive_summaries_and_figures(tmp_path, capsys, undrawn):
     assert main(["compare", CITY, "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert "| ATE [m]" in printed
@@ -41,17 +41,19 @@ def test_compare_writes_archive_summaries_and_figures(tmp_path, capsys):
     assert {"archive.h5", "summary.json", "summary.md", "map.png", "errors.png", "nis.png"} <= names
     summary = json.loads((folder / "summary.json").read_text())
     assert {"sequence", "frames", "landmarks", "modes"} == set(summary)
-    assert summary["frames"] == 40
+    assert summary["frames"] == 20
     assert list(summary["modes"]) == ["dead-reckoning", "mapping-only", "full", "smoothed"]
     assert all(set(values) == SUMMARY_KEYS for values in summary["modes"].values())
     assert list(read_archive(folder / "archive.h5").results) == list(summary["modes"])
 
 
 def test_recordings_of_one_name_do_not_overwrite_each_other(tmp_path):
-    assert main(["compare", CITY, CITY, "--modes", "dead-reckoning", "--out", str(tmp_path)]) == 0
+    quick = ["--modes", "dead-reckoning", "--no-figures", "--executor", "serial"]
+    assert main(["compare", CITY, CITY, *quick, "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"city", "city-2"}
 
 
+@pytest.mark.slow
 def test_simulate_run_info_plot_export_go_hand_in_hand(tmp_path, capsys):
     recording, archive = tmp_path / "city.h5", tmp_path / "deep" / "run.h5"
     assert main(["simulate", CITY, "--out", str(recording)]) == 0
@@ -60,14 +62,14 @@ def test_simulate_run_info_plot_export_go_hand_in_hand(tmp_path, capsys):
         assert json.loads(h5file["runs/full"].attrs["config"])["filter"]["variant"] == "standard"
     capsys.readouterr()
     assert main(["info", str(recording)]) == 0
-    assert "40 in 3.9 s" in capsys.readouterr().out
+    assert "20 in 1.9 s" in capsys.readouterr().out
     assert main(["info", str(archive)]) == 0
     assert "accepted" in capsys.readouterr().out
     assert main(["plot", str(archive), "--out", str(tmp_path / "figures")]) == 0
     assert (tmp_path / "figures" / "map.png").stat().st_size > 5000
     assert main(["export", str(archive), "--format", "tum"]) == 0
     tum = np.loadtxt(tmp_path / "deep" / "run.full.tum.txt")
-    assert tum.shape == (40, 8)
+    assert tum.shape == (20, 8)
     assert main(["export", str(archive), "--format", "kitti", "--out", str(tmp_path / "k.txt")]) == 0
     np.testing.assert_allclose(np.loadtxt(tmp_path / "k.txt")[:, 3::4], tum[:, 1:4], atol=1e-12)
 
@@ -168,7 +170,8 @@ def test_mistakes_in_the_call(tmp_path, capsys):
     assert "ekfslam-archive" in failure(capsys, "run", tmp_path / "o.h5", "--out", tmp_path / "p.h5")
 
 
-def test_posterior_writes_into_the_archive_and_draws(tmp_path, capsys):
+@pytest.mark.slow
+def test_posterior_writes_into_the_archive_and_draws(tmp_path, capsys, undrawn):
     archive = tmp_path / "o.h5"
     assert main(["run", CITY, "--out", str(archive)]) == 0
     assert main(["posterior", str(archive)]) == 0
@@ -201,9 +204,9 @@ def test_posterior_of_what_has_none(tmp_path, capsys):
     assert "has no log" in failure(capsys, "posterior", tmp_path / "old.h5")
 
 
-def test_check_writes_verdict_evidence_and_figure(tmp_path, capsys):
+def test_check_writes_verdict_evidence_and_figure(tmp_path, capsys, undrawn):
     archive = tmp_path / "city.h5"
-    assert main(["run", "builtin:city?frames=80", "--out", str(archive)]) == 0
+    assert main(["run", "builtin:city?frames=25", "--out", str(archive)]) == 0
     assert main(["check", str(archive), "--out", str(tmp_path / "checked")]) == 0
     assert "Verdict:" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "checked").iterdir()} == {"check.json", "check.md", "check.png"}
@@ -214,6 +217,7 @@ def test_check_writes_verdict_evidence_and_figure(tmp_path, capsys):
     assert "was made before innovations were kept: run again" in failure(capsys, "check", archive)
 
 
+@pytest.mark.slow
 def test_as_an_installed_command(tmp_path):
     """A real process: exit code, silence of the progress bar off a terminal, and output that survives `head`."""
     program = [sys.executable, "-m", "ekfslam.cli"]
@@ -247,6 +251,7 @@ def test_the_sign_of_the_lateral_velocity_is_a_flag(tmp_path, capsys):
     assert "lateral" in failure(capsys, "info", CITY, "--lateral", "as-stored")
 
 
+@pytest.mark.slow
 def test_many_recordings_are_compared_in_processes_as_one_by_one(tmp_path, capsys):
     worlds = [f"builtin:loop?frames=8&seed={seed}" for seed in (1, 2)]
     quick = ["--modes", "dead-reckoning", "full", "--no-figures"]
@@ -281,7 +286,7 @@ def test_one_recording_that_fails_does_not_keep_the_others(tmp_path, capsys, mon
 
 def test_compare_goes_on_without_a_posterior_that_is_ill_posed(tmp_path, capsys):
     """Without angular velocity noise the motion rows have no weight; the filter does not mind."""
-    assert main(["compare", CITY, "--sigma-w", "0", "--out", str(tmp_path)]) == 0
+    assert main(["compare", CITY, "--sigma-w", "0", "--no-figures", "--out", str(tmp_path)]) == 0
     assert "No smoothed: the posterior is ill-posed: velocities without noise" in capsys.readouterr().out
     assert "No smoothed" in (tmp_path / "city" / "summary.md").read_text()
     assert list(read_archive(tmp_path / "city" / "archive.h5").results) == ["dead-reckoning", "mapping-only", "full"]

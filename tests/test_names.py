@@ -29,6 +29,7 @@ from ekfslam.names import components, printable
 from ekfslam.storage.archive import read_archive, write_archive
 from ekfslam.studies.tuning import _toml_value, toml_heading
 
+QUICK = ["--modes", "dead-reckoning", "--no-figures"]
 NASTY = ["../../x", "/etc/x", "..", ".", "", "a/b\\c", "x\0y", "new\nline", "\x1b[31m", "$x_$", "{0.__class__}", "%n%s"]
 
 
@@ -63,8 +64,8 @@ def test_what_is_printable_can_be_printed_and_written(text):
 @pytest.mark.parametrize("name", NASTY)
 def test_no_name_leads_out_of_the_folder(tmp_path, name):
     out = tmp_path / "in" / "out"
-    write_sequence(dataclasses.replace(builtin("city?frames=20"), name=name), tmp_path / "a.h5")
-    assert main(["compare", str(tmp_path / "a.h5"), "--modes", "dead-reckoning", "--out", str(out)]) == 0
+    write_sequence(dataclasses.replace(builtin("city?frames=5"), name=name), tmp_path / "a.h5")
+    assert main(["compare", str(tmp_path / "a.h5"), *QUICK, "--out", str(out)]) == 0
     assert [path.name for path in tmp_path.iterdir() if path.name != "a.h5"] == ["in"]
     (folder,) = out.iterdir()
     assert json.loads((folder / "summary.json").read_text())["sequence"] == printable(name)
@@ -75,9 +76,9 @@ def test_recordings_of_colliding_names_have_folders_of_their_own(tmp_path):
     paths = []
     for i, name in enumerate(("a", "a", "a-2")):
         paths.append(str(tmp_path / f"{i}.h5"))
-        write_sequence(dataclasses.replace(builtin(f"city?frames=20&seed={i}"), name=name), paths[-1])
+        write_sequence(dataclasses.replace(builtin(f"city?frames=5&seed={i}"), name=name), paths[-1])
     out = tmp_path / "out"
-    assert main(["compare", *paths, "--modes", "dead-reckoning", "--out", str(out)]) == 0
+    assert main(["compare", *paths, *QUICK, "--executor", "serial", "--out", str(out)]) == 0
     assert {path.name for path in out.iterdir()} == {"a", "a-2", "a-2-2"}
     seeds = [read_archive(out / name / "archive.h5").attributes["seed"] for name in ("a", "a-2", "a-2-2")]
     assert seeds == [0, 1, 2]
@@ -89,10 +90,10 @@ def test_names_that_are_no_utf_8_work(tmp_path, capsys):
     assert main(["info", str(npz)]) == 0
     assert "a\\udcff" in capsys.readouterr().out
     out = tmp_path / os.fsdecode(b"out\xfe")
-    assert main(["compare", str(npz), "--modes", "dead-reckoning", "--out", str(out)]) == 0
+    assert main(["compare", str(npz), *QUICK, "--out", str(out)]) == 0
     archive = out / "a_udcff" / "archive.h5"
     assert read_archive(archive).name == "a\\udcff"
-    assert main(["compare", str(npz), "--modes", "dead-reckoning", "--out", str(out)]) == 0, "of the same origin"
+    assert main(["compare", str(npz), *QUICK, "--out", str(out)]) == 0, "of the same origin"
     assert main(["export", str(archive), "--format", "kitti", "--out", str(tmp_path / os.fsdecode(b"\xfd.txt"))]) == 0
     assert main(["info", str(tmp_path / os.fsdecode(b"none\xff"))]) == 2
     assert "\\udcff" in capsys.readouterr().err
@@ -100,7 +101,7 @@ def test_names_that_are_no_utf_8_work(tmp_path, capsys):
 
 def test_text_of_a_file_is_no_command_to_the_terminal(tmp_path, capsys):
     sequence = dataclasses.replace(
-        builtin("city?frames=20"), notes=("\x1b]0;title\x07",), attributes={"made_by": "\x1b[2J", "seed": 1}
+        builtin("city?frames=5"), notes=("\x1b]0;title\x07",), attributes={"made_by": "\x1b[2J", "seed": 1}
     )
     write_sequence(sequence, tmp_path / "a.h5")
     assert main(["info", str(tmp_path / "a.h5")]) == 0
@@ -121,7 +122,7 @@ def test_members_whose_names_cannot_be_printed_are_refused(tmp_path, kind):
         read_archive(tmp_path / "a.h5")
 
 
-def test_modes_of_an_archive_become_no_paths(tmp_path):
+def test_modes_of_an_archive_become_no_paths(tmp_path, undrawn):
     sequence = synthetic_sequence(frames=20, landmarks=20)
     results = {mode: synthetic_result(sequence, mode) for mode in ("..", "$a_$")}
     write_archive(tmp_path / "a.h5", sequence, results)
