@@ -57,8 +57,8 @@ def test_nor_do_its_parts(result, part, name):
 
 
 @pytest.mark.parametrize("states_noise", [True, False])
-def test_where_hygiene_leaves_nothing_every_mode_says_so(tmp_path, capsys, states_noise):
-    sequence = builtin("city?frames=30")
+def test_where_hygiene_leaves_nothing_every_mode_says_so(tmp_path, capsys, undrawn, states_noise):
+    sequence = builtin("city?frames=15")
     sequence = sequence if states_noise else dataclasses.replace(sequence, noise=None)
     comparison = compare(sequence, config=Config().with_overrides(NOTHING_LEFT))
     assert list(comparison.results) == ["dead-reckoning", "mapping-only", "full", "smoothed"]
@@ -106,7 +106,7 @@ def test_covariances_keep_their_digits_where_pixels_are_almost_exact(world, px, 
 @pytest.mark.parametrize("disparity_px", [0.0, 1e-12, 1e-3, -5.0])
 @pytest.mark.parametrize("states_noise", [True, False])
 def test_disparities_down_to_zero_without_hygiene(disparity_px, states_noise):
-    sequence = builtin("city?frames=30")
+    sequence = builtin("city?frames=12")
     pixels = sequence.observations.pixels_px.copy()
     pixels[::3, 2] = pixels[::3, 0] - disparity_px
     observations = dataclasses.replace(sequence.observations, pixels_px=pixels)
@@ -145,7 +145,7 @@ def test_velocities_just_below_end_in_a_finite_result_or_a_named_error(scale):
     assert set(comparison.results) | set(comparison.skipped) == {"dead-reckoning", "mapping-only", "full", "smoothed"}
 
 
-def test_a_filter_that_cannot_go_on_does_not_keep_the_others(tmp_path, monkeypatch):
+def test_a_filter_that_cannot_go_on_does_not_keep_the_others(tmp_path, monkeypatch, undrawn):
     true_run = run
 
     def failing(sequence, mode, config, *rest, **more):

@@ -86,13 +86,13 @@ def evo(tmp_path):
 @pytest.mark.parametrize(
     ("format", "command", "key"),
     [
-        ("tum", ATE, "ate_m"),
+        pytest.param("tum", ATE, "ate_m", marks=pytest.mark.slow),
         ("tum", (*ATE, "--align"), "ate_aligned_m"),
-        ("tum", (*RPE, *FRAME, *METRES), "rpe_1_frame_m"),
-        ("tum", (*RPE, *FRAME, *DEGREES), "rpe_1_frame_deg"),
-        ("kitti", ATE, "ate_m"),
-        ("kitti", (*ATE, "--align"), "ate_aligned_m"),
-        ("kitti", (*RPE, *PATH, *METRES), "rpe_10_m_m"),
+        pytest.param("tum", (*RPE, *FRAME, *METRES), "rpe_1_frame_m", marks=pytest.mark.slow),
+        pytest.param("tum", (*RPE, *FRAME, *DEGREES), "rpe_1_frame_deg", marks=pytest.mark.slow),
+        pytest.param("kitti", ATE, "ate_m", marks=pytest.mark.slow),
+        pytest.param("kitti", (*ATE, "--align"), "ate_aligned_m", marks=pytest.mark.slow),
+        pytest.param("kitti", (*RPE, *PATH, *METRES), "rpe_10_m_m", marks=pytest.mark.slow),
         ("kitti", (*RPE, *PATH, *DEGREES), "rpe_10_m_deg"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -103,6 +103,7 @@ def test_evo_finds_the_errors_of_the_summary(evo, world, result, archive, format
     assert evo(command, format, archive) == pytest.approx(stated, rel=0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_evo_finds_the_errors_where_truth_has_gaps(evo, result, with_gaps):
     stated = summarise(read_archive(with_gaps), result)["rpe_10_m_m"]
     assert evo((*RPE, *PATH, *METRES), "tum", with_gaps) == pytest.approx(stated, rel=0, abs=1e-9)

@@ -38,6 +38,7 @@ def test_every_example_is_tested():
     assert {path.stem for path in EXAMPLES.glob("*.py")} <= tested
 
 
+@pytest.mark.slow
 def test_own_filter_loop(tmp_path):
     lines = printed("own_filter_loop", tmp_path)
     for frame in (49, 99, 149, 199):
@@ -59,6 +60,7 @@ def test_sweep(tmp_path):
     assert found["1.0 m/s, velocities alone"] > found["0.2 m/s, velocities alone"]
 
 
+@pytest.mark.slow
 def test_own_reader(tmp_path):
     lines = printed("own_reader", tmp_path)
     assert lines["read by"] == "lines"
@@ -69,6 +71,7 @@ def test_own_reader(tmp_path):
     assert numbers(lines["largest error of a position"])[0] < 0.4
 
 
+@pytest.mark.slow
 def test_own_arrays(tmp_path):
     lines = printed("own_arrays", tmp_path)
     assert re.match(r"120 frames, \d{4} observations, attributes {'velocities': 'none'}", lines["built"])
@@ -79,6 +82,7 @@ def test_own_arrays(tmp_path):
         assert count == frames and 0.0 < error_m < 0.5
 
 
+@pytest.mark.slow
 def test_own_sensor(tmp_path):
     lines = printed("own_sensor", tmp_path)
     assert numbers(lines["Jacobian against differences"])[0] < 1e-7
@@ -87,6 +91,7 @@ def test_own_sensor(tmp_path):
     assert low < numbers(lines["mean pose NEES of 40 drives"])[0] < high
 
 
+@pytest.mark.slow
 def test_posterior_queries(tmp_path):
     lines = printed("posterior_queries", tmp_path)
     filtered_m, smoothed_m = (numbers(lines[name])[0] for name in ("filtered", "smoothed"))

@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from conftest import WHOLE
 from helpers import synthetic_result, synthetic_sequence
 
 from ekfslam.cli import main
@@ -53,7 +54,9 @@ def spoilt(value: np.ndarray, entry: float) -> np.ndarray:
     return value
 
 
+@pytest.mark.slow
 def test_every_number_of_an_archive_is_looked_at(whole, tmp_path):
+    """Each of the values; in the reduced form one a data set, in turn."""
     names = data_sets(whole)
     assert {"runs/full/log/frame", "runs/full/parameters/std", "runs/full/whitened/score", "truth/frame"} <= set(names)
     tried = 0
@@ -64,16 +67,17 @@ def test_every_number_of_an_archive_is_looked_at(whole, tmp_path):
             continue
         entries = [np.nan, np.inf, 1e200] if value.dtype.kind == "f" else [-(1 << 40), (1 << 62) + 1]
         entries = [2, 255] if value.dtype == np.uint8 else entries  # truth values
-        for entry in entries[: 1 if is_coordinate else 3]:
-            if name.endswith("apart") and np.isnan(entry):
-                continue
+        entries = [
+            entry for entry in entries[: 1 if is_coordinate else 3] if not (name.endswith("apart") and np.isnan(entry))
+        ]
+        for entry in entries if WHOLE else [entries[tried % len(entries)]]:
             path = altered(whole, tmp_path, name, spoilt(value, entry))
             with pytest.raises(ArchiveError, match=r"copy\.h5") as caught:
                 read_archive(path)
                 pytest.fail(f"{entry} in {name} is read")
             assert name.split("/")[-1] in str(caught.value), "the data set is named"
             tried += 1
-    assert tried > 80
+    assert tried > (80 if WHOLE else 40)
 
 
 @pytest.mark.parametrize(

@@ -45,9 +45,10 @@ def test_the_state_is_as_large_as_what_is_in_view_however_long_the_drive() -> No
     assert (sizes <= 12 + 3 * in_view).all()  # rejected observations start nothing
 
 
+@pytest.mark.slow
 def test_entries_of_the_factor_grow_in_proportion_to_the_landmarks() -> None:
     entries = []
-    for frames in (80, 160, 320):
+    for frames in (50, 100, 200):
         information = posterior(run(simulate(replace(SHORT_TRACKS, frames=frames)), "full")).information
         entries.append(information.factor.factor().nnz / information.elimination.landmarks)
     assert max(entries) < 1.5 * min(entries)
@@ -60,12 +61,13 @@ def test_the_experiment_writes_table_numbers_and_figure(tmp_path: Path, monkeypa
     assert spec.loader is not None
     scaling = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(scaling)
-    monkeypatch.setattr(scaling, "SIZES", (100, 200, 300, 400))
-    monkeypatch.setattr(scaling, "DENSE_SIZES", (100, 150, 200, 300))
-    monkeypatch.setattr(scaling, "IN_TURN_WITH", 300)
+    monkeypatch.setattr(scaling, "SIZES", (60, 90, 120, 180))
+    monkeypatch.setattr(scaling, "DENSE_SIZES", (60, 90, 120, 180))
+    monkeypatch.setattr(scaling, "IN_TURN_WITH", 180)
     monkeypatch.setattr(scaling, "POOLED", 0)
+    monkeypatch.setattr(scaling, "LOOP_FRAMES", 40)
     monkeypatch.setattr(
-        scaling, "in_own_process", lambda worker, landmarks: scaling.WORKERS[worker](min(landmarks, 901))
+        scaling, "in_own_process", lambda worker, landmarks: scaling.WORKERS[worker](min(landmarks, 300))
     )
     monkeypatch.setattr(sys, "argv", ["scaling.py", "--quick", "--out", str(tmp_path)])
     scaling.main()

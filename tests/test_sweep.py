@@ -15,6 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from conftest import processes
 
 from ekfslam.cli import main
 from ekfslam.config import Config
@@ -85,33 +86,29 @@ def test_a_row_is_what_a_run_by_hand_gives(undisturbed):
     assert not any(columns["error"])
 
 
-KILLED = """
-import os, signal, sys
-from ekfslam.studies import sweep as sweeps
-from ekfslam.studies.executors import SerialExecutor
+def killed(study: Path, path: Path, begun: Path, after: int) -> None:
+    """A sweep in a process that ends in the midst of a run."""
+    true_run = sweeps.run_task
 
-true_run, left = sweeps.run_task, int(sys.argv[3])
-def counted(task, limit):
-    global left
-    print(task.key, flush=True)
-    if left == 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    left -= 1
-    return true_run(task, limit)
-sweeps.run_task = counted
-sweeps.run_sweep(sweeps.Sweep.from_toml(sys.argv[1]), sys.argv[2], SerialExecutor(), False)
-"""
+    def counted(task, limit):
+        with begun.open("a") as log:
+            log.write(f"{task.key}\n")
+        if len(begun.read_text().splitlines()) > after:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return true_run(task, limit)
+
+    sweeps.run_task = counted
+    run_sweep(Sweep.from_toml(study), path, SerialExecutor(), False)
 
 
-def test_killed_twice_and_resumed_it_equals_an_undisturbed_one(study, tmp_path, undisturbed, monkeypatch):
+@pytest.mark.xdist_group("processes")
+def test_killed_twice_and_resumed_it_equals_an_undisturbed_one(study, tmp_path, undisturbed):
     path = tmp_path / "sweep.h5"
-    monkeypatch.setenv("PYTHONPATH", str(Path(sweeps.__file__).parents[2]))
-    begun = []
+    begun, log = [], tmp_path / "begun"
     for after in (5, 9):
-        call = [sys.executable, "-c", KILLED, str(study), str(path), str(after)]
-        done = subprocess.run(call, capture_output=True, text=True, env={**os.environ}, timeout=120)
-        assert done.returncode == -9, done.stderr
-        begun.append(done.stdout.split())
+        assert processes((killed, study, path, log, after)) == [-signal.SIGKILL]
+        begun.append(log.read_text().split())
+        log.unlink()
     assert not path.exists()
     assert begun[1][0] == begun[0][-1], "the run in whose midst it was killed begins anew, no other does"
     assert not set(begun[0][:-1]) & set(begun[1])

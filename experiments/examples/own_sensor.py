@@ -63,7 +63,7 @@ class Radar:
         return np.stack([ground * np.cos(bearing), ground * np.sin(bearing), r * np.sin(elevation)], axis=-1)
 
 
-def drive(sensor: Radar, rng: np.random.Generator, frames: int = 60) -> tuple[float, float]:
+def drive(sensor: Radar, rng: np.random.Generator, frames: int = 30) -> tuple[float, float]:
     """One lap of a ring; the last pose's NEES (6 degrees of freedom) and its error in m."""
     twist, tau_s = np.array([8.0, 0, 0, 0, 0, 0.8]), 2 * np.pi / 0.8 / frames
     landmarks = np.array([0.0, 10.0, 1.0]) + rng.uniform(-1, 1, (60, 3)) * [25, 25, 2]

@@ -15,7 +15,7 @@ from ekfslam.studies.executors import open_executor
 from ekfslam.studies.study import run_study
 from ekfslam.studies.summary import study_table, summarise_study
 
-SHORT = replace(ekfslam.LEVELS["low"], frames=120, landmarks=60)
+SHORT = replace(ekfslam.LEVELS["low"], frames=60, landmarks=60)
 LEVELS = {"sharp": SHORT, "blurred": replace(SHORT, sigma_px=2.0)}
 
 

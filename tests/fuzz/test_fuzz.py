@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from conftest import WHOLE
 from generators import GENERATORS, Valid, case_of
 from oracle import verdict
 
-EACH = 14
+EACH = 14 if WHOLE else 6
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +17,16 @@ def valid() -> Valid:
     return Valid.prepared()
 
 
-@pytest.mark.parametrize("family", range(len(GENERATORS)), ids=lambda family: GENERATORS[family].__name__)
+SLOW = ("bytes_of_recordings", "items_of_hdf5", "drives", "command_lines")
+
+
+@pytest.mark.parametrize(
+    "family",
+    [
+        pytest.param(family, id=one.__name__, marks=[pytest.mark.slow] if one.__name__ in SLOW else [])
+        for family, one in enumerate(GENERATORS)
+    ],
+)
 def test_every_input_is_taken_or_refused_by_name(valid, tmp_path, monkeypatch, family):
     monkeypatch.setattr("ekfslam.figures.style.png", lambda *_: b"")
     for i in range(EACH):
