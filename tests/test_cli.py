@@ -74,6 +74,7 @@ def test_simulate_run_info_plot_export_go_hand_in_hand(tmp_path, capsys):
     np.testing.assert_allclose(np.loadtxt(tmp_path / "k.txt")[:, 3::4], tum[:, 1:4], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_simulated_file_gives_the_builtin_s_result_to_the_last_bit(tmp_path):
     recording = tmp_path / "city.h5"
     main(["simulate", CITY, "--out", str(recording)])

@@ -87,8 +87,8 @@ def evo(tmp_path):
     ("format", "command", "key"),
     [
         pytest.param("tum", ATE, "ate_m", marks=pytest.mark.slow),
-        ("tum", (*ATE, "--align"), "ate_aligned_m"),
-        pytest.param("tum", (*RPE, *FRAME, *METRES), "rpe_1_frame_m", marks=pytest.mark.slow),
+        pytest.param("tum", (*ATE, "--align"), "ate_aligned_m", marks=pytest.mark.slow),
+        ("tum", (*RPE, *FRAME, *METRES), "rpe_1_frame_m"),
         pytest.param("tum", (*RPE, *FRAME, *DEGREES), "rpe_1_frame_deg", marks=pytest.mark.slow),
         pytest.param("kitti", ATE, "ate_m", marks=pytest.mark.slow),
         pytest.param("kitti", (*ATE, "--align"), "ate_aligned_m", marks=pytest.mark.slow),

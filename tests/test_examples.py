@@ -51,6 +51,7 @@ def test_own_filter_loop(tmp_path):
     assert abs(found_m - true_m) < 3.0 * std_m < 3.0 * alone_m
 
 
+@pytest.mark.slow
 def test_sweep(tmp_path):
     lines = printed("sweep", tmp_path)
     found = {line: numbers(text)[0] for line, text in lines.items() if " m/s, " in line}

@@ -38,7 +38,7 @@ def state_sizes(sequence: Sequence) -> list[int]:
 
 
 def test_the_state_is_as_large_as_what_is_in_view_however_long_the_drive() -> None:
-    sequence = simulate(replace(SHORT_TRACKS, frames=300))
+    sequence = simulate(replace(SHORT_TRACKS, frames=180))
     in_view = np.bincount(sequence.observations.frame, minlength=len(sequence))
     sizes = np.array(state_sizes(sequence))
     assert len(sequence.observations.ids) > 20 * in_view.max()
