@@ -6,6 +6,7 @@ import json
 import h5py
 import numpy as np
 import pytest
+from conftest import WHOLE
 from reference import small_world
 from test_archive import assert_same
 
