@@ -22,16 +22,19 @@ def city():
     return {mode: summarise(sequence, run(sequence, mode)) for mode in ("dead-reckoning", "mapping-only", "full")}
 
 
+@pytest.mark.slow
 def test_full_slam_beats_dead_reckoning_and_mapping_only_on_the_city(city):
     assert city["dead-reckoning"]["ate_m"] > 5 * city["full"]["ate_m"]
     assert city["mapping-only"]["landmark_rmse_m"] > 3 * city["full"]["landmark_rmse_m"]
 
 
+@pytest.mark.slow
 def test_innovations_on_the_city_are_white_despite_outliers(city):
     """The mean of NIS per degree of freedom is 1 within a few percent."""
     assert abs(city["full"]["nis_per_dof"] - 1) < 0.03
 
 
+@pytest.mark.slow
 def test_loop_keeps_its_landmarks_and_closes_the_loop():
     sequence = open_sequence("builtin:loop")
     result = run(sequence, "full")
@@ -40,6 +43,7 @@ def test_loop_keeps_its_landmarks_and_closes_the_loop():
     assert summarise(sequence, result)["final_error_m"] < 0.2
 
 
+@pytest.mark.slow
 def test_state_stays_as_small_as_the_view():
     """The cost of a frame depends on what is seen, not on what has been seen."""
     sequence = open_sequence("builtin:city?frames=300")
