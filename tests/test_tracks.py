@@ -576,6 +576,7 @@ def test_reprojection_errors_of_clean_and_of_moved_pixels():
         reprojection_errors(dataclasses.replace(world, truth=None))
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_hygiene_brings_down_the_reprojection_errors_of_the_dense_recording(data_path):
     sequence = open_sequence(data_path("ece276a/0027_dense_noisy.npz"), truth=data_path("kitti_odometry_poses/07.txt"))
