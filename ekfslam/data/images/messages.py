@@ -54,6 +54,9 @@ class Bag:
             self._reader: Any = rosbag1.Reader(path) if self.is_ros1 else rosbag2.Reader(path)
             self._reader.open()
             self._types = message_types(self.is_ros1)
+            for connection in self._reader.connections:
+                if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
+                    raise ValueError(f"a stream named {connection.topic!r} of the type {connection.msgtype!r}")
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
