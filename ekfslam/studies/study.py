@@ -355,6 +355,7 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
     archive = _resume(study, path)
     decides = {**study.parameters, "runs": None, **versions()}
     journal = Journal(path, decides, lambda level: _record(study, level))
+    _take_in(archive, journal, path)
     missing = [(level, run) for run in range(study.runs) for level in study.levels if not archive.done[level][run]]
     finished: Any = completed(missing, lambda task: executor.submit(run_one, study, *task))
     if progress:
