@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -401,6 +402,25 @@ def test_damaged_bags_are_named_whatever_byte_is_wrong(tmp_path, kind):
             opened(path).load(0)
         except EkfslamError as error:
             assert str(path) in str(error)
+
+
+@pytest.mark.parametrize("key", ["name", "type"])
+def test_streams_that_are_numbers_are_refused(tmp_path, key):
+    path = write(tmp_path, stereo())
+    metadata = path / "metadata.yaml"
+    text, changed = re.subn(rf"\b{key}: .*tf.*", f"{key}: 1.5", metadata.read_text(), flags=re.IGNORECASE)
+    assert changed == 1
+    metadata.write_text(text)
+    with pytest.raises(UnknownFormatError, match=r"damaged or unknown bag.*1\.5"):
+        opened(path)
+
+
+def test_a_way_of_storing_that_is_a_number_is_refused(tmp_path):
+    path = write(tmp_path, stereo())
+    metadata = path / "metadata.yaml"
+    metadata.write_text(re.sub(r"compression_mode: .*", "compression_mode: 1.5", metadata.read_text()))
+    with pytest.raises(UnknownFormatError, match=r"damaged or unknown bag \(an entry is of a wrong type\)"):
+        opened(path)
 
 
 def test_a_definition_that_a_bag_brings_is_not_used(tmp_path):

@@ -303,7 +303,7 @@ def test_a_first_sight_of_everything_anew_serves():
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_loop_closes_with_landmarks_that_come_back(variant):
     """Revival takes rows linearised again, in every variant, and the smoother has the clone as the pose before."""
-    world = builtin("loop?frames=330")
+    world = builtin("loop?frames=100&radius_m=10&landmarks=60")
     never, unseen = (
         run(world, "full", Config(filter=FilterConfig(variant, retire=retire))) for retire in ("never", "unseen")
     )

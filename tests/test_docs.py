@@ -19,6 +19,7 @@ sys.path.append(str(DOCS / "hooks"))
 from notebook import as_markdown, execute  # noqa: E402 (a folder of the documentation, no package)
 
 
+@pytest.mark.slow
 def test_the_tutorial_runs():
     names: dict = {}
     cells = execute(DOCS / "tutorial.ipynb", names)

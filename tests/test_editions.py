@@ -201,6 +201,7 @@ HOSTILE = {
         "instead of numbers",
     ),
     "no dictionary": (b"]\x85.", "holds no dictionary"),
+    "appends to a dictionary": (b"\x80\x04}K\x01a.", "operations do not fit together"),
     "truncated": (b"\x80\x04}(", "damaged"),
     "nothing": (b"", "damaged"),
     "empty stack": (b"0.", "underflow"),

@@ -50,6 +50,7 @@ def first(room, frames):
 # --- the whole way ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_rotation_of_the_right_camera_is_found(tracked):
     sequence, report = tracked
     # Pixels of a camera that turns by psi move by minus the correction; pitch is about x, yaw about y, roll about z.
@@ -74,6 +75,7 @@ def test_from_images_to_poses_without_velocities(tracked):
         run(sequence, "dead-reckoning")
 
 
+@pytest.mark.slow
 def test_without_self_calibration_poses_are_worse(room, tracked):
     fixed, _ = track(room, FrontEndConfig(rotation_deg=1e-6))
     calibrated_m, fixed_m = (summarise(data, run(data, "mapping-only"))["ate_m"] for data in (tracked[0], fixed))

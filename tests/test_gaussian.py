@@ -227,6 +227,19 @@ def test_all_verbs_over_many_frames(form, considered, certain, naps, monkeypatch
 
 
 @pytest.mark.parametrize("form", FORMS)
+def test_nothing_but_landmarks_is_uncertain(form):
+    rng = np.random.default_rng(10)
+    nothing, C = np.zeros((BODY, BODY)), np.stack([(1 + i) * 0.1 * (np.eye(3) + 0.4) for i in range(5)])
+    gaussian, naive = form(nothing, SEEN), Naive(nothing)
+    G = rng.normal(size=(5, 3, SEEN))
+    gaussian.augment(G, C), naive.augment(G, C)
+    gaussian.propagate(np.eye(BODY), nothing)
+    for slots in ([3, 1, 4], [1, 2]):
+        condition(rng, gaussian, naive, slots, out=[1])
+        same(gaussian, naive)
+
+
+@pytest.mark.parametrize("form", FORMS)
 def test_another_covariance_takes_its_place(form):
     rng = np.random.default_rng(7)
     root = rng.normal(size=(BODY + 15,) * 2)

@@ -9,6 +9,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import WHOLE
 from helpers import run_joint
 from reference import CAMERA, T_CAM_IMU, small_world
 from test_jacobians import POSES, TWISTS
@@ -498,12 +499,38 @@ def test_transition_and_noise_of_everything(name, T, walks):
 TILTED = se3.so3_exp(np.array([0.3, -0.2, 0.0]))
 
 
-@pytest.mark.parametrize("tracks", [TRACKS, {**TRACKS, "track_memory": 1.0}, {}], ids=["ar", "walk", "white"])
-@pytest.mark.parametrize("walks", [True, False])
-@pytest.mark.parametrize("calibration", [EVERYTHING, SOME], ids=["all", "some"])
-@pytest.mark.parametrize("coordinates", ["xyz", "image"])
-@pytest.mark.parametrize("variant", ["standard", "invariant"])
-def test_filter_of_everything_equals_the_literal_one(variant, coordinates, calibration, walks, tracks):
+ERRORS = {"ar": TRACKS, "walk": {**TRACKS, "track_memory": 1.0}, "white": {}}
+CASES = {
+    f"{variant}-{coordinates}-{calibration}-{walks}-{tracks}": (variant, coordinates, calibration, walks, tracks)
+    for variant in ("standard", "invariant")
+    for coordinates in ("xyz", "image")
+    for calibration in ("all", "some")
+    for walks in (True, False)
+    for tracks in ERRORS
+}
+# In the reduced form: all pairs of these, of which the images take longest.
+SOME_CASES = [
+    "standard-xyz-all-True-ar",
+    "standard-image-some-True-ar",
+    "invariant-xyz-some-False-ar",
+    "invariant-image-all-False-ar",
+    "standard-xyz-all-True-walk",
+    "standard-image-some-False-walk",
+    "invariant-xyz-some-True-walk",
+    "invariant-image-all-False-walk",
+    "standard-xyz-all-False-white",
+    "standard-image-some-True-white",
+    "invariant-xyz-some-True-white",
+    "invariant-image-all-False-white",
+]
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=pytest.mark.slow if "image" in c else ()) for c in (CASES if WHOLE else SOME_CASES)]
+)
+def test_filter_of_everything_equals_the_literal_one(case):
+    variant, coordinates, calibrated, walks, errors = CASES[case]
+    calibration, tracks = {"all": EVERYTHING, "some": SOME}[calibrated], ERRORS[errors]
     world = in_level_frame(
         small_world(frames=12, landmarks=20),
         TILTED,
@@ -570,7 +597,9 @@ def test_filter_of_everything_equals_the_literal_one(variant, coordinates, calib
 @pytest.mark.parametrize("variant", ["invariant", "fej", "standard"])
 def test_information_about_the_gauge_with_up_and_calibration(variant, coordinates, tracks):
     """Velocities taken as exact: not the least is gained or lost, but by the standard variant."""
-    world = in_level_frame(small_world(seed=4), TILTED, twist_std=np.zeros(6), tilt_rad=0.05, **tracks)
+    world = in_level_frame(
+        small_world(seed=4, frames=60 if WHOLE else 30), TILTED, twist_std=np.zeros(6), tilt_rad=0.05, **tracks
+    )
     config = dataclasses.replace(OPEN, variant=variant, landmark_coordinates=coordinates)
     ekf = filter_of(world, config, EVERYTHING, up=TILTED @ Z)
     prior = gauge_information(ekf)

@@ -15,6 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from conftest import WHOLE
 from PIL import Image
 
 from ekfslam.cli import main
@@ -35,7 +36,6 @@ from ekfslam.evaluation.consistency import (
 from ekfslam.filters import JointEKF
 from ekfslam.geometry import se3
 from ekfslam.models.sensors.stereo import Rig
-from ekfslam.reports import check_consistency
 from ekfslam.runner import run
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import SerialExecutor, open_executor
@@ -72,19 +72,21 @@ def serial(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2] if WHOLE else [2])
 def test_processes_give_the_same_bits_as_one_thread(tmp_path, serial, workers):
     with open_executor("processes", workers) as executor:
         run_study(SMALL, tmp_path / "s.h5", executor)
     assert_same_bits(tmp_path / "s.h5", serial)
 
 
+@pytest.mark.slow
 def test_dask_workers_give_the_same_bits(tmp_path, serial):
     distributed = pytest.importorskip(
         "distributed", reason="distributed is not installed: pip install ekfslam[cluster]"
     )
     with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=2 if WHOLE else 1, threads_per_worker=1, dashboard_address=None) as cluster,
         open_executor(cluster.scheduler_address.replace("tcp://", "dask://")) as executor,
     ):
         run_study(SMALL, tmp_path / "s.h5", executor)
@@ -97,13 +99,22 @@ def test_threads_of_one_process_take_turns_and_give_the_same_bits(tmp_path, seri
     assert_same_bits(tmp_path / "s.h5", serial)
 
 
+# All runs but the first are held up for a while, in which the test kills it: no run needs that long to compute.
 KILLED = """
 import sys
+import time
 from test_montecarlo import Study, short
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import open_executor
 
-STUDY = Study(short("mid", 12), ("invariant", "standard"), runs=40, seed=2)
+plain = montecarlo.run_one
+def run_one(study, level, run):
+    if run >= 6:
+        time.sleep(1.0)
+    return plain(study, level, run)
+
+montecarlo.run_one = run_one
+STUDY = Study(short("mid", 8), ("invariant", "standard"), runs=10, seed=2)
 if __name__ == "__main__":
     montecarlo.CHECKPOINT_S, montecarlo.CHECKPOINT_SHARE = 0.0, 1.0
     with open_executor(sys.argv[2], 2) as executor:
@@ -111,6 +122,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", ["serial", "processes"])
 def test_a_study_killed_in_the_middle_goes_on_and_ends_as_if_undisturbed(tmp_path, monkeypatch, executor):
     script, path = tmp_path / "killed.py", tmp_path / "study.h5"
@@ -121,12 +133,12 @@ def test_a_study_killed_in_the_middle_goes_on_and_ends_as_if_undisturbed(tmp_pat
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not (path.exists() and read_study(path).done["mid"].sum() >= 5):
         assert process.poll() is None, process.stderr.read().decode()
-        time.sleep(0.02)
+        time.sleep(0.1)
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=30)  # ends only when no worker holds the pipes any more
     before = read_study(path)
     held = before.done["mid"]
-    assert 5 <= held.sum() < 40
+    assert 5 <= held.sum() < 10
     assert not np.isnan(before.data["mid"]["standard"]["pose_nees"][held, 1:]).any()
     assert np.isnan(before.data["mid"]["standard"]["pose_nees"][~held]).all()
 
@@ -136,7 +148,7 @@ def test_a_study_killed_in_the_middle_goes_on_and_ends_as_if_undisturbed(tmp_pat
     run_study(before.study, path, SerialExecutor())
     assert set(runs_again) <= set(np.flatnonzero(~held).tolist()), "the journal may hold more than the archive"
     again = len(runs_again)
-    assert again >= 30 - held.sum()
+    assert again >= 8 - held.sum()
     run_study(before.study, path, SerialExecutor())
     assert len(runs_again) == again  # nothing was left to do
     run_study(before.study, tmp_path / "undisturbed.h5", SerialExecutor())
@@ -390,16 +402,18 @@ def test_an_executor_that_is_not_installed_says_what_to_install(monkeypatch, spe
         pass
 
 
+@pytest.mark.slow
 def test_the_command_writes_everything_and_goes_on_where_it_was(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
         "ekfslam.cli.commands.consistency.levels_of", lambda names: {name: short(name)[name] for name in names}
     )
-    call = ["consistency", "--runs", "2", "--level", "low", "mid", "--executor", "serial", "--out", str(tmp_path)]
+    call = ["consistency", "--runs", "2", "--level", "mid", "--executor", "serial", "--out", str(tmp_path)]
     assert main(call) == 0
     printed = capsys.readouterr()
     assert "| pose NEES (6)" in printed.out
+    assert printed.out.startswith((tmp_path / "table.md").read_text())
     assert printed.err == ""
-    figures = {f"{kind}_{level}.png" for kind in ("nees", "errors") for level in ("low", "mid")} | {"boxes.png"}
+    figures = {f"{kind}_mid.png" for kind in ("nees", "errors")} | {"boxes.png"}
     assert {p.name for p in tmp_path.iterdir()} == {"study.h5", "summary.json", "table.md", *figures}
     assert all(min(Image.open(tmp_path / name).size) > 400 for name in figures)
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -412,20 +426,14 @@ def test_the_command_writes_everything_and_goes_on_where_it_was(tmp_path, capsys
     assert "seed is 0, asked for 1" in capsys.readouterr().err
 
 
-def test_the_report_holds_what_it_wrote(tmp_path):
-    report = check_consistency(Study(short("mid"), ("invariant",), runs=1), tmp_path, "serial")
-    assert all(path.exists() for path in report.paths)
-    assert (tmp_path / "table.md").read_text() == report.table
-
-
 @pytest.mark.slow
 def test_invariant_is_consistent_over_twenty_runs_and_standard_is_not(tmp_path):
     """The whole point: pose ANEES of 20 runs at three instants within its two-sided 99.9 % bounds, or far outside."""
-    level = dataclasses.replace(LEVELS["large-heading"], frames=160)
+    frames = 160 if WHOLE else 36
+    level = dataclasses.replace(LEVELS["large-heading"], frames=frames)
     study = Study({"large-heading": level}, ("invariant", "standard"), runs=20, seed=0)
-    with open_executor("processes") as executor:
-        values = run_study(study, tmp_path / "s.h5", executor).data["large-heading"]
-    instants = [50, 100, 159]
+    values = run_study(study, tmp_path / "s.h5", SerialExecutor()).data["large-heading"]
+    instants = [frames // 3, 2 * frames // 3, frames - 1]
     low, high = chi2_bounds(6, 0.999, 20)
     np.testing.assert_allclose((low, high), (3.77, 8.88), atol=0.005)
     invariant, standard = (anees(values[v]["pose_nees"], 6, 0.999)[0][instants] for v in ("invariant", "standard"))

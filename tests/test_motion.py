@@ -37,6 +37,7 @@ def path(sequence, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_viewer_file_holds_poses_landmarks_and_errors(path, tmp_path, capsys):
     chunks = pytest.importorskip("rerun.chunk", reason="Rerun is not installed: pip install 'ekfslam[viewer]'")
     target = tmp_path / "drive.rrd"
@@ -93,6 +94,7 @@ def test_a_gif_shows_the_drive_to_its_end(path, tmp_path, capsys):
     assert "smoothed" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_mp4_has_its_pictures(path, tmp_path):
     if shutil.which("ffmpeg") is None or shutil.which("ffprobe") is None:
         pytest.skip("ffmpeg is not installed")

@@ -194,6 +194,7 @@ def test_nis_says_how_many_frames_are_inside_their_bounds(results):
         plot_nis({"dead-reckoning": results["dead-reckoning"]})
 
 
+@pytest.mark.slow
 def test_files_are_written_and_small(sequence, results, tmp_path):
     paths = save_figures(tmp_path / "new" / "folder", results, sequence.truth)
     assert [path.name for path in paths] == [

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import WHOLE
 from helpers import run_joint
 from reference import small_world
 from test_variants import gauge_directions
@@ -13,6 +14,7 @@ from ekfslam.config import CalibrationConfig, Config, FilterConfig, NoiseConfig,
 from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
+from ekfslam.data.stretches import cut
 from ekfslam.errors import IllPosedError, PosteriorError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import se3
@@ -88,6 +90,8 @@ def test_as_filtered_equals_the_dense_filter_with_gates_and_splits(variant):
 @pytest.mark.parametrize("name", ["0027", "0020", "0042"])
 def test_as_filtered_equals_the_dense_filter_on_the_recordings(data_path, name):
     sequence = open_sequence(data_path(f"ece276a/{name}.npz"))
+    if not WHOLE:
+        sequence = cut(sequence, 0, 200, sequence.initial_T_world_imu)
     config = Config().with_overrides(
         {"filter": {"variant": "standard", "landmark_coordinates": "xyz", "retire": "never"}}
     )
@@ -193,13 +197,22 @@ def dense_rows(system, frames):
     return np.vstack(rows), np.concatenate(right), first
 
 
-@pytest.mark.parametrize(("frames", "landmarks", "share"), [(1, 3, 1.0), (12, 1, 0.3), (15, 25, 0.25), (30, 40, 0.05)])
-@pytest.mark.parametrize("up_to", [0, 4, 100])
+SIZES = [(1, 3, 1.0), (12, 1, 0.3), (15, 25, 0.25), (30, 40, 0.05)]  # frames, landmarks, share that is seen
+STATES = [(0, 0, False, 6), (0, 2, True, 6), (5, 0, False, 6), (4, 3, True, 6), (0, 0, True, 8), (4, 3, True, 11)]
+
+
 @pytest.mark.parametrize(
-    ("aux", "drive", "chained", "w"),
-    [(0, 0, False, 6), (0, 2, True, 6), (5, 0, False, 6), (4, 3, True, 6), (0, 0, True, 8), (4, 3, True, 11)],
+    ("size", "up_to", "state"),
+    [
+        (i, up_to, j)
+        for i in range(len(SIZES))
+        for j in range(len(STATES))
+        for k, up_to in enumerate((0, 4, 100))
+        if WHOLE or k == (i + j) % 3  # all pairs
+    ],
 )
-def test_information_equals_dense_least_squares(frames, landmarks, share, up_to, aux, drive, chained, w):
+def test_information_equals_dense_least_squares(size, up_to, state):
+    (frames, landmarks, share), (aux, drive, chained, w) = SIZES[size], STATES[state]
     rng = np.random.default_rng(frames)
     system = random_system(rng, frames, landmarks, share, aux, drive, chained, w)
     J, r, first = dense_rows(system, frames)
@@ -250,14 +263,15 @@ def test_samples_have_the_covariance_they_are_drawn_from():
     structure = Elimination(4, 5, system.frame, system.landmark, np.arange(5), eliminate_up_to=3)
     found = JointInformation(structure, system)
     assert 0 < len(found.elimination.kept) < 5
-    eps, d = found.sample(np.random.default_rng(4), 20_000)
+    # Standard errors are 0.014 of a mean and at most 0.02 of a covariance; the bounds are four and five of them.
+    eps, d = found.sample(np.random.default_rng(4), 5_000)
     draws = np.concatenate([eps.reshape(len(eps), -1), d.reshape(len(d), -1)], axis=1)
     expected = found.covariance(np.arange(4), np.arange(5))
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
-        (draws.mean(axis=0) - np.concatenate([found.eps.ravel(), found.d.ravel()])) / scale, 0, atol=0.04
+        (draws.mean(axis=0) - np.concatenate([found.eps.ravel(), found.d.ravel()])) / scale, 0, atol=0.056
     )
-    np.testing.assert_allclose(np.cov(draws.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.05)
+    np.testing.assert_allclose(np.cov(draws.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.1)
 
 
 EVERYTHING = {
@@ -300,14 +314,17 @@ def numeric_rows(problem, state):
 SHARED = [CameraJitter(time_s=0.3), VisionDrift(length_m=3.0), StereoRotation(time_s=1.0)]
 
 
-@pytest.mark.parametrize(
-    ("everything", "shared"),
-    [(False, []), (True, []), (False, SHARED), (True, SHARED)],
-    ids=["white", "every block", "shared", "all"],
-)
-@pytest.mark.parametrize("turn", [0.01, 1.0, 3.1], ids=["near identity", "random", "near pi"])
-def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything, shared):
-    world = small_world(frames=8, landmarks=20)
+KINDS = {"white": (False, []), "every block": (True, []), "shared": (False, SHARED), "all": (True, SHARED)}
+TURNS = {"near identity": 0.01, "random": 1.0, "near pi": 3.1}
+# In the reduced form everything at once is turned in every way, and each kind of state in one.
+SOME = ["all-near identity", "all-random", "all-near pi", "white-near pi", "every block-near identity", "shared-random"]
+
+
+@pytest.mark.parametrize("case", [f"{kind}-{turn}" for kind in KINDS for turn in TURNS] if WHOLE else SOME)
+def test_relinearised_rows_are_derivatives_of_the_residuals(case):
+    kind, turn = case.split("-")
+    (everything, shared), turn = KINDS[kind], TURNS[turn]
+    world = small_world(frames=8, landmarks=20) if WHOLE else small_world(frames=5, landmarks=10)
     if everything:
         world = with_everything(world)
         options = {"calibration": CALIBRATION, "blocks": [TwistBias(0.1, 0.01, 3.0, 5.0), *shared]}
@@ -322,7 +339,7 @@ def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything, sh
     T_world = se3.exp(np.concatenate([rng.normal(size=3), turn * axis / np.linalg.norm(axis)]))
     state = dataclasses.replace(
         state,
-        T_imu_world=se3.exp(0.03 * rng.normal(size=(8, 6))) @ state.T_imu_world @ se3.inverse(T_world),
+        T_imu_world=se3.exp(0.03 * rng.normal(size=(len(world), 6))) @ state.T_imu_world @ se3.inverse(T_world),
         positions_m=se3.apply(T_world, state.positions_m) + 0.1 * rng.normal(size=state.positions_m.shape),
         zeta=0.3 * rng.normal(size=problem.width),
         shared=state.shared + 0.003 * rng.normal(size=state.shared.shape),
@@ -334,10 +351,10 @@ def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything, sh
         T_imu_world=state.T_imu_world @ se3.inverse(first),
         positions_m=se3.apply(first, state.positions_m),
     )
-    J, r, _ = dense_rows(problem.relinearised(state), 8)
+    J, r, _ = dense_rows(problem.relinearised(state), len(world))
     expected, residual = numeric_rows(problem, state)
     # Pixel rows explain z - h, motion rows minus the error.
-    motion, size = slice(problem.width, 8 * problem.width), len(residual)
+    motion, size = slice(problem.width, len(world) * problem.width), len(residual)
     expected[motion.stop :] *= -1
     tolerance = 2e-6 * np.abs(expected).max(axis=1, keepdims=True)
     assert (np.abs(J[:size] - expected) <= tolerance + 1e-6).all()
@@ -346,7 +363,7 @@ def test_relinearised_rows_are_derivatives_of_the_residuals(turn, everything, sh
     assert (np.abs(J).max(axis=0) > 0).all()
     # Rows over blocks alone: the gradient of their cost is -J^T r.
     if everything:
-        aux, start = state.aux.size, problem.width * 8
+        aux, start = state.aux.size, problem.width * len(world)
         slope = -(J[size:].T @ r[size:])[start : start + aux].reshape(state.aux.shape)
         h = 1e-6 * rng.normal(size=state.aux.shape)
         above, below = (problem.block_cost(dataclasses.replace(state, aux=state.aux + s * h)) for s in (1, -1))
@@ -414,7 +431,7 @@ def test_map_is_consistent():
     """Mean NEES of the last pose and of landmarks over 30 drives, linearised at the maximum: 6 and 3 are expected."""
     pose, landmark = [], []
     for seed in range(30):
-        world = builtin(f"loop?frames=100&seed={seed}")
+        world = builtin(f"loop?{'frames=100' if WHOLE else 'frames=25&landmarks=60'}&seed={seed}")
         ekf, _, _ = run_joint(world, rig_of(world), FilterConfig(retire="never"))
         found = posterior_of(ekf, PosteriorConfig(kernel="none"))
         xi = se3.log(se3.inverse(world.truth.T_world_imu) @ found.T_world_imu)
@@ -427,24 +444,27 @@ def test_map_is_consistent():
     assert 2.4 < np.mean(landmark) < 3.8
 
 
+LOOP = "loop" if WHOLE else "loop?frames=180&radius_m=10&landmarks=50"  # more than two rounds
+
+
 @pytest.mark.parametrize("variant", ["standard", "fej"])
 def test_revival_equals_never_retiring(variant):
-    world = builtin("loop")
+    world = builtin(LOOP)
     never, expected = drive(world, FilterConfig(variant, "xyz", retire="never"))
     revived, poses = drive(world, FilterConfig(variant, "xyz", retire="unseen"))
-    assert len(revived.retired.revived) > 5
-    assert revived.counts["retired"] > 100
+    assert len(revived.retired.revived) > (5 if WHOLE else 1)  # those that brought their neighbours along
+    assert revived.counts["retired"] > 50
     assert len(revived.landmarks()) == len(never.landmarks())
     np.testing.assert_allclose(poses, expected, atol=1e-6)
     afresh, other = drive(world, FilterConfig(variant, "xyz", retire="unseen", revive=-1))
-    assert len(afresh.retired.reappeared) > 50
+    assert len(afresh.retired.reappeared) > 20
     assert np.abs(other - expected).max() > 0.01
     # The log goes on through it all.
     assert_equal_to_dense_filter(posterior_of(revived), never)
 
 
 def test_revival_of_the_invariant_variant_is_as_good_as_never_retiring():
-    world = builtin("loop")
+    world = builtin(LOOP)
     config = FilterConfig(variant="invariant")
     error = {}
     for retire, revive in (("never", 0), ("unseen", 100), ("unseen", -1)):

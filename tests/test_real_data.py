@@ -24,7 +24,7 @@ UTIAS = (
 )
 # In the reduced form of the tests: the beginnings of some drives.
 FRAMES = None if WHOLE else 200
-DRIVES = UTIAS if WHOLE else UTIAS[:5]
+DRIVES = UTIAS if WHOLE else ("09_26_drive_0009", "09_26_drive_0036", "09_30_drive_0020")
 ODOMETRY = {"0020": "06", "0027": "07", "0042": "01", "0027_dense_noisy": "07"}
 
 
@@ -43,7 +43,7 @@ def summaries_of_the_drives():
     """Summaries of full SLAM, smoothed and dead reckoning on the UTIAS drives."""
     found = []
     for name in DRIVES:
-        sequence = open_sequence(recording(f"utias/2011_{name}_sync_KLT.mat"))[:FRAMES]
+        sequence = open_sequence(recording(f"utias/2011_{name}_sync_KLT.mat"))[: None if WHOLE else 150]
         full = run(sequence, "full")
         results = {"full": full, "smoothed": smooth(full), "dead-reckoning": run(sequence, "dead-reckoning")}
         found.append({mode: summarise(sequence, result) for mode, result in results.items()})
@@ -60,18 +60,20 @@ def lateral_slope(sequence):
     return np.polyfit(stored, true, 1)[0]
 
 
-@pytest.mark.parametrize("name", [*UTIAS, *ODOMETRY])
+@pytest.mark.parametrize("name", [*UTIAS, *ODOMETRY] if WHOLE else [*UTIAS[:4], "0020", "0027_dense_noisy"])
 def test_true_lateral_velocity_opposes_the_stored_one_on_every_recording(opened, name):
     assert lateral_slope(opened(name, lateral="as-stored")) < 0 < lateral_slope(opened(name))
 
 
-def error(sequence, mode, align=False):
+def errors(sequence, mode):
+    """Absolute trajectory error (m) of a run, as it is and with the trajectory aligned."""
     result, truth = run(sequence, mode), sequence.truth
-    return absolute_trajectory_error(result.T_world_imu[truth.frame], truth.T_world_imu, align=align)
+    estimate = result.T_world_imu[truth.frame]
+    return np.array([absolute_trajectory_error(estimate, truth.T_world_imu, align=align) for align in (False, True)])
 
 
 def gain(sequence):
-    return error(sequence, "dead-reckoning") / error(sequence, "full")
+    return errors(sequence, "dead-reckoning")[0] / errors(sequence, "full")[0]
 
 
 @pytest.mark.slow
@@ -83,7 +85,7 @@ def test_on_the_drives_full_slam_gains_and_its_covariance_is_honest():
     assert np.median(gains) >= 1.5
     for mode in ("full", "smoothed"):
         nees = np.array([drive[mode]["pose_nees_with_truth_noise_mean"] for drive in drives])
-        assert ((nees > 2.9) & (nees < 12)).sum() >= len(drives) - 2
+        assert ((nees > 2.9) & (nees < 12)).mean() > 0.6
         assert nees.max() < 30
         assert np.median([drive[mode]["pose_nees_relative_100_mean"] for drive in drives]) < 20
     assert all(0.5 < drive["full"]["nis_per_dof"] < 1.5 for drive in drives)
@@ -106,15 +108,13 @@ def test_full_slam_never_loses_badly_on_few_tracks(opened, name):
 def test_dense_tracks_with_noisy_and_with_clean_velocities(opened):
     noisy = opened("0027_dense_noisy")
     clean = dataclasses.replace(noisy, twist=opened("0027").twist)[:FRAMES]
-    noisy, bound_m, aligned_m = (noisy, 6.0, 3.5) if WHOLE else (noisy[:FRAMES], 1.5, 0.8)
-    assert error(noisy, "full") <= bound_m
-    assert error(noisy, "full", align=True) <= aligned_m
-    for align in (False, True):
-        assert error(clean, "full", align) <= error(clean, "dead-reckoning", align)
+    noisy, bounds_m = (noisy, (6.0, 3.5)) if WHOLE else (noisy[:FRAMES], (1.5, 0.8))
+    assert np.all(errors(noisy, "full") <= bounds_m)
+    assert np.all(errors(clean, "full") <= errors(clean, "dead-reckoning"))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["09_26_drive_0009", "09_26_drive_0036", "09_30_drive_0027"])
+@pytest.mark.parametrize("name", ["09_26_drive_0009", "09_26_drive_0036", "09_30_drive_0027"][: None if WHOLE else 1])
 def test_noise_added_to_the_velocities_is_filtered_out(opened, name):
     clean = opened(name)[:FRAMES]
     gains = []

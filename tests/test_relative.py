@@ -166,6 +166,7 @@ def test_the_invariant_filters_motions_do_not_depend_on_where_the_world_is():
     assert (np.abs(found[1] - found[0]) <= 1e-6 * std[:, :, None] * std[:, None, :]).all()
 
 
+@pytest.mark.slow
 def test_estimates_do_not_depend_on_references():
     world = open_sequence("builtin:city?frames=120")
     with_, without = (
@@ -181,6 +182,7 @@ def test_estimates_do_not_depend_on_references():
     assert run(dataclasses.replace(world, truth=None), "full").pairs is None
 
 
+@pytest.mark.slow
 def test_pairs_across_a_map_revival_are_left_out():
     world = open_sequence("builtin:loop?frames=330")
     settings = {"retire": "unseen", "retire_after": 3, "variant": "standard"}

@@ -7,6 +7,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import WHOLE
 from reference import CAMERA, T_CAM_IMU, small_world
 from test_jacobians import POSES, central, visible_points
 from test_level import (
@@ -115,8 +116,12 @@ def assert_equal_rows(ours, numeric):
     np.testing.assert_allclose(ours, numeric, rtol=1e-5, atol=1e-6 * np.abs(numeric).max())
 
 
-@pytest.mark.parametrize("way_m", [1.7, 0.03])
-@pytest.mark.parametrize("follows", ["some", "all", "none"])
+@pytest.mark.parametrize(
+    ("follows", "way_m"),
+    [(follows, way_m) for follows in ("some", "all", "none") for way_m in (1.7, 0.03)]
+    if WHOLE
+    else [("some", 1.7), ("all", 0.03), ("none", 1.7)],
+)
 @kinds
 @poses
 def test_rows_by_every_block_and_landmark(T, noise, follows, way_m):
@@ -341,7 +346,9 @@ def test_a_clone_is_its_block_before_it_changed():
 @pytest.mark.parametrize("variant", ["invariant", "fej", "standard"])
 def test_information_about_the_gauge_with_shared_errors(variant, coordinates, tracks):
     """Velocities taken as exact: not the least is gained or lost, but by the standard variant."""
-    world = in_level_frame(small_world(seed=4), TILTED, twist_std=np.zeros(6), tilt_rad=0.05, **tracks)
+    world = in_level_frame(
+        small_world(seed=4, frames=60 if WHOLE else 30), TILTED, twist_std=np.zeros(6), tilt_rad=0.05, **tracks
+    )
     config = dataclasses.replace(OPEN, variant=variant, landmark_coordinates=coordinates)
     ekf = filter_of(world, config, EVERYTHING, up=TILTED[:, 2], blocks=SHARED)
     prior = gauge_information(ekf)
@@ -436,13 +443,22 @@ class LiteralShared(Literal):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tracks", [TRACKS, {}], ids=["tracks", "white"])
-@pytest.mark.parametrize("coordinates", ["xyz", "image"])
-@pytest.mark.parametrize("variant", ["standard", "invariant"])
-def test_filter_with_shared_errors_equals_the_literal_one(variant, coordinates, tracks):
+@pytest.mark.parametrize(
+    ("variant", "coordinates", "errors"),
+    [
+        (variant, coordinates, errors)
+        for variant in ("standard", "invariant")
+        for coordinates in ("xyz", "image")
+        for errors in ("tracks", "white")
+        # In the reduced form: all pairs.
+        if WHOLE or [variant == "standard", coordinates == "image", errors == "tracks"].count(True) % 2
+    ],
+)
+def test_filter_with_shared_errors_equals_the_literal_one(variant, coordinates, errors):
     """As in `test_level`: of what is there some are left out, the first among them, and others come in any order."""
+    tracks = {"tracks": TRACKS, "white": {}}[errors]
     walk = {"twist_walk_std": NOISE.twist_walk_std, "motion_std": NOISE.motion_std, "tilt_rad": 0.05, **tracks}
-    world = in_level_frame(small_world(frames=10, landmarks=20), TILTED, **walk)
+    world = in_level_frame(small_world(frames=10, landmarks=20 if WHOLE else 12), TILTED, **walk)
     # Landmarks that are not seen for some frames stay awake.
     config = dataclasses.replace(OPEN, variant=variant, landmark_coordinates=coordinates, retire_after=100)
     ekf = filter_of(world, config, EVERYTHING, up=TILTED[:, 2], blocks=BLOCKS)
@@ -519,7 +535,8 @@ def test_residuals_of_the_batch_problem():
 # --- recovery: worlds in which one error is put in ------------------------------------------------------------------
 
 # Sparse tracks, so that a run takes a second; errors of tracks are white but for what is put in.
-DRIVE = "city?frames=60&outlier_fraction=0&max_tracks=25&sigma_v_m_s={}&sigma_w_rad_s={}&seed={}"
+FRAMES = 60 if WHOLE else 36
+DRIVE = f"city?frames={FRAMES}&outlier_fraction=0&max_tracks=25&sigma_v_m_s={{}}&sigma_w_rad_s={{}}&seed={{}}"
 CLOSED = FilterConfig(gate_probability=1.0, split_after=0, retire="unseen", retire_after=1, moving_sigma=1e9)
 WALKS = {"track_first_px": np.full(3, 0.3), "track_walk_px": np.full(3, 0.3)}
 
@@ -625,17 +642,17 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.parametrize(("block", "put_in", "well"), CASES.values(), ids=CASES.keys())
 def test_what_was_put_in_is_found_and_poses_are_honest_for_it(block, put_in, well):
-    """12 drives of 60 frames; estimates count once half of a drive is over."""
+    """12 drives; estimates count once half of a drive is over."""
     nees, without, errors, stds, truths = [], [], [], [], []
     for seed in range(12):
         world = Spoilt(seed, **put_in)
         of_poses, found = world.filtered(block)
         nees.append(of_poses.mean())
         (estimate, std), which = (
-            found[block.name][:, 30:],
+            found[block.name][:, FRAMES // 2 :],
             next(name for name in put_in if name not in ("std", "walks")),
         )
-        true = YAW[None] if which == "psi" else getattr(world, which)[30:]
+        true = YAW[None] if which == "psi" else getattr(world, which)[FRAMES // 2 :]
         errors.append(estimate - true)
         stds.append(std)
         truths.append(np.broadcast_to(true, estimate.shape))

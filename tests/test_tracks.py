@@ -6,6 +6,7 @@ import json
 import h5py
 import numpy as np
 import pytest
+from conftest import WHOLE
 from reference import small_world
 from test_archive import assert_same
 
@@ -575,6 +576,7 @@ def test_reprojection_errors_of_clean_and_of_moved_pixels():
         reprojection_errors(dataclasses.replace(world, truth=None))
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_hygiene_brings_down_the_reprojection_errors_of_the_dense_recording(data_path):
     sequence = open_sequence(data_path("ece276a/0027_dense_noisy.npz"), truth=data_path("kitti_odometry_poses/07.txt"))
@@ -593,6 +595,7 @@ def test_slow_tracks_may_stay_whole_at_repeated_frames(data_path):
     """Cut are those alone that move before or after; where velocities are noisy and white that helps the poses."""
     truth = data_path("kitti_odometry_poses/07.txt")
     sequence = open_sequence(data_path("ece276a/0027_dense_noisy.npz"), truth=truth)
+    sequence = sequence if WHOLE else sequence[:400]
     noise = noise_of(sequence, Config())
     every, some = (
         clean_tracks(sequence, noise, only(restart_at_repeats=True, restart_above_px=limit))[1] for limit in (0.0, 7.0)

@@ -203,6 +203,7 @@ def test_a_configuration_overrides_what_it_gives_and_leaves_the_rest():
         Config(truth=TruthConfig(stamp_s=-1.0))
 
 
+@pytest.mark.slow
 def test_compare_takes_the_truth_noise_of_the_configuration(tmp_path):
     world = open_sequence("builtin:loop?frames=20")
     config = Config().with_overrides({"truth": {"position_m": 10.0, "attitude_deg": 50.0}})

@@ -488,10 +488,13 @@ def _add_blocks(P: Array, start: int, blocks: Array) -> None:
 
 
 def _pivoted_root(P: Array) -> Array:
-    """F (n, f) of ``P = F F^T`` where P is singular: what is known for certain has no column."""
+    """F (n, f) of ``P = F F^T`` where P is singular: what is known for certain has no column.
+
+    Of nothing but zeros there is one column all the same, because BLAS knows no empty matrices.
+    """
     std = np.sqrt(np.maximum(P.diagonal(), 0.0))
     scale = np.divide(1.0, std, out=np.zeros_like(std), where=std > 0)
     L, pivots, rank, _ = lapack.dpstrf(P * np.outer(scale, scale), lower=1)
-    F = np.zeros((len(P), rank), order="F")
-    F[pivots - 1] = np.tril(L)[:, :rank]
+    F = np.zeros((len(P), max(rank, 1)), order="F")
+    F[pivots - 1, :rank] = np.tril(L)[:, :rank]
     return F * std[:, None]

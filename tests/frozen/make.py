@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -114,25 +114,25 @@ def of_result(result: Result, numbers: bool = True) -> Frozen:
     return kept
 
 
-def of_runs(sequence: Sequence, settings: dict, numbers: bool) -> Iterator[tuple[str, Frozen]]:
-    """All modes, the joint filter and its smoothed run in all variants; name and what is kept of each."""
+def of_runs(sequence: Sequence, settings: dict, numbers: bool, variants: Iterable[str]) -> Iterator[tuple[str, Frozen]]:
+    """All modes, the joint filter and its smoothed run in these variants; name and what is kept of each."""
     config = Config(noise=NoiseConfig(model="white"), filter=FilterConfig(landmark_coordinates="xyz", **settings))
     for mode in ("dead-reckoning", "mapping-only"):
         yield mode, of_result(run(sequence, mode, config), numbers)
-    for variant in VARIANTS:
+    for variant in variants:
         result = run(sequence, "full", config.with_overrides({"filter": {"variant": variant}}))
         yield f"full, {variant}", of_result(result, numbers)
         yield f"smoothed, {variant}", of_result(smooth(result), numbers)
 
 
-def of_world(name: str) -> Frozen:
+def of_world(name: str, variants: Iterable[str] = tuple(VARIANTS)) -> Frozen:
     source, settings, numbers = WORLDS[name]
-    return _joined(name, of_runs(open_sequence(source), settings, numbers))
+    return _joined(name, of_runs(open_sequence(source), settings, numbers, variants))
 
 
-def of_recording(name: str, path: Path) -> Frozen:
+def of_recording(name: str, path: Path, variants: Iterable[str] = tuple(VARIANTS)) -> Frozen:
     # As stored, as it was when these were frozen.
-    return _joined(name, of_runs(open_sequence(path, lateral="as-stored"), {}, numbers=False))
+    return _joined(name, of_runs(open_sequence(path, lateral="as-stored"), {}, numbers=False, variants=variants))
 
 
 def of_starry_night(path: Path) -> Frozen:

@@ -78,6 +78,7 @@ def verdict(case: Case, folder: Path) -> str:
         return f"an error of the program itself is blamed on the file: {error}"
     if case.arguments[0] == "sweep":  # a recording's name is the user's word
         printed = re.sub(r"\S*=\S*", "", printed)
+    printed = re.sub(r"'[^'\n]*'", "", printed)  # so are quoted words
     if code == 0 and re.search(r"(?<![\w.])[-+]?nan\b", printed, re.IGNORECASE) and "--help" not in case.arguments:
         return f"NaN printed:\n{printed}"
     scraps = [path.name for path in folder.rglob(".ekfslam.*")]

@@ -54,6 +54,9 @@ class Bag:
             self._reader: Any = rosbag1.Reader(path) if self.is_ros1 else rosbag2.Reader(path)
             self._reader.open()
             self._types = message_types(self.is_ros1)
+            for connection in self._reader.connections:
+                if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
+                    raise ValueError(f"a stream named {connection.topic!r} of the type {connection.msgtype!r}")
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
@@ -63,7 +66,12 @@ class Bag:
         except EkfslamError:
             raise
         except Exception as error:  # a damaged bag makes its decoders raise almost anything
-            text = printable(str(error))[:200] or type(error).__name__
+            about_python = isinstance(
+                error.__context__ or error, AttributeError | TypeError
+            )  # nothing that a user knows
+            text = (
+                "an entry is of a wrong type" if about_python else printable(str(error))[:200] or type(error).__name__
+            )
             raise UnknownFormatError(f"{self.path}: damaged or unknown bag ({text})") from None
 
     def connections(self, *kinds: str) -> list[Any]:

@@ -57,8 +57,12 @@ def read_pickled(path: Path, expected: str) -> dict[str, Any]:
         _inspect(stream)
         stream.seek(begin)
         found = _plain(_Restricted(stream).load())
-    except (ValueError, TypeError, AttributeError, KeyError, IndexError, EOFError, OverflowError) as error:
+    except (ValueError, EOFError, OverflowError) as error:
         raise UnknownFormatError(f"{path}: damaged .npy file ({_clean(error)}); {expected}") from None
+    except (TypeError, AttributeError, KeyError, IndexError):  # their words are about Python's objects, not the file
+        raise UnknownFormatError(
+            f"{path}: damaged .npy file (its operations do not fit together); {expected}"
+        ) from None
     except pickle.UnpicklingError as error:
         raise UnknownFormatError(f"{path}: {_clean(error)}; {expected}") from None
     if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
