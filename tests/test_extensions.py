@@ -43,8 +43,9 @@ def walking_world(rng, bias=None, frames=100 if WHOLE else 50):
             offset[k] = phi * offset[k - 1] + std * rng.standard_normal(6)
     T_imu_world = motion.integrate(np.eye(4), twist, np.diff(time_s))
     T_world_imu = se3.inverse(T_imu_world)
-    anchor = rng.integers(0, frames, 150)
-    points = se3.apply(T_world_imu[anchor], rng.uniform([6, -6, -2], [25, 6, 4], (150, 3)))
+    many = 3 * frames // 2
+    anchor = rng.integers(0, frames, many)
+    points = se3.apply(T_world_imu[anchor], rng.uniform([6, -6, -2], [25, 6, 4], (many, 3)))
     q = se3.apply((T_CAM_IMU @ T_imu_world)[:, None], points)
     pixels = camera.project(CAMERA, np.where(q[..., 2:] > 1, q, 1.0))
     inside = (q[..., 2] > 3) & (q[..., 2] < 30) & (np.abs(pixels[..., :2] - [600, 180]) < [600, 300]).all(axis=-1)

@@ -27,7 +27,7 @@ SEEDS = pytest.mark.parametrize("seed", seeds(3, 1))
 
 
 def world(seed, **changes):
-    small = {"frames": 300, "max_tracks": 40, "outlier_fraction": 0.0, "loss_probability": 0.02}
+    small = {"frames": 300 if WHOLE else 200, "max_tracks": 40, "outlier_fraction": 0.0, "loss_probability": 0.02}
     noise = {"sigma_v_m_s": SIGMA_V, "sigma_w_rad_s": SIGMA_W, "sigma_px": SIGMA_PX}
     return dataclasses.replace(simulate(City(seed=seed, **{**small, **noise, **changes})), noise=STATED)
 

@@ -78,7 +78,7 @@ def test_as_filtered_equals_the_dense_filter(variant, iterations, prior):
 
 @pytest.mark.parametrize("variant", ["standard", "fej"])
 def test_as_filtered_equals_the_dense_filter_with_gates_and_splits(variant):
-    world = builtin("loop?frames=200&outlier_fraction=0.1")
+    world = builtin("loop?frames=100&outlier_fraction=0.1")
     config = FilterConfig(variant=variant, landmark_coordinates="xyz", retire="never", split_after=2)
     ekf, _, reports = run_joint(world, rig_of(world), config)
     assert sum(len(report.split) for report in reports) > 0
