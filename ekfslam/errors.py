@@ -144,7 +144,7 @@ class NonFiniteResultError(FilterError):
     def __init__(self, mode: str, what: str, index: int) -> None:
         self.mode, self.what, self.index = mode, what, index
         super().__init__(
-            f"{mode}: {what}[{index}] is NaN or infinite; velocities, pixels or noise are beyond what numbers can hold"
+            f"{mode}: {what}[{index}] is not finite; velocities, pixels or noise are beyond what numbers can hold"
         )
 
 

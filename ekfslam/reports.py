@@ -23,10 +23,11 @@ from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.evaluation.verdict import Honesty, innovations_of, judge
 from ekfslam.figures.check import plot_check
+from ekfslam.figures.older import older_figures, remove_figures
 from ekfslam.figures.posterior import plot_map_before_and_after
 from ekfslam.figures.run import draw_figures
 from ekfslam.figures.study import draw_study_figures
-from ekfslam.figures.style import older_figures, png, pngs
+from ekfslam.figures.style import png, pngs
 from ekfslam.filters.result import Result
 from ekfslam.runner import run, versions
 from ekfslam.shown import Card, Shown, count
@@ -336,14 +337,6 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
     found = judge(result, smoothed, skipped)
     files.write_all({values: _json(found.values), table: found.table, figure: png(plot_check(result, found))})
     return Check(found, [values, table, figure])
-
-
-def remove_figures(older: Iterable[Path], new: Iterable[Path]) -> None:
-    """Remove older figures in whose place there are no new ones, and with ``check.png`` the verdict beside it."""
-    for path in set(older) - set(new):
-        verdict = [path.with_suffix(".md"), path.with_suffix(".json")] if path.name == "check.png" else []
-        for old in (path, *verdict):
-            old.unlink(missing_ok=True)
 
 
 def _json(summary: dict[str, Any]) -> str:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -21,6 +25,50 @@ DATA = Path(os.environ.get("EKFSLAM_DATA") or Path(__file__).resolve().parents[2
 def seeds(whole: int, reduced: int) -> range:
     """Seeds of a study: so many in the whole form of the tests, fewer in the reduced one."""
     return range(whole if WHOLE else reduced)
+
+
+# Copies of a process that has imported the package and has no threads: a new one takes a second to import it.
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload(["ekfslam.reports", "ekfslam.cli.commands.run", "ekfslam.cli.commands.posterior"])
+
+
+def processes(*calls: tuple[Any, ...]) -> list[int | None]:
+    """Exit codes of processes that work at once, each of a function of a module and its arguments.
+
+    Negative is the signal that ended one. For what happens to processes; their tests belong to one group of xdist.
+    """
+    begun = [FORKS.Process(target=_silently, args=call, daemon=True) for call in calls]
+    for process in begun:
+        process.start()
+    for process in begun:
+        process.join(120.0)
+    return [process.exitcode for process in begun]
+
+
+def _silently(work: Callable[..., object], *arguments: object) -> None:
+    with Path(os.devnull).open("w") as nowhere:
+        sys.stdout = sys.stderr = nowhere
+        work(*arguments)
+
+
+def command(arguments: list[str], cpu_s: float = 0.0) -> None:
+    """A command; after so much time of its process, that ends without warning."""
+    from ekfslam.cli import main
+
+    signal.setitimer(signal.ITIMER_PROF, cpu_s)  # its signal kills; 0 is never
+    assert main(arguments) == 0
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of figures are all one small picture: drawing takes longer than most runs, and `test_plotting` tests it."""
+    from matplotlib.figure import Figure
+
+    from ekfslam.figures.style import png
+
+    picture = png(Figure(figsize=(1, 1)))
+    for place in ("figures.style", "reports"):
+        monkeypatch.setattr(f"ekfslam.{place}.png", lambda *_: picture)
 
 
 @pytest.fixture

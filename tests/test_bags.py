@@ -415,6 +415,14 @@ def test_streams_that_are_numbers_are_refused(tmp_path, key):
         opened(path)
 
 
+def test_a_way_of_storing_that_is_a_number_is_refused(tmp_path):
+    path = write(tmp_path, stereo())
+    metadata = path / "metadata.yaml"
+    metadata.write_text(re.sub(r"compression_mode: .*", "compression_mode: 1.5", metadata.read_text()))
+    with pytest.raises(UnknownFormatError, match=r"damaged or unknown bag \(an entry is of a wrong type\)"):
+        opened(path)
+
+
 def test_a_definition_that_a_bag_brings_is_not_used(tmp_path):
     """Its types are those that rosbags knows; what a bag says of them is not even parsed."""
     bag, store = stereo(), message_types(is_ros1=False)

@@ -33,7 +33,7 @@ def result():
 def test_a_result_never_holds_nan(result, name, value):
     wrong = getattr(result, name).copy()
     wrong[7] = value
-    with pytest.raises(NonFiniteResultError, match=rf"full: {name}\[7\] is NaN or infinite"):
+    with pytest.raises(NonFiniteResultError, match=rf"full: {name}\[7\] is not finite"):
         dataclasses.replace(result, **{name: wrong})
 
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import shutil
-import subprocess
-import sys
-import time
+import signal
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from conftest import WHOLE, command, processes, seeds
 from test_archive import assert_same
+from test_montecarlo import short
 
 from ekfslam import runner
 from ekfslam.cli import main
@@ -25,34 +26,34 @@ from ekfslam.filters.landmarks import LandmarkTable
 from ekfslam.runner import run
 from ekfslam.storage import checkpoint
 from ekfslam.storage.checkpoint import Checkpoints, image, read
+from ekfslam.studies import study as montecarlo
+from ekfslam.studies.executors import SerialExecutor
 from ekfslam.studies.journal import Journal, _framed
+from ekfslam.studies.study import Study, run_study
 
+FRAMES = 60 if WHOLE else 36
+CITY, LOOP = (f"builtin:{name}?frames={FRAMES}" for name in ("city", "loop"))
 EVERYTHING = {
     "calibration": {"rotation_deg": 0.3, "lever_arm_m": 0.05, "disparity_px": 0.3},
     "blocks": {"twist_bias": {}, "camera_jitter": {}, "vision_drift": {}, "stereo_rotation": {}},
     "filter": {"relative_frames": 20},
 }
 DRIVES = {
-    "city": ("builtin:city?frames=60", {}),
-    "dense": ("builtin:loop?frames=60", {"filter": {"covariance_form": "dense", "retire": "unseen"}}),
-    "conditional": ("builtin:loop?frames=60", {"filter": {"covariance_form": "conditional"}}),
-    "dormant": ("builtin:city?frames=60", {"filter": {"covariance_form": "conditional", "retire": "never"}}),
-    "standard": ("builtin:city?frames=60", {"filter": {"variant": "standard", "landmark_coordinates": "xyz"}}),
-    "fej": ("builtin:city?frames=60", {"filter": {"variant": "fej"}}),
-    "blocks": ("builtin:city?frames=60", EVERYTHING),
+    "city": (CITY, {}),
+    "dense": (LOOP, {"filter": {"covariance_form": "dense", "retire": "unseen"}}),
+    "conditional": (LOOP, {"filter": {"covariance_form": "conditional"}}),
+    "dormant": (CITY, {"filter": {"covariance_form": "conditional", "retire": "never"}}),
+    "standard": (CITY, {"filter": {"variant": "standard", "landmark_coordinates": "xyz"}}),
+    "fej": (CITY, {"filter": {"variant": "fej"}}),
+    "blocks": (CITY, EVERYTHING),
     "automatic": ("unstated", EVERYTHING),
 }
-
-
-@pytest.fixture(autouse=True)
-def whatever_share(monkeypatch) -> None:
-    monkeypatch.setattr(checkpoint, "SHARE", 1e9)
 
 
 def drive(name: str):
     source, settings = DRIVES[name]
     if source == "unstated":
-        sequence = dataclasses.replace(builtin("city?frames=60"), noise=None, velocity_frame="level")
+        sequence = dataclasses.replace(builtin(f"city?frames={FRAMES}"), noise=None, velocity_frame="level")
     else:
         sequence = open_sequence(source)
     return sequence, Config().with_overrides(settings)
@@ -79,28 +80,46 @@ def interrupt_at(monkeypatch, frame: int) -> None:
     monkeypatch.setattr(runner, "run_filter", until)
 
 
-@pytest.mark.parametrize("name", DRIVES)
+@dataclasses.dataclass
+class Thinned(Checkpoints):
+    """Written after every frame, whatever time has passed; in the reduced form after frames 1, 6, 11, ... alone."""
+
+    def keep(self, key, state, always=False) -> None:
+        if WHOLE or state["frames"] % 5 == 1:
+            super().keep(key, state, always=True)
+
+
+def interrupted(path: Path, sequence, config: Config, frame: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt_at(patch, frame)
+        with pytest.raises(Interrupted):
+            run(sequence, "full", config, checkpoints=Thinned(path, True))
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in ("city", "conditional") else pytest.param(name, marks=pytest.mark.slow) for name in DRIVES]
+)
 def test_an_interrupted_run_ends_in_the_same_bits(tmp_path, name):
     sequence, config = drive(name)
     whole, path = untimed(run(sequence, "full", config)), tmp_path / "a.checkpoint"
-    for frame in (1, 17, 41):  # one interruption after the other
-        with pytest.MonkeyPatch.context() as patch:
-            interrupt_at(patch, frame)
-            with pytest.raises(Interrupted):
-                run(sequence, "full", config, checkpoints=Checkpoints(path, True, every_s=0.0))
-    again = untimed(run(sequence, "full", config, checkpoints=Checkpoints(path, True, every_s=0.0)))
+    for frame in (1, 13, 27):  # one interruption after the other
+        interrupted(path, sequence, config, frame)
+        assert path.exists()
+    again = untimed(run(sequence, "full", config, checkpoints=Thinned(path, True)))
     assert_same(again, whole)
 
 
-def test_a_checkpoint_is_what_is_gone_on_with(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def unfinished(tmp_path_factory) -> Path:
+    """The checkpoint of a run that was interrupted at frame 13."""
+    path = tmp_path_factory.mktemp("unfinished") / "a.checkpoint"
+    interrupted(path, *drive("city"), 13)
+    return path
+
+
+def test_a_checkpoint_is_what_is_gone_on_with(tmp_path, monkeypatch, unfinished):
     """No run from the beginning that happens to end the same."""
-    sequence, config = drive("city")
-    path, frames = tmp_path / "a.checkpoint", []
-    interrupt_at(monkeypatch, 30)
-    with pytest.raises(Interrupted):
-        run(sequence, "full", config, checkpoints=Checkpoints(path, every_s=0.0))
-    monkeypatch.undo()
-    monkeypatch.setattr(checkpoint, "SHARE", 1e9)
+    path, frames = Path(shutil.copy(unfinished, tmp_path)), []
     true_filter = runner.run_filter
 
     def counted(*arguments, **options):
@@ -109,22 +128,18 @@ def test_a_checkpoint_is_what_is_gone_on_with(tmp_path, monkeypatch):
             yield found
 
     monkeypatch.setattr(runner, "run_filter", counted)
-    run(sequence, "full", config, checkpoints=Checkpoints(path, True, every_s=0.0))
-    assert frames == list(range(30, 60))
+    sequence, config = drive("city")
+    run(sequence, "full", config, checkpoints=Checkpoints(path, True))
+    assert frames == list(range(13 if WHOLE else 11, FRAMES))
 
 
 @pytest.mark.parametrize("change", ["settings", "recording", "pixels", "key"])
-def test_a_checkpoint_of_something_else_is_refused(tmp_path, monkeypatch, change):
+def test_a_checkpoint_of_something_else_is_refused(monkeypatch, unfinished, change):
     sequence, config = drive("city")
-    path = tmp_path / "a.checkpoint"
-    interrupt_at(monkeypatch, 30)
-    with pytest.raises(Interrupted):
-        run(sequence, "full", config, checkpoints=Checkpoints(path, every_s=0.0))
-    monkeypatch.undo()
     if change == "settings":
         config = config.with_overrides({"filter": {"min_depth_m": 0.2}})
     elif change == "recording":
-        sequence = builtin("city?frames=60&seed=1")
+        sequence = builtin(f"city?frames={FRAMES}&seed=1")
     elif change == "pixels":
         pixels = sequence.observations.pixels_px.copy()
         pixels[-1, 0] += 1e-9
@@ -133,7 +148,7 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path, monkeypatch, change
     else:
         monkeypatch.setattr(runner, "versions", lambda: {"version_ekfslam": "0.0"})
     with pytest.raises(ResumeError, match="another recording, other settings or another release"):
-        run(sequence, "full", config, checkpoints=Checkpoints(path, True))
+        run(sequence, "full", config, checkpoints=Checkpoints(unfinished, True))
 
 
 def nested() -> dict:
@@ -159,6 +174,8 @@ def test_objects_come_back_with_what_they_share(tmp_path):
     assert found.keys() == expected.keys()
     assert found["plain"] == expected["plain"]
     assert found["same"] is found["array"]
+    for name in ("array", "view", "turned", "empty", "flags", "fixed"):
+        np.testing.assert_array_equal(found[name], expected[name])
     assert found["array"].flags.f_contiguous and not found["array"].flags.c_contiguous
     found["array"][1, 2] = 99.0
     assert found["view"][0, 1] == 99.0 and found["turned"][2, 1] == 99.0, "views of the same memory"
@@ -208,7 +225,7 @@ def replaced(kind: str, new: list):
         replaced("list", ["__init__", [0]]),
         replaced("tuple", ["value", 0]),
         lambda nodes: nodes.__setitem__(0, ["list", [0]]),
-        lambda nodes: [["list", [i + 1]] for i in range(100_000)],
+        lambda nodes: [["list", [i + 1]] for i in range(10_000)],
         lambda nodes: [1, 2, 3],
         lambda nodes: {"a": 1},
     ],
@@ -234,16 +251,6 @@ def test_flipped_bytes_of_a_checkpoint_are_named_errors(tmp_path):
     assert refused > 100
 
 
-CITY = "builtin:city?frames=150"
-SLOWLY = """
-import sys
-from ekfslam.storage import checkpoint
-checkpoint.EVERY_S, checkpoint.SHARE = 0.0, 1.0
-from ekfslam.cli import main
-raise SystemExit(main(sys.argv[1:]))
-"""
-
-
 def same_archives(a: Path, b: Path) -> None:
     """All data sets but the times are the same bits."""
     found: list[dict[str, bytes]] = []
@@ -257,18 +264,26 @@ def same_archives(a: Path, b: Path) -> None:
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize("command", ["run", "compare"])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_killed_and_resumed_ends_in_the_same_bits(tmp_path, command, seed):
+def killed(arguments: list[str], cpu_s: float) -> None:
+    """A command that writes checkpoints half of the time."""
+    checkpoint.EVERY_S, checkpoint.SHARE = 0.0, 1.0
+    command(arguments, cpu_s)
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("processes")
+@pytest.mark.parametrize("name", ["run", "compare"])
+@pytest.mark.parametrize("seed", seeds(4, 1))
+def test_killed_and_resumed_ends_in_the_same_bits(tmp_path, name, seed):
     out = tmp_path / "out"
-    target = out / "a.h5" if command == "run" else out / "city" / "archive.h5"
-    arguments = [command, CITY, "--out", str(target if command == "run" else out)]
+    target = out / "a.h5" if name == "run" else out / "city" / "archive.h5"
+    more = [] if WHOLE or name == "run" else ["--no-figures"]
+    arguments = [name, CITY, *more, "--out", str(target if name == "run" else out)]
     rng = np.random.default_rng(seed)
     for _ in range(3):
-        process = subprocess.Popen([sys.executable, "-c", SLOWLY, *arguments, "--resume"], stdout=subprocess.DEVNULL)
-        time.sleep(rng.uniform(1.0, 4.0))
-        process.kill()
-        process.wait()
+        call = (killed, [*arguments, "--resume"], rng.uniform(0.1, 0.5))
+        assert processes(call)[0] in (-signal.SIGPROF, 0)
+    assert not target.exists() and list(out.rglob("*checkpoint*"))
     assert main([*arguments, "--resume"]) == 0
     assert not list(out.rglob("*checkpoint*")) and not list(out.rglob(".ekfslam*"))
     resumed = Path(shutil.move(target, tmp_path / "resumed.h5"))
@@ -279,7 +294,7 @@ def test_killed_and_resumed_ends_in_the_same_bits(tmp_path, command, seed):
 def test_an_interruption_keeps_the_checkpoint_and_an_error_does_not(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
     out = tmp_path / "a.h5"
-    arguments = ["run", "builtin:city?frames=40", "--out", str(out)]
+    arguments = ["run", "builtin:city?frames=12", "--out", str(out)]
     for error, kept in ((KeyboardInterrupt(), True), (ResumeError("of something else"), True), (OSError("gone"), True)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(runner, "collect", lambda reports, error=error: (_ for _ in ()).throw(error))
@@ -292,34 +307,30 @@ def test_an_interruption_keeps_the_checkpoint_and_an_error_does_not(tmp_path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
-STUDY = """
-import os, signal, sys
-from test_montecarlo import Study, short
-from ekfslam.studies import study as montecarlo
-from ekfslam.studies.executors import SerialExecutor
+def study_killed(path: Path, after: int) -> None:
+    began, true_run = path.with_name("began"), montecarlo.run_one
 
-true_run, after = montecarlo.run_one, int(sys.argv[2])
-def counted(study, level, run):
-    print(level, run, flush=True)
-    if counted.done == after:
-        os.kill(os.getpid(), signal.SIGKILL)
-    counted.done += 1
-    return true_run(study, level, run)
-counted.done = 0
-montecarlo.run_one = counted
-montecarlo.run_study(Study(short("mid", 6), ("invariant",), runs=6, seed=2), sys.argv[1], SerialExecutor(), False)
-"""
+    def counted(study, level, run):
+        with began.open("a") as log:
+            log.write(f"{level} {run}\n")
+        if len(began.read_text().splitlines()) > after:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return true_run(study, level, run)
+
+    montecarlo.run_one = counted
+    run_study(Study(short("mid", 6), ("invariant",), runs=6, seed=2), path, SerialExecutor(), False)
 
 
 def study_process(path: Path, after: int) -> list[str]:
     """The runs that a process began which is killed in the midst of one."""
-    tests = Path(__file__).parent
-    program = f"import sys; sys.path[:0] = [{str(tests)!r}, {str(tests.parent)!r}]\n{STUDY}"
-    done = subprocess.run([sys.executable, "-c", program, str(path), str(after)], capture_output=True, text=True)
-    assert done.returncode in (0, -9), done.stderr
-    return done.stdout.split("\n")[:-1]
+    assert processes((study_killed, path, after))[0] in (0, -signal.SIGKILL)
+    began = path.with_name("began")
+    lines = began.read_text().splitlines()
+    began.unlink()
+    return lines
 
 
+@pytest.mark.xdist_group("processes")
 def test_a_killed_study_keeps_every_finished_run(tmp_path):
     assert study_process(tmp_path / "a.h5", 2) == ["mid 0", "mid 1", "mid 2"]
     assert [path.name for path in tmp_path.iterdir()] == [".a.h5.journal"], "no archive yet: it was too quick"

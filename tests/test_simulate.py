@@ -338,6 +338,7 @@ def test_unknown_world_names_the_known_ones():
         ("loop?sigma_px=-1", "sigma_px must be finite and not negative"),
         ("loop?sigma_v_m_s=nan", "sigma_v_m_s must be finite"),
         ("loop?radius_m=0", "radius_m must be positive"),
+        ("loop?radius_m=2&landmark_offset_m=3", "landmark_offset_m leaves no room .* at least 3.6"),
         ("city?outlier_fraction=1.5", r"outlier_fraction must be in \[0, 1\]"),
     ],
 )

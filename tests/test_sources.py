@@ -360,6 +360,8 @@ BROKEN_PLAIN: list[tuple[Callable[[Path], Any], type[EkfslamError], str]] = [
     (replace(FILE, "times =", "rate_hz = -1.0 #"), CalibrationError, "rate_hz"),
     (replace(FILE, "T_right_left =", "#"), CalibrationError, "either T_right_left or baseline_m"),
     (replace(FILE, "T_right_left =", "baseline_m = 'far' #"), CalibrationError, "baseline_m"),
+    (replace(FILE, "T_right_left =", f"baseline_m = 1{'0' * 400} #"), CalibrationError, "baseline_m"),
+    (replace(FILE, "T_right_left =", f"T_right_left = [[1{'0' * 400}]] #"), CalibrationError, "T_right_left"),
     (replace(FILE, "[[1,", "[[2,"), ExtrinsicsError, "T_right_left"),
     (replace(FILE, "-0.54", "'a'"), CalibrationError, "T_right_left: expected 4 x 4 numbers"),
     (replace(FILE, "-0.54", "nan"), CalibrationError, "T_right_left"),

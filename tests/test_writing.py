@@ -8,14 +8,13 @@ import signal
 import stat
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import WHOLE
+from conftest import WHOLE, command, processes, seeds
 
 from ekfslam import files
 from ekfslam.cli import main
@@ -122,20 +121,13 @@ WRITING = {
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("run") / "full.h5"
-    assert main(["run", "builtin:city?frames=60", "--out", str(path)]) == 0
+    assert main(["run", CITY, "--out", str(path)]) == 0
     return path
-
-
-@pytest.fixture
-def drawn_already(monkeypatch) -> None:
-    """Figures take most of the time, and only their sizes matter here."""
-    for place in ("figures.style", "reports"):
-        monkeypatch.setattr(f"ekfslam.{place}.png", lambda *_: b"as large as a figure" * 1500)
 
 
 @pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])
 @pytest.mark.parametrize("size", [0, 5_000])
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, archive, drawn_already, command, size):
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, archive, undrawn, command, size):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
     arguments = [part.format(folder=tmp_path / "out", archive=here) for part in WRITING[command]]
@@ -151,7 +143,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, arc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])
-def test_a_full_disk_of_any_size(tmp_path, capsys, archive, drawn_already, command):
+def test_a_full_disk_of_any_size(tmp_path, capsys, archive, undrawn, command):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
     arguments = [part.format(folder=tmp_path / "out", archive=here) for part in WRITING[command]]
@@ -160,7 +152,7 @@ def test_a_full_disk_of_any_size(tmp_path, capsys, archive, drawn_already, comma
     largest = max(len(value) for name, value in before.items() if name.startswith("out"))
     if command == "posterior":
         largest = len(before["full.h5"])
-    for size in np.geomspace(1, largest - 1, 20 if WHOLE else 6).astype(int):
+    for size in np.geomspace(1, largest - 1, 20 if WHOLE else 4).astype(int):
         capsys.readouterr()
         with disk_of(int(size)):
             assert main(arguments) == 2
@@ -192,7 +184,9 @@ def test_a_full_output_is_one_line(tmp_path):
     assert "No space left" in done.stderr
 
 
-@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-", "<&-"])
+@pytest.mark.parametrize(
+    "closed", [">&- 2>&-", *(pytest.param(one, marks=pytest.mark.slow) for one in (">&-", "2>&-", "<&-"))]
+)
 def test_closed_streams_are_no_error(tmp_path, closed):
     done = subprocess.run(
         f"{sys.executable} -m ekfslam.cli run {CITY} --mode dead-reckoning --out {tmp_path}/a.h5 {closed}",
@@ -219,15 +213,12 @@ def test_scraps_of_dead_processes_go_with_the_next_writing(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"a", alive.name}
 
 
+@pytest.mark.xdist_group("processes")
 def test_two_who_add_to_one_archive_lose_nothing(tmp_path, archive):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
-    program = [sys.executable, "-m", "ekfslam.cli", "posterior", str(here)]
-    both = [
-        subprocess.Popen([*program, *more, "--out", str(tmp_path / name)], stdout=subprocess.DEVNULL)
-        for name, more in (("map", []), ("filtered", ["--linearisation", "filtered"]))
-    ]
-    assert [process.wait() for process in both] == [0, 0]
+    add = ["posterior", str(here), "--no-figures"]
+    assert processes((command, add), (command, [*add, "--linearisation", "filtered"])) == [0, 0]
     assert sorted(read_archive(here).results) == ["as filtered", "full", "smoothed"]
 
 
@@ -239,7 +230,7 @@ def test_a_posterior_is_not_added_to_another_run(tmp_path, archive, capsys, monk
     true_smooth = posterior.smooth
 
     def replaced_meanwhile(*arguments):
-        assert main(["run", "builtin:city?frames=60", "--variant", "standard", "--out", str(here)]) == 0
+        assert main(["run", CITY, "--variant", "standard", "--out", str(here)]) == 0
         return true_smooth(*arguments)
 
     monkeypatch.setattr(posterior, "smooth", replaced_meanwhile)
@@ -248,23 +239,20 @@ def test_a_posterior_is_not_added_to_another_run(tmp_path, archive, capsys, monk
     assert list(read_archive(here).results) == ["full"]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.xdist_group("processes")
+@pytest.mark.parametrize("seed", seeds(50, 6))
 def test_a_kill_leaves_an_archive_or_none(tmp_path, seed):
     out = tmp_path / "a.h5"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "ekfslam.cli", "run", CITY, *QUICK, "--out", str(out)], stdout=subprocess.DEVNULL
-    )
-    time.sleep(np.random.default_rng(seed).uniform(0.2, 1.5))
-    process.kill()
-    process.wait()
+    call = ["run", CITY, *QUICK, "--out", str(out)]
+    assert processes((command, call, np.random.default_rng(seed).uniform(0.01, 0.08)))[0] in (-signal.SIGPROF, 0)
     if out.exists():
         read_archive(out)
-    assert main(["run", CITY, *QUICK, "--out", str(out)]) == 0
+    assert main(call) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
 @pytest.mark.parametrize("kind", ["text", "recording", "another seed", "damaged"])
-def test_what_is_no_earlier_result_of_the_same_needs_force(tmp_path, capsys, monkeypatch, kind):
+def test_what_is_no_earlier_result_of_the_same_needs_force(tmp_path, capsys, undrawn, kind):
     out = tmp_path / "city" / "archive.h5"
     out.parent.mkdir()
     if kind == "text":
@@ -306,9 +294,9 @@ def test_other_files_of_the_user_are_not_overwritten(tmp_path, capsys, archive, 
             assert main([*arguments, "--out", str(notes), *more]) == 0
 
 
-def test_figures_of_an_earlier_run_do_not_stay_beside_a_new_archive(tmp_path):
+def test_figures_of_an_earlier_run_do_not_stay_beside_a_new_archive(tmp_path, undrawn):
     folder = tmp_path / "city"
-    full = ["compare", "builtin:city?frames=60", "--out", str(tmp_path)]
+    full = ["compare", CITY, "--out", str(tmp_path)]
     assert main([*full, "--modes", "full", "smoothed"]) == 0
     assert main(["check", str(folder / "archive.h5")]) == 0
     (folder / "mine.png").write_bytes(b"no figure of ours")

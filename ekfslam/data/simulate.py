@@ -178,6 +178,15 @@ class Loop(Recording):
     landmark_offset_m: float = 16.0
     landmark_height_m: float = 4.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        least = ROAD_HALF_WIDTH_M - 0.2 * self.radius_m
+        if self.landmark_offset_m < least:
+            raise ConfigError(
+                f"{self.name}: landmark_offset_m leaves no room beside the road: must be at least {least:g} where "
+                f"radius_m is {self.radius_m:g}, found {self.landmark_offset_m:g}"
+            )
+
     @property
     def in_view(self) -> float:
         return float(self.landmarks)

@@ -261,5 +261,6 @@ def chi2_bounds(dof: ArrayLike, probability: float, runs: ArrayLike = 1) -> tupl
     tails = (1.0 - probability) / 2.0
     runs = np.asarray(runs)
     total = np.asarray(dof) * runs
-    # Those of scipy.stats.chi2, whose import takes as long as that of everything else.
+    total = np.where(total > 0, total, np.nan)
+    # As `scipy.stats.chi2` does, whose import takes longer than a short run.
     return 2.0 * gammaincinv(total / 2.0, tails) / runs, chdtri(total, tails) / runs

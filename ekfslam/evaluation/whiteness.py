@@ -9,7 +9,6 @@ Econometrica 55, 1987. Its relative standard error over T samples is about ``sqr
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import gammainc, gammaincinv
 
 from ekfslam.arrays import Array, IntArray
@@ -105,6 +104,8 @@ def gated_scale(mean: float, dimension: int, probability: float) -> float:
 
     if accepted_mean(_LARGEST_SCALE) <= mean:
         return _LARGEST_SCALE
+    from scipy.optimize import brentq  # takes longer to import than a short run
+
     return float(brentq(lambda scale: accepted_mean(scale) - mean, 1e-6 * mean, _LARGEST_SCALE))
 
 

@@ -9,7 +9,6 @@ never corrects a pose are grey.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import wraps
 from io import BytesIO
 from pathlib import Path
@@ -27,10 +26,10 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from ekfslam import files
+from ekfslam.figures.older import MADE_BY
 from ekfslam.names import components
 
 DPI = 150
-MADE_BY = "ekfslam"  # in every figure
 
 BLACK, DARK_GREY, GREY = "black", "0.35", "0.60"
 BLUE, SKY_BLUE = "#0072B2", "#56B4E9"
@@ -208,13 +207,3 @@ def save_all(
     contents = pngs(directory, figures, packed, format)
     files.write_all(contents)
     return list(contents)
-
-
-def older_figures(directory: Path) -> list[Path]:
-    """The figures in a folder that `png` has made."""
-    found = []
-    for path in sorted(directory.glob("*.png")):
-        with suppress(OSError, ValueError, SyntaxError), Image.open(path) as picture:
-            if picture.info.get("Software") == MADE_BY:
-                found.append(path)
-    return found

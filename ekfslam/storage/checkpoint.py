@@ -114,7 +114,8 @@ class _Packer:
         if owner is not array:
             offset = array.__array_interface__["data"][0] - owner.__array_interface__["data"][0]
             return ["view", self.node(owner), offset, dtype, shape, strides, array.flags.writeable]
-        content = array.transpose(np.argsort(strides, kind="stable")[::-1]).tobytes()
+        as_it_lies = array if array.flags.c_contiguous else array.transpose(np.argsort(strides, kind="stable")[::-1])
+        content = as_it_lies.tobytes()
         begin, self._size = self._size, self._size + len(content)
         self.memory.append(content)
         return ["array", begin, len(content), dtype, shape, strides, array.flags.writeable]

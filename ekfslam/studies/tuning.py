@@ -41,7 +41,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, IntArray
 from ekfslam.config import Config, NoiseConfig, NoiseModel
 from ekfslam.data.hygiene import clean_tracks
 from ekfslam.data.sequence import Noise, Observations, Sequence
@@ -225,8 +225,31 @@ def tune(
     model: NoiseModel = "white" if config.noise.model == "white" else "tuned"
     base = noise_of(sequence, dataclasses.replace(config, noise=NoiseConfig(model=model, drift=config.noise.drift)))
     found = velocity_noise(sequence.twist)
-    floor = base.motion_std[[0, 3]] if base.track_error is None else NOISY_FROM[[0, 3]]
+    start, free = _looked_for(base, found, drift)
+    parts, gated, ungated = parts_of(sequence, config, base, observations)
+    frames = sum(len(part) for part in parts)
+    with one_thread():
+        if not free:
+            here = sum(float(log_likelihoods(part, base, gated).sum()) for part in parts)
+            given = tuple(_as_it_is(name, start[name], found) for name in start)
+            return TunedNoise(sequence.name, model, given, found, here, frames, len(parts), converged=True)
+        problem = _Problem(parts, base, free, gated, ungated)
+        peak = _climbed(problem, start, f"{sequence.name}: tuning")
+    return TunedNoise(
+        sequence=sequence.name,
+        model=model,
+        estimates=_estimates(start, free, peak, found),
+        found=found,
+        log_likelihood=peak.log_likelihood,
+        frames=frames,
+        runs=peak.runs,
+        converged=peak.converged,
+    )
 
+
+def _looked_for(base: Noise, found: VelocityNoise, drift: bool) -> tuple[dict[str, float], list[str]]:
+    """Where parameters start, and which of them the likelihood is asked for."""
+    floor = base.motion_std[[0, 3]] if base.track_error is None else NOISY_FROM[[0, 3]]
     start = {
         "sigma_v_m_s": found.sigma[0] or base.twist_std[0],
         "sigma_w_rad_s": found.sigma[1] or base.twist_std[3],
@@ -238,86 +261,112 @@ def tune(
     if drift:
         start["drift"] = 0.2 if base.track_walk_px is None else float(base.track_walk_px[0])
         free.append("drift")
+    return start, free
 
-    parts, gated, ungated = parts_of(sequence, config, base, observations)
-    if not free:
-        with one_thread():
-            here = sum(float(log_likelihoods(part, base, gated).sum()) for part in parts)
-        given = tuple(_as_it_is(name, start[name], found) for name in start)
-        frames = sum(len(part) for part in parts)
-        return TunedNoise(sequence.name, model, given, found, here, frames, len(parts), converged=True)
-    bounds = np.log([PARAMETERS[name][1] for name in free])
-    x = np.clip(np.log([start[name] for name in free]), *bounds.T)
+
+@dataclass(frozen=True)
+class _Problem:
+    """What is filtered, under which noise, with which parameters free, with the gate and without it."""
+
+    parts: list[Sequence]
+    base: Noise
+    free: list[str]
+    gated: Config
+    ungated: Config
+
+    @property
+    def bounds(self) -> Array:
+        """(n, 2) of the logarithms of the free parameters."""
+        return np.log([PARAMETERS[name][1] for name in self.free])
+
+    def judged(self, x: Array) -> Callable[[Array], Array]:
+        """The terms of log L with what is rejected at x left out: of every frame, and last of all that is rejected."""
+        noise = _loose(_with(self.base, self.free, x))
+        kept, rejected = zip(*(without_rejected(part, noise, self.gated) for part in self.parts), strict=True)
+
+        def terms(x: Array) -> Array:
+            noise = _with(self.base, self.free, x)
+            by_frame = [log_likelihoods(part, noise, self.ungated) for part in kept]
+            return np.concatenate([*by_frame, [sum(rejected) * _LOG_WRONG]])
+
+        return terms
+
+
+@dataclass(frozen=True)
+class _Peak:
+    """The maximum of the likelihood: logarithms (n,), Hessian (n, n), gradients (n, T) of the frames."""
+
+    x: Array
+    inside: IntArray
+    H: Array
+    gradients: Array
+    log_likelihood: float
+    runs: int
+    converged: bool
+
+
+def _climbed(problem: _Problem, start: dict[str, float], label: str) -> _Peak:
+    """The maximum, found in rounds as the module's docstring says."""
+    bounds = problem.bounds
+    x = np.clip(np.log([start[name] for name in problem.free]), *bounds.T)
     best, step, here, converged, runs = x, np.zeros(len(x)), -np.inf, False, 0
-    with one_thread():
-        for _ in progress(range(_MOST_ROUNDS), f"{sequence.name}: tuning", unit="round"):
-            noise = _loose(_with(base, free, x))
-            kept, rejected = zip(*(without_rejected(part, noise, gated) for part in parts), strict=True)
-
-            def terms(x: Array, kept: tuple[Sequence, ...] = kept, rejected: int = sum(rejected)) -> Array:
-                noise = _with(base, free, x)
-                by_frame = [log_likelihoods(part, noise, ungated) for part in kept]
-                return np.concatenate([*by_frame, [rejected * _LOG_WRONG]])
-
-            now = terms(x)
-            runs += 2
-            if now.sum() <= here:
-                step = step / 2  # more was thrown away than the rest has won
-            else:
-                here, best, at_best = float(now.sum()), x, terms
-                gradients, curvature, beside = _derivatives(terms, x, here)
-                gradient = gradients.sum(axis=1)
-                runs += 2 * len(x)
-                step = np.clip(gradient / np.maximum(np.abs(curvature), 1e-9), -_LONGEST_STEP, _LONGEST_STEP)
-                step = np.clip(x + step, *bounds.T) - x
-            x = best + step
-            if np.abs(step).max() < _SHORTEST_STEP:
-                converged = True
-                break
-        H = _hessian(at_best, best, here, curvature, beside)
-        runs += len(x) * (len(x) - 1) // 2
-    if not converged:
-        x = best
+    for _ in progress(range(_MOST_ROUNDS), label, unit="round"):
+        terms = problem.judged(x)
+        now = terms(x)
+        runs += 2
+        if now.sum() <= here:
+            step = step / 2  # more was thrown away than the rest has won
+        else:
+            here, best, at_best = float(now.sum()), x, terms
+            gradients, curvature, beside = _derivatives(terms, x, here)
+            gradient = gradients.sum(axis=1)
+            runs += 2 * len(x)
+            step = np.clip(gradient / np.maximum(np.abs(curvature), 1e-9), -_LONGEST_STEP, _LONGEST_STEP)
+            step = np.clip(x + step, *bounds.T) - x
+        x = best + step
+        if np.abs(step).max() < _SHORTEST_STEP:
+            converged = True
+            break
+    H = _hessian(at_best, best, here, curvature, beside)
+    runs += len(x) * (len(x) - 1) // 2
+    x = x if converged else best
     inside = np.flatnonzero((x > bounds[:, 0]) & (x < bounds[:, 1]))
-    H, likely = H[np.ix_(inside, inside)], {}
-    together, errors = np.exp(x), np.full(len(x), np.nan)
-    if len(inside) and np.linalg.eigvalsh(H)[-1] < 0:
-        C = sandwich(H, gradients[inside, :-1])
-        alone = np.sqrt(np.diag(C))
-        likely = {free[i]: (together[i], together[i] * error) for i, error in zip(inside, alone, strict=True)}
-        x_inside, C = with_differences(x[inside], C, [free[i] for i in inside], found)
-        together[inside] = np.exp(x_inside)
-        errors[inside] = together[inside] * np.sqrt(np.diag(C))
+    return _Peak(x, inside, H[np.ix_(inside, inside)], gradients[inside, :-1], here, runs, converged)
 
+
+def _estimates(start: dict[str, float], free: list[str], peak: _Peak, found: VelocityNoise) -> tuple[Estimate, ...]:
+    """All parameters with their standard errors: likelihood and differences, each alone and together."""
+    likely: dict[str, tuple[float, float]] = {}
+    together, errors = np.exp(peak.x), np.full(len(free), np.nan)
+    if len(peak.inside) and np.linalg.eigvalsh(peak.H)[-1] < 0:
+        names = [free[i] for i in peak.inside]
+        C = sandwich(peak.H, peak.gradients)
+        alone = together[peak.inside], np.sqrt(np.diag(C))
+        likely = {name: (value, value * error) for name, value, error in zip(names, *alone, strict=True)}
+        x, C = with_differences(peak.x[peak.inside], C, names, found)
+        together[peak.inside] = np.exp(x)
+        errors[peak.inside] = together[peak.inside] * np.sqrt(np.diag(C))
+    pairs = zip(found.sigma.tolist(), found.sigma_error.tolist(), strict=True)
+    differences = dict(zip(PARAMETERS, pairs, strict=False))
     estimates = []
-    differences = dict(
-        zip(PARAMETERS, zip(found.sigma.tolist(), found.sigma_error.tolist(), strict=True), strict=False)
-    )
     for name in start:
         sigma, sigma_error = differences.get(name, (0.0, 0.0))
         if name not in free:
             estimates.append(_as_it_is(name, start[name], found))
-        elif name in likely:
-            (value, error), i = likely[name], free.index(name)
+            continue
+        i = free.index(name)
+        if name in likely:
+            value, error = likely[name]
             apart = abs(value - sigma) / np.hypot(error, sigma_error)
             remark = f"likelihood and differences are {apart:.1f} standard errors apart" if sigma and apart > 3 else ""
             a, b, c, d = (float(f"{number:.6g}") for number in (together[i], errors[i], value, error))
             estimates.append(Estimate(name, a, b, c, d, remark))
         else:
-            at_bound = free.index(name) not in inside
+            at_bound = i not in peak.inside
             remark = "at the bound of what is looked for" if at_bound else "the likelihood has no maximum here"
-            value = float(f"{together[free.index(name)]:.6g}")
+            value = float(f"{together[i]:.6g}")
             estimates.append(Estimate(name, sigma or value, sigma_error or None, value, remark=remark))
-    return TunedNoise(
-        sequence=sequence.name,
-        model=model,
-        estimates=tuple(estimates),
-        found=found,
-        log_likelihood=here,
-        frames=sum(len(part) for part in parts),
-        runs=runs,
-        converged=converged,
-    )
+    return tuple(estimates)
 
 
 def _as_it_is(name: str, start: float, found: VelocityNoise) -> Estimate:

@@ -19,8 +19,7 @@ from ekfslam.cli.options import (
 )
 from ekfslam.config import MODES
 from ekfslam.evaluation.truth import with_truth_noise
-from ekfslam.figures.style import older_figures
-from ekfslam.reports import remove_figures
+from ekfslam.figures.older import older_figures, remove_figures
 from ekfslam.runner import run
 from ekfslam.storage.archive import archive_image, require_same_origin
 from ekfslam.storage.checkpoint import Checkpoints

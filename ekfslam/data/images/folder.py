@@ -172,7 +172,7 @@ def _numbers(value: Any, shape: tuple[int | None, ...], name: str) -> Array:
     """An array of finite numbers of a shape, where None stands for any length."""
     try:
         found = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = np.full(1, np.nan)
     fits = len(found.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, found.shape, strict=True))
     if not fits or not np.isfinite(found).all():

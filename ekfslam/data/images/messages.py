@@ -66,7 +66,12 @@ class Bag:
         except EkfslamError:
             raise
         except Exception as error:  # a damaged bag makes its decoders raise almost anything
-            text = printable(str(error))[:200] or type(error).__name__
+            about_python = isinstance(
+                error.__context__ or error, AttributeError | TypeError
+            )  # nothing that a user knows
+            text = (
+                "an entry is of a wrong type" if about_python else printable(str(error))[:200] or type(error).__name__
+            )
             raise UnknownFormatError(f"{self.path}: damaged or unknown bag ({text})") from None
 
     def connections(self, *kinds: str) -> list[Any]:

@@ -1,0 +1,29 @@
+"""Figures of earlier runs, found and removed without Matplotlib, whose import takes longer than a short run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from PIL import Image
+
+MADE_BY = "ekfslam"  # in every figure
+
+
+def older_figures(directory: Path) -> list[Path]:
+    """The figures in a folder that `ekfslam.figures.style.png` has made."""
+    found = []
+    for path in sorted(directory.glob("*.png")):
+        with suppress(OSError, ValueError, SyntaxError), Image.open(path) as picture:
+            if picture.info.get("Software") == MADE_BY:
+                found.append(path)
+    return found
+
+
+def remove_figures(older: Iterable[Path], new: Iterable[Path]) -> None:
+    """Remove older figures in whose place there are no new ones, and with ``check.png`` the verdict beside it."""
+    for path in set(older) - set(new):
+        verdict = [path.with_suffix(".md"), path.with_suffix(".json")] if path.name == "check.png" else []
+        for old in (path, *verdict):
+            old.unlink(missing_ok=True)
