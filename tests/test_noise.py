@@ -75,6 +75,7 @@ def test_velocity_noise_of_simulations_is_recovered(world, seed):
     assert (velocity_noise(quiet.twist).sigma < [0.03, 0.003]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_velocity_noise_of_the_recordings(data_path):
     noisy = velocity_noise(open_sequence(data_path("ece276a/0027_dense_noisy.npz")).twist)
@@ -499,6 +500,7 @@ def test_variances_of_tracks_are_those_of_errors_that_walk(memory):
     np.testing.assert_allclose(moving, np.array([2.0, 1.35, 1.35]) * error.walk_std**2)
 
 
+@pytest.mark.slow
 def test_innovations_of_tracks_are_as_large_as_stated():
     """Errors that walk slowly, taken for white ones of the same size, look too small in every frame."""
     nis = {"tracks": [], "white": []}
@@ -514,6 +516,7 @@ def test_innovations_of_tracks_are_as_large_as_stated():
     assert np.mean(nis["white"]) < 0.6
 
 
+@pytest.mark.slow
 def test_landmarks_whose_tracks_err_are_as_uncertain_as_they_are_wrong():
     """What stays along a track no number of frames averages out; taken for white it makes the map overconfident."""
     squares = {"tracks": [], "white": []}
@@ -560,6 +563,7 @@ def test_the_whole_noise_is_stored(tmp_path):
         np.testing.assert_array_equal(value, getattr(result.noise, name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["standard", "fej"])
 def test_the_posterior_of_what_walks_is_the_filter_as_filtered(variant):
     world = without_noise(builtin(f"city?frames={60 if WHOLE else 20}"))
@@ -596,6 +600,7 @@ def test_observations_are_worth_what_is_known_of_the_error_of_their_track():
     assert min(kinds) > 10
 
 
+@pytest.mark.slow
 def test_a_margin_of_the_noise_is_not_allowed_to_single_tracks():
     plain, wide = (moving_world(margin=margin)[0] for margin in (1.0, 3.0))
     found = [

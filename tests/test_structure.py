@@ -93,6 +93,7 @@ def test_the_covariance_is_honest_with_the_sizes_found_and_only_with_them():
     assert np.mean([pose_nees_at_end(one, white) for one in worlds[:4]]) > 3 * high
 
 
+@pytest.mark.slow
 def test_white_noise_is_found_to_be_white():
     choice = choose(world(0, jitter=False), CONFIG, [SHARED, WHITE], runs=10)
     assert choice.chosen.name == "white" and choice.overrides["noise"] == choice.chosen.overrides["noise"]
