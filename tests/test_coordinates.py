@@ -300,7 +300,9 @@ def test_a_first_sight_of_everything_anew_serves():
     assert ekf.updated_pose == "pose"
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(
+    "variant", [v if v == "invariant" else pytest.param(v, marks=pytest.mark.slow) for v in VARIANTS]
+)
 def test_a_loop_closes_with_landmarks_that_come_back(variant):
     """Revival takes rows linearised again, in every variant, and the smoother has the clone as the pose before."""
     world = builtin("loop?frames=100&radius_m=10&landmarks=60")

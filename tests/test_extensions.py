@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import seeds
+from conftest import WHOLE, seeds
 from reference import CAMERA, T_CAM_IMU
 from test_jacobians import central
 
@@ -32,7 +32,7 @@ WALK = np.array([0.2, 0.05, 0.05, 0.01, 0.01, 0.02])
 BIAS = TwistBias(sigma_v_m_s=0.3, sigma_w_rad_s=0.02, time_v_s=5.0, time_w_s=8.0)
 
 
-def walking_world(rng, bias=None, frames=100):
+def walking_world(rng, bias=None, frames=100 if WHOLE else 50):
     """A drive whose true velocities walk, past landmarks about its path; also the true velocities and biases (T, 6)."""
     twist = np.array([6.0, 0, 0, 0, 0, 0.3]) + np.cumsum(WALK * rng.standard_normal((frames, 6)), axis=0)
     time_s, offset = 0.1 * np.arange(frames), np.zeros((frames, 6))
@@ -43,8 +43,9 @@ def walking_world(rng, bias=None, frames=100):
             offset[k] = phi * offset[k - 1] + std * rng.standard_normal(6)
     T_imu_world = motion.integrate(np.eye(4), twist, np.diff(time_s))
     T_world_imu = se3.inverse(T_imu_world)
-    anchor = rng.integers(0, frames, 150)
-    points = se3.apply(T_world_imu[anchor], rng.uniform([6, -6, -2], [25, 6, 4], (150, 3)))
+    many = 3 * frames // 2
+    anchor = rng.integers(0, frames, many)
+    points = se3.apply(T_world_imu[anchor], rng.uniform([6, -6, -2], [25, 6, 4], (many, 3)))
     q = se3.apply((T_CAM_IMU @ T_imu_world)[:, None], points)
     pixels = camera.project(CAMERA, np.where(q[..., 2:] > 1, q, 1.0))
     inside = (q[..., 2] > 3) & (q[..., 2] < 30) & (np.abs(pixels[..., :2] - [600, 180]) < [600, 300]).all(axis=-1)
@@ -64,19 +65,24 @@ def walking_world(rng, bias=None, frames=100):
     return sequence, twist, offset
 
 
-def drive(sequence, sensor, config=OPEN, further=None, **options):
-    """The filter as it ended, pose NEES (T-1,) of the filter, and the smoothed posterior with its pose NEES."""
+def filtered(sequence, sensor, config=OPEN, further=None, **options):
+    """The filter as it ended, and its pose NEES (T-1,)."""
     ekf = JointEKF(sensor, config, sequence.initial_T_world_imu, **options)
     T, P = [], []
     with one_thread():
         for _ in run_filter(ekf, sequence, further=further):
             T.append(ekf.T_world_imu)
             P.append(ekf.P[:6, :6].copy())
+    return ekf, nees(pose_error(np.array(T), sequence.truth.T_world_imu)[1:], np.array(P)[1:])
+
+
+def drive(sequence, sensor, config=OPEN, further=None, **options):
+    """As `filtered`, and the smoothed posterior with its pose NEES."""
+    ekf, of_filter = filtered(sequence, sensor, config, further, **options)
+    with one_thread():
         smoothed = posterior_of_log(ekf.log(), ekf.model, ekf.landmarks().position_m, SMOOTHED)
-    truth = sequence.truth.T_world_imu
-    filtered = nees(pose_error(np.array(T), truth)[1:], np.array(P)[1:])
-    behind = nees(pose_error(smoothed.T_world_imu, truth)[1:], smoothed.pose_covariance[1:])
-    return ekf, filtered, smoothed, behind
+    behind = nees(pose_error(smoothed.T_world_imu, sequence.truth.T_world_imu)[1:], smoothed.pose_covariance[1:])
+    return ekf, of_filter, smoothed, behind
 
 
 @pytest.mark.slow
@@ -87,12 +93,12 @@ def test_a_bias_of_the_velocities_is_found_consistently(with_twist):
     for seed in (drives := seeds(20, 6)):
         sequence, _, offset = walking_world(np.random.default_rng(seed), BIAS)
         noise = sequence.noise if with_twist else NOISE
-        ekf, filtered, smoothed, behind = drive(sequence, Rig(CAMERA, T_CAM_IMU, noise), blocks=[BIAS])
+        ekf, of_filter, smoothed, behind = drive(sequence, Rig(CAMERA, T_CAM_IMU, noise), blocks=[BIAS])
         at = ekf.model.layout["twist_bias"]
-        found["filter"].append(filtered.mean())
+        found["filter"].append(of_filter.mean())
         found["smoother"].append(behind.mean())
         found["bias"].append(nees(offset[-1:] - ekf.values["twist_bias"], ekf.P[at, at][None])[0])
-        middle = 50
+        middle = len(sequence) // 2
         error = offset[middle] - smoothed.values["twist_bias"][middle]
         found["smoothed bias"].append(nees(error[None], smoothed.block_covariance("twist_bias")[middle][None])[0])
         # It says more than its prior did.
@@ -104,13 +110,15 @@ def test_a_bias_of_the_velocities_is_found_consistently(with_twist):
     assert all(low < value < high for value in means.values()), means
 
 
+@pytest.mark.slow
 def test_without_its_block_a_bias_spoils_the_covariance():
     with_block, without = [], []
+    bias = TwistBias(0.6, 0.05, 50.0, 50.0)
     for seed in range(4):
-        sequence, _, _ = walking_world(np.random.default_rng(seed), TwistBias(0.6, 0.05, 50.0, 50.0))
+        sequence, _, _ = walking_world(np.random.default_rng(seed), bias, frames=100)
         rig = Rig(CAMERA, T_CAM_IMU, NOISE)
-        with_block.append(drive(sequence, rig, blocks=[TwistBias(0.6, 0.05, 50.0, 50.0)])[1].mean())
-        without.append(drive(sequence, rig)[1].mean())
+        with_block.append(filtered(sequence, rig, blocks=[bias])[1].mean())
+        without.append(filtered(sequence, rig)[1].mean())
     assert np.mean(without) > 2 * np.mean(with_block)
 
 
@@ -125,7 +133,7 @@ def wheels_of(sequence, twist, rng, period_s=0.04):
 
 @pytest.mark.slow
 def test_wheels_beside_an_imu_help_and_stay_consistent():
-    filtered, behind, variance = [], [], {"with": [], "without": []}
+    before, behind, variance = [], [], {"with": [], "without": []}
     for seed in (drives := seeds(20, 6)):
         rng = np.random.default_rng(seed)
         sequence, twist, _ = walking_world(rng)
@@ -136,12 +144,12 @@ def test_wheels_beside_an_imu_help_and_stay_consistent():
         rig = Rig(CAMERA, T_CAM_IMU, sequence.noise)
         ekf, of_filter, _, of_smoother = drive(sequence, rig, further=wheels_of(sequence, twist, rng))
         assert np.unique(ekf.log().velocity_axis[~ekf.log().velocity_is_biased]).tolist() == [0, 5]
-        filtered.append(of_filter.mean())
+        before.append(of_filter.mean())
         behind.append(of_smoother.mean())
         variance["with"].append(np.trace(ekf.P[:6, :6]))
-        variance["without"].append(np.trace(drive(sequence, rig)[0].P[:6, :6]))
+        variance["without"].append(np.trace(filtered(sequence, rig)[0].P[:6, :6]))
     low, high = chi2_bounds(6, 0.95, len(drives))
-    assert low < np.mean(filtered) < high
+    assert low < np.mean(before) < high
     assert low < np.mean(behind) < high
     assert np.mean(variance["with"]) < 0.8 * np.mean(variance["without"])
 
@@ -171,20 +179,20 @@ def test_wheels_belong_to_a_filter_that_estimates_velocities():
 @pytest.mark.slow
 def test_one_camera_maps_consistently():
     """12 drives through the city with the left camera alone: scale comes from the velocities."""
-    filtered, behind, error = [], [], {"camera": [], "reckoned": []}
+    before, behind, error = [], [], {"camera": [], "reckoned": []}
     for seed in (drives := seeds(12, 5)):
-        world = builtin(f"city?frames=100&seed={seed}&outlier_fraction=0")
+        world = builtin(f"city?frames={100 if WHOLE else 60}&seed={seed}&outlier_fraction=0")
         sensor = Monocular(world.camera, world.T_cam_imu, world.noise)
         ekf, of_filter, smoothed, of_smoother = drive(world, sensor, FilterConfig(retire="unseen", retire_after=1))
         assert len(ekf.landmarks()) > 20
-        filtered.append(of_filter.mean())
+        before.append(of_filter.mean())
         behind.append(of_smoother.mean())
         truth = world.truth.T_world_imu[:, :3, 3]
         reckoned = run(world, "dead-reckoning").T_world_imu
         error["camera"].append(np.linalg.norm(smoothed.T_world_imu[:, :3, 3] - truth, axis=1).mean())
         error["reckoned"].append(np.linalg.norm(reckoned[:, :3, 3] - truth, axis=1).mean())
     low, high = chi2_bounds(6, 0.95, len(drives))
-    assert low < np.mean(filtered) < high
+    assert low < np.mean(before) < high
     assert low < np.mean(behind) < high
     assert np.median(error["camera"]) < 0.5 * np.median(error["reckoned"])
 

@@ -52,7 +52,7 @@ def assert_same(sequence, settings, frames, tolerance=1e-9):
     return ekf
 
 
-@pytest.mark.parametrize("coordinates", ["image", "xyz"])
+@pytest.mark.parametrize("coordinates", ["image", pytest.param("xyz", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("variant", ["invariant", "fej", "standard"])
 def test_the_city(variant, coordinates):
     settings = {"filter": {"variant": variant, "landmark_coordinates": coordinates}}
@@ -81,6 +81,7 @@ def test_landmarks_that_come_back(variant):
     assert len(ekf.retired.revived) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["utias/2011_09_26_drive_0001_sync_KLT.mat", "ece276a/0027_dense_noisy.npz"])
 def test_recordings_with_the_automatic_model(data_path, name):

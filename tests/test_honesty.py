@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from conftest import WHOLE, seeds
 
 from ekfslam.data.sequence import Noise
 from ekfslam.data.simulate import CAMERA, T_CAM_IMU, City, simulate
@@ -22,11 +23,11 @@ from ekfslam.smoother.posterior import posterior
 
 SIGMA_V, SIGMA_W, SIGMA_PX = 0.1, 0.004, 0.7
 STATED = Noise.isotropic(SIGMA_V, SIGMA_W, SIGMA_PX)
-SEEDS = pytest.mark.parametrize("seed", range(3))
+SEEDS = pytest.mark.parametrize("seed", seeds(3, 1))
 
 
 def world(seed, **changes):
-    small = {"frames": 300, "max_tracks": 40, "outlier_fraction": 0.0, "loss_probability": 0.02}
+    small = {"frames": 300 if WHOLE else 200, "max_tracks": 40, "outlier_fraction": 0.0, "loss_probability": 0.02}
     noise = {"sigma_v_m_s": SIGMA_V, "sigma_w_rad_s": SIGMA_W, "sigma_px": SIGMA_PX}
     return dataclasses.replace(simulate(City(seed=seed, **{**small, **noise, **changes})), noise=STATED)
 
@@ -80,8 +81,10 @@ def test_a_true_model_is_honest(seed):
     assert found.verdict == "honest as far as innovations can tell"
     assert 0.8 < found.factor < 1.3
     assert abs(found.nis.value - 1) < 4 * found.nis.error < 0.1
+    assert found.agreement == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 @SEEDS
 def test_pixel_noise_understated_twice(seed):
     found = verdict_on(world(seed, sigma_px=2 * SIGMA_PX))
@@ -90,6 +93,7 @@ def test_pixel_noise_understated_twice(seed):
     assert not found.findings  # what the gates reject is explained by it
 
 
+@pytest.mark.slow
 @SEEDS
 def test_velocities_understated_three_times(seed):
     found = verdict_on(world(seed, sigma_v_m_s=3 * SIGMA_V, sigma_w_rad_s=3 * SIGMA_W))
@@ -101,8 +105,9 @@ def test_velocities_understated_three_times(seed):
     assert not found.findings
 
 
+@pytest.mark.slow
 @SEEDS
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("sign", [1, -1] if WHOLE else [-1])
 def test_a_constant_bias_of_the_yaw_rate(seed, sign):
     found = verdict_on(with_yaw_bias(seed, sign * 0.004))
     assert [cause.kind for cause in found.causes] == ["bias"]
@@ -111,6 +116,7 @@ def test_a_constant_bias_of_the_yaw_rate(seed, sign):
     assert "optimistic" in found.verdict and "in yaw" in found.verdict and "deg/s" in found.verdict
 
 
+@pytest.mark.slow
 @SEEDS
 def test_a_slow_drift_that_all_tracks_share(seed):
     found = verdict_on(with_turning_camera(seed))
@@ -119,6 +125,7 @@ def test_a_slow_drift_that_all_tracks_share(seed):
     assert found.tracks.scale == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 @SEEDS
 def test_tracks_whose_errors_walk(seed):
     found = verdict_on(with_walking_tracks(seed))
@@ -127,6 +134,7 @@ def test_tracks_whose_errors_walk(seed):
     assert (found.tracks.correlation[1] > 0.5).all()
 
 
+@pytest.mark.slow
 @SEEDS
 def test_outliers(seed):
     found = verdict_on(world(seed, outlier_fraction=0.1))
@@ -136,6 +144,7 @@ def test_outliers(seed):
     assert found.rejections.expected < 0.005
 
 
+@pytest.mark.slow
 @SEEDS
 def test_a_model_that_fears_too_much(seed):
     stated = Noise.isotropic(3 * SIGMA_V, 3 * SIGMA_W, 3 * SIGMA_PX)
@@ -145,12 +154,12 @@ def test_a_model_that_fears_too_much(seed):
     assert 1 / found.factor == pytest.approx(3.0, abs=0.6)
 
 
+@pytest.mark.slow
 def test_pixels_that_are_better_than_stated_leave_what_landmarks_share():
     stated = Noise.isotropic(SIGMA_V, SIGMA_W, 4 * SIGMA_PX)
     found = verdict_on(dataclasses.replace(world(0), noise=stated))
     assert found.agreement > 1.5
     assert "agreement" in [cause.kind for cause in found.findings]
-    assert verdict_on(world(1)).agreement == pytest.approx(1.0, abs=0.1)
 
 
 # --- the evidence -----------------------------------------------------------------------------------------------------
@@ -222,7 +231,7 @@ def test_blocks_that_follow_their_prior_agree_with_it():
 
 @pytest.fixture(scope="module")
 def one_run() -> Result:
-    return run(world(0, frames=120))
+    return run(world(0, frames=80))
 
 
 def test_smoother_against_filter(one_run):

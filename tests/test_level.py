@@ -508,7 +508,8 @@ CASES = {
     for walks in (True, False)
     for tracks in ERRORS
 }
-# In the reduced form: all pairs of these, of which the images take longest.
+QUICK = ("standard-xyz-all-True-ar", "invariant-xyz-some-False-ar")
+# In the reduced form: all pairs.
 SOME_CASES = [
     "standard-xyz-all-True-ar",
     "standard-image-some-True-ar",
@@ -526,7 +527,7 @@ SOME_CASES = [
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=pytest.mark.slow if "image" in c else ()) for c in (CASES if WHOLE else SOME_CASES)]
+    "case", [pytest.param(c, marks=() if c in QUICK else pytest.mark.slow) for c in (CASES if WHOLE else SOME_CASES)]
 )
 def test_filter_of_everything_equals_the_literal_one(case):
     variant, coordinates, calibrated, walks, errors = CASES[case]
@@ -669,6 +670,7 @@ def test_up_is_found_and_the_trajectory_is_better_for_it(walk, seeds):
     assert min(ratio) > 3
 
 
+@pytest.mark.slow
 def test_a_rig_that_stays_level_loses_nothing():
     level, plain = [], []
     for seed in range(1):

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import WHOLE, seeds
 from helpers import run_joint
 from reference import D, circle_dot, homogeneous, jacobian_of_pi, small_world, stereo_matrix
 from test_jacobians import central
@@ -74,6 +75,7 @@ def test_velocity_noise_of_simulations_is_recovered(world, seed):
     assert (velocity_noise(quiet.twist).sigma < [0.03, 0.003]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_velocity_noise_of_the_recordings(data_path):
     noisy = velocity_noise(open_sequence(data_path("ece276a/0027_dense_noisy.npz")).twist)
@@ -141,7 +143,7 @@ def test_blocks_of_the_automatic_model_give_way_to_what_is_configured():
 
 
 def test_interpolated_velocities_are_trusted_less():
-    world = without_noise(builtin("city?frames=60"))
+    world = without_noise(builtin("city?frames=40&max_tracks=20"))
     gap = dataclasses.replace(world, attributes={**world.attributes, "interpolated": "10-20"})
     problem = build(gap, Config())
     ekf = JointEKF(problem.model, problem.config.filter)
@@ -157,10 +159,11 @@ def test_interpolated_velocities_are_trusted_less():
     assert weight[10:19].max() < 0.5 * np.median(weight[25:])
 
 
+@pytest.mark.slow
 def test_the_walk_of_tracks_is_found_by_innovations():
     """Tracks that err twice as much as the model says have twice the factor; noisy velocities ask for the long run."""
     walk = dataclasses.replace(automatic_noise(np.zeros((100, 6))).track_error, flow_px=np.inf)
-    quiet = builtin("city?frames=120&outlier_fraction=0&sigma_v_m_s=0.01&sigma_w_rad_s=0.0002")
+    quiet = builtin(f"city?frames={120 if WHOLE else 50}&outlier_fraction=0&sigma_v_m_s=0.01&sigma_w_rad_s=0.0002")
     found = []
     for factor in (2.0, 4.0):
         world = tracked(quiet, dataclasses.replace(walk, walk_std=factor * walk.walk_std), 0)
@@ -384,15 +387,16 @@ def test_velocities_that_walk_freely_are_white(variant):
     np.testing.assert_allclose(b.covariance[-1], a.covariance[-1], rtol=2e-2, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_knowing_how_velocities_walk_helps_where_little_is_seen():
-    error = {"white": [], "walk": []}
-    for seed in range(6):
-        world = builtin(f"city?frames=300&max_tracks=2&seed={seed}")
+    error, frames = {"white": [], "walk": []}, 300 if WHOLE else 120
+    for seed in seeds(6, 4):
+        world = builtin(f"city?frames={frames}&max_tracks=2&seed={seed}")
         for name, walk in (("white", None), ("walk", velocity_noise(world.twist).walk.repeat(3))):
             result = run(with_noise(world, twist_walk_std=walk), "full")
             position = result.T_world_imu[:, :3, 3] - world.truth.T_world_imu[:, :3, 3]
             error[name].append(np.sqrt((position**2).sum(axis=1).mean()))
-            assert result.covariance.shape == (300, 6, 6)
+            assert result.covariance.shape == (frames, 6, 6)
     assert np.mean(error["walk"]) < 0.8 * np.mean(error["white"])
 
 
@@ -496,6 +500,7 @@ def test_variances_of_tracks_are_those_of_errors_that_walk(memory):
     np.testing.assert_allclose(moving, np.array([2.0, 1.35, 1.35]) * error.walk_std**2)
 
 
+@pytest.mark.slow
 def test_innovations_of_tracks_are_as_large_as_stated():
     """Errors that walk slowly, taken for white ones of the same size, look too small in every frame."""
     nis = {"tracks": [], "white": []}
@@ -511,6 +516,7 @@ def test_innovations_of_tracks_are_as_large_as_stated():
     assert np.mean(nis["white"]) < 0.6
 
 
+@pytest.mark.slow
 def test_landmarks_whose_tracks_err_are_as_uncertain_as_they_are_wrong():
     """What stays along a track no number of frames averages out; taken for white it makes the map overconfident."""
     squares = {"tracks": [], "white": []}
@@ -545,7 +551,7 @@ def test_drift_scales_how_errors_of_tracks_walk():
 
 
 def test_the_whole_noise_is_stored(tmp_path):
-    world = without_noise(builtin("city?frames=60"))
+    world = without_noise(builtin("city?frames=20"))
     result = run(world, "full")
     write_archive(tmp_path / "a.h5", world, {"full": result})
     read = open_result(tmp_path / "a.h5", "full").noise
@@ -557,9 +563,10 @@ def test_the_whole_noise_is_stored(tmp_path):
         np.testing.assert_array_equal(value, getattr(result.noise, name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["standard", "fej"])
 def test_the_posterior_of_what_walks_is_the_filter_as_filtered(variant):
-    world = without_noise(builtin("city?frames=60"))
+    world = without_noise(builtin(f"city?frames={60 if WHOLE else 20}"))
     settings = dataclasses.replace(STILL, variant=variant, retire="never")
     result = run(world, "full", Config(filter=settings))
     assert result.noise.track_error is not None and result.noise.twist_walk_std is not None
@@ -593,6 +600,7 @@ def test_observations_are_worth_what_is_known_of_the_error_of_their_track():
     assert min(kinds) > 10
 
 
+@pytest.mark.slow
 def test_a_margin_of_the_noise_is_not_allowed_to_single_tracks():
     plain, wide = (moving_world(margin=margin)[0] for margin in (1.0, 3.0))
     found = [

@@ -78,7 +78,7 @@ def test_as_filtered_equals_the_dense_filter(variant, iterations, prior):
 
 @pytest.mark.parametrize("variant", ["standard", "fej"])
 def test_as_filtered_equals_the_dense_filter_with_gates_and_splits(variant):
-    world = builtin("loop?frames=200&outlier_fraction=0.1")
+    world = builtin("loop?frames=100&outlier_fraction=0.1")
     config = FilterConfig(variant=variant, landmark_coordinates="xyz", retire="never", split_after=2)
     ekf, _, reports = run_joint(world, rig_of(world), config)
     assert sum(len(report.split) for report in reports) > 0
@@ -447,6 +447,7 @@ def test_map_is_consistent():
 LOOP = "loop" if WHOLE else "loop?frames=180&radius_m=10&landmarks=50"  # more than two rounds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["standard", "fej"])
 def test_revival_equals_never_retiring(variant):
     world = builtin(LOOP)
@@ -463,6 +464,7 @@ def test_revival_equals_never_retiring(variant):
     assert_equal_to_dense_filter(posterior_of(revived), never)
 
 
+@pytest.mark.slow
 def test_revival_of_the_invariant_variant_is_as_good_as_never_retiring():
     world = builtin(LOOP)
     config = FilterConfig(variant="invariant")

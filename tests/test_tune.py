@@ -232,7 +232,12 @@ def test_moving_tracks_can_be_left_out_alone():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "query",
-    ["frames=150&seed=0&sigma_px=1.0", "frames=150&seed=1&sigma_px=0.5", "frames=150&seed=2", "frames=60&sigma_px=0.3"]
+    [
+        "frames=150&seed=0&sigma_px=1.0",
+        "frames=150&seed=1&sigma_px=0.5",
+        "frames=150&seed=2",
+        "frames=60&sigma_px=0.3&outlier_fraction=0",
+    ]
     if WHOLE
     else ["frames=60&seed=1&sigma_px=0.5"],
 )
