@@ -223,6 +223,24 @@ def test_a_landmark_that_comes_back_is_revived_or_starts_afresh_and_is_counted()
     assert automatic.counts["retired"] == 0
 
 
+@pytest.mark.parametrize(("split_after", "splits"), [(2, True), (3, False)])
+def test_misses_in_a_row_count_on_after_a_landmark_was_away(split_after, splits):
+    world = small_world()
+    observations = world.observations
+    longest = np.bincount(observations.landmark).argmax()
+    track = np.flatnonzero(observations.landmark == longest)
+    pixels = observations.pixels_px.copy()
+    pixels[track[[4, 8]]] += 60.0  # the last before it goes, the first afterwards
+    keep = np.delete(np.arange(len(observations)), track[5:8])
+    gapped = Observations(observations.frame[keep], observations.landmark[keep], pixels[keep])
+    config = Config().with_overrides(
+        {"filter": {"retire": "unseen", "retire_after": 1, "split_after": split_after}, "hygiene": {"jump_sigma": 0.0}}
+    )
+    result = run(dataclasses.replace(world, observations=gapped), "full", config)
+    assert result.counts["revived"] == 1
+    assert ((result.landmarks.id == longest).sum() > 1) == splits
+
+
 def test_what_has_no_depth_is_rejected_whatever_hygiene_does():
     world = small_world()
     pixels = world.observations.pixels_px.copy()

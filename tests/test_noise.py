@@ -35,6 +35,7 @@ from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.smoother.problem import BatchProblem
 from ekfslam.storage.archive import open_result, write_archive
+from ekfslam.studies import automatic
 from ekfslam.studies.automatic import PERSISTENCE, with_track_scale
 
 OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0)
@@ -172,6 +173,16 @@ def test_the_walk_of_tracks_is_found_by_innovations():
     assert found[1] / found[0] == pytest.approx(2.0, rel=0.25)
     assert with_track_scale(Config(), without_noise(builtin("city?frames=60"))).noise.track_scale == PERSISTENCE
     assert with_track_scale(Config(), quiet).noise.track_scale is None  # it states its noise
+
+
+def test_the_factor_is_the_root_of_what_innovations_are_too_large_by(monkeypatch):
+    quiet = without_noise(builtin("city?frames=60&sigma_v_m_s=0.01&sigma_w_rad_s=0.0002"))
+
+    def filtered(_, config):
+        return 1000 * automatic.TARGET * (1.7 / config.noise.track_scale) ** 2, 1000
+
+    monkeypatch.setattr(automatic, "_innovations", filtered)
+    assert with_track_scale(Config(), quiet).noise.track_scale == pytest.approx(1.7)
 
 
 def test_misalignment_is_the_covariance_of_turned_velocities():
