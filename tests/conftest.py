@@ -27,6 +27,15 @@ def seeds(whole: int, reduced: int) -> range:
     return range(whole if WHOLE else reduced)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that share what their module has made run in one process, so that it is made once."""
+    for item in items:
+        if isinstance(item, pytest.Function) and item.get_closest_marker("xdist_group") is None:
+            made = [d for name in item.fixturenames for d in item._fixtureinfo.name2fixturedefs.get(name, ())]
+            if any(definition.scope == "module" for definition in made):
+                item.add_marker(pytest.mark.xdist_group(item.module.__name__))
+
+
 # Copies of a process that has imported the package and has no threads: a new one takes a second to import it.
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["ekfslam.reports", "ekfslam.cli.commands.run", "ekfslam.cli.commands.posterior"])

@@ -68,6 +68,7 @@ PAIRS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "variant", "coordinates"),
@@ -85,6 +86,7 @@ def test_retired_and_never_retired_agree_on_the_recordings(data_path, name, vari
     assert unseen.counts["retired"] > never.counts["retired"]
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_dense_noisy_recording_gains_threefold_over_dead_reckoning(data_path):
     truth = data_path("kitti_odometry_poses/07.txt")

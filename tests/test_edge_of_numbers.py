@@ -56,6 +56,7 @@ def test_nor_do_its_parts(result, part, name):
         dataclasses.replace(result, attributes={"log_likelihood": np.nan})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("states_noise", [True, False])
 def test_where_hygiene_leaves_nothing_every_mode_says_so(tmp_path, capsys, undrawn, states_noise):
     sequence = builtin("city?frames=15")
@@ -145,6 +146,7 @@ def test_velocities_just_below_end_in_a_finite_result_or_a_named_error(scale):
     assert set(comparison.results) | set(comparison.skipped) == {"dead-reckoning", "mapping-only", "full", "smoothed"}
 
 
+@pytest.mark.slow
 def test_a_filter_that_cannot_go_on_does_not_keep_the_others(tmp_path, monkeypatch, undrawn):
     true_run = run
 

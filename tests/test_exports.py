@@ -181,7 +181,9 @@ def test_the_inverse_of_the_information_matrix_is_the_joint_covariance(prior, li
     np.testing.assert_allclose(P / np.outer(std, std), wanted / np.outer(std, std), atol=1e-7)
 
 
-@pytest.mark.parametrize("format", list(EXPORTS))
+@pytest.mark.parametrize(
+    "format", [name if name == "tum" else pytest.param(name, marks=pytest.mark.slow) for name in EXPORTS]
+)
 def test_every_format_is_written_by_the_command_line_and_replaced_only_by_its_like(archive, tmp_path, capsys, format):
     out = tmp_path / f"out.{EXPORTS[format].ending}"
     call = ["export", str(archive), "--format", format, "--out", str(out)]

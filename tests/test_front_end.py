@@ -60,6 +60,7 @@ def test_rotation_of_the_right_camera_is_found(tracked):
     assert (report.rotation_std_px[-1] < 0.5 * report.rotation_std_px[0]).all()
 
 
+@pytest.mark.slow
 def test_from_images_to_poses_without_velocities(tracked):
     sequence, _ = tracked
     assert not sequence.has_velocities
@@ -82,6 +83,7 @@ def test_without_self_calibration_poses_are_worse(room, tracked):
     assert fixed_m > 2.0 * calibrated_m
 
 
+@pytest.mark.slow
 def test_tracks_do_not_depend_on_the_run_nor_much_on_the_prediction(room):
     some = first(room, 6)
     (one, report), (two, _) = track(some), track(some)

@@ -157,6 +157,7 @@ def test_a_study_killed_in_the_middle_goes_on_and_ends_as_if_undisturbed(tmp_pat
     assert all(name.endswith(".tmp") for name in left_over)  # at most what the killed process was writing
 
 
+@pytest.mark.slow
 def test_more_runs_extend_a_study_and_leave_the_old_ones_alone(tmp_path, serial):
     path = tmp_path / "s.h5"
     path.write_bytes(serial.read_bytes())

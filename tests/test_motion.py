@@ -124,6 +124,7 @@ def test_without_ffmpeg_one_line_says_so(sequence, tmp_path, monkeypatch):
         write_animation(tmp_path / "a.mp4", {"full": synthetic_result(sequence, "full")})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["svg", "pdf"])
 def test_vector_graphics_are_the_same_each_time(path, tmp_path, format):
     results = {"full": read_archive(path).results["full"]}

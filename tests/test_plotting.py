@@ -222,6 +222,7 @@ def test_drawing_leaves_no_global_state_behind(sequence, results):
     assert plt.get_fignums() == []
 
 
+@pytest.mark.slow
 def test_parameters_have_a_panel_each_with_units_and_what_was_not_observed(results, tmp_path):
     frames = len(results["full"].time_s)
     value = np.linspace(0, 1, 2 * frames).reshape(frames, 2)

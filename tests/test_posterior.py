@@ -513,6 +513,7 @@ def test_no_information_about_the_gauge_is_gained_across_a_revival(variant):
         assert smallest > 0.99
 
 
+@pytest.mark.slow
 def test_archive_alone_rebuilds_the_posterior(tmp_path):
     world = builtin("loop?frames=60")
     result = run(world, "full")

@@ -12,6 +12,9 @@ from rendered import recording, write_kitti
 import ekfslam
 from ekfslam.models.blocks import OPTIONAL_BLOCKS
 
+# All in one process, so that the page runs once.
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("recipes")]
+
 for package in ("cv2", "pandas", "xarray", "h5netcdf"):
     pytest.importorskip(package)
 

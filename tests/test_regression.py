@@ -63,6 +63,7 @@ def test_records_of_a_study():
     assert differences(found, read(HERE / "study.npz")) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_recordings(name, data_path):
@@ -70,6 +71,7 @@ def test_recordings(name, data_path):
     assert differences(found, frozen_of(name)) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_windows_of_starry_night(data_path):
     assert differences(of_starry_night(data_path(STARRY_NIGHT)), read(HERE / "starry_night.npz")) == {}

@@ -64,6 +64,7 @@ def assert_same(table: SweepTable, other: SweepTable) -> None:
             np.testing.assert_array_equal(values, other.columns[name], name)
 
 
+@pytest.mark.slow
 def test_a_row_is_what_a_run_by_hand_gives(undisturbed):
     assert len(undisturbed) == undisturbed.asked == 2 * 2 * 2 * 2 * 2
     columns = undisturbed.columns
@@ -101,6 +102,7 @@ def killed(study: Path, path: Path, begun: Path, after: int) -> None:
     run_sweep(Sweep.from_toml(study), path, SerialExecutor(), False)
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("processes")
 def test_killed_twice_and_resumed_it_equals_an_undisturbed_one(study, tmp_path, undisturbed):
     path = tmp_path / "sweep.h5"

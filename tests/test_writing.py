@@ -271,6 +271,7 @@ def test_a_kill_leaves_an_archive_or_none(tmp_path, seed):
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["text", "recording", "another seed", "damaged"])
 def test_what_is_no_earlier_result_of_the_same_needs_force(tmp_path, capsys, drawn_already, kind):
     out = tmp_path / "city" / "archive.h5"

@@ -9,6 +9,8 @@ from conftest import WHOLE
 from generators import GENERATORS, Valid, case_of
 from oracle import verdict
 
+pytestmark = pytest.mark.xdist_group("hostile inputs")  # in one process, so that the valid ones are made once
+
 EACH = 14 if WHOLE else 6
 
 
