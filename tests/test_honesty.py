@@ -13,6 +13,7 @@ from ekfslam.data.sequence import Noise
 from ekfslam.data.simulate import CAMERA, T_CAM_IMU, City, simulate
 from ekfslam.errors import HonestyError
 from ekfslam.evaluation import honesty
+from ekfslam.evaluation.consistency import pose_error
 from ekfslam.evaluation.verdict import Honesty, judge
 from ekfslam.figures.check import plot_check
 from ekfslam.filters.result import Parameters, Result, WhitenedInnovations
@@ -238,6 +239,15 @@ def test_smoother_against_filter(one_run):
     smoothed = posterior(one_run)
     found = honesty.smoother_agreement(one_run, smoothed)
     assert 0.5 < found.size.value < 2.5
+    difference = pose_error(one_run.T_world_imu, smoothed.T_world_imu)
+    for axis, std in enumerate(found.std):
+        shares = []
+        for P, after, d in zip(one_run.covariance, smoothed.pose_covariance, difference, strict=True):
+            turned = se3.adjoint(se3.exp(-d))
+            gain = (P - turned @ after @ turned.T)[axis, axis]
+            if P[axis, axis] > 0 and gain > 0.05 * P[axis, axis]:
+                shares.append(d[axis] ** 2 / gain)
+        assert std == pytest.approx(np.sqrt(np.mean(shares)), rel=1e-6)
     # Poses that are beside where they should be, but promise as much as before.
     beside = np.full(6, 3.0) * np.sqrt(one_run.covariance[:, [0], 0])
     bold = dataclasses.replace(one_run, T_world_imu=one_run.T_world_imu @ se3.exp(beside))

@@ -192,6 +192,7 @@ def test_archives_of_one_recording_stand_together(sequence, archive, tmp_path):
     assert together[2].label == "other: full"
     page = report_page(read_archives([archive, other, third]))
     assert page.count('href="#recording-0"') == 3
+    assert '<th scope="col">run</th><th scope="col">ATE [m], unaligned</th>' in page
 
 
 def test_long_series_are_thinned_with_their_ends_and_say_so():
