@@ -27,6 +27,7 @@ def seeds(whole: int, reduced: int) -> range:
     return range(whole if WHOLE else reduced)
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist looks at the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests that share what their module has made run in one process, so that it is made once."""
     for item in items:
