@@ -18,7 +18,7 @@ NOISY = Config().with_overrides({"noise": {"sigma_v_m_s": 0.5, "sigma_w_rad_s": 
 
 @pytest.fixture(scope="module")
 def city():
-    sequence = open_sequence("builtin:city" if WHOLE else "builtin:city?frames=500")
+    sequence = open_sequence("builtin:city" if WHOLE else "builtin:city?frames=300")
     return {mode: summarise(sequence, run(sequence, mode)) for mode in ("dead-reckoning", "mapping-only", "full")}
 
 
@@ -77,7 +77,7 @@ PAIRS = [
 def test_retired_and_never_retired_agree_on_the_recordings(data_path, name, variant, coordinates):
     sequence = open_sequence(data_path(f"ece276a/{name}.npz"))
     assert len(sequence) == LENGTHS[name]
-    sequence = sequence if WHOLE else sequence[:100]
+    sequence = sequence if WHOLE else sequence[:60]
     base = Config().with_overrides({"filter": {"variant": variant, "landmark_coordinates": coordinates}})
     unseen, never = (
         run(sequence, "full", base.with_overrides({"filter": {"retire": retire}})) for retire in ("unseen", "never")

@@ -79,6 +79,7 @@ def assert_same(a, b, where: str = "") -> None:
         assert a == b, where
 
 
+@pytest.mark.slow
 def test_results_come_back_bit_for_bit(written, results):
     read = read_archive(written)
     assert tuple(read.results) == MODES
@@ -87,6 +88,7 @@ def test_results_come_back_bit_for_bit(written, results):
         assert_same(open_result(written, mode), results[mode], mode)
 
 
+@pytest.mark.slow
 def test_the_log_comes_back_bit_for_bit_and_in_units(with_log):
     result = run(builtin("loop?frames=12"), "full")
     assert_same(open_result(with_log, "full").log, result.log)
@@ -112,6 +114,7 @@ def test_a_damaged_log_is_named(with_log, tmp_path):
         open_result(path, "full")
 
 
+@pytest.mark.slow
 def test_adding_a_result_keeps_the_others_and_replaces_its_own(copy, sequence, results):
     added = dataclasses.replace(results["full"], mode="smoothed")
     add_result(copy, added)
@@ -286,6 +289,7 @@ def test_kitti_export_holds_the_upper_rows_exactly(results, tmp_path):
 # Files of earlier releases
 
 
+@pytest.mark.slow
 def test_adding_to_an_archive_of_an_earlier_version_keeps_its_runs_readable(with_log, tmp_path):
     added = run(builtin("loop?frames=12"), "dead-reckoning")
     path = Path(shutil.copy(with_log, tmp_path / "old.h5"))

@@ -385,6 +385,7 @@ def test_broken_images_are_named_when_they_are_loaded(tmp_path, message, error, 
     assert words in str(caught.value) and str(path) in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_bags_are_named_whatever_byte_is_wrong(tmp_path, kind):
     path = write(tmp_path, stereo(), kind)

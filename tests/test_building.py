@@ -295,6 +295,7 @@ def test_recordings_without_velocities_give_none(tmp_path, still):
         attach_velocities(still, tmp_path / "none.txt")
 
 
+@pytest.mark.slow
 def test_velocities_on_the_command_line(tmp_path, world, still, capsys):
     recording, path, out = tmp_path / "a.h5", tmp_path / "velocities.csv", tmp_path / "run.h5"
     write_sequence(still, recording)

@@ -281,6 +281,7 @@ def test_velocities_of_the_first_frame_count_for_its_exposure():
     np.testing.assert_allclose(cross, expected[..., 0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_was_found_is_kept_printed_and_used_by_the_posterior(tmp_path, capsys):
     world = recorded(
         builtin(DRIVE.format(60, 0.02, 0.001)), np.array([0, 0, 0, 0, 0, 0, 0.05, 0, 0]), np.random.default_rng(2)

@@ -32,6 +32,7 @@ def failure(capsys, *arguments):
     return captured.err.strip().splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_compare_writes_archive_summaries_and_figures(tmp_path, capsys, undrawn):
     assert main(["compare", CITY, "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
@@ -85,6 +86,7 @@ def test_the_simulated_file_gives_the_builtin_s_result_to_the_last_bit(tmp_path)
     np.testing.assert_array_equal(a.covariance, b.covariance)
 
 
+@pytest.mark.slow
 def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
     config = tmp_path / "config.toml"
     config.write_text('[noise]\nsigma_px = 2.0\n[filter]\nvariant = "standard"\n')
@@ -193,6 +195,7 @@ def test_posterior_writes_into_the_archive_and_draws(tmp_path, capsys, undrawn):
         assert {"map_before_and_after.png", "sparsity.png"} <= {path.name for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 def test_posterior_of_what_has_none(tmp_path, capsys):
     main(["run", CITY, "--mode", "mapping-only", "--out", str(tmp_path / "o.h5")])
     capsys.readouterr()
@@ -205,6 +208,7 @@ def test_posterior_of_what_has_none(tmp_path, capsys):
     assert "has no log" in failure(capsys, "posterior", tmp_path / "old.h5")
 
 
+@pytest.mark.slow
 def test_check_writes_verdict_evidence_and_figure(tmp_path, capsys, undrawn):
     archive = tmp_path / "city.h5"
     assert main(["run", "builtin:city?frames=25", "--out", str(archive)]) == 0
@@ -285,6 +289,7 @@ def test_one_recording_that_fails_does_not_keep_the_others(tmp_path, capsys, mon
     assert said.err == "ekfslam: error: loop: lost its way\n"
 
 
+@pytest.mark.slow
 def test_compare_goes_on_without_a_posterior_that_is_ill_posed(tmp_path, capsys):
     """Without angular velocity noise the motion rows have no weight; the filter does not mind."""
     assert main(["compare", CITY, "--sigma-w", "0", "--no-figures", "--out", str(tmp_path)]) == 0

@@ -300,6 +300,7 @@ def test_a_first_sight_of_everything_anew_serves():
     assert ekf.updated_pose == "pose"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "variant", [v if v == "invariant" else pytest.param(v, marks=pytest.mark.slow) for v in VARIANTS]
 )

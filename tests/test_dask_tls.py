@@ -56,6 +56,7 @@ def cluster(certificates):
             yield opened
 
 
+@pytest.mark.slow
 def test_work_is_done_over_tls(cluster, certificates):
     assert cluster.scheduler_address.startswith("tls://")
     with dask.config.set(certificates), open_executor(cluster.scheduler_address) as executor:

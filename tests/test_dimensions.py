@@ -72,6 +72,7 @@ def groups(path: Path) -> dict[str, dict[str, h5py.Dataset]]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["archive", "sequence", "study"])
 def test_xarray_opens_every_group(files, kind):
     found = groups(files[kind])
@@ -96,6 +97,7 @@ def test_xarray_opens_every_group(files, kind):
             assert series is None or len(series) == values[name].size
 
 
+@pytest.mark.slow
 def test_values_are_taken_by_stamp_id_and_label(files, full):
     def opened(group):
         return xarray.open_dataset(files["archive"], group=f"runs/full/{group}", engine="h5netcdf").load()
@@ -134,6 +136,7 @@ def test_names_of_dimensions_are_distinct():
     assert len({axis.name for axis in AXES.values()}) == len(AXES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", [1, 2, 3, 4])
 def test_archives_of_every_earlier_version_are_read_and_written_again(version, tmp_path):
     """Files that those releases wrote; what is read of them is what is read after it was written in today's form."""

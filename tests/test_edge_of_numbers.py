@@ -80,6 +80,7 @@ def test_where_hygiene_leaves_nothing_every_mode_says_so(tmp_path, capsys, undra
     assert "full: note: not one observation was used" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_pixel_noise_of_zero_is_refused_by_name():
     sequence = builtin("city?frames=20")
     for std in (np.zeros(4), np.array([1.0, 0.0, 1.0, 1.0])):

@@ -83,6 +83,7 @@ def evo(tmp_path):
     return evaluate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("format", "command", "key"),
     [
@@ -125,6 +126,7 @@ def test_exported_truth_with_gaps_has_its_own_stamps(world, with_gaps, tmp_path,
     np.testing.assert_array_equal(rows[:, 1:4], world.truth.T_world_imu[known, :3, 3])
 
 
+@pytest.mark.slow
 def test_truth_that_cannot_be_exported_is_a_named_error(world, result, with_gaps, tmp_path, capsys):
     path, out = tmp_path / "blind.h5", tmp_path / "truth.txt"
     with pytest.raises(ArchiveError, match=r"gaps\.h5: holds the true pose of 53 of 80 frames.*take tum"):
@@ -140,6 +142,7 @@ def test_truth_that_cannot_be_exported_is_a_named_error(world, result, with_gaps
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_export_takes_whatever_the_archive_holds_and_names_it_otherwise(world, result, tmp_path, capsys):
     path = tmp_path / "loop.h5"
     write_archive(path, world, {"as filtered": dataclasses.replace(result, mode="as filtered")})

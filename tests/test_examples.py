@@ -116,6 +116,7 @@ def test_study(tmp_path):
         assert numbers(lines[f"{level}, standard"])[0] > low
 
 
+@pytest.mark.slow
 def test_live_queue(tmp_path):
     lines = printed("live_queue", tmp_path)
     out_of_order, late = numbers(lines["messages out of order"])

@@ -147,6 +147,7 @@ def test_errors_of_the_g2o_graph_at_the_truth_are_what_their_information_says(wo
     assert abs(np.median(view) - 2.37) < 0.4
 
 
+@pytest.mark.slow
 def test_gtsam_reads_the_graph(full, tmp_path):
     gtsam = pytest.importorskip("gtsam")
     (tmp_path / "city.g2o").write_text(g2o_text(full))
@@ -181,6 +182,7 @@ def test_the_inverse_of_the_information_matrix_is_the_joint_covariance(prior, li
     np.testing.assert_allclose(P / np.outer(std, std), wanted / np.outer(std, std), atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "format", [name if name == "tum" else pytest.param(name, marks=pytest.mark.slow) for name in EXPORTS]
 )

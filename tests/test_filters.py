@@ -201,6 +201,7 @@ def test_conditional_gate_equals_leaving_each_landmark_out(variant):
     assert report.dof == reference.dof
 
 
+@pytest.mark.slow
 def test_a_landmark_that_comes_back_is_revived_or_starts_afresh_and_is_counted():
     world = small_world()
     observations = world.observations

@@ -61,6 +61,7 @@ def test_the_city(variant, coordinates):
     assert ekf.counts["retired"] > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["invariant", "fej", "standard"])
 def test_every_block_and_errors_of_tracks(variant):
     settings = {"filter": {"variant": variant, **PRIOR, "landmark_coordinates": "image"}}
@@ -68,10 +69,12 @@ def test_every_block_and_errors_of_tracks(variant):
     assert_same(with_everything(builtin("city?frames=15")), settings, 15, tolerance=1e-8)
 
 
+@pytest.mark.slow
 def test_iterated_updates():
     assert_same(builtin("city?frames=25"), {"filter": {"iterations": 3}}, 25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["invariant", "fej"])
 def test_landmarks_that_come_back(variant):
     settings = {"filter": {"variant": variant, "retire": "unseen", "retire_after": 3, "landmark_coordinates": "xyz"}}
@@ -88,6 +91,7 @@ def test_recordings_with_the_automatic_model(data_path, name):
     assert_same(open_sequence(data_path(name)), {}, 60 if WHOLE else 25, tolerance=1e-8)
 
 
+@pytest.mark.slow
 def test_relative_poses_are_the_same():
     """What is only considered goes along in both forms."""
     world = builtin("city?frames=40")

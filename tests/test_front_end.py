@@ -250,6 +250,7 @@ def test_a_folder_of_kitti_odometry_is_read(folder, room):
     assert colour.calibration.T_right_left[0, 3] == pytest.approx(-BASELINE_M)
 
 
+@pytest.mark.slow
 def test_every_command_takes_a_folder(folder, tmp_path, capsys):
     from ekfslam.cli import main
 

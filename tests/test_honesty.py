@@ -75,6 +75,7 @@ def verdict_on(sequence) -> Honesty:
     return judge(run(sequence))
 
 
+@pytest.mark.slow
 @SEEDS
 def test_a_true_model_is_honest(seed):
     found = verdict_on(world(seed))
@@ -235,6 +236,7 @@ def one_run() -> Result:
     return run(world(0, frames=80))
 
 
+@pytest.mark.slow
 def test_smoother_against_filter(one_run):
     smoothed = posterior(one_run)
     found = honesty.smoother_agreement(one_run, smoothed)

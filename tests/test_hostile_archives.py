@@ -136,6 +136,7 @@ def test_a_correlation_above_one_is_named(whole, tmp_path):
         read_archive(path)
 
 
+@pytest.mark.slow
 def test_fields_of_a_log_that_contradict_each_other_are_named(whole, tmp_path):
     with h5py.File(whole) as h5file:
         log = {name: item[()] for name, item in h5file["runs/full/log"].items()}

@@ -76,6 +76,7 @@ def test_every_block_and_errors_of_tracks_in_the_city(variant):
     assert_equal_to_frozen_rows(ekf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("blocks", "names"),
     [({"twist_bias": {}}, UNSHARED), pytest.param(BLOCKS, ALL_BLOCKS, marks=pytest.mark.slow)],
@@ -158,6 +159,7 @@ def test_a_loop_closes_under_automatic_noise():
     assert kept[0] == kept[1] and kept[0]["moving"] > 0
 
 
+@pytest.mark.slow
 def test_as_filtered_of_a_run_with_every_block_is_the_filter():
     world = with_everything(builtin("city?frames=25"))
     settings = {

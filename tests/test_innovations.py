@@ -79,6 +79,7 @@ def test_where_nothing_is_left_there_is_no_number():
     np.testing.assert_array_equal(whitened(S, residual), [[np.nan] * 3, [1.0] * 3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["invariant", "fej"])
 def test_a_run_keeps_them(variant):
     world = builtin("city?frames=80&outlier_fraction=0.03")

@@ -99,6 +99,7 @@ def test_the_truth_is_a_line_there_too(data_path, name):
     assert np.median(bends[~inside]) > 1e-3
 
 
+@pytest.mark.slow
 def test_a_recording_says_so_and_remembers_it(tmp_path, capsys):
     fields = ece276a_fields()
     twist = interpolated(np.vstack([fields["linear_velocity"], fields["rotational_velocity"]]).T, 1, 6).T

@@ -517,6 +517,7 @@ def test_description_of_the_packets_is_checked_where_there_is_one(drive):
     assert (caught.value.source, caught.value.index) == (str(path), 9)
 
 
+@pytest.mark.slow
 def test_scrambled_files_never_raise_anything_but_named_errors(drive):
     rng = np.random.default_rng(3)
     files = [drive / STAMPS, drive / PACKET, *drive.parent.glob("calib_*.txt")]

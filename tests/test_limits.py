@@ -57,6 +57,7 @@ def test_an_array_that_claims_more_than_its_file_is_refused(tmp_path):
         open_sequence(path)
 
 
+@pytest.mark.slow
 def test_zeros_that_deflate_to_nothing_are_refused_unread(tmp_path):
     path = tmp_path / "a.npz"
     path = npz_of(path, header((4, 10, LARGE // 40)) + bytes(8 * LARGE // 16))
@@ -87,6 +88,7 @@ def test_a_variable_that_claims_gigabytes_is_refused_unread():
         parse_mat(mat_of(400_000_000, bytes(1_000)), limits.Budget("a.mat"))
 
 
+@pytest.mark.slow
 def test_what_a_variable_has_beyond_its_claim_is_not_decompressed():
     zeros = bytes(100_000_000)
     content = mat_of(1_000, zeros)

@@ -68,6 +68,7 @@ def assert_same(live, ekf):
     np.testing.assert_allclose(live.ekf.P, ekf.P, rtol=0, atol=1e-9 * max(std.max() ** 2, 1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, {"walks": True}, {"filter": {"variant": "standard"}}])
 def test_in_order_it_is_the_batch_filter(settings):
     problem = problem_of(**settings)
@@ -85,6 +86,7 @@ def test_in_order_it_is_the_batch_filter(settings):
     assert (live.counts.taken_in, live.counts.held, live.counts.out_of_order) == (FRAMES, 0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, {"walks": True}])
 def test_delayed_within_the_window_it_is_the_filter_in_order(settings):
     problem, rng = problem_of(**settings), np.random.default_rng(3)
@@ -104,6 +106,7 @@ def test_delayed_within_the_window_it_is_the_filter_in_order(settings):
     assert live.counts.late_images == live.counts.late_velocities == live.counts.held == 0
 
 
+@pytest.mark.slow
 def test_between_images_the_pose_is_the_filters_prediction():
     problem = problem_of()
     sequence = problem.sequence

@@ -93,6 +93,7 @@ def test_dask_workers_give_the_same_bits(tmp_path, serial):
     assert_same_bits(tmp_path / "s.h5", serial)
 
 
+@pytest.mark.slow
 def test_threads_of_one_process_take_turns_and_give_the_same_bits(tmp_path, serial):
     with ThreadPoolExecutor(3) as executor:
         run_study(SMALL, tmp_path / "s.h5", executor)

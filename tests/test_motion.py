@@ -76,6 +76,7 @@ def test_without_rerun_one_line_says_what_to_install(path, tmp_path, monkeypatch
     assert "pip install 'ekfslam[viewer]'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_gif_shows_the_drive_to_its_end(path, tmp_path, capsys):
     target = tmp_path / "drive.gif"
     assert main(["animate", str(path), "--out", str(target), "--pictures", "5", "--per-second", "10"]) == 0

@@ -72,6 +72,7 @@ def test_no_name_leads_out_of_the_folder(tmp_path, name):
     assert read_archive(folder / "archive.h5").name == printable(name)
 
 
+@pytest.mark.slow
 def test_recordings_of_colliding_names_have_folders_of_their_own(tmp_path):
     paths = []
     for i, name in enumerate(("a", "a", "a-2")):
@@ -122,6 +123,7 @@ def test_members_whose_names_cannot_be_printed_are_refused(tmp_path, kind):
         read_archive(tmp_path / "a.h5")
 
 
+@pytest.mark.slow
 def test_modes_of_an_archive_become_no_paths(tmp_path, undrawn):
     sequence = synthetic_sequence(frames=20, landmarks=20)
     results = {mode: synthetic_result(sequence, mode) for mode in ("..", "$a_$")}

@@ -470,6 +470,7 @@ def moving_world(share=0.3, speed=0.3, **changes):
     return tracked(world, world.noise.track_error, 1, movers, speed), movers
 
 
+@pytest.mark.slow
 def test_tracks_that_travel_with_the_rig_are_found_and_listed():
     world, movers = moving_world()
     rejections = (result := run(world, "full", Config(filter=FilterConfig(moving_share=0.1, split_after=3)))).rejections
@@ -483,6 +484,7 @@ def test_tracks_that_travel_with_the_rig_are_found_and_listed():
     assert np.isin(long, rejections.landmark).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_moving_is_for_good_and_never_where_pixels_are_white():
     world, _ = moving_world()
     white = with_noise(world, track_first_px=None, track_walk_px=None)
@@ -561,6 +563,7 @@ def test_drift_scales_how_errors_of_tracks_walk():
     assert with_drift(given, 0.0).track_error is None
 
 
+@pytest.mark.slow
 def test_the_whole_noise_is_stored(tmp_path):
     world = without_noise(builtin("city?frames=20"))
     result = run(world, "full")

@@ -130,6 +130,7 @@ def judged(tmp_path_factory):
     return read_archive(path)
 
 
+@pytest.mark.slow
 def test_evidence_is_that_of_check_and_of_the_truth(judged):
     page, honesty = report_page({"first": judged}), judge(judged.results["full"])
     for name, found, _ in honesty.overview[:-1]:
@@ -177,6 +178,7 @@ def test_only_its_own_script_and_style_may_run(page):
     assert policy.startswith("default-src 'none'")
 
 
+@pytest.mark.slow
 def test_archives_of_one_recording_stand_together(sequence, archive, tmp_path):
     other, third = tmp_path / "other" / "archive.h5", tmp_path / "third" / "archive.h5"
     for path in (other, third):
@@ -215,6 +217,7 @@ def test_command(archive, tmp_path, capsys):
     assert main(["report", str(archive), "a\0b", "--out", str(tmp_path / "b.html")]) == 2, "no name of a file"
 
 
+@pytest.mark.slow
 def test_the_script_draws_without_an_error(archive, tmp_path):
     """In a real browser: maps and plots are there, and nothing complains."""
     browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

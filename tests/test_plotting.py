@@ -210,6 +210,7 @@ def test_files_are_written_and_small(sequence, results, tmp_path):
         assert 5_000 < path.stat().st_size < 400_000, path.name
 
 
+@pytest.mark.slow
 def test_only_figures_with_content_are_written(results, tmp_path):
     paths = save_figures(tmp_path, {"dead-reckoning": results["dead-reckoning"]})
     assert [path.name for path in paths] == ["map.png", "side.png"]

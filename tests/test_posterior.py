@@ -258,6 +258,7 @@ def test_information_equals_dense_least_squares(size, up_to, state):
         np.testing.assert_allclose(found.covariance(some_frames, some, **options), expected, atol=1e-9 * largest)
 
 
+@pytest.mark.slow
 def test_samples_have_the_covariance_they_are_drawn_from():
     system = random_system(np.random.default_rng(3), 4, 5, 0.6)
     structure = Elimination(4, 5, system.frame, system.landmark, np.arange(5), eliminate_up_to=3)
@@ -525,6 +526,7 @@ def test_archive_alone_rebuilds_the_posterior(tmp_path):
         np.testing.assert_array_equal(here.landmark_covariance, there.landmark_covariance)
 
 
+@pytest.mark.slow
 def test_smoothed_result_is_the_posterior():
     world = builtin("loop?frames=60")
     result = run(world, "full")

@@ -67,6 +67,7 @@ def test_box_vehicle_sees_what_is_near_and_ahead():
     assert world.sees(q).tolist() == [True, False, False, True, False]
 
 
+@pytest.mark.slow
 def test_box_experiment_stays_bounded_for_the_invariant_variant():
     for seed in range(2):
         world = published.box_world(0.05, 0.05, 60, seed)
@@ -78,6 +79,7 @@ def test_box_experiment_stays_bounded_for_the_invariant_variant():
         assert figures["position_mean_square_m2"] < 1.0
 
 
+@pytest.mark.slow
 def test_circle_experiment_stays_in_the_plane_and_consistent():
     world = published.circle_world(300)
     np.testing.assert_allclose(world.T_world_imu[240], world.T_world_imu[0], atol=1e-9)
@@ -140,6 +142,7 @@ def test_window_of_a_simulated_loop_is_consistent(variant):
         assert low < window.landmark_nees.mean() < high
 
 
+@pytest.mark.slow
 def test_windows_start_at_a_draw_from_the_prior_of_the_filter():
     sequence = simulate(Loop("loop", frames=30))
     rng = np.random.default_rng(1)

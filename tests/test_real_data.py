@@ -24,7 +24,7 @@ UTIAS = (
 )
 # In the reduced form of the tests: the beginnings of some drives.
 FRAMES = None if WHOLE else 200
-DRIVES = UTIAS if WHOLE else ("09_26_drive_0009", "09_26_drive_0036", "09_30_drive_0020")
+DRIVES = UTIAS if WHOLE else ("09_26_drive_0009", "09_30_drive_0020")
 ODOMETRY = {"0020": "06", "0027": "07", "0042": "01", "0027_dense_noisy": "07"}
 
 
@@ -85,7 +85,7 @@ def test_on_the_drives_full_slam_gains_and_its_covariance_is_honest():
     assert np.median(gains) >= 1.5
     for mode in ("full", "smoothed"):
         nees = np.array([drive[mode]["pose_nees_with_truth_noise_mean"] for drive in drives])
-        assert ((nees > 2.9) & (nees < 12)).mean() > 0.6
+        assert ((nees > 2.9) & (nees < 12)).sum() >= len(drives) - (2 if WHOLE else 1)
         assert nees.max() < 30
         assert np.median([drive[mode]["pose_nees_relative_100_mean"] for drive in drives]) < 20
     assert all(0.5 < drive["full"]["nis_per_dof"] < 1.5 for drive in drives)

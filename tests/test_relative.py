@@ -152,6 +152,7 @@ def test_the_filters_cross_covariance_is_that_of_the_posterior_at_the_later_fram
         assert np.abs(P[:6, 6:] / np.outer(std[:6], std[6:])).max() > 0.1
 
 
+@pytest.mark.slow
 def test_the_invariant_filters_motions_do_not_depend_on_where_the_world_is():
     """The world's place is gauge: however uncertain, it must cancel, through every correction in between."""
     found = []
@@ -257,6 +258,7 @@ def test_pairs_are_so_many_frames_or_metres_apart_and_both_have_truth():
     assert set(standing[1] - standing[0]) == {10, 50, 100}
 
 
+@pytest.mark.slow
 def test_relative_nees_is_six_whatever_the_first_pose_and_with_the_noise_of_the_truth():
     noise = TruthNoise(0.1, 0.1, 0.3, 1.0, 0.005, 0.02, 0.002)
     exact, erring, blind = [], [], []
@@ -290,6 +292,7 @@ def test_a_covariance_that_is_too_small_shows():
 # Archives
 
 
+@pytest.mark.slow
 def test_pairs_are_stored_and_archives_without_them_are_read(tmp_path):
     world = open_sequence("builtin:loop?frames=40")
     result = run(world, "full", Config().with_overrides({"filter": {"relative_frames": 20}}))

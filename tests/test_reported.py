@@ -34,6 +34,7 @@ def over_level_ground(roll_deg, pitch_deg):
     return dataclasses.replace(world, twist=twist, velocity_frame="level"), np.column_stack([roll, pitch])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(3.0, 4.0), (-3.0, 4.0), (3.0, -4.0)])
 def test_roll_to_the_right_and_pitch_nose_down_are_positive(roll_deg, pitch_deg):
     sequence, true = over_level_ground(roll_deg, pitch_deg)
@@ -46,6 +47,7 @@ def test_roll_to_the_right_and_pitch_nose_down_are_positive(roll_deg, pitch_deg)
         assert (np.abs(value - other) > 10 * std).any()
 
 
+@pytest.mark.slow
 def test_tilt_is_given_in_degrees():
     sequence, _ = over_level_ground(0.0, 0.0)
     result = run(sequence, "full", Config(noise=NoiseConfig(tilt_deg=6.0)))

@@ -96,6 +96,7 @@ def interrupted(path: Path, sequence, config: Config, frame: int) -> None:
             run(sequence, "full", config, checkpoints=Thinned(path, True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [name if name in ("city", "conditional") else pytest.param(name, marks=pytest.mark.slow) for name in DRIVES]
 )
@@ -117,6 +118,7 @@ def unfinished(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_what_is_gone_on_with(tmp_path, monkeypatch, unfinished):
     """No run from the beginning that happens to end the same."""
     path, frames = Path(shutil.copy(unfinished, tmp_path)), []
@@ -235,6 +237,7 @@ def test_a_hostile_checkpoint_is_a_named_error(tmp_path, change):
         read(damaged(tmp_path, change), "key")
 
 
+@pytest.mark.slow
 def test_flipped_bytes_of_a_checkpoint_are_named_errors(tmp_path):
     content, rng = image("key", nested()), np.random.default_rng(0)
     refused = 0
@@ -291,6 +294,7 @@ def test_killed_and_resumed_ends_in_the_same_bits(tmp_path, name, seed):
     same_archives(resumed, target)
 
 
+@pytest.mark.slow
 def test_an_interruption_keeps_the_checkpoint_and_an_error_does_not(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
     out = tmp_path / "a.h5"

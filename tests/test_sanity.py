@@ -145,6 +145,7 @@ def inverted() -> Sequence:
     return MISTAKES["T_cam_imu looks inverted"](builtin("loop?frames=60"))
 
 
+@pytest.mark.slow
 def test_lines_are_kept_in_the_archive_and_said(tmp_path, inverted, capsys):
     result = run(inverted)
     before, after = result.remarks
@@ -185,6 +186,7 @@ def test_a_truth_that_only_a_run_can_judge_is_named():
     assert inspect_result(world, result, ()) == ()
 
 
+@pytest.mark.slow
 def test_drift_of_dead_reckoning_is_no_mistake():
     """Mapping-only rejects most of what it sees where dead reckoning has drifted."""
     result = run(open_sequence("builtin:city?frames=300"), "mapping-only")

@@ -42,6 +42,7 @@ def full(compared):
     return compared.results["full"]
 
 
+@pytest.mark.slow
 def test_everything_shows_itself_in_a_few_lines(world, compared, full, tmp_path):
     write_archive(tmp_path / "a.h5", world, compared.results)
     study = Study(runs=3)
@@ -69,6 +70,7 @@ def test_names_from_files_are_no_markup(world):
     assert "<script>" not in named._repr_html_() and "&lt;script&gt;" in named._repr_html_()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", ["map", "plot", "errors"])
 def test_a_result_draws_itself_and_a_notebook_shows_it(world, full, draw):
     figure = getattr(full, draw)(world)

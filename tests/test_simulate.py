@@ -298,6 +298,7 @@ def test_prior_moves_the_whole_truth_and_hides_the_first_pose(loop):
     np.testing.assert_array_equal(moved.twist, loop.twist)
 
 
+@pytest.mark.slow
 def test_prior_has_the_stated_spread():
     world = replace(LOOP, frames=3, initial_position_std_m=0.5, initial_rotation_std_rad=0.1)
     rng = np.random.default_rng(0)

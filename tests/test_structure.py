@@ -133,6 +133,7 @@ def test_numbers_at_dotted_names():
     assert before["noise"]["sigma_px"] == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [1, 2, 5, 9] if WHOLE else [1, 5])
 def test_runs_are_bounded_and_the_outcome_is_the_same_again(runs):
     one = world(0, frames=20)
@@ -150,6 +151,7 @@ def test_candidates_are_judged_without_the_truth():
     assert first[0].chosen.sizes == first[1].chosen.sizes
 
 
+@pytest.mark.slow
 def test_a_candidate_under_which_the_filter_breaks_down_is_named_and_loses(monkeypatch):
     reports = structure.filter_reports
 

@@ -156,6 +156,7 @@ def test_two_dask_workers_give_the_same_table(study, tmp_path, undisturbed):
         assert_same(run_sweep(Sweep.from_toml(study), tmp_path / "sweep.h5", executor), undisturbed)
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_has_a_table_and_an_extended_one_runs_what_is_new(tmp_path, monkeypatch):
     small = Sweep((Recording("builtin:loop?frames=8", "loop"),), modes=("dead-reckoning",), seeds=(1, 2))
     path, ran = tmp_path / "sweep.h5", []
@@ -278,6 +279,7 @@ def test_cases_are_settings_that_belong_together_each_in_its_mode(tmp_path):
         table.groups("colour")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["serial", "processes"])
 def test_columns_of_ones_own_and_prepared_recordings(tmp_path, where):
     world = "builtin:loop?frames=8"
@@ -403,6 +405,7 @@ def test_a_figure_has_no_more_lines_than_one_can_tell_apart():
     assert len(ax.lines) == 24
 
 
+@pytest.mark.slow
 def test_command(tmp_path, capsys):
     study, out = tmp_path / "s.toml", tmp_path / "out"
     study.write_text('recordings = ["builtin:loop?frames=8"]\nmodes = ["dead-reckoning"]\nseeds = [1, 2]')
@@ -429,6 +432,7 @@ def test_command(tmp_path, capsys):
     assert "2 of 2 runs" in found.out, "the table is shown all the same"
 
 
+@pytest.mark.slow
 def test_xarray_opens_the_table(tmp_path, undisturbed):
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("h5netcdf")

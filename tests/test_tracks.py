@@ -498,6 +498,7 @@ def test_dead_reckoning_looks_at_no_tracks(spoilt):
     assert run(spoilt, "dead-reckoning").hygiene is None
 
 
+@pytest.mark.slow
 def test_the_report_comes_back_from_the_archive_and_info_prints_it(spoilt, tmp_path, capsys):
     path = tmp_path / "a.h5"
     config = Config(hygiene=HygieneConfig(min_observations=3))
@@ -531,6 +532,7 @@ def test_info_of_a_recording_prints_the_report_of_the_defaults(data_path, capsys
     assert "hygiene       too short: switched off\n" in printed
 
 
+@pytest.mark.slow
 def test_archives_from_before_hygiene_still_open(spoilt, tmp_path):
     path = tmp_path / "old.h5"
     result = run(spoilt, "full")

@@ -80,6 +80,7 @@ def test_jitter_of_stamps_is_an_error_along_the_motion():
     np.testing.assert_allclose(pose_noise_covariance(NOISE, T[:1], time_s[:1])[0, 0, 0], 0.05**2)
 
 
+@pytest.mark.slow
 def test_nees_against_a_truth_that_errs_is_six_with_its_noise_and_too_large_without():
     with_, without, axes = [], [], []
     for seed in range(60):

@@ -73,6 +73,7 @@ def dense_log_density(ekf, report, measured):
     return -0.5 * (r @ np.linalg.inv(S) @ r + np.log(np.linalg.eigvalsh(S)).sum() + len(r) * np.log(2 * np.pi))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gate", [1.0, 0.99])
 def test_log_likelihood_equals_the_dense_one_also_where_rows_are_taken_out_again(gate, monkeypatch):
     # Where the pose is uncertain the first gate passes outliers that the second then finds, and takes out.
@@ -210,6 +211,7 @@ def test_velocity_noise_is_below_its_limit_also_where_none_is_seen():
     assert below >= 185 and unseen > 20
 
 
+@pytest.mark.slow
 def test_a_run_keeps_the_log_likelihood_of_its_innovations():
     world = builtin("city?frames=40&outlier_fraction=0")
     config = Config(filter=OPEN)
@@ -257,6 +259,7 @@ def test_the_noise_of_simulations_is_recovered(query):
         assert 0.8 < estimate.error / estimate.value * np.sqrt(6 * (len(world) - 1)) < 1.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_px", [0.5, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_little_noise_and_much_are_told_apart_without_outliers(sigma_px):
     world = without_noise(builtin(f"city?frames=24&max_tracks=10&outlier_fraction=0&sigma_px={sigma_px}"))

@@ -51,6 +51,7 @@ def test_covariances_hold_what_they_promise():
     assert (mean > low).all() and (mean < high).all(), (low, mean, high)
 
 
+@pytest.mark.slow
 def test_odometry_follows_the_truth_and_survives_frames_without_tracks():
     sequence = ekfslam.open_sequence("builtin:city?frames=40")
     twist = stereo_odometry(sequence)
@@ -96,6 +97,7 @@ def test_velocities_are_started_once_and_never_measured():
     assert (np.sqrt(np.diag(ekf.gaussian.body_covariance)[at]) < 0.2 * problem.model.noise.twist_std).all()
 
 
+@pytest.mark.slow
 def test_wheels_are_measured_where_nothing_else_is():
     world = ekfslam.open_sequence("builtin:city?frames=30&outlier_fraction=0")
     sequence = without_velocities(with_observations(world, world.observations.frame < 15))
@@ -107,6 +109,7 @@ def test_wheels_are_measured_where_nothing_else_is():
     assert gain[0] < 0.1 and (gain[1:] > 0.5).all(), gain
 
 
+@pytest.mark.slow
 def test_dead_reckoning_is_left_out_of_a_comparison(tmp_path):
     sequence = without_velocities(ekfslam.open_sequence("builtin:city?frames=8"))
     found = ekfslam.compare(sequence)
@@ -122,6 +125,7 @@ def test_dead_reckoning_is_left_out_of_a_comparison(tmp_path):
     np.testing.assert_allclose(queried.T_world_imu, direct.T_world_imu, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_stated_noise_tracks_decide_what_is_believed():
     sequence = dataclasses.replace(ekfslam.open_sequence("builtin:city?frames=20"), noise=None)
     walking = build(without_velocities(sequence))

@@ -144,24 +144,14 @@ def drawn_already(monkeypatch, undrawn) -> None:
     monkeypatch.setattr("ekfslam.reports.plot_check", lambda *_: None)
 
 
-@pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])
-@pytest.mark.parametrize("size", [0, pytest.param(5_000, marks=pytest.mark.slow)])
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, capsys, archive, drawn_already, command, size):
-    here = tmp_path / "full.h5"
-    here.write_bytes(archive.read_bytes())
-    arguments = [part.format(folder=tmp_path / "out", archive=here) for part in WRITING[command]]
-    assert main(arguments) == 0
-    before = contents(tmp_path)
-    largest = max(len(value) for name, value in before.items() if name.startswith("out"))
-    capsys.readouterr()
-    with disk_of(min(size, largest - 1)):
-        assert main(arguments) == 2
-    assert "cannot be written: File too large" in one_line(capsys)
-    assert contents(tmp_path) == before
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", [name for name in WRITING if name != "consistency"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        name if name == "simulate" else pytest.param(name, marks=pytest.mark.slow)
+        for name in WRITING
+        if name != "consistency"
+    ],
+)
 def test_a_full_disk_of_any_size(tmp_path, capsys, archive, drawn_already, command):
     here = tmp_path / "full.h5"
     here.write_bytes(archive.read_bytes())
@@ -171,7 +161,7 @@ def test_a_full_disk_of_any_size(tmp_path, capsys, archive, drawn_already, comma
     largest = max(len(value) for name, value in before.items() if name.startswith("out"))
     if command == "posterior":
         largest = len(before["full.h5"])
-    for size in np.geomspace(1, largest - 1, 20 if WHOLE else 4).astype(int):
+    for size in [0, *np.geomspace(1, largest - 1, 20 if WHOLE else 4).astype(int)]:
         capsys.readouterr()
         with disk_of(int(size)):
             assert main(arguments) == 2
@@ -194,6 +184,7 @@ def test_a_full_disk_ends_a_study_with_one_line(tmp_path, capsys):
     assert contents(tmp_path) == {}
 
 
+@pytest.mark.slow
 def test_a_full_output_is_one_line(tmp_path):
     done = subprocess.run(
         f"{sys.executable} -m ekfslam.cli info {CITY} > /dev/full", shell=True, capture_output=True, text=True
@@ -203,6 +194,7 @@ def test_a_full_output_is_one_line(tmp_path):
     assert "No space left" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "closed", [">&- 2>&-", *(pytest.param(one, marks=pytest.mark.slow) for one in (">&-", "2>&-", "<&-"))]
 )
@@ -232,6 +224,7 @@ def test_scraps_of_dead_processes_go_with_the_next_writing(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"a", alive.name}
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("processes")
 def test_two_who_add_to_one_archive_lose_nothing(tmp_path, archive):
     here = tmp_path / "full.h5"

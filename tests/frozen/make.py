@@ -114,7 +114,9 @@ def of_result(result: Result, numbers: bool = True) -> Frozen:
     return kept
 
 
-def of_runs(sequence: Sequence, settings: dict, numbers: bool, variants: Iterable[str]) -> Iterator[tuple[str, Frozen]]:
+def of_runs(
+    sequence: Sequence, settings: dict, numbers: bool, variants: Iterable[str], smoothed: bool = True
+) -> Iterator[tuple[str, Frozen]]:
     """All modes, the joint filter and its smoothed run in these variants; name and what is kept of each."""
     config = Config(noise=NoiseConfig(model="white"), filter=FilterConfig(landmark_coordinates="xyz", **settings))
     for mode in ("dead-reckoning", "mapping-only"):
@@ -122,12 +124,13 @@ def of_runs(sequence: Sequence, settings: dict, numbers: bool, variants: Iterabl
     for variant in variants:
         result = run(sequence, "full", config.with_overrides({"filter": {"variant": variant}}))
         yield f"full, {variant}", of_result(result, numbers)
-        yield f"smoothed, {variant}", of_result(smooth(result), numbers)
+        if smoothed:
+            yield f"smoothed, {variant}", of_result(smooth(result), numbers)
 
 
-def of_world(name: str, variants: Iterable[str] = tuple(VARIANTS)) -> Frozen:
+def of_world(name: str, variants: Iterable[str] = tuple(VARIANTS), smoothed: bool = True) -> Frozen:
     source, settings, numbers = WORLDS[name]
-    return _joined(name, of_runs(open_sequence(source), settings, numbers, variants))
+    return _joined(name, of_runs(open_sequence(source), settings, numbers, variants, smoothed))
 
 
 def of_recording(name: str, path: Path, variants: Iterable[str] = tuple(VARIANTS)) -> Frozen:
