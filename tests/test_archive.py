@@ -97,6 +97,7 @@ def test_the_log_comes_back_bit_for_bit_and_in_units(with_log):
         assert all(log[name].attrs["units"] and log[name].attrs["frame"] for name in log)
 
 
+@pytest.mark.slow
 def test_a_damaged_log_is_named(with_log, tmp_path):
     for name in ("rows", "T_imu_world_linear", "landmark"):
         path = Path(shutil.copy(with_log, tmp_path / "copy.h5"))

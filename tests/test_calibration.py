@@ -203,6 +203,7 @@ def test_only_a_stereo_rig_can_be_calibrated():
         JointEKF(sensor, OPEN, T, calibration=CalibrationConfig(time_s=0.02))
 
 
+@pytest.mark.slow
 def test_straight_driving_shows_neither_lever_arm_nor_time_offset():
     """The whole map moves along with either; also a camera's roll about the way is no different from the world's."""
     world = small_world(frames=40, sigma_v=0.0, sigma_w=0.0)

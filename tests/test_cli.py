@@ -48,6 +48,7 @@ def test_compare_writes_archive_summaries_and_figures(tmp_path, capsys, undrawn)
     assert list(read_archive(folder / "archive.h5").results) == list(summary["modes"])
 
 
+@pytest.mark.slow
 def test_recordings_of_one_name_do_not_overwrite_each_other(tmp_path):
     quick = ["--modes", "dead-reckoning", "--no-figures", "--executor", "serial"]
     assert main(["compare", CITY, CITY, *quick, "--out", str(tmp_path)]) == 0
@@ -124,6 +125,7 @@ def test_malformed_recordings_are_one_line_with_file_and_field(tmp_path, capsys,
         assert word in line
 
 
+@pytest.mark.slow
 def test_truth_of_another_length(tmp_path, capsys):
     npz = write_npz(tmp_path / "a.npz", ece276a_fields())
     poses = tmp_path / "poses.txt"

@@ -93,6 +93,7 @@ def test_pixel_noise_of_zero_is_refused_by_name():
         assert run(exact, "full", Config().with_overrides({"noise": {"sigma_px": 0.5}})).counts["accepted"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["dense", "conditional"])
 @pytest.mark.parametrize("world", ["city", "loop"])
 @pytest.mark.parametrize("px", [0.001, 0.003])

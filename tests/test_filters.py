@@ -96,6 +96,7 @@ def test_mapping_only_is_the_joint_filter_without_pose_uncertainty(variant, gate
         assert full.counts["rejected: gate"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["standard", "invariant"])
 def test_retired_and_never_retired_filters_agree_in_every_pose(variant):
     world = with_outliers(small_world(seed=5, frames=60, landmarks=80))

@@ -99,6 +99,7 @@ def test_tracks_do_not_depend_on_the_run_nor_much_on_the_prediction(room):
     assert len(track(wrong)[0].observations) > 0.8 * len(right.observations)
 
 
+@pytest.mark.slow
 def test_report_and_picture_say_what_became_of_the_tracks(room, tracked):
     sequence, report = tracked
     assert report.tracks == len(sequence.observations.ids) and report.lengths.min() >= 2

@@ -121,6 +121,7 @@ def distance_in_time(frames):
     return min(abs(k - r) for k in frames for own in RETURNING.values() for r in own)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["invariant", "fej"])
 @pytest.mark.parametrize("revive", [0, 1, 2, 3, 5, 8, 100])
 def test_those_seen_nearest_in_time_come_back_with_a_landmark(revive, variant):

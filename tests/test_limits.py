@@ -103,6 +103,7 @@ def recording(tmp_path) -> Path:
     return tmp_path / "a.h5"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["unwritten", "unwritten chunks", "chunk", "crumbs", "bomb", "filter"])
 def test_hdf5_that_claims_more_than_it_has_is_refused_unread(recording, kind):
     name = "sequence/observations/pixels"

@@ -152,6 +152,7 @@ def test_velocities_at_another_rate_lead_to_the_pose_that_they_make():
     assert live.counts.held == 0 and live.ekf.step == 2
 
 
+@pytest.mark.slow
 def test_gaps_and_velocities_that_do_not_come_are_counted_and_worth_less():
     problem = problem_of()
     sequence = problem.sequence

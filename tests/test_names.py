@@ -85,6 +85,7 @@ def test_recordings_of_colliding_names_have_folders_of_their_own(tmp_path):
     assert seeds == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_names_that_are_no_utf_8_work(tmp_path, capsys):
     npz = tmp_path / os.fsdecode(b"a\xff.npz")
     write_npz(npz, ece276a_fields())

@@ -143,6 +143,7 @@ def test_blocks_of_the_automatic_model_give_way_to_what_is_configured():
     assert build(unstated, problem.config).config == problem.config
 
 
+@pytest.mark.slow
 def test_interpolated_velocities_are_trusted_less():
     world = without_noise(builtin("city?frames=40&max_tracks=20"))
     gap = dataclasses.replace(world, attributes={**world.attributes, "interpolated": "10-20"})
@@ -387,6 +388,7 @@ def gauge_of_all(ekf):
     return np.vstack([body, N[6:]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["standard", "invariant", "fej"])
 def test_velocities_that_walk_freely_are_white(variant):
     """A walk much larger than the noise says nothing about the next velocity: the state without them, once more."""

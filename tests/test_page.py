@@ -203,6 +203,7 @@ def test_long_series_are_thinned_with_their_ends_and_say_so():
     assert numbers(packed(np.array([[1.5, -2.0]])), 2).tolist() == [1.5, -2.0]
 
 
+@pytest.mark.slow
 def test_command(archive, tmp_path, capsys):
     out = tmp_path / "page" / "report.html"
     assert main(["report", str(archive), "--out", str(out), "--title", "A & B"]) == 0

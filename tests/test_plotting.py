@@ -176,6 +176,7 @@ def test_errors_take_truth_of_some_frames(sequence, results):
     np.testing.assert_allclose(ax.lines[2].get_xdata(), sequence.time_s[::7])
 
 
+@pytest.mark.slow
 def test_nis_says_how_many_frames_are_inside_their_bounds(results):
     figure = plot_nis(results)
     assert len(figure.axes) == 2, "dead reckoning has no innovation"

@@ -318,7 +318,8 @@ SHARED = [CameraJitter(time_s=0.3), VisionDrift(length_m=3.0), StereoRotation(ti
 KINDS = {"white": (False, []), "every block": (True, []), "shared": (False, SHARED), "all": (True, SHARED)}
 TURNS = {"near identity": 0.01, "random": 1.0, "near pi": 3.1}
 # In the reduced form everything at once is turned in every way, and each kind of state in one.
-SOME = ["all-near identity", "all-random", "all-near pi", "white-near pi", "every block-near identity", "shared-random"]
+LONG = [pytest.param(f"all-{turn}", marks=pytest.mark.slow) for turn in ("near identity", "random")]
+SOME = [*LONG, "all-near pi", "white-near pi", "every block-near identity", "shared-random"]
 
 
 @pytest.mark.parametrize("case", [f"{kind}-{turn}" for kind in KINDS for turn in TURNS] if WHOLE else SOME)
@@ -411,6 +412,7 @@ def test_map_learns_nothing_about_where_the_world_is():
     assert ratio.min() > 0.99
 
 
+@pytest.mark.slow
 def test_robust_kernel_holds_against_outliers():
     world = small_world(frames=50, landmarks=60, sigma_v=0.05, sigma_w=0.005)
     rng = np.random.default_rng(0)

@@ -28,6 +28,7 @@ def errors(found):
     return se3.log(se3.inverse(poses) @ found.T_world_imu), landmarks - found.position_m
 
 
+@pytest.mark.slow
 def test_the_mean_of_samples_is_the_mean_of_the_posterior(found):
     xi, d = errors(found)
     for error, covariance in ((xi, found.pose_covariance), (d, found.landmark_covariance)):

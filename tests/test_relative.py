@@ -221,6 +221,7 @@ def test_every_mode_has_pairs_whose_joint_covariance_is_one(mode):
         assert np.linalg.eigvalsh(joint / np.outer(scale, scale))[0] > -1e-9
 
 
+@pytest.mark.slow
 def test_smoothed_pairs_are_those_of_the_posterior():
     result = run(open_sequence("builtin:loop?frames=60"), "full")
     found = posterior(result)

@@ -105,6 +105,7 @@ def test_times_are_the_median_the_largest_and_the_sum(flat):
 # --- archives of old ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_limits_in_pixels_of_old_archives_become_deviations_of_what_they_limit(tmp_path):
     """A disparity is uL - uR, a row mismatch vL - vR: each has the deviation of a difference of these two pixels."""
     world = open_sequence("builtin:loop?frames=5")

@@ -334,6 +334,7 @@ def study_process(path: Path, after: int) -> list[str]:
     return lines
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("processes")
 def test_a_killed_study_keeps_every_finished_run(tmp_path):
     assert study_process(tmp_path / "a.h5", 2) == ["mid 0", "mid 1", "mid 2"]

@@ -70,6 +70,7 @@ def test_group_axioms(a, b, c):
     np.testing.assert_allclose(se3.exp(-a), se3.inverse(A), atol=1e-13 * scale)
 
 
+@pytest.mark.slow
 @given(tangents(), tangents())
 def test_adjoint_is_conjugation_and_a_homomorphism(a, b):
     A, B = se3.exp(a), se3.exp(b)

@@ -140,6 +140,7 @@ def test_no_blocks():
     assert SelectedInverse(SparseCholesky(sp.csc_array(np.eye(9)), [6, 3])).blocks(none, none).shape == (0, 0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [8, 20])
 def test_rounding_does_not_grow_along_a_long_drive(window):
     """An integrated random walk of 3000 blocks, known well from one to the next and badly over a window."""

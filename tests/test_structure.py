@@ -143,6 +143,7 @@ def test_runs_are_bounded_and_the_outcome_is_the_same_again(runs):
     assert choice.frames == 20
 
 
+@pytest.mark.slow
 def test_candidates_are_judged_without_the_truth():
     one = world(0, frames=20)
     truth = dataclasses.replace(one.truth, T_world_imu=one.truth.T_world_imu @ se3.exp(np.full(6, 0.05)))

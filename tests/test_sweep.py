@@ -247,6 +247,7 @@ def frames(sequence, result):
     return float(len(sequence))
 
 
+@pytest.mark.slow
 def test_cases_are_settings_that_belong_together_each_in_its_mode(tmp_path):
     (tmp_path / "s.toml").write_text(
         """
@@ -356,6 +357,7 @@ def test_a_function_bound_to_a_function_is_known_by_the_source_of_both():
     assert " at 0x" not in content(heard)
 
 
+@pytest.mark.slow
 def test_the_table_is_read_as_it_was_written_and_refuses_damage(tmp_path, undisturbed):
     path = tmp_path / "sweep.h5"
     path.write_bytes(table_image(undisturbed))

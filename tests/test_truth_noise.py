@@ -217,6 +217,7 @@ def test_compare_takes_the_truth_noise_of_the_configuration(tmp_path):
     assert read_archive(tmp_path / "archive.h5").truth.noise == noise
 
 
+@pytest.mark.slow
 def test_truth_noise_on_the_command_line(tmp_path, capsys):
     (tmp_path / "c.toml").write_text("[truth]\nyaw_deg = 1.0\nposition_m = 0.5\n")
     arguments = ["run", "builtin:loop?frames=12", "--mode", "dead-reckoning", "--out", str(tmp_path / "a.h5")]

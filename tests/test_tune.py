@@ -129,6 +129,7 @@ def test_mapping_and_the_joint_filter_agree_where_nothing_but_landmarks_is_uncer
     np.testing.assert_allclose([a.log_likelihood for a in reports], [b.log_likelihood for b in other], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_rejecting_everything_does_not_pay():
     world = builtin("city?frames=20")
     config = resolve(Config(), world)
@@ -138,6 +139,7 @@ def test_rejecting_everything_does_not_pay():
         assert log_likelihoods(world, wrong, config).sum() < right - 1000
 
 
+@pytest.mark.slow
 def test_wrong_matches_are_left_out_and_splits_go_on_as_new_tracks():
     world = builtin("city?frames=30&max_tracks=30&outlier_fraction=0.05")
     config = resolve(Config(), world)
@@ -153,6 +155,7 @@ def test_wrong_matches_are_left_out_and_splits_go_on_as_new_tracks():
     assert again < 0.05 * rejected
 
 
+@pytest.mark.slow
 def test_long_recordings_are_filtered_in_stretches_spread_over_them():
     world = without_noise(builtin("city?frames=700"))
     config = resolve(Config(), world)

@@ -76,6 +76,7 @@ def test_without_a_gate_the_mean_is_the_scale():
     assert whiteness.gated_scale(3.24, 3, 0.999) > 50  # nearly as if uniform up to the gate
 
 
+@pytest.mark.slow
 def test_error_of_a_ratio_is_its_scatter():
     rng, found, errors = np.random.default_rng(4), [], []
     dof = rng.integers(30, 90, 300)

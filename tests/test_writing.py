@@ -144,6 +144,7 @@ def drawn_already(monkeypatch, undrawn) -> None:
     monkeypatch.setattr("ekfslam.reports.plot_check", lambda *_: None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [
@@ -291,6 +292,7 @@ def test_what_is_no_earlier_result_of_the_same_needs_force(tmp_path, capsys, dra
     assert list(read_archive(out).results) == ["dead-reckoning"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["simulate", "tune", "export"])
 def test_other_files_of_the_user_are_not_overwritten(tmp_path, capsys, archive, command):
     notes = tmp_path / "notes.txt"

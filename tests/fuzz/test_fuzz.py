@@ -9,7 +9,8 @@ from conftest import WHOLE
 from generators import GENERATORS, Valid, case_of
 from oracle import verdict
 
-pytestmark = pytest.mark.xdist_group("hostile inputs")  # in one process, so that the valid ones are made once
+# In one process, so that the valid ones are made once.
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("hostile inputs")]
 
 EACH = 14 if WHOLE else 6
 
@@ -19,16 +20,7 @@ def valid() -> Valid:
     return Valid.prepared()
 
 
-SLOW = ("bytes_of_recordings", "items_of_hdf5", "drives", "command_lines")
-
-
-@pytest.mark.parametrize(
-    "family",
-    [
-        pytest.param(family, id=one.__name__, marks=[pytest.mark.slow] if one.__name__ in SLOW else [])
-        for family, one in enumerate(GENERATORS)
-    ],
-)
+@pytest.mark.parametrize("family", range(len(GENERATORS)), ids=[one.__name__ for one in GENERATORS])
 def test_every_input_is_taken_or_refused_by_name(valid, tmp_path, monkeypatch, family):
     monkeypatch.setattr("ekfslam.figures.style.png", lambda *_: b"")
     for i in range(EACH):
