@@ -153,6 +153,9 @@ def test_lenses_are_those_of_opencv():
 def test_rectified_cameras_see_points_in_the_same_row():
     calibration = calibrated(distorted=True)
     rectified = rectification(calibration)
+    lengths = np.diagonal([calibration.K_left[:2, :2], calibration.K_right[:2, :2]], axis1=1, axis2=2)
+    assert rectified.camera.fu_px == rectified.camera.fv_px == pytest.approx(lengths.mean())
+    assert np.ptp(lengths) > 0 and np.ptp(lengths[:, 0]) != np.ptp(lengths[:, 1])
     rng = np.random.default_rng(1)
     q = rng.uniform((-2.0, -1.0, 4.0), (2.0, 1.0, 9.0), (40, 3))  # in the left camera
     z = project(rectified.camera, se3.apply(rectified.T_rectified_left, q))

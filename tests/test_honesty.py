@@ -265,6 +265,9 @@ def test_values_table_and_figure_say_the_same(one_run):
     assert f"{found.nis.value:.3g}" in found.table
     figure = plot_check(one_run, found)
     assert len(figure.axes) == 6
+    dots = next(line for line in figure.axes[0].lines if line.get_label() == "frame")
+    seen = one_run.innovation.dof > 0
+    np.testing.assert_allclose(dots.get_ydata(), (one_run.innovation.nis / np.maximum(one_run.innovation.dof, 1))[seen])
     for ax in figure.axes:
         assert "[" in ax.get_xlabel() and "[" in ax.get_ylabel() and ax.get_title()
     assert found.verdict[:20] in figure.get_suptitle()

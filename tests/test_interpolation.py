@@ -51,6 +51,15 @@ def test_one_velocity_that_is_no_line_is_enough_not_to_be_one():
     assert not interpolated_intervals(twist).any()
 
 
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
+def test_rounding_is_that_of_the_largest_velocity(size):
+    twist = interpolated(driven(), 10, 30)
+    twist[10:31, :3] += 1e-9 * np.array([[1], [0], [-1]] * 7)  # the largest is 8 m/s: within rounding
+    assert stretches(interpolated_intervals(size * twist)) == [(11, 30)]
+    twist[10:31, :3] += 1e-6 * np.array([[1], [0], [-1]] * 7)
+    assert not interpolated_intervals(size * twist).any()
+
+
 def test_standing_still_and_constant_velocity_are_measured():
     twist = driven()
     twist[20:40] = 0.0

@@ -11,6 +11,7 @@ import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.evaluation.verdict import judge
 from ekfslam.filters.result import Innovation
+from ekfslam.page import report
 from ekfslam.page.content import packed, recordings_of, thinned
 from ekfslam.page.report import read_archives, report_page, write_report
 from ekfslam.runner import run
@@ -179,6 +181,13 @@ def test_only_its_own_script_and_style_may_run(page):
 
 
 @pytest.mark.slow
+def test_labels_are_the_shortest_ends_that_differ():
+    paths = [Path(f"/{drive}/full/archive.h5") for drive in ("a", "b")]
+    assert report._labels([Path("/some/where/one.h5"), Path("/some/where/two.h5")]) == ["one", "two"]
+    first, second = report._labels(paths)
+    assert first != second and first.startswith("a") and second.startswith("b")
+
+
 def test_archives_of_one_recording_stand_together(sequence, archive, tmp_path):
     other, third = tmp_path / "other" / "archive.h5", tmp_path / "third" / "archive.h5"
     for path in (other, third):
