@@ -173,6 +173,7 @@ def test_the_inverse_of_the_information_matrix_is_the_joint_covariance(prior, li
     kind = read["kind"].astype(str)
     assert {"pose", "landmark", "calibration"} == set(kind) and len(kind) == matrix.shape[0]
     assert set(read["frame"][kind == "pose"]) == set(range(0 if prior == "some" else 1, 12))
+    assert (read["frame"][kind != "pose"] == -1).all() and (read["id"][kind != "landmark"] == -1).all()
     np.testing.assert_array_equal(read["id"][kind == "landmark"], np.repeat(found.id, 3))
     frames = np.unique(read["frame"][kind == "pose"])
     wanted = found.joint_covariance(frames, np.arange(len(found.id)))

@@ -251,6 +251,8 @@ def test_a_folder_of_kitti_odometry_is_read(folder, room):
     (folder / "calib.txt").write_text(f"P2: {P.format(20)}\nP3: {P.format(20 - 300 * BASELINE_M)}\n")
     colour = open_images(folder)
     assert colour.attributes["images"] == "image_2 image_3"
+    of_gray = "True poses of the benchmark are of the left gray camera"
+    assert [any(note.startswith(of_gray) for note in images.notes) for images in (found, colour)] == [False, True]
     assert colour.calibration.T_right_left[0, 3] == pytest.approx(-BASELINE_M)
 
 

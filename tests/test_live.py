@@ -129,6 +129,7 @@ def test_between_images_the_pose_is_the_filters_prediction():
     np.testing.assert_array_equal(live.ekf.P, ekf.P)  # asking changes nothing
     with pytest.raises(LateError, match=r"pose at .* comes too late"):
         live.pose(float(sequence.time_s[0]))
+    np.testing.assert_array_equal(live.pose(live._past[0][0]).T_world_imu, live._past[0][1].T_world_imu)
 
 
 def test_velocities_at_another_rate_lead_to_the_pose_that_they_make():

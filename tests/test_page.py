@@ -23,7 +23,7 @@ from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.evaluation.verdict import judge
 from ekfslam.filters.result import Innovation
-from ekfslam.page import report
+from ekfslam.page import content, report
 from ekfslam.page.content import packed, recordings_of, thinned
 from ekfslam.page.report import read_archives, report_page, write_report
 from ekfslam.runner import run
@@ -181,6 +181,15 @@ def test_only_its_own_script_and_style_may_run(page):
 
 
 @pytest.mark.slow
+def test_innovations_have_their_mean_a_degree_of_freedom(sequence):
+    dof = np.repeat([0, 30, 60], 20)
+    nis = np.linspace(0.5, 1.5, 60) * dof
+    result = dataclasses.replace(synthetic_result(sequence), innovation=Innovation(nis, dof, dof // 3, 0 * dof))
+    found = content._nis(result, result.time_s)
+    assert found["mean"] == pytest.approx(nis.sum() / dof.sum())
+    assert numbers(found["value"], 40) == pytest.approx(nis[20:] / dof[20:], rel=1e-6)
+
+
 def test_labels_are_the_shortest_ends_that_differ():
     paths = [Path(f"/{drive}/full/archive.h5") for drive in ("a", "b")]
     assert report._labels([Path("/some/where/one.h5"), Path("/some/where/two.h5")]) == ["one", "two"]
