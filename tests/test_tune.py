@@ -189,6 +189,19 @@ def test_the_sandwich_widens_errors_where_gradients_are_correlated_and_never_nar
     assert (np.linalg.eigvalsh(again) > 0).all()
 
 
+def test_where_the_likelihood_has_no_maximum_the_differences_count():
+    found = VelocityNoise(np.array([0.2, 0.0]), np.array([0.01, 0.0]), np.zeros(2), np.zeros(2))
+    free = ["sigma_v_m_s", "sigma_w_rad_s", "sigma_px"]
+    start = {"sigma_v_m_s": 0.2, "sigma_w_rad_s": 0.02, "sigma_px": 1.0}
+    flat = tuning._Peak(
+        np.log([0.3, 0.03, 2.0]), np.array([0, 2]), np.eye(2), np.zeros((2, 50)), 0.0, 9, converged=False
+    )
+    linear, angular, pixels = tuning._estimates(start, free, flat, found)
+    assert (linear.value, linear.error, linear.likely) == (0.2, 0.01, pytest.approx(0.3))
+    assert (angular.value, angular.error) == (pytest.approx(0.03), None) and "at the bound" in angular.remark
+    assert (pixels.value, pixels.error) == (pytest.approx(2.0), None) and "no maximum" in pixels.remark
+
+
 def test_differences_and_likelihood_are_weighted_by_their_information():
     x, C = np.log([0.6, 0.2]), np.array([[0.01, -0.004], [-0.004, 0.02]])
     found = VelocityNoise(np.array([0.5, 0.0]), np.array([0.03, 0.0]), np.array([0.6, 0.01]), np.zeros(2))
