@@ -7,7 +7,7 @@ from ekfslam.errors import InnovationError
 from ekfslam.filters import dormant
 from ekfslam.filters.conditional import ConditionalGaussian
 from ekfslam.filters.dense import DenseGaussian, add_square
-from ekfslam.filters.gates import agrees_with_others, most_given_others
+from ekfslam.filters.gates import agrees_with_others, most_given_others, moves_along
 from ekfslam.filters.gaussian import Rows
 from ekfslam.filters.landmarks import LandmarkTable
 
@@ -285,6 +285,16 @@ def test_an_innovation_covariance_that_is_not_positive_definite_is_named(form):
     rows.variance[1], rows.H_x[1, 0, 0] = 1.0, np.nan
     with pytest.raises(InnovationError, match=r"frame 4.*71"):
         gaussian.solve(gaussian.project(rows, 4, np.array([70, 71])), 4, np.array([70, 71]))
+
+
+def test_a_landmark_moves_from_its_third_observation_on_if_its_evidence_is_large():
+    table = LandmarkTable(dimension=3, extra=0)
+    table.append(id=[1, 2, 3, 4], position_m=np.zeros((4, 3)), observations=[2, 3, 9, 3])
+    along, information = np.array([50.0, -50.0, 50.0, 1.0]), np.full(4, 25.0)
+    verdict = moves_along(table, np.arange(4), along, information, np.full(4, 100.0), 25.0, 3.0, 0.05)
+    assert verdict.tolist() == [False, True, True, False]
+    # Gross outliers count as at the gate: half of what they show.
+    np.testing.assert_allclose(table.evidence, np.column_stack([0.5 * along, information]))
 
 
 def test_the_table_keeps_its_columns_aligned():
