@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from ekfslam.figures.maps import ellipse_axes, plot_landmark_arrows, plot_map, plot_trajectories
 from ekfslam.figures.run import plot_errors, plot_nis, plot_parameters, save_figures, world_error_covariance
+from ekfslam.figures.views import plot_trajectory
 from ekfslam.filters.result import Parameters, Result
 from ekfslam.geometry import se3
 
@@ -242,3 +243,18 @@ def test_parameters_have_a_panel_each_with_units_and_what_was_not_observed(resul
     assert tmp_path / "parameters.png" in save_figures(tmp_path, {"full": found})
     with pytest.raises(ValueError, match="no parameters"):
         plot_parameters(results["full"])
+
+
+@pytest.mark.parametrize("yaw_deg", [30, 179])
+def test_truth_is_drawn_beside_the_estimate(sequence, results, yaw_deg):
+    """A yaw of 179 degrees and one of -179 are two degrees apart."""
+
+    def turned(T_world_imu, degrees):
+        return se3.exp(np.array([0, 0, 0, 0, 0, np.radians(degrees)])) @ T_world_imu
+
+    first = np.degrees(np.arctan2(*sequence.truth.T_world_imu[0, 1::-1, 0]))
+    result = dataclasses.replace(results["full"], T_world_imu=turned(sequence.truth.T_world_imu, yaw_deg - first))
+    truth = dataclasses.replace(sequence.truth, T_world_imu=turned(sequence.truth.T_world_imu, yaw_deg + 2 - first))
+    yaw = next(ax for ax in plot_trajectory(result, truth).axes if ax.get_ylabel().startswith("yaw"))
+    true, estimate = (line.get_ydata() for line in yaw.lines)
+    np.testing.assert_allclose(true - estimate, 2.0, atol=1e-6)
