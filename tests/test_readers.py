@@ -601,3 +601,14 @@ def test_starry_night_landmarks_reproject_with_the_stated_noise(data_path):
     np.testing.assert_allclose(residual.std(axis=0), sequence.noise.pixel_std_px, rtol=1e-3)
     np.testing.assert_allclose(residual.std(axis=0), [6.2, 11.4, 6.5, 11.5], atol=0.05)
     assert inspect_tracks(observations, sequence.twist).returning_tracks == 20
+
+
+@pytest.mark.parametrize(
+    "change", [lambda values: values + 1j, lambda values: np.array(["text"])], ids=["complex", "text"]
+)
+def test_variables_that_are_no_real_numbers_are_refused(tmp_path, change):
+    fields = utias_fields()
+    fields["v_vk_vk_i"] = change(fields["v_vk_vk_i"])
+    path = write_mat(tmp_path / "drive.mat", fields)
+    with pytest.raises(EkfslamError, match="v_vk_vk_i"):
+        open_sequence(path)
