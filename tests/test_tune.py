@@ -189,6 +189,19 @@ def test_the_sandwich_widens_errors_where_gradients_are_correlated_and_never_nar
     assert (np.linalg.eigvalsh(again) > 0).all()
 
 
+def test_what_is_rejected_counts_in_the_likelihood_of_a_round():
+    world = builtin("city?frames=12&outlier_fraction=0.2")
+    config = resolve(Config(), world)
+    base = noise_of(world, config)
+    parts, gated, ungated = tuning.parts_of(world, config, base, 10_000)
+    problem = tuning._Problem(parts, base, ["sigma_px"], gated, ungated)
+    x = np.log([1.0])
+    loose = tuning._loose(tuning._with(base, ["sigma_px"], x))
+    rejected = sum(tuning.without_rejected(part, loose, gated)[1] for part in parts)
+    assert rejected > 20
+    assert problem.judged(x)(x)[-1] == pytest.approx(rejected * tuning._LOG_WRONG)
+
+
 def test_where_the_likelihood_has_no_maximum_the_differences_count():
     found = VelocityNoise(np.array([0.2, 0.0]), np.array([0.01, 0.0]), np.zeros(2), np.zeros(2))
     free = ["sigma_v_m_s", "sigma_w_rad_s", "sigma_px"]
