@@ -294,7 +294,10 @@ class _Problem:
 
 @dataclass(frozen=True)
 class _Peak:
-    """The maximum of the likelihood: logarithms (n,), Hessian (n, n), gradients (n, T) of the frames."""
+    """The maximum of the likelihood: logarithms x (n,), and which of them lie ``inside`` of their bounds (m,).
+
+    Of these are the Hessian H (m, m) and the gradients (m, T) of the frames.
+    """
 
     x: Array
     inside: IntArray

@@ -66,12 +66,9 @@ class Bag:
         except EkfslamError:
             raise
         except Exception as error:  # a damaged bag makes its decoders raise almost anything
-            about_python = isinstance(
-                error.__context__ or error, AttributeError | TypeError
-            )  # nothing that a user knows
-            text = (
-                "an entry is of a wrong type" if about_python else printable(str(error))[:200] or type(error).__name__
-            )
+            text = printable(str(error))[:200] or type(error).__name__
+            if isinstance(error.__context__ or error, AttributeError | TypeError):
+                text = "an entry is of a wrong type"  # their words are about Python's objects, not the file
             raise UnknownFormatError(f"{self.path}: damaged or unknown bag ({text})") from None
 
     def connections(self, *kinds: str) -> list[Any]:
