@@ -32,7 +32,6 @@ from .reports import Comparison, check, check_consistency, compare
 from .runner import run
 from .smoother.posterior import Posterior, posterior, smooth
 from .storage.archive import read_archive, write_archive
-from .storage.checkpoint import Checkpoints
 from .studies.study import LEVELS, Study
 from .studies.tuning import TunedNoise, tune
 
@@ -43,7 +42,6 @@ __all__ = [
     "MODES",
     "VARIANTS",
     "CalibrationConfig",
-    "Checkpoints",
     "Comparison",
     "Config",
     "EkfslamError",

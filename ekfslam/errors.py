@@ -47,10 +47,6 @@ class WriteError(ArchiveError):
     """A file cannot be written; an older one of its name is as it was."""
 
 
-class ResumeError(ArchiveError):
-    """A checkpoint is damaged, or belongs to another recording, other settings or another release."""
-
-
 class DataError(EkfslamError):
     """A data set is malformed.
 

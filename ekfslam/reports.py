@@ -29,11 +29,10 @@ from ekfslam.figures.run import draw_figures
 from ekfslam.figures.study import draw_study_figures
 from ekfslam.figures.style import png, pngs
 from ekfslam.filters.result import Result
-from ekfslam.runner import run, versions
+from ekfslam.runner import run
 from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import archive_image, open_result, require_same_origin
-from ekfslam.storage.checkpoint import Checkpoints, key_of
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed, open_executor
 from ekfslam.studies.study import Study, StudyArchive, run_study
 from ekfslam.studies.summary import study_table, summarise_study
@@ -121,7 +120,6 @@ def compare(
     sequence: Sequence,
     modes: Iterable[Mode] = MODES,
     config: Config | None = None,
-    checkpoints: Checkpoints | None = None,
 ) -> Comparison:
     """Run several modes with one configuration.
 
@@ -129,17 +127,14 @@ def compare(
         sequence: The recording.
         modes: What to run.
         config: Settings; defaults where None.
-        checkpoints: Where finished modes are kept meanwhile; and beside it, with the ending ``.full``, the state of the
-            joint filter. `Checkpoints.remove` them when the comparison is saved.
 
     Raises:
-        ArchiveError: A checkpoint to go on from is damaged, or of something else.
         ConfigError: Unknown mode.
         FilterError: No mode has a result; otherwise `Comparison.skipped` says which has none, and why.
     """
     if config is not None:
         sequence = with_truth_noise(sequence, config.truth)
-    results, skipped = _run_all(sequence, list(modes), config, checkpoints)
+    results, skipped = _run_all(sequence, list(modes), config)
     if skipped and not results:
         raise FilterError("; ".join(f"no {mode}: {reason}" for mode, reason in skipped.items()))
     summary = {
@@ -151,31 +146,21 @@ def compare(
     return Comparison(sequence, results, summary, skipped)
 
 
-def _run_all(
-    sequence: Sequence, modes: list[Mode], config: Config | None, checkpoints: Checkpoints | None
-) -> tuple[dict[str, Result], dict[str, str]]:
-    """Result of each mode, and why there is none; what a checkpoint holds is not run again."""
-    key = "" if checkpoints is None else key_of(sequence, config or Config(), "compare", versions())
-    kept = None if checkpoints is None else checkpoints.found(key)
-    done = {"results": {}, "skipped": {}} if kept is None else kept
-    results: dict[str, Result] = {mode: done["results"][mode] for mode in modes if mode in done["results"]}
-    skipped: dict[str, str] = {mode: done["skipped"][mode] for mode in modes if mode in done["skipped"]}
-    of_filter = None if checkpoints is None else checkpoints.beside(".full")
-    for mode in modes:
-        if mode in results or mode in skipped:
-            continue
+def _run_all(sequence: Sequence, modes: list[Mode], config: Config | None) -> tuple[dict[str, Result], dict[str, str]]:
+    """Return the result of each mode, and the reason for each mode without one."""
+    results: dict[str, Result] = {}
+    skipped: dict[str, str] = {}
+    for mode in dict.fromkeys(modes):
         if mode == "smoothed" and "full" in skipped:
             skipped[mode] = skipped["full"]
             continue
         # The filter that "smoothed" starts from need not run twice.
         known = mode == "smoothed" and "full" in results
         try:
-            results[mode] = smooth(results["full"]) if known else run(sequence, mode, config, None, of_filter)
+            results[mode] = smooth(results["full"]) if known else run(sequence, mode, config)
         except (IllPosedError, FilterError) as error:
             skipped[mode] = str(error)
-        if checkpoints is not None:
-            checkpoints.keep(key, {"results": results, "skipped": skipped}, always=True)
-    return {mode: results[mode] for mode in modes if mode in results}, skipped
+    return results, skipped
 
 
 def compare_into(
@@ -184,19 +169,20 @@ def compare_into(
     modes: Iterable[Mode] = MODES,
     config: Config | None = None,
     *,
-    resume: bool = False,
     force: bool = False,
     figures: bool = True,
 ) -> str:
-    """Compare modes on a recording, with checkpoints, and save all into a folder; what there is to say of it.
+    """Compare modes on a recording and save all into a folder.
+
+    Returns:
+        What a terminal shows: notes of the reader, the table, and the files written.
 
     Raises:
-        ArchiveError: The folder holds results of another recording, cannot be written, or has a damaged checkpoint.
+        ArchiveError: The folder holds results of another recording, or cannot be written.
         FilterError: No mode has a result.
     """
-    with Checkpoints(folder / "unfinished.checkpoint", resume) as checkpoints:
-        comparison = compare(sequence, modes, config, checkpoints)
-        paths = comparison.save(folder, force, figures)
+    comparison = compare(sequence, modes, config)
+    paths = comparison.save(folder, force, figures)
     notes = "".join(f"{sequence.name}: {note}\n" for note in sequence.notes)
     return f"{notes}\n{comparison.table}\nwritten to {folder}: {', '.join(path.name for path in paths)}"
 

@@ -33,7 +33,6 @@ from ekfslam.models.build import Problem, build
 from ekfslam.progress import progress
 from ekfslam.smoother.posterior import smooth
 from ekfslam.smoother.revival import MapRevival
-from ekfslam.storage.checkpoint import Checkpoints, key_of
 from ekfslam.studies.automatic import with_track_scale
 
 
@@ -43,7 +42,6 @@ def run(
     mode: Mode = "full",
     config: Config | None = None,
     further: FurtherVelocities | None = None,
-    checkpoints: Checkpoints | None = None,
 ) -> Result:
     """Estimate trajectory and map of a sequence.
 
@@ -53,11 +51,8 @@ def run(
             reckoning's poses), ``full`` (joint EKF SLAM) or ``smoothed`` (the posterior of a full run).
         config: Settings; defaults where None.
         further: Velocity measurements of other sensors, for the joint filter (`ekfslam.models.sensors.velocities`).
-        checkpoints: Where the joint filter keeps its state meanwhile, and whether to go on from there, bit for bit.
-            That ``further`` is the same then, the caller must see to.
 
     Raises:
-        ArchiveError: The checkpoint to go on from is damaged, or of something else.
         ConfigError: Unknown mode.
         NoVelocitiesError: Dead reckoning of a recording without velocities.
         FilterError: The filter cannot go on: an innovation covariance is not positive definite (`InnovationError`), a
@@ -71,13 +66,13 @@ def run(
             f"{sequence.name}: nobody measured velocities, so there is no dead reckoning; the other modes go by vision"
         )
     if mode == "smoothed":
-        return smooth(run(sequence, "full", config, further, checkpoints))
+        return smooth(run(sequence, "full", config, further))
     if mode == "full":
         config = with_track_scale(config or Config(), sequence)
     suspicions = inspect_sequence(sequence).warnings
     problem = build(sequence, config, clean=mode != "dead-reckoning")
     with one_thread():
-        estimate = _joint(problem, further, checkpoints) if mode == "full" else _dead_reckoned(problem, mode)
+        estimate = _joint(problem, further) if mode == "full" else _dead_reckoned(problem, mode)
     result = _result(problem, mode, estimate)
     lines = (*suspicions, *inspect_result(sequence, result, suspicions))
     return dataclasses.replace(result, attributes={**result.attributes, **sanity_attributes(lines)})
@@ -111,20 +106,24 @@ def _judged(problem: Problem) -> tuple[IntArray, IntArray] | None:
     return relative_pairs(truth, reach) if truth is not None and reach else None
 
 
-def _joint(problem: Problem, further: FurtherVelocities | None, checkpoints: Checkpoints | None) -> _Estimate:
-    """The joint filter's."""
-    state = _filtered(problem, _judged(problem), further, checkpoints)
-    ekf, references = state["ekf"], state["references"]
+def _joint(problem: Problem, further: FurtherVelocities | None) -> _Estimate:
+    """Run the joint filter."""
+    sequence, settings, judged = problem.sequence, problem.config.filter, _judged(problem)
+    count = len(sequence)
+    revival = MapRevival(problem.model, settings) if settings.revive >= 0 else None
+    ekf = JointEKF(problem.model, settings, revival=revival)
+    references = None if judged is None else References(ekf, *judged)
+    T_imu_world, covariance, ms = np.zeros((count, 4, 4)), np.zeros((count, 6, 6)), np.zeros(count)
+    reports: list[FrameReport] = []
+    frames = progress(range(count), f"{sequence.name}: full")
+    for k, report, ms[k] in run_filter(ekf, sequence, frames, further):
+        T_imu_world[k], covariance[k] = ekf.T_imu_world, ekf.gaussian.body_covariance[:6, :6]
+        reports.append(report)
+        if references is not None:
+            references.record(k)
+    pairs = None if references is None else references.pairs()
     return _Estimate(
-        state["T_imu_world"],
-        state["covariance"],
-        state["ms"],
-        None if references is None else references.pairs(),
-        state["reports"],
-        ekf.landmarks(),
-        ekf.counts,
-        ekf.log(),
-        ekf.parameters(),
+        T_imu_world, covariance, ms, pairs, reports, ekf.landmarks(), ekf.counts, ekf.log(), ekf.parameters()
     )
 
 
@@ -181,43 +180,6 @@ def _result(problem: Problem, mode: Mode, estimate: _Estimate) -> Result:
         whitened=whitened,
         attributes={**sequence.attributes, **account, **versions()},
     )
-
-
-def _filtered(
-    problem: Problem,
-    judged: tuple[IntArray, IntArray] | None,
-    further: FurtherVelocities | None,
-    checkpoints: Checkpoints | None,
-) -> dict[str, Any]:
-    """The joint filter after a recording, and what it left frame by frame: the state that checkpoints hold."""
-    sequence, settings = problem.sequence, problem.config.filter
-    count, key, state = len(sequence), "", None
-    if checkpoints is not None:
-        key = key_of(sequence, problem.config, "full", versions())
-        state = checkpoints.found(key)
-    if state is None:
-        revival = MapRevival(problem.model, settings) if settings.revive >= 0 else None
-        ekf = JointEKF(problem.model, settings, revival=revival)
-        state = {
-            "ekf": ekf,
-            "references": None if judged is None else References(ekf, *judged),
-            "T_imu_world": np.zeros((count, 4, 4)),
-            "covariance": np.zeros((count, 6, 6)),
-            "ms": np.zeros(count),
-            "reports": [],
-            "frames": 0,
-        }
-    ekf, references, begin = state["ekf"], state["references"], state["frames"]
-    frames = progress(range(begin, count), f"{sequence.name}: full")
-    for k, report, state["ms"][k] in run_filter(ekf, sequence, frames, further, begun=begin > 0):
-        state["T_imu_world"][k], state["covariance"][k] = ekf.T_imu_world, ekf.gaussian.body_covariance[:6, :6]
-        state["reports"].append(report)
-        if references is not None:
-            references.record(k)
-        state["frames"] = k + 1
-        if checkpoints is not None:
-            checkpoints.keep(key, state)
-    return state
 
 
 def versions() -> dict[str, str]:

@@ -60,6 +60,7 @@ def test_settings_studies_and_rejections(cooked):
     assert len(found["5"]["rejected"]) == found["5"]["result"].counts["rejected"] > 0
     assert 1.0 < np.nanmedian(found["7"]["nees"]) < 20.0
     assert repr(found["7"]["report"]).count("\n") < 6
+    assert found["14"]["resumed"].table == found["7"]["report"].table
 
 
 def test_files(cooked):
@@ -70,7 +71,6 @@ def test_files(cooked):
     found["11"]["trajectory"].close()
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert all(variant in page for variant in ekfslam.VARIANTS)
-    assert not (folder / "unfinished.checkpoint").exists()
 
 
 def test_live_and_own_block(cooked):

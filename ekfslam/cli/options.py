@@ -19,12 +19,13 @@ from ekfslam.storage.archive import Archive
 DEFAULT_DATA = "builtin:city"
 
 
+class _Unresumable(argparse.Action):
+    def __call__(self, *_: object, **__: object) -> None:
+        print("note: --resume has no effect: runs start from the beginning; sweeps and studies resume", flush=True)
+
+
 def add_resume(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--resume",
-        action="store_true",
-        help="go on where an interrupted run of the same stopped, to the same bits; its checkpoint lies beside --out",
-    )
+    parser.add_argument("--resume", action=_Unresumable, nargs=0, help=argparse.SUPPRESS)
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:

@@ -58,18 +58,17 @@ def run_filter(
     frames: Iterable[int] | None = None,
     further: FurtherVelocities | None = None,
     clock: Callable[[], float] = perf_counter,
-    begun: bool = False,
 ) -> Iterator[Frame]:
     """Feed a recording to an estimator, frame by frame; it can be asked for its state in between.
 
     Args:
-        estimator: As it starts: at the first of the frames; or as it was after the frame before the first of them.
+        estimator: A new one: it begins at the first of the frames.
         sequence: The recording.
         frames: Successive frames, all by default (or wrapped in a progress bar).
         further: Velocity measurements of other sensors.
         clock: In seconds; by default wall-clock time.
-        begun: Whether the estimator has had frames before.
     """
+    begun = False
     for k in range(len(sequence)) if frames is None else frames:
         begin = clock()
         if isinstance(estimator, JointEKF):

@@ -17,18 +17,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-OFTEN = """
-import sys
-from ekfslam.storage import checkpoint
-from ekfslam.studies import study
-checkpoint.EVERY_S, checkpoint.SHARE = 0.1, 0.5
-from ekfslam.cli import main
-raise SystemExit(main(sys.argv[1:]))
-"""
 WORLD = "builtin:city?frames=150"
 COMMANDS = {
-    "run": ["run", WORLD, "--out", "a.h5", "--resume"],
-    "compare": ["compare", WORLD, "--out", ".", "--resume"],
+    "run": ["run", WORLD, "--out", "a.h5"],
+    "compare": ["compare", WORLD, "--out", "."],
     "study": ["consistency", "--runs", "4", "--variants", "invariant", "--executor", "serial", "--out", "."],
     "posterior": ["posterior", "full.h5"],
 }
@@ -48,7 +40,7 @@ def archives(folder: Path) -> dict[str, bytes]:
 
 
 def start(arguments: list[str], folder: Path) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-c", OFTEN, *arguments], cwd=folder, stdout=subprocess.DEVNULL)
+    return subprocess.Popen([sys.executable, "-m", "ekfslam", *arguments], cwd=folder, stdout=subprocess.DEVNULL)
 
 
 def main() -> None:

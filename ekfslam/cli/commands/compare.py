@@ -63,7 +63,7 @@ def command(options: argparse.Namespace) -> None:
     recordings = dict(zip(folders, sequences, strict=True))
     where = "serial" if len(recordings) == 1 and options.executor == "processes" else options.executor
     workers = options.workers or min(len(recordings), os.cpu_count() or 1)
-    chosen = {"resume": options.resume, "force": options.force, "figures": not options.no_figures}
+    chosen = {"force": options.force, "figures": not options.no_figures}
     with open_executor(where, workers) as executor:
         for said in compare_all(recordings, executor, options.modes, config, **chosen):
             print(said)

@@ -22,7 +22,6 @@ from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.older import older_figures, remove_figures
 from ekfslam.runner import run
 from ekfslam.storage.archive import archive_image, require_same_origin
-from ekfslam.storage.checkpoint import Checkpoints
 
 EXAMPLES = (
     "run --mode full --variant invariant --out city.h5",
@@ -47,10 +46,9 @@ def command(options: argparse.Namespace) -> None:
     if not options.force:
         require_same_origin(options.out, sequence)
     print_warnings(sequence)
-    with Checkpoints(options.out.with_name(f"{options.out.name}.checkpoint"), options.resume) as checkpoints:
-        result = run(sequence, options.mode, config, checkpoints=checkpoints)
-        older = [] if _is_shared(options.out) else older_figures(options.out.parent)
-        files.write_all({options.out: archive_image(sequence, {result.mode: result})})
+    result = run(sequence, options.mode, config)
+    older = [] if _is_shared(options.out) else older_figures(options.out.parent)
+    files.write_all({options.out: archive_image(sequence, {result.mode: result})})
     remove_figures(older, ())
     print(table(sequence, len(sequence.observations.ids), {result.mode: result}))
     print(", ".join(f"{name} {count}" for name, count in result.counts.items()))
