@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import WHOLE
+from support.running import WHOLE
 
 from ekfslam.config import Config
 from ekfslam.data.simulate import BUILTIN, builtin, numbers_of

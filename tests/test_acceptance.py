@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from conftest import WHOLE
+from support.running import WHOLE
 
 from ekfslam import Config, open_sequence, run
 from ekfslam.evaluation.summary import summarise

@@ -10,7 +10,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers import synthetic_result, synthetic_sequence
+from support.helpers import synthetic_result, synthetic_sequence
+from support.same import assert_same
 
 from ekfslam.data.readers import read_sequence, write_sequence
 from ekfslam.data.simulate import builtin
@@ -60,23 +61,6 @@ def written(sequence, results, tmp_path_factory) -> Path:
 @pytest.fixture
 def copy(written, tmp_path) -> Path:
     return Path(shutil.copy(written, tmp_path / "copy.h5"))
-
-
-def assert_same(a, b, where: str = "") -> None:
-    """Equal bit for bit, in value and type, all through dataclasses, mappings and arrays."""
-    assert type(a) is type(b), where
-    if dataclasses.is_dataclass(a):
-        for f in dataclasses.fields(a):
-            assert_same(getattr(a, f.name), getattr(b, f.name), f"{where}.{f.name}")
-    elif isinstance(a, dict):
-        assert a.keys() == b.keys(), where
-        for key in a:
-            assert_same(a[key], b[key], f"{where}[{key}]")
-    elif isinstance(a, np.ndarray):
-        assert a.dtype == b.dtype, where
-        np.testing.assert_array_equal(a, b, err_msg=where)
-    else:
-        assert a == b, where
 
 
 @pytest.mark.slow

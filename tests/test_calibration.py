@@ -5,11 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers import run_joint
-from reference import CAMERA, T_CAM_IMU, small_world
-from test_archive import assert_same
-from test_jacobians import POSES, TWISTS, visible_points
-from test_level import OPEN, recorded, seen_rows, sighted, stencil
+from support.helpers import run_joint
+from support.jacobians import POSES, TWISTS, visible_points
+from support.literal import OPEN, recorded, seen_rows, sighted, stencil
+from support.reference import CAMERA, T_CAM_IMU, small_world
+from support.same import assert_same
 
 from ekfslam.cli import main
 from ekfslam.config import CalibrationConfig, Config, PosteriorConfig

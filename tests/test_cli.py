@@ -8,8 +8,8 @@ import sys
 import h5py
 import numpy as np
 import pytest
-from recordings import ece276a_fields, utias_fields, write_mat, write_npz
-from test_metrics import SUMMARY_KEYS
+from support.helpers import SUMMARY_KEYS
+from support.recordings import ece276a_fields, utias_fields, write_mat, write_npz
 
 from ekfslam import reports
 from ekfslam.cli import main

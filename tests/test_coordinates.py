@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers import run_joint
-from reference import CAMERA, T_CAM_IMU, small_world
-from test_jacobians import POSES, central
-from test_variants import drive, exact_motion, gauge_directions
+from support.gauge import drive, exact_motion, gauge_directions
+from support.helpers import run_joint
+from support.jacobians import POSES, central
+from support.reference import CAMERA, T_CAM_IMU, small_world
 
 from ekfslam import Config, posterior, run
 from ekfslam.config import CalibrationConfig, FilterConfig

@@ -11,7 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from test_archive import assert_same
+from support.same import assert_same
 
 from ekfslam.config import Config
 from ekfslam.data.readers import read_sequence, write_sequence

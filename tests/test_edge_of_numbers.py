@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers import synthetic_result, synthetic_sequence
+from support.helpers import synthetic_result, synthetic_sequence
 
 from ekfslam import reports
 from ekfslam.cli import main

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import pickle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from recordings import CAMERA_IN_IMU_M, FRAMES, R_CAM_IMU, K, ece276a_fields, pixels, utias_fields, write_mat, write_npz
+from support.npy import Runs, npy_fields, write_npy
+from support.recordings import (
+    CAMERA_IN_IMU_M,
+    FRAMES,
+    R_CAM_IMU,
+    K,
+    ece276a_fields,
+    pixels,
+    utias_fields,
+    write_mat,
+    write_npz,
+)
 
 from ekfslam.data.dense import UNSEEN
 from ekfslam.data.readers import open_sequence
@@ -27,43 +37,10 @@ from ekfslam.errors import (
 )
 from ekfslam.evaluation.reprojection import reprojection_errors
 from ekfslam.geometry import se3
-from ekfslam.geometry.camera import R_CAM_BODY
 from ekfslam.limits import reading_up_to
 
 WORLD = "loop?frames=40&sigma_px=0.5"
 T_CAM_IMU = se3.transform(R_CAM_IMU, -R_CAM_IMU @ CAMERA_IN_IMU_M)
-
-
-def dense_of(sequence: Sequence) -> np.ndarray:
-    """Features 4 x M x T."""
-    o = sequence.observations
-    features = np.full((4, int(o.ids.max()) + 1, len(sequence)), UNSEEN)
-    features[:, o.landmark, o.frame] = o.pixels_px.T
-    return features
-
-
-def npy_fields(sequence: Sequence) -> dict[str, Any]:
-    """A recording in the form of 2025: poses of the cameras with axes forward, left, up in the IMU frame."""
-    camera = sequence.camera
-    T_regular_imu = se3.transform(R_CAM_BODY.T, np.zeros(3)) @ sequence.T_cam_imu
-    left = se3.inverse(T_regular_imu)
-    right = left @ se3.transform(np.eye(3), np.array([0.0, -camera.baseline_m, 0.0]))
-    matrix = np.array([[camera.fu_px, 0, camera.cu_px], [0, camera.fv_px, camera.cv_px], [0, 0, 1]])
-    return {
-        "v_t": sequence.twist[:, :3].copy(),
-        "w_t": sequence.twist[:, 3:].copy(),
-        "timestamps": sequence.time_s.copy(),
-        "features": dense_of(sequence),
-        "K_l": matrix,
-        "K_r": matrix.copy(),
-        "extL_T_imu": left,
-        "extR_T_imu": right,
-    }
-
-
-def write_npy(path: Path, fields: Any) -> Path:
-    np.save(path, fields, allow_pickle=True)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -151,16 +128,6 @@ def test_cameras_at_one_place(tmp_path, world):
     fields["extR_T_imu"] = fields["extL_T_imu"]
     with pytest.raises(CalibrationError, match="extR_T_imu"):
         open_sequence(write_npy(tmp_path / "a.npy", fields))
-
-
-class Runs:
-    """What a pickle may hold that runs a command when it is loaded."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> Any:
-        return os.system, (f"touch {self.path}",)
 
 
 def raw_npy(path: Path, pickled: bytes) -> Path:

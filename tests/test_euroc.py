@@ -6,19 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import FRAMES, ece276a_fields, stamps, write_npz
 from scipy.spatial.transform import Rotation
+from support.recordings import FRAMES, HEADER, ece276a_fields, stamps, write_npz
 
 from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import DataError, NonFiniteError, StampError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3
 
-HEADER = (
-    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
-    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
-    "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
-)
 IN_RECORDING = "mav0/state_groundtruth_estimate0/data.csv"
 
 

@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import WHOLE, seeds
-from reference import CAMERA, T_CAM_IMU
-from test_jacobians import central
+from support.jacobians import central
+from support.reference import CAMERA, T_CAM_IMU
+from support.running import WHOLE, seeds
 
 from ekfslam.config import FilterConfig, PosteriorConfig
 from ekfslam.data.noise import Noise

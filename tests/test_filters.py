@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from reference import report_mapping, run_naive, small_world
+from support.reference import report_mapping, run_naive, small_world
 
 from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig
 from ekfslam.data.sequence import Observations

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from conftest import WHOLE
-from test_house import BLOCKS, CALIBRATION, PRIOR
-from test_posterior import with_everything
+from support.everything import BLOCKS, CALIBRATION, PRIOR, with_everything
+from support.running import WHOLE
 
 from ekfslam.config import Config
 from ekfslam.data.readers import open_sequence

@@ -23,7 +23,7 @@ from ekfslam.runner import run
 
 cv2 = pytest.importorskip("cv2")
 
-from rendered import BASELINE_M, SIZE, calibrated, drive, recording, write_kitti  # noqa: E402
+from support.rendered import BASELINE_M, SIZE, calibrated, drive, recording, write_kitti  # noqa: E402
 
 CAMERA = StereoCamera(300.0, 300.0, 199.5, 99.5, BASELINE_M)
 ROTATION_RAD = np.deg2rad([0.10, -0.08, 0.06])

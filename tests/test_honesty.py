@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import WHOLE, seeds
+from support.running import WHOLE, seeds
 
 from ekfslam.data.sequence import Noise
 from ekfslam.data.simulate import CAMERA, T_CAM_IMU, City, simulate

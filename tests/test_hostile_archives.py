@@ -9,8 +9,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import WHOLE
-from helpers import synthetic_result, synthetic_sequence
+from support.helpers import synthetic_result, synthetic_sequence
+from support.running import WHOLE
 
 from ekfslam.cli import main
 from ekfslam.config import Config

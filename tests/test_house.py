@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import WHOLE
-from helpers import truth_error
-from test_posterior import EVERYTHING, with_everything
+from support.everything import BLOCKS, CALIBRATION, EVERYTHING, PRIOR, with_everything
+from support.helpers import truth_error
+from support.running import WHOLE
 
 from ekfslam.config import Config
 from ekfslam.data.readers import open_sequence
@@ -21,14 +21,6 @@ from ekfslam.smoother.problem import BatchProblem
 from ekfslam.smoother.revival import MapRevival
 from ekfslam.smoother.sparse.information import JointInformation
 
-PRIOR = {
-    "landmark_coordinates": "xyz",
-    "moving_sigma": 20.0,
-    "initial_position_std_m": 0.1,
-    "initial_rotation_std_rad": 0.05,
-}
-CALIBRATION = {"rotation_deg": 0.3, "lever_arm_m": 0.05, "baseline": 0.01, "disparity_px": 0.3, "time_s": 0.01}
-BLOCKS = {"twist_bias": {}, "camera_jitter": {}, "vision_drift": {}, "stereo_rotation": {"time_s": 5.0}}
 SHARED = ["camera_jitter", "vision_drift", "stereo_rotation", "previous_camera_jitter", "previous_stereo_rotation"]
 ALL_BLOCKS = ["pose", "previous_pose", "calibration", *SHARED, "twist", "up", "twist_bias"]
 UNSHARED = [name for name in ALL_BLOCKS if name not in SHARED]

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers import synthetic_result, synthetic_sequence
-from recordings import ece276a_fields, write_npz
+from support.helpers import synthetic_result, synthetic_sequence
+from support.recordings import ece276a_fields, write_npz
 
 from ekfslam.cli import main
 from ekfslam.data.interpolation import SHORTEST, interpolated_intervals, known_intervals, stretches

@@ -5,7 +5,8 @@ States: random, near the identity, and near half turns; extrinsics far from triv
 
 import numpy as np
 import pytest
-from reference import CAMERA, T_CAM_IMU, jacobian_of_pi, small_world, stereo_matrix, triangulate_least_squares
+from support.jacobians import POSES, RNG, TWISTS, central, visible_points
+from support.reference import CAMERA, T_CAM_IMU, jacobian_of_pi, small_world, stereo_matrix, triangulate_least_squares
 
 from ekfslam.config import FilterConfig
 from ekfslam.data.sequence import Noise
@@ -18,30 +19,8 @@ from ekfslam.models.build import model_of
 from ekfslam.models.observation import initialise, linearise
 from ekfslam.models.sensors.stereo import Rig
 
-RNG = np.random.default_rng(7)
-HALF_TURNS = [(np.pi - 1e-7) * axis for axis in (*np.eye(3), np.array([0.6, -0.8, 0.0]))]
-POSES = {
-    "identity": np.eye(4),
-    "near identity": se3.exp(np.full(6, 1e-9)),
-    **{f"random {i}": se3.exp(RNG.normal(size=6) * [20, 20, 20, 1, 1, 1]) for i in range(4)},
-    **{f"near pi {i}": se3.exp(np.concatenate([RNG.normal(size=3) * 5, w])) for i, w in enumerate(HALF_TURNS)},
-}
 poses = pytest.mark.parametrize("T", POSES.values(), ids=POSES.keys())
-SPIN = np.array([8, 1, 0, 0, 0, 31.0])  # about a half turn in 0.1 s
-TWISTS = [np.zeros(6), np.full(6, 1e-9), *RNG.normal(size=(3, 6)) * [10, 2, 1, 1, 1, 1], SPIN]
 RIG = Rig(CAMERA, T_CAM_IMU, Noise(np.full(6, 0.1), np.array([0.7, 0.9, 1.1, 1.3])))
-
-
-def central(function, size, step=1e-6):
-    """Jacobian of a vector function of a ``size``-vector at zero, exact to second order."""
-    columns = [(function(h) - function(-h)) / (2 * step) for h in np.eye(size) * step]
-    return np.array(columns).T
-
-
-def visible_points(T_imu_world, n=5):
-    """World points in front of the camera, near and far."""
-    q = RNG.uniform([-3, -2, 2], [3, 2, 30], (n, 3))
-    return se3.apply(se3.inverse(T_CAM_IMU @ T_imu_world), q)
 
 
 def from_one_sight(rig, T, z):

@@ -4,42 +4,52 @@
 share no formula with the package beyond `se3`.
 """
 
-import copy
 import dataclasses
 
 import numpy as np
 import pytest
-from conftest import WHOLE
-from helpers import run_joint
-from reference import CAMERA, T_CAM_IMU, small_world
-from test_jacobians import POSES, TWISTS
-from test_variants import gauge_directions
+from support.helpers import run_joint
+from support.jacobians import POSES, TWISTS
+from support.literal import (
+    EVERYTHING,
+    OPEN,
+    P0,
+    TILTED,
+    TRACKS,
+    Literal,
+    X,
+    Y,
+    Z,
+    difference,
+    filter_of,
+    gauge_information,
+    gravity,
+    in_imu,
+    in_level_frame,
+    level_axes,
+    moved,
+    recorded,
+    rotated,
+    stencil,
+    with_noise,
+)
+from support.reference import CAMERA, T_CAM_IMU, small_world
+from support.running import WHOLE
 
-from ekfslam.config import CalibrationConfig, Config, FilterConfig
-from ekfslam.data.sequence import Noise, Observations
+from ekfslam.config import CalibrationConfig, Config
+from ekfslam.data.sequence import Noise
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import DataError
-from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import motion, se3
 from ekfslam.models.blocks import TwistBias
 from ekfslam.models.build import model_of, noise_of
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
 
-OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0, retire="never", moving_sigma=1e9)
-P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
-EVERYTHING = CalibrationConfig(rotation_deg=0.5, lever_arm_m=0.1, baseline=0.02, disparity_px=0.5, time_s=0.02)
 SOME = CalibrationConfig(rotation_deg=0.5, disparity_px=0.5, time_s=0.02)
 WALK = np.repeat([0.2, 0.02], 3)
-TRACKS = {
-    "track_first_px": np.array([0.3, 0.4, 0.8]),
-    "track_walk_px": np.array([0.2, 0.25, 0.3]),
-    "track_memory": 0.9,
-    "track_flow_px": 15.0,
-}
 BIAS = TwistBias(sigma_v_m_s=0.1, sigma_w_rad_s=0.01, time_v_s=3.0, time_w_s=7.0)
 RNG = np.random.default_rng(11)
-X, Y, Z = np.eye(3)
 UPS = {
     "level": Z,
     "hardly tilted": se3.so3_exp(np.array([1e-9, -2e-9, 0])) @ Z,
@@ -49,380 +59,6 @@ UPS = {
     **{f"random {i}": se3.so3_exp(np.append(RNG.uniform(-0.7, 0.7, 2), 0)) @ Z for i in range(3)},
 }
 ups = pytest.mark.parametrize("up", UPS.values(), ids=UPS.keys())
-
-
-def with_noise(sequence, **changes):
-    return dataclasses.replace(sequence, noise=dataclasses.replace(sequence.noise, **changes))
-
-
-def stencil(function, size, step=4e-3):
-    """As `central`, but to sixth order, some 12 digits; ``function`` takes a stack (7, size, size) of vectors."""
-    h = step * np.arange(-3, 4)[:, None, None] * np.eye(size)
-    weights = np.array([-1, 9, -45, 0, 45, -9, 1]) / 60
-    return np.tensordot(weights, function(h), 1).T / step
-
-
-def level_axes(up):
-    """The level frame, made of cross products: y is across both up and the IMU's x axis."""
-    y = np.cross(up, X)
-    y = y / np.linalg.norm(y, axis=-1, keepdims=True)
-    return np.stack([np.cross(y, up), y, up], axis=-1)
-
-
-def rotated(R, twist):
-    both = [(R @ part[..., None])[..., 0] for part in (twist[..., :3], twist[..., 3:])]
-    return np.concatenate(np.broadcast_arrays(*both), axis=-1)
-
-
-def in_imu(level_twist, up):
-    return rotated(level_axes(up), level_twist)
-
-
-def moved(T, W, twist, tau, errors=None):
-    """Pose and IMU velocities after one step at level velocities; up is the z axis of W, in world.
-
-    ``errors`` (9,) are those of the velocities, and the small angles that turn them.
-    """
-    u = in_imu(twist, (T[..., :3, :3] @ W)[..., 2])
-    if errors is not None:
-        u = rotated(se3.so3_exp(errors[..., 6:]), u) + errors[..., :6]
-    return se3.exp(-tau * u) @ T, u
-
-
-def difference(T, T_hat):
-    """Error (6,) of a pose."""
-    return se3.log(T @ np.linalg.inv(T_hat))
-
-
-def camera_pose(T, c, u, T_cam_imu):
-    return se3.exp(c[..., :6]) @ T_cam_imu @ se3.exp(-c[..., 8:] * u) @ T
-
-
-def seen_rows(T, c, u, m, camera=CAMERA, T_cam_imu=T_CAM_IMU):
-    """Rows (uL, v, uR) that a rig with calibration parameters c (9,) has of points (n, 3)."""
-    q = se3.apply(camera_pose(T, c, u, T_cam_imu)[..., None, :, :], m)
-    left = camera.fu_px * q[..., 0] / q[..., 2] + camera.cu_px
-    v = camera.fv_px * q[..., 1] / q[..., 2] + camera.cv_px
-    disparity = camera.fu_px * camera.baseline_m * np.exp(c[..., None, 6]) / q[..., 2] + c[..., None, 7]
-    return np.stack([left, v, left - disparity], axis=-1)
-
-
-def sighted(T, c, u, rows, camera=CAMERA, T_cam_imu=T_CAM_IMU):
-    """The point (3,) that `seen_rows` sees so."""
-    z = camera.fu_px * camera.baseline_m * np.exp(c[..., 6]) / (rows[..., 0] - rows[..., 2] - c[..., 7])
-    x, y = (rows[..., 0] - camera.cu_px) / camera.fu_px * z, (rows[..., 1] - camera.cv_px) / camera.fv_px * z
-    return se3.apply(np.linalg.inv(camera_pose(T, c, u, T_cam_imu)), np.stack([x, y, z], axis=-1))
-
-
-# From (uL, v, uR) to (u, v, disparity), and back.
-BY_DISPARITY = np.array([[1.0, 0, 0], [0, 1, 0], [1, 0, -1]])
-
-
-class Literal:
-    """Textbook EKF: full-width numeric F, H and G, S^-1, Joseph's form. Nothing is gated or retired.
-
-    The state is pose, pose before, free calibration parameters, velocities, up, bias, landmarks, as in `JointEKF`;
-    where the noise knows no tracks, velocities or bias, these have no columns. With ``images`` landmarks are corrected
-    in pixels (u, v, disparity) of the last updated camera, eq. (7').
-    """
-
-    def __init__(self, sequence, variant, free, std, up=Z, bias=None, images=False, P=P0):
-        self.sequence, self.noise, self.variant, self.free = sequence, sequence.noise, variant, free
-        self.images, self.updated, self.by_position = images, "T", 0
-        self.T = self.departed = np.linalg.inv(sequence.initial_T_world_imu)
-        self.before, self.c, self.twist, self.b = np.eye(4), np.zeros(9), None, np.zeros(6)
-        self.u = self.u_before = np.zeros(6)
-        self.W = self.T[:3, :3].T @ level_axes(up)
-        self.m, self.ids, self.first, self.last, self.rows = np.empty((0, 3)), [], {}, {}, {}
-        self.walks, self.bias, self.tracks = self.noise.twist_walk_std is not None, bias, self.noise.track_error
-        self.has_clone = images or self.tracks is not None
-        self.k, self.body, self.at = 0, 0, {}
-        of_bias = np.zeros(0) if bias is None else np.repeat([bias.sigma_v_m_s, bias.sigma_w_rad_s], 3)
-        prior = {
-            "pose": P,
-            "before": np.zeros((6 * self.has_clone,) * 2),
-            "c": np.diag(std**2),
-            "twist": np.zeros((6 * self.walks,) * 2),
-            "up": self.noise.tilt_rad**2 * np.eye(3),
-            "bias": np.diag(of_bias**2),
-        }
-        for name, block in prior.items():
-            self.at[name] = slice(self.body, self.body + len(block))
-            self.body += len(block)
-        self.P = np.zeros((self.body, self.body))
-        for name, block in prior.items():
-            self.P[self.at[name], self.at[name]] = block
-
-    def moved_by(self, e):
-        """The blocks with errors e."""
-        found = {
-            "T": se3.exp(e[..., self.at["pose"]]) @ self.T,
-            "before": self.before,
-            "c": self.c + e[..., self.at["c"]] @ np.eye(9)[self.free],
-            "twist": self.twist,
-            "W": se3.so3_exp(e[..., self.at["up"]]) @ self.W,
-            "b": self.b,
-        }
-        if self.has_clone:
-            found["before"] = se3.exp(e[..., self.at["before"]]) @ self.before
-        if self.twist is not None:
-            found["twist"] = self.twist + e[..., self.at["twist"]]
-        if self.bias is not None:
-            found["b"] = self.b + e[..., self.at["bias"]]
-        return found
-
-    def begin(self, measured):
-        self.u = moved(self.T, self.W, measured, 0.0)[1]
-
-    def predict(self, measured, tau):
-        self.wander(tau)
-        if self.walks:
-            self.measure(measured)
-
-        def driven(x):
-            return x["twist"] if self.walks else measured - x["b"]
-
-        nothing = np.zeros(len(self.P))
-        twist = driven(self.moved_by(nothing))
-        T, u = moved(self.T, self.W, twist, tau)
-
-        def after(e):
-            x = self.moved_by(e)
-            return difference(moved(x["T"], x["W"], driven(x), tau)[0], T)
-
-        F, G = np.eye(len(self.P)), np.zeros((len(self.P), 9))
-        F[:6] = stencil(after, len(self.P))
-        G[:6] = stencil(lambda errors: difference(moved(self.T, self.W, twist, tau, errors)[0], T), 9)
-        if self.has_clone:
-            F[self.at["before"]] = np.eye(len(self.P))[:6]
-        std = self.noise.motion_std if self.walks else np.hypot(self.noise.twist_std, self.noise.motion_std)
-        variance = np.concatenate([std**2, np.full(3, self.noise.misalignment_rad**2)])
-        self.P = F @ self.P @ F.T + G @ np.diag(variance) @ G.T
-        self.before, self.departed, self.updated = self.T, self.T, "before"
-        self.T, self.u, self.u_before, self.tau, self.k = T, u, self.u, tau, self.k + 1
-
-    def wander(self, tau):
-        """Velocities walk once they are known, the bias forgets."""
-        own = np.arange(len(self.P))
-        if self.twist is not None:
-            at = own[self.at["twist"]]
-            self.P[at, at] += self.noise.twist_walk_std**2
-        if self.bias is not None:
-            sigma = np.repeat([self.bias.sigma_v_m_s, self.bias.sigma_w_rad_s], 3)
-            kept = np.exp(-tau / np.repeat([self.bias.time_v_s, self.bias.time_w_s], 3))
-            F, at = np.eye(len(self.P)), own[self.at["bias"]]
-            F[at, at] = kept
-            self.P = F @ self.P @ F.T
-            self.P[at, at] += sigma**2 - (sigma * kept) ** 2
-            self.b = kept * self.b
-
-    def measure(self, measured):
-        """The velocities, whose first measurement is the first that is known of them."""
-        variance, none = np.diag(self.noise.twist_std**2), np.zeros((6, len(self.P)))
-        by_bias = none.copy()
-        by_bias[:, self.at["bias"]] = np.eye(6) if self.bias is not None else 0.0
-        if self.twist is None:
-            F = np.eye(len(self.P))
-            F[self.at["twist"]] = -by_bias
-            self.P = F @ self.P @ F.T
-            self.P[self.at["twist"], self.at["twist"]] += variance
-            self.twist = measured - self.b
-        else:
-            H = none + by_bias
-            H[:, self.at["twist"]] = np.eye(6)
-            self.condition(H, measured - self.twist - self.b, variance)
-
-    def update(self, ids, pixels):
-        rows = np.column_stack([pixels[:, 0], (pixels[:, 1] + pixels[:, 3]) / 2, pixels[:, 2]])
-        if self.tracks is not None:
-            rows = np.column_stack([rows[:, :2], pixels[:, 0] - pixels[:, 2]])
-        seen = [(i, z, self.ids.index(i)) for i, z in zip(ids.tolist(), rows, strict=True) if i in self.ids]
-        if seen:
-            # The velocities that a time offset counts by are those that the frame itself corrects.
-            trial = copy.deepcopy(vars(self))
-            self.correct(seen)
-            u = -difference(self.T, self.departed) / self.tau
-            vars(self).update(trial)
-            self.u = u
-            self.correct(seen)
-        for i, z in zip(ids.tolist(), rows, strict=True):
-            if i not in self.ids:
-                self.start(i, z)
-            self.last[i], self.rows[i] = self.k, z
-        self.updated = "T"
-
-    def look(self, x, m, before=False, follows=False):
-        """Rows of points (..., n, 3) now, or in the frame before, with disparities where tracks err."""
-        T, u = (x["before"], self.u_before) if before else (x["T"], self.u)
-        rows = seen_rows(T, x["c"], u, m)
-        return rows if self.tracks is None else rows @ BY_DISPARITY.T
-
-    def point(self, x, row):
-        """The point (3,) that is seen so now."""
-        back = np.eye(3) if self.tracks is None else BY_DISPARITY
-        return sighted(x["T"], x["c"], self.u, row @ back.T)
-
-    def correct(self, seen):
-        variance = []
-        for i, z, _ in seen:
-            if self.tracks is None:
-                variance.append(self.noise.pixel_std_px[0] ** 2 * np.array([1, 0.5, 1]))
-            elif self.last[i] == self.k - 1:
-                u, v, d = (z - self.rows[i]) ** 2
-                flow = np.array([u + 0.35 * (v + d), v + 0.35 * (u + d), d + 0.35 * (u + v)])
-                variance.append(self.noise.track_walk_px**2 * (1 + flow / self.noise.track_flow_px**2))
-            else:
-                spread = self.noise.track_first_px**2
-                for _ in range(self.first[i], self.k):
-                    spread = self.noise.track_memory**2 * spread + self.noise.track_walk_px**2
-                variance.append(spread)
-
-        def left(e):
-            x, parts = self.moved_by(e), []
-            m = self.m + e[..., self.body :].reshape(*e.shape[:-1], -1, 3)
-            for i, z, place in seen:
-                own = m[..., place : place + 1, :]
-                follows = self.tracks is not None and self.last[i] == self.k - 1
-                residual = z - self.look(x, own, follows=follows)
-                if follows:
-                    before = self.rows[i] - self.look(x, own, before=True)
-                    residual = residual - self.noise.track_memory * before
-                parts.append(residual[..., 0, :])
-            return np.concatenate(parts, axis=-1)
-
-        H = -stencil(left, len(self.P))
-        self.condition(H, left(np.zeros(len(self.P))), np.diag(np.concatenate(variance)))
-
-    def start(self, i, z):
-        n = len(self.P)
-        here = self.moved_by(np.zeros(n))
-        G = stencil(lambda e: self.point(self.moved_by(e), z), n)
-        by_row = stencil(lambda d: self.point(here, z + d), 3)
-        variance = self.noise.pixel_std_px[0] ** 2 * np.array([1, 0.5, 1])
-        if self.tracks is not None:
-            variance = self.noise.track_first_px**2
-        wide = np.vstack([np.eye(n), G])
-        self.P = wide @ self.P @ wide.T
-        self.P[n:, n:] += by_row @ np.diag(variance) @ by_row.T
-        self.m = np.vstack([self.m, self.point(here, z)])
-        self.ids.append(i)
-        self.first[i] = self.k
-
-    def to_stored(self):
-        """L, stored errors of poses and landmarks by the right-invariant ones; identity in between."""
-        L = np.eye(len(self.P))
-        L[:6, :6] = -se3.adjoint(self.T)
-        if self.has_clone:
-            L[self.at["before"], self.at["before"]] = -se3.adjoint(self.before)
-        for j, m in enumerate(self.m):
-            L[self.body + 3 * j : self.body + 3 * j + 3, 3:6] = -se3.skew(m)
-        return L
-
-    def image(self, e, by_position):
-        """Landmarks (n, 3) as the last updated camera has them, intrinsics as given; by positions where told so."""
-        x, m = self.moved_by(e), self.m + e[..., self.body :].reshape(*e.shape[:-1], -1, 3)
-        c = x["c"] * (np.arange(9) < 6)
-        q = se3.apply(camera_pose(x[self.updated], c, np.zeros(6), T_CAM_IMU)[..., None, :, :], m)
-        y = seen_rows(x[self.updated], c, np.zeros(6), m) @ BY_DISPARITY.T
-        return np.where(by_position[:, None], q, y)
-
-    def act_on_images(self, x):
-        """Eq. (7') as it stands: move the images, find the landmarks, and carry P along by full-width Jacobians."""
-        zero, n = np.zeros(len(self.P)), len(self.m)
-        q = self.image(zero, np.ones(n, dtype=bool))
-        z, nowhere = q[:, 2], np.zeros(n, dtype=bool)
-        away = ~((z > 0.1) & (np.abs(q[:, :2]).max(axis=1) < 3 * z))
-        away |= CAMERA.fu_px * CAMERA.baseline_m / z < 0.5
-        y = self.image(zero, nowhere)
-        step = (stencil(lambda e: self.image(e, nowhere).reshape(*e.shape[:-1], -1), len(x), 2e-3) @ x).reshape(-1, 3)
-        factor = (y + step)[:, 2] / y[:, 2]
-        away |= ~((factor > 0.25) & (factor < 4))
-        self.by_position += away.sum()
-
-        def coordinates(e):
-            return self.image(e, away).reshape(*e.shape[:-1], -1)
-
-        H = stencil(coordinates, len(x), 2e-3)
-        moved_to = (coordinates(zero) + H @ x).reshape(-1, 3)
-        poses = {"pose": self.T, "before": self.before}
-        vars(self).update(self.moved_by(x))
-        c, camera = self.c * (np.arange(9) < 6), getattr(self, self.updated)
-        from_pixels = sighted(camera, c, np.zeros(6), np.where(away[:, None], 1.0, moved_to) @ BY_DISPARITY.T)
-        from_positions = se3.apply(np.linalg.inv(camera_pose(camera, c, np.zeros(6), T_CAM_IMU)), moved_to)
-        self.m = np.where(away[:, None], from_positions, from_pixels)
-        G, H_after = np.eye(len(x)), stencil(coordinates, len(x), 2e-3)
-        if self.variant == "invariant":
-            for name, T in poses.items():
-                T_after = self.T if name == "pose" else self.before
-                G[self.at[name], self.at[name]] = se3.adjoint(T_after @ np.linalg.inv(T))
-        rest = H.copy()
-        rest[:, : self.body] -= H_after[:, : self.body] @ G[: self.body, : self.body]
-        G[self.body :] = np.linalg.solve(H_after[:, self.body :], rest)
-        self.P = G @ self.P @ G.T
-
-    def condition(self, H, residual, V):
-        K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + V)
-        x, rest = K @ residual, np.eye(len(self.P)) - K @ H
-        self.P = rest @ self.P @ rest.T + K @ V @ K.T
-        if self.images:
-            self.act_on_images(x)
-            return
-        stored, T_before, m_before, c_before = self.to_stored(), self.T, self.m, self.c
-        after = self.moved_by(x)
-        vars(self).update({name: value for name, value in after.items() if name not in ("T", "before")})
-        if self.variant == "standard":
-            self.T, self.before, self.m = after["T"], after["before"], self.m + x[self.body :].reshape(-1, 3)
-            return
-        e = np.linalg.inv(stored) @ x
-        self.T = self.T @ se3.exp(-e[:6])
-        if self.has_clone:
-            self.before = self.before @ se3.exp(-e[self.at["before"]])
-        R, J = se3.so3_exp(e[3:6]), se3.so3_left_jacobian(e[3:6])
-        self.m = self.m @ R.T + e[self.body :].reshape(-1, 3) @ J.T
-        transport = self.to_stored() @ np.linalg.inv(stored)
-        R_cam_world = (se3.exp(c_before[:6]) @ T_CAM_IMU @ T_before)[:3, :3]
-        for i, place in enumerate(self.free):
-            if place in (3, 4, 5):
-                axis = R_cam_world.T @ se3.so3_left_jacobian(c_before[3:6])[:, place - 3]
-                transport[self.body :, self.at["c"].start + i] += np.cross(self.m - m_before, axis).ravel()
-        self.P = transport @ self.P @ transport.T
-
-
-def gravity(sequence, W):
-    """Up in the frame of the IMU at every stamp, where ``W Z`` is up in that of the first."""
-    R = sequence.truth.T_world_imu[:, :3, :3]
-    return np.swapaxes(R, 1, 2) @ R[0] @ W @ Z
-
-
-def in_level_frame(sequence, W, **noise):
-    """The sequence with its velocities given in the level frame, as it was at the begin of each interval."""
-    up = gravity(sequence, W)
-    up = np.concatenate([up[:1], up[:-1]])
-    twist = rotated(np.swapaxes(level_axes(up), -1, -2), sequence.twist)
-    return with_noise(dataclasses.replace(sequence, twist=twist, velocity_frame="level"), **noise)
-
-
-def recorded(world, c, rng):
-    """The drive of a simulated world, recorded once more by a rig with parameters c; exposed at the poses of then."""
-    truth, observations = world.truth, world.observations
-    T = se3.inverse(truth.T_world_imu)
-    u = -se3.log(T[1:] @ se3.inverse(T[:-1])) / np.diff(world.time_s)[:, None]
-    k = observations.frame
-    ahead = np.vstack([u, u[-1]])[k]
-    place = truth.position_m[np.searchsorted(truth.landmark, observations.landmark)]
-    rows = seen_rows(T[k], np.tile(c, (len(k), 1)), ahead, place[:, None], world.camera, world.T_cam_imu)[:, 0]
-    pixels = rows[:, [0, 1, 2, 1]] + world.noise.pixel_std_px * rng.normal(size=(len(k), 4))
-    twist = np.vstack([u[0], u]) + world.noise.twist_std * rng.normal(size=(len(world), 6))
-    return dataclasses.replace(world, twist=twist, observations=Observations(k, observations.landmark, pixels))
-
-
-def filter_of(world, config, calibration=None, P=P0, up=None, blocks=()):
-    """The filter of a world, where ``up`` (3,) is what it takes as up in the first frame of the IMU."""
-    rig = Rig(world.camera, world.T_cam_imu, world.noise)
-    ekf = JointEKF(rig, config, world.initial_T_world_imu, P, calibration, blocks=blocks)
-    if up is not None:
-        ekf.values["up"] = ekf.T_world_imu[:3, :3] @ up
-    return ekf
 
 
 @ups
@@ -494,9 +130,6 @@ def test_transition_and_noise_of_everything(name, T, walks):
     std = np.concatenate([noise.motion_std if walks else noise.twist_std, np.full(3, noise.misalignment_rad)])
     np.testing.assert_allclose(step.Q, G @ np.diag(std**2) @ G.T, atol=1e-11)
     assert np.abs(step.Phi[:6, -9:-6]).max() > 1e-3
-
-
-TILTED = se3.so3_exp(np.array([0.3, -0.2, 0.0]))
 
 
 ERRORS = {"ar": TRACKS, "walk": {**TRACKS, "track_memory": 1.0}, "white": {}}
@@ -613,17 +246,6 @@ def test_information_about_the_gauge_with_up_and_calibration(variant, coordinate
         assert ratio.max() > 10
     else:
         np.testing.assert_allclose(ratio, 1.0, atol=1e-6)
-
-
-def gauge_information(ekf):
-    """Information (6, 6) about where the world is, from all but clones: exact velocities tell that of the pose."""
-    body, layout = np.zeros((ekf.gaussian.body, 6)), ekf.model.layout
-    N = gauge_directions(ekf.linear_T_imu_world, ekf.linear_positions_m)
-    body[layout["pose"]] = N[:6]
-    body[layout["up"], 3:] = np.eye(3)
-    clones = layout.columns(layout.clones.values())
-    N, P = np.delete(np.vstack([body, N[6:]]), clones, 0), np.delete(np.delete(ekf.P, clones, 0), clones, 1)
-    return N.T @ np.linalg.solve(P, N)
 
 
 DRIVE = "city?frames=120&outlier_fraction=0&max_tracks=6&sigma_v_m_s=0.02&sigma_w_rad_s=0.001&seed={}"

@@ -15,7 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from recordings import ece276a_fields, write_npz
+from support.recordings import ece276a_fields, write_npz
 
 from ekfslam import limits
 from ekfslam.cli import main

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_posterior import with_everything
+from support.everything import with_everything
 
 from ekfslam import LiveEKF
 from ekfslam.config import Config

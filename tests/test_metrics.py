@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers import FULL_SCALE, synthetic_result, synthetic_sequence
 from scipy.stats import chi2
+from support.helpers import FULL_SCALE, SUMMARY_KEYS, synthetic_result, synthetic_sequence
 
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.consistency import (
@@ -32,29 +32,6 @@ from ekfslam.evaluation.trajectory import (
 )
 from ekfslam.filters.result import Landmarks
 from ekfslam.geometry import se3
-
-SUMMARY_KEYS = {
-    "ate_m",
-    "ate_aligned_m",
-    "final_error_m",
-    "rpe_1_frame_m",
-    "rpe_1_frame_deg",
-    "rpe_10_m_m",
-    "rpe_10_m_deg",
-    "t_rel_percent",
-    "r_rel_deg_per_100m",
-    "ms_per_frame_median",
-    "ms_per_frame_max",
-    "total_s",
-    "accepted",
-    "rejected",
-    "nis_per_dof",
-    "pose_nees_mean",
-    "pose_nees_with_truth_noise_mean",
-    *(f"pose_nees_{axis}_mean" for axis in ("x", "y", "z", "roll", "pitch", "yaw")),
-    *(f"pose_nees_relative_{stretch}_mean" for stretch in ("10", "50", "100", "50_m", "100_m")),
-    "landmark_rmse_m",
-}
 
 
 def random_poses(rng: np.random.Generator, n: int) -> np.ndarray:

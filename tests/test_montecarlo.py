@@ -15,8 +15,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import WHOLE
 from PIL import Image
+from support.running import WHOLE
+from support.studies import short
 
 from ekfslam.cli import main
 from ekfslam.config import Config, FilterConfig
@@ -41,11 +42,6 @@ from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import SerialExecutor, open_executor
 from ekfslam.studies.study import FIELDS, LEVELS, Study, levels_of, read_study, realisation, run_one, run_study
 from ekfslam.studies.summary import study_table, summarise_study
-
-
-def short(level: str = "mid", frames: int = 8, **changes):
-    return {level: dataclasses.replace(LEVELS[level], frames=frames, **changes)}
-
 
 SMALL = Study({**short("mid"), **short("low")}, ("invariant", "standard"), runs=3, seed=5)
 
@@ -104,7 +100,8 @@ def test_threads_of_one_process_take_turns_and_give_the_same_bits(tmp_path, seri
 KILLED = """
 import sys
 import time
-from test_montecarlo import Study, short
+from support.studies import short
+from ekfslam.studies.study import Study
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import open_executor
 

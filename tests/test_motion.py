@@ -10,8 +10,8 @@ import subprocess
 
 import numpy as np
 import pytest
-from helpers import synthetic_result, synthetic_sequence
 from PIL import Image
+from support.helpers import synthetic_result, synthetic_sequence
 
 from ekfslam.cli import main
 from ekfslam.errors import ConfigError

@@ -12,10 +12,10 @@ import h5py
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from helpers import synthetic_result, synthetic_sequence
 from hypothesis import given
 from hypothesis import strategies as st
-from recordings import ece276a_fields, write_npz
+from support.helpers import synthetic_result, synthetic_sequence
+from support.recordings import ece276a_fields, write_npz
 
 from ekfslam.cli import main
 from ekfslam.config import Config

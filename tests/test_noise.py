@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import WHOLE, seeds
-from helpers import run_joint
-from reference import D, circle_dot, homogeneous, jacobian_of_pi, small_world, stereo_matrix
-from test_jacobians import central
-from test_variants import gauge_directions
+from support.gauge import gauge_directions
+from support.helpers import grown, run_joint, tracked
+from support.jacobians import central
+from support.reference import D, circle_dot, homogeneous, jacobian_of_pi, small_world, stereo_matrix
+from support.running import WHOLE, seeds
 
 from ekfslam.config import Config, FilterConfig, NoiseConfig, PosteriorConfig
 from ekfslam.data.noise import TrackError
@@ -19,7 +19,6 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import motion, se3
-from ekfslam.geometry.camera import project
 from ekfslam.models.build import build, noise_of
 from ekfslam.models.noise import (
     TRACK_WALK_PX,
@@ -49,12 +48,6 @@ TRACKS = {
     "track_flow_px": 40.0,
 }
 ERROR = TrackError(*TRACKS.values())
-
-
-def grown(motion, flow_px):
-    """By what the variances of a walk have grown (3,) where u, v and disparity have moved by ``motion`` (3,)."""
-    u, v, d = motion**2
-    return 1 + np.array([u + 0.35 * (v + d), v + 0.35 * (u + d), d + 0.35 * (u + v)]) / flow_px**2
 
 
 def with_noise(sequence, **changes):
@@ -435,32 +428,6 @@ def test_no_information_about_the_gauge_comes_with_velocities_and_errors_of_trac
         N = gauge_of_all(ekf)
         ratio = np.linalg.eigvals(np.linalg.solve(prior, N.T @ np.linalg.solve(ekf.P, N))).real
         assert ratio.max() < 1 + 1e-6
-
-
-def tracked(world, error, seed=1, movers=(), speed=0.3):
-    """A small world recorded once more with errors of tracks; some landmarks travel along with the rig."""
-    rng = np.random.default_rng(seed)
-    observations, truth = world.observations, world.truth
-    pixels, last = np.empty_like(observations.pixels_px), {}
-    place = dict(zip(truth.landmark.tolist(), truth.position_m, strict=True))
-    first = {}
-    for i, (k, j) in enumerate(zip(observations.frame.tolist(), observations.landmark.tolist(), strict=True)):
-        k0 = first.setdefault(j, k)
-        travelled = truth.T_world_imu[k, :3, 3] - truth.T_world_imu[k0, :3, 3]
-        m = place[j] + (speed * travelled if j in movers else 0.0)
-        seen = project(world.camera, se3.apply(world.T_cam_imu @ se3.inverse(truth.T_world_imu[k]), m))
-        if j not in last:
-            e = error.first_std * rng.normal(size=3)
-        else:
-            k_last, e, seen_last = last[j]
-            u, v, right, _ = seen - seen_last
-            growth = np.sqrt(grown(np.array([u, v, u - right]), error.flow_px))
-            for _ in range(k_last, k):
-                e = error.memory * e + error.walk_std * growth * rng.normal(size=3)
-        last[j] = k, e, seen
-        pixels[i] = seen + np.array([e[0], e[1], e[0] - e[2], e[1]])
-    moved = Observations(observations.frame, observations.landmark, pixels)
-    return dataclasses.replace(world, observations=moved)
 
 
 def moving_world(share=0.3, speed=0.3, **changes):

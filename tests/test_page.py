@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import synthetic_result, synthetic_sequence
+from support.helpers import synthetic_result, synthetic_sequence
 
 from ekfslam.cli import main
 from ekfslam.data.readers import open_sequence

@@ -8,9 +8,9 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from helpers import synthetic_result, synthetic_sequence
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
+from support.helpers import synthetic_result, synthetic_sequence
 
 from ekfslam.figures.maps import ellipse_axes, plot_landmark_arrows, plot_map, plot_trajectories
 from ekfslam.figures.run import plot_errors, plot_nis, plot_parameters, save_figures, world_error_covariance

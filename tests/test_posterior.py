@@ -5,10 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import WHOLE
-from helpers import run_joint
-from reference import small_world
-from test_variants import gauge_directions
+from support.everything import with_everything
+from support.gauge import gauge_directions
+from support.helpers import run_joint
+from support.reference import small_world
+from support.running import WHOLE
 
 from ekfslam.config import CalibrationConfig, Config, FilterConfig, NoiseConfig, PosteriorConfig
 from ekfslam.data.readers import open_sequence
@@ -275,22 +276,7 @@ def test_samples_have_the_covariance_they_are_drawn_from():
     np.testing.assert_allclose(np.cov(draws.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.1)
 
 
-EVERYTHING = {
-    "twist_walk_std": np.repeat([0.3, 0.03], 3),
-    "motion_std": np.repeat([0.02, 0.002], 3),
-    "misalignment_rad": 0.002,
-    "tilt_rad": 0.03,
-    "track_first_px": np.array([0.5, 0.6, 1.0]),
-    "track_walk_px": np.array([0.3, 0.35, 0.2]),
-    "track_memory": 0.9,
-    "track_flow_px": 20.0,
-}
 CALIBRATION = CalibrationConfig(0.3, 0.05, 0.01, 0.3, 0.0)
-
-
-def with_everything(world):
-    """A world whose stated noise puts every state block into the state."""
-    return dataclasses.replace(world, noise=dataclasses.replace(world.noise, **EVERYTHING))
 
 
 def numeric_rows(problem, state):

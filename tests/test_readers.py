@@ -12,7 +12,8 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from recordings import (
+from scipy.spatial.transform import Rotation
+from support.recordings import (
     CAMERA_IN_IMU_M,
     FRAMES,
     R_CAM_IMU,
@@ -25,7 +26,6 @@ from recordings import (
     write_mat,
     write_npz,
 )
-from scipy.spatial.transform import Rotation
 
 from ekfslam.data import readers
 from ekfslam.data.readers import open_sequence, read_sequence, write_sequence

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import WHOLE, recording, seeds
+from support.running import WHOLE, recording, seeds
 
 from ekfslam import open_sequence, run, smooth
 from ekfslam.evaluation.summary import summarise

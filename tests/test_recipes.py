@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rendered import recording, write_kitti
+from support.rendered import recording, write_kitti
 
 import ekfslam
 from ekfslam.models.blocks import OPTIONAL_BLOCKS

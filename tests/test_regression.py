@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import WHOLE
 from frozen.make import (
     HERE,
     RECORDINGS,
@@ -17,6 +16,7 @@ from frozen.make import (
     of_world,
     read,
 )
+from support.running import WHOLE
 
 from ekfslam.config import VARIANTS
 

@@ -5,8 +5,7 @@ import dataclasses
 import h5py
 import numpy as np
 import pytest
-from helpers import STEP_S, synthetic_result, synthetic_sequence
-from test_truth_noise import erring_truth
+from support.helpers import STEP_S, erring_truth, synthetic_result, synthetic_sequence
 
 from ekfslam.config import Config, PosteriorConfig
 from ekfslam.data.readers import open_sequence

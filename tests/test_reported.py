@@ -8,8 +8,8 @@ import json
 import h5py
 import numpy as np
 import pytest
-from helpers import synthetic_result, synthetic_sequence
 from scipy.spatial.transform import Rotation
+from support.helpers import synthetic_result, synthetic_sequence
 
 from ekfslam import LEVELS, Config, NoiseConfig, Study, open_sequence, read_archive, run, write_archive
 from ekfslam.data.sequence import Noise

@@ -9,8 +9,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import processes
-from test_montecarlo import short
+from support.running import processes
+from support.studies import short
 
 from ekfslam.cli import main
 from ekfslam.errors import ArchiveError

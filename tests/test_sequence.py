@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from recordings import FRAMES, TRACKS, ece276a_fields, utias_fields, write_mat, write_npz
+from support.recordings import FRAMES, TRACKS, ece276a_fields, utias_fields, write_mat, write_npz
 
 from ekfslam import errors
 from ekfslam.data.readers import open_sequence, write_sequence

@@ -7,10 +7,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import WHOLE, seeds
-from reference import CAMERA, T_CAM_IMU, small_world
-from test_jacobians import POSES, central, visible_points
-from test_level import (
+from support.jacobians import POSES, central, visible_points
+from support.literal import (
     BY_DISPARITY,
     EVERYTHING,
     OPEN,
@@ -23,6 +21,8 @@ from test_level import (
     gauge_information,
     in_level_frame,
 )
+from support.reference import CAMERA, T_CAM_IMU, small_world
+from support.running import WHOLE, seeds
 
 from ekfslam.config import FilterConfig
 from ekfslam.data.sequence import Noise, Observations

@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_archive import assert_same
+from support.same import assert_same
 
 import ekfslam
 from ekfslam.config import VARIANTS, Config

@@ -5,8 +5,8 @@ import functools
 
 import numpy as np
 import pytest
-from conftest import WHOLE, seeds
-from helpers import run_joint
+from support.helpers import run_joint
+from support.running import WHOLE, seeds
 
 from ekfslam.config import Config, FilterConfig
 from ekfslam.data.sequence import WITHOUT_TRACKS, Observations

@@ -15,7 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import processes
+from support.running import processes
 
 from ekfslam.cli import main
 from ekfslam.config import Config

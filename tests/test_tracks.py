@@ -6,9 +6,9 @@ import json
 import h5py
 import numpy as np
 import pytest
-from conftest import WHOLE
-from reference import small_world
-from test_archive import assert_same
+from support.reference import small_world
+from support.running import WHOLE
+from support.same import assert_same
 
 from ekfslam.cli import main
 from ekfslam.config import Config, FilterConfig, HygieneConfig

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from reference import T_CAM_IMU, small_world
+from support.reference import T_CAM_IMU, small_world
 
 from ekfslam import CalibrationConfig, FilterConfig
 from ekfslam.filters.joint import JointEKF

@@ -6,8 +6,8 @@ import math
 import h5py
 import numpy as np
 import pytest
-from helpers import synthetic_result, synthetic_sequence
-from recordings import ece276a_fields, utias_fields, write_mat, write_npz
+from support.helpers import erring_truth, synthetic_result, synthetic_sequence
+from support.recordings import ece276a_fields, utias_fields, write_mat, write_npz
 
 from ekfslam.cli import main
 from ekfslam.config import Config, TruthConfig
@@ -35,18 +35,6 @@ NOISE = TruthNoise(0.01, 0.02, 0.03, 0.1, 0.01, 0.05, 0.004)
 
 def with_noise(sequence, noise):
     return dataclasses.replace(sequence, truth=dataclasses.replace(sequence.truth, noise=noise))
-
-
-def erring_truth(truth, time_s, noise, rng):
-    """Another truth, as far from the given one as the noise says: the world is moved, then each pose errs."""
-    first = np.array([noise.first_roll_rad, noise.first_pitch_rad, noise.first_yaw_rad])
-    e0 = np.concatenate([noise.first_position_m * rng.standard_normal(3), first * rng.standard_normal(3)])
-    T = se3.inverse(truth.T_world_imu)
-    step = se3.log(se3.inverse(truth.T_world_imu[:-1]) @ truth.T_world_imu[1:]) / np.diff(time_s)[:, None]
-    own = np.repeat([noise.position_m, noise.attitude_rad], 3) * rng.standard_normal((len(T), 6))
-    own[1:] -= noise.stamp_s * rng.standard_normal((len(step), 1)) * step
-    moved = T @ se3.inverse(T[0]) @ se3.exp(e0) @ T[0]
-    return dataclasses.replace(truth, T_world_imu=se3.inverse(se3.exp(own) @ moved), noise=noise)
 
 
 # The equations

@@ -6,10 +6,9 @@ import tomllib
 
 import numpy as np
 import pytest
-from conftest import WHOLE
-from helpers import run_joint
-from reference import small_world
-from test_noise import tracked
+from support.helpers import run_joint, tracked
+from support.reference import small_world
+from support.running import WHOLE
 
 from ekfslam.cli import main
 from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig

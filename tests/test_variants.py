@@ -6,41 +6,20 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy.optimize
-from reference import CAMERA, T_CAM_IMU, small_world, stereo_matrix
-from test_jacobians import POSES, central, visible_points
+from support.gauge import P0, drive, exact_motion, gauge_directions
+from support.jacobians import POSES, central, visible_points
+from support.reference import CAMERA, T_CAM_IMU, small_world, stereo_matrix
 
 from ekfslam.config import Config, FilterConfig
 from ekfslam.data.sequence import Noise
 from ekfslam.errors import ConfigError
 from ekfslam.filters.gaussian import Rows
-from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
 from ekfslam.models.build import model_of
 from ekfslam.models.sensors.stereo import Rig
 
-P0 = np.diag([0.2, 0.1, 0.3, 0.05, 0.04, 0.08]) ** 2
 OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0, retire="never")
-
-
-def exact_motion(sequence):
-    """The sequence as seen by a filter that takes its velocities to be exact: W = 0, though they are noisy."""
-    return dataclasses.replace(sequence, noise=Noise(np.zeros(6), sequence.noise.pixel_std_px))
-
-
-def drive(sequence, config, P0=P0, frames=None):
-    ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, sequence.noise), config, sequence.initial_T_world_imu, P0)
-    for k in range(frames or len(sequence)):
-        if k > 0:
-            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
-        ekf.update(k, *sequence.observations.at(k))
-    return ekf
-
-
-def gauge_directions(T_imu_world, positions):
-    """``N = [-Ad_T ; [I, -m_i^]]``: what moving the world by ``[rho; theta]`` does to the stored errors."""
-    landmarks = np.concatenate([np.broadcast_to(np.eye(3), (len(positions), 3, 3)), -se3.skew(positions)], axis=-1)
-    return np.vstack([-se3.adjoint(T_imu_world), landmarks.reshape(-1, 6)])
 
 
 def gauge_ratio(ekf, T_start, P0):

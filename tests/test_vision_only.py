@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import seeds
 from scipy.stats import chi2
+from support.running import seeds
 
 import ekfslam
 from ekfslam.config import Config

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import WHOLE, command, processes, seeds
 from PIL import Image
+from support.running import WHOLE, command, processes, seeds
 
 from ekfslam import files
 from ekfslam.cli import main

@@ -8,12 +8,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image
-from rendered import BASELINE_M, recording
-from test_bags import KINDS, stereo
-from test_bags import write as write_bag
-from test_editions import npy_fields, write_npy
-from test_kitti_raw import write_drive
-from test_sources import write_course, write_euroc, write_plain, write_raw_images
+from support.bags import KINDS, stereo
+from support.bags import write as write_bag
+from support.images import write_course, write_euroc, write_plain, write_raw_images
+from support.kitti_raw import write_drive
+from support.npy import npy_fields, write_npy
+from support.rendered import BASELINE_M, recording
 
 from ekfslam.data.simulate import builtin
 

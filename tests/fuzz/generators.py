@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 import scipy.io
 from folders import Files, folders, is_text, png
-from recordings import ece276a_fields, utias_fields, write_mat, write_npz
+from support.recordings import ece276a_fields, utias_fields, write_mat, write_npz
 
 from ekfslam.cli import main
 from ekfslam.config import Config

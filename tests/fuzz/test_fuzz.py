@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from conftest import WHOLE
 from generators import GENERATORS, Valid, case_of
 from oracle import verdict
+from support.running import WHOLE
 
 # In one process, so that the valid ones are made once.
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("hostile inputs")]

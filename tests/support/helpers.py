@@ -17,7 +17,7 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.filters.result import REASONS, Innovation, Landmarks, Rejections, Result
 from ekfslam.geometry import camera, motion, se3
-from ekfslam.geometry.camera import StereoCamera
+from ekfslam.geometry.camera import StereoCamera, project
 from ekfslam.smoother.revival import MapRevival
 
 CAMERA = StereoCamera(fu_px=700.0, fv_px=700.0, cu_px=600.0, cv_px=180.0, baseline_m=0.54)
@@ -153,3 +153,71 @@ def truth_error(sequence, result):
     """Distance (T,) of the estimated positions from the true ones, m."""
     truth = sequence.truth
     return np.linalg.norm(result.T_world_imu[truth.frame, :3, 3] - truth.T_world_imu[:, :3, 3], axis=1)
+
+
+SUMMARY_KEYS = {
+    "ate_m",
+    "ate_aligned_m",
+    "final_error_m",
+    "rpe_1_frame_m",
+    "rpe_1_frame_deg",
+    "rpe_10_m_m",
+    "rpe_10_m_deg",
+    "t_rel_percent",
+    "r_rel_deg_per_100m",
+    "ms_per_frame_median",
+    "ms_per_frame_max",
+    "total_s",
+    "accepted",
+    "rejected",
+    "nis_per_dof",
+    "pose_nees_mean",
+    "pose_nees_with_truth_noise_mean",
+    *(f"pose_nees_{axis}_mean" for axis in ("x", "y", "z", "roll", "pitch", "yaw")),
+    *(f"pose_nees_relative_{stretch}_mean" for stretch in ("10", "50", "100", "50_m", "100_m")),
+    "landmark_rmse_m",
+}
+
+
+def erring_truth(truth, time_s, noise, rng):
+    """Another truth, as far from the given one as the noise says: the world is moved, then each pose errs."""
+    first = np.array([noise.first_roll_rad, noise.first_pitch_rad, noise.first_yaw_rad])
+    e0 = np.concatenate([noise.first_position_m * rng.standard_normal(3), first * rng.standard_normal(3)])
+    T = se3.inverse(truth.T_world_imu)
+    step = se3.log(se3.inverse(truth.T_world_imu[:-1]) @ truth.T_world_imu[1:]) / np.diff(time_s)[:, None]
+    own = np.repeat([noise.position_m, noise.attitude_rad], 3) * rng.standard_normal((len(T), 6))
+    own[1:] -= noise.stamp_s * rng.standard_normal((len(step), 1)) * step
+    moved = T @ se3.inverse(T[0]) @ se3.exp(e0) @ T[0]
+    return dataclasses.replace(truth, T_world_imu=se3.inverse(se3.exp(own) @ moved), noise=noise)
+
+
+def grown(motion, flow_px):
+    """By what the variances of a walk have grown (3,) where u, v and disparity have moved by ``motion`` (3,)."""
+    u, v, d = motion**2
+    return 1 + np.array([u + 0.35 * (v + d), v + 0.35 * (u + d), d + 0.35 * (u + v)]) / flow_px**2
+
+
+def tracked(world, error, seed=1, movers=(), speed=0.3):
+    """A small world recorded once more with errors of tracks; some landmarks travel along with the rig."""
+    rng = np.random.default_rng(seed)
+    observations, truth = world.observations, world.truth
+    pixels, last = np.empty_like(observations.pixels_px), {}
+    place = dict(zip(truth.landmark.tolist(), truth.position_m, strict=True))
+    first = {}
+    for i, (k, j) in enumerate(zip(observations.frame.tolist(), observations.landmark.tolist(), strict=True)):
+        k0 = first.setdefault(j, k)
+        travelled = truth.T_world_imu[k, :3, 3] - truth.T_world_imu[k0, :3, 3]
+        m = place[j] + (speed * travelled if j in movers else 0.0)
+        seen = project(world.camera, se3.apply(world.T_cam_imu @ se3.inverse(truth.T_world_imu[k]), m))
+        if j not in last:
+            e = error.first_std * rng.normal(size=3)
+        else:
+            k_last, e, seen_last = last[j]
+            u, v, right, _ = seen - seen_last
+            growth = np.sqrt(grown(np.array([u, v, u - right]), error.flow_px))
+            for _ in range(k_last, k):
+                e = error.memory * e + error.walk_std * growth * rng.normal(size=3)
+        last[j] = k, e, seen
+        pixels[i] = seen + np.array([e[0], e[1], e[0] - e[2], e[1]])
+    moved = Observations(observations.frame, observations.landmark, pixels)
+    return dataclasses.replace(world, observations=moved)

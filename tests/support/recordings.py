@@ -87,3 +87,10 @@ def write_npz(path: Path, fields: dict[str, Any]) -> Path:
 def write_mat(path: Path, fields: dict[str, Any]) -> Path:
     scipy.io.savemat(path, fields, appendmat=False)
     return path
+
+
+HEADER = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
+    "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
+)

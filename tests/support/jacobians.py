@@ -1,0 +1,31 @@
+"""Poses, velocities and points at which derivatives are compared with central differences."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ekfslam.geometry import se3
+from support.reference import T_CAM_IMU
+
+RNG = np.random.default_rng(7)
+HALF_TURNS = [(np.pi - 1e-7) * axis for axis in (*np.eye(3), np.array([0.6, -0.8, 0.0]))]
+POSES = {
+    "identity": np.eye(4),
+    "near identity": se3.exp(np.full(6, 1e-9)),
+    **{f"random {i}": se3.exp(RNG.normal(size=6) * [20, 20, 20, 1, 1, 1]) for i in range(4)},
+    **{f"near pi {i}": se3.exp(np.concatenate([RNG.normal(size=3) * 5, w])) for i, w in enumerate(HALF_TURNS)},
+}
+SPIN = np.array([8, 1, 0, 0, 0, 31.0])  # about a half turn in 0.1 s
+TWISTS = [np.zeros(6), np.full(6, 1e-9), *RNG.normal(size=(3, 6)) * [10, 2, 1, 1, 1, 1], SPIN]
+
+
+def central(function, size, step=1e-6):
+    """Jacobian of a vector function of a ``size``-vector at zero, exact to second order."""
+    columns = [(function(h) - function(-h)) / (2 * step) for h in np.eye(size) * step]
+    return np.array(columns).T
+
+
+def visible_points(T_imu_world, n=5):
+    """World points in front of the camera, near and far."""
+    q = RNG.uniform([-3, -2, 2], [3, 2, 30], (n, 3))
+    return se3.apply(se3.inverse(T_CAM_IMU @ T_imu_world), q)
