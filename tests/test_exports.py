@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 
 import numpy as np
 import pytest
@@ -70,10 +71,7 @@ def test_to_xarray_is_what_xarray_reads_of_the_archive(archive, full, group):
 
 
 def test_a_missing_package_is_named_with_what_installs_it(full, monkeypatch):
-    def absent(name):
-        raise ImportError(name)
-
-    monkeypatch.setattr(tables.importlib, "import_module", absent)
+    monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(MissingPackageError, match=r"to_dataframe needs the package pandas.*ekfslam\[tables\]"):
         full.to_dataframe()
 

@@ -1,4 +1,4 @@
-"""What a result draws of itself: `Result.map`, `Result.plot` and `Result.errors`.
+"""Figures of one result: `Result.map`, `Result.plot` and `Result.errors`.
 
 Figures are shown by a notebook as they are: without pyplot, nothing else would tell it how.
 """
@@ -22,29 +22,43 @@ from ekfslam.filters.result import Result
 _SIGMAS = 3.0
 
 
-def map_of(result: Result, of: Any = None) -> Figure:
-    """`plot_map` of one result."""
-    return _in_notebooks(plot_map({result.mode: result}, _truth(of)))
+def map_of(result: Result, truth: Any = None) -> Figure:
+    """Draw the map from above with trajectory and ellipses, see `ekfslam.figures.maps.plot_map`.
+
+    Args:
+        result: Any run.
+        truth: `Truth`, or a record that has one (`Sequence`, `Archive`), drawn for comparison.
+    """
+    return _in_notebooks(plot_map({result.mode: result}, _truth(truth)))
 
 
-def errors_of(result: Result, of: Any) -> Figure:
-    """`plot_errors` of one result.
+def errors_of(result: Result, truth: Any) -> Figure:
+    """Draw estimate minus truth against time with bands of 3 sigma, see `ekfslam.figures.run.plot_errors`.
+
+    Args:
+        result: Any run.
+        truth: As for `map_of`.
 
     Raises:
-        TruthError: There is no truth.
+        TruthError: The truth is missing or has no pose, or has frames that the result has not.
     """
-    truth = _truth(of)
-    if truth is None or not len(truth.frame):
+    found = _truth(truth)
+    if found is None or not len(found.frame):
         raise TruthError("errors need true poses, and there are none", source=result.sequence_name)
-    if truth.frame[-1] >= len(result.time_s):
-        message = f"the truth has frame {truth.frame[-1]}, the result has {len(result.time_s)} frames"
+    if found.frame[-1] >= len(result.time_s):
+        message = f"the truth has frame {found.frame[-1]}, the result has {len(result.time_s)} frames"
         raise TruthError(message, source=result.sequence_name)
-    return _in_notebooks(plot_errors({result.mode: result}, truth, getattr(of, "interpolated", None)))
+    return _in_notebooks(plot_errors({result.mode: result}, found, getattr(truth, "interpolated", None)))
 
 
-def trajectory_of(result: Result, of: Any = None) -> Figure:
-    """`plot_trajectory` of one result."""
-    return _in_notebooks(plot_trajectory(result, _truth(of)))
+def trajectory_of(result: Result, truth: Any = None) -> Figure:
+    """Draw position and attitude against time with bands of 3 sigma, see `plot_trajectory`.
+
+    Args:
+        result: Any run.
+        truth: As for `map_of`.
+    """
+    return _in_notebooks(plot_trajectory(result, _truth(truth)))
 
 
 @styled

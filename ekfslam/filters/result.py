@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as SequenceType
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from pkgutil import resolve_name
+from types import MethodType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +20,6 @@ from ekfslam.filters.log import Log
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.shown import Card, Shown, figure
-
-if TYPE_CHECKING:
-    import pandas
-    import xarray
-    from matplotlib.figure import Figure
 
 ERROR_CONVENTION = (
     "T_imu_world = exp(xi^) T_hat, xi = [rho; theta] translation first; landmark m = m_hat + d in world; "
@@ -219,6 +215,24 @@ class PosePairs:
         return PosePairs(none, none, np.empty((0, 6, 6)))
 
 
+class View:
+    """A method of `Result` that a room above provides: a function whose first argument is the result.
+
+    The function is named here and found at its first use, like an entry point. So results import no figures and no
+    files, and ``help(Result.map)`` shows the function.
+
+    Args:
+        function: ``module:name`` of the function.
+    """
+
+    def __init__(self, function: str) -> None:
+        self.function = function
+
+    def __get__(self, result: Result | None, owner: type) -> Callable[..., Any]:
+        function = resolve_name(self.function)
+        return function if result is None else MethodType(function, result)
+
+
 @dataclass(frozen=True, repr=False)
 class Result(Shown):
     """One mode run on one sequence.
@@ -386,79 +400,14 @@ class Result(Shown):
             whitened=None,
         )
 
-    # --- shown and handed on: what these need is imported when they are called ----------------------------------------
+    # --- methods that rooms above provide
 
-    def map(self, truth: Any = None) -> Figure:
-        """The map from above with trajectory and ellipses, see `ekfslam.figures.maps.plot_map`.
-
-        Args:
-            truth: `Truth`, or what has one (`Sequence`, `Archive`), to be drawn beside it.
-        """
-        from ekfslam.figures import views
-
-        return views.map_of(self, truth)
-
-    def plot(self, truth: Any = None) -> Figure:
-        """Position and attitude against time with bands of 3 sigma, see `ekfslam.figures.views.plot_trajectory`.
-
-        Args:
-            truth: As in `map`.
-        """
-        from ekfslam.figures import views
-
-        return views.trajectory_of(self, truth)
-
-    def errors(self, truth: Any) -> Figure:
-        """Estimate minus truth against time with bands of 3 sigma, see `ekfslam.figures.run.plot_errors`.
-
-        Args:
-            truth: As in `map`.
-
-        Raises:
-            TruthError: There is none.
-        """
-        from ekfslam.figures import views
-
-        return views.errors_of(self, truth)
-
-    def to_dataframe(self, table: str = "trajectory") -> pandas.DataFrame:
-        """A table for pandas: ``trajectory``, ``landmarks``, ``innovation`` or ``rejections``.
-
-        Columns are those of `ekfslam.storage.tables`; their units stand in their names.
-
-        Raises:
-            MissingPackageError: pandas is not installed.
-            ArchiveError: There is no such table.
-        """
-        from ekfslam.storage import tables
-
-        return tables.dataframe(self, table)
-
-    def to_xarray(self, group: str = "trajectory") -> xarray.Dataset:
-        """What xarray reads of the group of an archive: ``trajectory``, ``landmarks``, ``innovation``, ``rejections``.
-
-        Raises:
-            MissingPackageError: xarray is not installed.
-            ArchiveError: There is no such group.
-        """
-        from ekfslam.storage import tables
-
-        return tables.dataset(self, group)
-
-    def export(self, path: str | Path, format: str) -> None:
-        """Write it for other programs, see `ekfslam.storage.exports`.
-
-        Args:
-            path: File to write.
-            format: Any of ``EXPORTS``: ``tum`` and ``kitti`` are poses, ``ply`` is the map, ``csv-landmarks`` a table.
-
-        Raises:
-            ArchiveError: There is no such format, it cannot hold this result, or the file cannot be written.
-            PosteriorError: The format is ``information``, and the result has no log.
-        """
-        from ekfslam.storage import exports
-
-        exports.export(self, path, format)
+    map = View("ekfslam.figures.views:map_of")
+    plot = View("ekfslam.figures.views:trajectory_of")
+    errors = View("ekfslam.figures.views:errors_of")
+    to_dataframe = View("ekfslam.storage.tables:dataframe")
+    to_xarray = View("ekfslam.storage.tables:dataset")
+    export = View("ekfslam.storage.exports:export")
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -35,7 +35,12 @@ _G2O = f"# {MADE_BY}: "
 
 
 def export(result: Result, path: str | Path, format: str) -> None:
-    """Write a result in any format of `EXPORTS`.
+    """Write a result for other programs.
+
+    Args:
+        result: Any run.
+        path: File to write.
+        format: A name of `EXPORTS`: ``tum`` and ``kitti`` are poses, ``ply`` is the map, ``csv-landmarks`` a table.
 
     Raises:
         ArchiveError: There is no such format, it cannot hold this result, or the file cannot be written.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,10 @@ from ekfslam.arrays import Array
 from ekfslam.errors import ArchiveError, MissingPackageError
 from ekfslam.filters.result import REASONS, Result
 from ekfslam.storage.archive import LAYOUT
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 Columns = dict[str, NDArray]
 
@@ -86,13 +90,25 @@ def columns(result: Result, table: str) -> Columns:
     return TABLES[table](result)
 
 
-def dataframe(result: Result, table: str) -> Any:
-    """`columns` as a `pandas.DataFrame`; see `Result.to_dataframe`."""
+def dataframe(result: Result, table: str = "trajectory") -> pandas.DataFrame:
+    """Return a table for pandas: ``trajectory``, ``landmarks``, ``innovation`` or ``rejections``.
+
+    Units stand in the names of its columns.
+
+    Raises:
+        MissingPackageError: pandas is not installed.
+        ArchiveError: There is no such table.
+    """
     return _package("pandas", "to_dataframe").DataFrame(columns(result, table))
 
 
-def dataset(result: Result, group: str) -> Any:
-    """The data sets of a group of an archive as an `xarray.Dataset`; see `Result.to_xarray`."""
+def dataset(result: Result, group: str = "trajectory") -> xarray.Dataset:
+    """Return a group of an archive as xarray reads it: ``trajectory``, ``landmarks``, ``innovation``, ``rejections``.
+
+    Raises:
+        MissingPackageError: xarray is not installed.
+        ArchiveError: There is no such group.
+    """
     items = [item for item in LAYOUT if item.place[0] == group]
     if not items:
         groups = dict.fromkeys(item.place[0] for item in LAYOUT)

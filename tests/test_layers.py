@@ -1,0 +1,124 @@
+"""Imports lead downwards: no circle among modules, and no room imports from a room above it."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+import ekfslam
+
+# Rooms from the lowest to the highest: folders, and the modules that lie in ekfslam/ itself. A new one gets its place.
+ROOMS: tuple[tuple[str, ...], ...] = (
+    ("arrays", "errors", "names", "limits", "progress", "shown", "files", "dimensions", "hdf5"),
+    ("kernels",),
+    ("geometry",),
+    ("config",),
+    ("data",),
+    ("frontend",),
+    ("models",),
+    ("filters",),
+    ("smoother",),
+    ("storage",),
+    ("evaluation",),
+    ("resolve",),
+    ("runner",),
+    ("studies",),
+    ("figures",),
+    ("page",),
+    ("reports",),
+    ("cli", "__main__"),
+)
+
+# Imports that still lead upwards. The list may only become shorter.
+UPWARDS = {
+    ("ekfslam.runner", "ekfslam.studies"),
+    ("ekfslam.runner", "ekfslam.studies.automatic"),
+}
+# Modules of circles that are still there. The list may only become shorter.
+CIRCLES = {
+    "ekfslam.data.building",
+    "ekfslam.data.dense",
+    "ekfslam.data.images",
+    "ekfslam.data.images.registry",
+    "ekfslam.data.readers",
+    "ekfslam.data.sequence",
+}
+
+
+def packages(module: str) -> set[str]:
+    """Return the packages that a module lies in, the outermost excepted."""
+    parts = module.split(".")
+    return {".".join(parts[:n]) for n in range(2, len(parts))}
+
+
+def imported(path: Path, modules: set[str]) -> Iterator[str]:
+    """Yield the modules of the package that a file imports anywhere, in functions too."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path} has a relative import"
+            full = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [name if name in modules else str(node.module) for name in full]
+        yield from (name for name in names if name in modules)
+
+
+def imports_of(root: Path) -> dict[str, set[str]]:
+    """Return the modules of a package with the modules that each imports, and whose packages are imported with them."""
+    paths = {
+        ".".join((root.name, *path.relative_to(root).with_suffix("").parts)).removesuffix(".__init__"): path
+        for path in root.rglob("*.py")
+    }
+    found = {}
+    for module, path in paths.items():
+        direct = set(imported(path, set(paths)))
+        everything = direct.union(*(packages(name) for name in direct))
+        found[module] = everything - packages(module) - {module, root.name}
+    return found
+
+
+def circles(imports: dict[str, set[str]]) -> list[set[str]]:
+    """Return the groups of modules that import each other, directly or through others."""
+    names = sorted(imports)
+    pairs = [(names.index(name), names.index(other)) for name in names for other in imports[name]]
+    rows, columns = np.array(pairs).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(pairs)), (rows, columns)), shape=(len(names),) * 2)
+    _, group = connected_components(graph, connection="strong")
+    return [{names[i] for i in np.flatnonzero(group == n)} for n in np.flatnonzero(np.bincount(group) > 1)]
+
+
+def upwards(imports: dict[str, set[str]]) -> set[tuple[str, str]]:
+    """Return the imports that lead to a higher room."""
+    height = {room: i for i, rooms in enumerate(ROOMS) for room in rooms}
+    room = {module: height[module.split(".")[1]] for module in imports if "." in module}
+    return {(name, other) for name in room for other in imports[name] if room[other] > room[name]}
+
+
+@pytest.fixture(scope="module")
+def imports() -> dict[str, set[str]]:
+    return imports_of(Path(ekfslam.__file__).parent)
+
+
+def test_no_circle_of_imports_lazy_ones_counted(imports: dict[str, set[str]]) -> None:
+    assert set().union(*circles(imports)) <= CIRCLES
+
+
+def test_no_room_imports_from_a_room_above_it(imports: dict[str, set[str]]) -> None:
+    assert upwards(imports) <= UPWARDS
+
+
+def test_a_lazy_import_closes_a_circle(tmp_path: Path) -> None:
+    package = tmp_path / "ekfslam"
+    package.mkdir()
+    (package / "files.py").write_text("import ekfslam.config\n")
+    (package / "config.py").write_text("def f():\n    from ekfslam import files\n")
+    found = imports_of(package)
+    assert circles(found) == [{"ekfslam.files", "ekfslam.config"}]
+    assert upwards(found) == {("ekfslam.files", "ekfslam.config")}
