@@ -13,8 +13,8 @@ and the noise against its model by what the measurements leave at the truth,
 The recording is cut into windows of 100 frames. Each starts from the true pose, displaced by a draw from the prior that
 the filter is given, with an empty map; windows are the samples. Gates are off: the question is what a model of the
 noise is worth, and nothing shall be hidden. Two models are compared, neither of which has seen the truth: all of the
-stated pixel noise white, and the structure that `ekfslam.studies.structure.choose` finds by innovations: the camera
-jitters as far as the stated pixel noise says, and what is white beside it is small.
+stated pixel noise white, and the structure that `structure.choose` finds by innovations: the camera jitters as
+far as the stated pixel noise says, and the white rest is small.
 
 Whose the jitter is, three instruments tell. Camera (against the known landmarks), truth and integrated velocities each
 measure the rotation over some frames; their errors are independent, so that the variances of the differences give each
@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 from common import STARRY_NIGHT, argument_parser, has_recordings, truth_of, write
 from matplotlib.figure import Figure
+from structure import Choice, choose, stated_candidates, with_value
 
 import ekfslam
 from ekfslam.arrays import Array, IntArray
@@ -57,7 +58,6 @@ from ekfslam.geometry import camera, se3
 from ekfslam.models.blocks import StateBlock
 from ekfslam.models.build import noise_of, optional_blocks
 from ekfslam.models.sensors.stereo import Rig
-from ekfslam.studies.structure import Choice, choose, stated_candidates, with_value
 
 VARIANTS: tuple[Variant, ...] = ("invariant", "fej", "standard")
 WINDOW_FRAMES = 100
@@ -494,7 +494,7 @@ def noise_cells(row: dict[str, float], digits: int) -> list[str]:
 
 
 def choices_of(sequence: Sequence) -> dict[str, Choice]:
-    """What innovations choose among structures of the stated size, and of any size; the truth is taken away before."""
+    """Choose by innovations among structures of the stated size, and of any size; the truth is removed before."""
     white, shared = stated_candidates(sequence)
     rotation, time = (f"blocks.camera_jitter.{size}" for size in ("rotation_deg", "time_s"))
     of_any_time = dataclasses.replace(shared, by_likelihood=(*shared.by_likelihood, time))

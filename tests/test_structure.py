@@ -5,6 +5,8 @@ import functools
 
 import numpy as np
 import pytest
+import structure
+from structure import Candidate, choose, highest, stated_candidates, value_at, with_value
 from support.helpers import run_joint
 from support.running import WHOLE, seeds
 
@@ -15,8 +17,6 @@ from ekfslam.errors import ConfigError, EmptyTracksError, InnovationError
 from ekfslam.evaluation.consistency import chi2_bounds, nees, pose_error
 from ekfslam.geometry import camera, se3
 from ekfslam.models.build import build
-from ekfslam.studies import structure
-from ekfslam.studies.structure import Candidate, choose, highest, stated_candidates, value_at, with_value
 
 JITTER_M, JITTER_DEG, TIME_S, WHITE_PX = 0.03, 0.4, 0.2, 0.8
 FRAMES = 150 if WHOLE else 80

@@ -1,10 +1,10 @@
-"""`choose`: which structure of errors a recording has, and their sizes, found without truth.
+"""Choose the structure of a recording's errors and find their sizes, without truth.
 
 A *candidate* is a set of settings: which state blocks there are, whether pixels are white or tracks walk, and where the
 sizes start. The joint filter runs over stretches of the recording under each, and its innovations decide:
 
 - Sizes of what landmarks or frames share are those of the largest log-likelihood, the prediction error decomposition of
-  `ekfslam.studies.tuning`, whatever is rejected included. They are found one after the other, by a parabola through
+  `ekfslam.studies.tuning`, rejected observations included. They are found one after the other, by a parabola through
   three points, see `highest`.
 - The size of what is each observation's own is that at which the normalised innovation squared (NIS) is 1 per degree of
   freedom. Likelihood asks for less: it pays to call errors that last for many frames small ones.
@@ -59,7 +59,7 @@ class Candidate:
 
     @property
     def sizes(self) -> tuple[str, ...]:
-        """All that are looked for."""
+        """Names of all sizes that are looked for."""
         return (*self.by_likelihood, *([self.by_nis] if self.by_nis else []))
 
 
@@ -92,7 +92,7 @@ class Tried:
 
     @property
     def line(self) -> str:
-        """What was found, in words."""
+        """What was found, as one line of text."""
         sizes = "".join(f", {name} {size:.3g}" for name, size in self.sizes.items())
         if not np.isfinite(self.log_likelihood):
             return f"{self.name}: the filter broke down{sizes}"
@@ -139,7 +139,7 @@ def choose(
     frames: int = 300,
     runs: int = 30,
 ) -> Choice:
-    """The candidate under which the innovations of the joint filter are most likely, with its sizes.
+    """Return the candidate under which the innovations of the joint filter are most likely, with its sizes.
 
     Moving tracks and bad observations are left out as the configuration without the candidates' settings finds them, so
     that all candidates are judged by the same observations. The truth is not looked at.
@@ -181,13 +181,13 @@ def choose(
 
 
 def stated_candidates(sequence: Sequence) -> tuple[Candidate, ...]:
-    """The structures that the noise which a recording states can have.
+    """Return the possible structures of the noise that a recording states.
 
-    What the file states of a pixel is its whole error. It says not how much of it is white and how much all landmarks
-    of a frame share. The candidates keep the whole: ``white`` takes all of it as white, ``camera jitter`` takes it as
-    rotations of the camera that move the image as far, beside white noise of the size that the NIS asks for. Its time
-    is that of the block: a jitter slower than a stretch looks like a turned world, which costs nothing, so that
-    likelihood would make any jitter that innovations do not show as slow as that.
+    The file states the whole error of a pixel, but not which part of it is white and which part all landmarks of a
+    frame share. The candidates keep the whole: ``white`` takes all of it as white, ``camera jitter`` takes it as
+    rotations of the camera that move the image as far, plus white noise of the size that the NIS requires. The
+    correlation time is the default of the block: a jitter slower than a stretch looks like a turned world, which costs
+    nothing, so the likelihood would make every jitter that innovations do not show as slow as that.
 
     Raises:
         ConfigError: The recording states no noise.
@@ -212,7 +212,7 @@ def stated_candidates(sequence: Sequence) -> tuple[Candidate, ...]:
 
 
 def value_at(config: Config, name: str) -> float:
-    """The number at a dotted name, such as ``noise.sigma_px``.
+    """Return the number at a dotted name, such as ``noise.sigma_px``.
 
     Raises:
         ConfigError: There is none.
@@ -226,18 +226,18 @@ def value_at(config: Config, name: str) -> float:
 
 
 def with_value(overrides: Overrides, name: str, value: float) -> Overrides:
-    """Settings with the number at a dotted name replaced."""
+    """Return the settings with the number at a dotted name replaced."""
     key, *rest = name.split(".", 1)
     inner = overrides.get(key, {})
     return {**overrides, key: with_value(inner, rest[0], value) if rest else value}  # type: ignore[dict-item]
 
 
 def highest(step: float, below: float, here: float, above: float) -> float:
-    """Where a likelihood is highest, from its values where the logarithm of a size is ``-step, 0, step`` off.
+    """Find the maximum of a likelihood from its values at ``-step, 0, step`` of the logarithm of a size.
 
     The log-likelihood of a standard deviation s has no third derivative at its maximum as a function of ``s^(-2/3)``.
-    So the parabola goes through three points of that. It counts up to 1.5 steps; where it has no maximum, the better
-    side does.
+    So the parabola is fitted in that variable. It is trusted up to 1.5 steps. Without a maximum, the step goes to the
+    better side.
     """
     if np.isfinite(below + here + above):
         at = np.exp(-2 / 3 * np.array([-step, 0.0, step]))
@@ -280,7 +280,7 @@ class _Search:
         return self.budget - len(self.runs)
 
     def tried(self) -> Tried:
-        """The candidate at the sizes found."""
+        """Return the candidate at the sizes found."""
         x, shared = self._white(self.start), len(self.candidate.by_likelihood)
         for step in _STEPS if shared else ():
             # A sweep costs three runs a size, and one at what comes out.
@@ -301,7 +301,7 @@ class _Search:
         return overrides
 
     def _run(self, x: Array) -> tuple[float, float, int]:
-        """Log-likelihood, NIS and degrees of freedom at logarithms (n,) of the sizes."""
+        """Return log-likelihood, NIS and degrees of freedom at logarithms (n,) of the sizes."""
         key = tuple(x.tolist())
         if key not in self.runs:
             overrides = self._overrides(x)
@@ -317,7 +317,7 @@ class _Search:
         return self.runs[key]
 
     def _better(self, x: Array, i: int, step: float) -> Array:
-        """A better size i, by three runs."""
+        """Improve size i by three runs."""
         unit = step * np.eye(len(x))[i]
         below, here, above = (self._run(at)[0] for at in (x - unit, x, x + unit))
         better = x.copy()
@@ -325,7 +325,7 @@ class _Search:
         return np.clip(better, self.start - _FARTHEST, self.start + _FARTHEST)
 
     def _white(self, x: Array) -> Array:
-        """The last size moved to where the NIS is 1 per degree of freedom: secants of its logarithm."""
+        """Move the last size to where the NIS is 1 per degree of freedom, by secants of its logarithm."""
         if not self.candidate.by_nis:
             return x
         slope, before = -2.0, None  # of the logarithm of the NIS: that where all of the innovation is this size's
