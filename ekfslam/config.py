@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.special import gammaincinv
 
-from ekfslam.errors import ConfigError, UnknownFormatError
+from ekfslam.errors import ConfigError, RetiredSettingWarning, UnknownFormatError
 from ekfslam.limits import require_file
 
 Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
@@ -108,6 +109,13 @@ _PIXELS = _rule(
 )
 _PROBABILITY = _rule(float, "be in (0, 1]", lambda value: 0 < value <= 1)
 _BETWEEN_0_AND_1 = _rule(float, "be between 0 and 1", lambda value: 0 < value < 1)
+
+
+# Settings of earlier versions: a file that names them is read, and a note says what became of them.
+RETIRED = {
+    "blocks.stereo_rotation": "the block is gone: it improved nothing. Pitch and roll of the right camera are the mean "
+    "of vL - vR over the tracks of a recording",
+}
 
 
 @dataclass(frozen=True)
@@ -459,9 +467,10 @@ class Config:
             )
 
     def with_overrides(self, overrides: Mapping[str, Mapping[str, Any]]) -> Config:
-        """This configuration with ``{table: {key: value}}`` replaced; None values are skipped.
+        """Return this configuration with ``{table: {key: value}}`` replaced; None values are skipped.
 
-        Settings of a state block replace those of the same block and leave its others and all other blocks.
+        Settings of a state block replace those of the same block and leave its others and all other blocks. Settings
+        in `RETIRED` are skipped, too, with a `RetiredSettingWarning`.
 
         Raises:
             ConfigError: An unknown table or key, or a value of the wrong kind or range.
@@ -471,6 +480,7 @@ class Config:
             if table not in tables:
                 raise ConfigError(f"unknown table [{table}]; known: {', '.join(tables)}")
             _require_table(table, values)
+            values = _without_retired(table, values)
             if table == "blocks":
                 tables[table] = _replaced_blocks(self.blocks, values)
             else:
@@ -512,6 +522,14 @@ def check_stored(tables: Mapping[str, Any]) -> None:
             value = settings.get(known.name)
             if value is not None:
                 known.metadata["rule"].check(f"{setting.name}.{known.name}", value)
+
+
+def _without_retired(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a table that still exist, with a warning for each that does not."""
+    retired = {key: RETIRED[f"{table}.{key}"] for key in values if f"{table}.{key}" in RETIRED}
+    for key, note in retired.items():
+        warnings.warn(f"{table}.{key} is ignored: {note}", RetiredSettingWarning, stacklevel=3)
+    return {key: value for key, value in values.items() if key not in retired}
 
 
 def _require_table(name: str, value: object) -> None:

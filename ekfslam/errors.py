@@ -144,6 +144,10 @@ class NonFiniteResultError(FilterError):
         )
 
 
+class RetiredSettingWarning(UserWarning):
+    """A configuration names a setting that no longer exists; it is ignored."""
+
+
 class LateError(EkfslamError):
     """A message, or a question, is about a time that is over.
 

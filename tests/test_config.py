@@ -8,8 +8,9 @@ import math
 
 import pytest
 
-from ekfslam.config import Config, FilterConfig
-from ekfslam.errors import ConfigError
+from ekfslam.cli import main
+from ekfslam.config import RETIRED, Config, FilterConfig
+from ekfslam.errors import ConfigError, RetiredSettingWarning
 
 SETTINGS = [
     (table.name, setting)
@@ -73,3 +74,18 @@ def test_bad_tables_of_state_blocks_are_named(blocks, message):
         Config().with_overrides({"blocks": blocks})
     with pytest.raises(ConfigError, match=message):
         Config(blocks=blocks)
+
+
+@pytest.mark.parametrize("name", RETIRED)
+def test_a_retired_setting_is_skipped_with_a_warning(name):
+    table, key = name.split(".")
+    with pytest.warns(RetiredSettingWarning, match=rf"^{name} is ignored: "):
+        config = Config().with_overrides({table: {key: {} if table == "blocks" else 1}})
+    assert config == Config()
+
+
+def test_the_command_line_prints_a_retired_setting_as_a_note(tmp_path, capsys):
+    path = tmp_path / "old.toml"
+    path.write_text("[blocks.stereo_rotation]\ntime_s = 5.0\n")
+    assert main(["run", "nothing.mat", "--config", str(path), "--out", str(tmp_path / "o.h5")]) == 2
+    assert capsys.readouterr().err.startswith("ekfslam: note: blocks.stereo_rotation is ignored: the block is gone")

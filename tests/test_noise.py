@@ -116,7 +116,7 @@ def test_shared_errors_follow_what_velocities_are_worth():
     clean = np.cumsum(0.02 * rng.standard_normal((400, 6)), axis=0) * np.repeat([1.0, 0.02], 3)
     noisy = clean + np.repeat([0.5, 0.05], 3) * rng.standard_normal(clean.shape)
     ours, theirs = shared_errors(clean), shared_errors(noisy)
-    assert ours.keys() == theirs.keys() == {"twist_bias", "stereo_rotation", "camera_jitter", "vision_drift"}
+    assert ours.keys() == theirs.keys() == {"twist_bias", "camera_jitter", "vision_drift"}
     assert theirs["twist_bias"]["sigma_w_rad_s"] == pytest.approx(0.005, rel=0.2)
     assert ours["twist_bias"]["sigma_v_m_s"] < theirs["twist_bias"]["sigma_v_m_s"]
     assert ours["vision_drift"]["rotation_deg_m"] > theirs["vision_drift"]["rotation_deg_m"]
@@ -124,7 +124,7 @@ def test_shared_errors_follow_what_velocities_are_worth():
 
 def test_blocks_of_the_automatic_model_give_way_to_what_is_configured():
     unstated = without_noise(builtin("city?frames=60"))
-    names = {"twist_bias", "stereo_rotation", "camera_jitter", "vision_drift"}
+    names = {"twist_bias", "camera_jitter", "vision_drift"}
     problem = build(unstated, Config().with_overrides({"blocks": {"camera_jitter": {"time_s": 2.0}}}))
     assert set(problem.config.blocks) == names and problem.model.calibration is not None
     assert problem.config.blocks["camera_jitter"] == {"time_s": 2.0}

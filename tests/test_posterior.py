@@ -16,10 +16,10 @@ from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.data.stretches import cut
-from ekfslam.errors import IllPosedError, PosteriorError
+from ekfslam.errors import IllPosedError, PosteriorError, RetiredSettingWarning
 from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import CameraJitter, StereoRotation, TwistBias, VisionDrift
+from ekfslam.models.blocks import CameraJitter, TwistBias, VisionDrift
 from ekfslam.models.build import noise_of
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
@@ -298,7 +298,7 @@ def numeric_rows(problem, state):
     return np.column_stack(columns), residuals(np.zeros(ends[-1]))
 
 
-SHARED = [CameraJitter(time_s=0.3), VisionDrift(length_m=3.0), StereoRotation(time_s=1.0)]
+SHARED = [CameraJitter(time_s=0.3), VisionDrift(length_m=3.0)]
 
 
 KINDS = {"white": (False, []), "every block": (True, []), "shared": (False, SHARED), "all": (True, SHARED)}
@@ -559,3 +559,10 @@ def test_what_is_undetermined_is_named():
         found.joint_covariance([20])
     with pytest.raises(PosteriorError, match="there is no landmark"):
         found.joint_covariance([], [10**6])
+
+
+def test_a_result_with_a_retired_state_block_is_not_smoothed():
+    result = run(builtin("city?frames=3"), "full")
+    old = dataclasses.replace(result, config={**result.config, "blocks": {"stereo_rotation": {}}})
+    with pytest.warns(RetiredSettingWarning), pytest.raises(PosteriorError, match="the state block stereo_rotation"):
+        posterior(old)

@@ -30,9 +30,8 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
-from ekfslam.geometry import camera as cam
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import CameraJitter, Previous, StereoRotation, TwistBias, VisionDrift
+from ekfslam.models.blocks import CameraJitter, Previous, TwistBias, VisionDrift
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.build import model_of
 from ekfslam.models.model import Moment
@@ -48,15 +47,13 @@ NOISE = Noise(
 )
 KINDS = {"tracks": dataclasses.replace(NOISE, **TRACKS), "white": NOISE}
 BIAS = TwistBias(sigma_v_m_s=0.1, sigma_w_rad_s=0.01, time_v_s=3.0, time_w_s=7.0)
-SHARED = [CameraJitter(), VisionDrift(length_m=20.0), StereoRotation(time_s=5.0)]
+SHARED = [CameraJitter(), VisionDrift(length_m=20.0)]
 BLOCKS = [*SHARED, BIAS]
 ERRORS = {
     "calibration": np.array([0.05, -0.08, 0.06, 0.02, -0.03, 0.025, 0.03, 0.7, 0.03]),
     "camera_jitter": np.array([0.04, -0.03, 0.05, 0.02, -0.01, 0.015]),
     "vision_drift": np.array([0.02, 0.03, -0.01, 0.004, 0.003, -0.005]),
-    "stereo_rotation": np.array([0.004, -0.006, 0.005]),
     "previous_camera_jitter": np.array([-0.02, 0.05, 0.03, -0.015, 0.02, 0.01]),
-    "previous_stereo_rotation": np.array([-0.005, 0.003, 0.006]),
 }
 TWIST = np.array([7.0, 0.4, -0.3, 0.1, -0.2, 0.5])
 LEAST_WAY_M = 0.1
@@ -71,7 +68,7 @@ def pixel(q):
 def literal_rows(values, m, way_m, follows, twist, before=False, disparity=True):
     """Rows (n, 3) of landmarks (n, 3), those that follow another observation with the drift; or in the frame before."""
     prefix = "previous_" if before else ""
-    T, jitter, psi = (values[prefix + name] for name in ("pose", "camera_jitter", "stereo_rotation"))
+    T, jitter = (values[prefix + name] for name in ("pose", "camera_jitter"))
     c, rows = values["calibration"], []
     right_of_both = NOISE.pixel_std_px[1] ** 2 / (NOISE.pixel_std_px[1] ** 2 + NOISE.pixel_std_px[3] ** 2)
     for point, follows_one in zip(m, follows, strict=True):
@@ -81,7 +78,7 @@ def literal_rows(values, m, way_m, follows, twist, before=False, disparity=True)
         moved = se3.exp(-c[8] * twist) @ se3.exp(offset) @ T
         q = se3.apply(se3.exp(c[:6]) @ T_CAM_IMU @ moved, point)
         baseline = np.array([CAMERA.baseline_m * np.exp(c[6]), 0.0, 0.0])
-        left, right = pixel(q), pixel(se3.so3_exp(psi) @ (q - baseline))
+        left, right = pixel(q), pixel(q - baseline)
         v = (1 - right_of_both) * left[1] + right_of_both * right[1]
         rows.append([left[0], v, left[0] - right[0] + c[7] if disparity else right[0] - c[7]])
     return np.array(rows)
@@ -160,7 +157,7 @@ def test_rows_in_the_frame_before_by_every_block_and_landmark(T):
     np.testing.assert_allclose(seen.z.ravel(), rows(np.zeros(body + 15)), rtol=1e-11)
     H = wide(seen, body, slots, len(m))
     assert_equal_rows(H, central(rows, body + 15))
-    for name in ("pose", "camera_jitter", "stereo_rotation", "vision_drift"):
+    for name in ("pose", "camera_jitter", "vision_drift"):
         assert not H[:, model.layout[name]].any()
 
 
@@ -233,72 +230,6 @@ def test_new_landmarks_by_every_block(T, noise):
     assert model.inverted(moment, z)[1].all()
 
 
-# --- the rig whose right camera is turned ---------------------------------------------------------------------------
-
-ROTATIONS = {
-    "none": np.zeros(3),
-    "hardly": np.full(3, 1e-9),
-    "yaw": np.array([0.0, np.deg2rad(0.1), 0.0]),
-    "all": np.deg2rad([0.3, -0.4, 0.5]),
-    "one a point": np.deg2rad(np.random.default_rng(5).normal(0, 0.3, (7, 3))),
-}
-
-
-@pytest.mark.parametrize("psi", ROTATIONS.values(), ids=ROTATIONS.keys())
-@kinds
-def test_a_turned_right_camera(noise, psi):
-    """Rows, their derivatives by point and rotation, and the way back."""
-    rng = np.random.default_rng(2)
-    rig = Rig(CAMERA, T_CAM_IMU, noise, disparity_offset_px=0.7, right_rotation_rad=psi)
-    q = rng.uniform([-3, -2, 2], [3, 2, 40], (7, 3))
-    each = np.broadcast_to(psi, (7, 3))
-    A, B, z = rig.jacobian(q), rig.by_right_rotation(q), rig.predict(q)
-    for i, (point, own) in enumerate(zip(q, each, strict=True)):
-
-        def rows(p, angles):
-            left, right = pixel(p), pixel(se3.so3_exp(angles) @ (p - np.array([CAMERA.baseline_m, 0, 0])))
-            weight = cam.weight_of_left_row(noise.pixel_std_px)
-            v, disparity = weight * left[1] + (1 - weight) * right[1], left[0] - right[0] + 0.7
-            return np.array([left[0], v, disparity if noise.track_error is not None else left[0] - disparity])
-
-        np.testing.assert_allclose(z[i], rows(point, own), rtol=1e-12)
-        assert_equal_rows(A[i], central(lambda d, p=point, a=own, f=rows: f(p + d, a), 3))
-        assert_equal_rows(B[i], central(lambda d, p=point, a=own, f=rows: f(p, a + d), 3))
-    np.testing.assert_allclose(rig.invert(z), q, rtol=1e-9, atol=1e-9)
-    assert rig.has_depth(rig.invert(z)).all()
-
-
-def test_a_right_camera_that_is_not_turned_is_the_rectified_pair():
-    rng = np.random.default_rng(2)
-    rig, turned = (Rig(CAMERA, T_CAM_IMU, NOISE, right_rotation_rad=psi) for psi in (None, np.zeros(3)))
-    q = rng.uniform([-3, -2, 2], [3, 2, 40], (9, 3))
-    np.testing.assert_allclose(turned.predict(q), rig.predict(q), rtol=1e-14)
-    np.testing.assert_allclose(turned.jacobian(q), rig.jacobian(q), rtol=1e-12, atol=1e-12)
-    np.testing.assert_array_equal(turned.invert(rig.predict(q)), rig.invert(rig.predict(q)))
-
-
-@kinds
-def test_what_is_behind_infinity_has_no_point(noise):
-    """With a yaw of 0.2 degrees infinity itself has a disparity of 2.4 px; less than that starts no landmark."""
-    psi = np.array([0.0, -np.deg2rad(0.2), 0.0])
-    rig = Rig(CAMERA, T_CAM_IMU, noise, right_rotation_rad=psi)
-    depth = np.array([10.0, 200.0, 700.0, 2000.0, 1e6])
-    q = depth[:, None] * np.array([0.1, 0.05, 1.0])
-    z = rig.predict(q)
-    np.testing.assert_array_equal(rig.has_depth(rig.invert(z)), [True, True, True, False, False])
-    less = z[:1] * np.ones((3, 1))
-    disparity = np.array([1.0, 2.0, 5.0])
-    less[:, 2] = disparity if noise.track_error is not None else less[:, 0] - disparity
-    np.testing.assert_array_equal(rig.has_depth(rig.invert(less)), [False, False, True])
-    model = model_of(Rig(CAMERA, T_CAM_IMU, noise), noise, np.eye(4), P0, blocks=[StereoRotation()])
-    ekf = JointEKF(model, OPEN)
-    ekf.values = {**ekf.values, "stereo_rotation": psi}
-    pixels = np.column_stack([less[:, :2], less[:, 0] - disparity, less[:, 1]])
-    report = ekf.update(0, np.array([7, 5, 9]), pixels)
-    assert ekf.ids.tolist() == [9]
-    assert report.reason.tolist() == [1, 1, -1]
-
-
 # --- the model ------------------------------------------------------------------------------------------------------
 
 
@@ -309,7 +240,6 @@ def test_which_blocks_have_clones():
     assert [name for name in names if name.startswith("previous_")] == [
         "previous_pose",
         "previous_camera_jitter",
-        "previous_stereo_rotation",
     ]
     white = model_of(Rig(CAMERA, T_CAM_IMU, NOISE), NOISE, np.eye(4), P0, blocks=SHARED)
     assert not white.clones
@@ -324,12 +254,12 @@ def test_a_clone_is_its_block_before_it_changed():
     root = rng.normal(size=(layout.body, layout.body))
     P = root @ root.T
     ekf.P = P.copy()
-    ekf.values = {**ekf.values, **{name: ERRORS[name] for name in ("camera_jitter", "stereo_rotation", "vision_drift")}}
+    ekf.values = {**ekf.values, **{name: ERRORS[name] for name in ("camera_jitter", "vision_drift")}}
     before = ekf.values
     ekf.predict(TWIST, 0.2)
     way_m = 0.2 * np.linalg.norm(TWIST[:3])
     assert ekf.way_m == pytest.approx(way_m)
-    kept = {"camera_jitter": 0.2 / 0.6, "vision_drift": way_m / 20.0, "stereo_rotation": 0.2 / 5.0}
+    kept = {"camera_jitter": 0.2 / 0.6, "vision_drift": way_m / 20.0}
     for block in SHARED:
         at, phi = layout[block.name], np.exp(-kept[block.name])
         own, std = P[at, at], block.stationary_std
@@ -364,40 +294,25 @@ def test_information_about_the_gauge_with_shared_errors(variant, coordinates, tr
 
 
 class LiteralShared(Literal):
-    """The textbook EKF with shared errors; their columns come after those of all other blocks.
+    """The textbook EKF with shared errors; their columns come after those of all other blocks."""
 
-    Rotations of the right camera count in units of `UNIT` rad: as far as its differences go in others, depths are lost.
-    """
-
-    UNIT = 0.02
-    OWN = ("jitter", "drift", "psi", "jitter_before", "psi_before")
-    SIZE = (6, 6, 3, 6, 3)
+    OWN = ("jitter", "drift", "jitter_before")
+    SIZE = (6, 6, 6)
 
     def __init__(self, sequence, variant, images):
         super().__init__(sequence, variant, np.arange(9), prior_std(EVERYTHING), TILTED[:, 2], BIAS, images)
-        kept = len(self.SIZE) if self.tracks is not None else 3
+        kept = len(self.SIZE) if self.tracks is not None else 2
         for name, size in zip(self.OWN[:kept], self.SIZE[:kept], strict=True):
             self.at[name] = slice(self.body, self.body + size)
             self.body += size
         self.P = np.pad(self.P, (0, self.body - len(self.P)))
-        for block, name in zip(SHARED, self.OWN[:3], strict=True):
-            self.P[self.at[name], self.at[name]] = np.diag((block.stationary_std / self.unit(name)) ** 2)
+        for block, name in zip(SHARED, self.OWN[:2], strict=True):
+            self.P[self.at[name], self.at[name]] = np.diag(block.stationary_std**2)
         vars(self).update({name: np.zeros(size) for name, size in zip(self.OWN, self.SIZE, strict=True)})
-
-    def unit(self, name):
-        return self.UNIT if name.startswith("psi") else 1.0
-
-    @property
-    def units(self):
-        """Of the columns of P."""
-        units = np.ones(len(self.P))
-        for name in self.OWN:
-            units[self.at.get(name, slice(0))] = self.unit(name)
-        return units
 
     def moved_by(self, e):
         own = {name: getattr(self, name) for name in self.OWN}
-        own |= {name: own[name] + self.unit(name) * e[..., self.at[name]] for name in self.OWN if name in self.at}
+        own |= {name: own[name] + e[..., self.at[name]] for name in self.OWN if name in self.at}
         return {**super().moved_by(e), **own}
 
     def predict(self, measured, tau):
@@ -406,31 +321,28 @@ class LiteralShared(Literal):
 
     def wander(self, tau):
         F = np.eye(len(self.P))
-        for name in ("jitter", "psi"):
-            if f"{name}_before" in self.at:
-                F[self.at[f"{name}_before"]] = np.eye(len(self.P))[self.at[name]]
-                setattr(self, f"{name}_before", getattr(self, name))
+        if "jitter_before" in self.at:
+            F[self.at["jitter_before"]] = np.eye(len(self.P))[self.at["jitter"]]
+            self.jitter_before = self.jitter
         self.P = F @ self.P @ F.T
         super().wander(tau)
-        lengths = tau / 0.6, max(self.way_m, LEAST_WAY_M) / 20.0, tau / 5.0
-        for block, name, length in zip(SHARED, self.OWN[:3], lengths, strict=True):
+        lengths = tau / 0.6, max(self.way_m, LEAST_WAY_M) / 20.0
+        for block, name, length in zip(SHARED, self.OWN[:2], lengths, strict=True):
             F, kept = np.eye(len(self.P)), np.exp(-length)
             F[self.at[name], self.at[name]] *= kept
             self.P = F @ self.P @ F.T
-            self.P[self.at[name], self.at[name]] += np.diag(
-                (1 - kept**2) * (block.stationary_std / self.unit(name)) ** 2
-            )
+            self.P[self.at[name], self.at[name]] += np.diag((1 - kept**2) * block.stationary_std**2)
             setattr(self, name, kept * getattr(self, name))
 
     def look(self, x, m, before=False, follows=False):
-        offset, psi = (x["jitter_before"], x["psi_before"]) if before else (x["jitter"], x["psi"])
+        offset = x["jitter_before"] if before else x["jitter"]
         if follows:
             offset = offset + max(self.way_m, LEAST_WAY_M) * x["drift"]
         T, u = (x["before"], self.u_before) if before else (x["T"], self.u)
         q = se3.apply(camera_pose(se3.exp(offset) @ T, x["c"], u, T_CAM_IMU)[..., None, :, :], m)
         baseline = CAMERA.baseline_m * np.exp(x["c"][..., 6])
-        right = se3.so3_exp(psi)[..., None, :, :] @ (q - baseline[..., None, None] * np.eye(3)[0])[..., None]
-        left, right = (np.moveaxis(pixel(np.moveaxis(p, -1, 0)), 0, -1) for p in (q, right[..., 0]))
+        right = q - baseline[..., None, None] * np.eye(3)[0]
+        left, right = (np.moveaxis(pixel(np.moveaxis(p, -1, 0)), 0, -1) for p in (q, right))
         disparity = left[..., 0] - right[..., 0] + x["c"][..., None, 7]
         rows = np.stack([left[..., 0], (left[..., 1] + right[..., 1]) / 2, disparity], axis=-1)
         return rows if self.tracks is not None else rows @ BY_DISPARITY.T
@@ -468,7 +380,7 @@ def test_filter_with_shared_errors_equals_the_literal_one(variant, coordinates, 
         np.random.default_rng(3),
     )
     names = ["pose", "previous_pose", "calibration", "twist", "up", "twist_bias", *(block.name for block in SHARED)]
-    names += ["previous_camera_jitter", "previous_stereo_rotation"]
+    names += ["previous_camera_jitter"]
     body = layout.columns(name for name in names if name in layout)
     accuracy = 1e-9 if coordinates == "xyz" else 2e-8
     for k in range(len(world)):
@@ -493,10 +405,10 @@ def test_filter_with_shared_errors_equals_the_literal_one(variant, coordinates, 
             *pairs,
             (ekf.T_imu_world, literal.T),
             (ekf.positions_m, literal.m),
-            (ekf.P[np.ix_(columns, columns)], literal.P * np.outer(literal.units, literal.units)),
+            (ekf.P[np.ix_(columns, columns)], literal.P),
         ):
             np.testing.assert_allclose(ours, theirs, rtol=accuracy, atol=accuracy)
-    assert (np.abs(ekf.values["stereo_rotation"]) > 1e-6).all()
+    assert (np.abs(ekf.values["camera_jitter"]) > 1e-6).all()
 
 
 def test_residuals_of_the_batch_problem():
@@ -510,13 +422,13 @@ def test_residuals_of_the_batch_problem():
     drive_values = {**state.drive_values, "calibration": ERRORS["calibration"]}
     shared = state.shared + 0.01 * rng.normal(size=state.shared.shape)
     state = dataclasses.replace(state, shared=shared, drive_values=drive_values)
-    names = ["camera_jitter", "vision_drift", "stereo_rotation"]
+    names = ["camera_jitter", "vision_drift"]
     T, tau, way_m = state.T_imu_world, log.tau_s, np.linalg.norm(log.twist[:, :3], axis=1) * log.tau_s
     twist = [log.seen_twist[0], *(-se3.log(T[k] @ se3.inverse(T[k - 1])) / tau[k] for k in range(1, 9))]
 
     def left(i, follows):
         k, m = log.frame[i], state.positions_m[log.landmark[i]]
-        values = {"pose": T[k], **drive_values, **dict(zip(names, np.split(shared[k], [6, 12]), strict=True))}
+        values = {"pose": T[k], **drive_values, **dict(zip(names, np.split(shared[k], [6]), strict=True))}
         return log.rows[i] - literal_rows(values, m[None], way_m[k], [follows], twist[k])[0]
 
     found, expected = problem.observation_residual(problem.points(state), state) * np.sqrt(log.variance), []
@@ -524,9 +436,9 @@ def test_residuals_of_the_batch_problem():
         expected.append(left(i, previous >= 0) - (0.9 * left(previous, False) if previous >= 0 else 0.0))
     assert (log.previous >= 0).sum() > 20
     np.testing.assert_allclose(found, expected, atol=1e-7)
-    lengths = {"camera_jitter": tau / 0.6, "vision_drift": way_m / 20.0, "stereo_rotation": tau / 5.0}
+    lengths = {"camera_jitter": tau / 0.6, "vision_drift": way_m / 20.0}
     parts = []
-    for block, x in zip(SHARED, np.split(shared, [6, 12], axis=1), strict=True):
+    for block, x in zip(SHARED, np.split(shared, [6], axis=1), strict=True):
         kept = np.exp(-lengths[block.name][1:, None])
         parts.append((x[1:] - kept * x[:-1]) / (block.stationary_std * np.sqrt(1 - kept**2)))
     np.testing.assert_allclose(problem.motion_residual(state)[:, 6:], np.hstack(parts), rtol=1e-9)
@@ -541,10 +453,10 @@ CLOSED = FilterConfig(gate_probability=1.0, split_after=0, retire="unseen", reti
 WALKS = {"track_first_px": np.full(3, 0.3), "track_walk_px": np.full(3, 0.3)}
 
 
-def plain_rows(world, T, m, psi):
-    """Pixels (n, 4) of landmarks (n, 3), the right camera turned."""
+def plain_rows(world, T, m):
+    """Pixels (n, 4) of landmarks (n, 3)."""
     camera, q = world.camera, se3.apply(world.T_cam_imu @ T, m)
-    right = (q - np.array([camera.baseline_m, 0, 0])) @ se3.so3_exp(psi).T
+    right = q - np.array([camera.baseline_m, 0, 0])
     f, c = np.array([camera.fu_px, camera.fv_px]), np.array([camera.cu_px, camera.cv_px])
     return np.concatenate([f * q[:, :2] / q[:, 2:] + c, f * right[:, :2] / right[:, 2:] + c], axis=1)
 
@@ -555,12 +467,11 @@ class Spoilt:
     Args:
         seed: Of everything.
         std: Of the velocities, m/s and rad/s.
-        psi: (3,) rotation of the right camera.
         jitter, drift, bias: Blocks whose process is drawn from and put in; None: no such error.
         walks: Whether errors of tracks walk.
     """
 
-    def __init__(self, seed, std=(0.1, 0.005), psi=(0, 0, 0), jitter=None, drift=None, bias=None, walks=False):
+    def __init__(self, seed, std=(0.1, 0.005), jitter=None, drift=None, bias=None, walks=False):
         world, rng = builtin(DRIVE.format(*std, seed)), np.random.default_rng(seed)
         T, truth, tau = se3.inverse(world.truth.T_world_imu), world.truth, np.diff(world.time_s)
         u = -se3.log(T[1:] @ se3.inverse(T[:-1])) / tau[:, None]
@@ -572,8 +483,8 @@ class Spoilt:
             ids, _ = observations.at(k)
             m = truth.position_m[np.searchsorted(truth.landmark, ids)]
             seen_from = se3.exp(self.jitter[k]) @ T[k]
-            clean = plain_rows(world, seen_from, m, psi)
-            flow = plain_rows(world, se3.exp(max(way_m[k], LEAST_WAY_M) * self.drift[k]) @ seen_from, m, psi) - clean
+            clean = plain_rows(world, seen_from, m)
+            flow = plain_rows(world, se3.exp(max(way_m[k], LEAST_WAY_M) * self.drift[k]) @ seen_from, m) - clean
             noise = self.track_noise(rng, len(ids)) if walks else world.noise.pixel_std_px * rng.normal(size=flow.shape)
             # An error that walks is that of the frame before and a new part; it starts with nothing of the drift.
             old = [errors.get(i) if walks else None for i in ids.tolist()]
@@ -628,10 +539,8 @@ class Spoilt:
 
 QUIET = (0.02, 0.001)
 LARGE_BIAS = TwistBias(sigma_v_m_s=0.3, sigma_w_rad_s=0.02, time_v_s=30.0, time_w_s=30.0)
-YAW = np.array([0.0, np.deg2rad(0.08), 0.0])
 CASES = {
     # The block, what is put in, and what of it is found to a quarter.
-    "rotation of the right camera": (StereoRotation(), {"psi": YAW}, [1]),
     "jitter": (CameraJitter(), {"jitter": CameraJitter()}, []),
     "jitter, good velocities": (CameraJitter(), {"jitter": CameraJitter(), "std": QUIET}, []),
     "drift": (VisionDrift(), {"drift": VisionDrift(), "walks": True}, []),
@@ -652,7 +561,7 @@ def test_what_was_put_in_is_found_and_poses_are_honest_for_it(block, put_in, wel
             found[block.name][:, FRAMES // 2 :],
             next(name for name in put_in if name not in ("std", "walks")),
         )
-        true = YAW[None] if which == "psi" else getattr(world, which)[FRAMES // 2 :]
+        true = getattr(world, which)[FRAMES // 2 :]
         errors.append(estimate - true)
         stds.append(std)
         truths.append(np.broadcast_to(true, estimate.shape))

@@ -130,7 +130,7 @@ def test_without_stated_noise_tracks_decide_what_is_believed():
     sequence = dataclasses.replace(ekfslam.open_sequence("builtin:city?frames=20"), noise=None)
     walking = build(without_velocities(sequence))
     names = set(walking.model.layout)
-    assert {"twist", "vision_drift", "stereo_rotation", "camera_jitter"} <= names
+    assert {"twist", "vision_drift", "camera_jitter"} <= names
     assert not {"twist_bias", "up", "calibration"} & names
     checked = without_velocities(dataclasses.replace(sequence, attributes={**sequence.attributes, **CHECKED_TRACKS}))
     problem = build(checked)

@@ -13,13 +13,16 @@ import importlib
 import os
 import pkgutil
 import sys
+import warnings
+from collections.abc import Iterator
 from collections.abc import Sequence as SequenceType
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from ekfslam import __version__
 from ekfslam.cli import commands
-from ekfslam.errors import EkfslamError
+from ekfslam.errors import EkfslamError, RetiredSettingWarning
 from ekfslam.limits import DEFAULT_GB, reading_up_to
 from ekfslam.names import printable
 
@@ -30,7 +33,7 @@ def main(arguments: SequenceType[str] | None = None) -> int:
     options = _parser(given[:1]).parse_args(given)
     _prepare_output()
     try:
-        with reading_up_to(options.read_limit):
+        with reading_up_to(options.read_limit), _notes_on_one_line():
             options.command(options)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -87,6 +90,21 @@ def _declare(parser: argparse.ArgumentParser, name: str) -> None:
         help="how many gigabytes of numbers a file may hold; more is refused unread (default: %(default)s)",
     )
     module.add_arguments(parser)
+
+
+@contextmanager
+def _notes_on_one_line() -> Iterator[None]:
+    """Print a `RetiredSettingWarning` without the line of code that raised it."""
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
+        if issubclass(category, RetiredSettingWarning):
+            print(f"ekfslam: note: {message}", file=sys.stderr)
+        else:
+            default(message, category, *place, **options)
+
+    with warnings.catch_warnings():
+        default, warnings.showwarning = warnings.showwarning, show
+        yield
 
 
 def _prepare_output() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.noise import Noise, TrackError
 from ekfslam.geometry import motion, se3
-from ekfslam.models.blocks import Calibration, Layout, PreviousPose, StateBlock, StereoRotation, Twist, Values
+from ekfslam.models.blocks import Calibration, Layout, PreviousPose, StateBlock, Twist, Values
 from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
@@ -187,10 +187,6 @@ class Model:
         return tuple(block for block in self.shared if block.camera_share(now, now.astype(bool)) is not None)
 
     @cached_property
-    def _turns_right_camera(self) -> bool:
-        return any(isinstance(block, StereoRotation) for block in self.shared)
-
-    @cached_property
     def has_drift(self) -> bool:
         """Whether what a difference of observations shows of the present frame is not what one alone would show."""
         one = np.ones(())
@@ -352,7 +348,7 @@ class Model:
                 the frame before, shared blocks have the columns of their clones, too.
             is_difference: (n,) which observations are differences from the frame before; None: none is.
         """
-        layout, sensor = self.layout, self._sensor_of(moment)
+        layout, sensor = self.layout, self.sensor_at(moment.calibration)
         T, T_linear, offset = moment.T_imu_world, moment.T_linear, None
         if self._moves_camera:
             offset, shares = self._camera_offset(moment, is_difference)
@@ -376,15 +372,10 @@ class Model:
             for block, share in zip(self._moves_camera, shares, strict=True):
                 if (at := self._columns_in(block, pose)) is not None:
                     H_x[..., at] = share[..., None, None] * H_offset
-        if self._turns_right_camera:
-            at = self._columns_in(self.block("stereo_rotation"), pose)
-            assert at is not None and isinstance(sensor, Rig)
-            H_x[..., at] = sensor.by_right_rotation(q)
         return Seen(q, sensor.predict(q), H_x, H_m)
 
-    def _columns_in(self, block: StateBlock | None, pose: str) -> slice | None:
-        """Columns of a shared block as seen from a pose; None: it is of no account there."""
-        assert block is not None
+    def _columns_in(self, block: StateBlock, pose: str) -> slice | None:
+        """Return the columns of a shared block in a view from a pose; None: the view does not depend on the block."""
         if pose != "previous_pose":
             return self.layout[block.name]
         clone = self.layout.clones.get(block.name)
@@ -417,7 +408,7 @@ class Model:
 
     def predicted(self, moment: Moment, q: Array) -> Array:
         """Rows (n, d) of points (n, 3) in the frame of the sensor."""
-        return self._sensor_of(moment).predict(q)
+        return self.sensor_at(moment.calibration).predict(q)
 
     def inverted(self, moment: Moment, rows: Array) -> tuple[Array, BoolArray]:
         """Points (n, 3) in the frame of the sensor that rows (n, 3) are those of, and whether (n,) they show its depth.
@@ -425,7 +416,7 @@ class Model:
         The sensor's `screen` has judged that of the sensor as given. Where blocks change it, disparities may be less
         than that of a point at infinity.
         """
-        sensor = self._sensor_of(moment)
+        sensor = self.sensor_at(moment.calibration)
         q = sensor.invert(rows)
         if sensor is self.sensor:
             return q, np.ones(len(rows), dtype=bool)
@@ -447,7 +438,7 @@ class Model:
             T = se3.exp(self._camera_offset(moment, None)[0]) @ T
         if self.calibration is not None:
             T = self.calibration.delay(moment.calibration, moment.twist) @ T
-        sensor = self._sensor_of(moment)
+        sensor = self.sensor_at(moment.calibration)
         positions = se3.apply(se3.inverse(sensor.T_cam_imu @ T), q)
         here = self.see(moment.linearised_at(moment.T_imu_world), positions, positions)
         by_rows = np.linalg.inv(here.H_m)
@@ -458,24 +449,8 @@ class Model:
             G[..., pose] = -np.linalg.solve(there.H_m, there.H_x[..., pose])
         return positions, G, 0.5 * (covariance + covariance.swapaxes(-1, -2))
 
-    def _sensor_of(self, moment: Moment) -> Sensor:
-        """The sensor as all blocks of a moment have it."""
-        if self.calibration is None and not self._turns_right_camera:
-            return self.sensor
-        return (
-            self.calibration.applied(self._rig_of(moment), moment.calibration)
-            if self.calibration
-            else self._rig_of(moment)
-        )
-
-    def _rig_of(self, moment: Moment) -> Rig:
-        """The rig before it is calibrated, its right camera turned."""
-        if not self._turns_right_camera:
-            return self.rig
-        return dataclasses.replace(self.rig, right_rotation_rad=moment.shared["stereo_rotation"])
-
     def sensor_at(self, parameters: Array) -> Sensor:
-        """The sensor with a calibration (9,) applied."""
+        """Return the sensor with a calibration (9,) applied."""
         return self.sensor if self.calibration is None else self.calibration.applied(self.rig, parameters)
 
     @property

@@ -161,7 +161,6 @@ def shared_errors(twist: Array | None, checked: bool = False) -> dict[str, dict[
 
     - ``twist_bias``: of the unit's class where velocities are clean, a tenth of their noise where it is seen.
     - ``camera_jitter``: the defaults of this block.
-    - ``stereo_rotation``: the same, but not where tracks are checked: the front end takes the rotation out.
     - ``vision_drift``: a tracker's own drift is about 1 % of the way and a few mdeg/m. Where velocities are clean a
       larger, effective value leaves the low frequencies to them, as the long-term accuracy of such a unit deserves.
       Tracks that are checked do not drift.
@@ -181,8 +180,6 @@ def shared_errors(twist: Array | None, checked: bool = False) -> dict[str, dict[
             bias = np.maximum(BIAS_SHARE * found.sigma, bias)
         shared["twist_bias"] = {"sigma_v_m_s": float(bias[0]), "sigma_w_rad_s": float(bias[1])}
         shared["twist_bias"] |= {"time_v_s": 4.0, "time_w_s": 20.0} if found.is_clean else {"time_w_s": 200.0}
-    if not checked:
-        shared["stereo_rotation"] = {}
     shared["camera_jitter"] = {}
     if not checked:
         shared["vision_drift"] = drift

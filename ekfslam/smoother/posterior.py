@@ -236,9 +236,18 @@ def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterio
 
 
 def model_of_result(result: Result) -> Model:
-    """The model that a full run believed in."""
+    """Return the model of a full run.
+
+    Raises:
+        PosteriorError: The run had a state block that this version no longer has.
+    """
     assert result.log is not None
     stored, log = _config_of(result), result.log
+    if retired := set(result.config.get("blocks", {})) - set(stored.blocks):
+        raise PosteriorError(
+            f"{result.sequence_name}: this result had the state block {', '.join(sorted(retired))}, which no longer "
+            "exists: run the recording again to smooth it"
+        )
     start = log.T_predicted[0], log.initial_covariance
     rig = Rig(result.camera, result.T_cam_imu, result.noise)
     blocks, coordinates = optional_blocks(stored.blocks), stored.filter.landmark_coordinates

@@ -256,7 +256,7 @@ def settings(valid: Valid, rng: np.random.Generator) -> Case:
         value = _pick(
             rng, [repr(odd) for odd in ODD] + [f'"{word}"' for word in WORDS] + ["true", "[]", "{}", "0", "1", "2.0"]
         )
-        name = f"blocks.{_pick(rng, ('twist_bias', 'stereo_rotation', 'x'))}" if rng.random() < 0.1 else table
+        name = f"blocks.{_pick(rng, ('twist_bias', 'camera_jitter', 'x'))}" if rng.random() < 0.1 else table
         lines.append(f"[{name}]\n{key} = {value}\n")
     text = "".join(lines).encode(errors="replace")
     if rng.random() < 0.2:

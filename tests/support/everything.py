@@ -13,7 +13,7 @@ PRIOR = {
     "initial_rotation_std_rad": 0.05,
 }
 CALIBRATION = {"rotation_deg": 0.3, "lever_arm_m": 0.05, "baseline": 0.01, "disparity_px": 0.3, "time_s": 0.01}
-BLOCKS = {"twist_bias": {}, "camera_jitter": {}, "vision_drift": {}, "stereo_rotation": {"time_s": 5.0}}
+BLOCKS = {"twist_bias": {}, "camera_jitter": {}, "vision_drift": {}}
 
 EVERYTHING = {
     "twist_walk_std": np.repeat([0.3, 0.03], 3),

@@ -9,7 +9,6 @@ from ekfslam.models.blocks.calibration import Calibration
 from ekfslam.models.blocks.camera_jitter import CameraJitter
 from ekfslam.models.blocks.pose import Anchor, Pose, PreviousPose
 from ekfslam.models.blocks.previous import Previous
-from ekfslam.models.blocks.stereo_rotation import StereoRotation
 from ekfslam.models.blocks.twist import Twist
 from ekfslam.models.blocks.twist_bias import TwistBias
 from ekfslam.models.blocks.up import Up
@@ -25,7 +24,6 @@ __all__ = [
     "Previous",
     "PreviousPose",
     "StateBlock",
-    "StereoRotation",
     "Twist",
     "TwistBias",
     "Up",
