@@ -396,45 +396,13 @@ class TruthConfig:
 
 
 @dataclass(frozen=True)
-class TuningRecord:
-    """Where the noise of a tuned file comes from; it decides nothing, but is kept with every result.
-
-    Args:
-        sequence: Name of the recording that it was found on.
-        frames, runs: How many frames of it were filtered, and how many times.
-        log_likelihood: Of the innovations, at the maximum.
-        sigma_v_m_s, sigma_w_rad_s, sigma_px, drift: The estimates; those without ``_error`` have none.
-        found_sigma_v_m_s, found_sigma_w_rad_s: What the differences of the velocities say alone.
-        remarks: What is to be said of the maximum, such as an estimate at its bound.
-    """
-
-    sequence: str | None = field(default=None, metadata=_TEXT)
-    frames: int | None = field(default=None, metadata=_whole(0))
-    runs: int | None = field(default=None, metadata=_whole(0))
-    log_likelihood: float | None = field(default=None, metadata=_NUMBER)
-    sigma_v_m_s: float | None = field(default=None, metadata=_NUMBER)
-    sigma_v_m_s_error: float | None = field(default=None, metadata=_NUMBER)
-    sigma_w_rad_s: float | None = field(default=None, metadata=_NUMBER)
-    sigma_w_rad_s_error: float | None = field(default=None, metadata=_NUMBER)
-    sigma_px: float | None = field(default=None, metadata=_NUMBER)
-    sigma_px_error: float | None = field(default=None, metadata=_NUMBER)
-    drift: float | None = field(default=None, metadata=_NUMBER)
-    drift_error: float | None = field(default=None, metadata=_NUMBER)
-    found_sigma_v_m_s: float | None = field(default=None, metadata=_NUMBER)
-    found_sigma_v_m_s_error: float | None = field(default=None, metadata=_NUMBER)
-    found_sigma_v_m_s_limit: float | None = field(default=None, metadata=_NUMBER)
-    found_sigma_w_rad_s: float | None = field(default=None, metadata=_NUMBER)
-    found_sigma_w_rad_s_error: float | None = field(default=None, metadata=_NUMBER)
-    found_sigma_w_rad_s_limit: float | None = field(default=None, metadata=_NUMBER)
-    remarks: str | None = field(default=None, metadata=_TEXT)
-
-
-@dataclass(frozen=True)
 class Config:
     """Everything that decides what a run does besides the data, and the record of what was tuned.
 
     Args:
-        noise, filter, posterior, calibration, hygiene, front_end, truth, tuning: The tables of a file.
+        noise, filter, posterior, calibration, hygiene, front_end, truth: The tables of a file.
+        tuning: Record of `ekfslam tune`: texts and numbers by name. It decides nothing and becomes attributes
+            ``tuned_*`` of results.
         blocks: Name of an optional state block to its settings, ``[blocks.<name>]`` in a file. Here they are only
             plain values; `ekfslam.models.build` knows the blocks and what can be set of them.
 
@@ -449,14 +417,16 @@ class Config:
     hygiene: HygieneConfig = field(default_factory=HygieneConfig)
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
     truth: TruthConfig = field(default_factory=TruthConfig)
-    tuning: TuningRecord = field(default_factory=TuningRecord)
+    tuning: Mapping[str, str | float] = field(default_factory=dict, hash=False)
     blocks: Mapping[str, Mapping[str, BlockSetting]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         for table, settings in vars(self).items():
-            if table != "blocks":
+            if table not in ("blocks", "tuning"):
                 _check_table(table, settings)
+        _check_record(self.tuning)
         _check_blocks(self.blocks)
+        object.__setattr__(self, "tuning", dict(self.tuning))
         object.__setattr__(self, "blocks", {name: dict(settings) for name, settings in self.blocks.items()})
         if self.filter.variant == "fej" and self.filter.iterations > 1:
             raise ConfigError("filter.iterations > 1 contradicts first estimates: choose invariant or standard")
@@ -483,6 +453,8 @@ class Config:
             values = _without_retired(table, values)
             if table == "blocks":
                 tables[table] = _replaced_blocks(self.blocks, values)
+            elif table == "tuning":
+                tables[table] = {**self.tuning, **_given(values)}
             else:
                 tables[table] = _replaced(table, tables[table], values)
         return Config(**tables)
@@ -518,6 +490,9 @@ def check_stored(tables: Mapping[str, Any]) -> None:
         if setting.name == "blocks":
             _check_blocks(settings)
             continue
+        if setting.name == "tuning":
+            _check_record(_given(settings))
+            continue
         for known in dataclasses.fields(type(getattr(defaults, setting.name))):
             value = settings.get(known.name)
             if value is not None:
@@ -545,6 +520,20 @@ def _check_table(table: str, settings: Any) -> None:
             setting.metadata["rule"].check(f"{table}.{setting.name}", value)
 
 
+def _given(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that are not None."""
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def _check_record(record: Mapping[str, Any]) -> None:
+    """Raise a `ConfigError` unless a record of tuning holds texts and numbers under plain names."""
+    _require_table("tuning", record)
+    for key, value in record.items():
+        if not key.isidentifier():
+            raise ConfigError(f"tuning: {key!r} must be a plain name")
+        (_TEXT if isinstance(value, str) else _NUMBER)["rule"].check(f"tuning.{key}", value)
+
+
 def _check_blocks(blocks: Mapping[str, Any]) -> None:
     """Raise a `ConfigError` where this is no table of tables of plain values."""
     _require_table("blocks", blocks)
@@ -561,7 +550,7 @@ def _replaced(table: str, settings: Any, values: Mapping[str, Any]) -> Any:
     for key in values:
         if key not in rules:
             raise ConfigError(f"unknown key {table}.{key}; known: {', '.join(rules)}")
-    given = {key: rules[key].plain(value) for key, value in values.items() if value is not None}
+    given = {key: rules[key].plain(value) for key, value in _given(values).items()}
     return dataclasses.replace(settings, **given)
 
 
@@ -570,6 +559,5 @@ def _replaced_blocks(blocks: Mapping[str, Any], values: Mapping[str, Any]) -> Ma
     merged = dict(blocks)
     for name, settings in values.items():
         _require_table(f"blocks.{name}", settings)
-        given = {key: value for key, value in settings.items() if value is not None}
-        merged[name] = {**blocks.get(name, {}), **given}
+        merged[name] = {**blocks.get(name, {}), **_given(settings)}
     return merged

@@ -15,7 +15,7 @@ from ekfslam.errors import ConfigError, RetiredSettingWarning
 SETTINGS = [
     (table.name, setting)
     for table in dataclasses.fields(Config)
-    if table.name != "blocks"
+    if table.name not in ("blocks", "tuning")
     for setting in dataclasses.fields(getattr(Config(), table.name))
 ]
 BLOCKS = {"twist_bias": {"sigma_v_m_s": 0.03, "steps": 2, "is_on": True}, "clone": {"kind": "pose"}}
@@ -89,3 +89,22 @@ def test_the_command_line_prints_a_retired_setting_as_a_note(tmp_path, capsys):
     path.write_text("[blocks.stereo_rotation]\ntime_s = 5.0\n")
     assert main(["run", "nothing.mat", "--config", str(path), "--out", str(tmp_path / "o.h5")]) == 2
     assert capsys.readouterr().err.startswith("ekfslam: note: blocks.stereo_rotation is ignored: the block is gone")
+
+
+def test_a_record_of_tuning_is_kept_as_it_was_written(tmp_path):
+    (tmp_path / "noise.toml").write_text('[tuning]\nsequence = "city"\nruns = 9\nlog_likelihood = -2.5\n')
+    assert Config.from_toml(tmp_path / "noise.toml").tuning == {"sequence": "city", "runs": 9, "log_likelihood": -2.5}
+
+
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [
+        (3, r"\[tuning\] must be a table"),
+        ({"runs": [1.0]}, r"tuning\.runs must be a number"),
+        ({"runs": math.nan}, r"tuning\.runs must be a number, not NaN"),
+        ({"a/b": 1.0}, "'a/b' must be a plain name"),
+    ],
+)
+def test_a_bad_record_of_tuning_is_named(record, message):
+    with pytest.raises(ConfigError, match=message):
+        Config().with_overrides({"tuning": record})

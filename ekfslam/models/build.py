@@ -310,11 +310,10 @@ def noise_account(sequence: Sequence, config: Config) -> dict[str, str | int | f
     """Attributes for a result that say where its noise comes from.
 
     ``found_*``: what the differences of the velocities say, with standard errors and limits, where the noise is
-    automatic; ``tuned_*``: the `TuningRecord`, where there is one.
+    automatic; ``tuned_*``: the record of tuning, if there is one.
     """
     account = found_attributes(velocity_noise(sequence.twist)) if is_automatic(sequence, config) else {}
-    tuned = {f"tuned_{key}": value for key, value in vars(config.tuning).items() if value is not None}
-    return {**account, **tuned}
+    return {**account, **{f"tuned_{key}": value for key, value in config.tuning.items()}}
 
 
 def found_attributes(found: VelocityNoise) -> dict[str, float]:

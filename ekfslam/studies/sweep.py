@@ -375,7 +375,7 @@ def _settings(config: Config) -> dict[str, Any]:
     return {
         f"{table}.{name}": value
         for table, values in dataclasses.asdict(config).items()
-        if table != "tuning"
+        if table != "tuning"  # a record, no setting
         for name, value in _flat(values)
     }
 

@@ -159,11 +159,9 @@ class TunedNoise:
     def toml(self) -> str:
         """`config` as a TOML file: what of it is not a default."""
         lines = [toml_heading(self.sequence)]
-        for table in ("noise", "tuning"):
+        for table, values in (("noise", vars(self.config.noise)), ("tuning", self.config.tuning)):
             lines += ["", f"[{table}]"]
-            for key, value in vars(getattr(self.config, table)).items():
-                if value is not None:
-                    lines.append(f"{key} = {_toml_value(value)}")
+            lines += [f"{key} = {_toml_value(value)}" for key, value in values.items() if value is not None]
         return "\n".join(lines) + "\n"
 
     @property

@@ -31,7 +31,7 @@ from ekfslam.storage.exports import EXPORTS
 ODD: tuple[Any, ...] = (0, -1, 1, 2, 0.5, 1e-300, 1e-9, 1e9, 1e300, -1e300, np.nan, np.inf, -np.inf, 1 << 31, 1 << 62)
 WORDS = ("", "x", "nan", "inf", "-1", "1e999", "0", "../../x", "\x1b[2J", "é", "$a$", "a|b", "{0}", "9" * 400, "true")
 MODES = ("dead-reckoning", "mapping-only", "full", "smoothed")
-TABLES = {name: table for name, table in vars(Config()).items() if name != "blocks"}
+TABLES = {name: table for name, table in vars(Config()).items() if name not in ("blocks", "tuning")}
 QUICK = "[filter]\nrelative_frames = 5\n"
 
 
