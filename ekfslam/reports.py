@@ -19,9 +19,9 @@ from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import EkfslamError, FilterError, IllPosedError, PosteriorError
+from ekfslam.evaluation.honesty import Honesty, judge, require_innovations
 from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.evaluation.truth import with_truth_noise
-from ekfslam.evaluation.verdict import Honesty, innovations_of, judge
 from ekfslam.figures.check import plot_check
 from ekfslam.figures.older import older_figures, remove_figures
 from ekfslam.figures.posterior import plot_map_before_and_after
@@ -314,7 +314,7 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
     for path in (values, table, figure):
         files.require_writable(path)
     result = open_result(archive, mode)
-    innovations_of(result)
+    require_innovations(result)
     smoothed, skipped = None, ""
     try:
         smoothed = posterior(result)

@@ -12,9 +12,9 @@ from support.running import WHOLE, seeds
 from ekfslam.data.sequence import Noise
 from ekfslam.data.simulate import CAMERA, T_CAM_IMU, City, simulate
 from ekfslam.errors import HonestyError
-from ekfslam.evaluation import honesty
+from ekfslam.evaluation import evidence
 from ekfslam.evaluation.consistency import pose_error
-from ekfslam.evaluation.verdict import Honesty, judge
+from ekfslam.evaluation.honesty import Honesty, judge, require_innovations
 from ekfslam.figures.check import plot_check
 from ekfslam.filters.result import Parameters, Result, WhitenedInnovations
 from ekfslam.geometry import se3
@@ -180,13 +180,13 @@ def shared_of(mean=0.0, size=1.0, frames=400, seed=0):
 
 def test_components_given_others_are_those_of_the_conditional():
     found, given = shared_of(frames=5), np.array([5, 1])
-    z = honesty.partial(found, 2, given)
+    z = evidence.partial(found, 2, given)
     for k in range(5):
         c, C = found.score[k], found.information[k]
         weight = np.linalg.solve(C[np.ix_(given, given)], C[given, 2])
         expected = (c[2] - weight @ c[given]) / np.sqrt(C[2, 2] - weight @ C[given, 2])
         assert z[k] == pytest.approx(expected)
-    np.testing.assert_allclose(honesty.partial(found, 0, given[:0]), found.shared[:, 0])
+    np.testing.assert_allclose(evidence.partial(found, 0, given[:0]), found.shared[:, 0])
 
 
 def test_shared_squares_are_those_of_the_score():
@@ -199,7 +199,7 @@ def test_shared_squares_are_those_of_the_score():
 
 def test_one_constant_motion_is_blamed_on_its_axis_alone():
     motion = 0.4 * np.eye(6)[4]
-    found = honesty.shared_innovations(shared_of(motion), np.ones(400, dtype=bool), np.full(400, 0.1))
+    found = evidence.shared_innovations(shared_of(motion), np.ones(400, dtype=bool), np.full(400, 0.1))
     assert found.order[0] == 4
     others = np.delete(np.arange(6), 4)
     assert abs(found.mean[4]) > 8 * found.mean_error[4]
@@ -208,7 +208,7 @@ def test_one_constant_motion_is_blamed_on_its_axis_alone():
 
 
 def test_errors_of_any_size_are_found():
-    found = honesty.shared_innovations(shared_of(size=2.5), np.ones(400, dtype=bool), np.full(400, 0.1))
+    found = evidence.shared_innovations(shared_of(size=2.5), np.ones(400, dtype=bool), np.full(400, 0.1))
     np.testing.assert_allclose(found.std, 2.5, rtol=0.15)
     assert found.size.value == pytest.approx(6.25, rel=0.1)
     np.testing.assert_allclose(found.factor, 2.5, rtol=0.4)
@@ -222,13 +222,13 @@ def test_blocks_that_follow_their_prior_agree_with_it():
         information = 1 / 0.3**2 + np.arange(1, 201)
         value = np.cumsum(truth + measured) / information
         parameters = Parameters(("x",), ("1",), np.array([0.3]), value[:, None], information[:, None] ** -0.5)
-        (found,) = honesty.prior_agreement(parameters)
+        (found,) = evidence.prior_agreement(parameters)
         pulls.append(found.pull)
         steps.append(found.increment)
     assert np.std(pulls) == pytest.approx(1.0, abs=0.15)
     assert np.sqrt(np.mean(np.square(steps))) == pytest.approx(1.0, abs=0.1)
     still = Parameters(("x",), ("1",), np.array([0.3]), np.zeros((50, 1)), np.full((50, 1), 0.3))
-    assert honesty.prior_agreement(still) == (honesty.PriorAgreement("x", None, None),)
+    assert evidence.prior_agreement(still) == (evidence.PriorAgreement("x", None, None),)
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +239,7 @@ def one_run() -> Result:
 @pytest.mark.slow
 def test_smoother_against_filter(one_run):
     smoothed = posterior(one_run)
-    found = honesty.smoother_agreement(one_run, smoothed)
+    found = evidence.smoother_agreement(one_run, smoothed)
     assert 0.5 < found.size.value < 2.5
     difference = pose_error(one_run.T_world_imu, smoothed.T_world_imu)
     for axis, std in enumerate(found.std):
@@ -253,15 +253,15 @@ def test_smoother_against_filter(one_run):
     # Poses that are beside where they should be, but promise as much as before.
     beside = np.full(6, 3.0) * np.sqrt(one_run.covariance[:, [0], 0])
     bold = dataclasses.replace(one_run, T_world_imu=one_run.T_world_imu @ se3.exp(beside))
-    assert honesty.smoother_agreement(bold, smoothed).size.value > 3 * found.size.value
+    assert evidence.smoother_agreement(bold, smoothed).size.value > 3 * found.size.value
 
 
 def test_values_table_and_figure_say_the_same(one_run):
     found = judge(one_run, posterior(one_run))
     values = json.loads(json.dumps(found.values, allow_nan=False))
-    assert values["verdict"] == found.verdict and values["axes"] == list(honesty.AXES)
+    assert values["verdict"] == found.verdict and values["axes"] == list(evidence.AXES)
     assert values["shared"]["factor"] == pytest.approx(found.shared.factor)
-    assert found.verdict in found.table and honesty.BLIND in found.table
+    assert found.verdict in found.table and evidence.BLIND in found.table
     assert f"{found.nis.value:.3g}" in found.table
     figure = plot_check(one_run, found)
     assert len(figure.axes) == 6
@@ -278,10 +278,12 @@ def test_values_table_and_figure_say_the_same(one_run):
     [({"whitened": None}, "run again"), ({"whitened": None, "mode": "smoothed"}, "check 'full'")],
 )
 def test_results_without_innovations_are_refused(one_run, changes, words):
+    changed = dataclasses.replace(one_run, **changes)
     with pytest.raises(HonestyError, match=words):
-        judge(dataclasses.replace(one_run, **changes))
+        require_innovations(changed)
+    assert judge(changed).shared is None
 
 
 def test_a_recording_too_short_to_judge_is_refused():
     with pytest.raises(HonestyError, match="only 14 frames"):
-        judge(run(world(0, frames=15)))
+        require_innovations(run(world(0, frames=15)))

@@ -21,7 +21,7 @@ from ekfslam.cli import main
 from ekfslam.data.readers import open_sequence
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.consistency import pose_nees
-from ekfslam.evaluation.verdict import judge
+from ekfslam.evaluation.honesty import judge
 from ekfslam.filters.result import Innovation
 from ekfslam.page import content, report
 from ekfslam.page.content import packed, recordings_of, thinned
@@ -95,15 +95,14 @@ def carded(archive_of, **runs) -> dict[str, tuple[str, list[str]]]:
     """Kind and words of each run's card, by mode."""
     found = dataclasses.replace(archive_of, results=runs)
     (recording,) = recordings_of({"some": found})
-    return {run.label: (run.kind, run.said) for run in recording.runs}
+    return {run.label: (run.honesty.grade, run.said) for run in recording.runs}
 
 
 def test_every_run_has_a_verdict_from_what_there_is(archive):
     """Innovations where they were kept, NIS where not, and the truth; words as of `ekfslam check`."""
     known = read_archive(archive)
     full = known.results["full"]
-    of_truth = recordings_of({"some": known})[0].runs[-1].agreement
-    to_honest = 6.0 / of_truth.nees
+    to_honest = 6.0 / recordings_of({"some": known})[0].runs[-1].honesty.truth.nees
     honest = dataclasses.replace(full, covariance=full.covariance / to_honest, whitened=None)
     small = dataclasses.replace(honest, covariance=honest.covariance / 25.0)
     doubled = dataclasses.replace(
@@ -135,7 +134,7 @@ def judged(tmp_path_factory):
 @pytest.mark.slow
 def test_evidence_is_that_of_check_and_of_the_truth(judged):
     page, honesty = report_page({"first": judged}), judge(judged.results["full"])
-    for name, found, _ in honesty.overview[:-1]:
+    for name, found, _ in honesty.evidence:
         row = re.search(rf'<tr><th scope="row">{re.escape(html.escape(name))}[^<]*</th>(.*?)</tr>', page)
         assert f"<td>{found}</td>" in row[1] or f"<td>{found} (" in row[1], name
     assert "filter less smoother" not in page

@@ -1,135 +1,323 @@
-"""Verdicts and evidence on the covariance of any run, from whatever there is: innovations, NIS, truth.
+"""Evidence on the covariance of a run, from its innovations, its smoother and its truth.
 
-`ekfslam.evaluation.verdict` judges full runs by their innovations. Other modes keep none, and older archives neither.
-There the NIS of the frames, what was rejected, and the truth are what remains. Words are those of `ekfslam check`.
+A correct model has innovations that are white over frames, along tracks and between landmarks. Each deviation points at
+a part of the model. Shared innovations (`ekfslam.filters.result.WhitenedInnovations`) that are too large or persistent
+are errors of the velocities, or errors common to all tracks. The remainder of an observation, without its shared part,
+is an error of that track alone. `ekfslam.evaluation.honesty` turns the evidence into a judgement.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from ekfslam.arrays import BoolArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
-from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_nees
-from ekfslam.evaluation.honesty import SURE, Ratio, ratio
-from ekfslam.evaluation.verdict import NOTABLE, Honesty, factor_text, percent, ratio_text
-from ekfslam.filters.result import REASONS, Result
+from ekfslam.evaluation import whiteness
+from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_error, pose_nees
+from ekfslam.evaluation.tables import plus_minus
+from ekfslam.filters.result import REASONS, Parameters, Result, WhitenedInnovations
+from ekfslam.geometry import se3
+from ekfslam.smoother.posterior import Posterior
 
-PROBABILITY = 0.95  # of the bounds of NEES
-_POSE_DOF = 6
+LAGS = 20  # frames over which autocorrelation is shown
+_LAGS_OF_SUMS = 60  # upper limit of the frames over which it is summed, besides a tenth of the drive
+AXES = ("forward", "lateral", "vertical", "roll", "pitch", "yaw")  # x, y, z of the IMU
+ROWS = ("u", "v", "disparity")
+BLIND = (
+    "Innovations never see the gauge (absolute position and heading), nor errors common to vision and velocities, "
+    "nor drifts that are slower than the noise of the velocities reveals."
+)
+POSE_DOF = 6
+_LEAST_DOF = 12  # of a frame whose shared innovation is examined
+SURE = 3.0  # standard errors
+_LEAST_GAIN = 0.05  # share of its variance that the smoother must remove from a pose, for a comparison
+_TRUTH_PROBABILITY = 0.95  # of the bounds of the pose NEES
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A mean per degree of freedom, 1 expected, and its standard error, which allows for correlation over time."""
+
+    value: float
+    error: float
+
+    def __str__(self) -> str:
+        return plus_minus(f"{self.value:.3g}", f"{self.error:.2g}")
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """How far n series of innovations are from white noise of the stated size.
+
+    Args:
+        size: Mean square per degree of freedom.
+        correlation: (21, n) autocorrelation, lags 0 to 20 frames.
+        factor: (n,) square root of the long-run variance: ratio of errors to covariance.
+        persistence: (n,) long-run variance about the mean, divided by the variance: 1 is white.
+    """
+
+    size: Ratio
+    correlation: Array
+    factor: Array
+    persistence: Array
+
+
+@dataclass(frozen=True)
+class SharedInnovations(Whiteness):
+    """Errors common to the landmarks of a frame, along `AXES`.
+
+    The axes are examined in the order of ``factor``. Each is corrected for the axes before it, because an error in yaw
+    resembles one in lateral position. ``std`` and ``correlation`` are of each axis alone.
+
+    Args:
+        std: (6,) standard deviation about 0; 1 expected.
+        order: (6,) axes, worst first.
+        factor_low: (6,) lower bound of ``factor``, three standard errors below it.
+        mean, mean_error: (6,) means in standard deviations of a frame, and their standard errors.
+        rate: (6,) mean motion in m/s and rad/s: lower bound of a constant bias of the velocities.
+        frames: Number of frames examined.
+    """
+
+    std: Array
+    order: IntArray
+    factor_low: Array
+    mean: Array
+    mean_error: Array
+    rate: Array
+    frames: int
+
+
+@dataclass(frozen=True)
+class TrackInnovations(Whiteness):
+    """Errors of single observations, without the shared motion, along tracks, by `ROWS`.
+
+    Args:
+        scale: Ratio of the variances of single observations to the stated ones, corrected for the cut of the gate.
+        pairs: (21,) number of pairs of observations behind ``correlation``.
+    """
+
+    scale: float
+    pairs: IntArray
+
+
+@dataclass(frozen=True)
+class RejectedShares:
+    """Shares of rejected observations.
+
+    Args:
+        reasons: Share of all observations by reason.
+        gate: Share of the observations of known landmarks that the gates rejected in calm frames; None without whitened
+            innovations.
+        expected: Expected value of ``gate`` under the model with the variances that accepted innovations show.
+    """
+
+    reasons: Mapping[str, float]
+    gate: float | None = None
+    expected: float | None = None
+
+
+@dataclass(frozen=True)
+class PriorAgreement:
+    """A reported parameter against its prior.
+
+    Args:
+        name: Name of the parameter.
+        pull: Last estimate divided by ``sqrt(prior^2 - std^2)``; None if nothing was learnt.
+        increment: Root mean square of the changes over tenths of the drive, divided by
+            ``sqrt(std_before^2 - std_after^2)``; None if the deviation does not fall: the parameter is not constant.
+    """
+
+    name: str
+    pull: float | None
+    increment: float | None
+
+
+@dataclass(frozen=True)
+class SmootherAgreement:
+    """Filtered minus smoothed poses, whose covariance is ``P_filter - P_smoothed``.
+
+    Args:
+        size: Normalised square per degree of freedom, over the directions in which the smoother gained. Its error
+            allows for correlation over a fifth of the drive, and is rough.
+        std: (6,) root mean square of each axis alone; NaN if the smoother gained nothing there.
+        frames: Number of frames compared.
+    """
+
+    size: Ratio
+    std: Array
+    frames: int
 
 
 @dataclass(frozen=True)
 class TruthAgreement:
-    """Errors against the truth, in what the covariance says of them.
+    """Mean pose NEES over the frames (6 expected), truth noise included, and the 95 % bounds of a single pose.
 
-    The frames of a drive hang together, so that one drive counts as one sample.
-
-    Args:
-        nees: Mean of the pose NEES over the frames, the noise of the truth included; 6 expected.
-        low, high: Bounds within which the NEES of one pose lies with 95 %.
+    Errors persist over the frames of a drive, so one drive counts as one sample.
     """
 
     nees: float
     low: float
     high: float
 
-    @property
-    def is_within(self) -> bool:
-        return self.low <= self.nees <= self.high
 
-    @property
-    def factor(self) -> float:
-        """By which the covariance is too small, in standard deviations, about; below 1: too large."""
-        return float(np.sqrt(self.nees / _POSE_DOF))
-
-    @property
-    def verdict(self) -> str:
-        """The judgement in words."""
-        if self.is_within:
-            return "honest as far as the truth of one drive can tell"
-        return f"{factor_text(self.factor)} against the truth"
-
-    @property
-    def figures(self) -> str:
-        """What it rests on, in words."""
-        return f"pose NEES {self.nees:.3g}, where one honest drive has {self.low:.1f} to {self.high:.1f}"
+def ratio(values: Array, dof: IntArray, lags: int = LAGS) -> Ratio:
+    """Return the sum of normalised squares (T,) divided by the sum of their degrees of freedom (T,)."""
+    return Ratio(float(values.sum() / max(dof.sum(), 1)), whiteness.ratio_error(values, dof, lags))
 
 
-@dataclass(frozen=True)
-class InnovationSize:
-    """Innovations of a run, in what their covariance says of them.
+def examined_frames(result: Result) -> BoolArray:
+    """Return the frames (T,) with enough observations to separate shared innovations from single ones."""
+    assert result.whitened is not None
+    return np.isfinite(result.whitened.shared_nis) & (result.innovation.dof > _LEAST_DOF)
 
-    Args:
-        nis: Per degree of freedom.
+
+def partial(whitened: WhitenedInnovations, axis: int, given: IntArray) -> Array:
+    """Return score ``axis`` (T,) without its regression on the scores ``given``, by its deviation; NaN if that is 0."""
+    c, C = whitened.score, whitened.information
+    mean, variance = c[:, axis], C[:, axis, axis]
+    if len(given):
+        own, cross = C[:, given[:, None], given], C[:, given, axis]
+        # The ridge keeps frames without information from being singular.
+        diagonal = np.diagonal(own, axis1=1, axis2=2)
+        ridge = np.where(diagonal > 0, 1e-12 * diagonal, 1.0)[:, :, None] * np.eye(len(given))
+        weight = np.linalg.solve(own + ridge, cross[..., None])[..., 0]
+        mean = mean - np.einsum("tg,tg->t", weight, c[:, given])
+        variance = variance - np.einsum("tg,tg->t", weight, cross)
+    enough = variance > 1e-9 * C[:, axis, axis]
+    return np.where(enough, mean / np.sqrt(np.where(enough, variance, 1.0)), np.nan)
+
+
+def shared_innovations(whitened: WhitenedInnovations, examined: BoolArray, tau_s: Array) -> SharedInnovations:
+    """Return the errors common to all landmarks in the frames examined (T,), whose intervals are ``tau_s`` (T,)."""
+    kept = dataclasses.replace(whitened, score=whitened.score[examined], information=whitened.information[examined])
+    frames = int(examined.sum())
+    lags = max(LAGS, min(_LAGS_OF_SUMS, frames // 10))
+    own = whiteness.autocovariance(kept.shared, LAGS)
+
+    def long_run(series: Array) -> float:
+        return float(whiteness.long_run_variance(whiteness.autocovariance(series[:, None], lags))[0])
+
+    order: list[int] = []
+    factor, mean, mean_error, persistence = (np.full(6, np.nan) for _ in range(4))
+    while len(order) < 6:
+        series = {a: partial(kept, a, np.array(order, dtype=np.int64)) for a in range(6) if a not in order}
+        variances = {a: long_run(z) for a, z in series.items()}
+        worst = max(variances, key=variances.__getitem__)
+        z = series[worst]
+        mean[worst], variance = np.nanmean(z), float(np.nanvar(z))
+        about_mean = long_run(z - mean[worst])
+        factor[worst] = np.sqrt(variances[worst])
+        mean_error[worst] = np.sqrt(max(about_mean, variance) / frames)
+        persistence[worst] = about_mean / variance
+        order.append(worst)
+    motion = kept.score.sum(axis=0) / np.diagonal(kept.information.sum(axis=0))
+    return SharedInnovations(
+        size=ratio(kept.shared_nis, np.full(frames, POSE_DOF)),
+        std=np.sqrt(own[0]),
+        correlation=own / own[0],
+        order=np.array(order),
+        factor=factor,
+        factor_low=factor / np.sqrt(1.0 + SURE * whiteness.relative_error(frames, lags)),
+        mean=mean,
+        mean_error=mean_error,
+        persistence=persistence,
+        rate=motion / np.mean(tau_s[examined]),
+        frames=frames,
+    )
+
+
+def track_innovations(result: Result, examined: BoolArray, gate: float) -> TrackInnovations:
+    """Return the errors of single tracks in the frames examined (T,), which passed gates of probability ``gate``."""
+    assert result.whitened is not None
+    whitened, innovation = result.whitened, result.innovation
+    rest = innovation.nis[examined] - whitened.shared_nis[examined]
+    size = ratio(rest, innovation.dof[examined] - POSE_DOF)
+    scale = whiteness.gated_scale(size.value, whitened.apart.shape[1], gate)
+    products, pairs = whiteness.along_tracks(whitened.frame, whitened.landmark, whitened.apart, LAGS)
+    persistence = np.maximum(whiteness.long_run_variance(products), 0.0) / products[0]
+    variance = products[0] * scale / size.value
+    return TrackInnovations(size, products / products[0], np.sqrt(variance * persistence), persistence, scale, pairs)
+
+
+def reasons_of(result: Result) -> dict[str, float]:
+    """Return the share of all observations that was rejected, by reason; reasons without any are left out."""
+    total = max(int((result.innovation.accepted + result.innovation.rejected).sum()), 1)
+    counts = np.bincount(result.rejections.reason, minlength=len(REASONS)).tolist()
+    return {name: number / total for name, number in zip(REASONS, counts, strict=True) if number}
+
+
+def rejected_shares(result: Result, examined: BoolArray, gate: float, own_scale: float) -> RejectedShares:
+    """Return the rejected shares, and the share that gates of probability ``gate`` are expected to reject.
+
+    The second gate judges without the shared motion, so ``own_scale`` (of `TrackInnovations`) bounds the scale.
     """
-
-    nis: Ratio
-
-    @property
-    def factor(self) -> float:
-        """By which they are larger than expected, in standard deviations."""
-        return float(np.sqrt(self.nis.value))
-
-    @property
-    def is_expected(self) -> bool:
-        """Whether they are not notably larger or smaller than expected, or may be so by chance."""
-        return abs(self.nis.value - 1.0) <= SURE * self.nis.error or 1 / NOTABLE <= self.factor <= NOTABLE
-
-    @property
-    def verdict(self) -> str:
-        """The judgement in words."""
-        if self.is_expected:
-            return "innovations are as large as expected"
-        size = f"{self.factor:.1f}x larger" if self.factor > 1 else f"{1 / max(self.factor, 1e-3):.1f}x smaller"
-        return f"innovations are about {size} than expected"
-
-    @property
-    def figures(self) -> str:
-        """What it rests on, in words."""
-        return f"NIS {ratio_text(self.nis)} per degree of freedom, where 1 is expected"
+    assert result.whitened is not None
+    whitened, rejections, frames = result.whitened, result.rejections, len(result.time_s)
+    # If the shared innovations of a frame are large, the gates reject good observations, too.
+    nis = whitened.shared_nis
+    calm = examined & (nis <= np.median(nis[examined]))
+    known = np.bincount(whitened.frame, minlength=frames)[calm].sum()
+    gated = rejections.frame[rejections.reason == REASONS.index("gate")]
+    at_gate = np.bincount(gated, minlength=frames)[calm].sum()
+    squares = whitened.alone[calm[whitened.frame]] ** 2
+    dimension = squares.shape[1]
+    scale = max(whiteness.gated_scale(float(np.nanmean(squares)), dimension, gate), own_scale)
+    return RejectedShares(
+        reasons_of(result),
+        float(at_gate / max(at_gate + known, 1)),
+        whiteness.rejected_share(scale, dimension, gate),
+    )
 
 
-def truth_agreement(result: Result, truth: Truth | None, interpolated: BoolArray) -> TruthAgreement | None:
-    """A run against the truth; None where no pose can be compared.
+def prior_agreement(parameters: Parameters) -> tuple[PriorAgreement, ...]:
+    """Return every parameter against its prior, and its changes against the changes of its deviation."""
+    at = np.linspace(0, len(parameters.value) - 1, 11).astype(int)
+    found = []
+    for i, name in enumerate(parameters.name):
+        value, std, prior = parameters.value[:, i], parameters.std[:, i], parameters.prior_std[i]
+        gained = prior**2 - std[-1] ** 2
+        learnt = -np.diff(std[at] ** 2)
+        told = learnt > 1e-3 * prior**2
+        is_constant = bool((learnt >= -1e-9 * prior**2).all()) and told.any()
+        squares = np.diff(value[at])[told] ** 2 / learnt[told]
+        pull = float(value[-1] / np.sqrt(gained)) if gained > 0.01 * prior**2 else None
+        found.append(PriorAgreement(name, pull, float(np.sqrt(squares.mean())) if is_constant else None))
+    return tuple(found)
 
-    Args:
-        result: Of any mode.
-        truth: Of the recording.
-        interpolated: (T,) its interpolated intervals, after which nothing is judged.
-    """
+
+def smoother_agreement(result: Result, smoothed: Posterior) -> SmootherAgreement:
+    """Compare filtered with smoothed poses, see `SmootherAgreement`."""
+    difference = pose_error(result.T_world_imu, smoothed.T_world_imu)
+    turned = se3.adjoint(se3.exp(-difference))
+    P, after = result.covariance, turned @ smoothed.pose_covariance @ turned.swapaxes(1, 2)
+    known = (np.diagonal(P, axis1=1, axis2=2) > 0).all(axis=1)
+    P, difference, gain = P[known], difference[known], P[known] - after[known]
+    std = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    correlation = P / (std[:, :, None] * std[:, None, :])
+    values, axes = np.linalg.eigh(correlation)
+    # W^T P W = I, so that the shares are the relative gain of the smoother in each direction.
+    W = axes / np.sqrt(np.maximum(values, 1e-12))[:, None, :] / std[:, :, None]
+    shares, directions = np.linalg.eigh(W.swapaxes(1, 2) @ gain @ W)
+    along = np.einsum("tba,tcb,tc->ta", directions, W, difference)
+    counts = shares > _LEAST_GAIN
+    squares = np.where(counts, along**2 / np.where(counts, shares, 1.0), 0.0)
+    own = np.diagonal(gain, axis1=1, axis2=2)
+    gained = own > _LEAST_GAIN * std**2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        axis = np.where(gained, difference**2 / own, 0.0).sum(axis=0) / gained.sum(axis=0)
+    size = ratio(squares.sum(axis=1), counts.sum(axis=1), max(LAGS, len(counts) // 5))
+    return SmootherAgreement(size, np.sqrt(axis), int(counts.any(axis=1).sum()))
+
+
+def truth_agreement(result: Result, truth: Truth | None, interpolated: BoolArray | None) -> TruthAgreement | None:
+    """Compare a run with the truth, without the frames after ``interpolated`` (T,) intervals; None if none is left."""
     if truth is None or not len(truth.frame):
         return None
-    _, nees = pose_nees(result, measured_truth(truth, interpolated, result.time_s), with_truth_noise=True)
-    if not np.isfinite(nees).any():
-        return None
-    low, high = chi2_bounds(_POSE_DOF, PROBABILITY)
-    return TruthAgreement(float(np.nanmean(nees)), float(low), float(high))
-
-
-def innovation_size(result: Result) -> InnovationSize | None:
-    """How large the innovations of a run are; None where there are none."""
-    innovation = result.innovation
-    return InnovationSize(ratio(innovation.nis, innovation.dof)) if innovation.dof.sum() > 0 else None
-
-
-def evidence_of(result: Result, truth: TruthAgreement | None, honesty: Honesty | None) -> dict[str, tuple[str, str]]:
-    """What the verdicts on a run rest on, in words: from a figure's name to what was found, and what is expected."""
-    rows = {}
-    if truth is not None:
-        expected = f"{_POSE_DOF}, of one drive {truth.low:.1f} to {truth.high:.1f}"
-        rows["pose NEES, with truth noise"] = (f"{truth.nees:.3g}", expected)
-    if honesty is not None:
-        known = honesty.overview[: len(honesty.overview) - (honesty.smoother is None)]
-        return rows | {name: (found, expected) for name, found, expected in known}
-    size = innovation_size(result)
-    if size is not None:
-        rows["NIS"] = (ratio_text(size.nis), "1")
-    total = int((result.innovation.accepted + result.innovation.rejected).sum())
-    for code, name in enumerate(REASONS):
-        share = float((result.rejections.reason == code).sum()) / max(total, 1)
-        if share > 0:
-            rows[f"rejected: {name}"] = (percent(share), "")
-    return rows
+    measured = truth if interpolated is None else measured_truth(truth, interpolated, result.time_s)
+    _, nees = pose_nees(result, measured, with_truth_noise=True)
+    low, high = chi2_bounds(POSE_DOF, _TRUTH_PROBABILITY)
+    return TruthAgreement(float(np.nanmean(nees)), float(low), float(high)) if np.isfinite(nees).any() else None

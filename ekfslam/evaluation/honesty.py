@@ -1,301 +1,418 @@
-"""Honesty without truth: whether a covariance holds what it promises, as far as innovations can tell.
+"""`judge`: verdicts on the covariance of a run, with their causes, from all evidence that the run offers.
 
-A true model has innovations that are white: over frames, along tracks, and between landmarks. What is wrong with them
-says what is wrong with the model. Shared innovations (`ekfslam.filters.result.WhitenedInnovations`) that are too large
-or that persist are errors of the velocities, or of all tracks alike. What is left of each observation without them is
-an error of that track alone.
-
-Innovations never see the gauge, absolute position and heading. Nor do they see what vision and velocities have in
-common, or what drifts more slowly than the noise of the velocities lets one tell.
+A full run is judged by its innovations. Other modes and older archives keep none, so that the size of the NIS and the
+truth remain.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.evaluation import whiteness
-from ekfslam.evaluation.consistency import pose_error
-from ekfslam.filters.result import REASONS, Innovation, Parameters, Result, WhitenedInnovations
-from ekfslam.geometry import se3
+from ekfslam.arrays import Array, BoolArray
+from ekfslam.data.sequence import Truth
+from ekfslam.errors import HonestyError
+from ekfslam.evaluation import evidence
+from ekfslam.evaluation.evidence import AXES, BLIND, LAGS, POSE_DOF, ROWS, SURE, Ratio, SharedInnovations
+from ekfslam.evaluation.tables import document, markdown_table, number
+from ekfslam.filters.result import Result
 from ekfslam.smoother.posterior import Posterior
 
-LAGS = 20  # frames over which autocorrelation is shown
-_LAGS_OF_SUMS = 60  # over which it is summed, at most; a tenth of the drive where that is less
-AXES = ("forward", "lateral", "vertical", "roll", "pitch", "yaw")  # x, y, z of the IMU
-ROWS = ("u", "v", "disparity")
-BLIND = (
-    "Innovations never see the gauge (absolute position and heading), nor what vision and velocities have in common, "
-    "nor what drifts more slowly than the noise of the velocities lets one tell."
-)
-
-_SHARED_DOF = 6
-LEAST_DOF = 12  # of a frame whose shared innovation is looked at
-SURE = 3.0  # standard errors
-_LEAST_GAIN = 0.05  # share of its variance that a pose must gain by the smoother to be compared
-
-
-@dataclass(frozen=True)
-class Ratio:
-    """A mean per degree of freedom, where 1 is expected, and its standard error that allows for correlation."""
-
-    value: float
-    error: float
+_NOTABLE = 1.3  # factor from which a deviation is reported
+_LEAST_LOW = 1.15  # of the factor, minus three standard errors
+_PERSISTS, _LEAST_SLOW = 2.0, 1.5  # persistence from which errors of tracks, and shared errors, are called slow
+_LEAST_MEAN, _SURE_OF_MEAN = 0.3, 4.5  # of a constant error: standard deviations of a frame, standard errors
+_LEAST_OUTLIERS, _LEAST_MOVING = 0.01, 0.1  # shares of the observations
+_LEAST_AGREEMENT = 1.5  # ratio of standard deviations
+_PULL = 3.5  # standard deviations from its prior that speak against a block
+_SMOOTHER = 3.0  # normalised square per degree of freedom: that of an EKF in XYZ may be 2
+_BAD = 2.0  # factor
+_SHARED = {
+    "bias": " and are constant: a bias of the velocities (up to {})",
+    "shared drift": " and persist over frames: a slow error of all tracks or of the velocities",
+    "shared noise": ", independently in each frame: velocities noisier than stated, or a jitter of all tracks",
+}
 
 
 @dataclass(frozen=True)
-class SharedInnovations:
-    """Errors on which the landmarks of a frame agree, along `AXES`.
-
-    The axes are taken in the order of ``factor``, and each is judged less what is explained by those before: an error
-    in yaw looks like one in lateral position, too.
+class Cause:
+    """A defect of the model.
 
     Args:
-        size: Mean of their squares per degree of freedom.
-        std: (6,) standard deviation about 0, each axis by itself; 1 expected.
-        correlation: (21, 6) autocorrelation, lags 0 to 20 frames, each axis by itself.
-        order: (6,) axes, worst first.
-        factor: (6,) square root of the long-run variance: by how much errors outgrow the covariance.
-        factor_low: (6,) what it exceeds with near certainty.
-        mean, mean_error: (6,) means in standard deviations of a frame, and their standard errors.
-        persistence: (6,) long-run variance about the mean, by the variance: 1 is white.
-        rate: (6,) mean motion in m/s and rad/s: what a constant bias of measured velocities is at least.
-        frames: How many there are.
+        kind: A key of ``_SHARED`` for errors common to the landmarks of a frame, ``pixel noise``, ``tracks``,
+            ``agreement``, ``outliers``, ``moving``, ``prior`` or ``smoother``.
+        where: Axes, rows, or names of parameters.
+        factor: Ratio of errors to covariance, beyond what single observations explain; 1 for causes without one.
+        text: Description.
     """
 
-    size: Ratio
-    std: Array
-    correlation: Array
-    order: IntArray
-    factor: Array
-    factor_low: Array
-    mean: Array
-    mean_error: Array
-    persistence: Array
-    rate: Array
-    frames: int
+    kind: str
+    where: tuple[str, ...]
+    factor: float
+    text: str
 
 
 @dataclass(frozen=True)
-class TrackInnovations:
-    """What is left of each observation without the shared motion, by `ROWS`.
+class Judgement:
+    """A verdict from one kind of evidence.
 
     Args:
-        size: NIS per degree of freedom without the shared part.
-        scale: By how much variances of single observations exceed those stated; corrected for what the gate cuts off.
-        correlation: (21, d) autocorrelation along tracks.
-        pairs: (21,) pairs of observations behind it.
-        factor: (d,) square root of the long-run variance.
-        persistence: (d,) long-run variance by the variance: 1 is white.
+        text: The verdict in words.
+        reasons: Causes, or the figures behind it.
+        factor: Ratio of errors to covariance, in standard deviations; 1 if nothing speaks against the covariance.
     """
 
-    size: Ratio
-    scale: float
-    correlation: Array
-    pairs: IntArray
-    factor: Array
-    persistence: Array
+    text: str
+    reasons: tuple[str, ...]
+    factor: float
 
 
 @dataclass(frozen=True)
-class RejectedShares:
-    """What was rejected.
+class Honesty:
+    """All verdicts on a run, and their evidence; None for evidence that the run does not offer.
 
     Args:
-        reasons: Share of all observations by reason.
-        gate: Share of the observations of known landmarks that the gates rejected, in frames that are calm otherwise.
-        expected: The same by the model, with the variances that accepted innovations show.
-    """
-
-    reasons: Mapping[str, float]
-    gate: float
-    expected: float
-
-
-@dataclass(frozen=True)
-class PriorAgreement:
-    """A reported parameter against its prior.
-
-    Args:
-        name: Of the parameter.
-        pull: Last estimate less the prior mean 0, by ``sqrt(prior^2 - std^2)``; None where nothing was learnt.
-        increment: Root mean square of the changes over tenths of the drive, by ``sqrt(std_before^2 - std_after^2)``;
-            None where the deviation does not fall, so that the parameter is not constant.
+        name: Name of the recording.
+        frames: Number of frames.
+        nis: NIS per degree of freedom.
+        shared, tracks, rejections, priors, smoother, truth: The evidence.
+        smoother_skipped: Reason for the missing comparison with the smoother; empty if there is one.
+        innovations_skipped: Reason for missing innovations; empty if there are some.
+        factor: Approximate ratio of errors to covariance, in standard deviations, by innovations: above 1 the
+            covariance is too small.
+        causes: Causes of a covariance that is too small or too large, worst first.
+        findings: Other defects.
     """
 
     name: str
-    pull: float | None
-    increment: float | None
+    frames: int
+    nis: Ratio | None
+    shared: SharedInnovations | None
+    tracks: evidence.TrackInnovations | None
+    rejections: evidence.RejectedShares
+    priors: tuple[evidence.PriorAgreement, ...]
+    smoother: evidence.SmootherAgreement | None
+    truth: evidence.TruthAgreement | None
+    smoother_skipped: str
+    innovations_skipped: str
+    factor: float
+    causes: tuple[Cause, ...]
+    findings: tuple[Cause, ...]
+
+    @property
+    def agreement(self) -> float:
+        """Ratio of shared errors to those of single observations, in standard deviations; 1 expected."""
+        return np.nan if self.shared is None or self.tracks is None else _agreement(self.shared, self.tracks)
+
+    @property
+    def judgements(self) -> list[Judgement]:
+        """The verdicts, the main one first; empty without any evidence."""
+        found = [*self._by_innovations(), *self._by_truth()]
+        # A defect comes first. If there is none, the truth says more than the size of the NIS.
+        if len(found) == 2 and self.shared is None and found[0].factor == 1.0:
+            found.reverse()
+        return found
+
+    @property
+    def verdict(self) -> str:
+        """The main verdict and its reasons in one sentence."""
+        if not self.judgements:
+            return self.innovations_skipped
+        text = self.judgements[0].text
+        if self.causes:
+            text += f"; cause: {'; '.join(cause.text for cause in self.causes)}"
+        return text + (f". Also: {'; '.join(cause.text for cause in self.findings)}" if self.findings else "")
+
+    @property
+    def grade(self) -> str:
+        """``good``, ``fair`` or ``bad`` by the largest factor of the verdicts, ``none`` without verdicts."""
+        factors = [judgement.factor for judgement in self.judgements]
+        if not factors:
+            return "none"
+        return "bad" if max(factors) >= _BAD else "fair" if any(factor != 1 for factor in factors) else "good"
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Everything as plain values for JSON; None replaces what is not a number."""
+        words = {"verdict": self.verdict, "agreement": self.agreement, "blind": BLIND, "axes": AXES, "rows": ROWS}
+        return {name: _plain(value) for name, value in {**words, **dataclasses.asdict(self)}.items()}
+
+    @property
+    def evidence(self) -> list[list[str]]:
+        """Rows of three cells: name of a figure, value found, value expected."""
+        rows = []
+        if self.truth is not None:
+            expected = f"{POSE_DOF}, of one drive {self.truth.low:.1f} to {self.truth.high:.1f}"
+            rows.append(["pose NEES, with truth noise", f"{self.truth.nees:.3g}", expected])
+        if self.nis is not None:
+            rows.append(["NIS", str(self.nis), "1"])
+        if self.shared is not None and self.tracks is not None:
+            rows += [
+                ["NIS shared by the landmarks of a frame", str(self.shared.size), "1"],
+                ["NIS of single observations, without that", str(self.tracks.size), "1"],
+                ["shared errors against single ones (deviations)", f"{self.agreement:.2f}", "1"],
+                ["variance of single ones, without the gate's cut", f"{self.tracks.scale:.3g}", "1"],
+                ["rejected by gates, calm frames", *map(_percent, (self.rejections.gate, self.rejections.expected))],
+            ]
+        rows += [[f"rejected: {name}", _percent(share), ""] for name, share in self.rejections.reasons.items()]
+        return rows if self.smoother is None else [*rows, ["filter less smoother", str(self.smoother.size), "1"]]
+
+    @property
+    def table(self) -> str:
+        """Verdict and evidence as Markdown that is also legible on a terminal."""
+        blocks = [
+            f"# {self.name}: honesty of the covariance, {self.frames} frames",
+            f"**Verdict: {self.verdict}.**",
+            markdown_table(["per degree of freedom, or share", "found", "expected"], self.evidence, padded=True),
+        ]
+        if self.smoother is None:
+            blocks.append(f"No comparison with the smoother: {self.smoother_skipped}.")
+        if self.shared is not None and self.tracks is not None:
+            shared, tracks = self.shared, self.tracks
+            of_axes = {"size": shared.std, **_lags(shared, 1, 5), "mean": shared.mean, "+-": shared.mean_error}
+            of_axes |= {"persists": shared.persistence, "grows by": shared.factor, "at least": shared.factor_low}
+            of_rows = {**_lags(tracks, 1, 5, LAGS), "persists": tracks.persistence, "grows by": tracks.factor}
+            blocks += [
+                "Errors that the landmarks of a frame share, in standard deviations that the filter expects of them:",
+                _table("axis", AXES, of_axes),
+                "Errors of single observations, without those, along tracks:",
+                _table("row", ROWS, of_rows),
+            ]
+        if self.priors:
+            rows = [[prior.name, number(prior.pull, ".2f"), number(prior.increment, ".2f")] for prior in self.priors]
+            blocks.append(markdown_table(["block", "from its prior [sigma]", "steps [sigma]"], rows, padded=True))
+        return document(*blocks, BLIND)
+
+    def _by_innovations(self) -> Iterator[Judgement]:
+        """Yield the verdict by whitened innovations, else by the size of the NIS."""
+        if self.shared is not None:
+            reasons = tuple(cause.text for cause in (*self.causes, *self.findings))
+            if not self.causes:
+                yield Judgement("honest as far as innovations can tell", reasons, 1.0)
+                return
+            worst = self.causes[0]
+            where = f" in {_axes(worst.where)}" if worst.kind in _SHARED else ""
+            limit = "" if self.factor > 1 else ", as far as innovations can tell"
+            yield Judgement(f"{_factor(self.factor)}{where}{limit}", reasons, self.factor)
+        elif self.nis is not None:
+            factor = float(np.sqrt(self.nis.value))
+            figures = (f"NIS {self.nis} per degree of freedom, where 1 is expected",)
+            if abs(self.nis.value - 1.0) <= SURE * self.nis.error or 1 / _NOTABLE <= factor <= _NOTABLE:
+                yield Judgement("innovations are as large as expected", figures, 1.0)
+                return
+            size = f"{factor:.1f}x larger" if factor > 1 else f"{1 / max(factor, 1e-3):.1f}x smaller"
+            yield Judgement(f"innovations are about {size} than expected", figures, factor)
+
+    def _by_truth(self) -> Iterator[Judgement]:
+        """Yield the verdict by the truth."""
+        if self.truth is None:
+            return
+        nees, low, high = dataclasses.astuple(self.truth)
+        figures = (f"pose NEES {nees:.3g}, where one honest drive has {low:.1f} to {high:.1f}",)
+        if low <= nees <= high:
+            yield Judgement("honest as far as the truth of one drive can tell", figures, 1.0)
+        else:
+            factor = float(np.sqrt(nees / POSE_DOF))
+            yield Judgement(f"{_factor(factor)} against the truth", figures, factor)
 
 
-@dataclass(frozen=True)
-class SmootherAgreement:
-    """Filtered less smoothed poses: their covariance is ``P_filter - P_smoothed``.
+def judge(
+    result: Result,
+    smoothed: Posterior | None = None,
+    skipped: str = "not required",
+    truth: Truth | None = None,
+    interpolated: BoolArray | None = None,
+) -> Honesty:
+    """Judge the covariance of a run by its innovations, and by its smoother and its truth if they are given.
 
     Args:
-        size: Normalised square per degree of freedom, over the directions in which the smoother gained. Its error
-            allows for correlation over a fifth of the drive, and is rough.
-        std: (6,) each axis by itself; NaN where nothing was gained.
-        frames: Frames compared.
+        result: A run of any mode.
+        smoothed: Its posterior.
+        skipped: Reason for a missing posterior.
+        truth: Truth of the recording.
+        interpolated: (T,) interpolated intervals of the recording; the frames after them are not compared with truth.
     """
-
-    size: Ratio
-    std: Array
-    frames: int
-
-
-def partial(whitened: WhitenedInnovations, axis: int, given: IntArray) -> Array:
-    """(T,) ``c_a`` less what components ``given`` explain of it, by its standard deviation; NaN where that is 0."""
-    c, C = whitened.score, whitened.information
-    mean, variance = c[:, axis], C[:, axis, axis]
-    if len(given):
-        own, cross = C[:, given[:, None], given], C[:, given, axis]
-        weight = np.linalg.solve(own + _ridge(own), cross[..., None])[..., 0]
-        mean = mean - np.einsum("tg,tg->t", weight, c[:, given])
-        variance = variance - np.einsum("tg,tg->t", weight, cross)
-    enough = variance > 1e-9 * C[:, axis, axis]
-    return np.where(enough, mean / np.sqrt(np.where(enough, variance, 1.0)), np.nan)
-
-
-def _ridge(own: Array) -> Array:
-    """What keeps frames without information from being singular."""
-    diagonal = np.diagonal(own, axis1=1, axis2=2)
-    return np.where(diagonal > 0, 1e-12 * diagonal, 1.0)[:, :, None] * np.eye(own.shape[1])
-
-
-def shared_innovations(whitened: WhitenedInnovations, looked_at: BoolArray, tau_s: Array) -> SharedInnovations:
-    """What the frames looked at (T,) show of errors that all landmarks share; ``tau_s`` (T,) their intervals."""
-    kept = dataclasses.replace(whitened, score=whitened.score[looked_at], information=whitened.information[looked_at])
-    frames = int(looked_at.sum())
-    lags = max(LAGS, min(_LAGS_OF_SUMS, frames // 10))
-    error = whiteness.relative_error(frames, lags)
-    own = whiteness.autocovariance(kept.shared, LAGS)
-    order: list[int] = []
-    factor, mean, mean_error, persistence = (np.full(6, np.nan) for _ in range(4))
-    while len(order) < 6:
-        given = np.array(order, dtype=np.int64)
-        series = {a: partial(kept, a, given) for a in range(6) if a not in order}
-        long_run = {a: _long_run(z, lags) for a, z in series.items()}
-        worst = max(long_run, key=long_run.__getitem__)
-        z = series[worst]
-        mean[worst], variance = np.nanmean(z), float(np.nanvar(z))
-        about_mean = _long_run(z - mean[worst], lags)
-        factor[worst] = np.sqrt(long_run[worst])
-        mean_error[worst] = np.sqrt(max(about_mean, variance) / frames)
-        persistence[worst] = about_mean / variance
-        order.append(worst)
-    shared_nis = kept.shared_nis
-    motion = kept.score.sum(axis=0) / np.diagonal(kept.information.sum(axis=0))
-    return SharedInnovations(
-        size=ratio(shared_nis, np.full(frames, _SHARED_DOF)),
-        std=np.sqrt(own[0]),
-        correlation=own / own[0],
-        order=np.array(order),
-        factor=factor,
-        factor_low=factor / np.sqrt(1.0 + SURE * error),
-        mean=mean,
-        mean_error=mean_error,
-        persistence=persistence,
-        rate=motion / np.mean(tau_s[looked_at]),
-        frames=frames,
-    )
-
-
-def track_innovations(
-    whitened: WhitenedInnovations, innovation: Innovation, looked_at: BoolArray, gate: float
-) -> TrackInnovations:
-    """What single tracks show in the frames looked at (T,), behind gates of a probability."""
-    rest = innovation.nis[looked_at] - whitened.shared_nis[looked_at]
-    size = ratio(rest, innovation.dof[looked_at] - _SHARED_DOF)
-    dimension = whitened.apart.shape[1]
-    scale = whiteness.gated_scale(size.value, dimension, gate)
-    products, pairs = whiteness.along_tracks(whitened.frame, whitened.landmark, whitened.apart, LAGS)
-    long_run = whiteness.long_run_variance(products)
-    persistence = np.maximum(long_run, 0.0) / products[0]
-    variance = products[0] * scale / size.value
-    return TrackInnovations(size, scale, products / products[0], pairs, np.sqrt(variance * persistence), persistence)
-
-
-def rejected_shares(result: Result, looked_at: BoolArray, gate: float, own_scale: float) -> RejectedShares:
-    """What was rejected, and what the gates (of a probability) should reject.
-
-    ``own_scale`` is that of `TrackInnovations`: the second gate judges without the shared motion.
-    """
-    assert result.whitened is not None
-    whitened = result.whitened
-    rejections, innovation, frames = result.rejections, result.innovation, len(result.time_s)
-    total = int((innovation.accepted + innovation.rejected).sum())
-    reasons = {name: float((rejections.reason == code).sum()) / total for code, name in enumerate(REASONS)}
-    # In frames whose shared innovations are large the gates throw out what is right.
-    nis = whitened.shared_nis
-    calm = looked_at & (nis <= np.median(nis[looked_at]))
-    known = np.bincount(whitened.frame, minlength=frames)[calm].sum()
-    gated = rejections.frame[rejections.reason == REASONS.index("gate")]
-    at_gate = np.bincount(gated, minlength=frames)[calm].sum()
-    squares = whitened.alone[calm[whitened.frame]] ** 2
-    dimension = squares.shape[1]
-    scale = whiteness.gated_scale(float(np.nanmean(squares)), dimension, gate)
-    scale = max(scale, own_scale)
-    return RejectedShares(
-        {name: share for name, share in reasons.items() if share > 0},
-        float(at_gate / max(at_gate + known, 1)),
-        whiteness.rejected_share(scale, dimension, gate),
-    )
-
-
-def prior_agreement(parameters: Parameters) -> tuple[PriorAgreement, ...]:
-    """Every parameter against its prior, and its changes against those of its deviation."""
-    at = np.linspace(0, len(parameters.value) - 1, 11).astype(int)
-    found = []
-    for i, name in enumerate(parameters.name):
-        value, std, prior = parameters.value[:, i], parameters.std[:, i], parameters.prior_std[i]
-        gained = prior**2 - std[-1] ** 2
-        learnt = -np.diff(std[at] ** 2)
-        told = learnt > 1e-3 * prior**2
-        is_constant = bool((learnt >= -1e-9 * prior**2).all()) and told.any()
-        squares = np.diff(value[at])[told] ** 2 / learnt[told]
-        found.append(
-            PriorAgreement(
-                name,
-                float(value[-1] / np.sqrt(gained)) if gained > 0.01 * prior**2 else None,
-                float(np.sqrt(squares.mean())) if is_constant else None,
-            )
+    shared, tracks, rejections = None, None, evidence.RejectedShares(evidence.reasons_of(result))
+    priors = () if result.parameters is None else evidence.prior_agreement(result.parameters)
+    smoother = None if smoothed is None else evidence.smoother_agreement(result, smoothed)
+    missing, whitened, innovation = _missing_innovations(result), result.whitened, result.innovation
+    factor, causes, findings = 1.0, tuple[Cause, ...](), tuple[Cause, ...]()
+    if whitened is not None and not missing:
+        examined = evidence.examined_frames(result)
+        gate, tau_s = (
+            float(result.config["filter"]["gate_probability"]),
+            np.diff(result.time_s, prepend=result.time_s[0]),
         )
-    return tuple(found)
+        shared = evidence.shared_innovations(whitened, examined, tau_s)
+        tracks = evidence.track_innovations(result, examined, gate)
+        rejections = evidence.rejected_shares(result, examined, gate, tracks.scale)
+        factor, causes, findings = _causes(shared, tracks, smoother)
+    return Honesty(
+        name=result.sequence_name,
+        frames=len(result.time_s),
+        nis=evidence.ratio(innovation.nis, innovation.dof) if innovation.dof.sum() > 0 else None,
+        shared=shared,
+        tracks=tracks,
+        rejections=rejections,
+        priors=priors,
+        smoother=smoother,
+        truth=evidence.truth_agreement(result, truth, interpolated),
+        smoother_skipped="" if smoother is not None else skipped,
+        innovations_skipped=missing,
+        factor=factor,
+        causes=causes,
+        findings=(*findings, *_rejection_causes(rejections), *_prior_causes(priors)),
+    )
 
 
-def smoother_agreement(result: Result, smoothed: Posterior) -> SmootherAgreement:
-    """Filtered against smoothed poses, see `SmootherAgreement`."""
-    difference = pose_error(result.T_world_imu, smoothed.T_world_imu)
-    turned = se3.adjoint(se3.exp(-difference))
-    P, after = result.covariance, turned @ smoothed.pose_covariance @ turned.swapaxes(1, 2)
-    known = (np.diagonal(P, axis1=1, axis2=2) > 0).all(axis=1)
-    P, difference, gain = P[known], difference[known], P[known] - after[known]
-    std = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    correlation = P / (std[:, :, None] * std[:, None, :])
-    values, axes = np.linalg.eigh(correlation)
-    # W^T P W = I, so that the shares are what the smoother gained of each direction's variance.
-    W = axes / np.sqrt(np.maximum(values, 1e-12))[:, None, :] / std[:, :, None]
-    shares, directions = np.linalg.eigh(W.swapaxes(1, 2) @ gain @ W)
-    along = np.einsum("tba,tcb,tc->ta", directions, W, difference)
-    counts = shares > _LEAST_GAIN
-    squares = np.where(counts, along**2 / np.where(counts, shares, 1.0), 0.0)
-    own = np.diagonal(gain, axis1=1, axis2=2)
-    gained = own > _LEAST_GAIN * std**2
-    with np.errstate(invalid="ignore", divide="ignore"):
-        axis = np.where(gained, difference**2 / own, 0.0).sum(axis=0) / gained.sum(axis=0)
-    size = ratio(squares.sum(axis=1), counts.sum(axis=1), max(LAGS, len(counts) // 5))
-    return SmootherAgreement(size, np.sqrt(axis), int(counts.any(axis=1).sum()))
+def require_innovations(result: Result) -> None:
+    """Raise unless a run has innovations to be judged by.
+
+    Raises:
+        HonestyError: The result has no whitened innovations, or too few frames with them.
+    """
+    missing = _missing_innovations(result)
+    if missing:
+        raise HonestyError(f"{result.sequence_name}: {missing}")
 
 
-def _long_run(series: Array, lags: int) -> float:
-    return float(whiteness.long_run_variance(whiteness.autocovariance(series[:, None], lags))[0])
+def _missing_innovations(result: Result) -> str:
+    """Return why a run has no innovations to be judged by; empty if it has."""
+    if result.whitened is None:
+        why = "was made before innovations were kept: run again" if result.mode == "full" else "has none: check 'full'"
+        return f"no innovations to judge by: the result of {result.mode!r} {why}"
+    frames = int(evidence.examined_frames(result).sum())
+    return "" if frames > LAGS else f"only {frames} frames have innovations to judge by"
 
 
-def ratio(values: Array, dof: IntArray, lags: int = LAGS) -> Ratio:
-    """Sum of normalised squares (T,) by that of their degrees of freedom (T,)."""
-    return Ratio(float(values.sum() / max(dof.sum(), 1)), whiteness.ratio_error(values, dof, lags))
+def _causes(
+    shared: SharedInnovations, tracks: evidence.TrackInnovations, smoother: evidence.SmootherAgreement | None
+) -> tuple[float, tuple[Cause, ...], tuple[Cause, ...]]:
+    """Return the ratio of errors to covariance, its causes, and the causes that act the other way."""
+    found = (*_shared_causes(shared, tracks), *_track_causes(tracks))
+    small, large = (tuple(cause for cause in found if (cause.factor > 1) == way) for way in (True, False))
+    small = tuple(sorted(small, key=lambda cause: -cause.factor)) or tuple(_smoother_causes(smoother))
+    if small:
+        factor, causes, aside = small[0].factor, small, large
+    else:
+        factor = float(max(np.sqrt((shared.factor**2).mean()), np.sqrt(tracks.scale), tracks.factor.max()))
+        causes, aside = (large, ()) if factor < 1 / _NOTABLE else ((), large)
+    agreement = _agreement(shared, tracks)
+    if agreement >= _LEAST_AGREEMENT and not any(cause.kind in _SHARED for cause in causes):
+        text = (
+            f"the landmarks of a frame agree: relative to single errors, shared errors are {agreement:.1f}x too large"
+        )
+        aside = (*aside, Cause("agreement", (), 1.0, text))
+    return factor, causes, aside
+
+
+def _shared_causes(shared: SharedInnovations, tracks: evidence.TrackInnovations) -> Iterator[Cause]:
+    """Yield causes of shared errors, beyond what they inherit from errors of single observations."""
+    explained = max(1.0, float(np.sqrt(tracks.scale)), _grown(tracks))
+    order, mean, factor = shared.order, np.abs(shared.mean), shared.factor / explained
+    large = (factor > _NOTABLE) & (shared.factor_low > _LEAST_LOW * explained)
+    constant = (mean > _LEAST_MEAN) & (mean > _SURE_OF_MEAN * shared.mean_error)
+    rest = order[(large & ~constant)[order]]
+    # An error that is independent in each frame shows at once, a slow one only in sums.
+    slow = np.log(shared.persistence[rest])
+    fast = 2.0 * np.log(factor[rest]) - slow
+    is_slow = len(rest) and slow.mean() > max(np.log(_LEAST_SLOW), fast.mean())
+    groups = {"bias": order[(large & constant)[order]], "shared drift" if is_slow else "shared noise": rest}
+    for kind, axes in groups.items():
+        if len(axes):
+            where, rates = tuple(AXES[a] for a in axes), _listed([_rate(shared.rate[a], a) for a in axes])
+            text = f"innovations agree across landmarks in {_axes(where)}{_SHARED[kind].format(rates)}"
+            yield Cause(kind, where, float(factor[axes[0]]), text)
+
+
+def _track_causes(tracks: evidence.TrackInnovations) -> Iterator[Cause]:
+    pixels, names = float(np.sqrt(tracks.scale)), ROWS[: len(tracks.factor)]
+    slow, grown = np.flatnonzero(tracks.persistence > _PERSISTS), _grown(tracks)
+    if grown > _NOTABLE:
+        where = tuple(names[i] for i in slow)
+        text = f"errors persist along tracks in {_listed(where)}, where the model expects independent ones"
+        yield Cause("tracks", where, grown, text)
+    if abs(np.log(pixels)) > np.log(_NOTABLE) and abs(tracks.size.value - 1.0) > SURE * tracks.size.error:
+        word = "larger" if pixels > 1 else "smaller"
+        text = f"errors of single observations are about {max(pixels, 1 / pixels):.1f}x {word} than stated"
+        if pixels < 1 and len(slow):
+            text += f", yet persist along tracks, so that in sums they are {grown:.1f}x larger than stated"
+        yield Cause("pixel noise", names, pixels, text)
+
+
+def _rejection_causes(rejections: evidence.RejectedShares) -> Iterator[Cause]:
+    gate, expected, moving = rejections.gate, rejections.expected, rejections.reasons.get("moving", 0.0)
+    # Two gates and a tail that is not quite Gaussian reject slightly more than one gate should.
+    if gate is not None and expected is not None and gate > 3.0 * expected + _LEAST_OUTLIERS:
+        text = f"the gates reject {_percent(gate)} of the observations ({_percent(expected)} expected): outliers"
+        yield Cause("outliers", (), 1.0, text)
+    if moving > _LEAST_MOVING:
+        yield Cause("moving", (), 1.0, f"{_percent(moving)} of the observations are rejected as moving points")
+
+
+def _prior_causes(priors: Sequence[evidence.PriorAgreement]) -> Iterator[Cause]:
+    names = tuple(prior.name for prior in priors if max(abs(prior.pull or 0.0), prior.increment or 0.0) > _PULL)
+    if names:
+        text = f"disagreement with the prior of {_listed(names)}, or steps larger than its deviation allows"
+        yield Cause("prior", names, 1.0, text)
+
+
+def _smoother_causes(smoother: evidence.SmootherAgreement | None) -> Iterator[Cause]:
+    if smoother is not None and smoother.size.value > max(_SMOOTHER, 1.0 + SURE * smoother.size.error):
+        factor = float(np.sqrt(smoother.size.value))
+        text = f"filter and smoother differ {factor:.1f}x more than their covariances allow, unexplained by innovations"
+        yield Cause("smoother", (), factor, text)
+
+
+def _grown(tracks: evidence.TrackInnovations) -> float:
+    """Return the largest factor of the rows whose errors persist along tracks; 0 if there is none."""
+    return float(tracks.factor[tracks.persistence > _PERSISTS].max(initial=0.0))
+
+
+def _agreement(shared: SharedInnovations, tracks: evidence.TrackInnovations) -> float:
+    return float(np.sqrt(shared.size.value / tracks.size.value))
+
+
+def _lags(found: evidence.Whiteness, *lags: int) -> dict[str, Array]:
+    return {f"lag {lag}": found.correlation[lag] for lag in lags}
+
+
+def _table(kind: str, names: Sequence[str], columns: dict[str, Array]) -> str:
+    values = np.column_stack(list(columns.values())).tolist()
+    rows = [[name, *(f"{value:.2f}" for value in row)] for name, row in zip(names, values, strict=False)]
+    return markdown_table([kind, *columns], rows, padded=True)
+
+
+def _rate(rate: float, axis: int) -> str:
+    return f"{rate:+.2g} m/s" if axis < 3 else f"{np.degrees(rate):+.2g} deg/s"
+
+
+def _axes(names: Sequence[str]) -> str:
+    return "all axes" if len(names) == len(AXES) else _listed(names)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
+
+
+def _factor(factor: float) -> str:
+    word, size = ("optimistic", factor) if factor > 1 else ("pessimistic", 1 / factor)
+    return f"covariance {word} by about {size:.1f}x"
+
+
+def _percent(share: float | None) -> str:
+    return number(None if share is None else 100 * share, ".2g") + " %"
+
+
+def _plain(value: Any) -> Any:
+    """Return arrays as lists, and None for what is not a number."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [_plain(item) for item in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value

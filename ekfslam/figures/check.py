@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.evaluation.consistency import chi2_bounds
-from ekfslam.evaluation.honesty import AXES, LAGS, ROWS
-from ekfslam.evaluation.verdict import Honesty
+from ekfslam.evaluation.evidence import AXES, LAGS, ROWS, Whiteness
+from ekfslam.evaluation.honesty import Honesty
 from ekfslam.figures.style import BOUNDS, EXPECTED, SERIES, ZERO, line_of, log_axis, styled
 from ekfslam.filters.result import REASONS, Result
 
@@ -26,14 +26,15 @@ def plot_check(result: Result, found: Honesty) -> Figure:
 
     Args:
         result: With whitened innovations.
-        found: What `ekfslam.evaluation.verdict.judge` said of it.
+        found: What `ekfslam.evaluation.honesty.judge` said of it.
     """
+    assert found.shared is not None and found.tracks is not None
     figure = Figure(figsize=(11.0, 9.6))
     panels = figure.subplots(3, 2)
-    _nis(panels[0, 0], result, found)
+    _nis(panels[0, 0], result)
     _rejections(panels[0, 1], result)
-    _along_tracks(panels[1, 0], found)
-    _over_frames(panels[1, 1], found)
+    _correlation(panels[1, 0], found.tracks, found.tracks.pairs, ROWS, "along tracks, shared motion removed")
+    _correlation(panels[1, 1], found.shared, np.full(LAGS + 1, found.shared.frames), AXES, "of shared innovations")
     shared, time_s = _shared(result)
     for ax, axes, title in zip(panels[2], (range(3), range(3, 6)), ("translation", "rotation"), strict=True):
         _over_time(ax, time_s, shared, axes)
@@ -42,7 +43,7 @@ def plot_check(result: Result, found: Honesty) -> Figure:
     return figure
 
 
-def _nis(ax: Axes, result: Result, found: Honesty) -> None:
+def _nis(ax: Axes, result: Result) -> None:
     seen = result.innovation.dof > 0
     time_s, dof = (result.time_s - result.time_s[0])[seen], result.innovation.dof[seen]
     values = result.innovation.nis[seen] / dof
@@ -52,7 +53,11 @@ def _nis(ax: Axes, result: Result, found: Honesty) -> None:
     ax.plot(time_s, values, ".", color=line_of("full")["color"], markersize=2.5, label="frame")
     if values.max() > _LOG_RATIO * max(values.min(), 1e-9):
         log_axis(ax, (1.0, 3.0))
-    ax.set(xlabel="time [s]", ylabel="NIS per dof [-]", title=f"NIS: mean {found.nis.value:.2f} (1 expected)")
+    ax.set(
+        xlabel="time [s]",
+        ylabel="NIS per dof [-]",
+        title=f"NIS: mean {result.innovation.nis.sum() / dof.sum():.2f} (1 expected)",
+    )
     ax.margins(x=0.01, y=0.25)
     ax.legend(loc="upper right", ncols=3)
 
@@ -74,24 +79,14 @@ def _rejections(ax: Axes, result: Result) -> None:
         ax.legend(loc="upper right")
 
 
-def _along_tracks(ax: Axes, found: Honesty) -> None:
-    lags, pairs = np.arange(LAGS + 1), np.maximum(found.tracks.pairs, 1)
-    _correlation(ax, lags, _SIGMAS / np.sqrt(pairs), found.tracks.correlation, ROWS)
-    ax.set_title("autocorrelation along tracks, shared motion taken out")
-
-
-def _over_frames(ax: Axes, found: Honesty) -> None:
-    lags = np.arange(LAGS + 1)
-    _correlation(ax, lags, np.full(LAGS + 1, _SIGMAS / np.sqrt(found.shared.frames)), found.shared.correlation, AXES)
-    ax.set_title("autocorrelation of what a frame's landmarks share")
-
-
-def _correlation(ax: Axes, lags: IntArray, bound: Array, values: Array, names: tuple[str, ...]) -> None:
+def _correlation(ax: Axes, found: Whiteness, samples: IntArray, names: tuple[str, ...], title: str) -> None:
+    lags, values = np.arange(LAGS + 1), found.correlation
+    bound = _SIGMAS / np.sqrt(np.maximum(samples, 1))
     ax.fill_between(lags, -bound, bound, **BOUNDS, label=f"{100 * _PROBABILITY:g} % if white")
     ax.axhline(0.0, **ZERO)
     for i in range(values.shape[1]):
         ax.plot(lags[1:], values[1:, i], **SERIES[i], label=names[i])
-    ax.set(xlabel="lag [frames]", ylabel="correlation [-]", xticks=lags[::5])
+    ax.set(xlabel="lag [frames]", ylabel="correlation [-]", xticks=lags[::5], title=f"autocorrelation {title}")
     ax.set_ylim(min(-0.3, 1.1 * values[1:].min()), max(0.8, 1.6 * values[1:].max()))
     ax.legend(loc="upper right", ncols=2)
 

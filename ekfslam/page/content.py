@@ -16,7 +16,6 @@ from matplotlib.colors import to_hex
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import MODES
-from ekfslam.errors import HonestyError
 from ekfslam.evaluation.consistency import (
     chi2_bounds,
     measured_truth,
@@ -24,16 +23,9 @@ from ekfslam.evaluation.consistency import (
     world_axes_errors,
     world_axes_std,
 )
-from ekfslam.evaluation.evidence import (
-    InnovationSize,
-    TruthAgreement,
-    evidence_of,
-    innovation_size,
-    truth_agreement,
-)
+from ekfslam.evaluation.honesty import Honesty, judge
 from ekfslam.evaluation.summary import summarise
 from ekfslam.evaluation.trajectory import distance_along
-from ekfslam.evaluation.verdict import Honesty, judge
 from ekfslam.figures.style import (
     BLUE,
     GREEN,
@@ -82,57 +74,17 @@ class Run:
         return summarise(self.archive, self.result)
 
     @cached_property
-    def honesty(self) -> Honesty | str:
-        """The judgement by innovations alone, or why there is none."""
-        try:
-            return judge(self.result)
-        except HonestyError as error:
-            return str(error)
-
-    @cached_property
-    def agreement(self) -> TruthAgreement | None:
-        """The judgement by truth, where there is one."""
-        return truth_agreement(self.result, self.archive.truth, self.archive.interpolated)
-
-    @cached_property
-    def size(self) -> InnovationSize | None:
-        """That of its innovations, where nothing better judges them."""
-        return innovation_size(self.result) if isinstance(self.honesty, str) else None
-
-    @property
-    def evidence(self) -> dict[str, tuple[str, str]]:
-        """From a figure's name to what was found, and what is expected."""
-        return evidence_of(self.result, self.agreement, None if isinstance(self.honesty, str) else self.honesty)
+    def honesty(self) -> Honesty:
+        """The judgement by innovations and truth."""
+        return judge(self.result, truth=self.archive.truth, interpolated=self.archive.interpolated)
 
     @property
     def said(self) -> list[str]:
-        """Verdicts in words: the first one, then what belongs to it and what else there is."""
-        others = [found for found in (self.size, self.agreement) if found is not None]
-        if not isinstance(self.honesty, str):
-            head, _, also = self.honesty.verdict.partition(". Also: ")
-            head, _, why = head.partition("; cause: ")
-            causes = [part for text in (why, also) for part in text.split("; ") if part]
-            return [head, *causes, *(f"{found.verdict}: {found.figures}" for found in others)]
-        if not others:
-            return [self.honesty.partition(": ")[2] or self.honesty]
-        # What is wrong comes first; of what is right, the truth.
-        first = others[0] if self.size is not None and not self.size.is_expected else others[-1]
-        rest = [f"{found.verdict}: {found.figures}" for found in others if found is not first]
-        return [first.verdict, first.figures, *rest]
-
-    @property
-    def kind(self) -> str:
-        """``good``; ``fair`` or ``bad`` by the largest factor by which errors exceed what is stated; or ``none``."""
-        factors = []
-        if not isinstance(self.honesty, str):
-            factors.append(self.honesty.factor if self.honesty.causes else 1.0)
-        if self.size is not None:
-            factors.append(1.0 if self.size.is_expected else self.size.factor)
-        if self.agreement is not None:
-            factors.append(1.0 if self.agreement.is_within else self.agreement.factor)
-        if not factors:
-            return "none"
-        return "bad" if max(factors) >= 2 else "fair" if any(factor != 1 for factor in factors) else "good"
+        """Verdicts in words: the main one, its reasons, and one line for each other verdict."""
+        if not self.honesty.judgements:
+            return [self.honesty.innovations_skipped]
+        main, *others = self.honesty.judgements
+        return [main.text, *main.reasons, *(f"{other.text}: {', '.join(other.reasons)}" for other in others)]
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import Any
 from ekfslam import files
 from ekfslam.config import Config
 from ekfslam.errors import ArchiveError
-from ekfslam.evaluation.honesty import BLIND
+from ekfslam.evaluation.evidence import BLIND
 from ekfslam.evaluation.summary import merit_rows
 from ekfslam.evaluation.tables import MISSING
 from ekfslam.names import components, printable
@@ -174,7 +174,7 @@ def _carded(recording: Recording) -> list[Run]:
     runs = list(recording.runs)
     if len(runs) <= _MOST_CARDS:
         return runs
-    return [run for run in runs if not isinstance(run.honesty, str)] or runs[-1:]
+    return [run for run in runs if run.honesty.shared is not None] or runs[-1:]
 
 
 def _card(run: Run) -> str:
@@ -184,7 +184,7 @@ def _card(run: Run) -> str:
         f"<div><dt>{escape(heading)}</dt><dd>{escape(value)}</dd></div>"
         for heading, value in merit_rows([{key: run.summary[key] for key in _ERRORS}])
     )
-    return f"""<article class="card {run.kind}">
+    return f"""<article class="card {run.honesty.grade}">
 <h3>{escape(run.label)}</h3>
 <p class="verdict">{escape(head[:1].upper() + head[1:])}</p>
 {_list([*items, *run.result.remarks], "causes")}
@@ -193,20 +193,22 @@ def _card(run: Run) -> str:
 
 
 def _evidence(recording: Recording) -> str:
-    """A table of what the verdicts rest on; what is expected stands beside the name, or beside what was found."""
-    found = [run.evidence for run in recording.runs]
+    """Return a table of the evidence; expected values stand beside the name if all runs have the same one."""
+    found = [{name: cells for name, *cells in run.honesty.evidence} for run in recording.runs]
     rows = []
     for name in dict.fromkeys(name for evidence in sorted(found, key=len, reverse=True) for name in evidence):
-        expected = {evidence[name][1] for evidence in found if name in evidence}
-        is_common = len(expected) == 1
-        cells = []
-        for evidence in found:
-            value, own = evidence.get(name, (MISSING, ""))
-            cells.append(value if is_common or not own else f"{value} ({own})")
-        common = f" ({expected.pop()})" if is_common and expected != {""} else ""
-        rows.append([f"{name}{common}", *cells])
+        cells = [evidence.get(name, [MISSING, ""]) for evidence in found]
+        expected = {own for value, own in cells if value != MISSING}
+        if len(expected) == 1:
+            rows.append([_expecting(name, expected.pop()), *(value for value, _ in cells)])
+        else:
+            rows.append([name, *(_expecting(value, own) for value, own in cells)])
     heading = "<h3>Evidence <small>found (expected)</small></h3>"
     return f"{heading}\n{_table(['', *(run.label for run in recording.runs)], rows)}" if rows else ""
+
+
+def _expecting(text: str, expected: str) -> str:
+    return f"{text} ({expected})" if expected else text
 
 
 def _detail(run: Run) -> str:
