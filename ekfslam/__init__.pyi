@@ -11,6 +11,7 @@ from .config import (
     TruthConfig,
 )
 from .data.images import ImageRecording, open_images
+from .data.inputs import InertialNoise, InertialSamples, Velocities
 from .data.noise import Noise
 from .data.readers import (
     Reader,
@@ -49,6 +50,8 @@ __all__ = [
     "FrontEndConfig",
     "HygieneConfig",
     "ImageRecording",
+    "InertialNoise",
+    "InertialSamples",
     "LiveEKF",
     "Noise",
     "NoiseConfig",
@@ -65,6 +68,7 @@ __all__ = [
     "Truth",
     "TruthConfig",
     "TunedNoise",
+    "Velocities",
     "attach_truth",
     "attach_velocities",
     "check",

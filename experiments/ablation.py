@@ -23,6 +23,7 @@ from common import DENSE, REPORT, UTIAS, argument_parser, has_recordings, open_r
 from real_data import recordings
 
 import ekfslam
+from ekfslam.data.inputs import Velocities
 from ekfslam.data.sequence import Sequence
 from ekfslam.evaluation.tables import document, markdown_table, number, plus_minus
 from ekfslam.figures.run import plot_parameters
@@ -103,8 +104,7 @@ def with_true_motion(
     return dataclasses.replace(
         sequence,
         time_s=sequence.time_s[truth.frame],
-        twist=twist,
-        velocity_frame="imu",
+        inputs=(Velocities(sequence.time_s[truth.frame], twist),),
         noise=noise,
         truth=dataclasses.replace(truth, frame=truth.frame - truth.frame[0]),
         observations=dataclasses.replace(

@@ -9,7 +9,6 @@ the dense tracks of 0027 (0.5 m/s and 0.05 rad/s a sample, several seeds); the f
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from functools import partial
 from pathlib import Path
@@ -94,14 +93,14 @@ def recordings(data: Path) -> tuple[Recording, ...]:
 
 def with_velocities(sequence: Sequence, seed: int | None, edition: Path) -> Sequence:
     """The velocities of another edition of the same frames."""
-    return dataclasses.replace(sequence, twist=open_sequence(edition).twist)
+    return sequence.with_velocities(open_sequence(edition).twist)
 
 
 def with_noise(sequence: Sequence, seed: int | None, edition: Path | None = None) -> Sequence:
     """White noise added to the velocities, or to those of another edition."""
     clean = sequence if edition is None else with_velocities(sequence, seed, edition)
     noise = ADDED_STD * np.random.default_rng(seed).standard_normal(clean.twist.shape)
-    return dataclasses.replace(clean, twist=clean.twist + noise)
+    return clean.with_velocities(clean.twist + noise)
 
 
 # --- Columns ---------------------------------------------------------------------------------------------------------

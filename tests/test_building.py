@@ -231,7 +231,7 @@ def test_velocities_of_another_recording_bring_its_extrinsics(tmp_path, world):
 
 def test_velocities_of_a_recording_on_another_clock(tmp_path, world, still):
     path = tmp_path / "other.h5"
-    write_sequence(dataclasses.replace(world, time_s=world.time_s + 1.3e9), path)
+    write_sequence(dataclasses.replace(world, time_s=world.time_s + 1.3e9, twist=world.twist), path)
     found = attach_velocities(still, path)
     np.testing.assert_allclose(found.twist, world.twist, atol=1e-5)
     assert any("another clock" in note for note in found.notes)

@@ -76,7 +76,7 @@ def test_own_reader(tmp_path):
 def test_own_arrays(tmp_path):
     lines = printed("own_arrays", tmp_path)
     assert re.match(r"120 frames, \d{4} observations, attributes {'velocities': 'none'}", lines["built"])
-    assert lines["refused"].startswith("T_cam_imu: velocities mean nothing")
+    assert lines["refused"].startswith("T_cam_imu: velocities and inertial samples need")
     assert lines["velocities"] == "frames and samples have the same stamps."
     for name, frames in (("frames 20:80", 60), ("from 3 to 6 s", 30)):
         count, error_m = numbers(lines[name])

@@ -68,6 +68,9 @@ def assert_same(a: Sequence, b: Sequence) -> None:
             for field in dataclasses.fields(value):
                 if field.name != "source":
                     yield from flat(getattr(value, field.name), f"{name}.{field.name}")
+        elif isinstance(value, tuple):
+            for i, part in enumerate(value):
+                yield from flat(part, f"{name}[{i}]")
         else:
             yield name, value
 
@@ -379,8 +382,8 @@ def test_own_form_of_a_newer_version_is_refused_with_both_versions(tmp_path, npz
     path = tmp_path / "a.h5"
     write_sequence(open_sequence(npz), path)
     with h5py.File(path, "r+") as h5file:
-        h5file.attrs["format_version"] = 3
-    with pytest.raises(ArchiveError, match=r"a\.h5: has format version 3, this release reads up to version 2"):
+        h5file.attrs["format_version"] = 4
+    with pytest.raises(ArchiveError, match=r"a\.h5: has format version 4, this release reads up to version 3"):
         open_sequence(path)
 
 

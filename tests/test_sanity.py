@@ -42,7 +42,7 @@ def times(*factors: float) -> Callable[[Sequence], Sequence]:
 
 
 def since_start(unit: float) -> Callable[[Sequence], Sequence]:
-    return changed(time_s=lambda world: unit * (world.time_s - world.time_s[0]))
+    return changed(time_s=lambda world: unit * (world.time_s - world.time_s[0]), twist=lambda world: world.twist)
 
 
 BODY_CAM = se3.transform(R_CAM_BODY.T, np.zeros(3))
@@ -129,7 +129,7 @@ def test_stamps_since_1970_in_other_units_are_named():
     world = builtin("loop?frames=20")
     for unit, name in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
         with pytest.raises(NonFiniteError, match=name):
-            dataclasses.replace(world, time_s=unit * (1.3e9 + world.time_s))
+            dataclasses.replace(world, time_s=unit * (1.3e9 + world.time_s), twist=world.twist)
 
 
 def test_without_velocities_only_tracks_are_looked_at():

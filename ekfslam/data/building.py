@@ -7,13 +7,13 @@ from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.dense import flat_observations
+from ekfslam.data.inputs import InertialSamples, VelocityFrame
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import (
     WITHOUT_VELOCITIES,
     Observations,
     Sequence,
     Truth,
-    VelocityFrame,
     require_finite,
     require_shape,
     validate_stamps,
@@ -31,6 +31,7 @@ def from_tracks(
     frame: ArrayLike | None,
     landmark: ArrayLike | None,
     twist: ArrayLike | None,
+    imu: InertialSamples | None,
     T_cam_imu: ArrayLike | None,
     T_world_imu: ArrayLike | None,
     *,
@@ -43,9 +44,9 @@ def from_tracks(
     stamps = _numbers(time_s, "time_s")
     validate_stamps(stamps)
     if T_cam_imu is None:
-        if twist is not None:
+        if twist is not None or imu is not None:
             raise ExtrinsicsError(
-                "velocities mean nothing without the camera's place in their frame", field="T_cam_imu"
+                "velocities and inertial samples need the pose of the camera in their frame", field="T_cam_imu"
             )
         T_cam_imu = se3.transform(R_CAM_BODY, np.zeros(3))
     observations, notes = _observations(_numbers(pixels_px, "pixels_px"), frame, landmark, len(stamps))
@@ -53,7 +54,8 @@ def from_tracks(
         name=name,
         source=SOURCE,
         time_s=stamps,
-        twist=np.zeros((len(stamps), 6)) if twist is None else _numbers(twist, "twist"),
+        inputs=() if imu is None else (imu,),
+        twist=None if twist is None else _numbers(twist, "twist"),
         camera=camera,
         T_cam_imu=_numbers(T_cam_imu, "T_cam_imu"),
         observations=observations,

@@ -15,7 +15,7 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray
 
 SHORTEST = 3  # samples in a row that lie on the line between their neighbours; a single lost packet does no harm
-_ATTRIBUTE = "interpolated"
+INTERPOLATED = "interpolated"
 _ROUNDING = 1e-9  # of the largest value; measured velocities bend by more than 1e-4 of it
 
 
@@ -57,18 +57,18 @@ def attributes_of_part(
     attributes: Mapping[str, str | int | float], is_interpolated: BoolArray
 ) -> dict[str, str | int | float]:
     """Attributes for a part of a recording, whose intervals have other numbers: which (T,) are interpolated."""
-    others = {name: value for name, value in attributes.items() if name != _ATTRIBUTE}
+    others = {name: value for name, value in attributes.items() if name != INTERPOLATED}
     return {**others, **_attributes(is_interpolated)}
 
 
 def _attributes(is_interpolated: BoolArray) -> dict[str, str]:
     found = " ".join(f"{begin}-{end}" for begin, end in stretches(is_interpolated))
-    return {_ATTRIBUTE: found} if found else {}
+    return {INTERPOLATED: found} if found else {}
 
 
 def known_intervals(attributes: Mapping[str, str | int | float], twist: Array) -> BoolArray:
     """Interpolated intervals (T,) of a recording: as its attributes have them, or else as its velocities show."""
-    text = str(attributes.get(_ATTRIBUTE, ""))
+    text = str(attributes.get(INTERPOLATED, ""))
     if not re.fullmatch(r"\d+-\d+( \d+-\d+)*", text):
         return interpolated_intervals(twist)
     found = np.zeros(len(twist), dtype=bool)

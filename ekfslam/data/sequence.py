@@ -9,13 +9,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.data.interpolation import attributes_of_part, known_intervals
+from ekfslam.data.checks import (
+    LARGEST_VELOCITY,
+    frozen,
+    require_finite,
+    require_rigid,
+    require_shape,
+    validate_stamps,
+)
+from ekfslam.data.inputs import InertialSamples, Input, Velocities, VelocityFrame, validate_inputs
+from ekfslam.data.interpolation import INTERPOLATED, attributes_of_part, known_intervals
 from ekfslam.data.noise import Noise
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import (
@@ -24,9 +32,7 @@ from ekfslam.errors import (
     DuplicateObservationError,
     EmptyTracksError,
     ExtrinsicsError,
-    NonFiniteError,
     ShapeError,
-    StampError,
     TruthError,
 )
 from ekfslam.geometry import se3
@@ -34,20 +40,14 @@ from ekfslam.geometry.camera import StereoCamera
 from ekfslam.names import printable
 from ekfslam.shown import Card, Shown, count, figure
 
-VelocityFrame = Literal["imu", "level"]
-
-ROTATION_TOLERANCE = 1e-4  # files print rotations with as few as five digits
-
-# No quantity of a recording is larger, in s, m, m/s, rad/s or px: beyond, a square or a product loses all digits.
-LARGEST = 1e12
 LARGEST_ID = 1 << 62  # pieces of cut tracks count on from the largest
-_LARGEST_VELOCITY, _LARGEST_DISTANCE_M, _LARGEST_PX = 1e6, 1e9, 1e7
+_LARGEST_DISTANCE_M, _LARGEST_PX = 1e9, 1e7
 
 # Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
 # Among those of one whose tracks are compared with their first sight in every frame, so that their errors do not walk.
 CHECKED_TRACKS = {"tracks": "checked"}
-# Among the attributes of one whose velocities nobody measured; they are 0 then, and mean nothing.
+# Attributes of a recording whose velocities were not measured. Any it has are those of its own odometry.
 WITHOUT_VELOCITIES = {"velocities": "none"}
 
 
@@ -123,21 +123,25 @@ class Truth:
             object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, init=False)
 class Sequence(Shown):
-    """One recording of a stereo rig with body velocities.
+    """One recording of a stereo rig, with velocities or inertial samples of its body.
+
+    ``twist`` and ``velocity_frame`` are short for an input `Velocities` at the stamps of the frames. They also serve
+    ``dataclasses.replace(sequence, twist=...)``, which replaces the velocities among the inputs.
 
     Args:
         name: Short name, used for folders and titles; what cannot be printed is written out (``\\x1b``).
         source: File or built-in world it came from, used in error messages.
         time_s: (T,) strictly increasing stamps.
-        twist: (T, 6) measured velocities ``[v; w]`` in ``velocity_frame``; ``twist[k]`` drives ``(t[k-1], t[k]]``.
         camera: Stereo intrinsics.
         T_cam_imu: (4, 4) extrinsics, IMU to left optical frame; made rigid to rounding, as files print few digits.
         observations: Flat stereo observations; none only where the attributes have `WITHOUT_TRACKS`.
         truth: Ground truth, if there is any.
         noise: Noise as stated by the source, if it states any.
-        velocity_frame: ``imu``, or ``level``: x forward, y left, z up over level ground, see `motion.level_frame`.
+        inputs: Velocities and inertial samples, at any rate and from any number of sources.
+        twist: (T, 6) velocities ``[v; w]``; ``twist[k]`` drives ``(t[k-1], t[k]]``. None keeps those of ``inputs``.
+        velocity_frame: Frame of the velocities, see `Velocities`. None keeps it, and is ``imu`` for a new ``twist``.
         notes: What the reader found and did about it, one sentence each.
         attributes: Further facts to keep with every result (seed, checksum, simulation parameters).
     """
@@ -145,27 +149,51 @@ class Sequence(Shown):
     name: str
     source: str
     time_s: Array
-    twist: Array
     camera: StereoCamera
     T_cam_imu: Array
     observations: Observations
-    truth: Truth | None = None
-    noise: Noise | None = None
-    velocity_frame: VelocityFrame = "imu"
-    notes: tuple[str, ...] = ()
-    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    truth: Truth | None
+    noise: Noise | None
+    inputs: tuple[Input, ...]
+    notes: tuple[str, ...]
+    attributes: Mapping[str, str | int | float]
 
-    def __post_init__(self) -> None:
-        for name in ("time_s", "twist", "T_cam_imu"):
-            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
+    def __init__(
+        self,
+        name: str,
+        source: str,
+        time_s: ArrayLike,
+        *,
+        camera: StereoCamera,
+        T_cam_imu: ArrayLike,
+        observations: Observations,
+        truth: Truth | None = None,
+        noise: Noise | None = None,
+        inputs: tuple[Input, ...] = (),
+        twist: ArrayLike | None = None,
+        velocity_frame: VelocityFrame | None = None,
+        notes: tuple[str, ...] = (),
+        attributes: Mapping[str, str | int | float] | None = None,
+    ) -> None:
+        given = {"name": printable(name), "source": source, "camera": camera, "observations": observations}
+        given |= {
+            "truth": truth,
+            "noise": noise,
+            "notes": notes,
+            "attributes": {} if attributes is None else attributes,
+        }
+        given |= {"time_s": frozen(np.asarray(time_s, dtype=float)), "T_cam_imu": np.asarray(T_cam_imu, dtype=float)}
+        for field_name, value in given.items():
+            object.__setattr__(self, field_name, value)
         try:
+            validate_stamps(self.time_s)
+            object.__setattr__(self, "inputs", _with_twist(self, tuple(inputs), twist, velocity_frame))
             _validate(self)
         except DataError as error:
             if error.source:
                 raise
-            raise type(error)(error.message, source=self.source, field=error.field, index=error.index) from None
+            raise type(error)(error.message, source=source, field=error.field, index=error.index) from None
         object.__setattr__(self, "T_cam_imu", frozen(se3.nearest_rigid(self.T_cam_imu)))
-        object.__setattr__(self, "name", printable(self.name))
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -213,7 +241,7 @@ class Sequence(Shown):
         return replace(
             self,
             time_s=self.time_s[begin:end],
-            twist=self.twist[begin:end],
+            inputs=tuple(samples.between(self.time_s[begin], self.time_s[end - 1]) for samples in self.inputs),
             observations=Observations(self.observations.frame[seen] - begin, *parts),
             truth=truth,
             attributes={
@@ -231,6 +259,7 @@ class Sequence(Shown):
         frame: ArrayLike | None = None,
         landmark: ArrayLike | None = None,
         twist: ArrayLike | None = None,
+        imu: InertialSamples | None = None,
         T_cam_imu: ArrayLike | None = None,
         T_world_imu: ArrayLike | None = None,
         velocity_frame: VelocityFrame = "imu",
@@ -245,9 +274,10 @@ class Sequence(Shown):
                 ``frame`` and ``landmark``.
             camera: Of the rectified pair.
             frame, landmark: (K,) frame index and id of each row of pixels.
-            twist: (T, 6) velocities, see `Sequence`; None where nobody measured any.
-            T_cam_imu: (4, 4). By default, and only without velocities: the body is the left camera, its axes forward,
-                left and up.
+            twist: (T, 6) velocities, see `Sequence`; None if none were measured.
+            imu: Samples of a gyroscope and an accelerometer; None if there are none.
+            T_cam_imu: (4, 4). By default the body is the left camera, with axes forward, left and up. Required with
+                ``twist`` or ``imu``.
             T_world_imu: (T, 4, 4) true poses, NaN where one is unknown.
             velocity_frame, noise, name: See `Sequence`.
 
@@ -256,7 +286,7 @@ class Sequence(Shown):
         """
         from ekfslam.data.building import from_tracks
 
-        arrays = (time_s, pixels_px, frame, landmark, twist, T_cam_imu, T_world_imu)
+        arrays = (time_s, pixels_px, frame, landmark, twist, imu, T_cam_imu, T_world_imu)
         return from_tracks(*arrays, camera=camera, velocity_frame=velocity_frame, noise=noise, name=name)
 
     def between(self, begin_s: float, end_s: float) -> Sequence:
@@ -268,10 +298,37 @@ class Sequence(Shown):
         begin, end = np.searchsorted(self.time_s, (begin_s, end_s)).tolist()
         return self[begin:end]
 
+    def with_velocities(self, twist: ArrayLike, velocity_frame: VelocityFrame | None = None) -> Sequence:
+        """Return the recording with other velocities (T, 6); by default in the same frame as those before."""
+        return replace(self, inputs=_with_twist(self, self.inputs, twist, velocity_frame))
+
+    @cached_property
+    def velocities(self) -> Velocities | None:
+        """First input of velocities; None if there is none."""
+        return next((samples for samples in self.inputs if isinstance(samples, Velocities)), None)
+
+    @cached_property
+    def inertial(self) -> InertialSamples | None:
+        """First input of inertial samples; None if there is none."""
+        return next((samples for samples in self.inputs if isinstance(samples, InertialSamples)), None)
+
+    @cached_property
+    def twist(self) -> Array:
+        """(T, 6) velocities ``[v; w]``; ``twist[k]`` drives ``(t[k-1], t[k]]``. Zero if there are none."""
+        velocities = self.velocities
+        return frozen(np.zeros((len(self), 6)) if velocities is None else velocities.mean(self.time_s))
+
+    @property
+    def velocity_frame(self) -> VelocityFrame:
+        """Frame of the velocities; ``imu`` if there are none."""
+        return "imu" if self.velocities is None else self.velocities.frame
+
     @cached_property
     def interpolated(self) -> BoolArray:
-        """Which intervals (T,) have velocities, and probably true poses, that were never measured."""
-        return known_intervals(self.attributes, self.twist)
+        """Intervals (T,) whose velocities, and probably true poses, were interpolated rather than measured."""
+        if self.velocities is None or self.velocities.has_stamps(self.time_s) or INTERPOLATED in self.attributes:
+            return known_intervals(self.attributes, self.twist)
+        return self.velocities.interpolated_at(self.time_s)
 
     @property
     def has_checked_tracks(self) -> bool:
@@ -280,8 +337,8 @@ class Sequence(Shown):
 
     @property
     def has_velocities(self) -> bool:
-        """Whether its velocities were measured; else only cameras say how the rig moves."""
-        return self.attributes.get("velocities") != WITHOUT_VELOCITIES["velocities"]
+        """Whether velocities of its body were measured."""
+        return self.velocities is not None and self.attributes.get("velocities") != WITHOUT_VELOCITIES["velocities"]
 
     @property
     def initial_T_world_imu(self) -> Array:
@@ -289,58 +346,6 @@ class Sequence(Shown):
         if self.truth is not None and len(self.truth.frame) and self.truth.frame[0] == 0:
             return se3.nearest_rigid(self.truth.T_world_imu[0])
         return np.eye(4)
-
-
-def frozen(array: NDArray) -> NDArray:
-    """The array, read-only, so that a frozen dataclass is frozen all through."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
-
-
-def require_shape(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> None:
-    """Raise `ShapeError` unless ``value`` has ``shape``, where None stands for any length."""
-    found = np.shape(value)
-    if len(found) != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, found, strict=True)
-    ):
-        wanted = " x ".join("n" if size is None else str(size) for size in shape)
-        raise ShapeError(f"expected shape {wanted}, found {' x '.join(map(str, found)) or 'a scalar'}", field=name)
-
-
-def require_finite(value: Array, name: str, largest: float = LARGEST) -> None:
-    """Raise `NonFiniteError` with the index of the first number that is NaN, infinite, or beyond all sense."""
-    bad = np.argwhere(~(np.abs(value) <= largest))
-    if len(bad):
-        index = tuple(int(i) for i in bad[0])
-        kind = f"larger than {largest:g}" if np.isfinite(np.asarray(value)[index]) else "NaN or infinite"
-        raise NonFiniteError(
-            f"{len(bad)} values are {kind}, the first is {value[index]}",
-            field=name,
-            index=index[0] if len(index) == 1 else index or None,
-        )
-
-
-def rigid_defect(T: Array) -> Array:
-    """By how much (...) finite (..., 4, 4) are no rotations and translations; 2 and more where they mirror."""
-    R = T[..., :3, :3]
-    defect = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-    bottom = np.abs(T[..., 3, :] - np.array([0, 0, 0, 1])).max(axis=-1)
-    return np.maximum(defect, bottom) + np.where(np.linalg.det(R) < 0, 2.0, 0.0)
-
-
-def require_rigid(T: Array, name: str, error: type[DataError]) -> None:
-    """Raise ``error`` unless every (..., 4, 4) matrix is a rotation and a translation."""
-    defect = rigid_defect(T)
-    bad = np.argwhere(defect > ROTATION_TOLERANCE)
-    if len(bad):
-        index = tuple(int(i) for i in bad[0])
-        raise error(
-            f"not a rigid transform: orthogonality defect {defect[index]:.2g}, "
-            f"determinant {np.linalg.det(T[index][:3, :3]):.6g}",
-            field=name,
-            index=index[0] if len(index) == 1 else index or None,
-        )
 
 
 def validate_camera(camera: StereoCamera) -> None:
@@ -355,39 +360,32 @@ def validate_camera(camera: StereoCamera) -> None:
         raise CalibrationError(f"stereo baseline must be positive, found {camera.baseline_m:g} m", field="baseline")
 
 
-def validate_stamps(time_s: Array) -> None:
-    """Raise a `DataError` unless these are stamps (T,) of at least one frame that increase strictly."""
-    require_shape(time_s, (None,), "time_s")
-    if len(time_s) == 0:
-        raise ShapeError("the sequence has no frames", field="time_s")
-    least = float(np.abs(time_s).min())
-    if LARGEST < least < np.inf:
-        units = {1e14: "milliseconds", 1e17: "microseconds", np.inf: "nanoseconds"}
-        unit = next(name for below, name in units.items() if least < below)
-        text = f"stamp {time_s[0]:g} is no time in seconds, stamps look like {unit} since 1970"
-        raise NonFiniteError(text, field="time_s", index=0)
-    require_finite(time_s, "time_s")
-    steps = np.diff(time_s)
-    if (steps <= 0).any():
-        index = int(np.argmax(steps <= 0)) + 1
-        kind = "duplicates" if steps[index - 1] == 0 else "is before"
-        raise StampError(
-            f"stamp {time_s[index]:.6f} s {kind} its predecessor {time_s[index - 1]:.6f} s",
-            field="time_s",
-            index=index,
+def _with_twist(
+    sequence: Sequence, inputs: tuple[Input, ...], twist: ArrayLike | None, frame: VelocityFrame | None
+) -> tuple[Input, ...]:
+    """Return the inputs with the velocities ``twist`` (T, 6) in place of theirs, or with theirs in another frame.
+
+    Velocities of 0 that the attributes state as never measured are none at all.
+    """
+    others = tuple(samples for samples in inputs if not isinstance(samples, Velocities))
+    if twist is None:
+        return (
+            inputs
+            if frame is None
+            else tuple(
+                replace(samples, frame=frame) if isinstance(samples, Velocities) else samples for samples in inputs
+            )
         )
+    frames: list[VelocityFrame] = [samples.frame for samples in inputs if isinstance(samples, Velocities)]
+    velocities = Velocities(sequence.time_s, np.asarray(twist, dtype=float), frame or (*frames, "imu")[0])
+    if WITHOUT_VELOCITIES.items() <= sequence.attributes.items() and not velocities.twist.any():
+        return others
+    return (velocities, *others)
 
 
 def _validate(sequence: Sequence) -> None:
     frames = len(sequence.time_s)
-    validate_stamps(sequence.time_s)
-    require_shape(sequence.twist, (frames, 6), "twist")
-    require_finite(sequence.twist, "twist", _LARGEST_VELOCITY)
-    if sequence.velocity_frame not in get_args(VelocityFrame):
-        raise DataError(
-            f"expected {' or '.join(get_args(VelocityFrame))}, found {sequence.velocity_frame!r}",
-            field="velocity_frame",
-        )
+    validate_inputs(sequence.inputs, sequence.time_s)
     validate_camera(sequence.camera)
     require_shape(sequence.T_cam_imu, (4, 4), "T_cam_imu")
     require_finite(sequence.T_cam_imu, "T_cam_imu", _LARGEST_DISTANCE_M)
@@ -464,7 +462,7 @@ def validate_noise(noise: Noise) -> None:
             continue
         value = np.asarray(getattr(noise, name), dtype=float)
         require_shape(value, (size,), f"noise.{name}")
-        require_finite(value, f"noise.{name}", _LARGEST_VELOCITY)
+        require_finite(value, f"noise.{name}", LARGEST_VELOCITY)
         if (value < 0).any():
             raise DataError("standard deviations must not be negative", field=f"noise.{name}")
     for name in ("misalignment_rad", "tilt_rad"):

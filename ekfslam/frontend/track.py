@@ -154,7 +154,7 @@ def _sequence(
         name=recording.name,
         source=recording.source,
         time_s=recording.time_s,
-        twist=np.zeros((len(recording), 6)) if recording.twist is None else recording.twist,
+        twist=recording.twist,
         camera=camera,
         T_cam_imu=T_cam_imu,
         observations=observations,

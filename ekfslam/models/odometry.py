@@ -31,8 +31,8 @@ _START_FACTOR = 10.0
 
 
 def with_odometry(sequence: Sequence) -> Sequence:
-    """A recording without velocities with those of its odometry (T, 6), in the frame of the IMU."""
-    return dataclasses.replace(sequence, twist=stereo_odometry(sequence), velocity_frame="imu")
+    """Return the recording with the velocities of `stereo_odometry`, in the IMU frame."""
+    return sequence.with_velocities(stereo_odometry(sequence), "imu")
 
 
 def stereo_odometry(sequence: Sequence) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
-from ekfslam.data.sequence import rigid_defect
+from ekfslam.data.checks import rigid_defect
 from ekfslam.errors import ArchiveError
 from ekfslam.hdf5 import NUMBERS, Check
 

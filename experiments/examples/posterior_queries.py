@@ -7,8 +7,6 @@ which the recording is given first.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 import ekfslam
@@ -19,7 +17,7 @@ BIAS = np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.02])  # m/s and rad/s, of what the I
 
 def main() -> None:
     sequence = ekfslam.open_sequence("builtin:loop?frames=200")
-    sequence = dataclasses.replace(sequence, twist=sequence.twist + BIAS)
+    sequence = sequence.with_velocities(sequence.twist + BIAS)
     block = {"sigma_v_m_s": 0.3, "sigma_w_rad_s": 0.03, "time_v_s": 1e4, "time_w_s": 1e4}
     result = ekfslam.run(sequence, "full", Config(blocks={"twist_bias": block}))
     found, truth = ekfslam.posterior(result), sequence.truth

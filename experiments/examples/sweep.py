@@ -7,7 +7,6 @@ cores, ``serial`` none but this one.
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -29,7 +28,7 @@ CASES = {
 def with_noise(sequence: ekfslam.Sequence, seed: int | None, std_m_s: float) -> ekfslam.Sequence:
     """White noise added to the linear velocities."""
     noise = std_m_s * np.random.default_rng(seed).standard_normal((len(sequence), 3))
-    return dataclasses.replace(sequence, twist=sequence.twist + np.pad(noise, ((0, 0), (0, 3))))
+    return sequence.with_velocities(sequence.twist + np.pad(noise, ((0, 0), (0, 3))))
 
 
 def landmarks(sequence: ekfslam.Sequence, result: ekfslam.Result) -> float:

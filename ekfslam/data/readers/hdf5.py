@@ -2,6 +2,9 @@
 
     /                   attributes format, format_version
     /sequence           attributes name, velocity_frame; time (T,), twist (T, 6), T_cam_imu (4, 4), notes (n,) of text
+        inputs/<i>      every input but velocities at the stamps of the frames, which are ``twist``:
+                        Velocities: attribute frame; time (N,), twist (N, 6), interpolated (N,)
+                        InertialSamples: `InertialNoise` as attributes, if stated; time (N,), gyro (N, 3), accel (N, 3)
         camera          attributes fu_px, fv_px, cu_px, cv_px, baseline_m
         attributes      the further facts, as attributes
         observations    frame (K,), landmark (K,), pixels (K, 4)
@@ -23,6 +26,9 @@ import h5py
 import numpy as np
 
 from ekfslam import files, hdf5
+from ekfslam.arrays import Array
+from ekfslam.data.inputs import InertialNoise, InertialSamples, Input, Velocities
+from ekfslam.data.interpolation import interpolated_intervals
 from ekfslam.data.noise import Noise
 from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
 from ekfslam.data.sequence import Observations, Sequence, Truth
@@ -32,7 +38,7 @@ from ekfslam.errors import ArchiveError, ShapeError, UnknownFormatError
 from ekfslam.geometry.camera import StereoCamera
 
 FORMAT = "ekfslam-sequence"
-FORMAT_VERSION = 2  # 2 added coordinates of all dimensions
+FORMAT_VERSION = 3  # 2 added coordinates of all dimensions, 3 inputs
 
 _INDICES = ("frame index", "landmark id")  # units of whole numbers
 
@@ -57,6 +63,21 @@ _TRUTH = hdf5.layout(
     ("truth/landmarks/id", "landmark", ("M",), "landmark id", "none"),
     ("truth/landmarks/position", "position_m", ("M", "xyz"), "m", "world"),
 )
+_SAMPLES = {
+    kind.__name__: hdf5.layout(*rows, N="sample")
+    for kind, rows in {
+        Velocities: (
+            ("time", "time_s", ("N",), "s", "clock of the recording"),
+            ("twist", "twist", ("N", "u"), "m/s (columns 0-2), rad/s (columns 3-5)", "imu"),
+            ("interpolated", "interpolated", ("N",), "1", "none", hdf5.FLAGS),
+        ),
+        InertialSamples: (
+            ("time", "time_s", ("N",), "s", "clock of the recording"),
+            ("gyro", "gyro_rad_s", ("N", "xyz"), "rad/s", "imu"),
+            ("accel", "accel_m_s2", ("N", "xyz"), "m/s^2", "imu"),
+        ),
+    }.items()
+}
 _NOTES = hdf5.layout(("sequence/notes", "notes", ("n",), "text", "none", hdf5.TEXTS))
 LAYOUT = (*_SEQUENCE, *_NOTES, *_NOISE, *_TRUTH)  # of an archive, too
 OBSERVATIONS_LAYOUT = _OBSERVATIONS
@@ -137,6 +158,7 @@ def write_sequence_group(h5file: h5py.Group, sequence: Any, observations: Observ
         hdf5.write_attributes(group["noise"], {key: further[key] for key in further if key not in _NOISE_FIELDS})
     if observations is not None:
         hdf5.write_fields(h5file, _OBSERVATIONS, observations)
+        _write_inputs(group.create_group("inputs"), sequence)
 
 
 def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
@@ -150,6 +172,8 @@ def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
     if "observations" not in found:
         raise ArchiveError(f"{source}: holds a sequence without its observations")
     with spelled_as_in(source, SPELLING):
+        if "sequence/inputs" in h5file:
+            found |= _read_inputs(h5file["sequence/inputs"], found)
         return Sequence(**found)
 
 
@@ -186,6 +210,48 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
         if "sequence/observations" in h5file:
             found["observations"] = Observations(**_read(h5file, _OBSERVATIONS))
         return found
+
+
+def _write_inputs(group: h5py.Group, sequence: Sequence) -> None:
+    for i, samples in enumerate(sequence.inputs):
+        if samples is sequence.velocities and _is_twist(samples, sequence.time_s):
+            hdf5.write_attributes(group, {"twist": i})
+            continue
+        kind = type(samples).__name__
+        if isinstance(samples, Velocities):
+            further: dict[str, Any] = {"frame": samples.frame}
+        else:
+            further = {} if samples.noise is None else vars(samples.noise)
+        hdf5.write_fields(group.create_group(str(i)), _SAMPLES[kind], samples)
+        hdf5.write_attributes(group[str(i)], {"kind": kind, **further})
+
+
+def _is_twist(samples: Velocities, time_s: Array) -> bool:
+    """Return whether ``twist`` and ``velocity_frame`` alone restore the samples."""
+    found = samples.interpolated == interpolated_intervals(samples.twist)
+    return samples.has_stamps(time_s) and bool(found.all())
+
+
+def _read_inputs(group: h5py.Group, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments ``inputs``, ``twist`` and ``velocity_frame`` of a `Sequence`."""
+    twist_at = hdf5.attributes(group).get("twist")
+    inputs: list[Input] = []
+    for i in range(len(group) + (twist_at is not None)):
+        if i == twist_at:
+            inputs.append(Velocities(found["time_s"], found["twist"], found["velocity_frame"]))
+            continue
+        part, stored = _group(group, str(i)), hdf5.attributes(_group(group, str(i)))
+        kind = stored.pop("kind", None)
+        if kind not in _SAMPLES:
+            raise ShapeError(f"inputs of kind {kind!r} are unknown", field=f"sequence/inputs/{i}@kind")
+        arrays = hdf5.read_fields(part, _SAMPLES[kind])
+        if kind == Velocities.__name__:
+            inputs.append(Velocities(**arrays, **stored))
+        else:
+            names = [field.name for field in fields(InertialNoise)]
+            noise = InertialNoise(**{name: stored[name] for name in names}) if set(names) <= stored.keys() else None
+            inputs.append(InertialSamples(**arrays, noise=noise))
+    return {"inputs": tuple(inputs), "twist": None, "velocity_frame": None}
 
 
 def write_truth_group(h5file: h5py.Group, truth: Truth) -> None:

@@ -1,0 +1,90 @@
+"""Checks of plain arrays, with errors that name field and index; every record of a recording uses them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ekfslam.arrays import Array
+from ekfslam.errors import DataError, NonFiniteError, ShapeError, StampError
+
+ROTATION_TOLERANCE = 1e-4  # files print rotations with as few as five digits
+
+# No quantity of a recording is larger, in s, m, m/s, rad/s or px: beyond, a square or a product loses all digits.
+LARGEST = 1e12
+LARGEST_VELOCITY = 1e6
+
+
+def frozen(array: NDArray) -> NDArray:
+    """The array, read-only, so that a frozen dataclass is frozen all through."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def require_shape(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> None:
+    """Raise `ShapeError` unless ``value`` has ``shape``, where None stands for any length."""
+    found = np.shape(value)
+    if len(found) != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, found, strict=True)
+    ):
+        wanted = " x ".join("n" if size is None else str(size) for size in shape)
+        raise ShapeError(f"expected shape {wanted}, found {' x '.join(map(str, found)) or 'a scalar'}", field=name)
+
+
+def require_finite(value: Array, name: str, largest: float = LARGEST) -> None:
+    """Raise `NonFiniteError` with the index of the first number that is NaN, infinite, or beyond all sense."""
+    bad = np.argwhere(~(np.abs(value) <= largest))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        kind = f"larger than {largest:g}" if np.isfinite(np.asarray(value)[index]) else "NaN or infinite"
+        raise NonFiniteError(
+            f"{len(bad)} values are {kind}, the first is {value[index]}",
+            field=name,
+            index=index[0] if len(index) == 1 else index or None,
+        )
+
+
+def rigid_defect(T: Array) -> Array:
+    """By how much (...) finite (..., 4, 4) are no rotations and translations; 2 and more where they mirror."""
+    R = T[..., :3, :3]
+    defect = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+    bottom = np.abs(T[..., 3, :] - np.array([0, 0, 0, 1])).max(axis=-1)
+    return np.maximum(defect, bottom) + np.where(np.linalg.det(R) < 0, 2.0, 0.0)
+
+
+def require_rigid(T: Array, name: str, error: type[DataError]) -> None:
+    """Raise ``error`` unless every (..., 4, 4) matrix is a rotation and a translation."""
+    defect = rigid_defect(T)
+    bad = np.argwhere(defect > ROTATION_TOLERANCE)
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        raise error(
+            f"not a rigid transform: orthogonality defect {defect[index]:.2g}, "
+            f"determinant {np.linalg.det(T[index][:3, :3]):.6g}",
+            field=name,
+            index=index[0] if len(index) == 1 else index or None,
+        )
+
+
+def validate_stamps(time_s: Array) -> None:
+    """Raise a `DataError` unless these are stamps (T,) of at least one frame that increase strictly."""
+    require_shape(time_s, (None,), "time_s")
+    if len(time_s) == 0:
+        raise ShapeError("the sequence has no frames", field="time_s")
+    least = float(np.abs(time_s).min())
+    if LARGEST < least < np.inf:
+        units = {1e14: "milliseconds", 1e17: "microseconds", np.inf: "nanoseconds"}
+        unit = next(name for below, name in units.items() if least < below)
+        text = f"stamp {time_s[0]:g} is no time in seconds, stamps look like {unit} since 1970"
+        raise NonFiniteError(text, field="time_s", index=0)
+    require_finite(time_s, "time_s")
+    steps = np.diff(time_s)
+    if (steps <= 0).any():
+        index = int(np.argmax(steps <= 0)) + 1
+        kind = "duplicates" if steps[index - 1] == 0 else "is before"
+        raise StampError(
+            f"stamp {time_s[index]:.6f} s {kind} its predecessor {time_s[index - 1]:.6f} s",
+            field="time_s",
+            index=index,
+        )

@@ -1,0 +1,168 @@
+"""Inputs of a recording: what moves the body between two images, at any rate and from any number of sources."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeVar, get_args
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.checks import LARGEST_VELOCITY, frozen, require_finite, require_shape, validate_stamps
+from ekfslam.data.interpolation import interpolated_intervals
+from ekfslam.errors import DataError, ShapeError
+
+VelocityFrame = Literal["imu", "level"]
+
+
+@dataclass(frozen=True)
+class Velocities:
+    """Measured body velocities; sample k drives the interval from stamp k-1 to stamp k.
+
+    Args:
+        time_s: (N,) strictly increasing stamps.
+        twist: (N, 6) velocities ``[v; w]``, m/s and rad/s.
+        frame: ``imu``, or ``level``: x forward, y left, z up over level ground, see `motion.level_frame`.
+        interpolated: (N,) whether a sample was interpolated rather than measured. By default found from the samples.
+
+    Raises:
+        DataError: An array is malformed; the subclass says how.
+    """
+
+    time_s: Array
+    twist: Array
+    frame: VelocityFrame = "imu"
+    interpolated: BoolArray = None  # type: ignore[assignment]  # filled in
+
+    def __post_init__(self) -> None:
+        _freeze(self, "time_s", "twist")
+        validate_stamps(self.time_s)
+        require_shape(self.twist, (len(self.time_s), 6), "twist")
+        require_finite(self.twist, "twist", LARGEST_VELOCITY)
+        if self.frame not in get_args(VelocityFrame):
+            raise DataError(
+                f"expected {' or '.join(get_args(VelocityFrame))}, found {self.frame!r}", field="velocity_frame"
+            )
+        found = interpolated_intervals(self.twist) if self.interpolated is None else self.interpolated
+        require_shape(found, self.time_s.shape, "interpolated")
+        object.__setattr__(self, "interpolated", frozen(np.asarray(found, dtype=bool)))
+
+    def between(self, begin_s: float, end_s: float) -> Velocities:
+        """Return the samples that drive the time from ``begin_s`` to ``end_s``."""
+        begin, last = np.searchsorted(self.time_s, (begin_s, end_s)).tolist()
+        return _part(self, min(begin, len(self.time_s) - 1), last + 1)
+
+    def has_stamps(self, time_s: Array) -> bool:
+        """Return whether there is one sample for each of the stamps (T,)."""
+        return np.array_equal(self.time_s, time_s)
+
+    def mean(self, time_s: Array) -> Array:
+        """Return the mean velocities (T, 6) over the intervals that end at the stamps (T,).
+
+        The first is the velocity at the first stamp. Before the first sample and after the last, its value holds.
+        """
+        if self.has_stamps(time_s):
+            return self.twist
+        at = self._driving(time_s)
+        grid = np.union1d(self.time_s, time_s)
+        held = self.twist[self._driving(grid)]
+        way = np.cumsum(held * np.diff(grid, prepend=grid[0])[:, None], axis=0)[np.searchsorted(grid, time_s)]
+        return np.vstack([self.twist[at[:1]], np.diff(way, axis=0) / np.diff(time_s)[:, None]])
+
+    def interpolated_at(self, time_s: Array) -> BoolArray:
+        """Return whether a sample of each interval that ends at the stamps (T,) was interpolated."""
+        before = np.concatenate([[0], np.cumsum(self.interpolated)])
+        end = self._driving(time_s) + 1
+        begin = np.minimum(np.concatenate([end[:1] - 1, end[:-1]]), end - 1)
+        return np.asarray(before[end] > before[begin])
+
+    def _driving(self, time_s: Array) -> IntArray:
+        return np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
+
+
+@dataclass(frozen=True)
+class InertialNoise:
+    """Continuous-time noise densities of an inertial unit, as in ``sensor.yaml`` of EuRoC and ``imu.yaml`` of Kalibr.
+
+    The standard deviation of a sample is ``gyro * sqrt(rate)``; a bias changes by ``gyro_walk * sqrt(dt)`` in ``dt``.
+
+    Args:
+        gyro: rad/s/sqrt(Hz).
+        accel: m/s^2/sqrt(Hz).
+        gyro_walk: rad/s^2/sqrt(Hz).
+        accel_walk: m/s^3/sqrt(Hz).
+
+    Raises:
+        DataError: A density is negative, infinite or NaN.
+    """
+
+    gyro: float
+    accel: float
+    gyro_walk: float
+    accel_walk: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and 0 <= value <= LARGEST_VELOCITY):
+                raise DataError(f"must be finite and not negative, found {value}", field=f"inertial noise {name}")
+
+
+@dataclass(frozen=True)
+class InertialSamples:
+    """Instantaneous samples of a gyroscope and an accelerometer, both in the IMU frame.
+
+    Args:
+        time_s: (N,) strictly increasing stamps, on the clock of the recording.
+        gyro_rad_s: (N, 3) angular rates.
+        accel_m_s2: (N, 3) specific forces: +9.81 along up at rest.
+        noise: Densities; None if the source states none.
+
+    Raises:
+        DataError: An array is malformed; the subclass says how.
+    """
+
+    time_s: Array
+    gyro_rad_s: Array
+    accel_m_s2: Array
+    noise: InertialNoise | None = None
+
+    def __post_init__(self) -> None:
+        _freeze(self, "time_s", "gyro_rad_s", "accel_m_s2")
+        validate_stamps(self.time_s)
+        for name in ("gyro_rad_s", "accel_m_s2"):
+            require_shape(getattr(self, name), (len(self.time_s), 3), name)
+            require_finite(getattr(self, name), name, LARGEST_VELOCITY)
+
+    def between(self, begin_s: float, end_s: float) -> InertialSamples:
+        """Return the samples from ``begin_s`` to ``end_s``, with one more on each side to interpolate to both ends."""
+        begin = int(np.searchsorted(self.time_s, begin_s, side="right")) - 1
+        end = int(np.searchsorted(self.time_s, end_s)) + 1
+        return _part(self, max(begin, 0), end)
+
+
+Input = Velocities | InertialSamples
+AnyInput = TypeVar("AnyInput", Velocities, InertialSamples)
+
+
+def validate_inputs(inputs: tuple[Input, ...], time_s: Array) -> None:
+    """Raise `DataError` if an input is of another type, or has no time in common with the frames (T,)."""
+    for i, samples in enumerate(inputs):
+        if not isinstance(samples, Velocities | InertialSamples):
+            raise DataError(f"expected Velocities or InertialSamples, found {type(samples).__name__}", field="inputs")
+        if samples.time_s[-1] < time_s[0] or samples.time_s[0] > time_s[-1]:
+            raise ShapeError(
+                f"samples from {samples.time_s[0]:.3f} to {samples.time_s[-1]:.3f} s have no time in common with "
+                f"frames from {time_s[0]:.3f} to {time_s[-1]:.3f} s",
+                field="inputs",
+                index=i,
+            )
+
+
+def _freeze(record: Input, *names: str) -> None:
+    for name in names:
+        object.__setattr__(record, name, frozen(np.asarray(getattr(record, name), dtype=float)))
+
+
+def _part(record: AnyInput, begin: int, end: int) -> AnyInput:
+    cut: dict[str, Any] = {name: x[begin:end] for name, x in vars(record).items() if isinstance(x, np.ndarray)}
+    return replace(record, **cut)
