@@ -37,6 +37,7 @@ from support.reference import CAMERA, T_CAM_IMU, small_world
 from support.running import WHOLE
 
 from ekfslam.config import CalibrationConfig, Config
+from ekfslam.data.interval import Interval
 from ekfslam.data.sequence import Noise
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import DataError
@@ -107,10 +108,10 @@ def test_transition_and_noise_of_everything(name, T, walks):
     values = {**model.initial_values(), "twist_bias": b, "up": W @ Z}
     if walks:
         values["twist"] = twist
-    step = model.step(values, twist + b, tau, T, False)
+    step = model.step(values, Interval.of_one(twist + b, tau), T, False)
     T_next, u = moved(T, W, twist, tau)
-    np.testing.assert_allclose(step.T_imu_world, T_next, atol=1e-12)
-    np.testing.assert_allclose(step.twist, u, atol=1e-13)
+    np.testing.assert_allclose(step.values["pose"], T_next, atol=1e-12)
+    np.testing.assert_allclose(step.imu_twist, u, atol=1e-13)
     names = ["pose", "previous_pose", "calibration", *(["twist"] if walks else []), "up", "twist_bias"]
     ends = np.cumsum([block.size for block in model.layout.blocks])
     assert list(model.layout) == names

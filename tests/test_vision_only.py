@@ -9,6 +9,7 @@ from support.running import seeds
 
 import ekfslam
 from ekfslam.config import Config
+from ekfslam.data.interval import Interval
 from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations
 from ekfslam.errors import NoVelocitiesError
 from ekfslam.evaluation.consistency import pose_nees
@@ -87,7 +88,8 @@ def test_one_motion_that_no_vehicle_has_is_left_out():
 def test_velocities_are_started_once_and_never_measured():
     sequence = without_velocities(ekfslam.open_sequence("builtin:city?frames=12&outlier_fraction=0"))
     problem = build(sequence)
-    assert not problem.model.measures_twist and "twist (6)" in problem.lines[0]
+    assert problem.model.process.measured(Interval.of_one(np.ones(6), 0.1), is_first=False) is None
+    assert "twist (6)" in problem.lines[0]
     ekf = JointEKF(problem.model, problem.config.filter)
     list(run_filter(ekf, problem.sequence))
     log = ekf.log()

@@ -116,7 +116,7 @@ def _gate_alone(
     squares = gates.normalised_squares(S, tried.rows.residual, frame, e.ids[tried.rows.slot])
     inside = squares <= gate
     verdict[some[~inside]] = GATE
-    if _judges_motion(e) and not e.model.has_twist:
+    if _judges_motion(e) and not e.model.process.estimates_velocity:
         evidence = gates.evidence_alone(tried.rows, S, _motion(e, seen, some))
         moving = _moving(e, tried.rows.slot, evidence, squares, gate)
         verdict[some[moving]] = MOVING
@@ -142,7 +142,7 @@ def _gate_by_others(
         S: (j, d, d) of each by itself, before the conditioning.
         seen: What all landmarks (k,) look like, of which these are ``some`` (j,).
     """
-    verdict, judges_motion = np.full(len(some), ACCEPTED), _judges_motion(e) and e.model.has_twist
+    verdict, judges_motion = np.full(len(some), ACCEPTED), _judges_motion(e) and e.model.process.estimates_velocity
     if not (np.isfinite(gate) or judges_motion):
         return verdict
     doubtful = np.arange(len(some))

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import FilterConfig
+from ekfslam.data.interval import Interval
 from ekfslam.errors import ConfigError
 from ekfslam.filters.conditional import ConditionalGaussian
 from ekfslam.filters.coordinates import CameraCoordinates, Change, View
@@ -171,8 +172,9 @@ class Estimate:
         return sp.csr_array((values.ravel(), (row.ravel(), columns.ravel())), shape=(k * d, len(self.P)))
 
     def transition_jacobian(self, twist: Array, tau_s: float) -> sp.csr_array:
-        """Full-width F (b+3n, b+3n) of a prediction by velocities (6,), identity but for the rows of the body."""
-        step = self.model.step(self.values, twist, tau_s, self.linear_T_imu_world, self.variant.first_estimates)
+        """Return the full-width F (b+3n, b+3n) of a step by a velocity (6,), identity but for the rows of the body."""
+        interval = Interval.of_one(twist, tau_s)
+        step = self.model.step(self.values, interval, self.linear_T_imu_world, self.variant.first_estimates)
         full = sp.lil_array(sp.identity(len(self.P)))
         full[: len(step.Phi), : len(step.Phi)] = step.Phi
         return sp.csr_array(full)

@@ -12,6 +12,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import CalibrationConfig, FilterConfig
+from ekfslam.data.interval import Interval
 from ekfslam.errors import ConfigError
 from ekfslam.filters import lifecycle
 from ekfslam.filters.correction import correct
@@ -29,7 +30,8 @@ from ekfslam.filters.waiting import Waiting
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import StateBlock
 from ekfslam.models.build import model_of
-from ekfslam.models.model import Model, VelocityRows
+from ekfslam.models.model import Model, Transition
+from ekfslam.models.process import Measured
 from ekfslam.models.sensors.base import ACCEPTED, DISPARITY, MOVING, WAITING, DelayedSensor, Sensor
 
 
@@ -77,91 +79,83 @@ class JointEKF(Estimate):
         self.revival, self.retired = revival, Retired()
         self._log = LogBook(self)
         self._reported: list[Array] = []  # estimates and standard deviations (2, p) after each frame
-        self._is_twist_known = False
         self._moving_ids: set[int] = set()
         delayed = model.sensor if isinstance(model.sensor, DelayedSensor) else None
         self._waiting = None if delayed is None else Waiting(delayed, config.gate_probability)
         self._log_likelihood = 0.0  # of the velocities measured since the last frame
 
-    def begin(self, twist: Array) -> None:
-        """Velocities (6,) at the first frame, which no prediction leads to; only a time offset asks for them."""
-        values = {**self.values, "twist": twist}
-        self.imu_twist, _ = self.model.imu_velocities(values, twist, self.T_imu_world[:3, :3])
+    def begin(self, inputs: Array) -> None:
+        """Take the inputs (c,) at the first frame, to which no prediction leads; only a time offset needs them."""
+        self.imu_twist = self.model.process.begin(self.values, np.asarray(inputs, dtype=float))
         self._log.amend(imu_twist=self.imu_twist, seen_twist=self.imu_twist)
 
-    def predict(self, twist: Array, tau_s: float, also: VelocityRows | None = None, is_gap: bool = False) -> None:
+    def predict(
+        self, inputs: Interval | Array, tau_s: float = 0.0, also: Measured | None = None, is_gap: bool = False
+    ) -> None:
         """Eq. (1) and (2) over one interval.
 
         Args:
-            twist: (6,) measured velocities, m/s and rad/s.
-            tau_s: Duration.
-            also: What further sensors measured of these velocities, where they are in the state.
-            is_gap: Whether the velocities were interpolated across a gap, so that they are worth less.
+            inputs: The interval; or one velocity (6,) ``[v; w]``, m/s and rad/s, that holds during it.
+            tau_s: Duration, for one velocity.
+            also: Measurements by further sensors during the interval, if the velocity is in the state.
+            is_gap: Whether the one velocity was interpolated across a gap.
+
+        Raises:
+            ConfigError: Measurements by further sensors of a velocity that is not in the state.
         """
-        model, pose = self.model, self.model.layout["pose"]
-        self.way_m = model.way_m(np.asarray(twist, dtype=float), tau_s)
+        model, process = self.model, self.model.process
+        interval = inputs if isinstance(inputs, Interval) else Interval.of_one(inputs, tau_s, is_gap)
+        self.way_m = process.way_m(self.values, interval)
+        moved = model.wander(self.values, interval.tau_s, self.way_m)
         self.coordinates = self.coordinates.copy()  # the log has those after the update
-        self._wander(tau_s)
-        if model.has_twist:
-            self._measure_velocities(twist, also)
+        if moved is not None:
+            self.coordinates, self.values = moved.Phi @ self.coordinates, moved.values
+        if process.estimates_velocity:
+            moved = self._measure(moved, interval, also)
         elif also is not None:
             raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
-        step = model.step(self.values, twist, tau_s, self.linear_T_imu_world, self.variant.first_estimates, is_gap)
-        self.gaussian.propagate(step.Phi, step.Q)
-        departed = self.coordinates
-        self.coordinates = departed.copy()
-        self.coordinates[pose] = 0.0
-        self.T_departed, self.values = self.T_imu_world, {**self.values, "pose": step.T_imu_world}
-        if model.has_clone:
-            self.values["previous_pose"] = self.T_departed
-            self.coordinates[model.layout["previous_pose"]] = departed[pose]
-        self.T_predicted_before, self.T_predicted = self.T_predicted, step.T_imu_world
+        step = model.step(self.values, interval, self.linear_T_imu_world, self.variant.first_estimates)
+        whole = step if moved is None else step.after(moved)
+        self.gaussian.propagate(whole.Phi, whole.Q)
+        departed, self.T_departed = self.coordinates, self.T_imu_world
+        self.coordinates, self.values = model.coordinates_after(step, departed), step.values
+        self.T_predicted_before, self.T_predicted = self.T_predicted, self.T_imu_world
         self.updated_pose = "previous_pose" if self.updated_pose == "pose" and model.has_clone else None
-        self.imu_twist_before, self.imu_twist, self.tau_s = self.imu_twist, step.twist, tau_s
+        self.imu_twist_before, self.imu_twist, self.tau_s = self.imu_twist, step.imu_twist, interval.tau_s
         self.step += 1
-        self._log.predicted(self, twist, departed, is_gap)
+        self._log.predicted(self, interval, departed)
 
-    def _wander(self, tau_s: float) -> None:
-        """Clones of shared blocks take their values; blocks that change by themselves, ``x+ = phi x + w``, do so."""
-        model, layout, values = self.model, self.model.layout, dict(self.values)
-        Phi, Q = np.eye(layout.body), np.zeros((layout.body, layout.body))
-        for clone, name in model.clones:
-            at, of = layout[clone], layout[name]
-            Phi[at, at], Phi[at, of] = 0.0, np.eye(at.stop - at.start)
-            self.coordinates[at], values[clone] = self.coordinates[of], values[name]
-        for block in model.wandering:
-            moves = block.transition(tau_s, self.way_m)
-            # Velocities that nothing has measured yet are not there to change.
-            if moves is not None and (block.name != "twist" or self._is_twist_known):
-                at, (phi, std) = layout[block.name], moves
-                Phi[at, at], Q[at, at] = np.diag(phi), np.diag(std**2)
-                self.coordinates[at] *= phi
-                values[block.name] = phi * values[block.name]
-        self.values = values
-        if model.clones or model.wandering:
-            self.gaussian.propagate(Phi, Q)
+    def _measure(self, moved: Transition | None, interval: Interval, also: Measured | None) -> Transition | None:
+        """Condition on measurements of blocks by the inputs; the first inputs start blocks instead.
 
-    def _measure_velocities(self, twist: Array, also: VelocityRows | None) -> None:
-        """Condition on velocity measurements; the first one of the IMU starts the twist."""
-        model, std = self.model, self.model.noise.twist_std
-        is_used = model.measures_twist or not self._is_twist_known
-        rows = [*([VelocityRows.of_imu(twist, std)] if is_used else []), *([] if also is None else [also])]
+        Returns:
+            What the covariance has not followed yet of the transition so far.
+        """
+        model, is_first = self.model, self.step == 0
+        own = model.process.measured(interval, is_first)
+        rows = [some for some in (own, also) if some is not None]
         if rows:
-            self._log.measured(VelocityRows.concatenate(rows))
-        if not self._is_twist_known:
-            self.gaussian.propagate(*model.twist_from_measurement(std))
-            self.values = {**self.values, "twist": model.unbiased(np.asarray(twist, dtype=float), self.values)}
-            self.coordinates[model.layout["twist"]] = self.values["twist"]
-            self._is_twist_known, rows = True, rows[1:]
-        if rows:
-            measured = VelocityRows.concatenate(rows)
-            H = model.velocity_jacobian(measured)
-            residual = measured.value - H @ self.coordinates
-            solution = self.gaussian.solve_body(H, residual, measured.std**2, self.step + 1)
-            self.gaussian.apply(solution)
-            done = solution.done
-            self._log_likelihood += log_density(done.nis, done.log_det, len(residual))
-            self.retract(done.correction)
+            self._log.measured(Measured.concatenate(rows))
+        if is_first and (start := model.process.start(self.values, interval)) is not None:
+            begun = model.widened(self.values, start)
+            moved = begun if moved is None else begun.after(moved)
+            self.values = moved.values
+            for name, value in start.values.items():
+                self.coordinates[model.layout[name]] = value
+            rows = [] if also is None else [also]
+        if not rows:
+            return moved
+        if moved is not None:
+            self.gaussian.propagate(moved.Phi, moved.Q)
+        measured = Measured.concatenate(rows)
+        H = model.process.jacobian(measured)
+        residual = measured.value - H @ self.coordinates
+        solution = self.gaussian.solve_body(H, residual, measured.std**2, self.step + 1)
+        self.gaussian.apply(solution)
+        done = solution.done
+        self._log_likelihood += log_density(done.nis, done.log_det, len(residual))
+        self.retract(done.correction)
+        return None
 
     def update(self, frame: int, ids: IntArray, measured: Array) -> FrameReport:
         """Retire what is out of view, correct with what is known (6), start what is new (5).

@@ -51,7 +51,7 @@ class Log:
         position_m: (K, 3) where the landmark was linearised, in world.
         is_gap: (T,) whether the velocities that led to a frame were interpolated across a gap.
         velocity_frame: (N,) frame of each scalar measurement of velocities, where these are estimated.
-        velocity_axis, velocity_value, velocity_std, velocity_is_biased: (N,) see `ekfslam.models.model.VelocityRows`.
+        velocity_axis, velocity_value, velocity_std, velocity_is_biased: (N,) see `ekfslam.models.process.Measured`.
     """
 
     first_estimates: bool
@@ -81,7 +81,7 @@ class Log:
     velocity_axis: IntArray
     velocity_value: Array
     velocity_std: Array
-    velocity_is_biased: Array
+    velocity_is_biased: BoolArray
     is_gap: BoolArray
 
     @staticmethod

@@ -7,10 +7,12 @@ from dataclasses import fields
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
+from ekfslam.data.interval import Interval
 from ekfslam.filters.correction import Correction
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.log import Log
-from ekfslam.models.model import VelocityRows
+from ekfslam.models.process import Measured
+from ekfslam.models.process.velocities import mean_velocity
 
 _PER_FRAME = (
     "twist",
@@ -58,13 +60,13 @@ class LogBook:
             "velocity_is_biased": [np.empty(0, dtype=bool)],
         }
         self._landmarks = self._observations = 0
-        self.predicted(start, np.zeros(6), start.coordinates)
+        self.predicted(start, Interval.of_one(np.zeros(6), 0.0), start.coordinates)
 
-    def predicted(self, now: Estimate, twist: Array, departed: Array, is_gap: bool = False) -> None:
-        """A new frame, reached by a prediction with measured velocities (6,) from coordinates (body,)."""
+    def predicted(self, now: Estimate, interval: Interval, departed: Array) -> None:
+        """Add a frame, reached by a prediction over an interval from coordinates (body,)."""
         T, coordinates = now.T_imu_world, now.coordinates.copy()
         values = {
-            "twist": np.asarray(twist, dtype=float),
+            "twist": mean_velocity(interval),
             "tau_s": now.tau_s,
             "imu_twist": now.imu_twist,
             "seen_twist": now.imu_twist,
@@ -77,7 +79,7 @@ class LogBook:
             "linear": coordinates,
             "updated": coordinates,
             "up": now.up_world,
-            "is_gap": is_gap,
+            "is_gap": interval.is_gap,
         }
         for name, value in values.items():
             self._frames[name].append(value)
@@ -87,7 +89,7 @@ class LogBook:
         for name, value in values.items():
             self._frames[name][-1] = value
 
-    def measured(self, rows: VelocityRows) -> None:
+    def measured(self, rows: Measured) -> None:
         """Measurements of the velocities that lead to the next frame."""
         self._lists["velocity_frame"].append(np.full(len(rows.axis), len(self._frames["tau_s"])))
         for field in fields(rows):

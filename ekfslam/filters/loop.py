@@ -15,7 +15,7 @@ from ekfslam.errors import FilterError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.reports import FrameReport
-from ekfslam.models.model import VelocityRows
+from ekfslam.models.process import Measured
 
 
 class Frame(NamedTuple):
@@ -29,7 +29,7 @@ class Frame(NamedTuple):
 class FurtherVelocities(Protocol):
     """What further sensors measured: see `ekfslam.models.sensors.velocities.VelocitySource`."""
 
-    def during(self, begin_s: float, end_s: float) -> VelocityRows | None:
+    def during(self, begin_s: float, end_s: float) -> Measured | None:
         """Measurements of the velocities of one interval."""
 
 

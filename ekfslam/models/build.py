@@ -53,6 +53,7 @@ from ekfslam.models.noise import (
     with_drift,
 )
 from ekfslam.models.odometry import vision_noise, with_odometry
+from ekfslam.models.process import MakeProcess, velocities
 from ekfslam.models.sensors.base import DelayedSensor, Sensor
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
@@ -152,6 +153,7 @@ def model_of(
     blocks: SequenceType[StateBlock] = (),
     coordinates: LandmarkCoordinates = FilterConfig.landmark_coordinates,
     measures_twist: bool = True,
+    make_process: MakeProcess = velocities,
 ) -> Model:
     """The state blocks that a sensor and its noise ask for: which there are, is decided here and nowhere else.
 
@@ -163,6 +165,7 @@ def model_of(
         blocks: Further ones.
         coordinates: Of landmarks: those in the last updated camera need its pose.
         measures_twist: Whether velocities are measured at all, see `Twist`.
+        make_process: The process that moves the blocks; its own blocks besides the pose are among ``blocks``.
 
     Raises:
         ConfigError: A calibration to estimate, but no stereo rig; a block twice; or one that the sensor has no use for.
@@ -190,7 +193,7 @@ def model_of(
     names = [block.name for block in chosen]
     if len(set(names)) < len(names):
         raise ConfigError(f"a state block is there twice: {', '.join(names)}")
-    return Model(sensor, noise, tuple(chosen))
+    return Model(sensor, noise, tuple(chosen), make_process)
 
 
 def _is_seen_before(block: StateBlock) -> bool:

@@ -7,17 +7,18 @@ filter asks for one frame and the smoother for a whole drive.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.interval import Interval
 from ekfslam.data.noise import Noise, TrackError
 from ekfslam.geometry import motion, se3
-from ekfslam.models.blocks import Calibration, Layout, PreviousPose, StateBlock, Twist, Values
+from ekfslam.models.blocks import Calibration, Layout, PreviousPose, StateBlock, Values
 from ekfslam.models.observation import linearise
+from ekfslam.models.process import MakeProcess, Measured, Process, Step, VelocityInputs, velocities
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
 
@@ -67,42 +68,25 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Step:
-    """One prediction: next ``T_imu_world`` (4, 4), velocities of the IMU (6,), transition and noise (body, body)."""
-
-    T_imu_world: Array
-    twist: Array
-    Phi: Array
-    Q: Array
-
-
-@dataclass(frozen=True)
-class VelocityRows:
-    """Scalar measurements of true velocities, one an axis: the IMU's own, and those of further sources.
+class Transition:
+    """A change of the blocks from one frame towards the next: ``x+ = Phi x + w``.
 
     Args:
-        axis: (n,) 0 to 5: which of the six velocities.
-        value: (n,) m/s or rad/s.
-        std: (n,) standard deviations.
-        is_biased: (n,) whether biases of the IMU's velocities are in it.
+        values: All blocks after it.
+        Phi: (body, body).
+        Q: (body, body) covariance of w.
+        imu_twist: (6,) velocity of the IMU at its end, if a process moved the pose.
     """
 
-    axis: IntArray
-    value: Array
-    std: Array
-    is_biased: Array
+    values: dict[str, Array]
+    Phi: Array
+    Q: Array
+    imu_twist: Array = field(default_factory=lambda: np.zeros(6))
 
-    @staticmethod
-    def concatenate(parts: Iterable[VelocityRows]) -> VelocityRows:
-        """All rows of the parts, in their order."""
-        parts = list(parts)
-        names = [field.name for field in dataclasses.fields(VelocityRows)]
-        return VelocityRows(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-    @staticmethod
-    def of_imu(measured: Array, std: Array) -> VelocityRows:
-        """The six velocities that the IMU measures."""
-        return VelocityRows(np.arange(6), np.asarray(measured, dtype=float), std, np.ones(6, dtype=bool))
+    def after(self, first: Transition) -> Transition:
+        """Return this transition with another one before it."""
+        Q = self.Phi @ first.Q @ self.Phi.T + self.Q
+        return dataclasses.replace(self, Phi=self.Phi @ first.Phi, Q=Q)
 
 
 @dataclass(frozen=True)
@@ -113,16 +97,26 @@ class Model:
         sensor: Of landmarks.
         noise: Of velocities and tracks.
         blocks: Of the state; the pose is always the first.
+        make_process: The process that moves them, by default that of velocities.
+        joint_prior: (body, body) covariance before the first frame, in the columns of ``layout``; None: blocks are
+            independent of each other, with the covariances that they state.
     """
 
     sensor: Sensor
     noise: Noise
     blocks: tuple[StateBlock, ...]
+    make_process: MakeProcess = velocities
+    joint_prior: Array | None = None
 
     @cached_property
     def layout(self) -> Layout:
         """Columns of the blocks."""
         return Layout(self.blocks)
+
+    @cached_property
+    def process(self) -> Process:
+        """The process model."""
+        return self.make_process(self.layout, self.noise)
 
     def block(self, name: str) -> StateBlock | None:
         """A block by name; None where it is not in the state."""
@@ -155,23 +149,6 @@ class Model:
         return tuple((clone, name) for clone, name in pairs if name != "pose")
 
     @cached_property
-    def has_twist(self) -> bool:
-        """Whether the velocities are in the state, so that velocity sensors measure them."""
-        return any(isinstance(block, Twist) for block in self.blocks)
-
-    @cached_property
-    def measures_twist(self) -> bool:
-        """Whether the recording's velocities measure the twist in every interval, and not only start it."""
-        return all(block.is_measured for block in self.blocks if isinstance(block, Twist))
-
-    @cached_property
-    def has_velocity_blocks(self) -> bool:
-        """Whether the velocities of the IMU depend on blocks, and are not simply those measured."""
-        kinds = (type(block) for block in self.blocks)
-        turns = any(kind.turn_velocities is not StateBlock.turn_velocities for kind in kinds)
-        return self.has_twist or bool(self._offsets) or turns
-
-    @cached_property
     def wandering(self) -> tuple[StateBlock, ...]:
         """Blocks that change from frame to frame by themselves, in the order of their columns."""
         return tuple(block for block in self.layout.blocks if block.transition(0.0, 0.0) is not None)
@@ -193,13 +170,11 @@ class Model:
         differs = (block.camera_share(one, one > 0) != block.camera_share(one, one < 0) for block in self._moves_camera)
         return any(differs)
 
-    def way_m(self, measured: Array, tau_s: Array | float) -> Array:
-        """Way (...) driven over intervals, by the measured velocities (..., 6)."""
-        return np.linalg.norm(measured[..., :3], axis=-1) * np.asarray(tau_s)
-
     @cached_property
     def prior_covariance(self) -> Array:
         """(body, body) before the first frame."""
+        if self.joint_prior is not None:
+            return self.joint_prior
         P = np.zeros((self.layout.body, self.layout.body))
         for block in self.blocks:
             P[self.layout[block.name], self.layout[block.name]] = block.prior_covariance()
@@ -234,100 +209,88 @@ class Model:
         found = [np.array(block.reported(values, covariance, self.layout)) for block in blocks]
         return np.hstack(found)
 
-    # --- velocities ---------------------------------------------------------------------------------------------------
+    # --- from one frame to the next -----------------------------------------------------------------------------------
 
-    @cached_property
-    def _offsets(self) -> tuple[tuple[StateBlock, Array], ...]:
-        """Blocks that are added to the velocities that the IMU measures, with their derivatives (6, size)."""
-        pairs = ((block, block.velocity_offset()) for block in self.layout.blocks)
-        return tuple((block, J) for block, J in pairs if J is not None)
+    def wander(self, values: Values, tau_s: float, way_m: Array) -> Transition | None:
+        """Return how clones and walking blocks change by themselves; None: there are none.
 
-    def velocity_jacobian(self, rows: VelocityRows) -> Array:
-        """H (n, body) of velocity measurements by all blocks."""
-        H = np.zeros((len(rows.axis), self.layout.body))
-        H[np.arange(len(H)), self.layout["twist"].start + rows.axis] = 1.0
-        for block, J in self._offsets:
-            H[:, self.layout[block.name]] = np.where(rows.is_biased[:, None], J[rows.axis], 0.0)
-        return H
+        A clone takes the value that its block has now. Clones of the process's own blocks are not among them.
+        """
+        own = self.process.own
+        clones = [(self.layout.clones[name], name) for name in self.layout.clones if name not in own]
+        if not clones and not self.wandering:
+            return None
+        layout, moved = self.layout, dict(values)
+        Phi, Q = np.eye(layout.body), np.zeros((layout.body, layout.body))
+        for clone, name in clones:
+            at, of = layout[clone], layout[name]
+            Phi[at, at], Phi[at, of] = 0.0, np.eye(at.stop - at.start)
+            moved[clone] = values[name]
+        for block in self.wandering:
+            moves = block.transition(tau_s, way_m)
+            assert moves is not None
+            at, (phi, std) = layout[block.name], moves
+            Phi[at, at], Q[at, at] = np.diag(phi), np.diag(std**2)
+            moved[block.name] = phi * values[block.name]
+        return Transition(moved, Phi, Q)
 
-    def unbiased(self, measured: Array, values: Values) -> Array:
-        """Measured velocities (..., 6) less the biases in the state."""
-        for block, J in self._offsets:
-            measured = measured - (J @ values[block.name][..., None])[..., 0]
-        return measured
-
-    def twist_from_measurement(self, std: Array) -> tuple[Array, Array]:
-        """Phi and Q (body, body) of the step in which the first measurement (std (6,)) starts the twist."""
-        at = self.layout["twist"]
-        Phi, Q = np.eye(self.layout.body), np.zeros((self.layout.body, self.layout.body))
-        Phi[at, at], Q[at, at] = 0.0, np.diag(std**2)
-        for block, J in self._offsets:
-            Phi[at, self.layout[block.name]] = -J
-        return Phi, Q
-
-    def imu_velocities(self, values: Values, measured: Array, R_linear: Array) -> tuple[Array, Array]:
-        """Velocities of the IMU that drive an interval, and their derivative by the blocks.
+    def step(self, values: Values, interval: Interval, T_linear: Array, first_estimates: bool) -> Transition:
+        """Return the step of the process, in which clones of its own blocks take their values.
 
         Args:
-            values: Estimates; of pose (..., 4, 4) and up those before the interval, of twist and bias those during it.
-            measured: (..., 6) velocities, used where the twist is not in the state.
-            R_linear: (..., 3, 3) rotation at which the error of the pose is linearised.
-
-        Returns:
-            (..., 6) m/s and rad/s; (..., 6, body).
+            values: Estimates before, walking blocks as they are during the interval.
+            interval: The inputs.
+            T_linear: (4, 4) pose at which the pose's error before the step is linearised.
+            first_estimates: Whether Phi leads from there (FEJ) and not from the estimate.
         """
-        by = np.zeros((*np.shape(measured), self.layout.body))
-        if self.has_twist:
-            twist = values["twist"]
-            by[..., self.layout["twist"]] = np.eye(6)
-        else:
-            twist = self.unbiased(measured, values)
-            for block, J in self._offsets:
-                by[..., self.layout[block.name]] = -J
-        for block in self.layout.blocks:
-            twist, by = block.turn_velocities(twist, by, values, R_linear, self.layout)
-        return twist, by
+        moved = self.widened(values, self.process.step(values, interval, T_linear, first_estimates))
+        for name in self.process.own:
+            if (clone := self.layout.clones.get(name)) is not None:
+                at = self.layout[clone]
+                moved.Phi[at, at], moved.Phi[at, self.layout[name]] = 0.0, np.eye(at.stop - at.start)
+                moved.values[clone] = values[name]
+        return moved
+
+    def coordinates_after(self, step: Transition, departed: Array) -> Array:
+        """Return the coordinates (body,) after a step, given those before it.
+
+        Those of a pose count from where it is predicted: they start at 0. Those of the process's other blocks are their
+        values.
+        """
+        coordinates, layout = departed.copy(), self.layout
+        for name in self.process.own:
+            coordinates[layout[name]] = 0.0 if name in layout.poses else step.values[name]
+            if (clone := layout.clones.get(name)) is not None:
+                coordinates[layout[clone]] = departed[layout[name]]
+        return coordinates
+
+    def widened(self, values: Values, step: Step) -> Transition:
+        """Return a step of some blocks as a transition of all blocks."""
+        Phi, Q = np.eye(self.layout.body), np.zeros((self.layout.body, self.layout.body))
+        columns = self.layout.columns(step.values)
+        Phi[columns] = step.Phi
+        Q[np.ix_(columns, columns)] = step.Q
+        return Transition({**values, **step.values}, Phi, Q, step.imu_twist)
+
+    # --- to be replaced by the process in the smoother ----------------------------------------------------------------
+
+    def way_m(self, measured: Array, tau_s: Array | float) -> Array:
+        """Way (...) driven over intervals, by the measured velocities (..., 6)."""
+        return np.asarray(np.linalg.norm(measured[..., :3], axis=-1) * np.asarray(tau_s))
+
+    def velocity_jacobian(self, rows: Measured) -> Array:
+        """H (n, body) of velocity measurements by all blocks."""
+        return self.process.jacobian(rows)
+
+    def imu_velocities(self, values: Values, measured: Array, R_linear: Array) -> tuple[Array, Array]:
+        """See `ekfslam.models.process.velocities.VelocityInputs.imu_velocities`."""
+        assert isinstance(self.process, VelocityInputs)
+        return self.process.imu_velocities(values, measured, R_linear)
 
     def process_noise(self, twist: Array, tau_s: Array | float, is_gap: BoolArray) -> Array:
         """Q (n, 6, 6) of eq. (2) for the velocities (n, 6) that move the pose, some of which were interpolated."""
         process = self.noise.process
         return motion.process_noise(twist, tau_s, process.pose_std_during(is_gap), process.misalignment_rad)
-
-    def step(
-        self,
-        values: Values,
-        measured: Array,
-        tau_s: float,
-        T_linear: Array,
-        first_estimates: bool,
-        is_gap: bool = False,
-    ) -> Step:
-        """Eq. (1) and (2): the pose moves, its clone takes the place where it was.
-
-        Args:
-            values: Estimates before.
-            measured: (6,) velocities, used where the twist is not in the state.
-            tau_s: Duration.
-            T_linear: (4, 4) pose at which the pose's error before the step is linearised.
-            first_estimates: Whether F leads from there (FEJ) and not from the estimate.
-            is_gap: Whether the velocities were interpolated.
-        """
-        at, R_linear = self.layout["pose"], T_linear[:3, :3]
-        process, twist, by = self.noise.process, measured, None
-        if self.has_velocity_blocks:
-            twist, by = self.imu_velocities(values, measured, R_linear)
-        E, G = motion.increment(twist, tau_s), motion.twist_jacobian(twist, tau_s)
-        T_next = E @ values["pose"]
-        Phi, Q = np.eye(self.layout.body), np.zeros((self.layout.body, self.layout.body))
-        if self.has_clone:
-            clone = self.layout["previous_pose"]
-            Phi[clone, clone], Phi[clone, at] = 0.0, np.eye(6)
-        Phi[at, at] = motion.error_jacobian(T_next @ se3.inverse(T_linear) if first_estimates else E)
-        if by is not None:
-            Phi[at] -= G @ by
-        pose_std = process.pose_std_during(is_gap) if is_gap else process.pose_std
-        Q[at, at] = motion.process_noise_by(G, twist, pose_std, process.misalignment_rad)
-        return Step(T_next, twist, Phi, Q)
 
     # --- observations of landmarks ------------------------------------------------------------------------------------
 

@@ -14,7 +14,8 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import IllPosedError
 from ekfslam.filters.log import Log
 from ekfslam.models.blocks import StateBlock
-from ekfslam.models.model import Model, VelocityRows
+from ekfslam.models.model import Model
+from ekfslam.models.process import Measured
 from ekfslam.smoother.sparse.information import Elimination
 
 
@@ -129,9 +130,9 @@ class BatchRows:
         return np.flatnonzero(self.log.previous >= 0)
 
     @cached_property
-    def _velocities(self) -> VelocityRows:
+    def _velocities(self) -> Measured:
         log = self.log
-        return VelocityRows(log.velocity_axis, log.velocity_value, log.velocity_std, log.velocity_is_biased)
+        return Measured(log.velocity_axis, log.velocity_value, log.velocity_std, log.velocity_is_biased)
 
     @cached_property
     def _aux_moves(self) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.errors import ConfigError
-from ekfslam.models.model import VelocityRows
+from ekfslam.models.process import Measured
 
 AXES = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
 
@@ -49,11 +49,11 @@ class VelocitySource:
         if not (np.asarray(self.std) > 0).all():
             raise ConfigError(f"standard deviations of a velocity source must be positive, found {self.std}")
 
-    def during(self, begin_s: float, end_s: float) -> VelocityRows | None:
+    def during(self, begin_s: float, end_s: float) -> Measured | None:
         """Its measurements with stamps in ``(begin_s, end_s]``; None where there are none."""
         first, last = np.searchsorted(self.time_s, (begin_s, end_s), side="right")
         if first == last:
             return None
         axis = np.tile([AXES.index(name) for name in self.axes], last - first)
         std = np.tile(np.asarray(self.std, dtype=float), last - first)
-        return VelocityRows(axis, np.ravel(self.value[first:last]), std, np.zeros(len(axis), dtype=bool))
+        return Measured(axis, np.ravel(self.value[first:last]), std, np.zeros(len(axis), dtype=bool))

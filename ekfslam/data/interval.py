@@ -1,0 +1,65 @@
+"""The inputs of one interval between two frames, or of many: velocities or inertial samples, one row a piece."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+
+
+@dataclass(frozen=True)
+class Interval:
+    """The inputs that lead from one frame to the next.
+
+    The interval is cut into pieces, and each piece has one row of inputs. Their meaning is that of the process
+    (`ekfslam.models.process`): velocities ``[v; w]``, constant during the piece, or the mean inertial sample ``[w; f]``
+    of the piece.
+
+    Args:
+        tau_s: Duration.
+        dt_s: (n,) durations of the pieces, in order of time; their sum is ``tau_s`` to rounding.
+        inputs: (n, c) one row a piece.
+        is_gap: Whether inputs were interpolated across a gap.
+    """
+
+    tau_s: float
+    dt_s: Array
+    inputs: Array
+    is_gap: bool = False
+
+    @staticmethod
+    def of_one(inputs: Array, tau_s: float, is_gap: bool = False) -> Interval:
+        """Return an interval with one piece, given its inputs (c,)."""
+        return Interval(tau_s, np.array([tau_s]), np.asarray(inputs, dtype=float)[None], is_gap)
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """Successive intervals as flat arrays: m intervals with N pieces in all.
+
+    Args:
+        tau_s: (m,) durations.
+        is_gap: (m,) see `Interval`.
+        start: (m+1,) first piece of each interval, and N.
+        dt_s, inputs: (N,), (N, c) of the pieces.
+    """
+
+    tau_s: Array
+    is_gap: BoolArray
+    start: IntArray
+    dt_s: Array
+    inputs: Array
+
+    @property
+    def have_one_piece(self) -> bool:
+        """Whether each interval has one piece, so that ``inputs`` is (m, c)."""
+        return len(self.dt_s) == len(self.tau_s) and bool((np.diff(self.start) == 1).all())
+
+    def __len__(self) -> int:
+        return len(self.tau_s)
+
+    def __getitem__(self, index: int) -> Interval:
+        pieces = slice(self.start[index], self.start[index + 1])
+        return Interval(float(self.tau_s[index]), self.dt_s[pieces], self.inputs[pieces], bool(self.is_gap[index]))

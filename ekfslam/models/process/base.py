@@ -1,0 +1,159 @@
+"""The interface of a process model: how the state gets from one frame to the next, and what drives it.
+
+A process moves some blocks, its *own*: the pose always, and a velocity or biases if it has them. Constant blocks,
+blocks that walk by themselves (`StateBlock.transition`) and clones are not among them; its step may depend on all.
+
+To add a process, write one file with a subclass and its settings, one file for each new block, and hand
+``make_process`` to `ekfslam.models.build.model_of`.
+
+Contract:
+
+- A process is built for one layout: ``make_process(layout, noise)``. It keeps no state.
+- ``values`` map block names to estimates. Methods accept leading dimensions (m, ...) with `Intervals` in place of an
+  `Interval`: the filter takes one interval, the smoother all at once. A process that cannot do all at once loops over
+  ``intervals[k]`` there.
+- Blocks that walk by themselves have walked already: a step starts from *their* values of the frame that it leads to,
+  and from the values of its own blocks in the frame before.
+- Errors are those of the blocks (`StateBlock.retract`). The rows of ``Phi`` and ``Q`` are the columns of the blocks
+  that a step moves.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.interval import Interval, Intervals
+from ekfslam.data.noise import Noise
+from ekfslam.models.blocks.base import Layout, Values
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step over one interval, or over m of them (then with a leading dimension).
+
+    Args:
+        values: The blocks that it moves, after it, by name; they have p columns.
+        imu_twist: (..., 6) velocity ``[v; w]`` of the IMU at the end of the step, m/s and rad/s in the IMU frame.
+        Phi: (..., p, body) derivative of the errors of these blocks by all errors before the step.
+        Q: (..., p, p) covariance of the noise that the step adds.
+    """
+
+    values: Values
+    imu_twist: Array
+    Phi: Array
+    Q: Array
+
+
+@dataclass(frozen=True)
+class Residual:
+    """The error of steps between states that are not their solution; m intervals.
+
+    Args:
+        error: (m, p) own errors of the state after, as seen from the prediction: 0 if it is the prediction.
+        by_before: (m, p, body) derivative by the errors of the process's own blocks in the frame before.
+        by_after: (m, p, body) derivative by the errors of its own blocks, and of all other blocks, in the frame after.
+    """
+
+    error: Array
+    by_before: Array
+    by_after: Array
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Scalar measurements of blocks by inputs, each of one component that the process has (an axis of its velocity).
+
+    Args:
+        axis: (n,) which component.
+        value: (n,) measured value.
+        std: (n,) standard deviation.
+        is_biased: (n,) whether it comes from the recording's own inputs, whose biases are in the state.
+    """
+
+    axis: IntArray
+    value: Array
+    std: Array
+    is_biased: BoolArray
+
+    @staticmethod
+    def concatenate(parts: Iterable[Measured]) -> Measured:
+        """Return all measurements of the parts, in their order."""
+        parts = list(parts)
+        return Measured(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Measured)))
+
+
+class Process(ABC):
+    """A process model for one layout.
+
+    Attributes:
+        own: Names of the blocks that it moves, the pose first, in the order of the columns of ``Phi`` and ``Q``.
+        layout: Columns of all blocks.
+        estimates_velocity: Whether velocities are in the state, so that further sensors can measure them.
+    """
+
+    own: tuple[str, ...] = ("pose",)
+    layout: Layout
+    estimates_velocity: bool = False
+
+    @abstractmethod
+    def step(self, values: Values, interval: Interval | Intervals, T_linear: Array, first_estimates: bool) -> Step:
+        """Return the step over an interval.
+
+        Args:
+            values: Estimates (see the contract).
+            interval: The inputs.
+            T_linear: (..., 4, 4) pose at which the pose's error before the step is linearised.
+            first_estimates: Whether Phi leads from there (FEJ) and not from the estimate.
+        """
+
+    @abstractmethod
+    def residual(self, before: Values, after: Values, intervals: Intervals) -> Residual:
+        """Return the error of steps between given states, with its derivatives.
+
+        Args:
+            before, after: Estimates (m, ...) of the blocks in the frames before and after each interval.
+            intervals: m of them.
+        """
+
+    @abstractmethod
+    def begin(self, values: Values, inputs: Array) -> Array:
+        """Return ``[v; w]`` (6,) of the IMU at the first frame, given the inputs (c,) there."""
+
+    @abstractmethod
+    def imu_twist(self, before: Values, after: Values, interval: Interval | Intervals) -> Array:
+        """Return ``[v; w]`` (..., 6) of the IMU at the frame after an interval, given corrected estimates.
+
+        A time offset of the images counts by it, eq. (9).
+        """
+
+    @abstractmethod
+    def way_m(self, values: Values, interval: Interval | Intervals) -> Array:
+        """Return the way (...) driven during an interval, given the values before it."""
+
+    def start(self, values: Values, interval: Interval) -> Step | None:
+        """Return the step with which the first inputs start blocks that nothing is known of; None: there are none."""
+        return None
+
+    def measured(self, interval: Interval, is_first: bool) -> Measured | None:
+        """Return the measurements of blocks that the inputs of an interval make; None: they are no measurements.
+
+        In the first interval `start` uses them.
+        """
+        return None
+
+    def jacobian(self, measured: Measured) -> Array:
+        """Return H (n, body) of measurements by all blocks, which are vectors: ``value = H x + noise``."""
+        raise NotImplementedError(f"{type(self).__name__} has nothing that further sensors could measure")
+
+    @property
+    def columns(self) -> IntArray:
+        """Columns (p,) of the process's own blocks in the body."""
+        return self.layout.columns(self.own)
+
+
+MakeProcess = Callable[[Layout, Noise], Process]
