@@ -1,9 +1,10 @@
-"""Results are those of an earlier version, frozen by `frozen/make.py`; all of them with white, stated noise."""
+"""Results are those of an earlier version, frozen by `frozen/make.py` (white noise) and `frozen/automatic.py`."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from frozen import automatic
 from frozen.make import (
     HERE,
     RECORDINGS,
@@ -80,6 +81,24 @@ def test_recordings(name, data_path):
 @pytest.mark.data
 def test_windows_of_starry_night(data_path):
     assert differences(of_starry_night(data_path(STARRY_NIGHT)), read(HERE / "starry_night.npz")) == {}
+
+
+def frozen_automatic(name):
+    """What was frozen of a source by the automatic model."""
+    return {key: x for key, x in read(automatic.FILE).items() if key.startswith(f"{name}: ")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", automatic.WORLDS)
+def test_the_automatic_model_on_built_in_worlds(name):
+    assert differences(automatic.of_source(name, name), frozen_automatic(name)) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.data
+@pytest.mark.parametrize("name", automatic.RECORDINGS)
+def test_the_automatic_model_on_recordings(name, data_path):
+    assert differences(automatic.of_source(name, data_path(name)), frozen_automatic(name)) == {}
 
 
 def test_a_change_in_the_ninth_digit_shows():
