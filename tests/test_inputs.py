@@ -8,7 +8,15 @@ from support.helpers import synthetic_sequence
 
 import ekfslam
 from ekfslam.data.inputs import InertialNoise, InertialSamples, Velocities
-from ekfslam.errors import DataError, EkfslamError, ExtrinsicsError, NonFiniteError, ShapeError, StampError
+from ekfslam.errors import (
+    DataError,
+    EkfslamError,
+    ExtrinsicsError,
+    LostDataError,
+    NonFiniteError,
+    ShapeError,
+    StampError,
+)
 
 DENSITIES = InertialNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3)
 
@@ -142,3 +150,15 @@ def test_tracks_with_samples_need_the_pose_of_the_camera():
         sequence.time_s, seen.pixels_px, sequence.camera, **arrays, T_cam_imu=sequence.T_cam_imu
     )
     assert built.inertial is arrays["imu"] and not built.has_velocities
+
+
+def test_velocities_at_a_higher_rate_lead_to_the_frame_piece_by_piece():
+    fast = Velocities(np.arange(0, 2, 0.04), np.arange(50)[:, None] * np.ones(6))
+    found = world(inputs=(fast,)).interval(3)
+    assert np.allclose(found.dt_s, [0.04, 0.04, 0.02]) and np.isclose(found.tau_s, 0.1)
+    assert found.inputs[:, 0].tolist() == [6.0, 7.0, 8.0]
+
+
+def test_a_recording_without_samples_has_no_inertial_intervals():
+    with pytest.raises(LostDataError, match="no inertial samples"):
+        world().interval(3, InertialSamples)

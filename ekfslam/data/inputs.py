@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
@@ -10,9 +11,11 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.checks import LARGEST_VELOCITY, frozen, require_finite, require_shape, validate_stamps
 from ekfslam.data.interpolation import interpolated_intervals
-from ekfslam.errors import DataError, ShapeError
+from ekfslam.data.interval import Interval
+from ekfslam.errors import DataError, LostDataError, ShapeError
 
 VelocityFrame = Literal["imu", "level"]
+_GAP_STEPS = 3.0
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,19 @@ class Velocities:
         """Return the samples that drive the time from ``begin_s`` to ``end_s``."""
         begin, last = np.searchsorted(self.time_s, (begin_s, end_s)).tolist()
         return _part(self, min(begin, len(self.time_s) - 1), last + 1)
+
+    def interval(self, begin_s: float, end_s: float) -> Interval:
+        """Return the samples that drive a time, each with the duration for which it does.
+
+        Raises:
+            LostDataError: The samples begin after this time or end before it, by more than a step.
+        """
+        part = self.between(begin_s, end_s)
+        _require_cover(self, begin_s, end_s)
+        ends = np.append(part.time_s[:-1], end_s)
+        dt = np.diff(ends, prepend=begin_s)
+        driving = dt > 0
+        return Interval(end_s - begin_s, dt[driving], part.twist[driving], bool(part.interpolated[driving].any()))
 
     def has_stamps(self, time_s: Array) -> bool:
         """Return whether there is one sample for each of the stamps (T,)."""
@@ -139,6 +155,32 @@ class InertialSamples:
         end = int(np.searchsorted(self.time_s, end_s)) + 1
         return _part(self, max(begin, 0), end)
 
+    @cached_property
+    def step_s(self) -> float:
+        """Median time between samples."""
+        return _median_step(self.time_s)
+
+    def at(self, time_s: Array | float) -> Array:
+        """Return the samples ``[w; f]`` (..., 6) at some time, linear between stamps."""
+        columns = np.hstack([self.gyro_rad_s, self.accel_m_s2]).T
+        return np.stack([np.interp(time_s, self.time_s, column) for column in columns], axis=-1)
+
+    def interval(self, begin_s: float, end_s: float) -> Interval:
+        """Return the mean samples ``[w; f]`` between successive stamps, linear to both ends of the interval.
+
+        It is a gap if samples are missing: a step between two of them is more than three times the median.
+
+        Raises:
+            LostDataError: The samples begin after this time or end before it, by more than a step.
+        """
+        part = self.between(begin_s, end_s)
+        _require_cover(self, begin_s, end_s)
+        inside = part.time_s[(part.time_s > begin_s) & (part.time_s < end_s)]
+        stamps = np.concatenate([[begin_s], inside, [end_s]])
+        values = part.at(stamps)
+        is_gap = len(part.time_s) > 1 and bool(np.diff(part.time_s).max() > _GAP_STEPS * self.step_s)
+        return Interval(end_s - begin_s, np.diff(stamps), 0.5 * (values[1:] + values[:-1]), is_gap)
+
 
 Input = Velocities | InertialSamples
 AnyInput = TypeVar("AnyInput", Velocities, InertialSamples)
@@ -156,6 +198,23 @@ def validate_inputs(inputs: tuple[Input, ...], time_s: Array) -> None:
                 field="inputs",
                 index=i,
             )
+
+
+def _median_step(time_s: Array) -> float:
+    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+
+
+def _require_cover(samples: Input, begin_s: float, end_s: float) -> None:
+    """Raise `LostDataError` if an interval is not within the samples, or at most one step outside."""
+    first, last = float(samples.time_s[0]), float(samples.time_s[-1])
+    if begin_s >= first and end_s <= last:
+        return
+    reach = _median_step(samples.time_s)
+    if begin_s < first - reach or end_s > last + reach:
+        raise LostDataError(
+            f"there are no samples from {begin_s:.3f} to {end_s:.3f} s, only from {first:.3f} to {last:.3f} s",
+            field="inputs",
+        )
 
 
 def _freeze(record: Input, *names: str) -> None:

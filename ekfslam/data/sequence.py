@@ -24,6 +24,7 @@ from ekfslam.data.checks import (
 )
 from ekfslam.data.inputs import InertialSamples, Input, Velocities, VelocityFrame, validate_inputs
 from ekfslam.data.interpolation import INTERPOLATED, attributes_of_part, known_intervals
+from ekfslam.data.interval import Interval
 from ekfslam.data.noise import Noise
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import (
@@ -32,6 +33,7 @@ from ekfslam.errors import (
     DuplicateObservationError,
     EmptyTracksError,
     ExtrinsicsError,
+    LostDataError,
     ShapeError,
     TruthError,
 )
@@ -317,6 +319,34 @@ class Sequence(Shown):
         """(T, 6) velocities ``[v; w]``; ``twist[k]`` drives ``(t[k-1], t[k]]``. Zero if there are none."""
         velocities = self.velocities
         return frozen(np.zeros((len(self), 6)) if velocities is None else velocities.mean(self.time_s))
+
+    def interval(self, frame: int, kind: type[Input] = Velocities) -> Interval:
+        """Return the inputs of a kind that lead to a frame from the frame before.
+
+        Raises:
+            LostDataError: There are no inputs of this kind, or none during the interval.
+        """
+        begin_s, end_s = float(self.time_s[frame - 1]), float(self.time_s[frame])
+        velocities = self.velocities
+        if kind is InertialSamples:
+            return self._samples.interval(begin_s, end_s)
+        if velocities is None or velocities.has_stamps(self.time_s):
+            return Interval.of_one(self.twist[frame], end_s - begin_s, bool(self.interpolated[frame]))
+        return velocities.interval(begin_s, end_s)
+
+    def inputs_at(self, frame: int, kind: type[Input] = Velocities) -> Array:
+        """Return the inputs (6,) of a kind at a frame.
+
+        Raises:
+            LostDataError: There are no inputs of this kind.
+        """
+        return self._samples.at(self.time_s[frame]) if kind is InertialSamples else self.twist[frame]
+
+    @property
+    def _samples(self) -> InertialSamples:
+        if self.inertial is None:
+            raise LostDataError("the recording has no inertial samples", source=self.source, field="inputs")
+        return self.inertial
 
     @property
     def velocity_frame(self) -> VelocityFrame:

@@ -75,9 +75,9 @@ def run_filter(
             if begun:
                 before, now = float(sequence.time_s[k - 1]), float(sequence.time_s[k])
                 also = None if further is None else further.during(before, now)
-                estimator.predict(sequence.twist[k], now - before, also, bool(sequence.interpolated[k]))
+                estimator.predict(sequence.interval(k, estimator.model.process.takes), also=also)
             else:
-                estimator.begin(sequence.twist[k])
+                estimator.begin(sequence.inputs_at(k, estimator.model.process.takes))
         begun = True
         report = estimator.update(k, *sequence.observations.at(k))
         yield Frame(k, report, 1e3 * (clock() - begin))

@@ -27,6 +27,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.inputs import InertialSamples, Velocities
 from ekfslam.data.interval import Interval, Intervals
 from ekfslam.data.noise import Noise
 from ekfslam.models.blocks.base import Layout, Values
@@ -93,11 +94,13 @@ class Process(ABC):
     Attributes:
         own: Names of the blocks that it moves, the pose first, in the order of the columns of ``Phi`` and ``Q``.
         layout: Columns of all blocks.
+        takes: Kind of the inputs.
         estimates_velocity: Whether velocities are in the state, so that further sensors can measure them.
     """
 
     own: tuple[str, ...] = ("pose",)
     layout: Layout
+    takes: type[Velocities] | type[InertialSamples] = Velocities
     estimates_velocity: bool = False
 
     @abstractmethod
