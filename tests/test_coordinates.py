@@ -319,7 +319,7 @@ def test_a_loop_closes_with_landmarks_that_come_back(variant):
 
 def test_a_model_without_the_clone_is_refused():
     model = model_of(Rig(CAMERA, T_CAM_IMU, NOISE), NOISE, np.eye(4), P0, coordinates="xyz")
-    with pytest.raises(ConfigError, match="'image' needs previous_pose"):
+    with pytest.raises(ConfigError, match="'image' needs a clone of the pose"):
         JointEKF(model, OPEN)
     assert JointEKF(model, dataclasses.replace(OPEN, landmark_coordinates="xyz")).P.shape == (6, 6)
 

@@ -11,6 +11,7 @@ from ekfslam.data.sequence import Observations
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.observing import measurement_jacobian
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import se3
 from ekfslam.models.build import noise_of
@@ -170,7 +171,7 @@ def test_conditional_gate_equals_leaving_each_landmark_out(variant):
     assert len(ids) >= 5
     # Too small for the marginal gate, whose S holds the pose's uncertainty; plain beside the others.
     pixels[2] += [6.0, 4.0, 6.0, 4.0]
-    H = ekf.measurement_jacobian(ids).toarray()
+    H = measurement_jacobian(ekf, ids).toarray()
     V = np.diag(np.tile(rig.variance_px2, len(ids)))
     at = [ekf.ids.tolist().index(i) for i in ids]
     q = se3.apply(rig.T_cam_imu @ ekf.T_imu_world, ekf.positions_m[at])
@@ -302,7 +303,7 @@ def test_indefinite_as_a_whole_is_an_error_too(world):
 def test_measurement_jacobian_of_an_unknown_landmark(world):
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), OPEN, np.eye(4))
     with pytest.raises(KeyError, match="12345"):
-        ekf.measurement_jacobian(np.array([12345]))
+        measurement_jacobian(ekf, np.array([12345]))
 
 
 def test_dead_reckoning_covariance_is_that_of_sampled_runs(world):

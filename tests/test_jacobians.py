@@ -9,9 +9,12 @@ from support.jacobians import POSES, RNG, TWISTS, central, visible_points
 from support.reference import CAMERA, T_CAM_IMU, jacobian_of_pi, small_world, stereo_matrix, triangulate_least_squares
 
 from ekfslam.config import FilterConfig
+from ekfslam.data.interval import Interval
 from ekfslam.data.sequence import Noise
 from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.observing import measurement_jacobian
+from ekfslam.filters.prediction import transition_jacobian
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
@@ -89,7 +92,7 @@ def test_full_width_jacobians_of_a_shuffled_non_first_subset(T, variant):
         moved = ekf.positions_m + error[6:].reshape(-1, 3)
         return rows(se3.exp(error[:6]) @ ekf.T_imu_world, moved[at])
 
-    H = ekf.measurement_jacobian(seen)
+    H = measurement_jacobian(ekf, seen)
     assert H.shape == (9, 24)
     assert H.nnz <= 9 * 9
     np.testing.assert_allclose(H.toarray(), central(predicted, 24), rtol=1e-5, atol=1e-4)
@@ -101,7 +104,7 @@ def test_full_width_jacobians_of_a_shuffled_non_first_subset(T, variant):
         T_next = E @ se3.exp(error[:6]) @ ekf.T_imu_world
         return np.concatenate([se3.log(T_next @ se3.inverse(E @ ekf.T_imu_world)), error[6:]])
 
-    F = ekf.transition_jacobian(twist, tau)
+    F = transition_jacobian(ekf, Interval.of_one(twist, tau))
     np.testing.assert_allclose(F.toarray(), central(propagated, 24), rtol=1e-6, atol=1e-6)
 
 

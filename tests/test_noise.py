@@ -11,12 +11,15 @@ from support.reference import D, circle_dot, homogeneous, jacobian_of_pi, small_
 from support.running import WHOLE, seeds
 
 from ekfslam.config import Config, FilterConfig, NoiseConfig, PosteriorConfig
+from ekfslam.data.interval import Interval
 from ekfslam.data.noise import TrackError
 from ekfslam.data.readers import open_sequence, write_sequence
 from ekfslam.data.sequence import Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
+from ekfslam.filters.observing import measurement_jacobian, moment_before, observe
+from ekfslam.filters.prediction import transition_jacobian
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import motion, se3
 from ekfslam.models.build import build, noise_of
@@ -348,21 +351,21 @@ def test_transition_and_measurement_jacobians_know_of_the_velocities(tracks):
             ekf.predict(world.twist[k], 0.1)
         ekf.update(k, *world.observations.at(k))
     at = ekf.model.layout["twist"]
-    F = ekf.transition_jacobian(ekf.values["twist"], 0.1).toarray()
+    F = transition_jacobian(ekf, Interval.of_one(ekf.values["twist"], 0.1)).toarray()
     np.testing.assert_allclose(F[:6, at], -motion.twist_jacobian(ekf.values["twist"], 0.1))
     expected = np.eye(len(F))
     if tracks:
         expected[6:12] = expected[:6]
     np.testing.assert_array_equal(F[6:], expected[6:])
     N = gauge_of_all(ekf)
-    H = ekf.measurement_jacobian(ekf.ids)
+    H = measurement_jacobian(ekf, ekf.ids)
     assert np.abs(H @ N).max() < 1e-9 * np.abs(H.toarray()).max() * np.abs(N).max()
     if not tracks:
         return
     # Differences from the frame before see the gauge no more than the rows themselves.
     ekf.predict(world.twist[3], 0.1)
     seen_then = np.isin(ekf.ids, world.observations.at(2)[0])
-    _, rows = ekf.observe(np.arange(len(ekf.ids)), ekf.table.seen_rows)
+    _, rows = observe(ekf, ekf.mean, np.arange(len(ekf.ids)), ekf.table.seen_rows)
     N = gauge_of_all(ekf)
     by = rows.H_x @ N[: ekf.gaussian.seen] + rows.H_m @ N[ekf.gaussian.body :].reshape(-1, 3, 6)
     assert np.abs(by).max() < 1e-9 * np.abs(rows.H_x).max() * np.abs(N).max()
@@ -377,7 +380,7 @@ def gauge_of_all(ekf):
     body = np.zeros((ekf.gaussian.body, 6))
     body[layout["pose"]] = N[:6]
     if "previous_pose" in layout:
-        body[layout["previous_pose"]] = -se3.adjoint(ekf.moment_before().T_linear)
+        body[layout["previous_pose"]] = -se3.adjoint(moment_before(ekf, ekf.mean).T_linear)
     return np.vstack([body, N[6:]])
 
 

@@ -490,7 +490,7 @@ def test_no_information_about_the_gauge_is_gained_across_a_revival(variant):
         if k > 0:
             ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
         ekf.update(k, *world.observations.at(k))
-        T, m = ekf.T_predicted if variant == "fej" else ekf.T_imu_world, ekf.linear_positions_m
+        T, m = ekf.motion.T_predicted if variant == "fej" else ekf.T_imu_world, ekf.linear_positions_m
         N = gauge_directions(T, m)
         ratio = np.linalg.eigvals(np.linalg.solve(expected, N.T @ np.linalg.solve(ekf.P, N))).real
         largest, smallest = max(largest, ratio.max()), min(smallest, ratio.min())

@@ -30,6 +30,7 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
+from ekfslam.filters.observing import observe
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import CameraJitter, Previous, TwistBias, VisionDrift
 from ekfslam.models.blocks.calibration import prior_std
@@ -191,10 +192,10 @@ def test_observations_of_the_filter_by_every_block_and_landmark(T, memory):
     def residual(x):
         moved, points = model.retract(values, x[:body]), (ekf.positions_m + x[body:].reshape(-1, 3))[slots]
         now = measured - literal_rows(moved, points, way_m, follows, ekf.imu_twist)
-        last = before - literal_rows(moved, points, way_m, follows, ekf.imu_twist_before, before=True)
+        last = before - literal_rows(moved, points, way_m, follows, ekf.motion.imu_twist_before, before=True)
         return (now - memory * follows[:, None] * last).ravel()
 
-    _, rows = ekf.observe(slots, measured)
+    _, rows = observe(ekf, ekf.mean, slots, measured)
     size = body + 18
     np.testing.assert_allclose(rows.residual.ravel(), residual(np.zeros(size)), atol=1e-8)
     assert_equal_rows(wide(rows, body, rows.slot, 6), -central(residual, size))
@@ -258,7 +259,7 @@ def test_a_clone_is_its_block_before_it_changed():
     before = ekf.values
     ekf.predict(TWIST, 0.2)
     way_m = 0.2 * np.linalg.norm(TWIST[:3])
-    assert ekf.way_m == pytest.approx(way_m)
+    assert ekf.motion.way_m == pytest.approx(way_m)
     kept = {"camera_jitter": 0.2 / 0.6, "vision_drift": way_m / 20.0}
     for block in SHARED:
         at, phi = layout[block.name], np.exp(-kept[block.name])

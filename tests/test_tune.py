@@ -21,6 +21,7 @@ from ekfslam.filters.dense import DenseSolution
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.filters.mapping import IndependentLandmarks
+from ekfslam.filters.observing import measurement_jacobian
 from ekfslam.geometry import motion
 from ekfslam.models.build import noise_of, resolve
 from ekfslam.models.noise import VelocityNoise, velocity_noise, with_drift
@@ -63,7 +64,7 @@ def dense_log_density(ekf, report, measured):
     ids = report.ids[known]
     if len(ids) == 0:
         return 0.0
-    H = ekf.measurement_jacobian(ids).toarray()
+    H = measurement_jacobian(ekf, ids).toarray()
     rows = ekf.sensor.rows(measured[known])
     slot = [ekf.ids.tolist().index(i) for i in ids]
     q = (ekf.sensor.T_cam_imu @ ekf.T_imu_world)[:3] @ np.c_[ekf.positions_m[slot], np.ones(len(ids))].T

@@ -8,10 +8,11 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters import gates
-from ekfslam.filters.estimate import Estimate
+from ekfslam.filters.estimate import Estimate, Mean
 from ekfslam.filters.gaussian import Conditioned, Projection, Rows, Solution
 from ekfslam.filters.innovations import FrameInnovations, innovations_of
-from ekfslam.geometry import se3
+from ekfslam.filters.observing import observe
+from ekfslam.filters.retraction import carried_back, parts, retracted
 from ekfslam.models.model import Seen
 from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, MOVING
 
@@ -24,83 +25,86 @@ class Correction:
     """What a frame's known landmarks say.
 
     Args:
+        solution: Eq. (6) solved, to be applied to the covariance; None: nothing was accepted.
         done: Correction of the mean, NIS and ``log det S`` of what was accepted.
         dof: Its degrees of freedom.
         verdict: (k,) on each landmark: `ACCEPTED` or a reason code.
         slot, measured, variance: (j,), (j, d), (j, d) of the accepted ones.
-        position_m: (j, 3) where they were linearised.
-        linear: (body,) coordinates at which the update was linearised.
-        T_linear, T_linear_before: (4, 4) poses there, of this frame and of the one before.
+        linear: Where they were linearised.
+        coordinates: (body,) coordinates there.
         innovations: Those of the accepted ones, of the first iteration.
     """
 
+    solution: Solution | None
     done: Conditioned
     dof: int
     verdict: IntArray
     slot: IntArray
     measured: Array
     variance: Array
-    position_m: Array
-    linear: Array
-    T_linear: Array
-    T_linear_before: Array
+    linear: Mean
+    coordinates: Array
     innovations: FrameInnovations
 
 
 def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correction:
-    """Eq. (6) with its gates, for landmarks at ``slot`` (k,) with rows (k, d). The covariance is conditioned.
+    """Solve eq. (6) with its gates, for landmarks at ``slot`` (k,) with rows (k, d).
 
     A landmark must agree with the prediction, and with the prediction as corrected by all *other* landmarks of the
-    frame: the first gate is weak while the pose itself is uncertain, the second is not. What the second rejects has
-    been used already, and is taken out again. The mean is left to the caller.
+    frame: the first gate is weak while the pose itself is uncertain, the second is not. The second gate rejects
+    observations that the joint solution already contains, so they are removed from it.
+
+    The estimate stays, but for the evidence of motion in its table. The caller applies solution and correction.
 
     Raises:
         InnovationError: The innovation covariance is not positive definite.
     """
     gate = gates.threshold(e.config.gate_probability, e.sensor.dimension)
     verdict = np.full(len(slot), ACCEPTED)
-    seen, rows = e.observe(slot, measured)
+    at, solution, innovations = e.mean, None, FrameInnovations.none(e.sensor.dimension)
+    seen, rows = observe(e, at, slot, measured)
     verdict[~e.sensor.in_view(seen.q, e.config.min_depth_m)] = BEHIND_CAMERA
     some, tried = _gate_alone(e, frame, rows, seen, verdict, gate)
-    innovations, solution = FrameInnovations.none(e.sensor.dimension), None
     if len(some):
-        if e.model.has_time_offset and e.tau_s:
-            e.imu_twist = _seen_twist(e, frame, tried)
-            _, rows = e.observe(slot, measured)
+        if e.model.has_time_offset and e.motion.tau_s:
+            at = replace(at, imu_twist=_corrected_twist(e, frame, tried))
+            _, rows = observe(e, at, slot, measured)
             tried = e.gaussian.project(rows.only(some), frame, e.ids[slot[some]])
-        S = tried.variances + gates.diagonal(tried.rows.variance)
-        solution = e.gaussian.solve(tried, frame, e.ids[slot[some]])
-        left = tried.rows.corrected(*e.parts(solution.done.correction))
-        verdict[some] = _gate_by_others(e, solution, left, S, seen, some, gate)
-        inside = verdict[some] == ACCEPTED
-        accepted = tried.rows
-        if not inside.all():
-            solution = solution.without(~inside)
-            accepted, S = accepted.only(inside), S[inside]
-            left = accepted.corrected(*e.parts(solution.done.correction))
-        innovations = innovations_of(solution, e.table.log_row[accepted.slot], accepted, S, left.residual)
+        solution, innovations = _gate_jointly(e, frame, tried, seen, some, verdict, gate)
     taken = verdict == ACCEPTED
     if not taken.all():
         rows, measured = rows.only(taken), measured[taken]
-    clone = e.values.get("previous_pose", e.T_departed)
-    linear = e.coordinates, e.T_imu_world, clone
-    position = e.table.position_m[rows.slot]
-    done = Conditioned(np.zeros(e.gaussian.body + 3 * e.gaussian.landmarks))
+    done, coordinates = Conditioned(np.zeros(e.gaussian.body + 3 * e.gaussian.landmarks)), e.coordinates
     if solution is not None:
         done = solution.done
         if e.config.iterations > 1 and taken.any():
-            solution, position, linear = _iterate(e, frame, solution, rows.slot, measured)
+            solution, at, coordinates = _iterated(e, at, frame, solution, rows.slot, measured)
             done = replace(done, correction=solution.done.correction)
-        e.gaussian.apply(solution)
     return Correction(
-        done, rows.residual.size, verdict, rows.slot, measured, rows.variance, position, *linear, innovations
+        solution, done, rows.residual.size, verdict, rows.slot, measured, rows.variance, at, coordinates, innovations
     )
+
+
+def _gate_jointly(
+    e: Estimate, frame: int, tried: Projection, seen: Seen, some: IntArray, verdict: IntArray, gate: float
+) -> tuple[Solution, FrameInnovations]:
+    """Solve eq. (6) for rows (j), and remove those that others reject; the verdict (k,) on these is written."""
+    S = tried.variances + gates.diagonal(tried.rows.variance)
+    solution = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot])
+    accepted, left = tried.rows, tried.rows.corrected(*parts(e, solution.done.correction))
+    verdict[some] = _gate_by_others(e, solution, left, S, seen, some, gate)
+    inside = verdict[some] == ACCEPTED
+    if not inside.all():
+        solution = solution.without(~inside)
+        accepted, S = accepted.only(inside), S[inside]
+        left = accepted.corrected(*parts(e, solution.done.correction))
+    return solution, innovations_of(solution, e.table.log_row[accepted.slot], accepted, S, left.residual)
 
 
 def _gate_alone(
     e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArray, gate: float
 ) -> tuple[IntArray, Projection]:
-    """Which landmarks (j,) of the rows pass the gate by themselves, and their rows seen through the covariance.
+    """Return which landmarks (j,) of the rows pass the gate by themselves, and their rows seen through the covariance.
 
     The verdict (k,) on the others is written.
     """
@@ -127,14 +131,14 @@ def _gate_alone(
 
 
 def _own_variance(tried: Projection) -> Array:
-    """Variances (k, d) of the innovations."""
+    """Return the variances (k, d) of the innovations."""
     return np.diagonal(tried.variances, axis1=1, axis2=2) + tried.rows.variance
 
 
 def _gate_by_others(
     e: Estimate, solution: Solution, left: Rows, S: Array, seen: Seen, some: IntArray, gate: float
 ) -> IntArray:
-    """Verdicts (j,) on landmarks by what all others of the frame say.
+    """Return verdicts (j,) on landmarks by all others of the frame.
 
     Args:
         solution: Of eq. (6) for the rows (j).
@@ -161,13 +165,13 @@ def _gate_by_others(
 
 
 def _judges_motion(e: Estimate) -> bool:
-    """Whether tracks are tested for moving along: where they may err at all, from the second frame on."""
-    return e.model.track_error is not None and e.tau_s > 0
+    """Whether tracks are tested for moving along: if they may err at all, from the second frame on."""
+    return e.model.track_error is not None and e.motion.tau_s > 0
 
 
 def _motion(e: Estimate, seen: Seen, some: IntArray) -> Array:
-    """Derivative (j, d) of the rows by a motion of their landmarks along the last step of the rig."""
-    return seen.H_m[some] @ (e.T_imu_world[:3, :3].T @ (e.imu_twist[:3] * e.tau_s))
+    """Return the derivative (j, d) of the rows by a motion of their landmarks along the last step of the rig."""
+    return seen.H_m[some] @ (e.T_imu_world[:3, :3].T @ (e.imu_twist[:3] * e.motion.tau_s))
 
 
 def _moving(e: Estimate, slot: IntArray, evidence: tuple[Array, Array], squares: Array, gate: float) -> BoolArray:
@@ -175,42 +179,37 @@ def _moving(e: Estimate, slot: IntArray, evidence: tuple[Array, Array], squares:
     return gates.moves_along(e.table, slot, *evidence, squares, gate, sigma, e.config.moving_share)
 
 
-def _seen_twist(e: Estimate, frame: int, tried: Projection) -> Array:
-    """The velocities (6,) that led to this frame, as corrected by its observations.
+def _corrected_twist(e: Estimate, frame: int, tried: Projection) -> Array:
+    """Return the velocity (6,) at this frame as corrected by its observations.
 
-    A time offset counts in proportion to them. With the measured ones, whose noise the innovations show, too, it would
+    A time offset counts in proportion to it. With the measured one, whose noise the innovations show, too, it would
     come out far too small.
     """
-    xi = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot]).done.correction[:6]
-    return -se3.log(se3.exp(xi) @ e.T_imu_world @ se3.inverse(e.T_departed)) / e.tau_s
+    correction = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot]).done.correction
+    after = e.model.retract(e.values, correction)
+    return e.model.process.imu_twist({"pose": e.motion.T_departed}, after, e.motion.interval)
 
 
-def _iterate(
-    e: Estimate, frame: int, solution: Solution, slot: IntArray, measured: Array
-) -> tuple[Solution, Array, tuple[Array, Array, Array]]:
-    """Gauss-Newton on eq. (6): linearise again at the corrected state, always from the same prior.
+def _iterated(
+    e: Estimate, at: Mean, frame: int, solution: Solution, slot: IntArray, measured: Array
+) -> tuple[Solution, Mean, Array]:
+    """Iterate eq. (6) by Gauss-Newton: linearise again at the corrected mean, always from the same prior.
 
-    Rows taken at the corrected state are carried back into the prior's coordinates by the variant's derivative D,
+    Rows taken at the corrected mean are carried back into the prior's coordinates by the variant's derivative D,
     ``H_k D_k``, and the residual becomes ``r_k + H_k D_k (xi, d)_k``. Source: Bell and Cathey, "The iterated Kalman
     filter update as a Gauss-Newton method", IEEE TAC 1993.
 
     Returns:
-        The last solution; the landmarks (j, 3), coordinates and poses at which it was linearised.
+        The last solution; the mean and the coordinates (body,) at which it was linearised.
     """
-    values, positions = e.values, e.positions_m
+    linear, coordinates = at, e.coordinates
     for _ in range(e.config.iterations - 1):
         correction = solution.done.correction
-        x, d = e.parts(correction)
-        moved = e.retracted(correction)
-        after = moved.values
-        linear = (
-            e.coordinates + correction[: len(e.coordinates)],
-            after["pose"],
-            after.get("previous_pose", e.T_departed),
-        )
-        e.values, e.table.position_m = after, moved.position_m
-        _, rows = e.observe(slot, measured)
-        e.values, e.table.position_m = values, positions
-        rows = e.carried_back(rows, moved).corrected(-x, -d)
+        x, d = parts(e, correction)
+        moved = retracted(e, correction)
+        linear = replace(moved.mean, imu_twist=at.imu_twist)
+        coordinates = e.coordinates + correction[: len(e.coordinates)]
+        _, rows = observe(e, linear, slot, measured)
+        rows = carried_back(e, rows, moved).corrected(-x, -d)
         solution = e.gaussian.solve(e.gaussian.project(rows, frame, e.ids[slot]), frame, e.ids[slot])
-    return solution, moved.position_m[slot], linear
+    return solution, linear, coordinates

@@ -51,6 +51,7 @@ class Retired:
         row_of: Rows in the log of those that may come back, by id.
         revived: Ids of retired landmarks that were seen again and came back.
         reappeared: Ids of retired landmarks that were seen again and started afresh.
+        moving: Ids of tracks that were found to move; they are not used again.
     """
 
     def __init__(self) -> None:
@@ -60,9 +61,20 @@ class Retired:
         self._verdicts: dict[int, tuple[int, Array]] = {}  # misses and evidence of moving, by row
         self.revived: list[int] = []
         self.reappeared: list[int] = []
+        self.moving: set[int] = set()
 
     def __len__(self) -> int:
         return sum(len(part) for part in self._parts)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Totals by name."""
+        return {
+            "retired": len(self),
+            "revived": len(self.revived),
+            "reappeared": len(self.reappeared),
+            "moving": len(self.moving),
+        }
 
     def add(self, table: LandmarkTable, covariance: Array, gone: BoolArray, may_return: bool) -> None:
         """Landmarks (n,) of a table that are gone, with the covariances (k, 3, 3) of these."""

@@ -25,12 +25,14 @@ from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
+from ekfslam.data.interval import Interval
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import require_finite, require_shape
 from ekfslam.errors import ConfigError, DuplicateObservationError, LateError, MissingVelocityError, StampError
-from ekfslam.filters.joint import JointEKF, without_landmarks
+from ekfslam.filters.estimate import Estimate
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.prediction import predict
 from ekfslam.filters.reports import FrameReport
-from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.models.sensors.stereo import Rig
 
@@ -49,14 +51,6 @@ class Pose(NamedTuple):
     T_world_imu: Array
     covariance: Array
     is_held: bool
-
-
-class Driven(NamedTuple):
-    """What drives from one stamp to another: the velocity (6,), and whether part of it was held or across a gap."""
-
-    twist: Array
-    is_held: bool
-    is_gap: bool
 
 
 @dataclasses.dataclass
@@ -97,27 +91,25 @@ class _Velocities:
         self.stamps.insert(at, t)
         self._twists.insert(at, twist)
 
-    def at(self, t: float) -> Driven:
-        """What holds at a stamp."""
+    def at(self, t: float) -> tuple[Array, bool]:
+        """Return the velocity (6,) at a stamp, and whether none came after it, so that the last one is held."""
         at = min(bisect_left(self.stamps, t), len(self.stamps) - 1)
-        return Driven(self._twists[at], self.stamps[-1] < t, False)
+        return self._twists[at], self.stamps[-1] < t
 
-    def during(self, begin: float, end: float, gap_s: float) -> Driven:
-        """What drives from one stamp to a later one, as one velocity."""
+    def during(self, begin: float, end: float, gap_s: float) -> tuple[Interval, bool]:
+        """Return the velocities from one stamp to a later one, and whether the last one is held.
+
+        The interval is a gap if velocities in it are more than ``gap_s`` apart.
+        """
         if not self.stamps:
             raise MissingVelocityError(end)
         stamps, last = self.stamps, len(self.stamps) - 1
         first, stop = bisect_right(stamps, begin), min(bisect_left(stamps, end), last)
-        pieces = range(min(first, stop), stop + 1)
+        pieces, is_held = range(min(first, stop), stop + 1), stamps[last] < end
         is_gap = any(i > 0 and stamps[i] - stamps[i - 1] > gap_s for i in pieces)
-        twist = self._twists[stop]
-        if len(pieces) > 1:
-            bounds = np.array([begin, *(stamps[i] for i in pieces[:-1]), end])
-            E = np.eye(4)
-            for step in motion.increment(np.array([self._twists[i] for i in pieces]), np.diff(bounds)):
-                E = step @ E
-            twist = -se3.log(E) / (end - begin)
-        return Driven(twist, stamps[last] < end, is_gap)
+        bounds = np.array([begin, *(stamps[i] for i in pieces[:-1]), end])
+        twists = np.array([self._twists[i] for i in pieces])
+        return Interval(end - begin, np.diff(bounds), twists, is_gap), is_held
 
     def forget(self, before: float) -> None:
         """Those before a stamp, but for the last of them, which says since when the next one holds."""
@@ -160,7 +152,7 @@ class LiveEKF:
         self._velocities = _Velocities()
         self._waiting: list[tuple[float, IntArray, Array]] = []
         self._newest = {"velocity": -np.inf, "image": -np.inf}
-        self._past: list[tuple[float, JointEKF]] = []
+        self._past: list[tuple[float, Estimate]] = []
 
     @classmethod
     def from_rig(
@@ -277,13 +269,13 @@ class LiveEKF:
         at = bisect_right(self._past, t, key=lambda past: past[0]) - 1
         if at < 0:
             raise LateError("pose", t, self._past[0][0] if self._past else None)
-        begin, ekf = self._past[at]
+        begin, then = self._past[at]
         is_held = False
         if t > begin:
-            twist, is_held, is_gap = self._velocities.during(begin, t, self.gap_s)
-            ekf = without_landmarks(ekf)
-            ekf.predict(twist, t - begin, is_gap=is_gap or is_held)
-        return Pose(t, ekf.T_world_imu, ekf.gaussian.body_covariance[:6, :6].copy(), is_held)
+            interval, is_held = self._velocities.during(begin, t, self.gap_s)
+            then = then.without_landmarks()
+            predict(then, _worth(interval, is_held), None)
+        return Pose(t, then.T_world_imu, then.gaussian.body_covariance[:6, :6].copy(), is_held)
 
     def _in_time(self, kind: Literal["velocity", "image"], t: float) -> bool:
         """Whether a message is of use; counts it, or raises, where it is not."""
@@ -308,18 +300,24 @@ class LiveEKF:
         reports = []
         while self._waiting and self._waiting[0][0] <= until and self._velocities.stamps:
             (t, ids, measured), begin = self._waiting[0], self.time_s
-            driven = self._velocities.at(t) if begin is None else self._velocities.during(begin, t, self.gap_s)
-            del self._waiting[0]
-            self.counts.held += driven.is_held
-            self.counts.gaps += driven.is_gap
             if begin is None:
-                self.ekf.begin(driven.twist)
+                twist, is_held = self._velocities.at(t)
+                self.ekf.begin(twist)
             else:
-                self.ekf.predict(driven.twist, t - begin, is_gap=driven.is_gap or driven.is_held)
+                interval, is_held = self._velocities.during(begin, t, self.gap_s)
+                self.ekf.predict(_worth(interval, is_held))
+                self.counts.gaps += interval.is_gap
+            self.counts.held += is_held
+            del self._waiting[0]
             reports.append(self.ekf.update(self.counts.taken_in, ids, measured))
             self.counts.taken_in += 1
             self.time_s = t
-            self._past.append((t, without_landmarks(self.ekf)))
+            self._past.append((t, self.ekf.without_landmarks()))
             self._past = [past for past in self._past if past[0] >= t - self.history_s]
             self._velocities.forget(self._past[0][0])
         return reports
+
+
+def _worth(interval: Interval, is_held: bool) -> Interval:
+    """Return an interval whose held velocity is trusted as little as one across a gap."""
+    return dataclasses.replace(interval, is_gap=True) if is_held else interval

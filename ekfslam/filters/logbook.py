@@ -11,6 +11,7 @@ from ekfslam.data.interval import Interval
 from ekfslam.filters.correction import Correction
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.log import Log
+from ekfslam.filters.prediction import Prediction
 from ekfslam.models.process import Measured
 from ekfslam.models.process.velocities import mean_velocity
 
@@ -60,20 +61,25 @@ class LogBook:
             "velocity_is_biased": [np.empty(0, dtype=bool)],
         }
         self._landmarks = self._observations = 0
-        self.predicted(start, Interval.of_one(np.zeros(6), 0.0), start.coordinates)
+        self._add_frame(start, start.motion.interval, start.coordinates)
 
-    def predicted(self, now: Estimate, interval: Interval, departed: Array) -> None:
-        """Add a frame, reached by a prediction over an interval from coordinates (body,)."""
+    def predicted(self, now: Estimate, interval: Interval, found: Prediction) -> None:
+        """Add a frame, reached by a prediction over an interval."""
+        if found.measured is not None:
+            self._measured(found.measured)
+        self._add_frame(now, interval, found.departed)
+
+    def _add_frame(self, now: Estimate, interval: Interval, departed: Array) -> None:
         T, coordinates = now.T_imu_world, now.coordinates.copy()
         values = {
             "twist": mean_velocity(interval),
-            "tau_s": now.tau_s,
+            "tau_s": interval.tau_s,
             "imu_twist": now.imu_twist,
             "seen_twist": now.imu_twist,
-            "T_departed": now.T_departed,
+            "T_departed": now.motion.T_departed,
             "T_predicted": T,
             "T_linear": T,
-            "T_linear_before": now.T_departed,
+            "T_linear_before": now.motion.T_departed,
             "T_updated": T,
             "departed": departed,
             "linear": coordinates,
@@ -89,8 +95,8 @@ class LogBook:
         for name, value in values.items():
             self._frames[name][-1] = value
 
-    def measured(self, rows: Measured) -> None:
-        """Measurements of the velocities that lead to the next frame."""
+    def _measured(self, rows: Measured) -> None:
+        """Add measurements of blocks during the interval to the next frame."""
         self._lists["velocity_frame"].append(np.full(len(rows.axis), len(self._frames["tau_s"])))
         for field in fields(rows):
             self._lists[f"velocity_{field.name}"].append(getattr(rows, field.name))
@@ -100,12 +106,14 @@ class LogBook:
         table, slot = now.table, found.slot
         follows = (table.last_step[slot] == now.step - 1) & (now.model.track_error is not None)
         previous = np.where(follows, table.last_observation[slot], -1)
-        self._observed(now.step, table.log_row[slot], found.measured, found.variance, found.position_m, previous)
+        linear, clone = found.linear, now.model.layout.clones.get("pose")
+        position_m = linear.position_m[slot]
+        self._observed(now.step, table.log_row[slot], found.measured, found.variance, position_m, previous)
         self.amend(
-            seen_twist=now.imu_twist,
-            linear=found.linear.copy(),
-            T_linear=found.T_linear,
-            T_linear_before=found.T_linear_before,
+            seen_twist=linear.imu_twist,
+            linear=found.coordinates.copy(),
+            T_linear=linear.values["pose"],
+            T_linear_before=now.motion.T_departed if clone is None else linear.values[clone],
         )
 
     def started(self, ids: IntArray, positions_m: Array, *views: tuple[int, Array, Array]) -> IntArray:

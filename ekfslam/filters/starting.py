@@ -7,6 +7,8 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.logbook import LogBook
+from ekfslam.filters.observing import moment
+from ekfslam.filters.retraction import retract
 from ekfslam.filters.waiting import Waiting
 
 
@@ -25,14 +27,14 @@ def start(e: Estimate, log: LogBook, waiting: Waiting | None, frame: int, ids: I
     """
     if waiting is not None:
         return _start_after_waiting(e, log, waiting, frame, ids, rows)
-    error, now = e.model.track_error, e.moment()
+    error, now = e.model.track_error, moment(e, e.mean)
     q, has_depth = e.model.inverted(now, rows)
     ids, rows, q = ids[has_depth], rows[has_depth], q[has_depth]
     if len(ids):
         none = np.zeros(len(ids), dtype=np.int64)
         variance = e.sensor.variance(rows) if error is None else error.absolute_variance(none)
-        moment = now.linearised_at(e.variant.linear(now.T_imu_world, e.T_predicted))
-        positions, G, covariance = e.model.initialise(moment, q, variance)
+        linear = now.linearised_at(e.variant.linear(now.T_imu_world, e.motion.T_predicted))
+        positions, G, covariance = e.model.initialise(linear, q, variance)
         e.gaussian.augment(G, covariance)
         _append(e, log, frame, ids, positions, rows, (e.step, rows, variance))
     return has_depth
@@ -50,7 +52,7 @@ def _start_after_waiting(
         _append(e, log, frame, ids[found.which], found.position_m, now, *views)
         solution = e.gaussian.solve_body(found.H, found.residual, np.ones(len(found.residual)), e.step)
         e.gaussian.apply(solution)
-        e.retract(solution.done.correction)
+        retract(e, solution.done.correction)
     waiting.move_on(e, ids[~found.which], rows[~found.which])
     return found.which
 

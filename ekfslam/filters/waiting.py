@@ -19,6 +19,7 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate
+from ekfslam.filters.observing import moment
 from ekfslam.geometry import se3
 from ekfslam.models.model import Moment
 from ekfslam.models.sensors.base import DelayedSensor
@@ -98,8 +99,8 @@ class Waiting:
 
     def _views(self, e: Estimate, position: Array, then: Array, now: Array) -> tuple[Array, Array, Array]:
         """Whitened rows over blocks (k, 2d, seen) and landmark (k, 2d, 3), and right sides (k, 2d), of both views."""
-        T_anchor, present = e.values["anchor"], e.moment()
-        T_linear = e.variant.linear(present.T_imu_world, e.T_predicted)
+        T_anchor, present = e.values["anchor"], moment(e, e.mean)
+        T_linear = e.variant.linear(present.T_imu_world, e.motion.T_predicted)
         anchor = Moment(T_anchor, e.variant.linear(T_anchor, self._T_linear), present.calibration, present.twist)
         present = present.linearised_at(T_linear)
         views = (
@@ -126,4 +127,4 @@ class Waiting:
         Phi[layout["anchor"], layout["anchor"]], Phi[layout["anchor"], layout["pose"]] = 0.0, np.eye(6)
         e.gaussian.propagate(Phi, np.zeros_like(Phi))
         e.values = {**e.values, "anchor": e.T_imu_world}
-        self._ids, self._rows, self._step, self._T_linear = ids, rows, e.step, e.T_predicted
+        self._ids, self._rows, self._step, self._T_linear = ids, rows, e.step, e.motion.T_predicted

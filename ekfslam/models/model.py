@@ -22,6 +22,9 @@ from ekfslam.models.process import MakeProcess, Measured, Process, Step, Velocit
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
 
+# Calibration parameters that are as given.
+GIVEN = np.zeros(9)
+
 
 @dataclass(frozen=True)
 class Moment:
@@ -126,6 +129,10 @@ class Model:
     def calibration(self) -> Calibration | None:
         """The calibration, where it is in the state."""
         return next((block for block in self.blocks if isinstance(block, Calibration)), None)
+
+    def parameters(self, values: Values) -> Array:
+        """Return the calibration parameters (9,), which are 0 if they are not in the state."""
+        return values["calibration"] if self.calibration is not None else GIVEN
 
     @property
     def has_time_offset(self) -> bool:

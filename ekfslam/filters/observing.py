@@ -1,0 +1,75 @@
+"""Equations (3), (4), (9), (10) and (11): the rows of a frame's observations, linearised at a given mean.
+
+Nothing here writes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.filters.estimate import Estimate, Mean
+from ekfslam.filters.gaussian import Rows
+from ekfslam.models.model import Moment, Seen
+
+
+def moment(e: Estimate, at: Mean) -> Moment:
+    """Return the moment of the present frame."""
+    shared = {block.name: at.values[block.name] for block in e.model.shared}
+    T = at.values["pose"]
+    T_linear = e.variant.linear(T, e.motion.T_predicted)
+    return Moment(T, T_linear, e.model.parameters(at.values), at.imu_twist, shared, e.motion.way_m)
+
+
+def moment_before(e: Estimate, at: Mean) -> Moment:
+    """Return the moment of the frame before, as far as clones know it."""
+    clones = e.model.layout.clones
+    T = at.values[clones["pose"]]
+    T_linear = e.variant.linear(T, e.motion.T_predicted_before)
+    shared = {block.name: at.values[clones.get(block.name, block.name)] for block in e.model.shared}
+    return Moment(T, T_linear, e.model.parameters(at.values), e.motion.imu_twist_before, shared)
+
+
+def observe(e: Estimate, at: Mean, slot: IntArray, measured: Array) -> tuple[Seen, Rows]:
+    """Return landmarks at the slots (k,) as the sensor sees them, and the rows of what it ``measured`` (k, d).
+
+    If tracks have errors, eq. (10), an observation that follows another one is the difference from it.
+    """
+    model, table = e.model, e.table
+    positions = at.position_m[slot]
+    linear = e.variant.linear(positions, table.initial_m[slot])
+    error = model.track_error
+    is_difference = (table.last_step[slot] == e.step - 1) & (error is not None)
+    seen = model.see(moment(e, at), positions, linear, is_difference=is_difference)
+    H_x, H_m, residual = seen.H_x, seen.H_m, measured - seen.z
+    if error is None:
+        return seen, Rows(slot, H_x, H_m, residual, e.sensor.variance(measured))
+    variance = error.absolute_variance(e.step - table.first_step[slot])
+    follows = np.flatnonzero(is_difference)
+    if len(follows):
+        before = model.see(moment_before(e, at), positions[follows], linear[follows], model.layout.clones["pose"])
+        rows_before = table.seen_rows[slot[follows]]
+        H_x, H_m = H_x.copy(), H_m.copy()
+        residual[follows] -= error.memory * (rows_before - before.z)
+        H_x[follows] -= error.memory * before.H_x
+        H_m[follows] -= error.memory * before.H_m
+        variance[follows] = error.step_variance(measured[follows] - rows_before)
+    return seen, Rows(slot, H_x, H_m, residual, variance)
+
+
+def measurement_jacobian(e: Estimate, ids: IntArray) -> sp.csr_array:
+    """Return the full-width H (3k, b+3n) of the sensor's rows of active landmarks ``ids`` (k,), for inspection.
+
+    Raises:
+        KeyError: An id is not active.
+    """
+    slot = e.slots(ids)
+    seen = e.model.see(moment(e, e.mean), e.positions_m[slot], e.linear_positions_m[slot])
+    k, d, width = seen.H_x.shape
+    row = np.broadcast_to(np.arange(k * d).reshape(k, d, 1), (k, d, width + 3))
+    body = np.broadcast_to(np.arange(width), (k, d, width))
+    own = np.broadcast_to((e.gaussian.body + 3 * slot)[:, None, None] + np.arange(3), (k, d, 3))
+    columns = np.concatenate([body, own], axis=-1)
+    values = np.concatenate([seen.H_x, seen.H_m], axis=-1)
+    return sp.csr_array((values.ravel(), (row.ravel(), columns.ravel())), shape=(k * d, len(e.P)))

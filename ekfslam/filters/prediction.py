@@ -1,0 +1,105 @@
+"""Equations (1) and (2): one interval.
+
+`predict` writes blocks, coordinates, covariance, motion and step of an estimate. Landmarks stay as they are, unless
+inputs measure a block.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import scipy.sparse as sp
+
+from ekfslam.arrays import Array
+from ekfslam.data.interval import Interval
+from ekfslam.errors import ConfigError
+from ekfslam.filters.estimate import Estimate, Motion
+from ekfslam.filters.reports import log_density
+from ekfslam.filters.retraction import retract
+from ekfslam.models.model import Transition
+from ekfslam.models.process import Measured
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a prediction did besides moving the estimate.
+
+    Args:
+        departed: (body,) coordinates before the process moved its blocks.
+        measured: Measurements of blocks during the interval; None: there were none.
+        log_likelihood: Log-density of these; 0 without.
+    """
+
+    departed: Array
+    measured: Measured | None
+    log_likelihood: float
+
+
+def predict(e: Estimate, interval: Interval, also: Measured | None) -> Prediction:
+    """Predict over an interval: clones and walking blocks, then measurements of blocks, then the process.
+
+    Args:
+        e: Moves.
+        interval: The inputs.
+        also: Measurements by further sensors.
+
+    Raises:
+        ConfigError: Measurements by further sensors of a velocity that is not in the state.
+    """
+    model, process = e.model, e.model.process
+    if also is not None and not process.estimates_velocity:
+        raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
+    way_m = process.way_m(e.values, interval)
+    moved = model.wander(e.values, interval.tau_s, way_m)
+    e.coordinates = e.coordinates.copy()  # the log has those after the update
+    if moved is not None:
+        e.coordinates, e.values = moved.Phi @ e.coordinates, moved.values
+    moved, measured, log_likelihood = _measure(e, moved, interval, also)
+    step = model.step(e.values, interval, e.linear_T_imu_world, e.variant.first_estimates)
+    whole = step if moved is None else step.after(moved)
+    e.gaussian.propagate(whole.Phi, whole.Q)
+    departed, T_departed = e.coordinates, e.T_imu_world
+    e.coordinates, e.values = model.coordinates_after(step, departed), step.values
+    e.motion = Motion(T_departed, e.T_imu_world, e.motion.T_predicted, interval, way_m, e.imu_twist)
+    e.imu_twist, e.step = step.imu_twist, e.step + 1
+    e.updated_pose = model.layout.clones.get("pose") if e.updated_pose == "pose" else None
+    return Prediction(departed, measured, log_likelihood)
+
+
+def _measure(
+    e: Estimate, moved: Transition | None, interval: Interval, also: Measured | None
+) -> tuple[Transition | None, Measured | None, float]:
+    """Condition on measurements of blocks by the inputs; the first inputs start blocks instead.
+
+    Returns:
+        What the covariance has not followed yet of the transition so far; the measurements and their log-density.
+    """
+    process, is_first = e.model.process, e.step == 0
+    parts = [some for some in (process.measured(interval, is_first), also) if some is not None]
+    measured = Measured.concatenate(parts) if parts else None
+    if is_first and (start := process.start(e.values, interval)) is not None:
+        begun = e.model.widened(e.values, start)
+        moved = begun if moved is None else begun.after(moved)
+        e.values = moved.values
+        for name, value in start.values.items():
+            e.coordinates[e.model.layout[name]] = value
+        parts = [] if also is None else [also]
+    if not parts:
+        return moved, measured, 0.0
+    if moved is not None:
+        e.gaussian.propagate(moved.Phi, moved.Q)
+    used = Measured.concatenate(parts)
+    H = process.jacobian(used)
+    residual = used.value - H @ e.coordinates
+    solution = e.gaussian.solve_body(H, residual, used.std**2, e.step + 1)
+    e.gaussian.apply(solution)
+    retract(e, solution.done.correction)
+    return None, measured, log_density(solution.done.nis, solution.done.log_det, len(residual))
+
+
+def transition_jacobian(e: Estimate, interval: Interval) -> sp.csr_array:
+    """Return the full-width F (b+3n, b+3n) of a step, identity but for the rows of the body, for inspection."""
+    step = e.model.step(e.values, interval, e.linear_T_imu_world, e.variant.first_estimates)
+    full = sp.lil_array(sp.identity(len(e.P)))
+    full[: len(step.Phi), : len(step.Phi)] = step.Phi
+    return sp.csr_array(full)
