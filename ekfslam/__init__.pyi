@@ -10,16 +10,13 @@ from .config import (
     PosteriorConfig,
     TruthConfig,
 )
-from .data.images import ImageRecording, open_images
+from .data.images import ImageRecording
 from .data.inputs import InertialNoise, InertialSamples, Velocities
 from .data.noise import Noise
-from .data.readers import (
-    Reader,
-    Source,
-    attach_truth,
-    open_kitti_raw,
-    write_sequence,
-)
+from .data.opening import attach_truth, open_images
+from .data.readers.hdf5 import write_sequence
+from .data.readers.kitti_raw import open_kitti_raw
+from .data.readers.registry import Reader, Source
 from .data.sequence import Observations, Sequence, Truth
 from .data.velocities import attach_velocities
 from .errors import EkfslamError

@@ -16,9 +16,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from ekfslam import files
+from ekfslam import files, open_sequence
 from ekfslam.arrays import Array
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.trajectory import absolute_trajectory_error
 from ekfslam.figures.style import pngs

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from common import argument_parser, swept
 
-from ekfslam.data.readers import open_sequence
+from ekfslam import open_sequence
 from ekfslam.reports import compare_all
 from ekfslam.studies.executors import open_executor
 from ekfslam.studies.sweep import Recording, Sweep

@@ -29,9 +29,8 @@ from common import argument_parser, has_recordings, trajectory_errors, truth_of,
 from matplotlib.figure import Figure
 
 import ekfslam
+from ekfslam import attach_truth, open_images
 from ekfslam.arrays import Array
-from ekfslam.data.images import open_images
-from ekfslam.data.readers import attach_truth
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.velocities import attach_velocities
 from ekfslam.evaluation.summary import summarise

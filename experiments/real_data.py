@@ -28,8 +28,8 @@ from common import (
 )
 from matplotlib.figure import Figure
 
+from ekfslam import open_sequence
 from ekfslam.arrays import Array
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.evaluation.tables import document, markdown_table, number
 from ekfslam.figures.style import ORANGE, REFERENCE, marker_of, styled

@@ -35,8 +35,9 @@ from support.bags import (
     write,
 )
 
-from ekfslam.data.images import ImageRecording, open_images
-from ekfslam.data.images.messages import message_types
+from ekfslam import open_images
+from ekfslam.data.images import ImageRecording
+from ekfslam.data.readers.messages import message_types
 from ekfslam.errors import (
     CalibrationError,
     EkfslamError,

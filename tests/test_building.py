@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import ekfslam
-from ekfslam import Observations, Sequence, StereoCamera, Truth, attach_velocities
+from ekfslam import Observations, Sequence, StereoCamera, Truth, attach_velocities, open_sequence
 from ekfslam.cli import main
 from ekfslam.cli.options import _stretch
-from ekfslam.data.images.pairs import ImageRecording, PairCalibration
-from ekfslam.data.readers import open_sequence, write_sequence
+from ekfslam.data.images import ImageRecording, PairCalibration
+from ekfslam.data.readers import write_sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import (
     ConfigError,

@@ -11,9 +11,8 @@ import pytest
 from support.helpers import SUMMARY_KEYS
 from support.recordings import ece276a_fields, utias_fields, write_mat, write_npz
 
-from ekfslam import reports
+from ekfslam import open_sequence, reports
 from ekfslam.cli import main
-from ekfslam.data.readers import open_sequence
 from ekfslam.errors import FilterError
 from ekfslam.storage.archive import read_archive
 

@@ -22,8 +22,8 @@ from support.recordings import (
     write_npz,
 )
 
+from ekfslam import open_sequence
 from ekfslam.data.dense import UNSEEN
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import (

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.recordings import FRAMES, HEADER, ece276a_fields, stamps, write_npz
 
-from ekfslam.data.readers import open_sequence
+from ekfslam import open_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import DataError, NonFiniteError, StampError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3

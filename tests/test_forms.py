@@ -5,8 +5,8 @@ import pytest
 from support.everything import BLOCKS, CALIBRATION, PRIOR, with_everything
 from support.running import WHOLE
 
+from ekfslam import open_sequence
 from ekfslam.config import Config
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.filters.conditional import ConditionalGaussian
 from ekfslam.filters.joint import JointEKF

@@ -8,8 +8,8 @@ from support.everything import BLOCKS, CALIBRATION, EVERYTHING, PRIOR, with_ever
 from support.helpers import truth_error
 from support.running import WHOLE
 
+from ekfslam import open_sequence
 from ekfslam.config import Config
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Truth
 from ekfslam.data.simulate import builtin
 from ekfslam.filters.joint import JointEKF

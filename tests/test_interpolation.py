@@ -7,9 +7,10 @@ import pytest
 from support.helpers import synthetic_result, synthetic_sequence
 from support.recordings import ece276a_fields, write_npz
 
+from ekfslam import open_sequence
 from ekfslam.cli import main
 from ekfslam.data.interpolation import SHORTEST, interpolated_intervals, known_intervals, stretches
-from ekfslam.data.readers import open_sequence, read_sequence, write_sequence
+from ekfslam.data.readers import read_sequence, write_sequence
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.evaluation.consistency import measured_truth, pose_nees
 from ekfslam.evaluation.relative import relative_pose_nees

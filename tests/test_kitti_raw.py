@@ -27,9 +27,10 @@ from support.kitti_raw import (
 )
 from support.recordings import ece276a_fields, stamps, write_npz
 
+from ekfslam import open_kitti_raw, open_sequence
 from ekfslam.cli import main
-from ekfslam.data.readers import open_kitti_raw, open_sequence, read_sequence, write_sequence
-from ekfslam.data.readers.kitti_raw import PACKET_FIELDS
+from ekfslam.data.readers import read_sequence, write_sequence
+from ekfslam.data.readers.oxts import PACKET_FIELDS
 from ekfslam.data.sequence import Observations
 from ekfslam.errors import (
     CalibrationError,

@@ -44,9 +44,6 @@ UPWARDS = {
 CIRCLES = {
     "ekfslam.data.building",
     "ekfslam.data.dense",
-    "ekfslam.data.images",
-    "ekfslam.data.images.registry",
-    "ekfslam.data.readers",
     "ekfslam.data.sequence",
 }
 

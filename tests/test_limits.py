@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 from support.recordings import ece276a_fields, write_npz
 
-from ekfslam import limits
+from ekfslam import limits, open_sequence
 from ekfslam.cli import main
 from ekfslam.config import Config
-from ekfslam.data.readers import open_sequence, write_sequence
+from ekfslam.data.readers import write_sequence
 from ekfslam.data.readers.matfile import parse_mat
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError, EkfslamError, UnknownFormatError

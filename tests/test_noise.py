@@ -10,10 +10,11 @@ from support.jacobians import central
 from support.reference import D, circle_dot, homogeneous, jacobian_of_pi, small_world, stereo_matrix
 from support.running import WHOLE, seeds
 
+from ekfslam import open_sequence
 from ekfslam.config import Config, FilterConfig, NoiseConfig, PosteriorConfig
 from ekfslam.data.interval import Interval
 from ekfslam.data.noise import TrackError
-from ekfslam.data.readers import open_sequence, write_sequence
+from ekfslam.data.readers import write_sequence
 from ekfslam.data.sequence import Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.filters.joint import JointEKF

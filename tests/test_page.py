@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from support.helpers import synthetic_result, synthetic_sequence
 
+from ekfslam import open_sequence
 from ekfslam.cli import main
-from ekfslam.data.readers import open_sequence
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.evaluation.honesty import judge

@@ -11,8 +11,8 @@ from support.helpers import run_joint
 from support.reference import small_world
 from support.running import WHOLE
 
+from ekfslam import open_sequence
 from ekfslam.config import CalibrationConfig, Config, FilterConfig, NoiseConfig, PosteriorConfig
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.data.stretches import cut

@@ -27,8 +27,9 @@ from support.recordings import (
     write_npz,
 )
 
+from ekfslam import open_sequence
 from ekfslam.data import readers
-from ekfslam.data.readers import open_sequence, read_sequence, write_sequence
+from ekfslam.data.readers import read_sequence, write_sequence
 from ekfslam.data.readers.hdf5 import read_sequence_fields, read_sequence_group, write_sequence_group, write_truth_group
 from ekfslam.data.readers.matfile import parse_mat
 from ekfslam.data.readers.text import parse_table
@@ -295,19 +296,24 @@ def test_mat_files_of_either_byte_order_and_every_number_type_are_parsed():
 # Adding a format, and the parser of text
 
 FORMAT = """
-from ekfslam.data.readers.registry import Poses, Reader, TruthReader
+from ekfslam.data.readers.poses import Poses
+from ekfslam.data.readers.registry import Reader
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
 from ekfslam.data.simulate import builtin
 
 READER = Reader("mine", "a .mine file", lambda source: source.head.startswith(b"MINE"), lambda source: builtin("loop"))
 
 
-def read(path, sequence):
-    table = parse_table(read_lines(path, ""), path, columns=2)
-    return Poses(sequence.truth.T_world_imu[: len(table.values)], table.values[:, 0], (path,))
+def truth(source, sequence):
+    table = parse_table(read_lines(source.path, ""), source.path, columns=2)
+    return Poses(sequence.truth.T_world_imu[: len(table.values)], table.values[:, 0], (source.path,))
 
 
-TRUTH_READER = TruthReader("mine", "2 numbers a line (mine)", lambda path: len(first_row(path).split()) == 2, read)
+def is_truth(source):
+    return len(first_row(source.path).split()) == 2
+
+
+TRUTH = Reader("mine", "2 numbers a line (mine)", is_truth, truth=truth)
 """
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from support.helpers import STEP_S, erring_truth, synthetic_result, synthetic_sequence
 
+from ekfslam import open_sequence
 from ekfslam.config import Config, PosteriorConfig
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Truth
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import ArchiveError

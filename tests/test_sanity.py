@@ -10,8 +10,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from ekfslam import attach_truth, open_sequence
 from ekfslam.cli import main
-from ekfslam.data.readers import attach_truth, open_sequence, write_sequence
+from ekfslam.data.readers import write_sequence
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import NonFiniteError

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from support.recordings import FRAMES, TRACKS, ece276a_fields, utias_fields, write_mat, write_npz
 
-from ekfslam import errors
-from ekfslam.data.readers import open_sequence, write_sequence
+from ekfslam import errors, open_sequence
+from ekfslam.data.readers import write_sequence
 from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import (

@@ -29,8 +29,8 @@ from support.kitti_raw import write_drive
 from support.npy import Runs, write_npy
 from support.recordings import HEADER
 
-from ekfslam.data.images import ImageRecording, open_images
-from ekfslam.data.readers import open_kitti_raw
+from ekfslam import open_images, open_kitti_raw
+from ekfslam.data.images import ImageRecording
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import (
     CalibrationError,

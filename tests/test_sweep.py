@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from support.running import processes
 
+from ekfslam import open_sequence
 from ekfslam.cli import main
 from ekfslam.config import Config
-from ekfslam.data.readers import open_sequence
 from ekfslam.errors import ArchiveError, ConfigError
 from ekfslam.evaluation.summary import KEYS, summarise
 from ekfslam.figures.sweep import plot_sweep

@@ -10,10 +10,10 @@ from support.reference import small_world
 from support.running import WHOLE
 from support.same import assert_same
 
+from ekfslam import open_sequence
 from ekfslam.cli import main
 from ekfslam.config import Config, FilterConfig, HygieneConfig
 from ekfslam.data.hygiene import RULES, clean_tracks, jumps
-from ekfslam.data.readers import open_sequence
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.data.tracks import cut_tracks, inspect_tracks, repeated_frames, successive

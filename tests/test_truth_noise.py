@@ -9,9 +9,10 @@ import pytest
 from support.helpers import erring_truth, synthetic_result, synthetic_sequence
 from support.recordings import ece276a_fields, utias_fields, write_mat, write_npz
 
+from ekfslam import open_sequence
 from ekfslam.cli import main
 from ekfslam.config import Config, TruthConfig
-from ekfslam.data.readers import open_sequence, write_sequence
+from ekfslam.data.readers import write_sequence
 from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE, TruthNoise
 from ekfslam.errors import ConfigError, DataError
 from ekfslam.evaluation.consistency import (

@@ -10,9 +10,10 @@ from support.helpers import run_joint, tracked
 from support.reference import small_world
 from support.running import WHOLE
 
+from ekfslam import open_sequence
 from ekfslam.cli import main
 from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig
-from ekfslam.data.readers import open_sequence, write_sequence
+from ekfslam.data.readers import write_sequence
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError, EmptyTracksError

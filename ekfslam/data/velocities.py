@@ -14,14 +14,13 @@ from typing import Any, TypeVar, cast, get_args
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
-from ekfslam.data.images.pairs import ImageRecording
-from ekfslam.data.images.registry import image_readers
+from ekfslam.data.images import ImageRecording
 from ekfslam.data.interpolation import attributes_of_part, interpolation_attributes, known_intervals
 from ekfslam.data.readers.fields import checksum
-from ekfslam.data.readers.registry import Lateral, Reader, Source, discovered, listed
-from ekfslam.data.readers.text import Table, first_row, parse_table, read_lines
+from ekfslam.data.readers.registry import Lateral, Source, expected, read_as
+from ekfslam.data.readers.text import first_row, parse_table, read_lines
 from ekfslam.data.sequence import WITHOUT_VELOCITIES, Sequence, VelocityFrame
-from ekfslam.errors import ConfigError, LostDataError, StampError, UnknownFormatError
+from ekfslam.errors import ConfigError, LostDataError, UnknownFormatError
 from ekfslam.geometry import se3
 
 Recording = TypeVar("Recording", Sequence, ImageRecording)
@@ -113,15 +112,14 @@ def read_velocities(path: Path, lateral: Lateral = "corrected") -> Velocities:
     row = first_row(path) if path.is_file() else ""
     if len(_words(row)) == len(COLUMNS):
         return _of_text(path)
-    source = Source.at(path, "corrected", lateral)
-    tracks = next((reader for reader in discovered(Reader) if reader.recognises(source)), None)
-    if tracks is not None:
-        return _of_recording(tracks.open(source), str(path))
-    images = next((reader for reader in image_readers() if reader.recognises(source)), None)
-    if images is not None:
-        return _of_recording(images.open(source), str(path))
-    problem = source.problem or "unknown content"
-    raise UnknownFormatError(f"{path}: no velocities ({problem}); {listed(discovered(Reader))}, or {EXPECTED}")
+    source = Source.at(path, lateral=lateral)
+    recording: Sequence | ImageRecording | None = read_as(source, "tracks")
+    if recording is None:
+        recording = read_as(source, "images")
+    if recording is None:
+        problem = source.problem or "unknown content"
+        raise UnknownFormatError(f"{path}: no velocities ({problem}); {expected('tracks', 'images')}, or {EXPECTED}")
+    return _of_recording(recording, str(path))
 
 
 def _words(row: str) -> list[str]:
@@ -143,17 +141,11 @@ def _of_text(path: Path) -> Velocities:
     table = parse_table(rows, path, columns=len(COLUMNS), separator=separator)
     if not len(table.values):
         raise UnknownFormatError(f"{path}: holds no velocities; expected {EXPECTED}")
-    _require_increasing(table)
+    table.require_increasing()
     frame = cast(VelocityFrame, stated or "imu")
     notes = () if stated else (f"{path.name} does not say in which frame its velocities are: they are taken as imu.",)
     attributes: dict[str, str | int | float] = {"velocities_sha256": checksum(path)}
     return Velocities(str(path), table.values[:, 0], table.values[:, 1:], frame, None, attributes, notes)
-
-
-def _require_increasing(table: Table) -> None:
-    backwards = np.diff(table.values[:, 0]) <= 0
-    if backwards.any():
-        raise StampError("the stamp does not increase", **table.where(int(np.argmax(backwards)) + 1))
 
 
 def _of_recording(recording: Sequence | ImageRecording, path: str) -> Velocities:

@@ -8,7 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from ekfslam.data.images.pairs import Image, ImageRecording
+from ekfslam.data.images import Image, ImageRecording
 from ekfslam.data.sequence import Sequence
 from ekfslam.figures.style import BAND_ALPHA, BLUE, GREY, SERIES, ZERO, styled
 from ekfslam.frontend.rectify import rectification

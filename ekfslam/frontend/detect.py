@@ -6,7 +6,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import FrontEndConfig
-from ekfslam.data.images.pairs import Image
+from ekfslam.data.images import Image
 from ekfslam.frontend.opencv import opencv
 
 

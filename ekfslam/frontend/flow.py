@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
-from ekfslam.data.images.pairs import Image
+from ekfslam.data.images import Image
 from ekfslam.frontend.opencv import opencv
 
 _STEPS, _LEAST_STEP_PX, _LEAST_EIGENVALUE = 30, 0.01, 1e-4

@@ -6,7 +6,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import FrontEndConfig
-from ekfslam.data.images.pairs import Image
+from ekfslam.data.images import Image
 from ekfslam.frontend.flow import flow, inside, returns
 from ekfslam.frontend.opencv import opencv
 

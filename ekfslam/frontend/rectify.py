@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, Float32Array
-from ekfslam.data.images.pairs import Distortion, Image, PairCalibration
+from ekfslam.data.images import Distortion, Image, PairCalibration
 from ekfslam.errors import CalibrationError
 from ekfslam.frontend.opencv import opencv
 from ekfslam.geometry import se3

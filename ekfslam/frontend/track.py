@@ -9,7 +9,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FrontEndConfig
-from ekfslam.data.images.pairs import ImageRecording
+from ekfslam.data.images import ImageRecording
 from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations, Sequence
 from ekfslam.errors import EmptyTracksError
 from ekfslam.frontend.opencv import one_thread

@@ -9,7 +9,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import FrontEndConfig
-from ekfslam.data.images.pairs import Image
+from ekfslam.data.images import Image
 from ekfslam.frontend.detect import corners, eroded, spread, without
 from ekfslam.frontend.features import Features, Followed, follow
 from ekfslam.frontend.flow import inside

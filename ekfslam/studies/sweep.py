@@ -45,7 +45,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.config import MODES, VARIANTS, Config, FrontEndConfig
-from ekfslam.data.readers import BUILTIN
+from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.sequence import Sequence, stretch
 from ekfslam.errors import ArchiveError, ConfigError, EkfslamError, UnknownFormatError
 from ekfslam.evaluation.summary import KEYS, summarise

@@ -14,7 +14,7 @@ from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2 import StoragePlugin
 from scipy.spatial.transform import Rotation
 
-from ekfslam.data.images.messages import message_types
+from ekfslam.data.readers.messages import message_types
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import R_CAM_BODY
 

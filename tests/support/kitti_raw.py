@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ekfslam.data.readers.kitti_raw import PACKET_FIELDS
+from ekfslam.data.readers.oxts import PACKET_FIELDS
 from ekfslam.geometry import se3
 
 FRAMES = 70  # so that six lost stamps in a row are too many, but not too large a share

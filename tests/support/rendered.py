@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import map_coordinates, zoom
 
-from ekfslam.data.images.pairs import Distortion, ImageRecording, PairCalibration
+from ekfslam.data.images import Distortion, ImageRecording, PairCalibration
 from ekfslam.data.sequence import Truth
 from ekfslam.geometry import motion, se3
 from ekfslam.geometry.lens import equidistant, radtan

@@ -11,7 +11,7 @@ from ekfslam import hdf5, kernels
 from ekfslam.cli.options import DEFAULT_DATA, add_data_options, open_data, table
 from ekfslam.config import Config
 from ekfslam.data.interpolation import stretches
-from ekfslam.data.readers import BUILTIN
+from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.evaluation.sanity import inspect_sequence

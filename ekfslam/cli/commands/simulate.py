@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ekfslam import files
 from ekfslam.cli.options import DEFAULT_DATA, add_force, require_ours
-from ekfslam.data.readers import BUILTIN
 from ekfslam.data.readers.hdf5 import is_recording_of, sequence_image
+from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.simulate import builtin
 
 EXAMPLES = ("simulate city --out city.h5", "simulate 'loop?seed=7' --out loop.h5")

@@ -8,9 +8,8 @@ from pathlib import Path
 from ekfslam import files
 from ekfslam.cli.options import add_force, add_place_options, require_ours
 from ekfslam.config import Config
-from ekfslam.data.images import open_images
+from ekfslam.data.opening import attach_truth, open_images
 from ekfslam.data.readers.hdf5 import is_recording_of, sequence_image
-from ekfslam.data.readers.truth import attach_truth
 from ekfslam.data.velocities import attach_velocities
 from ekfslam.errors import UnknownFormatError
 from ekfslam.figures.style import png

@@ -1,4 +1,7 @@
-"""The .npy recordings of the course from 2025 on: a pickled dictionary, with two cameras in an IMU frame."""
+"""The course data from 2025 on: a pickled dictionary in .npy, with velocities and two cameras in an IMU frame.
+
+It has tracks (``features``), or images in a second file (``dataset02_imgs.npy`` for ``dataset02.npy``).
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.data.dense import flat_observations
+from ekfslam.data.images import Image, ImageRecording, PairCalibration
 from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.readers.ece276a import AS_STORED_NOTE, camera_of, stamps_of
 from ekfslam.data.readers.fields import checksum, require, require_numbers, spelled_as_in
@@ -16,14 +20,14 @@ from ekfslam.data.readers.pickled import MAGIC, read_pickled
 from ekfslam.data.readers.registry import Reader
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, require_rigid
 from ekfslam.data.tracks import inspect_tracks
-from ekfslam.errors import CalibrationError, ExtrinsicsError, ShapeError, UnknownFormatError
+from ekfslam.errors import CalibrationError, ExtrinsicsError, LostDataError, ShapeError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import R_CAM_BODY, StereoCamera
 
 FIELDS = ("v_t", "w_t", "timestamps", "features", "K_l", "K_r", "extL_T_imu", "extR_T_imu")
-EXPECTED = f"expected an .npy file with a dictionary of {', '.join(FIELDS)}"
 IMAGE_FIELDS = ("cam_imgs_L", "cam_imgs_R")
 
+_EXPECTED = f"expected an .npy file with a dictionary of {', '.join(FIELDS)}"
 _EXTRINSICS_NOTE = (
     "The stored extL_T_imu is a pose of the left camera with axes forward, left, up: T_cam_imu = oTr inv(extL_T_imu) "
     "is used, and the distance of both cameras as the baseline."
@@ -34,23 +38,22 @@ def read_ece276a_npy(path: Path) -> Sequence:
     """Read ``v_t w_t`` (T x 3), ``timestamps``, ``features`` (4 x M x T), ``K_l K_r extL_T_imu extR_T_imu``.
 
     ``T_cam_imu = oTr inv(extL_T_imu)`` with the optical axes oTr, and the baseline is the length of the translation of
-    ``inv(extL_T_imu) extR_T_imu``. A pixel row is unseen where it is -1 or NaN.
+    ``inv(extL_T_imu) extR_T_imu``. A pixel row of -1 or NaN means unseen.
 
     Raises:
         UnknownFormatError: The file is damaged, names other things than arrays, or holds another dictionary.
         DataError: A field is missing or malformed; the subclass says how.
     """
-    fields = read_pickled(path, EXPECTED)
+    fields = read_pickled(path, _EXPECTED)
     if "v_t" not in fields:
-        hint = " of images; give the recording beside it" if IMAGE_FIELDS[0] in fields else ""
-        raise UnknownFormatError(f"{path}: an .npy file{hint} with the fields [{', '.join(fields)}]; {EXPECTED}")
+        hint = " of images; give the recording itself" if IMAGE_FIELDS[0] in fields else ""
+        raise UnknownFormatError(f"{path}: an .npy file{hint} with the fields [{', '.join(fields)}]; {_EXPECTED}")
     with spelled_as_in(str(path), {"time_s": "timestamps", "T_cam_imu": "extL_T_imu", "K": "K_l"}):
-        time_s, twist = motion_of(fields)
-        camera, T_cam_imu = _rig(fields)
+        time_s, twist = _motion(fields)
+        camera, T_cam_imu = _rectified_camera(fields)
         if fields.get("features") is None:
             raise ShapeError("this field is missing: the recording has images only, see `track`", field="features")
-        frames = len(time_s)
-        features = require_numbers(fields, "features", (4, None, frames), finite=False)
+        features = require_numbers(fields, "features", (4, None, len(time_s)), finite=False)
         observations, found = flat_observations(features, frame_axis=2, field="features")
         return Sequence(
             name=path.stem,
@@ -61,17 +64,53 @@ def read_ece276a_npy(path: Path) -> Sequence:
             T_cam_imu=T_cam_imu,
             observations=observations,
             velocity_frame="level",
-            notes=(
-                *notes_of(twist),
-                *found,
-                *inspect_tracks(observations, twist).notes,
-            ),
-            attributes=attributes_of(path, twist),
+            notes=(*_notes(twist), *found, *inspect_tracks(observations, twist).notes),
+            attributes=_attributes(path, twist, READER.name),
         )
 
 
-def motion_of(fields: dict[str, Any]) -> tuple[Array, Array]:
-    """Stamps (T,) and velocities (T, 6) of a recording, whose velocities are T x 3 or 3 x T."""
+def open_ece276a_images(path: Path) -> ImageRecording | None:
+    """Open lists of images ``cam_imgs_L cam_imgs_R``, all in memory, with the velocities and calibration.
+
+    Args:
+        path: Path of the recording or of its images; the result is None unless both exist.
+
+    Raises:
+        UnknownFormatError: A file is damaged, names other things than arrays, or holds another dictionary.
+        LostDataError: There are more or fewer images than stamps.
+        DataError: A field is missing or malformed; the subclass says how.
+    """
+    name = path.stem.removesuffix("_imgs")
+    recording, images = path.with_name(f"{name}.npy"), path.with_name(f"{name}_imgs.npy")
+    if not (recording.is_file() and images.is_file()):
+        return None
+    fields = read_pickled(recording, _EXPECTED)
+    pictures = read_pickled(images, f"expected a dictionary of {' and '.join(IMAGE_FIELDS)}")
+    with spelled_as_in(str(recording)):
+        time_s, twist = _motion(fields)
+        T_cam_imu, T_right_left = _extrinsics(fields)
+        K_left, K_right = (require_numbers(fields, name, (3, 3)) for name in ("K_l", "K_r"))
+    with spelled_as_in(str(images)):
+        left, right = (_images(pictures, name, len(time_s)) for name in IMAGE_FIELDS)
+        size = _require_alike(left, right)
+    with spelled_as_in(str(recording), {"K_left": "K_l", "K_right": "K_r", "T_right_left": "extR_T_imu"}):
+        calibration = PairCalibration(K_left, K_right, size, T_right_left)
+    return ImageRecording(
+        name=recording.stem,
+        source=str(recording),
+        time_s=time_s,
+        calibration=calibration,
+        load=lambda frame: (left[frame], right[frame]),
+        T_cam_imu=T_cam_imu,
+        twist=twist,
+        velocity_frame="level",
+        notes=_notes(twist),
+        attributes=_attributes(recording, twist, "ece276a_npy_images"),
+    )
+
+
+def _motion(fields: dict[str, Any]) -> tuple[Array, Array]:
+    """Return stamps (T,) and velocities (T, 6) of a recording, whose velocities are T x 3 or 3 x T."""
     time_s = stamps_of(fields, "timestamps")
     frames = len(time_s)
     velocities = []
@@ -82,23 +121,17 @@ def motion_of(fields: dict[str, Any]) -> tuple[Array, Array]:
     return time_s, np.concatenate(velocities, axis=1)
 
 
-def notes_of(twist: Array) -> tuple[str, ...]:
-    """What was made of the fields that this edition has, tracks or images."""
+def _notes(twist: Array) -> tuple[str, ...]:
     return (_EXTRINSICS_NOTE, LEVEL_VELOCITIES_NOTE, AS_STORED_NOTE, *interpolation_notes(twist))
 
 
-def attributes_of(path: Path, twist: Array) -> dict[str, str | int | float]:
-    """Facts that are kept with every result of this edition."""
-    return {
-        "checksum_sha256": checksum(path),
-        "reader": READER.name,
-        "lateral": "as-stored",
-        **interpolation_attributes(twist),
-    }
+def _attributes(path: Path, twist: Array, reader: str) -> dict[str, str | int | float]:
+    attributes = {"checksum_sha256": checksum(path), "reader": reader, "lateral": "as-stored"}
+    return {**attributes, **interpolation_attributes(twist)}
 
 
-def extrinsics_of(fields: dict[str, Any]) -> tuple[Array, Array]:
-    """``T_cam_imu`` (4, 4) of the left optical frame, and ``T_right_left`` (4, 4) of the optical frames.
+def _extrinsics(fields: dict[str, Any]) -> tuple[Array, Array]:
+    """Return ``T_cam_imu`` (4, 4) of the left optical frame, and ``T_right_left`` (4, 4) of the optical frames.
 
     Raises:
         DataError: A pose is missing or not rigid, or both cameras are at one place.
@@ -113,12 +146,11 @@ def extrinsics_of(fields: dict[str, Any]) -> tuple[Array, Array]:
     return optical @ se3.inverse(left), T_right_left
 
 
-def _rig(fields: dict[str, Any]) -> tuple[StereoCamera, Array]:
-    """Camera and ``T_cam_imu`` of features, which are those of a rectified pair."""
-    T_cam_imu, T_right_left = extrinsics_of(fields)
-    baseline_m = float(np.linalg.norm(T_right_left[:3, 3]))
+def _rectified_camera(fields: dict[str, Any]) -> tuple[StereoCamera, Array]:
+    """Return camera and ``T_cam_imu`` of features, which are those of a rectified pair."""
+    T_cam_imu, T_right_left = _extrinsics(fields)
     K_left, K_right = (require_numbers(fields, name, (3, 3)) for name in ("K_l", "K_r"))
-    camera = camera_of(K_left, baseline_m)
+    camera = camera_of(K_left, float(np.linalg.norm(T_right_left[:3, 3])))
     if not np.allclose(K_left, K_right, rtol=1e-3):
         raise CalibrationError(
             "the cameras have different intrinsics, so their features are not rectified", field="K_r"
@@ -126,9 +158,33 @@ def _rig(fields: dict[str, Any]) -> tuple[StereoCamera, Array]:
     return camera, T_cam_imu
 
 
+def _images(pictures: dict[str, Any], name: str, count: int) -> list[Image]:
+    """Return one image for each of ``count`` stamps."""
+    found = pictures.get(name)
+    if found is None:
+        require(pictures, name)
+    images = list(found) if isinstance(found, list) or (isinstance(found, np.ndarray) and found.ndim) else []
+    if len(images) != count or not count:
+        raise LostDataError(f"{len(images)} images for {count} stamps", field=name)
+    return images
+
+
+def _require_alike(left: list[Image], right: list[Image]) -> tuple[int, int]:
+    """Return width and height of all images; raise `ShapeError` unless they are (height, width) uint8."""
+    shape = left[0].shape if isinstance(left[0], np.ndarray) else ()
+    for name, images in zip(IMAGE_FIELDS, (left, right), strict=True):
+        for index, image in enumerate(images):
+            is_gray = isinstance(image, np.ndarray) and image.ndim == 2 and image.dtype == np.uint8
+            if not is_gray or image.shape != shape:
+                kind = f"{image.dtype} of {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+                raise ShapeError(f"expected gray images of uint8 {shape}, found {kind}", field=name, index=index)
+    return shape[1], shape[0]
+
+
 READER = Reader(
     "ece276a_npy",
     "an .npy recording (ECE 276A)",
     lambda source: source.head.startswith(MAGIC),
-    lambda source: read_ece276a_npy(source.path),
+    tracks=lambda source: read_ece276a_npy(source.path),
+    images=lambda source: open_ece276a_images(source.path),
 )

@@ -1,4 +1,4 @@
-"""What the readers share: named fields of a file, checked one by one."""
+"""Named fields of a file, checked one by one, and conventions that several formats share."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LATERAL_NOTES: dict[Lateral, str] = {
 
 
 def checksum(*paths: Path) -> str:
-    """SHA-256 of the contents of files in their order, hexadecimal."""
+    """Return the SHA-256 of the contents of files in their order, hexadecimal."""
     digest = hashlib.sha256()
     for path in paths:
         with path.open("rb") as file:
@@ -36,11 +36,11 @@ def checksum(*paths: Path) -> str:
 
 @contextmanager
 def spelled_as_in(source: str, spelling: Mapping[str, str] | None = None) -> Iterator[None]:
-    """Let data errors raised inside name the file and spell the field as the file does.
+    """Add the file, and its own names of fields, to data errors that are raised inside.
 
     Args:
-        source: The file.
-        spelling: Field names of `Sequence` to field names of the file, where they differ.
+        source: Name of the file.
+        spelling: Field names of the file by those of `Sequence`, if they differ.
     """
     try:
         yield
@@ -50,7 +50,7 @@ def spelled_as_in(source: str, spelling: Mapping[str, str] | None = None) -> Ite
 
 
 def require(fields: Mapping[str, Any], name: str) -> NDArray:
-    """A field of a file as an array, whatever its type.
+    """Return a field of a file as an array of any type.
 
     Raises:
         ShapeError: The field is missing.
@@ -67,11 +67,11 @@ def require_numbers(
     dtype: type = np.float64,
     finite: bool = True,
 ) -> NDArray:
-    """A field of a file as numbers of the wanted shape (None stands for any length) and type, finite by default.
+    """Return a field of a file as numbers of a shape (None stands for any length) and type, finite by default.
 
     Raises:
-        ShapeError: The field is missing, is not numeric (integral where ``dtype`` is) or has another shape.
-        NonFiniteError: It holds NaN or infinity.
+        ShapeError: The field is missing, is not numeric (integral if ``dtype`` is) or has another shape.
+        NonFiniteError: The field holds NaN or infinity.
     """
     value = require(fields, name)
     if value.dtype.kind not in ("iu" if np.issubdtype(dtype, np.integer) else "iuf"):
@@ -83,7 +83,7 @@ def require_numbers(
 
 
 def with_lateral(level_twist: Array, lateral: Lateral) -> Array:
-    """Level velocities (..., 6) of KITTI with the lateral one to the left: ``corrected`` negates it.
+    """Return level velocities (..., 6) of KITTI with the lateral one to the left: ``corrected`` negates it.
 
     The data format calls ``vl`` leftward, but on every drive it opposes the true lateral velocity, and already the
     first packet of 2011_09_26_drive_0001 contradicts its own velocity north and east. All other signs are right.

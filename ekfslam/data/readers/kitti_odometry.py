@@ -1,32 +1,98 @@
-"""True poses in the text files of the KITTI odometry benchmark: 12 numbers a line, one line a frame."""
+"""The KITTI odometry benchmark: folders of rectified stereo images, and text files of true poses.
+
+A folder has ``image_0 image_1`` (gray) or ``image_2 image_3`` (colour), ``calib.txt`` and ``times.txt``. Poses are 12
+numbers a line, one line a frame.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from ekfslam.data.readers.registry import Poses, TruthReader
-from ekfslam.data.readers.text import first_row, parse_table, read_lines
+import numpy as np
+
+from ekfslam.data.images import ImageRecording, PairCalibration
+from ekfslam.data.readers.pictures import PairFiles, in_order, numbered_images, size_of
+from ekfslam.data.readers.poses import Poses
+from ekfslam.data.readers.registry import Reader
+from ekfslam.data.readers.text import first_row, parse_table, read_keys, read_lines
 from ekfslam.data.sequence import Sequence, require_rigid
 from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
-from ekfslam.errors import TruthError
+from ekfslam.errors import CalibrationError, LostDataError, ShapeError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3
+from ekfslam.geometry.camera import R_CAM_BODY
 
+_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
 _COLUMNS = 12
-_EXPECTED = f"{_COLUMNS} numbers a line (KITTI odometry)"
+
+
+def open_kitti_odometry(folder: Path) -> ImageRecording:
+    """Open a sequence of the benchmark: rectified pairs and stamps, without velocities.
+
+    The body is the left camera, with axes forward, left and up. The gray pair is preferred.
+
+    Raises:
+        UnknownFormatError: A file is missing or no text.
+        CalibrationError: ``calib.txt`` lacks a camera, or the two are no rectified pair.
+        LostDataError: An image is missing, or has no stamp.
+        LineError: A line is malformed.
+    """
+    names = next((pair for pair in _PAIRS if all((folder / name).is_dir() for name in pair)), None)
+    if names is None:
+        raise UnknownFormatError(
+            f"{folder}: no pair of image folders; expected image_0 and image_1, or image_2 and image_3"
+        )
+    times = parse_table(read_lines(folder / "times.txt", "expected a stamp a line"), folder / "times.txt", columns=1)
+    found = [numbered_images(folder / name) for name in names]
+    frames, stamps = max(max(images) for images in found) + 1, len(times.values)
+    left, right = (in_order(images, range(frames)) for images in found)
+    if frames > stamps:
+        raise LostDataError(f"{frames} images, but {stamps} stamps in times.txt", source=str(folder), field="times.txt")
+    size = size_of(left[0])
+    notes = ["There are no velocities: the body is the left camera, its axes forward, left and up."]
+    if frames < stamps:
+        notes.append(f"The folder has the first {frames} of {stamps} images.")
+    if names[0] == "image_2":
+        notes.append("True poses of the benchmark are of the left gray camera, 6 cm from the left colour camera.")
+    return ImageRecording(
+        name=folder.resolve().name,
+        source=str(folder),
+        time_s=times.values[:frames, 0],
+        calibration=_calibration(folder / "calib.txt", [f"P{name[-1]}" for name in names], size),
+        load=PairFiles(left, right, size),
+        T_cam_imu=se3.transform(R_CAM_BODY, np.zeros(3)),
+        notes=tuple(notes),
+        attributes={"reader": IMAGES.name, "images": " ".join(names)},
+    )
+
+
+def _calibration(path: Path, keys: list[str], size: tuple[int, int]) -> PairCalibration:
+    """Return the calibration of two cameras of ``calib.txt``, whose images are rectified."""
+    values = read_keys(path, dict.fromkeys(keys, _COLUMNS), "expected P0: and 12 numbers")
+    left, right = (values[key].reshape(3, 4) for key in keys)
+    if not np.allclose(left[:, :3], right[:, :3], rtol=1e-6, atol=1e-9):
+        raise ShapeError(
+            "the two cameras have different intrinsics, so the pair is not rectified", source=str(path), field="P"
+        )
+    shift = np.linalg.solve(left[:, :3], right[:, 3] - left[:, 3])
+    if not -shift[0] > 10.0 * np.abs(shift[1:]).max():
+        raise CalibrationError("the right camera is not to the right of the left one", source=str(path), field="P")
+    # The other two components of a rectified pair are rounding of the calibration.
+    T_right_left = se3.transform(np.eye(3), np.array([shift[0], 0.0, 0.0]))
+    return PairCalibration(left[:, :3], left[:, :3], size, T_right_left)
 
 
 def read_kitti_odometry(path: Path, sequence: Sequence) -> Poses:
-    """3x4 matrices: row i is ``T_cam0_cam`` of frame i, the pose of the left camera in its first frame.
+    """Read 3x4 matrices: row i is ``T_cam0_cam`` of frame i, the pose of the left camera in its first frame.
 
     ``T_world_imu = T_imu_cam T_cam0_cam T_cam_imu`` with the sequence's extrinsics, so the first pose is the identity.
-    They are from the GPS/INS unit of KITTI, so their noise is `KITTI_TRUTH_NOISE`.
+    The poses are from the GPS/INS unit of KITTI, so their noise is `KITTI_TRUTH_NOISE`.
 
     Raises:
         UnknownFormatError: The file is not text.
         TruthError: A line is malformed, or not a rigid transform.
         NonFiniteError: A line holds NaN or infinity.
     """
-    table = parse_table(read_lines(path, f"expected {_EXPECTED}"), path, columns=_COLUMNS, error=TruthError)
+    table = parse_table(read_lines(path, f"expected {POSES.expected}"), path, columns=_COLUMNS, error=TruthError)
     matrices = table.values.reshape(-1, 3, 4)
     T_cam0_cam = se3.transform(matrices[:, :, :3], matrices[:, :, 3])
     try:
@@ -38,8 +104,15 @@ def read_kitti_odometry(path: Path, sequence: Sequence) -> Poses:
     return Poses(T_world_imu, None, (path,), KITTI_TRUTH_NOISE)
 
 
-def _recognises(path: Path) -> bool:
-    return len(first_row(path).split()) == _COLUMNS
-
-
-TRUTH_READER = TruthReader("KITTI odometry", _EXPECTED, _recognises, read_kitti_odometry)
+IMAGES = Reader(
+    "kitti_odometry_images",
+    "a folder of KITTI odometry (image_0 image_1 calib.txt times.txt)",
+    lambda source: (source.path / "calib.txt").is_file() and any((source.path / left).is_dir() for left, _ in _PAIRS),
+    images=lambda source: open_kitti_odometry(source.path),
+)
+POSES = Reader(
+    "KITTI odometry",
+    f"{_COLUMNS} numbers a line (KITTI odometry)",
+    lambda source: len(first_row(source.path).split()) == _COLUMNS,
+    truth=lambda source, sequence: read_kitti_odometry(source.path, sequence),
+)

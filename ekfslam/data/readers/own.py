@@ -1,4 +1,4 @@
-"""Files of `ekfslam.write_sequence` as recordings; what is in them `ekfslam.data.readers.hdf5` says."""
+"""Files of `ekfslam.write_sequence` as recordings; see `ekfslam.data.readers.hdf5` for their layout."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _UNKNOWN_LATERAL = (
 )
 
 
-def _open(source: Source) -> Sequence:
+def _tracks(source: Source) -> Sequence:
     sequence = read_sequence(source.path)
     own = {"checksum_sha256": checksum(source.path), "reader": READER.name}
     notes = sequence.notes
@@ -24,4 +24,4 @@ def _open(source: Source) -> Sequence:
     return dataclasses.replace(sequence, attributes={**sequence.attributes, **own}, notes=notes)
 
 
-READER = Reader("hdf5", "an ekfslam HDF5 file", lambda source: source.head.startswith(b"\x89HDF\r\n\x1a\n"), _open)
+READER = Reader("hdf5", "an ekfslam HDF5 file", lambda source: source.head.startswith(b"\x89HDF\r\n\x1a\n"), _tracks)

@@ -1,11 +1,11 @@
-"""How formats are found: a file of this folder that reads a format holds a `Reader`, a `TruthReader`, or both.
+"""The registry of formats: each file of this folder that reads a format holds a `Reader` of it.
 
-To add a format is to add a file; nothing else names the formats. This is a whole one::
+To add a format, add a file: no other file names the formats. This is a complete one::
 
-    def _open(source: Source) -> Sequence:
+    def tracks(source: Source) -> Sequence:
         ...
 
-    READER = Reader("mine", "a .mine file", lambda source: source.head.startswith(b"MINE"), _open)
+    READER = Reader("mine", "a .mine file", lambda source: source.head.startswith(b"MINE"), tracks)
 """
 
 from __future__ import annotations
@@ -13,32 +13,32 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import stat
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, TypeVar
+from typing import Any, Literal
 
-from ekfslam.arrays import Array
+from ekfslam.data.images import ImageRecording
+from ekfslam.data.readers.poses import Poses
 from ekfslam.data.sequence import Sequence
-from ekfslam.data.truth_noise import TruthNoise
 
 Extrinsics = Literal["corrected", "as-stored"]
 Lateral = Literal["corrected", "as-stored"]
-Entry = TypeVar("Entry")
+Kind = Literal["tracks", "images", "truth"]
 
 _HEAD_BYTES = 128
 
 
 @dataclass(frozen=True)
 class Source:
-    """What is to be opened.
+    """A file, folder or built-in world to be opened.
 
     Args:
-        place: Path of a file or folder, or the name of what is no file.
-        extrinsics: How to take the extrinsics of a format that stores them ambiguously.
-        lateral: How to take the lateral velocity of a format that stores level velocities.
-        head: The first 128 bytes; empty for what is no file.
-        problem: Why there is no ``head``; empty where there is one.
+        place: Path of a file or folder, or name of a built-in world.
+        extrinsics: Reading of extrinsics that a format stores ambiguously.
+        lateral: Reading of the lateral velocity of KITTI.
+        head: First 128 bytes of a file; empty otherwise.
+        problem: Reason why there is no ``head``; empty if there is one.
     """
 
     place: str
@@ -52,8 +52,8 @@ class Source:
         return Path(self.place)
 
     @staticmethod
-    def at(place: str | Path, extrinsics: Extrinsics, lateral: Lateral) -> Source:
-        """The source at a place, whatever is there."""
+    def at(place: str | Path, extrinsics: Extrinsics = "corrected", lateral: Lateral = "corrected") -> Source:
+        """Return the source at a place, which need not exist."""
         problem = ""
         try:
             if stat.S_ISREG(Path(place).stat().st_mode):
@@ -67,72 +67,53 @@ class Source:
 
 @dataclass(frozen=True)
 class Reader:
-    """A format of recordings.
+    """A format: how it is recognised, and what it gives.
+
+    The functions raise `UnknownFormatError` or `DataError` for a damaged source. They return None if this source does
+    not hold their kind of data.
 
     Args:
-        name: The attribute ``reader`` of its sequences.
-        expected: What a file or folder of it is called in messages, with its article.
-        recognises: Whether a source is of this format, by its content rather than by its name.
-        open: The recording; raises `UnknownFormatError` or `DataError`.
+        name: Attribute ``reader`` of its recordings.
+        expected: Description of such a source in messages, with its article.
+        recognises: Test of the content of a source, not of its name; it never raises.
+        tracks: Reader of stereo tracks.
+        images: Reader of stereo images.
+        truth: Reader of true poses, for a sequence whose extrinsics it may need.
     """
 
     name: str
     expected: str
     recognises: Callable[[Source], bool]
-    open: Callable[[Source], Sequence]
+    tracks: Callable[[Source], Sequence | None] | None = None
+    images: Callable[[Source], ImageRecording | None] | None = None
+    truth: Callable[[Source, Sequence], Poses | None] | None = None
 
 
-@dataclass(frozen=True)
-class Poses:
-    """True poses as a file has them.
-
-    Args:
-        T_world_imu: (F, 4, 4).
-        time_s: (F,) their stamps, which increase; None where row i is the pose of frame i.
-        files: What was read.
-        noise: How far they may be wrong; None: the format says nothing of it.
-    """
-
-    T_world_imu: Array
-    time_s: Array | None
-    files: tuple[Path, ...]
-    noise: TruthNoise | None = None
+def readers(*kinds: Kind) -> tuple[Reader, ...]:
+    """Return the readers that give at least one of some kinds, in the order of the names of their files."""
+    package = importlib.import_module(__package__)
+    modules = [importlib.import_module(f"{__package__}.{file.name}") for file in pkgutil.iter_modules(package.__path__)]
+    found = dict.fromkeys(value for module in modules for value in vars(module).values() if isinstance(value, Reader))
+    return tuple(reader for reader in found if any(getattr(reader, kind) is not None for kind in kinds))
 
 
-@dataclass(frozen=True)
-class TruthReader:
-    """A format of true poses.
+def read_as(source: Source, kind: Kind, *arguments: Any) -> Any:
+    """Return what the first suitable reader finds in a source, or None if no reader finds this kind of data there.
 
     Args:
-        name: Of the format.
-        expected: What a file or folder of it is called in messages.
-        recognises: Whether a path is of this format, by its content rather than by its name.
-        read: The poses in it, for a sequence whose extrinsics it may need; raises `UnknownFormatError` or `DataError`.
+        source: Source to read.
+        kind: Kind of data.
+        arguments: Further arguments of the reader's function.
     """
-
-    name: str
-    expected: str
-    recognises: Callable[[Path], bool]
-    read: Callable[[Path, Sequence], Poses]
-
-
-def discovered(kind: type[Entry], folder: str = __package__) -> tuple[Entry, ...]:
-    """The entries of a kind in all files of a package, by default this one, in the order of the files' names."""
-    package = importlib.import_module(folder)
-    modules = [importlib.import_module(f"{folder}.{file.name}") for file in pkgutil.iter_modules(package.__path__)]
-    entries = [value for module in modules for value in vars(module).values() if isinstance(value, kind)]
-    return tuple(dict.fromkeys(entries))
+    for reader in readers(kind):
+        if reader.recognises(source):
+            found = getattr(reader, kind)(source, *arguments)
+            if found is not None:
+                return found
+    return None
 
 
-class Expected(Protocol):
-    """What a source can be of."""
-
-    @property
-    def expected(self) -> str:
-        """What a file or folder of it is called in messages, with its article."""
-
-
-def listed(entries: Iterable[Expected]) -> str:
-    """What the formats of readers are called, as one clause that begins with "expected"."""
-    *others, last = (entry.expected for entry in entries)
+def expected(*kinds: Kind) -> str:
+    """Return the descriptions of all readers of some kinds, as a clause that begins with "expected"."""
+    *others, last = (reader.expected for reader in readers(*kinds))
     return f"expected {', '.join(others)} or {last}" if others else f"expected {last}"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from ekfslam.data import simulate
-from ekfslam.data.readers.registry import Reader, Source
-from ekfslam.data.sequence import Sequence
+from ekfslam.data.readers.registry import Reader
 
 BUILTIN = "builtin:"
 
-
-def _open(source: Source) -> Sequence:
-    return simulate.builtin(source.place.removeprefix(BUILTIN))
-
-
-READER = Reader("simulated", f"a simulated world {BUILTIN}NAME", lambda source: source.place.startswith(BUILTIN), _open)
+READER = Reader(
+    "simulated",
+    f"a simulated world {BUILTIN}NAME",
+    lambda source: source.place.startswith(BUILTIN),
+    lambda source: simulate.builtin(source.place.removeprefix(BUILTIN)),
+)

@@ -1,4 +1,4 @@
-"""Text files of numbers: lines of columns, with comments, empty lines and headers. The one parser of all formats.
+"""Text files of numbers: lines of columns, with comments, empty lines and headers.
 
 Every error names the file and the line, counted from 1.
 """
@@ -14,14 +14,14 @@ from typing import TypedDict
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
-from ekfslam.errors import DataError, LineError, NonFiniteError, UnknownFormatError
+from ekfslam.errors import CalibrationError, DataError, LineError, NonFiniteError, StampError, UnknownFormatError
 from ekfslam.limits import require_file
 
 Converters = Mapping[int, Callable[[str], float]]
 
 
 class Where(TypedDict):
-    """The place that a `DataError` names."""
+    """Place that a `DataError` names."""
 
     source: str
     field: str
@@ -29,16 +29,16 @@ class Where(TypedDict):
 
 
 def line_of(path: Path, number: int) -> Where:
-    """A line of a file, counted from 1, as keyword arguments of a `DataError`."""
+    """Return a line of a file, counted from 1, as keyword arguments of a `DataError`."""
     return {"source": str(path), "field": "line", "index": number}
 
 
 @dataclass(frozen=True)
 class Table:
-    """The rows of numbers in a text file.
+    """Rows of numbers in a text file.
 
     Args:
-        path: The file.
+        path: Text file.
         values: (n, columns) numbers, all finite.
         line: (n,) line of each row.
     """
@@ -48,15 +48,21 @@ class Table:
     line: IntArray
 
     def where(self, row: int) -> Where:
-        """The line of a row, as keyword arguments of a `DataError`."""
+        """Return the line of a row as keyword arguments of a `DataError`."""
         return line_of(self.path, int(self.line[row]))
+
+    def require_increasing(self) -> None:
+        """Raise `StampError` unless the first column increases."""
+        backwards = np.diff(self.values[:, 0]) <= 0
+        if backwards.any():
+            raise StampError("the stamp does not increase", **self.where(int(np.argmax(backwards)) + 1))
 
 
 def read_lines(path: Path, expected: str) -> list[str]:
-    """The lines of a text file.
+    """Return the lines of a text file.
 
     Raises:
-        UnknownFormatError: It cannot be read, or is not text; the message ends with what was ``expected``.
+        UnknownFormatError: It cannot be read, or is not text; the message ends with ``expected``.
     """
     try:
         require_file(path, is_text=True)
@@ -66,7 +72,7 @@ def read_lines(path: Path, expected: str) -> list[str]:
 
 
 def rows_of(lines: Iterable[str], comment: str | None = "#") -> Iterable[tuple[int, str]]:
-    """Number and content of the lines that hold more than blanks and comments."""
+    """Yield number and content of the lines that hold more than blanks and comments."""
     for number, line in enumerate(lines, start=1):
         content = (line.split(comment, 1)[0] if comment else line).strip()
         if content:
@@ -74,7 +80,7 @@ def rows_of(lines: Iterable[str], comment: str | None = "#") -> Iterable[tuple[i
 
 
 def first_line(path: Path) -> str:
-    """The first line of a file; empty if there is none, or it is no text."""
+    """Return the first line of a file; empty if there is none, or it is no text."""
     try:
         require_file(path)
         with path.open(encoding="utf-8") as file:
@@ -84,7 +90,7 @@ def first_line(path: Path) -> str:
 
 
 def first_row(path: Path) -> str:
-    """The first line of a file that holds more than a comment, without it; empty if there is none, or no file."""
+    """Return the first line that holds more than a comment, without that; empty if there is none, or no file."""
     try:
         require_file(path, is_text=True)
         with path.open(encoding="utf-8", errors="replace") as file:
@@ -101,17 +107,17 @@ def parse_numbers(
     converters: Converters = MappingProxyType({}),
     error: type[DataError] = LineError,
 ) -> list[float]:
-    """Exactly as many finite numbers as there are to be columns.
+    """Return the finite numbers of a line, one for each column.
 
     Args:
-        words: What should be numbers.
-        columns: How many there should be.
-        where: The line that they are from.
-        converters: By column, what makes a number of a word, where that is not `float`.
-        error: What to raise for a malformed line.
+        words: Texts of the numbers.
+        columns: Required number of them.
+        where: Line of the file.
+        converters: Function that converts a word, by column; `float` by default.
+        error: Exception for a malformed line.
 
     Raises:
-        DataError: There are more or fewer words, or one is no number; ``error`` says which subclass.
+        DataError: There are more or fewer words, or one is no number; ``error`` is its subclass.
         NonFiniteError: A number is NaN or infinite.
     """
     if len(words) != columns:
@@ -136,15 +142,15 @@ def parse_table(
     converters: Converters = MappingProxyType({}),
     error: type[DataError] = LineError,
 ) -> Table:
-    """All rows of numbers; there may be none.
+    """Return all rows of numbers; there may be none.
 
     Args:
-        lines: Of the file.
-        path: The file, for messages.
-        columns: How many every row has; as many as the first row by default.
-        used: How many of them are read; the others may hold anything. All by default.
-        separator: Between columns; blanks by default.
-        comment: What begins a comment; None if nothing does.
+        lines: Lines of the file.
+        path: Name of the file in messages.
+        columns: Number of columns; that of the first row by default.
+        used: Number of columns that are read; the others may hold anything. All by default.
+        separator: Separator of columns; blanks by default.
+        comment: Beginning of a comment; None if there are none.
         converters, error: See `parse_numbers`.
 
     Raises:
@@ -162,3 +168,27 @@ def parse_table(
         numbers.append(number)
     width = len(values[0]) if values else (used or columns or 0)
     return Table(path, np.array(values).reshape(len(values), width), np.array(numbers, dtype=np.int64))
+
+
+def read_keys(path: Path, counts: Mapping[str, int], expected: str) -> dict[str, Array]:
+    """Read the numbers of some keys from lines ``KEY: numbers``; other lines may hold anything.
+
+    Args:
+        path: Text file.
+        counts: Required number of numbers by key.
+        expected: End of the message if this is no text file.
+
+    Raises:
+        UnknownFormatError: The file cannot be read, or is not text.
+        LineError, NonFiniteError: A line of a wanted key is malformed.
+        CalibrationError: A key is missing.
+    """
+    values: dict[str, Array] = {}
+    for number, line in enumerate(read_lines(path, expected), start=1):
+        key, _, rest = line.partition(":")
+        if (key := key.strip()) in counts:
+            values[key] = np.array(parse_numbers(rest.split(), counts[key], line_of(path, number)))
+    for key in counts:
+        if key not in values:
+            raise CalibrationError("this key is missing", source=str(path), field=key)
+    return values

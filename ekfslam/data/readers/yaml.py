@@ -1,6 +1,6 @@
-"""The numbers and words of a calibration in YAML, as cameras are described by EuRoC and Kalibr.
+"""Calibrations in YAML, as EuRoC and Kalibr write them.
 
-No more of YAML is read than such files hold: lines ``key: value``, blocks below a key by indentation, and lists of
+Only the part of YAML in such files is read: lines ``key: value``, blocks below a key by indentation, and lists of
 numbers in brackets or by dashes, over several lines. Nothing of a file is evaluated.
 """
 
@@ -23,11 +23,11 @@ _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w
 
 @dataclass(frozen=True)
 class Calibration:
-    """What is written below each key of a file, ``cam0.T_cam_imu``, as text.
+    """Texts of a file by key, such as ``cam0.T_cam_imu``.
 
     Args:
-        path: The file.
-        values: Text by key; keys within blocks follow those of their blocks after a dot.
+        path: File that was read.
+        values: Text by key; the key of a block and a dot precede the keys in it.
     """
 
     path: Path
@@ -37,13 +37,13 @@ class Calibration:
         return key in self.values
 
     def word(self, key: str) -> str:
-        """A word; raises a `CalibrationError` where it is missing."""
+        """Return the word of a key; raise `CalibrationError` if it is missing."""
         if key not in self.values:
             raise CalibrationError("this key is missing", source=str(self.path), field=key)
         return self.values[key].strip().strip("\"'")
 
     def numbers(self, key: str, count: int | None = None) -> Array:
-        """Numbers (n,) below a key; raises a `CalibrationError` where they are missing or not ``count``."""
+        """Return the numbers (n,) of a key; raise `CalibrationError` if they are missing or not ``count``."""
         found = np.array([float(text) for text in _NUMBER.findall(self.word(key))])
         if count is not None and len(found) != count:
             raise CalibrationError(f"expected {count} numbers, found {len(found)}", source=str(self.path), field=key)
@@ -51,7 +51,7 @@ class Calibration:
 
 
 def read_yaml(path: Path) -> Calibration:
-    """The keys of a file.
+    """Read the keys of a file.
 
     Raises:
         UnknownFormatError: The file is missing or no text.

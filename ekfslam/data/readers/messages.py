@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array
-from ekfslam.data.images.pairs import Image
-from ekfslam.data.images.pixels import decode_gray
+from ekfslam.data.images import Image
+from ekfslam.data.readers.pictures import decode_gray
 from ekfslam.errors import CalibrationError, EkfslamError, MissingPackageError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.names import printable
@@ -187,7 +188,4 @@ def transform_of(transform: Any) -> Array:
     quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
     if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-3:
         raise CalibrationError("a transform without a unit quaternion", field="tf_static")
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    half = np.arctan2(np.linalg.norm([x, y, z]), w)
-    axis = np.array([x, y, z]) / max(np.linalg.norm([x, y, z]), 1e-300)
-    return se3.transform(se3.so3_exp(2.0 * half * axis), np.array([t.x, t.y, t.z], dtype=float))
+    return se3.transform(Rotation.from_quat(quaternion).as_matrix(), np.array([t.x, t.y, t.z], dtype=float))

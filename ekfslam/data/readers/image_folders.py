@@ -1,8 +1,8 @@
-"""A plain pair of image folders with a calibration of one's own: a folder with ``calibration.toml``, or that file.
+"""A plain pair of image folders with its own calibration: a folder with ``calibration.toml``, or that file.
 
 ::
 
-    left = "left"                       # folders of images, beside this file; those of equal names belong together
+    left = "left"                       # folders of images next to this file; equal names belong together
     right = "right"
     times = "times.txt"                 # a stamp a line, s; or rate_hz = 10.0
     T_right_left = [[1, 0, 0, -0.54], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -27,12 +27,10 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.data.images.folders import images_in
-from ekfslam.data.images.pairs import Distortion, ImageRecording, PairCalibration
-from ekfslam.data.images.pixels import PairFiles, size_of
-from ekfslam.data.images.registry import ImageReader
+from ekfslam.data.images import Distortion, ImageRecording, PairCalibration
 from ekfslam.data.readers.fields import checksum, spelled_as_in
-from ekfslam.data.readers.registry import Source
+from ekfslam.data.readers.pictures import PairFiles, images_in, size_of
+from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
 from ekfslam.data.sequence import require_rigid
 from ekfslam.data.velocities import attach_velocities
@@ -40,7 +38,6 @@ from ekfslam.errors import CalibrationError, DataError, ExtrinsicsError, LostDat
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import R_CAM_BODY
 
-NAME = "image_folders"
 FILE = "calibration.toml"
 _KEYS = {"left", "right", "times", "rate_hz", "T_right_left", "baseline_m", "T_cam_imu", "velocities"}
 _TABLES = {"left_camera", "right_camera"}
@@ -48,18 +45,18 @@ _CAMERA_KEYS = {"intrinsics", "distortion_model", "distortion"}
 
 
 def open_folder(path: Path) -> ImageRecording:
-    """The images that a calibration describes, see this module.
+    """Open the images that a calibration describes, see this module.
 
     Without ``T_cam_imu`` the body is the left camera, its axes forward, left and up.
 
     Args:
-        path: ``calibration.toml``, or its folder.
+        path: Path of ``calibration.toml``, or of its folder.
 
     Raises:
         UnknownFormatError: A file or folder is missing, or the calibration is no TOML.
         CalibrationError: A key is missing, unknown or malformed.
         LostDataError: An image has no partner, or no stamp.
-        DataError: A calibration means nothing, or velocities are malformed; the subclass says how.
+        DataError: A calibration is impossible, or velocities are malformed; the subclass says how.
     """
     file = _file_of(path)
     folder = file.parent
@@ -78,7 +75,7 @@ def open_folder(path: Path) -> ImageRecording:
             load=PairFiles(left, right, size),
             T_cam_imu=_matrix(values, "T_cam_imu") if "T_cam_imu" in values else se3.transform(R_CAM_BODY, np.zeros(3)),
             notes=_notes(values),
-            attributes={"reader": NAME, "checksum_sha256": checksum(file)},
+            attributes={"reader": READER.name, "checksum_sha256": checksum(file)},
         )
     if "velocities" not in values:
         return recording
@@ -119,7 +116,7 @@ def _text(values: dict[str, Any], key: str, file: Path) -> str:
 
 
 def _stamps(values: dict[str, Any], folder: Path, file: Path, count: int) -> Array:
-    """Stamps (count,) of the images."""
+    """Return the stamps (count,) of the images."""
     if ("times" in values) == ("rate_hz" in values):
         raise CalibrationError("expected either times or rate_hz", field="times")
     if "rate_hz" in values:
@@ -169,7 +166,7 @@ def _matrix(values: dict[str, Any], key: str) -> Array:
 
 
 def _numbers(value: Any, shape: tuple[int | None, ...], name: str) -> Array:
-    """An array of finite numbers of a shape, where None stands for any length."""
+    """Return an array of finite numbers of a shape; None stands for any length."""
     try:
         found = np.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -188,6 +185,9 @@ def _recognises(source: Source) -> bool:
     return file.suffix == ".toml" and bool(first_row(file)) and b"\x00" not in source.head
 
 
-IMAGE_READER = ImageReader(
-    NAME, f"a folder with {FILE} of a pair of image folders", _recognises, lambda source: open_folder(source.path)
+READER = Reader(
+    "image_folders",
+    f"a folder with {FILE} of a pair of image folders",
+    _recognises,
+    images=lambda source: open_folder(source.path),
 )

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, IntArray
-from ekfslam.data.images.folders import pair_stamps
-from ekfslam.data.images.messages import (
+from ekfslam.data.images import Distortion, DistortionModel, Image, ImageRecording, PairCalibration
+from ekfslam.data.readers.fields import spelled_as_in
+from ekfslam.data.readers.messages import (
     CAMERA_INFO,
     COMPRESSED,
     IMAGE,
@@ -32,10 +33,8 @@ from ekfslam.data.images.messages import (
     stamp_of,
     transform_of,
 )
-from ekfslam.data.images.pairs import Distortion, DistortionModel, Image, ImageRecording, PairCalibration
-from ekfslam.data.images.registry import ImageReader
-from ekfslam.data.readers.fields import spelled_as_in
-from ekfslam.data.readers.registry import Source
+from ekfslam.data.readers.pictures import pair_stamps
+from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_line
 from ekfslam.data.velocities import Velocities, is_covered, resample
 from ekfslam.errors import CalibrationError, LostDataError, StampError, UnknownFormatError
@@ -43,7 +42,6 @@ from ekfslam.geometry import se3
 from ekfslam.geometry.camera import R_CAM_BODY
 from ekfslam.names import printable
 
-NAME = "bag"
 _MODELS: dict[str, DistortionModel] = {
     "plumb_bob": "radtan",
     "rational_polynomial": "radtan",
@@ -165,7 +163,7 @@ def _opened(bag: Bag) -> ImageRecording:
         T_cam_imu=se3.transform(R_cam_optical, np.zeros(3)) @ T_optical_body,
         twist=twist,
         notes=notes,
-        attributes={"reader": NAME, "topics": printable(f"{left.topic} {right.topic}")},
+        attributes={"reader": READER.name, "topics": printable(f"{left.topic} {right.topic}")},
     )
 
 
@@ -344,4 +342,4 @@ def _recognises(source: Source) -> bool:
     return source.path.is_dir() and first_line(source.path / "metadata.yaml").startswith("rosbag2_bagfile_information")
 
 
-IMAGE_READER = ImageReader(NAME, "a bag of ROS 1 or ROS 2, or MCAP", _recognises, lambda source: open_bag(source.path))
+READER = Reader("bag", "a bag of ROS 1 or ROS 2, or MCAP", _recognises, images=lambda source: open_bag(source.path))

@@ -1,0 +1,124 @@
+"""Opening of recordings and of ground truth, of any format that a reader of `ekfslam.data.readers` knows."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import get_args
+
+from ekfslam.arrays import Array
+from ekfslam.data.images import ImageRecording
+from ekfslam.data.readers.fields import checksum
+from ekfslam.data.readers.poses import Poses, truth_of_frames
+from ekfslam.data.readers.registry import Extrinsics, Lateral, Source, expected, read_as
+from ekfslam.data.readers.text import read_lines, rows_of
+from ekfslam.data.sequence import Sequence
+from ekfslam.errors import ConfigError, TruthError, UnknownFormatError
+
+MIN_COVERAGE = 0.9  # a file that knows fewer of the frames belongs to another recording
+
+
+def open_recording(
+    source: str | Path, *, extrinsics: Extrinsics = "corrected", lateral: Lateral = "corrected"
+) -> Sequence | ImageRecording:
+    """Open a recording as it is stored: as images if it has any, otherwise as tracks.
+
+    Args:
+        source: Path of a recording, or ``builtin:NAME``.
+        extrinsics, lateral: See `ekfslam.open_sequence`.
+
+    Raises:
+        UnknownFormatError: The file is missing, empty, damaged or of unknown content, or there is no such world.
+        ConfigError: The recording's format does not know ``extrinsics`` or ``lateral``.
+        ArchiveError: A newer release wrote the file.
+        DataError: A field is missing or malformed; the subclass says how.
+    """
+    choices = {"extrinsics": (extrinsics, Extrinsics), "lateral": (lateral, Lateral)}
+    for name, (choice, known) in choices.items():
+        if choice not in get_args(known):
+            raise ConfigError(f"{name} must be one of {', '.join(get_args(known))}, found {choice!r}")
+    place = Source.at(source, extrinsics, lateral)
+    images: ImageRecording | None = read_as(place, "images")
+    if images is not None:
+        return images
+    sequence: Sequence | None = read_as(place, "tracks")
+    if sequence is None:
+        problem = f"cannot be read ({place.problem})" if place.problem else "unknown content"
+        if not place.head and not place.problem:
+            problem = "empty file"
+        raise UnknownFormatError(f"{place.place}: {problem}; {expected('tracks', 'images')}")
+    for name, (choice, _) in choices.items():
+        # A file of our own has been read before: it keeps the choice made then.
+        if choice != "corrected" and choice != sequence.attributes.get(name):
+            raise ConfigError(f"{source}: {name} {choice!r} mean nothing for this format")
+    return sequence
+
+
+def open_images(source: str | Path, *, lateral: Lateral = "corrected") -> ImageRecording | None:
+    """Open a recording of stereo images; return None if no reader finds images there.
+
+    Args:
+        source: Path of a file or folder.
+        lateral: Reading of the lateral velocity of KITTI, see `ekfslam.open_sequence`.
+
+    Raises:
+        UnknownFormatError: A file of the recording is missing or damaged.
+        DataError: A field is missing or malformed; the subclass says how.
+    """
+    images: ImageRecording | None = read_as(Source.at(source, lateral=lateral), "images")
+    return images
+
+
+def attach_truth(sequence: Sequence, path: Path) -> Sequence:
+    """Replace the truth of a sequence by the poses of a file or folder.
+
+    The content decides the format: KITTI odometry, TUM, the csv of EuRoC or a folder with it, or a drive folder of
+    KITTI raw. A pose with a stamp is given to the frame with the nearest stamp, if that is within half the median time
+    step. Without stamps, row i is the pose of frame i.
+
+    Stamps are compared in seconds as they are stored. If both clocks have different origins, the error names both
+    spans. Text after ``#`` is a comment. Extra rows are cut, and missing ones leave frames without truth, with a note.
+
+    Poses of KITTI come with their noise (`ekfslam.data.truth_noise`); TUM and EuRoC state none.
+
+    Raises:
+        UnknownFormatError: The file is missing, is not text, or has no known format.
+        TruthError: A line is malformed or not a rigid transform, or less than 90 % of the frames are covered.
+        NonFiniteError: A line holds NaN or infinity.
+        StampError: The stamps do not increase.
+        DataError: A drive folder of KITTI raw is malformed; the subclass says how.
+    """
+    poses: Poses | None = read_as(Source.at(path), "truth", sequence)
+    if poses is None:
+        raise _unknown_poses(path)
+    truth = truth_of_frames(sequence.time_s, poses)
+    frames, known, count = len(sequence), len(truth.frame), len(poses.T_world_imu)
+    if known < MIN_COVERAGE * frames:
+        spans = ""
+        if poses.time_s is not None:
+            spans = f"; its stamps are {_span(poses.time_s)}, the sequence's {_span(sequence.time_s)}"
+        raise TruthError(
+            f"{count} poses give truth to {known} of the {frames} frames of {sequence.source}; "
+            f"at least {MIN_COVERAGE:.0%} are needed{spans}",
+            source=str(path),
+        )
+    note = f"Truth of {known} of {frames} frames from {path.name}"
+    note += f"; {count - known} of its {count} poses are not used." if known < count else "."
+    return dataclasses.replace(
+        sequence,
+        truth=truth,
+        notes=(*sequence.notes, note),
+        attributes={**sequence.attributes, "truth_checksum_sha256": checksum(*poses.files)},
+    )
+
+
+def _unknown_poses(path: Path) -> UnknownFormatError:
+    formats = expected("truth")
+    number, content = next(iter(rows_of(read_lines(path, formats))), (0, ""))
+    if not content:
+        return UnknownFormatError(f"{path}: holds no poses; {formats}")
+    return UnknownFormatError(f"{path}: line {number} has {len(content.split())} columns; {formats}")
+
+
+def _span(time_s: Array) -> str:
+    return f"{time_s[0]:.3f} to {time_s[-1]:.3f} s"

@@ -1,0 +1,149 @@
+"""Image files: gray pixels, folders of numbered images, and pairs of equal stamps."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image as Pillow
+from PIL import UnidentifiedImageError
+
+from ekfslam.arrays import IntArray
+from ekfslam.data.images import Image
+from ekfslam.data.readers.poses import nearest
+from ekfslam.errors import CalibrationError, LostDataError, UnknownFormatError
+from ekfslam.limits import Budget, require_file
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp")
+LEAST_PAIRED = 0.9  # of the images, that must have a partner
+_TOLERANCE_NS = 5_000_000  # cameras that are not triggered together are no stereo pair
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM")  # PPM includes pgm
+_DAMAGES = (OSError, ValueError, SyntaxError, UnidentifiedImageError, Pillow.DecompressionBombError)
+
+
+def read_gray(path: Path, size: tuple[int, int] | None = None) -> Image:
+    """Read an image file as (height, width) uint8. Colours become luma, 16 bits their upper eight.
+
+    Args:
+        path: Image file.
+        size: Required width and height; any by default.
+
+    Raises:
+        UnknownFormatError: The file is missing, damaged, too large or no image.
+        CalibrationError: The image has another size.
+    """
+    require_file(path)
+    return decode_gray(path.read_bytes(), str(path), size)
+
+
+def decode_gray(content: bytes, source: str, size: tuple[int, int] | None = None) -> Image:
+    """Return `read_gray` of the bytes of an image file; ``source`` names it in messages."""
+    try:
+        with Pillow.open(io.BytesIO(content), formats=_FORMATS) as image:
+            width, height = image.size
+            Budget(source).take(4 * width * height, "the image")
+            if size is not None and image.size != size:
+                raise CalibrationError(
+                    f"the image has {width} x {height} pixels, the calibration {size[0]} x {size[1]}", source=source
+                )
+            if image.mode.startswith("I"):
+                return np.ascontiguousarray(np.asarray(image, dtype=np.uint32) >> 8, dtype=np.uint8)
+            return np.asarray(image if image.mode == "L" else image.convert("L"))
+    except _DAMAGES as error:
+        raise UnknownFormatError(f"{source}: not a readable image ({error})") from None
+
+
+def size_of(path: Path) -> tuple[int, int]:
+    """Read width and height of an image file from its header alone.
+
+    Raises:
+        UnknownFormatError: The file is missing, damaged or no image.
+    """
+    require_file(path)
+    try:
+        with Pillow.open(path, formats=_FORMATS) as image:
+            return image.size
+    except _DAMAGES as error:
+        raise UnknownFormatError(f"{path}: not a readable image ({error})") from None
+
+
+@dataclass(frozen=True)
+class PairFiles:
+    """The function `ImageRecording.load` of image files.
+
+    Args:
+        left, right: Path of each frame's image.
+        size: Required width and height of all images.
+    """
+
+    left: Sequence[Path]
+    right: Sequence[Path]
+    size: tuple[int, int]
+
+    def __call__(self, frame: int) -> tuple[Image, Image]:
+        return read_gray(self.left[frame], self.size), read_gray(self.right[frame], self.size)
+
+
+def images_in(folder: Path) -> tuple[Path, ...]:
+    """Return the image files of a folder in the order of their names.
+
+    Raises:
+        UnknownFormatError: The folder is missing, or there are none.
+    """
+    if not folder.is_dir():
+        raise UnknownFormatError(f"{folder}: this folder of images is missing")
+    found = tuple(sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES))
+    if not found:
+        raise UnknownFormatError(f"{folder}: there are no images")
+    return found
+
+
+def numbered_images(folder: Path) -> dict[int, Path]:
+    """Return the image files of a folder by the number that is their name.
+
+    Raises:
+        UnknownFormatError: The folder is missing, there are no images, or a name is no number.
+    """
+    found = {}
+    for path in images_in(folder):
+        if not path.stem.isdigit():
+            raise UnknownFormatError(f"{path}: expected a number for a name, such as 000000.png")
+        found[int(path.stem)] = path
+    return found
+
+
+def in_order(found: dict[int, Path], numbers: range) -> list[Path]:
+    """Return the images of successive numbers.
+
+    Raises:
+        LostDataError: One of them is missing.
+    """
+    missing = next((number for number in numbers if number not in found), None)
+    if missing is None:
+        return [found[number] for number in numbers]
+    some = next(iter(found.values()))
+    raise LostDataError(
+        f"image {missing:0{len(some.stem)}d} is missing", source=str(some.parent), field="images", index=missing
+    )
+
+
+def pair_stamps(left_ns: IntArray, right_ns: IntArray, source: str) -> tuple[IntArray, IntArray, tuple[str, ...]]:
+    """Return indices (n,) of left and right images with equal ascending stamps (ns), and a note on the others.
+
+    Raises:
+        LostDataError: Less than `LEAST_PAIRED` of the images of a camera have a partner.
+    """
+    right = nearest(right_ns, left_ns)
+    left = np.flatnonzero(np.abs(right_ns[right] - left_ns) <= _TOLERANCE_NS)
+    right, kept = np.unique(right[left], return_index=True)
+    left = left[kept]
+    if len(left) < LEAST_PAIRED * max(len(left_ns), len(right_ns)):
+        raise LostDataError(
+            f"only {len(left)} of {len(left_ns)} left and {len(right_ns)} right images have the same stamp",
+            source=source,
+        )
+    alone = len(left_ns) + len(right_ns) - 2 * len(left)
+    return left, right, (f"{alone} images without a partner are left out.",) if alone else ()

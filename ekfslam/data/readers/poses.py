@@ -1,0 +1,72 @@
+"""True poses as files have them, and their frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.readers.text import Table
+from ekfslam.data.sequence import Truth
+from ekfslam.data.truth_noise import TruthNoise
+from ekfslam.errors import TruthError
+from ekfslam.geometry import se3
+
+_QUATERNION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Poses:
+    """True poses of a file.
+
+    Args:
+        T_world_imu: (F, 4, 4) poses.
+        time_s: (F,) increasing stamps; None if row i is the pose of frame i.
+        files: Files that were read.
+        noise: Accuracy of the poses; None if the format does not state it.
+    """
+
+    T_world_imu: Array
+    time_s: Array | None
+    files: tuple[Path, ...]
+    noise: TruthNoise | None = None
+
+
+def stamped_poses(table: Table) -> Poses:
+    """Return the poses in rows of seconds, metres (3), and a quaternion (4) with w last.
+
+    Raises:
+        TruthError: A quaternion does not have the length 1.
+        StampError: The stamps do not increase.
+    """
+    table.require_increasing()
+    time_s, position_m, quaternion = table.values[:, 0], table.values[:, 1:4], table.values[:, 4:]
+    defect = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0)
+    if (defect > _QUATERNION_TOLERANCE).any():
+        row = int(np.argmax(defect > _QUATERNION_TOLERANCE))
+        raise TruthError(f"not a unit quaternion: its norm is off by {defect[row]:.2g}", **table.where(row))
+    return Poses(se3.transform(Rotation.from_quat(quaternion).as_matrix(), position_m), time_s, (table.path,))
+
+
+def truth_of_frames(time_s: Array, poses: Poses) -> Truth:
+    """Return the poses of frames with stamps (T,), matched as `ekfslam.attach_truth` says."""
+    if poses.time_s is None:
+        used = min(len(time_s), len(poses.T_world_imu))
+        return Truth(np.arange(used), poses.T_world_imu[:used], noise=poses.noise)
+    tolerance_s = 0.5 * np.median(np.diff(time_s)) if len(time_s) > 1 else 0.0
+    row = nearest(poses.time_s, time_s)
+    # Nearest in both directions, so that no pose serves two frames.
+    mutual = nearest(time_s, poses.time_s)[row] == np.arange(len(time_s))
+    frame = np.flatnonzero(mutual & (np.abs(poses.time_s[row] - time_s) <= tolerance_s))
+    return Truth(frame, poses.T_world_imu[row[frame]], noise=poses.noise)
+
+
+def nearest(ascending: Array | IntArray, wanted: Array | IntArray) -> IntArray:
+    """Return the index (n,) of the entry of ``ascending`` (m,) that is nearest to each of ``wanted`` (n,)."""
+    right = np.clip(np.searchsorted(ascending, wanted), 1, max(len(ascending) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(ascending) - 1)
+    return np.where(wanted - ascending[left] <= ascending[right] - wanted, left, right)
