@@ -39,7 +39,7 @@ Equations (docstrings cite these numbers)::
     z(k) = h(k) + e(k),  e(k) = f e(k-1) + w,  hence
     z(k) - f z(k-1) = h(k) - f h(k-1) + w  over pose k, pose k-1 and landmark        (10) errors of tracks
     q = T_cam_imu exp((n + l b)^) T_imu_world m, l the way in z(k) of a difference (10),
-    else 0;  q_right = exp(psi^) (q - (baseline, 0, 0))                              (11) errors that landmarks share
+    else 0                                                                           (11) errors that landmarks share
 
 Glossary:
 

@@ -129,7 +129,7 @@ class NoiseConfig:
         drift: How far the error of a track walks in the image from one frame to the next, px; 0 takes pixel noise as
             white, None takes what the model says.
         track_scale: Factor on how far errors of tracks walk in the automatic model; None: it is found by their
-            innovations, see `ekfslam.studies.automatic`.
+            innovations, see `ekfslam.resolve`.
         shared: Whether errors that all samples or all tracks share (`ekfslam.models.noise.shared_errors`) are in the
             state of the automatic model.
         tilt_deg: Of velocities in a level frame: prior standard deviation of roll and pitch, which the joint filter

@@ -29,11 +29,10 @@ from ekfslam.filters.references import References
 from ekfslam.filters.reports import FrameReport, collect
 from ekfslam.filters.result import Innovation, Landmarks, Parameters, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
-from ekfslam.models.build import Problem, build
 from ekfslam.progress import progress
+from ekfslam.resolve import Problem, resolve
 from ekfslam.smoother.posterior import smooth
 from ekfslam.smoother.revival import MapRevival
-from ekfslam.studies.automatic import with_track_scale
 
 
 @solvable()
@@ -67,10 +66,8 @@ def run(
         )
     if mode == "smoothed":
         return smooth(run(sequence, "full", config, further))
-    if mode == "full":
-        config = with_track_scale(config or Config(), sequence)
     suspicions = inspect_sequence(sequence).warnings
-    problem = build(sequence, config, clean=mode != "dead-reckoning")
+    problem = resolve(sequence, config, mode)
     with one_thread():
         estimate = _joint(problem, further) if mode == "full" else _dead_reckoned(problem, mode)
     result = _result(problem, mode, estimate)

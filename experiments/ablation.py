@@ -28,7 +28,7 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.evaluation.tables import document, markdown_table, number, plus_minus
 from ekfslam.figures.run import plot_parameters
 from ekfslam.geometry import se3
-from ekfslam.models.build import noise_of
+from ekfslam.resolve import noise_of
 from ekfslam.studies.sweep import Case, Sweep
 
 CALIBRATION = {"rotation_deg": 0.5, "lever_arm_m": 0.05, "baseline": 0.02, "disparity_px": 0.5, "time_s": 0.02}

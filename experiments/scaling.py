@@ -42,7 +42,7 @@ from ekfslam.evaluation.tables import document, markdown_table
 from ekfslam.figures.style import GREY, log_axis, style_of, styled
 from ekfslam.filters import JointEKF, loop
 from ekfslam.filters.result import Result
-from ekfslam.models.build import build, resolve
+from ekfslam.resolve import resolve
 from ekfslam.smoother.posterior import Posterior, model_of_result, posterior
 from ekfslam.smoother.problem import BatchProblem
 from ekfslam.smoother.revival import MapRevival
@@ -196,9 +196,10 @@ def position_error_m(sequence: Sequence, T_world_imu: Array) -> float:
 
 def steps(sequence: Sequence, retire: str, variant: str = "invariant") -> Iterator[tuple[JointEKF, float]]:
     """The joint filter after each frame, with the CPU milliseconds of the frame."""
-    config = resolve(Config().with_overrides({"filter": {"retire": retire, "variant": variant}}), sequence)
-    model = build(sequence, config, clean=False).model
-    ekf = JointEKF(model, config.filter, revival=MapRevival(model, config.filter))
+    config = Config().with_overrides({"filter": {"retire": retire, "variant": variant, "covariance_form": "dense"}})
+    problem = resolve(sequence, config, "dead-reckoning")
+    model, settings = problem.model, problem.config.filter
+    ekf = JointEKF(model, settings, revival=MapRevival(model, settings))
     for frame in loop.run_filter(ekf, sequence, clock=process_time):
         yield ekf, frame.ms
 

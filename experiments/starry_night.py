@@ -56,8 +56,9 @@ from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.geometry import camera, se3
 from ekfslam.models.blocks import StateBlock
-from ekfslam.models.build import noise_of, optional_blocks
+from ekfslam.models.build import optional_blocks
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.resolve import noise_of
 
 VARIANTS: tuple[Variant, ...] = ("invariant", "fej", "standard")
 WINDOW_FRAMES = 100

@@ -29,7 +29,7 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError, EmptyTracksError, InnovationError
 from ekfslam.filters.loop import one_thread
 from ekfslam.models.blocks.camera_jitter import CameraJitter
-from ekfslam.models.build import noise_of, resolve
+from ekfslam.resolve import noise_of, settings_of
 from ekfslam.studies.tuning import filter_reports, parts_of, penalised
 
 Overrides = Mapping[str, Mapping[str, Any]]
@@ -160,7 +160,7 @@ def choose(
         raise ConfigError("no candidates to choose from")
     if len(sequence.observations) == 0:
         raise EmptyTracksError("structures are told by observations, and there are none", source=sequence.source)
-    config = resolve(config or Config(), sequence)
+    config = settings_of(sequence, config or Config())
     observations = int(np.ceil(frames * len(sequence.observations) / len(sequence)))
     found: dict[int, Tried] = {}
     error: InnovationError | None = None

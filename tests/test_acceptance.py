@@ -9,8 +9,8 @@ from support.running import WHOLE
 from ekfslam import Config, open_sequence, run
 from ekfslam.evaluation.summary import summarise
 from ekfslam.filters.joint import JointEKF
-from ekfslam.models.build import resolve
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.resolve import settings_of
 
 # What the dense, noisy edition of the recordings had added to its velocities.
 NOISY = Config().with_overrides({"noise": {"sigma_v_m_s": 0.5, "sigma_w_rad_s": 0.05, "sigma_px": 2.0}})
@@ -47,7 +47,7 @@ def test_loop_keeps_its_landmarks_and_closes_the_loop():
 def test_state_stays_as_small_as_the_view():
     """The cost of a frame depends on what is seen, not on what has been seen."""
     sequence = open_sequence("builtin:city?frames=300")
-    config = resolve(Config(), sequence).filter
+    config = settings_of(sequence, Config()).filter
     ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, sequence.noise), config, sequence.initial_T_world_imu)
     for k in range(len(sequence)):
         if k:

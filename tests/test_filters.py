@@ -14,8 +14,8 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.observing import measurement_jacobian
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import se3
-from ekfslam.models.build import noise_of
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.resolve import noise_of
 from ekfslam.runner import run
 
 OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0)

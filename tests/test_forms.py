@@ -11,7 +11,7 @@ from ekfslam.data.simulate import builtin
 from ekfslam.filters.conditional import ConditionalGaussian
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
-from ekfslam.models.build import build
+from ekfslam.resolve import resolve
 from ekfslam.runner import run
 from ekfslam.smoother.revival import MapRevival
 
@@ -19,7 +19,7 @@ from ekfslam.smoother.revival import MapRevival
 def drive(sequence, settings, form, frames):
     """The filter after so many frames, and what it reported of each."""
     settings = {**settings, "filter": {**settings.get("filter", {}), "covariance_form": form}}
-    problem = build(sequence, Config().with_overrides(settings))
+    problem = resolve(sequence, Config().with_overrides(settings))
     revival = MapRevival(problem.model, problem.config.filter)
     ekf, reports = JointEKF(problem.model, problem.config.filter, revival=revival), []
     assert isinstance(ekf.gaussian, ConditionalGaussian) == (form == "conditional")
@@ -105,7 +105,7 @@ def test_relative_poses_are_the_same():
 def test_auto_takes_what_is_cheaper():
     """The conditional form where many landmarks are seen for a short time, the dense one where few are."""
     few, many = builtin("city?frames=100"), builtin("city?frames=20&max_tracks=250&landmarks_per_m=20")
-    assert build(few).config.filter.covariance_form == "dense"
-    assert build(many).config.filter.covariance_form == "conditional"
+    assert resolve(few).config.filter.covariance_form == "dense"
+    assert resolve(many).config.filter.covariance_form == "conditional"
     stated = Config().with_overrides({"filter": {"covariance_form": "conditional"}})
-    assert build(few, stated).config.filter.covariance_form == "conditional"
+    assert resolve(few, stated).config.filter.covariance_form == "conditional"

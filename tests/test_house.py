@@ -14,7 +14,7 @@ from ekfslam.data.sequence import Truth
 from ekfslam.data.simulate import builtin
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
-from ekfslam.models.build import build
+from ekfslam.resolve import resolve
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.smoother.problem import BatchProblem
@@ -28,7 +28,7 @@ UNSHARED = [name for name in ALL_BLOCKS if name not in SHARED]
 
 def drive(sequence, settings, blocks=ALL_BLOCKS):
     """The filter after a recording whose model has the blocks."""
-    problem = build(sequence, Config().with_overrides(settings))
+    problem = resolve(sequence, Config().with_overrides(settings))
     assert [block.name for block in problem.model.layout.blocks] == blocks
     ekf = JointEKF(problem.model, problem.config.filter)
     ekf.revival = MapRevival(ekf.model, ekf.config) if problem.config.filter.retire == "unseen" else None
@@ -102,7 +102,7 @@ def test_every_block_and_errors_of_tracks_on_a_recording(data_path, variant):
         observations=observations,
         truth=truth,
     )
-    found = build(short).model.noise
+    found = resolve(short).model.noise
     walks = {key: EVERYTHING[key] for key in ("twist_walk_std", "motion_std")}
     noise = dataclasses.replace(found, **walks, twist_std=np.full(6, 0.05))
     settings = {

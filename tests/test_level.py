@@ -43,8 +43,9 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import DataError
 from ekfslam.geometry import motion, se3
 from ekfslam.models.blocks import TwistBias
-from ekfslam.models.build import model_of, noise_of
+from ekfslam.models.build import model_of
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.resolve import noise_of
 from ekfslam.runner import run
 
 SOME = CalibrationConfig(rotation_deg=0.5, disparity_px=0.5, time_s=0.02)

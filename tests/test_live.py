@@ -23,7 +23,7 @@ from ekfslam.errors import (
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import motion, se3
-from ekfslam.models.build import build
+from ekfslam.resolve import resolve
 from ekfslam.smoother.revival import MapRevival
 
 FRAMES = 40
@@ -33,7 +33,7 @@ def problem_of(name="city", **settings):
     world = builtin(f"{name}?frames={FRAMES}")
     if settings.pop("walks", False):  # velocities are in the state, and errors of tracks
         world = with_everything(world)
-    return build(world, Config().with_overrides(settings))
+    return resolve(world, Config().with_overrides(settings))
 
 
 def filter_of(problem):

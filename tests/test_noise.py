@@ -23,7 +23,6 @@ from ekfslam.filters.observing import measurement_jacobian, moment_before, obser
 from ekfslam.filters.prediction import transition_jacobian
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import motion, se3
-from ekfslam.models.build import build, noise_of
 from ekfslam.models.noise import (
     TRACK_WALK_PX,
     VELOCITY_STD,
@@ -34,12 +33,11 @@ from ekfslam.models.noise import (
 )
 from ekfslam.models.sensors.base import MOVING
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.resolve import PERSISTENCE, TARGET, noise_of, resolve
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.smoother.problem import BatchProblem
 from ekfslam.storage.archive import open_result, write_archive
-from ekfslam.studies import automatic
-from ekfslam.studies.automatic import PERSISTENCE, with_track_scale
 
 OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0)
 STILL = dataclasses.replace(OPEN, moving_sigma=1e9)
@@ -129,22 +127,22 @@ def test_shared_errors_follow_what_velocities_are_worth():
 def test_blocks_of_the_automatic_model_give_way_to_what_is_configured():
     unstated = without_noise(builtin("city?frames=60"))
     names = {"twist_bias", "camera_jitter", "vision_drift"}
-    problem = build(unstated, Config().with_overrides({"blocks": {"camera_jitter": {"time_s": 2.0}}}))
+    problem = resolve(unstated, Config().with_overrides({"blocks": {"camera_jitter": {"time_s": 2.0}}}))
     assert set(problem.config.blocks) == names and problem.model.calibration is not None
     assert problem.config.blocks["camera_jitter"] == {"time_s": 2.0}
     for settings in ({"noise": {"shared": False}}, {"noise": {"model": "white"}}):
-        without = build(unstated, Config().with_overrides(settings))
+        without = resolve(unstated, Config().with_overrides(settings))
         assert not without.config.blocks and without.model.calibration is None
-    assert not build(builtin("city?frames=60"), Config()).config.blocks
+    assert not resolve(builtin("city?frames=60"), Config()).config.blocks
     # Run again with what was resolved: the same.
-    assert build(unstated, problem.config).config == problem.config
+    assert resolve(unstated, problem.config).config == problem.config
 
 
 @pytest.mark.slow
 def test_interpolated_velocities_are_trusted_less():
     world = without_noise(builtin("city?frames=40&max_tracks=20"))
     gap = dataclasses.replace(world, attributes={**world.attributes, "interpolated": "10-20"})
-    problem = build(gap, Config())
+    problem = resolve(gap, Config())
     ekf = JointEKF(problem.model, problem.config.filter)
     for _ in run_filter(ekf, problem.sequence):
         pass
@@ -158,29 +156,36 @@ def test_interpolated_velocities_are_trusted_less():
     assert weight[10:19].max() < 0.5 * np.median(weight[25:])
 
 
-@pytest.mark.slow
-def test_the_walk_of_tracks_is_found_by_innovations():
-    """Tracks that err twice as much as the model says have twice the factor; noisy velocities ask for the long run."""
+def scale_of(sequence):
+    return resolve(sequence).config.noise.track_scale
+
+
+def walking_tracks(factor):
+    """Return a drive with clean velocities whose tracks err `factor` times as much as the automatic model says."""
     walk = dataclasses.replace(automatic_noise(np.zeros((100, 6))).track_error, flow_px=np.inf)
-    quiet = builtin(f"city?frames={120 if WHOLE else 50}&outlier_fraction=0&sigma_v_m_s=0.01&sigma_w_rad_s=0.0002")
-    found = []
-    for factor in (2.0, 4.0):
-        world = tracked(quiet, dataclasses.replace(walk, walk_std=factor * walk.walk_std), 0)
-        config = with_track_scale(Config(), without_noise(world))
-        found.append(config.noise.track_scale)
-    assert found[1] / found[0] == pytest.approx(2.0, rel=0.25)
-    assert with_track_scale(Config(), without_noise(builtin("city?frames=60"))).noise.track_scale == PERSISTENCE
-    assert with_track_scale(Config(), quiet).noise.track_scale is None  # it states its noise
+    quiet = builtin("city?frames=60&outlier_fraction=0&sigma_v_m_s=0.01&sigma_w_rad_s=0.0002&max_tracks=60")
+    return without_noise(tracked(quiet, dataclasses.replace(walk, walk_std=factor * walk.walk_std), 0))
 
 
-def test_the_factor_is_the_root_of_what_innovations_are_too_large_by(monkeypatch):
-    quiet = without_noise(builtin("city?frames=60&sigma_v_m_s=0.01&sigma_w_rad_s=0.0002"))
+def test_the_track_scale_follows_the_errors_of_tracks():
+    assert scale_of(walking_tracks(4.0)) / scale_of(walking_tracks(2.0)) == pytest.approx(2.0, rel=0.25)
 
-    def filtered(_, config):
-        return 1000 * automatic.TARGET * (1.7 / config.noise.track_scale) ** 2, 1000
 
-    monkeypatch.setattr(automatic, "_innovations", filtered)
-    assert with_track_scale(Config(), quiet).noise.track_scale == pytest.approx(1.7)
+def test_the_track_scale_brings_the_nis_of_the_run_to_its_target():
+    innovation = run(walking_tracks(2.0), "full").innovation
+    assert innovation.nis.sum() / innovation.dof.sum() == pytest.approx(TARGET, rel=0.2)
+
+
+def test_the_track_scale_of_noisy_velocities_is_that_of_the_long_run():
+    assert scale_of(without_noise(builtin("city?frames=10"))) == PERSISTENCE
+
+
+def test_a_recording_that_states_its_noise_has_no_track_scale():
+    assert scale_of(builtin("city?frames=10")) is None
+
+
+def test_too_few_innovations_leave_the_track_scale_at_one():
+    assert scale_of(walking_tracks(4.0)[:1]) == 1.0
 
 
 def test_misalignment_is_the_covariance_of_turned_velocities():

@@ -20,8 +20,8 @@ from ekfslam.errors import IllPosedError, PosteriorError, RetiredSettingWarning
 from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import CameraJitter, TwistBias, VisionDrift
-from ekfslam.models.build import noise_of
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.resolve import noise_of
 from ekfslam.runner import run
 from ekfslam.smoother.optimise import kernel_cost, kernel_weight
 from ekfslam.smoother.posterior import posterior, posterior_of_log, smooth

@@ -16,8 +16,8 @@ from ekfslam.config import Config, FilterConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import City, simulate
 from ekfslam.filters import JointEKF
-from ekfslam.models.build import noise_of, resolve
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.resolve import noise_of, settings_of
 from ekfslam.smoother.posterior import posterior
 
 EXPERIMENT = Path(__file__).parents[1] / "experiments" / "scaling.py"
@@ -25,7 +25,7 @@ SHORT_TRACKS = City(landmarks_per_m=8.0, max_tracks=77, loss_probability=0.09)
 
 
 def state_sizes(sequence: Sequence) -> list[int]:
-    config = resolve(Config(filter=FilterConfig(retire="unseen")), sequence)
+    config = settings_of(sequence, Config(filter=FilterConfig(retire="unseen")))
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise_of(sequence, config))
     ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu)
     sizes = []

@@ -16,7 +16,7 @@ from ekfslam.data.simulate import Loop, simulate
 from ekfslam.errors import ConfigError, EmptyTracksError, InnovationError
 from ekfslam.evaluation.consistency import chi2_bounds, nees, pose_error
 from ekfslam.geometry import camera, se3
-from ekfslam.models.build import build
+from ekfslam.resolve import resolve
 
 JITTER_M, JITTER_DEG, TIME_S, WHITE_PX = 0.03, 0.4, 0.2, 0.8
 FRAMES = 150 if WHOLE else 80
@@ -56,7 +56,7 @@ def world(seed: int, jitter: bool = True, frames: int = FRAMES):
 
 
 def pose_nees_at_end(sequence, overrides) -> float:
-    problem = build(sequence, CONFIG.with_overrides(overrides), clean=False)
+    problem = resolve(sequence, CONFIG.with_overrides(overrides), "dead-reckoning")
     ekf, _, _ = run_joint(sequence, problem.model, problem.config.filter)
     return float(nees(pose_error(ekf.T_world_imu, sequence.truth.T_world_imu[-1]), ekf.P[:6, :6]))
 

@@ -21,7 +21,7 @@ from ekfslam.errors import ArchiveError, DuplicateObservationError, TruthError
 from ekfslam.evaluation.reprojection import reprojection_errors
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import project
-from ekfslam.models.build import noise_of
+from ekfslam.resolve import noise_of
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior
 from ekfslam.storage.archive import open_result, write_archive

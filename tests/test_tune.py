@@ -24,10 +24,10 @@ from ekfslam.filters.loop import run_filter
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.observing import measurement_jacobian
 from ekfslam.geometry import motion
-from ekfslam.models.build import noise_of, resolve
 from ekfslam.models.noise import VelocityNoise, velocity_noise, with_drift
 from ekfslam.models.sensors.base import MOVING
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.resolve import noise_of, settings_of
 from ekfslam.runner import run
 from ekfslam.storage.archive import open_result
 from ekfslam.studies import tuning
@@ -122,7 +122,7 @@ def test_measured_velocities_count_where_they_are_in_the_state():
 def test_mapping_and_the_joint_filter_agree_where_nothing_but_landmarks_is_uncertain():
     world = small_world()
     noise = Noise.isotropic(0.0, 0.0, 0.8)
-    config = resolve(Config(filter=OPEN), world)
+    config = settings_of(world, Config(filter=OPEN))
     rig = Rig(world.camera, world.T_cam_imu, noise)
     reports = run_joint(world, rig, config.filter)[2]
     T, _ = dead_reckon(world, noise, np.zeros((6, 6)))
@@ -133,7 +133,7 @@ def test_mapping_and_the_joint_filter_agree_where_nothing_but_landmarks_is_uncer
 @pytest.mark.slow
 def test_rejecting_everything_does_not_pay():
     world = builtin("city?frames=20")
-    config = resolve(Config(), world)
+    config = settings_of(world, Config())
     right = log_likelihoods(world, world.noise, config).sum()
     for factor in (0.02, 0.2, 5.0):
         wrong = Noise.isotropic(0.5 * factor, 0.05 * factor, 0.7 * factor)
@@ -143,7 +143,7 @@ def test_rejecting_everything_does_not_pay():
 @pytest.mark.slow
 def test_wrong_matches_are_left_out_and_splits_go_on_as_new_tracks():
     world = builtin("city?frames=30&max_tracks=30&outlier_fraction=0.05")
-    config = resolve(Config(), world)
+    config = settings_of(world, Config())
     kept, rejected = without_rejected(world, world.noise, config)
     result = run(world, "full")
     assert (
@@ -159,7 +159,7 @@ def test_wrong_matches_are_left_out_and_splits_go_on_as_new_tracks():
 @pytest.mark.slow
 def test_long_recordings_are_filtered_in_stretches_spread_over_them():
     world = without_noise(builtin("city?frames=700"))
-    config = resolve(Config(), world)
+    config = settings_of(world, Config())
     parts = stretches(world, config, 10_000)
     assert [len(part) for part in parts] == [50] * len(parts)
     begins = [int(np.flatnonzero(world.time_s == part.time_s[0])[0]) for part in parts]
@@ -192,7 +192,7 @@ def test_the_sandwich_widens_errors_where_gradients_are_correlated_and_never_nar
 
 def test_what_is_rejected_counts_in_the_likelihood_of_a_round():
     world = builtin("city?frames=12&outlier_fraction=0.2")
-    config = resolve(Config(), world)
+    config = settings_of(world, Config())
     base = noise_of(world, config)
     parts, gated, ungated = tuning.parts_of(world, config, base, 10_000)
     problem = tuning._Problem(parts, base, ["sigma_px"], gated, ungated)
@@ -245,7 +245,7 @@ def test_velocity_noise_is_below_its_limit_also_where_none_is_seen():
 def test_a_run_keeps_the_log_likelihood_of_its_innovations():
     world = builtin("city?frames=40&outlier_fraction=0")
     config = Config(filter=OPEN)
-    expected = log_likelihoods(world, world.noise, resolve(config, world)).sum()
+    expected = log_likelihoods(world, world.noise, settings_of(world, config)).sum()
     result = run(world, "full", dataclasses.replace(config, hygiene=HygieneConfig(min_disparity_sigma=0)))
     of_right = result.innovation.dof.sum() // 3 * np.log1p(-OUTLIER_SHARE)
     np.testing.assert_allclose(result.attributes["log_likelihood"], expected - of_right)
@@ -254,7 +254,7 @@ def test_a_run_keeps_the_log_likelihood_of_its_innovations():
 
 def test_moving_tracks_can_be_left_out_alone():
     world = with_outliers(small_world())
-    config = resolve(Config(), world)
+    config = settings_of(world, Config())
     assert without_rejected(world, world.noise, config)[1] > 50
     split_none = dataclasses.replace(config, filter=dataclasses.replace(config.filter, split_after=0))
     same, rejected = without_rejected(world, world.noise, split_none, (MOVING,))

@@ -16,9 +16,9 @@ from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import motion, se3
-from ekfslam.models.build import build
 from ekfslam.models.odometry import stereo_odometry
 from ekfslam.models.sensors.velocities import VelocitySource
+from ekfslam.resolve import resolve
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import smooth
 
@@ -87,7 +87,7 @@ def test_one_motion_that_no_vehicle_has_is_left_out():
 
 def test_velocities_are_started_once_and_never_measured():
     sequence = without_velocities(ekfslam.open_sequence("builtin:city?frames=12&outlier_fraction=0"))
-    problem = build(sequence)
+    problem = resolve(sequence)
     assert problem.model.process.measured(Interval.of_one(np.ones(6), 0.1), is_first=False) is None
     assert "twist (6)" in problem.lines[0]
     ekf = JointEKF(problem.model, problem.config.filter)
@@ -130,13 +130,13 @@ def test_dead_reckoning_is_left_out_of_a_comparison(tmp_path):
 @pytest.mark.slow
 def test_without_stated_noise_tracks_decide_what_is_believed():
     sequence = dataclasses.replace(ekfslam.open_sequence("builtin:city?frames=20"), noise=None)
-    walking = build(without_velocities(sequence))
+    walking = resolve(without_velocities(sequence))
     names = set(walking.model.layout)
     assert {"twist", "vision_drift", "camera_jitter"} <= names
     assert not {"twist_bias", "up", "calibration"} & names
     checked = without_velocities(dataclasses.replace(sequence, attributes={**sequence.attributes, **CHECKED_TRACKS}))
-    problem = build(checked)
+    problem = resolve(checked)
     assert problem.model.track_error is None and problem.model.noise.pixel_std_px[0] == 0.3
     assert "camera_jitter" in problem.model.layout and "vision_drift" not in problem.model.layout
-    given = build(checked, Config().with_overrides({"noise": {"sigma_px": 0.6}}))
+    given = resolve(checked, Config().with_overrides({"noise": {"sigma_px": 0.6}}))
     assert given.model.noise.pixel_std_px[0] == 0.6

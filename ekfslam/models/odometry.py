@@ -30,11 +30,6 @@ _LEAST_WALK = np.repeat([0.05, 0.005], 3)
 _START_FACTOR = 10.0
 
 
-def with_odometry(sequence: Sequence) -> Sequence:
-    """Return the recording with the velocities of `stereo_odometry`, in the IMU frame."""
-    return sequence.with_velocities(stereo_odometry(sequence), "imu")
-
-
 def stereo_odometry(sequence: Sequence) -> Array:
     """Velocities (T, 6) between successive frames from the tracks that both see; the last known ones where too few do.
 

@@ -53,12 +53,13 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter, solvable
 from ekfslam.filters.reports import FrameReport
 from ekfslam.geometry import se3
-from ekfslam.models.build import found_attributes, noise_of, optional_blocks, resolve, with_automatic_blocks
+from ekfslam.models.build import optional_blocks
 from ekfslam.models.noise import NOISY_FROM, VelocityNoise, velocity_noise, with_drift, with_error
 from ekfslam.models.sensors.base import BEHIND_CAMERA, GATE, MOVING
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.names import printable
 from ekfslam.progress import progress
+from ekfslam.resolve import found_attributes, noise_of, settings_of
 
 # Of wrong matches: how many there are, and how far off they may be.
 OUTLIER_SHARE = 0.02
@@ -219,7 +220,7 @@ def tune(
     """
     if len(sequence.observations) == 0:
         raise EmptyTracksError("noise is tuned by observations, and there are none", source=sequence.source)
-    config = with_automatic_blocks(resolve(config or Config(), sequence), sequence)
+    config = settings_of(sequence, config or Config())
     model: NoiseModel = "white" if config.noise.model == "white" else "tuned"
     base = noise_of(sequence, dataclasses.replace(config, noise=NoiseConfig(model=model, drift=config.noise.drift)))
     found = velocity_noise(sequence.twist)

@@ -16,8 +16,8 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.truth import with_truth_noise
-from ekfslam.models.build import build
 from ekfslam.models.noise import velocity_noise
+from ekfslam.resolve import resolve
 from ekfslam.runner import versions
 from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT
 from ekfslam.storage.archive import read_archive
@@ -98,7 +98,7 @@ def _print_findings(sequence: Sequence) -> None:
         print(f"sanity        {line}")
     for line in sanity.warnings:
         print(f"warning       {line}")
-    problem = build(sequence)
+    problem = resolve(sequence)
     assert problem.hygiene is not None
     for line in problem.lines:
         print(f"state         {line}")
