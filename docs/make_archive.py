@@ -6,12 +6,13 @@ python docs/make_archive.py
 from __future__ import annotations
 
 import inspect
+import re
 from pathlib import Path
 
-from ekfslam import dimensions, files, hdf5
+from ekfslam import files, stored
 from ekfslam.data.readers import hdf5 as sequences
 from ekfslam.evaluation.tables import document, markdown_table
-from ekfslam.filters.result import ERROR_CONVENTION, REASONS
+from ekfslam.filters.result import ERROR_CONVENTION, Result
 from ekfslam.storage import archive
 from ekfslam.storage.exports import EXPORTS
 from ekfslam.studies import study
@@ -37,9 +38,9 @@ pandas and xarray come with `pip install 'ekfslam[tables]'`. h5py needs nothing 
 """
 
 DIMENSIONS = """
-Every dimension is a dimension scale of HDF5, beside the data sets that have it, and holds the coordinate along it. So
-each group can be opened by itself. What has no labels, stamps or ids counts from 0. A square matrix has its second
-axis as `<name>_2`.
+Every dimension is a dimension scale of HDF5 in the group of the data sets that have it, and holds the coordinate along
+it. So each group can be opened alone. A dimension without labels, stamps or ids counts from 0. A square matrix has its
+second axis as `<name>_2`.
 """.strip()
 
 STORAGE = """
@@ -58,9 +59,9 @@ Pieces of 64 KiB and 256 KiB gave the same within 1 %.
 """
 
 READING = """
-A reader must not trust a file: this package looks at all of it before it uses anything. It refuses links, data in other
-files, types that no archive has, sizes beyond a limit, values out of their range, coordinates that are not what the
-table above says, and fields that contradict each other. Each is one error that names file and item. Archives of all
+A reader must not trust a file: this package inspects all of it before it uses anything. It refuses links, data in other
+files, types that no archive has, sizes beyond a limit, values out of their range, coordinates other than those of the
+table above, and fields that contradict each other. Each is one error that names file and item. Archives of all
 earlier format versions are read.
 """
 
@@ -71,14 +72,15 @@ def page() -> str:
     parts += [f"Errors: {ERROR_CONVENTION}.", "## Groups and attributes", _tree(archive.__doc__)]
     parts += ["## Dimensions", _dimensions()]
     parts += ["## Data sets of the recording and its truth", _table(sequences.LAYOUT, False)]
-    parts += [
-        "A recording by itself (`ekfslam-sequence`) has these besides:",
-        _table(sequences.OBSERVATIONS_LAYOUT, False),
-    ]
-    for group, layout in archive.LAYOUTS.items():
-        place = "/".join(part for part in ("runs/<mode>", group) if part)
-        parts += [f"## Data sets below `{place}`", _table(layout)]
-    parts += [f"Codes of `rejections/reason`: {', '.join(f'{i} {text}' for i, text in enumerate(REASONS))}."]
+    parts += ["A recording by itself (`ekfslam-sequence`) also has:", _table(sequences.OBSERVATIONS_LAYOUT, False)]
+    for name, record, layout in stored.layouts_of(Result):
+        parts += [f"## Fields below `runs/<mode>{name and '/'}{name}`", f"They are fields of `{record.__name__}`."]
+        stated = stored.attributes_of(record)
+        parts += [f"Attributes: {', '.join(f'`{field}`' for field in stated)}."] if stated else []
+        parts += [_table(layout, meanings=_meanings(record))]
+        for item in layout:
+            if item.codes:
+                parts += [f"Codes of `{item.name}`: {', '.join(f'{i} {text}' for i, text in enumerate(item.codes))}."]
     parts += ["## Archives of studies", _tree(study.__doc__), _table((*study.LEVEL_LAYOUT, *study.VARIANT_LAYOUT))]
     parts += ["## Storage", STORAGE, "## Reading", READING]
     rows = [[f"`{name}`", export.words, f"`.{export.ending}`"] for name, export in EXPORTS.items()]
@@ -95,22 +97,34 @@ def _tree(doc: str | None) -> str:
     return "\n".join(lines[begin:][:length])
 
 
-def _table(layout: hdf5.Layout, checked: bool = True) -> str:
+def _meanings(record: type) -> dict[str, str]:
+    """Return what the docstring of a class of records says of each field."""
+    args = inspect.cleandoc(record.__doc__ or "").partition("Args:")[2].partition("\n\n")[0]
+    found: dict[str, str] = {}
+    for names, words in re.findall(r"(?m)^ {4}([\w, ]+): ((?:.|\n {8})*)", args):
+        found |= dict.fromkeys(names.split(", "), " ".join(words.replace("``", "`").split()).rstrip("."))
+    return found
+
+
+def _table(layout: stored.Layout, checked: bool = True, meanings: dict[str, str] | None = None) -> str:
+    headings = ["data set", "dimensions", "units", "frame"]
+    headings += ["values must"] * checked + ["field"] * (meanings is not None)
     rows = []
     for item in layout:
-        words = item.check.words.replace(f"from 0 to {1 << 62}", "from 0 on")
-        checks = [words.replace(f"to {1 << 62}", "on")] if checked else []
-        rows.append([f"`{item.name}`", ", ".join(item.dims) or "-", item.units, item.frame, *checks])
-    headings = ["data set", "dimensions", "units", "frame", *(["values must"] if checked else [])]
-    return markdown_table(headings, rows, left=5)
+        words = item.check.words.replace(f"from 0 to {stored.MOST}", "from 0 on").replace(f"to {stored.MOST}", "on")
+        row = [f"`{item.name}`", ", ".join(item.dims) or "-", item.units, item.frame] + [words] * checked
+        row += [f"`{item.field}`: {meanings.get(item.field, '')}"] if meanings is not None else []
+        rows.append(row)
+    return markdown_table(headings, rows, left=6)
 
 
 def _dimensions() -> str:
-    layouts = (sequences.LAYOUT, sequences.OBSERVATIONS_LAYOUT, *archive.LAYOUTS.values(), study.LEVEL_LAYOUT)
-    items = [item for layout in (*layouts, study.VARIANT_LAYOUT) for item in layout]
-    names = dict.fromkeys(name for item in items for name in item.dims if not name.endswith(dimensions.SECOND))
-    labels = {axis.name: ", ".join(axis.labels) for axis in dimensions.AXES.values()}
-    rows = [[f"`{name}`", dimensions.meaning_of(name), labels.get(name, "")] for name in names]
+    layouts = [sequences.LAYOUT, sequences.OBSERVATIONS_LAYOUT]
+    layouts += [layout for _, _, layout in stored.layouts_of(Result)] + [study.LEVEL_LAYOUT, study.VARIANT_LAYOUT]
+    items = [item for layout in layouts for item in layout]
+    names = dict.fromkeys(name for item in items for name in item.dims if not name.endswith(stored.SECOND))
+    labels = {axis.name: ", ".join(axis.labels) for axis in stored.AXES.values()}
+    rows = [[f"`{name}`", stored.meaning_of(name), labels.get(name, "")] for name in names]
     return f"{DIMENSIONS}\n\n{markdown_table(['dimension', 'along it', 'labels'], rows, left=3)}"
 
 

@@ -5,7 +5,7 @@
   shows while it is read becomes one named error.
 - Data sets are declared in layouts, next to the records that they hold. Each has the attributes ``units`` and ``frame``
   (of reference), and a `Check` of its values, which holds for what is written as well as for what is read.
-- Every dimension has a name and a coordinate, see `ekfslam.dimensions`. Of older files none has.
+- Every dimension has a name and a coordinate, see `ekfslam.stored`. Older files have none.
 - `opened` looks at everything in a file before anything is read. It refuses links, data that lie in other files, and
   types of data that no file of ours has.
 - Text is read in both of HDF5's forms and written with fixed length: libhdf5 hangs on some damaged files with text of
@@ -17,25 +17,26 @@ A leaf: readers of data use it as well as archives do, so it imports nothing of 
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ekfslam import dimensions
+from ekfslam import stored
 from ekfslam.errors import ArchiveError, EkfslamError, UnknownFormatError
 from ekfslam.limits import Budget, require_file
 from ekfslam.names import printable
+from ekfslam.stored import Item
 
 # What h5py, zlib and json raise where a file is damaged.
 _DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError, MemoryError, zlib.error)
@@ -43,91 +44,9 @@ _LONG = 10_000  # entries from which compression pays
 # Of compression. A drive of 1000 frames takes 7.3 MB in place of 13.2, and 0.2 s more to write; level 9: 7.2 MB, 1.9 s.
 _LEVEL, _CHUNK_BYTES = 1, 1 << 20
 _MOST_OBJECTS = 100_000  # of a file: one of ours has some hundreds
-_LARGEST = 1e100  # a number whose square and cube are still numbers
-_MOST = 1 << 62  # a whole number to which one can be added
 
-
-class Check(NamedTuple):
-    """What the values of a data set must be.
-
-    Args:
-        kinds: Of their NumPy types, which decide as what they are read: ``f`` numbers, ``i`` whole numbers, ``b`` truth
-            values, ``S`` text.
-        words: What must hold for each, as it follows "must".
-        holds: Which of them it holds for, given the shared lengths: of the shape of the values, or of its first axes.
-    """
-
-    kinds: str
-    words: str
-    holds: Callable[[NDArray, Mapping[str, int]], NDArray]
-
-
-def _in(low: float, high: float) -> Callable[[NDArray, Mapping[str, int]], NDArray]:
-    return lambda value, _: (value >= low) & (value <= high)  # holds for no NaN
-
-
-def _ascends(value: NDArray, _: Mapping[str, int]) -> NDArray:
-    return (np.abs(value) <= _LARGEST) & (np.diff(value, prepend=-np.inf) > 0)
-
-
-NUMBERS = Check("f", "be finite", _in(-_LARGEST, _LARGEST))
-NUMBERS_OR_NONE = Check("f", "be finite or NaN", lambda value, _: ~(np.abs(value) > _LARGEST))
-NOT_NEGATIVE = Check("f", "be finite and not negative", _in(0, _LARGEST))
-POSITIVE = Check("f", "be finite and positive", _in(1 / _LARGEST, _LARGEST))
-ASCENDING = Check("f", "be finite and ascend", _ascends)
-FLAGS = Check("b", "be a truth value", lambda value, _: (value == 0) | (value == 1))
-TEXTS = Check("S", "be text", lambda value, _: np.ones(value.shape, dtype=bool))
-
-
-def index_of(length: str, least: int = 0) -> Check:
-    """Whole numbers from ``least`` up to, and without, a shared length."""
-    return Check(
-        "i", f"be an index from {least} to {length} - 1", lambda value, n: (value >= least) & (value < n[length])
-    )
-
-
-def whole(low: int, high: int = _MOST) -> Check:
-    """Whole numbers between two, both included."""
-    return Check("i", f"be a whole number from {low} to {high}", _in(low, high))
-
-
-COUNTS = whole(0)
-
-
-class Item(NamedTuple):
-    """A data set of a layout.
-
-    Args:
-        name: Of the data set below its group.
-        field: Of the record that it holds, with dots for fields of fields.
-        shape: Of lengths that data sets share and of fixed axes, see `ekfslam.dimensions`.
-        units, frame: Its attributes.
-        check: What its values must be.
-        dims: Names of its dimensions.
-    """
-
-    name: str
-    field: str
-    shape: dimensions.Shape
-    units: str
-    frame: str
-    check: Check = NUMBERS
-    dims: tuple[str, ...] = ()
-
-    @property
-    def place(self) -> tuple[str, str]:
-        """The folder below the group, and the name there."""
-        folder, _, leaf = self.name.rpartition("/")
-        return folder, leaf
-
-
-Layout = tuple[Item, ...]
-
-
-def layout(*rows: tuple[Any, ...], **names: str) -> Layout:
-    """A layout of the arguments of its items; ``names`` are those of lengths that differ from `dimensions.AXES`."""
-    items = (Item(*row) for row in rows)
-    return tuple(item._replace(dims=dimensions.names_of(item.shape, names)) for item in items)
+Coordinates = Mapping[str, NDArray]
+NONE: Coordinates = MappingProxyType({})
 
 
 def image(format: str, version: int, fill: Callable[[h5py.File], None]) -> bytes:
@@ -281,45 +200,126 @@ def _is_known(dtype: np.dtype) -> bool:
     return dtype.kind in "fiubS" or h5py.check_string_dtype(dtype) is not None
 
 
+def write_record(group: h5py.Group, record: Any, sizes: dict[str, int], coordinates: Coordinates = NONE) -> None:
+    """Write a record whose class says how it is stored: attributes, data sets, and a group for each record in it.
+
+    Args:
+        group: Group of the record.
+        record: Record to write, see `ekfslam.stored`.
+        sizes: Known shared lengths; those found here are added.
+        coordinates: Values along dimensions by name, where no data set has them.
+
+    Raises:
+        ArchiveError: A value breaks its check: such a file could not be read again.
+    """
+    stated = {name: getattr(record, name) for name in stored.attributes_of(type(record))}
+    write_attributes(group, stated)
+    coordinates = {**coordinates, **_named_entries(type(record), stated)}
+    write_fields(group, stored.layout_of(type(record)), record, sizes, coordinates)
+    for name in stored.groups_of(type(record)):
+        if getattr(record, name) is not None:
+            write_record(group.require_group(name), getattr(record, name), sizes, coordinates)
+
+
+def read_record(
+    group: h5py.Group,
+    record: type,
+    sizes: dict[str, int],
+    coordinates: Coordinates = NONE,
+    complete: Callable[[type, dict[str, Any]], dict[str, Any]] = lambda record, found: found,
+) -> dict[str, Any]:
+    """Read the stored fields of a class of records, checked; see `write_record`.
+
+    Args:
+        group: Group of the record.
+        record: Class of the record.
+        sizes: Known shared lengths; those found here are added.
+        coordinates: Values along dimensions; coordinates in the file must equal them.
+        complete: Function of class and fields that adds fields which older releases did not write.
+
+    Raises:
+        ArchiveError: A field is missing, has another shape or type, or breaks its check.
+    """
+    layout = stored.layout_of(record)
+    found = {name: _read_attribute(group, name, kind) for name, (kind, _) in stored.attributes_of(record).items()}
+    coordinates = {**coordinates, **_named_entries(record, found)}
+    present = tuple(item for item in layout if item.name in group)
+    found = complete(record, found | _read(group, present, sizes))
+    for item in layout:
+        if item.field not in found:
+            raise ArchiveError(f"{_place(group, item.name)} is missing")
+    require_coordinates(group, present, coordinates)
+    for name, (_, along) in stored.attributes_of(record).items():
+        if along and len(found[name]) != sizes[along]:
+            raise ArchiveError(
+                f"{group.file.filename}: {_spoken(group, name)} has {len(found[name])} entries, expected {sizes[along]}"
+            )
+    optional = {field.name for field in dataclasses.fields(record) if field.default is None}
+    for name, part in stored.groups_of(record).items():
+        is_there = name in group or name not in optional
+        below = read_record(subgroup(group, name), part, sizes, coordinates, complete) if is_there else None
+        found[name] = None if below is None else part(**below)
+    return found
+
+
+def _named_entries(record: type, attributes: Mapping[str, Any]) -> dict[str, NDArray]:
+    """Return the coordinates that attributes of a record give to dimensions, the first attribute of each."""
+    named: dict[str, NDArray] = {}
+    for name, (_, along) in stored.attributes_of(record).items():
+        if along:
+            named.setdefault(stored.AXES[along].name, fixed_texts(attributes[name]))
+    return named
+
+
+def _read_attribute(group: h5py.Group, name: str, kind: type) -> Any:
+    value = attribute(group, name)
+    if kind is tuple:
+        return texts(value)
+    return printable(str(value)) if kind is str else kind(value)
+
+
 def write_fields(
     group: h5py.Group,
-    layout: Layout,
+    layout: Iterable[Item],
     record: Any,
-    sizes: Mapping[str, int] | None = None,
-    coordinates: Mapping[str, NDArray] = MappingProxyType({}),
+    sizes: dict[str, int] | None = None,
+    coordinates: Coordinates = NONE,
 ) -> None:
     """Write the data sets of a layout from the fields of a record, or the values of a mapping, and their dimensions.
 
     Args:
-        group: To write below.
-        layout: What to write.
-        record: Its fields, or items, are written.
-        sizes: Shared lengths that are known.
+        group: Group to write below.
+        layout: Data sets to write.
+        record: Record or mapping with the fields.
+        sizes: Known shared lengths; those found here are added.
         coordinates: Values along dimensions by name, where no data set of the layout has them.
 
     Raises:
-        ArchiveError: A value is not what its check asks for: such a file could not be read again.
+        ArchiveError: A value breaks its check: such a file could not be read again.
     """
-    values = [value_of(item, record) for item in layout]
-    _checked(group, layout, values, dict(sizes or {}))
+    layout = tuple(layout)
+    values = [
+        np.asarray(record[item.field] if isinstance(record, Mapping) else getattr(record, item.field))
+        for item in layout
+    ]
+    _checked(group, layout, values, {} if sizes is None else sizes)
     made = [
-        _create(group, item.name, value, {"units": item.units, "frame": item.frame})
+        _create(group, item.name, value, {"units": item.units, "frame": item.frame, "names": item.codes or None})
         for item, value in zip(layout, values, strict=True)
     ]
     scales: dict[str, h5py.Dataset] = {}
     for item, dataset in zip(layout, made, strict=True):
-        folder, _ = item.place
-        for i, name in enumerate(item.dims):
-            place = f"{folder}/{name}" if folder else name
+        for i, (place, name) in enumerate(_scales_of(item)):
             if place not in scales:
                 scales[place] = _scale(group, place, name, dataset.shape[i], coordinates)
             if place != item.name:
                 dataset.dims[i].attach_scale(scales[place])
 
 
-def value_of(item: Item, record: Any) -> NDArray:
-    """What a record, or a mapping, has for an item of a layout."""
-    return np.asarray(record[item.field] if isinstance(record, Mapping) else attrgetter(item.field)(record))
+def _scales_of(item: Item) -> list[tuple[str, str]]:
+    """Return path and name of the coordinate of each dimension of a data set: they lie in its folder."""
+    folder, _ = item.place
+    return [(f"{folder}/{name}" if folder else name, name) for name in item.dims]
 
 
 def _create(group: h5py.Group, name: str, value: NDArray, attributes: Mapping[str, Any]) -> h5py.Dataset:
@@ -334,12 +334,12 @@ def _create(group: h5py.Group, name: str, value: NDArray, attributes: Mapping[st
     return dataset
 
 
-def _scale(group: h5py.Group, place: str, name: str, length: int, given: Mapping[str, NDArray]) -> h5py.Dataset:
-    """The coordinate of a dimension at a place below a group, made if missing."""
+def _scale(group: h5py.Group, place: str, name: str, length: int, given: Coordinates) -> h5py.Dataset:
+    """Return the coordinate of a dimension at a place below a group, made if missing."""
     scale = group.get(place)
     if scale is None:
-        value = dimensions.coordinate(name, length, given)
-        attributes = {"units": "s" if name == "time" else "1", "long_name": dimensions.meaning_of(name)}
+        value = stored.coordinate(name, length, given)
+        attributes = {"units": "s" if name == "time" else "1", "long_name": stored.meaning_of(name)}
         attributes |= {"frame": "clock of the recording" if name == "time" else "none"}
         scale = _create(group, place, value, attributes | ({"_Encoding": "utf-8"} if value.dtype.kind == "S" else {}))
     if scale.shape != (length,):
@@ -349,63 +349,61 @@ def _scale(group: h5py.Group, place: str, name: str, length: int, given: Mapping
     return scale
 
 
-def require_coordinates(
-    group: h5py.Group, layout: Layout, coordinates: Mapping[str, NDArray] = MappingProxyType({})
-) -> None:
-    """Raise an `ArchiveError` where a coordinate in a file is not what `write_fields` would have written."""
+def require_coordinates(group: h5py.Group, layout: Iterable[Item], coordinates: Coordinates = NONE) -> None:
+    """Raise an `ArchiveError` if a coordinate in a file differs from the one that `write_fields` would write."""
+    layout = tuple(layout)
     seen = {item.name for item in layout}
     for item in layout:
-        folder, _ = item.place
-        for i, name in enumerate(item.dims):
-            place = f"{folder}/{name}" if folder else name
-            if place in seen:
+        for i, (place, name) in enumerate(_scales_of(item)):
+            if place in seen or place not in group:
                 continue
             seen.add(place)
-            scale = group.get(place)
-            if scale is None:
-                continue
-            expected = dimensions.coordinate(name, group[item.name].shape[i], coordinates)
-            if not isinstance(scale, h5py.Dataset) or not np.array_equal(scale[()], expected):
+            expected = stored.coordinate(name, group[item.name].shape[i], coordinates)
+            if not isinstance(group[place], h5py.Dataset) or not np.array_equal(group[place][()], expected):
                 raise ArchiveError(f"{_place(group, place)} is not the coordinate of {item.name}")
 
 
 def read_fields(
     group: h5py.Group,
-    layout: Layout,
-    sizes: Mapping[str, int] | None = None,
-    coordinates: Mapping[str, NDArray] = MappingProxyType({}),
+    layout: Iterable[Item],
+    sizes: dict[str, int] | None = None,
+    coordinates: Coordinates = NONE,
 ) -> dict[str, Any]:
-    """The data sets of a layout by field, checked; the first one along a shared length decides it.
+    """Read the data sets of a layout by field, checked; the first one along a shared length decides it.
 
     Args:
-        group: To read from.
-        layout: What to read.
-        sizes: Shared lengths that are known.
-        coordinates: As for `write_fields`; those in the file must be the same.
+        group: Group to read from.
+        layout: Data sets to read.
+        sizes: Known shared lengths; those found here are added.
+        coordinates: As for `write_fields`; coordinates in the file must equal them.
 
     Raises:
-        ArchiveError: A data set is missing, has another shape or type, or a value is not what its check asks for.
+        ArchiveError: A data set is missing, has another shape or type, or breaks its check.
     """
-    values = []
+    layout = tuple(layout)
+    found = _read(group, layout, {} if sizes is None else sizes)
+    require_coordinates(group, layout, coordinates)
+    return found
+
+
+def _read(group: h5py.Group, layout: stored.Layout, sizes: dict[str, int]) -> dict[str, NDArray]:
     for item in layout:
         if not isinstance(group.get(item.name), h5py.Dataset):
             raise ArchiveError(f"{_place(group, item.name)} is missing")
-        values.append(group[item.name][()])
-    found = _checked(group, layout, values, dict(sizes or {}))
-    require_coordinates(group, layout, coordinates)
-    return {item.field: value for item, value in zip(layout, found, strict=True)}
+    values = _checked(group, layout, [group[item.name][()] for item in layout], sizes)
+    return {item.field: value for item, value in zip(layout, values, strict=True)}
 
 
 _TYPES = {"f": ("fiu", np.float64), "i": ("iu", np.int64), "b": ("biu", np.bool_), "S": ("SO", np.object_)}
 
 
-def _checked(group: h5py.Group, layout: Layout, values: list[Any], known: dict[str, int]) -> list[NDArray]:
-    """The values of a layout in the types of their checks; an `ArchiveError` where one breaks its check."""
+def _checked(group: h5py.Group, layout: stored.Layout, values: list[Any], known: dict[str, int]) -> list[NDArray]:
+    """Return the values of a layout in the types of their checks; raise an `ArchiveError` if one breaks its check."""
     for item, value in zip(layout, values, strict=True):
         if np.ndim(value) == len(item.shape):
             for n, length in zip(item.shape, np.shape(value), strict=True):
-                known.setdefault(n, dimensions.fixed_length(n) or length)
-        wanted = tuple(known.get(n, dimensions.fixed_length(n) or n) for n in item.shape)
+                known.setdefault(n, stored.fixed_length(n) or length)
+        wanted = tuple(known.get(n, stored.fixed_length(n) or n) for n in item.shape)
         if np.shape(value) != wanted:
             raise ArchiveError(f"{_place(group, item.name)} has shape {np.shape(value)}, expected {wanted}")
     found = []

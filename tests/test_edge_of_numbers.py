@@ -17,7 +17,7 @@ from ekfslam.errors import ConfigError, FilterError, InnovationError, NonFiniteE
 from ekfslam.filters.result import LINEAR_FROM_PX
 from ekfslam.reports import compare
 from ekfslam.runner import run
-from ekfslam.storage.checks import COVARIANCES
+from ekfslam.stored import COVARIANCES
 
 NOTHING_LEFT = {"hygiene": {"min_observations": 1000}}
 OFF = {"min_disparity_sigma": 0.0, "max_row_mismatch_sigma": 0.0, "reused_id_sigma": 0.0, "restart_at_repeats": False}

@@ -16,9 +16,10 @@ from ekfslam.cli import main
 from ekfslam.config import Config
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError
+from ekfslam.filters.result import Result
 from ekfslam.runner import run
-from ekfslam.storage import archive as archive_module
 from ekfslam.storage.archive import add_result, open_result, read_archive, write_archive
+from ekfslam.stored import layouts_of
 
 
 @pytest.fixture(scope="module")
@@ -302,11 +303,11 @@ def test_an_archive_without_a_run_is_one_line(whole, tmp_path, capsys, command):
 
 
 def test_every_item_of_every_layout_has_a_check_that_can_fail():
-    layouts = [value for name, value in vars(archive_module).items() if name.endswith("LAYOUT") or "_LOG_" in name]
+    layouts = [layout for _, _, layout in layouts_of(Result)]
     assert len(layouts) >= 8
     for item in (item for layout in layouts for item in layout):
         bad = {"f": np.nan, "i": -(1 << 40)}.get(item.check.kinds)
         if bad is None or item.name == "apart":
             continue
         shape = tuple(4 if isinstance(n, str) else n for n in item.shape)
-        assert not item.check.holds(np.full(shape, bad), {"T": 4, "M": 4, "K": 4}).all(), item.name
+        assert not item.check.holds(np.full(shape, bad), {"T": 4, "M": 4, "L": 4, "K": 4}).all(), item.name

@@ -15,7 +15,7 @@ import ekfslam
 
 # Rooms from the lowest to the highest: folders, and the modules that lie in ekfslam/ itself. A new one gets its place.
 ROOMS: tuple[tuple[str, ...], ...] = (
-    ("arrays", "errors", "names", "limits", "progress", "shown", "files", "dimensions", "hdf5"),
+    ("arrays", "errors", "names", "limits", "progress", "shown", "files", "stored", "hdf5"),
     ("kernels",),
     ("geometry",),
     ("config",),

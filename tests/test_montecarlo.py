@@ -22,7 +22,6 @@ from support.studies import short
 from ekfslam.cli import main
 from ekfslam.config import Config, FilterConfig
 from ekfslam.data.simulate import simulate
-from ekfslam.dimensions import AXES
 from ekfslam.errors import ArchiveError, ConfigError, InnovationError
 from ekfslam.evaluation.consistency import (
     anees,
@@ -38,6 +37,7 @@ from ekfslam.filters import JointEKF
 from ekfslam.geometry import se3
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
+from ekfslam.stored import AXES
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import SerialExecutor, open_executor
 from ekfslam.studies.study import FIELDS, LEVELS, Study, levels_of, read_study, realisation, run_one, run_study

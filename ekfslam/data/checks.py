@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ekfslam.arrays import Array
 from ekfslam.errors import DataError, NonFiniteError, ShapeError, StampError
+from ekfslam.stored import rigid_defect
 
 ROTATION_TOLERANCE = 1e-4  # files print rotations with as few as five digits
 
@@ -43,14 +44,6 @@ def require_finite(value: Array, name: str, largest: float = LARGEST) -> None:
             field=name,
             index=index[0] if len(index) == 1 else index or None,
         )
-
-
-def rigid_defect(T: Array) -> Array:
-    """By how much (...) finite (..., 4, 4) are no rotations and translations; 2 and more where they mirror."""
-    R = T[..., :3, :3]
-    defect = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-    bottom = np.abs(T[..., 3, :] - np.array([0, 0, 0, 1])).max(axis=-1)
-    return np.maximum(defect, bottom) + np.where(np.linalg.det(R) < 0, 2.0, 0.0)
 
 
 def require_rigid(T: Array, name: str, error: type[DataError]) -> None:

@@ -11,7 +11,7 @@ leaves one.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from ekfslam.data.sequence import Noise, Observations, Sequence
 from ekfslam.data.tracks import cut_tracks, repeated_frames, successive
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
+from ekfslam.stored import COUNTS, FRAMES, attribute, stored, whole, zeros
 
 # The rules in the order in which they are applied, with the key of ``[hygiene]`` that switches each. The index of a
 # rule is its code in `HygieneReport.rule`, also in archives: what is new comes last.
@@ -56,11 +57,11 @@ class HygieneReport:
         continuation: (n,) id that a cut track has from there on; -1 where the observation was dropped.
     """
 
-    observations: int
-    rule: IntArray
-    frame: IntArray
-    landmark: IntArray
-    continuation: IntArray
+    observations: int = field(metadata=attribute(int))
+    rule: IntArray = field(metadata=stored("finding", "code, see names", codes=RULES))
+    frame: IntArray = field(metadata=stored("finding", "frame index", check=FRAMES))
+    landmark: IntArray = field(metadata=stored("finding", "landmark id", check=COUNTS))
+    continuation: IntArray = field(metadata=stored("finding", "landmark id, -1 where dropped", check=whole(-1)))
 
     @property
     def dropped(self) -> int:
@@ -93,9 +94,8 @@ class HygieneReport:
 
     @staticmethod
     def empty(observations: int) -> HygieneReport:
-        """Of clean tracks."""
-        none = np.empty(0, dtype=np.int64)
-        return HygieneReport(observations, none, none, none, none)
+        """Return the report on clean tracks."""
+        return HygieneReport(observations, **zeros(HygieneReport, finding=0))
 
 
 def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tuple[Observations, HygieneReport]:

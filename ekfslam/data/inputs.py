@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, TypeVar, get_args
 
@@ -13,6 +13,7 @@ from ekfslam.data.checks import LARGEST_VELOCITY, frozen, require_finite, requir
 from ekfslam.data.interpolation import interpolated_intervals
 from ekfslam.data.interval import Interval
 from ekfslam.errors import DataError, LostDataError, ShapeError
+from ekfslam.stored import FLAGS, attribute, stored
 
 VelocityFrame = Literal["imu", "level"]
 _GAP_STEPS = 3.0
@@ -32,10 +33,13 @@ class Velocities:
         DataError: An array is malformed; the subclass says how.
     """
 
-    time_s: Array
-    twist: Array
-    frame: VelocityFrame = "imu"
-    interpolated: BoolArray = None  # type: ignore[assignment]  # filled in
+    time_s: Array = field(metadata=stored("sample", "s", "clock of the recording", name="time"))
+    twist: Array = field(metadata=stored("sample u", "m/s (columns 0-2), rad/s (columns 3-5)", "imu"))
+    frame: VelocityFrame = field(default="imu", metadata=attribute(str))
+    interpolated: BoolArray = field(
+        default=None,  # type: ignore[arg-type]  # filled in
+        metadata=stored("sample", check=FLAGS),
+    )
 
     def __post_init__(self) -> None:
         _freeze(self, "time_s", "twist")
@@ -137,9 +141,9 @@ class InertialSamples:
         DataError: An array is malformed; the subclass says how.
     """
 
-    time_s: Array
-    gyro_rad_s: Array
-    accel_m_s2: Array
+    time_s: Array = field(metadata=stored("sample", "s", "clock of the recording", name="time"))
+    gyro_rad_s: Array = field(metadata=stored("sample xyz", "rad/s", "imu", name="gyro"))
+    accel_m_s2: Array = field(metadata=stored("sample xyz", "m/s^2", "imu", name="accel"))
     noise: InertialNoise | None = None
 
     def __post_init__(self) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.stored import stored
 
 # How much of the squared motion of a track's other rows counts for a row, see `TrackError.step_variance`.
 ACROSS = 0.35
@@ -109,8 +110,8 @@ class Noise:
             that agree among tracks; what judges one track by itself need not allow for that.
     """
 
-    twist_std: Array
-    pixel_std_px: Array
+    twist_std: Array = field(metadata=stored("u", "m/s (0-2), rad/s (3-5)", "imu"))
+    pixel_std_px: Array = field(metadata=stored("pixels", "px", "image: uL, vL, uR, vR", name="pixel_std"))
     twist_walk_std: Array | None = None
     motion_std: Array = field(default_factory=lambda: np.zeros(6))
     misalignment_rad: float = 0.0

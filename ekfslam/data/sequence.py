@@ -41,6 +41,7 @@ from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.names import printable
 from ekfslam.shown import Card, Shown, count, figure
+from ekfslam.stored import COUNTS, stored
 
 LARGEST_ID = 1 << 62  # pieces of cut tracks count on from the largest
 _LARGEST_DISTANCE_M, _LARGEST_PX = 1e9, 1e7
@@ -69,9 +70,9 @@ class Observations:
         pixels_px: (K, 4) rectified pixels (uL, vL, uR, vR).
     """
 
-    frame: IntArray
-    landmark: IntArray
-    pixels_px: Array
+    frame: IntArray = field(metadata=stored("K", "frame index", check=COUNTS))
+    landmark: IntArray = field(metadata=stored("K", "landmark id", check=COUNTS))
+    pixels_px: Array = field(metadata=stored("K pixels", "px", "image: uL, vL, uR, vR", name="pixels"))
 
     def __post_init__(self) -> None:
         frame = np.asarray(self.frame, dtype=np.int64).ravel()
@@ -112,10 +113,16 @@ class Truth:
         noise: How far the poses themselves may be wrong; None: they are exact, or nothing is known of it.
     """
 
-    frame: IntArray
-    T_world_imu: Array
-    landmark: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    position_m: Array = field(default_factory=lambda: np.empty((0, 3)))
+    frame: IntArray = field(metadata=stored("F", "frame index", check=COUNTS))
+    T_world_imu: Array = field(metadata=stored("F row column", "m (translation)", "world from imu"))
+    landmark: IntArray = field(
+        default_factory=lambda: np.empty(0, dtype=np.int64),
+        metadata=stored("M", "landmark id", check=COUNTS, name="landmarks/id"),
+    )
+    position_m: Array = field(
+        default_factory=lambda: np.empty((0, 3)),
+        metadata=stored("M xyz", "m", "world", name="landmarks/position"),
+    )
     noise: TruthNoise | None = None
 
     def __post_init__(self) -> None:
@@ -150,9 +157,9 @@ class Sequence(Shown):
 
     name: str
     source: str
-    time_s: Array
+    time_s: Array = field(metadata=stored("T", "s", "clock of the recording", name="time"))
     camera: StereoCamera
-    T_cam_imu: Array
+    T_cam_imu: Array = field(metadata=stored("row column", "m (translation)", "cam from imu"))
     observations: Observations
     truth: Truth | None
     noise: Noise | None

@@ -9,13 +9,31 @@ from where it was predicted; those of blocks that are vectors are their values.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.geometry import se3
+from ekfslam.stored import (
+    COUNTS,
+    COVARIANCES,
+    FLAGS,
+    FRAMES,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RIGID,
+    attribute,
+    index_of,
+    stored,
+    whole,
+)
+
+_COORDINATES = "see ekfslam.filters.log"
+_VELOCITIES = "m/s (0-2), rad/s (3-5)"
+
+
+def _poses(name: str) -> dict[str, Any]:
+    """Return the metadata of poses, a data set of this name."""
+    return stored("T row column", "m (translation)", "imu from world", RIGID, name)
 
 
 @dataclass(frozen=True)
@@ -54,65 +72,37 @@ class Log:
         velocity_axis, velocity_value, velocity_std, velocity_is_biased: (N,) see `ekfslam.models.process.Measured`.
     """
 
-    first_estimates: bool
-    initial_covariance: Array
-    twist: Array
-    tau_s: Array
-    imu_twist: Array
-    seen_twist: Array
-    T_departed: Array
-    T_predicted: Array
-    T_linear: Array
-    T_linear_before: Array
-    T_updated: Array
-    departed: Array
-    linear: Array
-    updated: Array
-    up: Array
-    id: IntArray
-    first_position_m: Array
-    frame: IntArray
-    landmark: IntArray
-    previous: IntArray
-    rows: Array
-    variance: Array
-    position_m: Array
-    velocity_frame: IntArray
-    velocity_axis: IntArray
-    velocity_value: Array
-    velocity_std: Array
-    velocity_is_biased: BoolArray
-    is_gap: BoolArray
-
-    @staticmethod
-    def of_poses_alone(**known: Any) -> Log:
-        """A log with the fields that archives had before format version 4: of a filter whose one block is the pose."""
-        predicted, frames = known["T_predicted"], len(known["tau_s"])
-
-        def coordinates(T: Array, reference: Array) -> Array:
-            return se3.log(T @ se3.inverse(reference))
-
-        departed = np.concatenate([predicted[:1], known["T_updated"][:-1]])
-        updated = coordinates(known["T_updated"], predicted)
-        no_index, none = np.empty(0, dtype=np.int64), np.empty(0)
-        return Log(
-            **known,
-            imu_twist=known["twist"],
-            seen_twist=known["twist"],
-            T_departed=departed,
-            T_linear_before=departed,
-            departed=np.concatenate([np.zeros((1, 6)), updated[:-1]]),
-            linear=coordinates(known["T_linear"], predicted),
-            updated=updated,
-            up=np.empty((frames, 0)),
-            previous=np.full(len(known["frame"]), -1),
-            velocity_frame=no_index,
-            velocity_axis=no_index,
-            velocity_value=none,
-            velocity_std=none,
-            velocity_is_biased=np.empty(0, dtype=bool),
-            is_gap=np.zeros(frames, dtype=bool),
-        )
+    first_estimates: bool = field(metadata=attribute(bool))
+    initial_covariance: Array = field(
+        metadata=stored("xi xi", "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu", COVARIANCES)
+    )
+    twist: Array = field(metadata=stored("T u", _VELOCITIES, "that of the velocities"))
+    tau_s: Array = field(metadata=stored("T", "s", check=NOT_NEGATIVE, name="tau"))
+    imu_twist: Array = field(metadata=stored("T u", _VELOCITIES, "imu"))
+    seen_twist: Array = field(metadata=stored("T u", _VELOCITIES, "imu"))
+    T_departed: Array = field(metadata=_poses("T_imu_world_departed"))
+    T_predicted: Array = field(metadata=_poses("T_imu_world_predicted"))
+    T_linear: Array = field(metadata=_poses("T_imu_world_linear"))
+    T_linear_before: Array = field(metadata=_poses("T_imu_world_linear_before"))
+    T_updated: Array = field(metadata=_poses("T_imu_world_updated"))
+    departed: Array = field(metadata=stored("T B", _COORDINATES, "imu"))
+    linear: Array = field(metadata=stored("T B", _COORDINATES, "imu"))
+    updated: Array = field(metadata=stored("T B", _COORDINATES, "imu"))
+    up: Array = field(metadata=stored("T U", "1", "world"))
+    id: IntArray = field(metadata=stored("L", "landmark id", check=COUNTS, name="landmark_id"))
+    first_position_m: Array = field(metadata=stored("L xyz", "m", "world", name="first_position"))
+    frame: IntArray = field(metadata=stored("K", "frame index", check=FRAMES))
+    landmark: IntArray = field(metadata=stored("K", "row of landmark_id", check=index_of("L")))
+    previous: IntArray = field(metadata=stored("K", "observation, -1: none", check=index_of("K", least=-1)))
+    rows: Array = field(metadata=stored("K d", "px, (uL, v, uR) or (u, v, disparity)", "image"))
+    variance: Array = field(metadata=stored("K d", "px^2", "image", POSITIVE))
+    position_m: Array = field(metadata=stored("K xyz", "m", "world", name="linear_position"))
+    velocity_frame: IntArray = field(metadata=stored("velocity", "frame index", check=FRAMES))
+    velocity_axis: IntArray = field(metadata=stored("velocity", "axis, 0 to 5", check=whole(0, 5)))
+    velocity_value: Array = field(metadata=stored("velocity", "m/s or rad/s", "that of the velocities"))
+    velocity_std: Array = field(metadata=stored("velocity", "m/s or rad/s", "that of the velocities", NOT_NEGATIVE))
+    velocity_is_biased: BoolArray = field(metadata=stored("velocity", "truth value", check=FLAGS))
+    is_gap: BoolArray = field(metadata=stored("T", "truth value", check=FLAGS))
 
     @property
     def frames(self) -> int:

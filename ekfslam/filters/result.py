@@ -20,6 +20,22 @@ from ekfslam.filters.log import Log
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.shown import Card, Shown, figure
+from ekfslam.stored import (
+    ASCENDING,
+    COUNTS,
+    COVARIANCES,
+    FRAMES,
+    NOT_NEGATIVE,
+    NUMBERS_OR_NONE,
+    RIGID,
+    along,
+    attribute,
+    group,
+    index_of,
+    stored,
+    values_of,
+    zeros,
+)
 
 ERROR_CONVENTION = (
     "T_imu_world = exp(xi^) T_hat, xi = [rho; theta] translation first; landmark m = m_hat + d in world; "
@@ -30,6 +46,8 @@ ERROR_CONVENTION = (
 # the business of `ekfslam.data.hygiene`, keeps its place.
 REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera", "moving", "waiting")
 
+_POSE_COVARIANCE = "m^2, m rad, rad^2 (rho 0-2, theta 3-5)"
+_PARAMETER_UNITS = "see attribute unit of the group"
 
 # Pixel noise below which a linearised update gains more than it should. In both built-in worlds the pose NEES is the
 # same from 0.7 to 0.1 px, twice as large at 0.03 px, ten times at 0.01 px.
@@ -51,30 +69,30 @@ class Landmarks:
         observations: (M,) number of accepted observations, the first included.
     """
 
-    id: IntArray
-    position_m: Array
-    covariance: Array
-    initial_position_m: Array
-    first_frame: IntArray
-    last_frame: IntArray
-    observations: IntArray
+    id: IntArray = field(metadata=stored("M", "landmark id", check=COUNTS))
+    position_m: Array = field(metadata=stored("M xyz", "m", "world", name="position"))
+    covariance: Array = field(metadata=stored("M xyz xyz", "m^2", "world", COVARIANCES))
+    initial_position_m: Array = field(metadata=stored("M xyz", "m", "world", name="initial_position"))
+    first_frame: IntArray = field(metadata=stored("M", "frame index", check=FRAMES))
+    last_frame: IntArray = field(metadata=stored("M", "frame index", check=FRAMES))
+    observations: IntArray = field(metadata=stored("M", "count", check=COUNTS))
 
     def __len__(self) -> int:
         return len(self.id)
 
     def only(self, which: IntArray | NDArray[np.bool_]) -> Landmarks:
-        """Some of the landmarks."""
-        return Landmarks(*(getattr(self, f.name)[which] for f in fields(Landmarks)))
+        """Return some of the landmarks."""
+        return replace(self, **along(self, "M", which))
 
     @staticmethod
     def concatenate(parts: SequenceType[Landmarks]) -> Landmarks:
-        """All landmarks of the parts, in their order."""
+        """Return all landmarks of the parts, in their order."""
         return Landmarks(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Landmarks)))
 
     @staticmethod
     def empty() -> Landmarks:
-        none = np.empty(0, dtype=np.int64)
-        return Landmarks(none, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), none, none, none)
+        """Return a map without landmarks."""
+        return Landmarks(**zeros(Landmarks, M=0))
 
 
 @dataclass(frozen=True)
@@ -88,16 +106,15 @@ class Innovation:
         rejected: (T,) observations that did not.
     """
 
-    nis: Array
-    dof: IntArray
-    accepted: IntArray
-    rejected: IntArray
+    nis: Array = field(metadata=stored("T"))
+    dof: IntArray = field(metadata=stored("T", "count", check=COUNTS))
+    accepted: IntArray = field(metadata=stored("T", "count", check=COUNTS))
+    rejected: IntArray = field(metadata=stored("T", "count", check=COUNTS))
 
     @staticmethod
     def empty(frames: int) -> Innovation:
-        """Of a run without observations."""
-        none = np.zeros(frames, dtype=np.int64)
-        return Innovation(np.zeros(frames), none, none, none)
+        """Return the statistics of a run without observations."""
+        return Innovation(**zeros(Innovation, T=frames))
 
 
 @dataclass(frozen=True)
@@ -117,12 +134,14 @@ class WhitenedInnovations:
         information: (T, 6, 6) its covariance ``C = J^T S^-1 J``; 0 where nothing was accepted.
     """
 
-    frame: IntArray
-    landmark: IntArray
-    alone: Array
-    apart: Array
-    score: Array
-    information: Array
+    frame: IntArray = field(metadata=stored("innovation", "frame index", check=FRAMES))
+    landmark: IntArray = field(metadata=stored("innovation", "row of log/landmark_id", check=index_of("M")))
+    alone: Array = field(metadata=stored("innovation d", "1", "image"))
+    apart: Array = field(metadata=stored("innovation d", "1", "image", NUMBERS_OR_NONE))
+    score: Array = field(metadata=stored("T xi", "1/m (rho 0-2), 1/rad (theta 3-5)", "imu"))
+    information: Array = field(
+        metadata=stored("T xi xi", "1/m^2, 1/(m rad), 1/rad^2 (rho 0-2, theta 3-5)", "imu", COVARIANCES)
+    )
 
     @property
     def shared(self) -> Array:
@@ -147,14 +166,14 @@ class WhitenedInnovations:
 class Rejections:
     """Every rejected observation: (R,) frame, landmark id, and index into `REASONS`."""
 
-    frame: IntArray
-    landmark: IntArray
-    reason: IntArray
+    frame: IntArray = field(metadata=stored("R", "frame index", check=FRAMES))
+    landmark: IntArray = field(metadata=stored("R", "landmark id", check=COUNTS))
+    reason: IntArray = field(metadata=stored("R", "code, see names", codes=REASONS))
 
     @staticmethod
     def empty() -> Rejections:
-        none = np.empty(0, dtype=np.int64)
-        return Rejections(none, none, none)
+        """Return the rejections of a run that rejected nothing."""
+        return Rejections(**zeros(Rejections, R=0))
 
 
 @dataclass(frozen=True)
@@ -167,11 +186,11 @@ class Parameters:
         value, std: (T, p) estimates and their deviations.
     """
 
-    name: tuple[str, ...]
-    unit: tuple[str, ...]
-    prior_std: Array
-    value: Array
-    std: Array
+    name: tuple[str, ...] = field(metadata=attribute(tuple, along="P"))
+    unit: tuple[str, ...] = field(metadata=attribute(tuple, along="P"))
+    prior_std: Array = field(metadata=stored("P", _PARAMETER_UNITS, "imu", NOT_NEGATIVE))
+    value: Array = field(metadata=stored("T P", _PARAMETER_UNITS, "imu"))
+    std: Array = field(metadata=stored("T P", _PARAMETER_UNITS, "imu", NOT_NEGATIVE))
 
     @property
     def is_observed(self) -> NDArray[np.bool_]:
@@ -198,21 +217,21 @@ class PosePairs:
         cross: (n, 6, 6) covariance of ``xi_j`` (rows) and ``xi_k`` as both were reported.
     """
 
-    first: IntArray
-    second: IntArray
-    cross: Array
+    first: IntArray = field(metadata=stored("pair", "frame index", check=FRAMES))
+    second: IntArray = field(metadata=stored("pair", "frame index", check=FRAMES))
+    cross: Array = field(metadata=stored("pair xi xi", _POSE_COVARIANCE, "imu of first, imu of second"))
 
     def __len__(self) -> int:
         return len(self.first)
 
     def only(self, which: NDArray[np.bool_]) -> PosePairs:
-        """Some of the pairs."""
-        return PosePairs(self.first[which], self.second[which], self.cross[which])
+        """Return some of the pairs."""
+        return replace(self, **along(self, "pair", which))
 
     @staticmethod
     def empty() -> PosePairs:
-        none = np.empty(0, dtype=np.int64)
-        return PosePairs(none, none, np.empty((0, 6, 6)))
+        """Return no pairs."""
+        return PosePairs(**zeros(PosePairs, pair=0))
 
 
 class View:
@@ -262,47 +281,42 @@ class Result(Shown):
     """
 
     mode: str
-    sequence_name: str
-    time_s: Array
-    T_world_imu: Array
-    covariance: Array
-    landmarks: Landmarks
-    innovation: Innovation
-    rejections: Rejections
-    ms_per_frame: Array
+    sequence_name: str = field(metadata=attribute(str))
+    time_s: Array = field(metadata=stored("T", "s", "clock of the recording", ASCENDING, name="trajectory/time"))
+    T_world_imu: Array = field(
+        metadata=stored("T row column", "m (translation)", "world from imu", RIGID, name="trajectory/T_world_imu")
+    )
+    covariance: Array = field(
+        metadata=stored("T xi xi", _POSE_COVARIANCE, "imu", COVARIANCES, name="trajectory/covariance")
+    )
+    landmarks: Landmarks = field(metadata=group(Landmarks))
+    innovation: Innovation = field(metadata=group(Innovation))
+    rejections: Rejections = field(metadata=group(Rejections))
+    ms_per_frame: Array = field(metadata=stored("T", "ms", check=NOT_NEGATIVE, name="timing/ms_per_frame"))
     counts: Mapping[str, int]
     config: Mapping[str, Any]
     noise: Noise
     camera: StereoCamera
     T_cam_imu: Array
-    log: Log | None = None
-    hygiene: HygieneReport | None = None
-    parameters: Parameters | None = None
-    pairs: PosePairs | None = None
-    whitened: WhitenedInnovations | None = None
+    log: Log | None = field(default=None, metadata=group(Log))
+    hygiene: HygieneReport | None = field(default=None, metadata=group(HygieneReport))
+    parameters: Parameters | None = field(default=None, metadata=group(Parameters))
+    pairs: PosePairs | None = field(default=None, metadata=group(PosePairs))
+    whitened: WhitenedInnovations | None = field(default=None, metadata=group(WhitenedInnovations))
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, value in self._numbers().items():
+        stated = [value for value in self.attributes.values() if isinstance(value, float)]
+        numbers = {
+            name: value
+            for name, item, value in values_of(self)
+            # An infinite variance in a log is an observation without weight.
+            if item.check.kinds == "f" and item.check is not NUMBERS_OR_NONE and not name.startswith("log.")
+        }
+        for name, value in {**numbers, "attributes": np.array(stated)}.items():
             is_wrong = ~np.isfinite(value)
             if is_wrong.any():
                 raise NonFiniteResultError(self.mode, name, int(np.argwhere(is_wrong)[0][0]))
-
-    def _numbers(self) -> dict[str, Array]:
-        """Everything in it that must be a finite number."""
-        numbers = {name: getattr(self, name) for name in ("time_s", "T_world_imu", "covariance", "ms_per_frame")}
-        parts: list[tuple[str, Any, tuple[str, ...]]] = [
-            ("landmarks", self.landmarks, ("position_m", "covariance", "initial_position_m")),
-            ("innovation", self.innovation, ("nis",)),
-            ("parameters", self.parameters, ("value", "std", "prior_std")),
-            ("pairs", self.pairs, ("cross",)),
-            ("whitened", self.whitened, ("alone", "score", "information")),
-        ]
-        for part, record, names in parts:
-            if record is not None:
-                numbers |= {f"{part}.{name}": getattr(record, name) for name in names}
-        stated = [value for value in self.attributes.values() if isinstance(value, float)]
-        return numbers | {"attributes": np.array(stated)}
 
     def card(self) -> Card:
         """What ``repr`` and a notebook show."""
@@ -375,11 +389,10 @@ class Result(Shown):
         if begin >= end:
             raise ShapeError(f"there are no frames from {begin_s:g} s to {end_s:g} s", source=self.sequence_name)
 
-        def cut(record: Any, *names: str) -> dict[str, Any]:
-            return {name: getattr(record, name)[begin:end] for name in names}
-
+        frames = slice(begin, end)
         rejections, pairs, parameters = self.rejections, self.pairs, self.parameters
         rejected = (rejections.frame >= begin) & (rejections.frame < end)
+        rejections = replace(rejections, **along(rejections, "R", rejected))
         known = self.landmarks.only((self.landmarks.first_frame < end) & (self.landmarks.last_frame >= begin))
         first, last = (np.clip(frame, begin, end - 1) - begin for frame in (known.first_frame, known.last_frame))
         if pairs is not None:
@@ -387,13 +400,11 @@ class Result(Shown):
             pairs = replace(pairs, first=pairs.first - begin, second=pairs.second - begin)
         return replace(
             self,
-            **cut(self, "time_s", "T_world_imu", "covariance", "ms_per_frame"),
-            innovation=Innovation(**cut(self.innovation, *(f.name for f in fields(Innovation)))),
+            **along(self, "T", frames),
+            innovation=replace(self.innovation, **along(self.innovation, "T", frames)),
             landmarks=replace(known, first_frame=first, last_frame=last),
-            rejections=Rejections(
-                rejections.frame[rejected] - begin, rejections.landmark[rejected], rejections.reason[rejected]
-            ),
-            parameters=None if parameters is None else replace(parameters, **cut(parameters, "value", "std")),
+            rejections=replace(rejections, frame=rejections.frame - begin),
+            parameters=None if parameters is None else replace(parameters, **along(parameters, "T", frames)),
             pairs=pairs,
             log=None,
             hygiene=None,

@@ -1,4 +1,4 @@
-"""What poses and covariances in a file must be, beside what `ekfslam.hdf5` knows of numbers."""
+"""Agreement of the fields of a result that are each valid alone."""
 
 from __future__ import annotations
 
@@ -7,49 +7,36 @@ from typing import Any
 
 import numpy as np
 
-from ekfslam.arrays import Array, BoolArray
-from ekfslam.data.checks import rigid_defect
 from ekfslam.errors import ArchiveError
-from ekfslam.hdf5 import NUMBERS, Check
-
-RIGID_TOLERANCE = 1e-6
-COVARIANCE_TOLERANCE = 1e-6  # of correlations: far above rounding, far below what shows in an ellipse
+from ekfslam.filters.log import Log
 
 
-def _is_rigid(T: Array, _: Mapping[str, int]) -> BoolArray:
-    found = np.nan_to_num(T, nan=0.0, posinf=0.0, neginf=0.0)
-    return (rigid_defect(found) <= RIGID_TOLERANCE) & NUMBERS.holds(T, {}).all(axis=(-1, -2))
+def require_agreement(result: Mapping[str, Any], place: str) -> None:
+    """Raise an `ArchiveError` if fields of a stored result contradict each other.
+
+    Args:
+        result: Stored fields of a `Result`, each valid alone.
+        place: File and group, for the message.
+    """
+    pairs, log = result["pairs"], result["log"]
+    if pairs is not None and not (pairs.first < pairs.second).all():
+        raise ArchiveError(f"{place}/pairs holds frames that are no pair")
+    if log is not None:
+        _require_log(log, len(result["landmarks"]), f"{place}/log")
 
 
-def _is_covariance(P: Array, _: Mapping[str, int]) -> BoolArray:
-    """Whether (...) of (..., n, n) are symmetric and positive semi-definite, by their correlations."""
-    is_number = np.asarray(NUMBERS.holds(P, {}).all(axis=(-1, -2)))
-    P = np.where(is_number[..., None, None], P, 0.0)
-    variance = np.diagonal(P, axis1=-2, axis2=-1)
-    std = np.sqrt(np.where(variance > 0, variance, 1.0))
-    C = P / std[..., :, None] / std[..., None, :]
-    is_symmetric = (np.abs(C - C.swapaxes(-1, -2)) <= COVARIANCE_TOLERANCE).all(axis=(-1, -2))
-    C = np.clip(C, -2.0, 2.0)  # beyond 1 it is none, but its eigenvalues must stay numbers
-    smallest = np.linalg.eigvalsh((C + C.swapaxes(-1, -2)) / 2)[..., 0]
-    return is_number & is_symmetric & (variance >= 0).all(axis=-1) & (smallest >= -COVARIANCE_TOLERANCE)
-
-
-RIGID = Check("f", "be a rigid transform", _is_rigid)
-COVARIANCES = Check("f", "be symmetric and positive semi-definite", _is_covariance)
-
-
-def require_agreement(log: Mapping[str, Any], place: str) -> None:
-    """Raise an `ArchiveError` where the fields of a log, each right by itself, contradict each other."""
-    frame, landmark, previous = (log[name] for name in ("frame", "landmark", "previous"))
-    if len(np.unique(landmark)) < len(log["id"]):
-        unseen = np.setdiff1d(np.arange(len(log["id"])), landmark)[0]
+def _require_log(log: Log, landmarks: int, place: str) -> None:
+    if log.landmarks != landmarks:
+        raise ArchiveError(f"{place}/landmark_id has {log.landmarks} entries, but the map has {landmarks} landmarks")
+    if len(np.unique(log.landmark)) < log.landmarks:
+        unseen = np.setdiff1d(np.arange(log.landmarks), log.landmark)[0]
         raise ArchiveError(f"{place}/landmark_id[{unseen}] has no observation")
-    follows = np.flatnonzero(previous >= 0)
-    before = previous[follows]
-    wrong = (landmark[before] != landmark[follows]) | (frame[before] != frame[follows] - 1)
+    follows = np.flatnonzero(log.previous >= 0)
+    before = log.previous[follows]
+    wrong = (log.landmark[before] != log.landmark[follows]) | (log.frame[before] != log.frame[follows] - 1)
     if wrong.any():
         raise ArchiveError(
             f"{place}/previous[{follows[np.argmax(wrong)]}] is no observation of the same landmark in the frame before"
         )
-    if log["up"].shape[1] not in (0, 3):
-        raise ArchiveError(f"{place}/up has {log['up'].shape[1]} columns, expected 3, or 0 where it is not estimated")
+    if log.up.shape[1] not in (0, 3):
+        raise ArchiveError(f"{place}/up has {log.up.shape[1]} columns, expected 3, or 0 where it is not estimated")

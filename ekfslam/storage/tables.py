@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ekfslam import dimensions, hdf5
 from ekfslam.arrays import Array
 from ekfslam.errors import ArchiveError, MissingPackageError
 from ekfslam.filters.result import REASONS, Result
-from ekfslam.storage.archive import LAYOUT
+from ekfslam.stored import Item, coordinate, values_of
 
 if TYPE_CHECKING:
     import pandas
@@ -109,20 +108,23 @@ def dataset(result: Result, group: str = "trajectory") -> xarray.Dataset:
         MissingPackageError: xarray is not installed.
         ArchiveError: There is no such group.
     """
-    items = [item for item in LAYOUT if item.place[0] == group]
-    if not items:
-        groups = dict.fromkeys(item.place[0] for item in LAYOUT)
+    groups: dict[str, list[tuple[Item, NDArray]]] = {}
+    for name, item, value in values_of(result):
+        groups.setdefault(item.place[0] or name.partition(".")[0], []).append((item, value))
+    if group not in groups:
         raise ArchiveError(f"{result.sequence_name}: there is no group {group!r}; known: {', '.join(groups)}")
-    found: dict[str, Any] = {}
-    for item in items:
-        value = np.asarray(hdf5.value_of(item, result))
-        found[item.place[1]] = (item.dims, value, {"units": item.units, "frame": item.frame})
+    names = () if result.parameters is None else result.parameters.name
+    given = {"time": result.time_s, "parameter": np.array(names)}
+    variables: dict[str, Any] = {}
+    coordinates: dict[str, Any] = {}
+    for item, value in groups[group]:
         for name, length in zip(item.dims, value.shape, strict=True):
-            along = dimensions.coordinate(name, length, {"time": result.time_s})
+            along = coordinate(name, length, given)
             along = along.astype(str) if along.dtype.kind == "S" else along
-            found.setdefault(name, ((name,), along, {"units": "s" if name == "time" else "1"}))
-    own = {name: found.pop(name) for name in {name for item in items for name in item.dims}}
-    return _package("xarray", "to_xarray").Dataset(found, own)
+            coordinates.setdefault(name, ((name,), along, {"units": "s" if name == "time" else "1"}))
+        place = coordinates if item.place[1] in item.dims else variables
+        place[item.place[1]] = (item.dims, value, {"units": item.units, "frame": item.frame})
+    return _package("xarray", "to_xarray").Dataset(variables, coordinates)
 
 
 def _package(name: str, what: str) -> Any:

@@ -41,7 +41,6 @@ from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import VARIANTS, Config, FilterConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import Loop, simulate
-from ekfslam.dimensions import Shape, fixed_length
 from ekfslam.errors import ArchiveError, ConfigError, FilterError
 from ekfslam.evaluation.consistency import (
     joint_nees,
@@ -58,6 +57,7 @@ from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress as with_progress
 from ekfslam.runner import versions
 from ekfslam.shown import Card, Shown, count
+from ekfslam.stored import COUNTS, FLAGS, NUMBERS_OR_NONE, Item, Shape, fixed_length
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed
 from ekfslam.studies.journal import Journal
 
@@ -117,16 +117,14 @@ CHECKPOINT_S = 5.0
 CHECKPOINT_SHARE = 0.05  # of the time may go into checkpoints of a large study
 
 # Data sets below a level, and below a variant of it.
-LEVEL_LAYOUT = hdf5.layout(
-    ("time", "time", ("T",), "s", "nominal stamps"),
-    ("done", "done", ("runs",), "1", "runs that are in", hdf5.FLAGS),
+LEVEL_LAYOUT = (
+    Item("time", "time", ("T",), "s", "nominal stamps"),
+    Item("done", "done", ("runs",), "1", "runs that are in", FLAGS),
 )
-_CHECKS = {float: hdf5.NUMBERS_OR_NONE, int: hdf5.COUNTS, bool: hdf5.FLAGS}
-VARIANT_LAYOUT = hdf5.layout(
-    *(
-        (name, name, ("runs", *shape), units, frame, _CHECKS[kind])
-        for name, (shape, kind, units, frame) in FIELDS.items()
-    )
+_CHECKS = {float: NUMBERS_OR_NONE, int: COUNTS, bool: FLAGS}
+VARIANT_LAYOUT = tuple(
+    Item(name, name, ("runs", *shape), units, frame, _CHECKS[kind])
+    for name, (shape, kind, units, frame) in FIELDS.items()
 )
 
 Record = dict[str, dict[str, NDArray]]  # variant, field, value of one run

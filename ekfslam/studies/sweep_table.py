@@ -23,12 +23,11 @@ from ekfslam.evaluation.summary import KEYS
 from ekfslam.evaluation.tables import document, markdown_table, significant
 from ekfslam.names import printable
 from ekfslam.runner import versions
+from ekfslam.stored import TEXTS, Check, Item
 
 FORMAT, FORMAT_VERSION = "ekfslam-sweep", 1
 _RUNS, _ROW = "runs", "run"  # the length that all columns share, and its dimension
-_ANY_NUMBER = hdf5.Check(
-    "f", "be numbers", lambda value, _: np.ones(value.shape, dtype=bool)
-)  # a limit may be infinite
+_ANY_NUMBER = Check("f", "be numbers", lambda value, _: np.ones(value.shape, dtype=bool))  # a limit may be infinite
 SHOWN = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_dof", "landmark_rmse_m", "total_s")
 
 
@@ -135,7 +134,7 @@ def table_image(table: SweepTable) -> bytes:
         facts = {"swept": json.dumps(table.swept), "runs": table.asked, **versions()}
         hdf5.write_attributes(h5file, facts)
         group = h5file.create_group("table", track_order=True)
-        layout = hdf5.layout(*(_item(name, values.dtype.kind) for name, values in table.columns.items()))
+        layout = [_item(name, values.dtype.kind) for name, values in table.columns.items()]
         stored = {
             name: values
             if values.dtype.kind == "f"
@@ -171,7 +170,7 @@ def read_table(path: str | Path) -> SweepTable:
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         group = hdf5.subgroup(h5file, "table")
         items = [_item(name, "f" if group[name].dtype.kind == "f" else "S") for name in group if name != _ROW]
-        found = hdf5.read_fields(group, hdf5.layout(*items))
+        found = hdf5.read_fields(group, items)
         columns = {
             name: value
             if value.dtype.kind == "f"
@@ -185,9 +184,8 @@ def read_table(path: str | Path) -> SweepTable:
         return SweepTable(columns, tuple(swept), int(hdf5.attribute(h5file, "runs")))
 
 
-def _item(name: str, kind: str) -> tuple[Any, ...]:
-    check = _ANY_NUMBER if kind == "f" else hdf5.TEXTS
-    return name, name, (_RUNS,), "see the name", "none", check
+def _item(name: str, kind: str) -> Item:
+    return Item(name, name, (_RUNS,), "see the name", "none", _ANY_NUMBER if kind == "f" else TEXTS)
 
 
 def _parquet(table: SweepTable) -> bytes | None:

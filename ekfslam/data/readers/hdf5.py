@@ -33,61 +33,34 @@ from ekfslam.data.noise import Noise
 from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
 from ekfslam.data.sequence import Observations, Sequence, Truth
 from ekfslam.data.truth_noise import TruthNoise
-from ekfslam.dimensions import fixed_length
 from ekfslam.errors import ArchiveError, ShapeError, UnknownFormatError
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.stored import TEXTS, Item, Layout, fixed_length, layout_of
 
 FORMAT = "ekfslam-sequence"
 FORMAT_VERSION = 3  # 2 added coordinates of all dimensions, 3 inputs
 
-_INDICES = ("frame index", "landmark id")  # units of whole numbers
 
-# Part of a `Sequence` to data sets below /, fields of the part, shape, units, frame.
-_SEQUENCE = hdf5.layout(
-    ("sequence/time", "time_s", ("T",), "s", "clock of the recording"),
-    ("sequence/twist", "twist", ("T", "u"), "m/s (columns 0-2), rad/s (columns 3-5)", "imu"),
-    ("sequence/T_cam_imu", "T_cam_imu", ("row", "column"), "m (translation)", "cam from imu"),
-)
-_OBSERVATIONS = hdf5.layout(
-    ("sequence/observations/frame", "frame", ("K",), "frame index", "none"),
-    ("sequence/observations/landmark", "landmark", ("K",), "landmark id", "none"),
-    ("sequence/observations/pixels", "pixels_px", ("K", "pixels"), "px", "image: uL, vL, uR, vR"),
-)
-_NOISE = hdf5.layout(
-    ("sequence/noise/twist_std", "twist_std", ("u",), "m/s (0-2), rad/s (3-5)", "imu"),
-    ("sequence/noise/pixel_std", "pixel_std_px", ("pixels",), "px", "image: uL, vL, uR, vR"),
-)
-_TRUTH = hdf5.layout(
-    ("truth/frame", "frame", ("F",), "frame index", "none"),
-    ("truth/T_world_imu", "T_world_imu", ("F", "row", "column"), "m (translation)", "world from imu"),
-    ("truth/landmarks/id", "landmark", ("M",), "landmark id", "none"),
-    ("truth/landmarks/position", "position_m", ("M", "xyz"), "m", "world"),
-)
-_SAMPLES = {
-    kind.__name__: hdf5.layout(*rows, N="sample")
-    for kind, rows in {
-        Velocities: (
-            ("time", "time_s", ("N",), "s", "clock of the recording"),
-            ("twist", "twist", ("N", "u"), "m/s (columns 0-2), rad/s (columns 3-5)", "imu"),
-            ("interpolated", "interpolated", ("N",), "1", "none", hdf5.FLAGS),
-        ),
-        InertialSamples: (
-            ("time", "time_s", ("N",), "s", "clock of the recording"),
-            ("gyro", "gyro_rad_s", ("N", "xyz"), "rad/s", "imu"),
-            ("accel", "accel_m_s2", ("N", "xyz"), "m/s^2", "imu"),
-        ),
-    }.items()
-}
-_NOTES = hdf5.layout(("sequence/notes", "notes", ("n",), "text", "none", hdf5.TEXTS))
+def _below(place: str, layout: Layout) -> Layout:
+    return tuple(item._replace(name=f"{place}/{item.name}") for item in layout)
+
+
+_TWIST = Item("twist", "twist", ("T", "u"), "m/s (columns 0-2), rad/s (columns 3-5)", "imu")
+_SEQUENCE = _below("sequence", (*layout_of(Sequence), _TWIST))
+_OBSERVATIONS = _below("sequence/observations", layout_of(Observations))
+_NOISE = _below("sequence/noise", layout_of(Noise))
+_TRUTH = _below("truth", layout_of(Truth))
+_INPUTS: dict[str, type[Input]] = {kind.__name__: kind for kind in (Velocities, InertialSamples)}
+_NOTES = (Item("sequence/notes", "notes", ("n",), "text", "none", TEXTS),)
 LAYOUT = (*_SEQUENCE, *_NOTES, *_NOISE, *_TRUTH)  # of an archive, too
 OBSERVATIONS_LAYOUT = _OBSERVATIONS
 _CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
 _OLD_NOISE = ("drift", "bearing_drift_rad")  # walks of landmarks, before errors of tracks walked in the image
 _TRUTH_NOISE = "noise_"  # before the names of attributes
-_NOISE_FIELDS = tuple(field for _, field, *_ in _NOISE)
+_NOISE_FIELDS = tuple(item.field for item in _NOISE)
 
 _PARTS = {"": _SEQUENCE, "observations.": _OBSERVATIONS, "noise.": _NOISE, "truth.": _TRUTH}
-SPELLING = {part + field: name for part, layout in _PARTS.items() for name, field, *_ in layout} | {
+SPELLING = {part + item.field: item.name for part, layout in _PARTS.items() for item in layout} | {
     "K": "sequence/camera@fu_px, fv_px",
     "baseline": "sequence/camera@baseline_m",
     "observations": "sequence/observations",
@@ -217,13 +190,11 @@ def _write_inputs(group: h5py.Group, sequence: Sequence) -> None:
         if samples is sequence.velocities and _is_twist(samples, sequence.time_s):
             hdf5.write_attributes(group, {"twist": i})
             continue
-        kind = type(samples).__name__
-        if isinstance(samples, Velocities):
-            further: dict[str, Any] = {"frame": samples.frame}
-        else:
-            further = {} if samples.noise is None else vars(samples.noise)
-        hdf5.write_fields(group.create_group(str(i)), _SAMPLES[kind], samples)
-        hdf5.write_attributes(group[str(i)], {"kind": kind, **further})
+        part = group.create_group(str(i))
+        hdf5.write_record(part, samples, {})
+        hdf5.write_attributes(part, {"kind": type(samples).__name__})
+        if isinstance(samples, InertialSamples) and samples.noise is not None:
+            hdf5.write_attributes(part, vars(samples.noise))
 
 
 def _is_twist(samples: Velocities, time_s: Array) -> bool:
@@ -240,17 +211,15 @@ def _read_inputs(group: h5py.Group, found: Mapping[str, Any]) -> dict[str, Any]:
         if i == twist_at:
             inputs.append(Velocities(found["time_s"], found["twist"], found["velocity_frame"]))
             continue
-        part, stored = _group(group, str(i)), hdf5.attributes(_group(group, str(i)))
-        kind = stored.pop("kind", None)
-        if kind not in _SAMPLES:
-            raise ShapeError(f"inputs of kind {kind!r} are unknown", field=f"sequence/inputs/{i}@kind")
-        arrays = hdf5.read_fields(part, _SAMPLES[kind])
-        if kind == Velocities.__name__:
-            inputs.append(Velocities(**arrays, **stored))
-        else:
-            names = [field.name for field in fields(InertialNoise)]
-            noise = InertialNoise(**{name: stored[name] for name in names}) if set(names) <= stored.keys() else None
-            inputs.append(InertialSamples(**arrays, noise=noise))
+        part, stated = _group(group, str(i)), hdf5.attributes(_group(group, str(i)))
+        if stated.get("kind") not in _INPUTS:
+            raise ShapeError(f"inputs of kind {stated.get('kind')!r} are unknown", field=f"sequence/inputs/{i}@kind")
+        kind = _INPUTS[stated["kind"]]
+        arguments = hdf5.read_record(part, kind, {})
+        names = {field.name for field in fields(InertialNoise)}
+        if kind is InertialSamples and names <= stated.keys():
+            arguments["noise"] = InertialNoise(**{name: stated[name] for name in names})
+        inputs.append(kind(**arguments))
     return {"inputs": tuple(inputs), "twist": None, "velocity_frame": None}
 
 
@@ -289,16 +258,16 @@ def noise_of_attributes(attributes: Mapping[str, Any], prefix: str = "") -> dict
     return {name: float(value) if np.ndim(value) == 0 else value for name, value in stored.items() if value is not None}
 
 
-def _read(h5file: h5py.Group, layout: hdf5.Layout) -> dict[str, Any]:
+def _read(h5file: h5py.Group, layout: Layout) -> dict[str, Any]:
     """The data sets of a layout by field, as finite numbers; that lengths agree, the record checks that takes them."""
     found = {
-        field: require_numbers(
+        item.field: require_numbers(
             h5file,
-            name,
-            tuple(fixed_length(n) for n in shape),
-            np.int64 if units in _INDICES else np.float64,
+            item.name,
+            tuple(fixed_length(axis) for axis in item.shape),
+            np.int64 if item.check.kinds == "i" else np.float64,
         )
-        for name, field, shape, units, *_ in layout
+        for item in layout
     }
     hdf5.require_coordinates(h5file, layout)
     return found

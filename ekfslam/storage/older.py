@@ -1,0 +1,79 @@
+"""Archives of older format versions in the terms of this release.
+
+The version of a run is that of the release that wrote it. Version 1 has no log. Version 3 added hygiene and parameters,
+version 4 the state blocks and the errors of tracks in the log, version 5 the coordinates of all dimensions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.config import HygieneConfig
+from ekfslam.data.noise import Noise
+from ekfslam.filters.log import Log
+from ekfslam.geometry import se3
+from ekfslam.stored import zeros
+
+
+def completed(record: type, found: dict[str, Any], version: int) -> dict[str, Any]:
+    """Return the fields of a record with the fields that a release of this format version did not write.
+
+    A field that this version should have stays missing.
+    """
+    if record is not Log:
+        return found
+    if version < 4 and {"twist", "T_linear", "T_predicted", "T_updated", "frame"} <= found.keys():
+        found = {**_blocks_of_a_pose(found), **found}
+    if "tau_s" in found:
+        found.setdefault("is_gap", np.zeros(len(found["tau_s"]), dtype=bool))  # some releases of version 4 lack it
+    return found
+
+
+def _blocks_of_a_pose(log: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields that version 4 added to a log, for a filter with the pose as its only block."""
+    predicted = log["T_predicted"]
+
+    def coordinates(T: Array) -> Array:
+        return se3.log(T @ se3.inverse(predicted))
+
+    departed = np.concatenate([predicted[:1], log["T_updated"][:-1]])
+    updated = coordinates(log["T_updated"])
+    without = zeros(Log, T=len(predicted), B=6, U=0, L=0, K=len(log["frame"]), d=0, velocity=0)
+    return {
+        **{name: without[name] for name in without if name.startswith("velocity") or name == "up"},
+        "imu_twist": log["twist"],
+        "seen_twist": log["twist"],
+        "T_departed": departed,
+        "T_linear_before": departed,
+        "departed": np.concatenate([np.zeros((1, 6)), updated[:-1]]),
+        "linear": coordinates(log["T_linear"]),
+        "updated": updated,
+        "previous": without["previous"] - 1,
+    }
+
+
+def config_of(config: dict[str, Any], noise: Noise, version: int) -> dict[str, Any]:
+    """Return a configuration of an older version in the keys of this release.
+
+    Before the coordinates could be chosen, landmarks were positions in world. Before version 4, ``drift`` was a share
+    of the distance driven, which says nothing about today's drift in px. Before version 3, the filter had the rules of
+    hygiene.
+    """
+    if version < 4 and "noise" in config:
+        config = {**config, "noise": {**config["noise"], "drift": None}}
+    config = {**config, "filter": {"landmark_coordinates": "xyz", **config.get("filter", {})}}
+    if "hygiene" in config:
+        return config
+    rest = dict(config.get("filter", {}))
+    std = noise.pixel_std_px
+    rules = {
+        "restart_at_repeats": rest.pop("restart_at_repeats", False),
+        "min_disparity_sigma": rest.pop("min_disparity_px", 0.0) / float(np.hypot(std[0], std[2])),
+        "max_row_mismatch_sigma": rest.pop("max_row_mismatch_px", 0.0) / float(np.hypot(std[1], std[3])),
+        "reused_id_sigma": 0.0,
+    }
+    return {**config, "filter": rest, "hygiene": {**asdict(HygieneConfig()), **rules}}
