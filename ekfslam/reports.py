@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
 from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
@@ -24,7 +22,6 @@ from ekfslam.evaluation.summary import compare_table, summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.check import plot_check
 from ekfslam.figures.older import older_figures, remove_figures
-from ekfslam.figures.posterior import plot_map_before_and_after
 from ekfslam.figures.run import draw_figures
 from ekfslam.figures.study import draw_study_figures
 from ekfslam.figures.style import png, pngs
@@ -96,7 +93,7 @@ class Comparison(Shown):
         if not force:
             require_same_origin(archive, self.sequence)
         notes = "".join(f"- {note}\n" for note in self.sequence.notes)
-        drawn = self._figures() if figures else {}
+        drawn = draw_figures(self.results, self.sequence.truth, self.sequence.interpolated) if figures else {}
         contents = {
             archive: archive_image(self.sequence, self.results),
             summary: _json(self.summary),
@@ -107,13 +104,6 @@ class Comparison(Shown):
         files.write_all(contents)
         remove_figures(older, contents)
         return list(contents)
-
-    def _figures(self) -> dict[str, Figure]:
-        figures = draw_figures(self.results, self.sequence.truth, self.sequence.interpolated)
-        if "full" in self.results and "smoothed" in self.results:
-            drawn = plot_map_before_and_after(self.results["full"], self.results["smoothed"], self.sequence.truth)
-            figures["map_before_and_after"] = drawn
-        return figures
 
 
 def compare(

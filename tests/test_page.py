@@ -22,9 +22,10 @@ from ekfslam.cli import main
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.evaluation.honesty import judge
+from ekfslam.figures import series
 from ekfslam.filters.result import Innovation
-from ekfslam.page import content, report
-from ekfslam.page.content import packed, recordings_of, thinned
+from ekfslam.page import report
+from ekfslam.page.content import packed, sections_of, thinned
 from ekfslam.page.report import read_archives, report_page, write_report
 from ekfslam.runner import run
 from ekfslam.storage.archive import read_archive, write_archive
@@ -50,8 +51,8 @@ class Page(HTMLParser):
             self.blocks.setdefault(self.tags[-1], []).append(data)
 
 
-def numbers(text: str, *shape: int) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(text), "<f4").reshape(shape)
+def numbers(packed: dict[str, str], *shape: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(packed["f32"]), "<f4").reshape(shape)
 
 
 @pytest.fixture(scope="module")
@@ -78,10 +79,11 @@ def test_the_page_holds_the_numbers_of_the_archive(archive, page):
     assert [run["label"] for run in recording["runs"]] == ["dead-reckoning", "full"]
     shown, frames = recording["runs"][1], len(full.time_s)
     np.testing.assert_allclose(numbers(shown["xyz"], frames, 3), full.T_world_imu[:, :3, 3], rtol=1e-6)
-    error = numbers(shown["errors"]["error"], -1, 6)[:, :3]
+    error = np.transpose([numbers(plot["curves"][0]["y"], -1) for plot in shown["errors"][:3]])
     true = read.truth.T_world_imu[:, :3, 3]
     np.testing.assert_allclose(error, full.T_world_imu[read.truth.frame, :3, 3] - true, rtol=1e-5, atol=1e-7)
-    assert shown["errors"]["neesMean"] == pytest.approx(np.nanmean(pose_nees(full, read.truth, True)[1]))
+    nees = np.nanmean(pose_nees(full, read.truth, True)[1])
+    assert f"mean {nees:.3g}; grey: 95 % of honest poses" in shown["consistency"][0]["words"]
     landmarks = shown["landmarks"]
     assert landmarks["id"] == [str(i) for i in full.landmarks.id]
     np.testing.assert_allclose(numbers(landmarks["xyz"], -1, 3), full.landmarks.position_m, rtol=1e-6)
@@ -94,7 +96,7 @@ def test_the_page_holds_the_numbers_of_the_archive(archive, page):
 def carded(archive_of, **runs) -> dict[str, tuple[str, list[str]]]:
     """Kind and words of each run's card, by mode."""
     found = dataclasses.replace(archive_of, results=runs)
-    (recording,) = recordings_of({"some": found})
+    (recording,) = sections_of({"some": found})
     return {run.label: (run.honesty.grade, run.said) for run in recording.runs}
 
 
@@ -102,7 +104,7 @@ def test_every_run_has_a_verdict_from_what_there_is(archive):
     """Innovations where they were kept, NIS where not, and the truth; words as of `ekfslam check`."""
     known = read_archive(archive)
     full = known.results["full"]
-    to_honest = 6.0 / recordings_of({"some": known})[0].runs[-1].honesty.truth.nees
+    to_honest = 6.0 / sections_of({"some": known})[0].runs[-1].honesty.truth.nees
     honest = dataclasses.replace(full, covariance=full.covariance / to_honest, whitened=None)
     small = dataclasses.replace(honest, covariance=honest.covariance / 25.0)
     doubled = dataclasses.replace(
@@ -179,14 +181,13 @@ def test_only_its_own_script_and_style_may_run(page):
     assert policy.startswith("default-src 'none'")
 
 
-@pytest.mark.slow
 def test_innovations_have_their_mean_a_degree_of_freedom(sequence):
     dof = np.repeat([0, 30, 60], 20)
     nis = np.linspace(0.5, 1.5, 60) * dof
     result = dataclasses.replace(synthetic_result(sequence), innovation=Innovation(nis, dof, dof // 3, 0 * dof))
-    found = content._nis(result, result.time_s)
-    assert found["mean"] == pytest.approx(nis.sum() / dof.sum())
-    assert numbers(found["value"], 40) == pytest.approx(nis[20:] / dof[20:], rel=1e-6)
+    found = series.nis(result)
+    assert found.mean == pytest.approx(nis.sum() / dof.sum())
+    np.testing.assert_allclose(found.y, nis[20:] / dof[20:])
 
 
 def test_labels_are_the_shortest_ends_that_differ():
@@ -203,9 +204,9 @@ def test_archives_of_one_recording_stand_together(sequence, archive, tmp_path):
     write_archive(other, sequence, {"full": synthetic_result(sequence, "full")})
     longer = synthetic_sequence(frames=70, landmarks=40)
     write_archive(third, longer, {"full": synthetic_result(longer, "full")})
-    recordings = recordings_of(read_archives([archive, other, third]))
-    assert [len(recording.runs) for recording in recordings] == [3, 1]
-    together = recordings[0].runs
+    sections = sections_of(read_archives([archive, other, third]))
+    assert [len(recording.runs) for recording in sections] == [3, 1]
+    together = sections[0].runs
     assert len({run.color + run.dash for run in together}) == 3
     assert [run.shown for run in together] == [False, True, True]
     assert together[2].label == "other: full"

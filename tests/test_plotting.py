@@ -12,11 +12,13 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
 from support.helpers import synthetic_result, synthetic_sequence
 
+from ekfslam.figures import series
 from ekfslam.figures.maps import ellipse_axes, plot_landmark_arrows, plot_map, plot_trajectories
-from ekfslam.figures.run import plot_errors, plot_nis, plot_parameters, save_figures, world_error_covariance
+from ekfslam.figures.run import plot_errors, plot_nis, plot_parameters, save_figures
 from ekfslam.figures.views import plot_trajectory
 from ekfslam.filters.result import Parameters, Result
 from ekfslam.geometry import se3
+from ekfslam.geometry.motion import world_axes_covariance
 
 MODES = ("dead-reckoning", "mapping-only", "full")
 
@@ -55,7 +57,7 @@ def test_ellipse_of_a_diagonal_covariance_lies_along_the_axes():
     assert abs(angle) == pytest.approx(90.0)
 
 
-def test_world_error_covariance_is_that_of_sampled_errors(results):
+def test_covariance_along_world_axes_is_that_of_sampled_errors(results):
     result = results["full"]
     k, rng = 50, np.random.default_rng(1)
     P = 1e-4 * result.covariance[k]
@@ -64,7 +66,9 @@ def test_world_error_covariance_is_that_of_sampled_errors(results):
     T_world_imu = se3.inverse(se3.exp((R @ rng.standard_normal((40_000, 6, 1)))[..., 0]) @ T_imu_world)
     position = T_world_imu[:, :3, 3] - result.T_world_imu[k, :3, 3]
     rotation = se3.so3_log(T_world_imu[:, :3, :3] @ result.T_world_imu[k, :3, :3].T)
-    for sampled, covariance in zip((position, rotation), world_error_covariance(result), strict=True):
+    for sampled, covariance in zip(
+        (position, rotation), world_axes_covariance(result.T_world_imu, result.covariance), strict=True
+    ):
         expected = 1e-4 * covariance[k]
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         np.testing.assert_allclose(np.cov(sampled.T) / scale, expected / scale, atol=0.03)
@@ -146,7 +150,7 @@ def test_arrows_lead_from_first_to_final_estimate(results):
     assert len(segments) > 0.8 * len(landmarks)
 
 
-def test_errors_show_estimate_minus_truth_within_three_sigma_in_world(sequence, results):
+def test_errors_have_a_row_an_axis_and_a_column_a_trajectory(sequence, results):
     figure = plot_errors(results, sequence.truth)
     axes = np.array(figure.axes).reshape(6, 2)
     assert [ax.get_ylabel() for ax in axes[:, 0]] == [
@@ -156,17 +160,29 @@ def test_errors_show_estimate_minus_truth_within_three_sigma_in_world(sequence, 
     assert axes[-1, 0].get_xlabel() == "time [s]"
     assert axes[0, 0].get_title().startswith("dead-reckoning, mapping-only"), "the two share their trajectory"
     assert axes[0, 1].get_title().startswith("full")
+
+
+def test_errors_are_drawn_with_their_bounds(sequence, results):
+    figure = plot_errors({"full": results["full"]}, sequence.truth)
+    for ax, error in zip(figure.axes, series.errors(results["full"], sequence.truth), strict=True):
+        (band,) = ax.collections
+        vertices = band.get_paths()[0].vertices
+        assert [vertices[:, 1].min(), vertices[:, 1].max()] == pytest.approx([error.low.min(), error.high.max()])
+        np.testing.assert_array_equal(ax.lines[-1].get_ydata(), error.y)
+
+
+def test_errors_are_estimate_minus_truth_within_three_sigma_in_world(sequence, results):
     full = results["full"]
-    position_covariance, rotation_covariance = world_error_covariance(full)
-    lower, upper, error, _ = (line.get_ydata() for line in axes[1, 1].lines)
-    np.testing.assert_allclose(upper, 3 * np.sqrt(position_covariance[:, 1, 1]), rtol=1e-12)
-    np.testing.assert_allclose(lower, -upper)
-    np.testing.assert_allclose(error, full.T_world_imu[:, 1, 3] - sequence.truth.T_world_imu[:, 1, 3], atol=1e-12)
-    upper, error = (axes[5, 1].lines[i].get_ydata() for i in (1, 2))
-    np.testing.assert_allclose(upper, np.degrees(3 * np.sqrt(rotation_covariance[:, 2, 2])), rtol=1e-12)
+    errors = series.errors(full, sequence.truth)
+    position_covariance, rotation_covariance = world_axes_covariance(full.T_world_imu, full.covariance)
+    y, yaw = errors[1], errors[5]
+    np.testing.assert_allclose(y.high, 3 * np.sqrt(position_covariance[:, 1, 1]), rtol=1e-12)
+    np.testing.assert_allclose(y.low, -y.high)
+    np.testing.assert_allclose(y.y, full.T_world_imu[:, 1, 3] - sequence.truth.T_world_imu[:, 1, 3], atol=1e-12)
+    np.testing.assert_allclose(yaw.high, np.degrees(3 * np.sqrt(rotation_covariance[:, 2, 2])), rtol=1e-12)
     # The vehicle turns about z alone, so the heading error is the rotation error about z to first order.
     heading = [np.arctan2(T[:, 1, 0], T[:, 0, 0]) for T in (full.T_world_imu, sequence.truth.T_world_imu)]
-    np.testing.assert_allclose(error, np.degrees(heading[0] - heading[1]), atol=2e-3)
+    np.testing.assert_allclose(yaw.y, np.degrees(heading[0] - heading[1]), atol=2e-3)
 
 
 def test_errors_take_truth_of_some_frames(sequence, results):
@@ -174,7 +190,7 @@ def test_errors_take_truth_of_some_frames(sequence, results):
         sequence.truth, frame=sequence.truth.frame[::7], T_world_imu=sequence.truth.T_world_imu[::7]
     )
     ax = plot_errors({"full": results["full"]}, truth).axes[0]
-    np.testing.assert_allclose(ax.lines[2].get_xdata(), sequence.time_s[::7])
+    np.testing.assert_allclose(ax.lines[-1].get_xdata(), sequence.time_s[::7])
 
 
 @pytest.mark.slow
@@ -237,7 +253,7 @@ def test_parameters_have_a_panel_each_with_units_and_what_was_not_observed(resul
     assert (roll.get_title(), roll.get_ylabel()) == ("roll", "[deg]")
     assert (time.get_title(), time.get_ylabel()) == ("time offset (not observable)", "[s]")
     assert "s]" in time.get_xlabel()
-    np.testing.assert_allclose(roll.lines[0].get_ydata(), np.rad2deg(value[:, 0]))
+    np.testing.assert_allclose(roll.lines[-1].get_ydata(), np.rad2deg(value[:, 0]))
     top = time.collections[0].get_paths()[0].vertices[:, 1].max()
     assert top == pytest.approx(value[-1, 1] + 1.5)
     assert tmp_path / "parameters.png" in save_figures(tmp_path, {"full": found})

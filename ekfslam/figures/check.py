@@ -9,14 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array, IntArray
-from ekfslam.evaluation.consistency import chi2_bounds
 from ekfslam.evaluation.evidence import AXES, LAGS, ROWS, Whiteness
 from ekfslam.evaluation.honesty import Honesty
-from ekfslam.figures.style import BOUNDS, EXPECTED, SERIES, ZERO, line_of, log_axis, styled
+from ekfslam.figures import series
+from ekfslam.figures.series import PROBABILITY, draw_series
+from ekfslam.figures.style import BOUNDS, SERIES, ZERO, line_of, styled
 from ekfslam.filters.result import REASONS, Result
 
-_PROBABILITY, _SIGMAS = 0.95, 1.96
-_LOG_RATIO = 20.0  # largest over smallest NIS per dof from which a logarithmic axis shows more
+_SIGMAS = 1.96  # of white noise, with `PROBABILITY`
 _BINS = 60  # of the time axis, in which rejections are counted
 
 
@@ -44,20 +44,9 @@ def plot_check(result: Result, found: Honesty) -> Figure:
 
 
 def _nis(ax: Axes, result: Result) -> None:
-    seen = result.innovation.dof > 0
-    time_s, dof = (result.time_s - result.time_s[0])[seen], result.innovation.dof[seen]
-    values = result.innovation.nis[seen] / dof
-    low, high = (bound / dof for bound in chi2_bounds(dof, _PROBABILITY))
-    ax.fill_between(time_s, low, high, step="mid", **BOUNDS, label=f"{100 * _PROBABILITY:g} % bounds")
-    ax.axhline(1.0, **EXPECTED, label="expected")
-    ax.plot(time_s, values, ".", color=line_of("full")["color"], markersize=2.5, label="frame")
-    if values.max() > _LOG_RATIO * max(values.min(), 1e-9):
-        log_axis(ax, (1.0, 3.0))
-    ax.set(
-        xlabel="time [s]",
-        ylabel="NIS per dof [-]",
-        title=f"NIS: mean {result.innovation.nis.sum() / dof.sum():.2f} (1 expected)",
-    )
+    nis, color = series.nis(result), line_of("full")["color"]
+    draw_series(ax, nis, color, {"color": color, "marker": ".", "markersize": 2.5, "linestyle": ""}, label="frame")
+    ax.set(xlabel=nis.labels[0], title=f"NIS: mean {nis.mean:.2f} (1 expected)")
     ax.margins(x=0.01, y=0.25)
     ax.legend(loc="upper right", ncols=3)
 
@@ -82,7 +71,7 @@ def _rejections(ax: Axes, result: Result) -> None:
 def _correlation(ax: Axes, found: Whiteness, samples: IntArray, names: tuple[str, ...], title: str) -> None:
     lags, values = np.arange(LAGS + 1), found.correlation
     bound = _SIGMAS / np.sqrt(np.maximum(samples, 1))
-    ax.fill_between(lags, -bound, bound, **BOUNDS, label=f"{100 * _PROBABILITY:g} % if white")
+    ax.fill_between(lags, -bound, bound, **BOUNDS, label=f"{100 * PROBABILITY:g} % if white")
     ax.axhline(0.0, **ZERO)
     for i in range(values.shape[1]):
         ax.plot(lags[1:], values[1:, i], **SERIES[i], label=names[i])
@@ -102,7 +91,7 @@ def _shared(result: Result) -> tuple[Array, Array]:
 
 
 def _over_time(ax: Axes, time_s: Array, shared: Array, axes: range) -> None:
-    ax.axhspan(-_SIGMAS, _SIGMAS, **BOUNDS, label=f"{100 * _PROBABILITY:g} % if white")
+    ax.axhspan(-_SIGMAS, _SIGMAS, **BOUNDS, label=f"{100 * PROBABILITY:g} % if white")
     ax.axhline(0.0, **ZERO)
     for a in axes:
         ax.plot(time_s, shared[:, a], **SERIES[a], label=AXES[a])

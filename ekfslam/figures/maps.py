@@ -17,9 +17,9 @@ from matplotlib.lines import Line2D
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
-from ekfslam.evaluation.consistency import world_axes_std
 from ekfslam.evaluation.trajectory import distance_along
-from ekfslam.figures.style import BAND_ALPHA, FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, line_of, style_of, styled
+from ekfslam.figures.series import BAND_SIGMAS, draw_series, height
+from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, line_of, style_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.geometry.motion import world_axes_covariance
 
@@ -140,21 +140,18 @@ def plot_side(results: Mapping[str, Result], truth: Truth | None = None) -> Figu
         ax.plot(way[landmarks.last_frame], z, ".", **dots, label=label, zorder=1.5)
         heights.append(np.percentile(z, [2, 98]))
     if truth is not None and len(truth.frame):
-        ax.plot(distance_along(truth.T_world_imu), truth.T_world_imu[:, 2, 3], **TRUTH, label="truth", zorder=2)
-        heights.append(truth.T_world_imu[:, 2, 3])
+        true = height(truth.T_world_imu)
+        draw_series(ax, true, "", {**TRUTH, "zorder": 2}, label="truth")
+        heights.append(true.y)
     for mode, result in results.items():
-        z, driven = result.T_world_imu[:, 2, 3], distance_along(result.T_world_imu)
-        band = 3.0 * world_axes_std(result.T_world_imu, result.covariance)[:, 2]
         line = line_of(mode)
-        ax.plot(driven, z, **line, label=mode, zorder=3)
-        ax.fill_between(driven, z - band, z + band, color=line["color"], alpha=BAND_ALPHA, linewidth=0)
+        one = height(result.T_world_imu, result.covariance)
+        draw_series(ax, one, line["color"], {**line, "zorder": 3}, label=mode)
     low, high = min(z.min() for z in heights), max(z.max() for z in heights)
     margin = 0.06 * (high - low) + 0.05
     ax.set_ylim(low - margin, high + margin)
-    ax.margins(x=0.01)
-    ax.set(xlabel="distance driven [m]", ylabel="z [m]")
     _outside_legend(ax)
-    ax.set_title(f"{mapper.sequence_name}: from the side, 3-sigma bands")
+    ax.set_title(f"{mapper.sequence_name}: from the side, {BAND_SIGMAS:g}-sigma bands")
     return figure
 
 

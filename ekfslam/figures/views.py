@@ -7,19 +7,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
-from scipy.spatial.transform import Rotation
 
-from ekfslam.arrays import Array
 from ekfslam.data.sequence import Truth
 from ekfslam.errors import TruthError
 from ekfslam.figures.maps import plot_map
 from ekfslam.figures.run import plot_errors
-from ekfslam.figures.style import BAND_ALPHA, TRUTH, line_of, png, styled
+from ekfslam.figures.series import BAND_SIGMAS, draw_series, trajectory
+from ekfslam.figures.style import TRUTH, line_of, png, styled
 from ekfslam.filters.result import Result
-
-_SIGMAS = 3.0
 
 
 def map_of(result: Result, truth: Any = None) -> Figure:
@@ -63,59 +59,21 @@ def trajectory_of(result: Result, truth: Any = None) -> Figure:
 
 @styled
 def plot_trajectory(result: Result, truth: Truth | None = None) -> Figure:
-    """Position (m) and attitude (degrees) against time with bands of 3 sigma, positions along the axes of world.
+    """Draw position (m, axes of world) and attitude (degrees) over time with 3-sigma bands.
 
     The attitude is yaw about z of world, then pitch, then roll.
     """
     figure = Figure(figsize=(8.0, 7.6))
     axes = figure.subplots(3, 2, sharex=True)
-    time_s = result.time_s - result.time_s[0]
     color = line_of(result.mode)["color"]
-    std = np.hstack([result.position_std_world_m, np.degrees(_attitude_std(result.T_world_imu, result.covariance))])
-    values = _unwrapped(result.T_world_imu)
-    for i, (ax, name) in enumerate(zip(axes.T.ravel(), ("x", "y", "z", "roll", "pitch", "yaw"), strict=True)):
-        value, band = values[:, i], _SIGMAS * std[:, i]
-        ax.fill_between(time_s, value - band, value + band, color=color, alpha=BAND_ALPHA, linewidth=0)
-        if truth is not None and len(truth.frame):
-            true = _unwrapped(truth.T_world_imu)[:, i]
-            turns = 360.0 * np.round((true[0] - value[truth.frame[0]]) / 360.0) if i >= 3 else 0.0
-            ax.plot(time_s[truth.frame], true - turns, **TRUTH, label="truth")
-        ax.plot(time_s, value, **line_of(result.mode), label=f"{result.mode}, {_SIGMAS:g} sigma")
-        ax.set_ylabel(f"{name} [{'m' if i < 3 else 'deg'}]")
-        ax.margins(x=0.01)
-    for ax in axes[-1]:
-        ax.set_xlabel("time [s]")
+    for ax, (one, true) in zip(axes.T.ravel(), trajectory(result, truth), strict=True):
+        if true is not None:
+            draw_series(ax, true, color, TRUTH, label="truth")
+        draw_series(ax, one, color, line_of(result.mode), label=f"{result.mode}, {BAND_SIGMAS:g} sigma")
     figure.align_ylabels()
     figure.suptitle(f"{result.sequence_name}, {result.mode}: pose of the IMU in world")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
-
-
-def _unwrapped(T_world_imu: Array) -> Array:
-    """Position (m), roll, pitch and yaw (degrees) of poses (T, 4, 4): (T, 6), angles without jumps."""
-    yaw_pitch_roll = Rotation.from_matrix(T_world_imu[:, :3, :3]).as_euler("ZYX")
-    return np.hstack([T_world_imu[:, :3, 3], np.degrees(np.unwrap(yaw_pitch_roll[:, ::-1], axis=0))])
-
-
-def _attitude_std(T_world_imu: Array, covariance: Array) -> Array:
-    """Standard deviations (T, 3) of roll, pitch and yaw, rad, to first order.
-
-    The rotation error ``theta`` is about the axes of the IMU, ``R_true = R exp(-theta^)``. With roll r and pitch p, the
-    derivatives of the angles by it are the rows of the matrix E below.
-    """
-    _, pitch, roll = Rotation.from_matrix(T_world_imu[:, :3, :3]).as_euler("ZYX").T
-    sin, cos, zero = np.sin(roll), np.cos(roll), np.zeros_like(roll)
-    level = np.maximum(np.cos(pitch), 1e-9)
-    E = np.stack(
-        [
-            np.stack([zero + 1.0, sin * np.tan(pitch), cos * np.tan(pitch)], axis=-1),
-            np.stack([zero, cos, -sin], axis=-1),
-            np.stack([zero, sin / level, cos / level], axis=-1),
-        ],
-        axis=1,
-    )
-    return np.sqrt(np.maximum(np.einsum("tij,tjk,tik->ti", E, covariance[:, 3:, 3:], E), 0.0))
 
 
 def _truth(of: Any) -> Truth | None:

@@ -9,23 +9,21 @@ import base64
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.colors import to_hex
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import MODES
-from ekfslam.evaluation.consistency import (
-    chi2_bounds,
-    measured_truth,
-    pose_nees,
-    world_axes_errors,
-    world_axes_std,
-)
+from ekfslam.data.sequence import Truth
+from ekfslam.evaluation.consistency import world_axes_std
 from ekfslam.evaluation.honesty import Honesty, judge
 from ekfslam.evaluation.summary import summarise
 from ekfslam.evaluation.trajectory import distance_along
+from ekfslam.figures import series
+from ekfslam.figures.maps import SIGMAS
+from ekfslam.figures.series import Series
 from ekfslam.figures.style import (
     BLUE,
     GREEN,
@@ -43,8 +41,6 @@ from ekfslam.storage.archive import Archive
 
 POINTS = 1500  # of a series; longer ones are thinned evenly
 POSES = 24  # with an ellipse or an arrow
-BAND_SIGMAS = 3.0
-PROBABILITY = 0.95  # of the bounds of NIS and NEES
 PART = " \u00b7 "  # between the parts of a label
 _DASHES = {"-": "", "--": "7 4", ":": "2 3", "-.": "8 3 2 3"}
 _COLORS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)
@@ -69,6 +65,12 @@ class Run:
     dash: str
     shown: bool
 
+    @property
+    def truth(self) -> Truth | None:
+        """The truth, if any pose of it is known."""
+        truth = self.archive.truth
+        return truth if truth is not None and len(truth.frame) else None
+
     @cached_property
     def summary(self) -> dict[str, float | int | None]:
         return summarise(self.archive, self.result)
@@ -88,8 +90,8 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Recording:
-    """Runs on the same recording."""
+class Section:
+    """Runs on one recording: a section of the page."""
 
     name: str
     runs: tuple[Run, ...]
@@ -100,15 +102,18 @@ class Recording:
         return self.runs[0].archive
 
     @property
+    def truth(self) -> Truth | None:
+        """The truth of the first archive, if any pose of it is known."""
+        return self.runs[0].truth
+
+    @property
     def length_m(self) -> float:
         """Way along the truth, or along the last run where there is none."""
-        truth = self.archive.truth
-        known = truth is not None and len(truth.frame) > 1
-        T = truth.T_world_imu if truth is not None and known else self.runs[-1].result.T_world_imu
+        T = self.runs[-1].result.T_world_imu if self.truth is None else self.truth.T_world_imu
         return float(distance_along(T)[-1])
 
 
-def recordings_of(archives: Mapping[str, Archive]) -> list[Recording]:
+def sections_of(archives: Mapping[str, Archive]) -> list[Section]:
     """Archives, by label, sorted by recording: those with the same name and stamps stand together."""
     groups: list[dict[str, Archive]] = []
     for label, archive in archives.items():
@@ -119,7 +124,7 @@ def recordings_of(archives: Mapping[str, Archive]) -> list[Recording]:
                 break
         else:
             groups.append({label: archive})
-    return [Recording(next(iter(group.values())).name, tuple(_runs(group))) for group in groups]
+    return [Section(next(iter(group.values())).name, tuple(_runs(group))) for group in groups]
 
 
 def _runs(archives: Mapping[str, Archive]) -> Iterator[Run]:
@@ -147,56 +152,125 @@ def _told_apart(labels: Sequence[str]) -> list[str]:
     return [PART.join(part) for part in parts]
 
 
-def plotted(recording: Recording) -> dict[str, Any]:
-    """Everything that the script of a page draws of a recording, ready for JSON; arrays as `packed`."""
-    archive = recording.archive
+def plotted(section: Section) -> dict[str, Any]:
+    """Return everything that the script of a page draws of a recording, ready for JSON; arrays as `packed`."""
+    archive = section.archive
     time_s = archive.time_s - archive.time_s[0]
-    every = max(-(-len(time_s) // POINTS), 1)
-    kept = np.unique(np.append(np.arange(0, len(time_s), every), len(time_s) - 1))
+    kept, truth = thinned(len(time_s), POINTS), section.truth
     return {
-        "name": recording.name,
-        "every": every,
+        "sigmas": SIGMAS,
         "landmarkColor": to_hex(LANDMARK_COLOR),
         "time": packed(time_s[kept]),
-        "truth": _truth(archive, time_s),
-        "runs": [_plotted_run(run, kept, time_s) for run in recording.runs],
+        "truth": truth
+        and {
+            "xyz": packed(truth.T_world_imu[thinned(len(truth.frame), POINTS), :3, 3]),
+            "landmarks": packed(truth.position_m),
+        },
+        "plots": _compared(section),
+        "runs": [_plotted_run(section, j, kept) for j in range(len(section.runs))],
     }
 
 
-def _truth(archive: Archive, time_s: Array) -> dict[str, Any] | None:
-    truth = archive.truth
-    if truth is None or not len(truth.frame):
-        return None
-    some = thinned(len(truth.frame), POINTS)
-    return {
-        "time": packed(time_s[truth.frame[some]]),
-        "xyz": packed(truth.T_world_imu[some, :3, 3]),
-        "way": packed(distance_along(truth.T_world_imu)[some]),
-        "landmarks": packed(truth.position_m),
-    }
+def _compared(section: Section) -> list[dict[str, Any]]:
+    """Return the plots that show several runs: heights, and distances from the truth."""
+    shown, truth = [(j, run) for j, run in enumerate(section.runs) if run.shown], section.truth
+    best = next((j for j, run in shown if run.result.mode == "full"), shown[0][0])
+    heights = [] if truth is None else [Curve(series.height(truth.T_world_imu), "truth", "truth")]
+    for j, run in shown:
+        one = series.height(run.result.T_world_imu, run.result.covariance)
+        heights.append(Curve(one if j == best else one.without_bounds(), run.label, "", j, j))
+    words = f"z in m over metres driven; band: {series.BAND_SIGMAS:g} sigma of {section.runs[best].label}"
+    plots = [_plot("Height profile", words, heights)]
+    off = [
+        Curve(series.distance_from_truth(run.result, run.truth), run.label, "", j)
+        for j, run in shown
+        if run.truth is not None
+    ]
+    if off:
+        plots.append(_plot("Distance from the truth", "m, first pose aligned, nothing else", off))
+    return plots
 
 
-def _plotted_run(run: Run, kept: IntArray, time_s: Array) -> dict[str, Any]:
-    result = run.result
-    T, some = result.T_world_imu, thinned(len(result.time_s), POSES)
-    std = world_axes_std(T[kept], result.covariance[kept])
+def _plotted_run(section: Section, j: int, kept: IntArray) -> dict[str, Any]:
+    run, truth = section.runs[j], section.runs[j].truth
+    result, T = run.result, run.result.T_world_imu
+    some = thinned(len(T), POSES)
+    errors = [] if truth is None else series.errors(result, truth)
+    words = "Without truth there are no errors to show."
+    if errors:
+        inside = f"{100 * series.share_inside(errors):.1f} % inside"
+        words = f"Estimate minus truth along the axes of world, with {series.BAND_SIGMAS:g}-sigma bounds: {inside}."
     return {
         "label": run.label,
         "mode": result.mode,
         "dash": run.dash,
         "shown": run.shown,
         "xyz": packed(T[kept, :3, 3]),
-        "std": packed(std[:, :3]),
-        "way": packed(distance_along(T)[kept]),
+        "std": packed(world_axes_std(T[kept], result.covariance[kept])[:, :3]),
         "marks": {
             "xyz": packed(T[some, :3, 3]),
             "forward": packed(T[some, :3, 0]),
             "cov": packed(_upper(world_axes_covariance(T[some], result.covariance[some])[0])),
         },
         "landmarks": _landmarks(result.landmarks),
-        "errors": _errors(run, kept, time_s),
-        "nis": _nis(result, time_s),
+        "words": words,
+        "errors": [_plot(one.name, one.unit, [Curve(one, "error", "thin", None, j)]) for one in errors],
+        "consistency": list(_consistency(run, j)),
     }
+
+
+def _consistency(run: Run, j: int) -> Iterator[dict[str, Any]]:
+    """Yield the plots of NEES and NIS of a run."""
+    percent = f"{100 * series.PROBABILITY:g} %"
+    if run.truth is not None:
+        nees = series.nees(run.result, run.truth, run.archive.interpolated)
+        if nees.mean is not None:
+            words = f"6 expected, mean {nees.mean:.3g}; grey: {percent} of honest poses"
+            yield _plot("Pose NEES", words, [Curve(nees, "NEES", "thin", j)])
+    nis = series.nis(run.result)
+    if nis.mean is not None:
+        share = f"{100 * nis.share_inside:.1f} % of frames within their {percent}, grey"
+        words = f"1 expected, mean {nis.mean:.3g}; {share}"
+        yield _plot("NIS per degree of freedom", words, [Curve(nis, "NIS / dof", "dots", j)])
+
+
+class Curve(NamedTuple):
+    """A series in a plot.
+
+    Args:
+        of: The series.
+        name: Name in tooltips.
+        kind: Style in ``report.css``: ``truth``, ``thin``, ``dots``, or none.
+        run, band: Number of the run in whose colour the curve and its bounds are drawn; None for black and grey.
+    """
+
+    of: Series
+    name: str
+    kind: str = ""
+    run: int | None = None
+    band: int | None = None
+
+
+def _plot(title: str, words: str, curves: Sequence[Curve]) -> dict[str, Any]:
+    """Return a plot of curves with common axes."""
+    first = curves[0].of
+    return {
+        "title": title,
+        "words": words,
+        "unit": first.unit,
+        "xUnit": first.x_unit,
+        "xLabel": first.labels[0],
+        "log": any(curve.of.is_log for curve in curves),
+        "levels": first.levels,
+        "curves": [_packed_curve(curve) for curve in curves],
+    }
+
+
+def _packed_curve(curve: Curve) -> dict[str, Any]:
+    some = curve.of.only(thinned(len(curve.of.x), POINTS))
+    arrays = {"x": some.x, "y": some.y, "low": some.low, "high": some.high}
+    packed_arrays = {key: packed(values) for key, values in arrays.items() if values is not None}
+    return {"name": curve.name, "kind": curve.kind, "run": curve.run, "band": curve.band, **packed_arrays}
 
 
 def _landmarks(landmarks: Landmarks) -> dict[str, Any] | None:
@@ -210,70 +284,23 @@ def _landmarks(landmarks: Landmarks) -> dict[str, Any] | None:
     }
 
 
-def _errors(run: Run, kept: IntArray, time_s: Array) -> dict[str, Any] | None:
-    """Errors along world axes with their bands at true poses, and the NEES that they have."""
-    truth = run.archive.truth
-    if truth is None or not len(truth.frame):
-        return None
-    result = run.result
-    of_truth = np.flatnonzero(np.isin(truth.frame, kept))
-    frame, T_true = truth.frame[of_truth], truth.T_world_imu[of_truth]
-    in_degrees = np.repeat([1.0, np.rad2deg(1.0)], 3)
-    errors = in_degrees * world_axes_errors(result.T_world_imu[frame], T_true)
-    bands = BAND_SIGMAS * in_degrees * world_axes_std(result.T_world_imu[frame], result.covariance[frame])
-    judged = measured_truth(truth, run.archive.interpolated, result.time_s)
-    judged_frame, nees = pose_nees(result, judged, with_truth_noise=True)
-    shown = np.isfinite(nees) & np.isin(judged_frame, kept)
-    low, high = chi2_bounds(6, PROBABILITY)
-    return {
-        "time": packed(time_s[frame]),
-        "error": packed(errors),
-        "band": packed(bands),
-        "inside": float(np.mean(np.abs(errors) <= bands)),
-        "neesTime": packed(time_s[judged_frame[shown]]),
-        "nees": packed(nees[shown]),
-        "neesBounds": [float(low), float(high)],
-        "neesMean": float(np.nanmean(nees)) if np.isfinite(nees).any() else None,
-    }
-
-
-def _nis(result: Result, time_s: Array) -> dict[str, Any] | None:
-    innovation = result.innovation
-    seen = np.flatnonzero(innovation.dof > 0)
-    if not len(seen):
-        return None
-    dof = innovation.dof[seen]
-    value = innovation.nis[seen] / dof
-    low, high = (bound / dof for bound in chi2_bounds(dof, PROBABILITY))
-    some = thinned(len(seen), POINTS)
-    return {
-        "time": packed(time_s[seen[some]]),
-        "value": packed(value[some]),
-        "low": packed(low[some]),
-        "high": packed(high[some]),
-        "inside": float(np.mean((value >= low) & (value <= high))),
-        "mean": float(innovation.nis.sum() / innovation.dof.sum()),
-    }
-
-
 def thinned(length: int, most: int) -> IntArray:
-    """At most ``most`` indices spread over ``length``, first and last included."""
+    """Return at most ``most`` indices spread over ``length``, first and last included."""
     return np.unique(np.linspace(0, length - 1, min(most, length)).astype(np.int64))
 
 
-def packed(values: Array) -> str:
-    """An array as base64 of its 32-bit floats, row by row: half the size of digits."""
-    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()
+def packed(values: Array) -> dict[str, str]:
+    """Return an array as base64 of its 32-bit floats, row by row: half the size of digits."""
+    return {"f32": base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()}
 
 
 def _upper(covariance: Array) -> Array:
-    """xx, xy, xz, yy, yz, zz of (n, 3, 3): (n, 6)."""
+    """Return xx, xy, xz, yy, yz, zz of (n, 3, 3) as (n, 6)."""
     rows, columns = np.triu_indices(3)
     return covariance[:, rows, columns]
 
 
-def remarks_of(recording: Recording) -> Sequence[str]:
-    """What has to be said of the plots."""
-    frames = len(recording.archive.time_s)
-    every = -(-frames // POINTS)
-    return () if every < 2 else (f"Plots show every {every}th of {frames} frames; figures of merit are of all.",)
+def remarks_of(section: Section) -> Sequence[str]:
+    """Return remarks on the plots."""
+    frames = len(section.archive.time_s)
+    return () if frames <= POINTS else (f"Plots show {POINTS} of {frames} frames; figures of merit are of all.",)

@@ -2,7 +2,6 @@
 // Draws maps and plots of a report from the numbers in the page. Names are only ever set as text.
 
 const SVG = "http://www.w3.org/2000/svg";
-const SIGMAS = 2; // of ellipses
 const MOST_ELLIPSES = 350; // of landmarks in a view
 const tip = element("div", { class: "tip", hidden: "" }, document.body);
 
@@ -20,21 +19,6 @@ function drawn(name, attributes, parent, color) {
   if (color) made.style.setProperty("--c", color);
   if (parent) parent.appendChild(made);
   return made;
-}
-
-function unpacked(text) {
-  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-  return new Float32Array(bytes.buffer);
-}
-
-/** Every packed array of the page, in place; other texts stand in `kept`. */
-function unpack(value, kept = ["name", "label", "mode", "dash", "id", "landmarkColor"]) {
-  for (const key in value) {
-    if (kept.includes(key)) continue;
-    if (typeof value[key] === "string") value[key] = unpacked(value[key]);
-    else if (value[key] && typeof value[key] === "object") unpack(value[key], kept);
-  }
-  return value;
 }
 
 const column = (table, width, j) => Float64Array.from({ length: table.length / width }, (_, i) => table[i * width + j]);
@@ -112,26 +96,19 @@ function figure(parent, title, words, draw) {
   return made;
 }
 
-/**
- * A plot against time or way. `spec.series`: x, y, color, name, and optional dash, kind ("line", "dots", "truth");
- * `spec.bands`: x, low, high, color or none; `spec.level`: a horizontal line; `spec.log`; `spec.unit`; `spec.xUnit`.
- */
-function plot(parent, title, words, spec) {
-  figure(parent, title, words, (room, width) => {
+/** A plot of the table of series, `plotted` in content.py: curves with bounds and levels, colours of recording `g`. */
+function plot(parent, spec, g, dashes, onTime) {
+  const of = (j) => (j === null ? "var(--ink)" : colorOf(g, j));
+  figure(parent, spec.title, spec.words, (room, width) => {
     room.replaceChildren();
     const height = spec.height || 190, left = 50, bottom = 24, top = 6, right = 8;
-    const svg = drawn("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": title }, room);
-    const bands = spec.bands || [];
-    let x0 = Infinity, x1 = -Infinity, y0 = Infinity, y1 = -Infinity;
-    const widen = (xs, ys) => {
-      for (let i = 0; i < xs.length; i++) {
-        if (!Number.isFinite(ys[i]) || (spec.log && ys[i] <= 0)) continue;
-        x0 = Math.min(x0, xs[i]); x1 = Math.max(x1, xs[i]); y0 = Math.min(y0, ys[i]); y1 = Math.max(y1, ys[i]);
+    const svg = drawn("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": spec.title }, room);
+    let x0 = Infinity, x1 = -Infinity, y0 = Math.min(...spec.levels, Infinity), y1 = Math.max(...spec.levels, -Infinity);
+    for (const { x, y, low, high } of spec.curves)
+      for (const values of [y, low, high]) for (let i = 0; values && i < x.length; i++) {
+        if (!Number.isFinite(values[i]) || (spec.log && values[i] <= 0)) continue;
+        x0 = Math.min(x0, x[i]); x1 = Math.max(x1, x[i]); y0 = Math.min(y0, values[i]); y1 = Math.max(y1, values[i]);
       }
-    };
-    for (const s of spec.series) widen(s.x, s.y);
-    for (const b of bands) { widen(b.x, b.low); widen(b.x, b.high); }
-    if (spec.level !== undefined) { y0 = Math.min(y0, spec.level); y1 = Math.max(y1, spec.level); }
     if (!(x1 > x0)) { x0 = (x0 === Infinity ? 0 : x0) - 0.5; x1 = x0 + 1; }
     if (spec.log) { y0 = Math.max(y0, y1 * 1e-5) / 1.15; y1 *= 1.15; }
     else { const margin = 0.06 * (y1 - y0) || 1; y0 -= margin; y1 += margin; }
@@ -143,46 +120,42 @@ function plot(parent, title, words, spec) {
       drawn("line", { class: "rule", x1: left, x2: width - right, y1: Y(y), y2: Y(y) }, svg);
       drawn("text", { class: "axis", x: left - 7, y: Y(y) + 4, "text-anchor": "end" }, svg).textContent = short(y);
     }
-    for (const x of ticks(x0, x1, Math.max(3, width / 110)).filter((x) => X(x) < width - right - 22))
+    for (const x of ticks(x0, x1, Math.max(3, width / 110)).filter((x) => X(x) < width - right - 8 * spec.xLabel.length))
       drawn("text", { class: "axis", x: X(x), y: height - 7, "text-anchor": "middle" }, svg).textContent = short(x);
-    drawn("text", { class: "axis", x: width - right, y: height - 7, "text-anchor": "end" }, svg).textContent = spec.xUnit || "s";
-    for (const b of bands) {
-      const up = path(b.x, b.high, to), down = path([...b.x].reverse(), [...b.low].reverse(), to).replace("M", "L");
-      if (up) drawn("path", { class: b.color ? "fill" : "region", d: up + down + "Z" }, svg, b.color);
+    drawn("text", { class: "axis", x: width - right, y: height - 7, "text-anchor": "end" }, svg).textContent = spec.xLabel;
+    for (const { x, low, high, band } of spec.curves.filter((c) => c.low)) {
+      const up = path(x, high, to), down = path([...x].reverse(), [...low].reverse(), to).replace("M", "L");
+      if (up) drawn("path", { class: band === null ? "region" : "fill", d: up + down + "Z" }, svg, of(band));
     }
-    if (spec.level !== undefined) drawn("line", { class: "zero", x1: left, x2: width - right, y1: Y(spec.level), y2: Y(spec.level) }, svg);
-    for (const s of spec.series) {
-      if (s.kind === "dots") {
-        const d = Array.from(s.x, (x, i) => `M${X(x).toFixed(1)} ${Y(s.y[i]).toFixed(1)}h.01`).join("");
-        drawn("path", { class: "dots", d, "stroke-width": 2.6 }, svg, s.color);
-      } else drawn("path", { class: `line ${s.kind || ""}`, d: path(s.x, s.y, to), "stroke-dasharray": s.dash || "" }, svg, s.color);
+    for (const level of spec.levels) drawn("line", { class: "zero", x1: left, x2: width - right, y1: Y(level), y2: Y(level) }, svg);
+    for (const { x, y, kind, run } of spec.curves) {
+      if (kind === "dots") {
+        const d = Array.from(x, (v, i) => `M${X(v).toFixed(1)} ${Y(y[i]).toFixed(1)}h.01`).join("");
+        drawn("path", { class: "dots", d, "stroke-width": 2.6 }, svg, of(run));
+      } else drawn("path", { class: `line ${kind}`, d: path(x, y, to), "stroke-dasharray": kind || run === null ? "" : dashes[run] }, svg, of(run));
     }
-    hover(svg, spec, X, width, height, left, right, bottom);
+    hover(svg, spec, X, width, height, left, right, bottom, spec.xUnit === "s" ? onTime : () => {});
   });
 }
 
-function hover(svg, spec, X, width, height, left, right, bottom) {
+function hover(svg, spec, X, width, height, left, right, bottom, onTime) {
   const cursor = drawn("line", { class: "cursor", y1: 0, y2: height - bottom, visibility: "hidden" }, svg);
-  const end = () => { tip.hidden = true; cursor.setAttribute("visibility", "hidden"); if (spec.onTime) spec.onTime(null); };
+  const end = () => { tip.hidden = true; cursor.setAttribute("visibility", "hidden"); onTime(null); };
   svg.addEventListener("pointerleave", end);
   svg.addEventListener("pointermove", (event) => {
-    const at = event.clientX - svg.getBoundingClientRect().left;
-    const lines = [];
-    let x = null;
-    for (const s of spec.series) {
-      if (!s.x.length) continue;
-      const share = (at - left) / (width - left - right), low = X(s.x[0]), high = X(s.x[s.x.length - 1]);
-      if (share < 0 || share > 1) continue;
-      const wanted = s.x[0] + ((at - low) / (high - low || 1)) * (s.x[s.x.length - 1] - s.x[0]);
-      const i = nearest(s.x, wanted);
-      x = x === null ? s.x[i] : x;
-      lines.push(`${s.name}: ${short(s.y[i])} ${spec.unit || ""}` + (s.around ? ` (${s.around(i)})` : ""));
+    const at = event.clientX - svg.getBoundingClientRect().left, share = (at - left) / (width - left - right), lines = [];
+    let first = null;
+    for (const { x, y, low, high, name } of share < 0 || share > 1 ? [] : spec.curves.filter((c) => c.x.length)) {
+      const last = x[x.length - 1];
+      const i = nearest(x, x[0] + ((at - X(x[0])) / (X(last) - X(x[0]) || 1)) * (last - x[0]));
+      first = first === null ? x[i] : first;
+      lines.push(`${name}: ${short(y[i])} ${spec.unit}` + (low ? ` (${short(low[i])} to ${short(high[i])})` : ""));
     }
-    if (x === null) return end();
+    if (first === null) return end();
     cursor.setAttribute("visibility", "visible");
-    cursor.setAttribute("x1", X(x)); cursor.setAttribute("x2", X(x));
-    if (spec.onTime) spec.onTime(x);
-    showTip(event, `${short(x)} ${spec.xUnit || "s"}\n${lines.join("\n")}`);
+    cursor.setAttribute("x1", X(first)); cursor.setAttribute("x2", X(first));
+    onTime(first);
+    showTip(event, `${short(first)} ${spec.xUnit}\n${lines.join("\n")}`);
   });
 }
 
@@ -214,10 +187,10 @@ function choose(parent, heading, names, chosen, change) {
   });
 }
 
-/** Half axes and direction of the ellipse of a covariance ((a, b), (b, c)). */
+/** Half axes of one sigma and direction of the ellipse of a covariance ((a, b), (b, c)). */
 function ellipse(a, b, c) {
   const middle = (a + c) / 2, root = Math.hypot((a - c) / 2, b);
-  return [SIGMAS * Math.sqrt(Math.max(middle + root, 0)), SIGMAS * Math.sqrt(Math.max(middle - root, 0)), Math.atan2(2 * b, a - c) / 2];
+  return [Math.sqrt(Math.max(middle + root, 0)), Math.sqrt(Math.max(middle - root, 0)), Math.atan2(2 * b, a - c) / 2];
 }
 
 const COV = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]; // where an entry of a covariance stands in its packed row
@@ -382,7 +355,7 @@ class Track {
     const layer = drawn("path", { class: "line thin", d: text }, svg, color);
     layer.style.opacity = Math.min(Math.max(12 / Math.sqrt(some.length + 1), 0.35), 0.9);
     this.said.push(
-      `Ellipses hold ${SIGMAS} sigma, 86 % of a Gaussian in this plane` +
+      `Ellipses hold ${recording.sigmas} sigma, 86 % of a Gaussian in this plane` +
       (stride > 1 ? `; one in ${stride} landmarks shows its own, zoom in for all` : "") +
       (large ? `; ${large} too large to be drawn.` : ".")
     );
@@ -390,11 +363,12 @@ class Track {
 
   /** Ellipses of rows of points as one path, those longer than a share of the view left out and counted. */
   ellipses(xyz, cov, rows, share) {
-    const [a, b] = this.axes, kx = this.scale, ky = this.scale * this.stretch, limit = share * Math.hypot(this.width, this.height);
+    const [a, b] = this.axes, kx = this.scale, ky = this.scale * this.stretch, limit = share * Math.hypot(this.width, this.height), { sigmas } = this.recording;
     let text = "", large = 0;
     for (const i of rows) {
       const at = (p, q) => cov[6 * i + COV[p][q]];
-      const [long, thin, angle] = ellipse(kx * kx * at(a, a), -kx * ky * at(a, b), ky * ky * at(b, b));
+      const [half, other, angle] = ellipse(kx * kx * at(a, a), -kx * ky * at(a, b), ky * ky * at(b, b));
+      const long = sigmas * half, thin = sigmas * other;
       if (long > limit) { large++; continue; }
       const x = this.X(xyz[3 * i + a]), y = this.Y(xyz[3 * i + b]), dx = long * Math.cos(angle), dy = long * Math.sin(angle);
       const arc = `A${long.toFixed(2)} ${thin.toFixed(2)} ${(angle * 180 / Math.PI).toFixed(1)} 1 0 `;
@@ -486,58 +460,26 @@ class Track {
   }
 }
 
-/** Height against the way driven, and how far runs are from the truth. */
-function profiles(parent, recording, g, onTime) {
-  const runs = recording.runs.map((run, j) => [run, colorOf(g, j)]).filter(([run]) => run.shown);
-  const row = element("div", { class: "grid2" }, parent), truth = recording.truth;
-  const heights = runs.map(([run, color]) => ({ x: run.way, y: column(run.xyz, 3, 2), color, dash: run.dash, name: run.label }));
-  if (truth) heights.unshift({ x: truth.way, y: column(truth.xyz, 3, 2), kind: "truth", name: "truth" });
-  const [best, color] = runs[Math.max(runs.findIndex(([run]) => run.mode === "full"), 0)], z = column(best.xyz, 3, 2), std = column(best.std, 3, 2);
-  const band = { x: best.way, low: z.map((v, i) => v - 3 * std[i]), high: z.map((v, i) => v + 3 * std[i]), color };
-  plot(row, "Height profile", `z in m against metres driven; band: 3 sigma of ${best.label}`, { series: heights, bands: [band], unit: "m", xUnit: "m" });
-  const off = runs.filter(([run]) => run.errors).map(([run, c]) => ({
-    x: run.errors.time, color: c, dash: run.dash, name: run.label,
-    y: Float64Array.from(run.errors.time, (_, i) => Math.hypot(...[0, 1, 2].map((k) => run.errors.error[6 * i + k]))),
-  }));
-  if (off.length) plot(row, "Distance from the truth", "m, first pose aligned, nothing else", { series: off, unit: "m", log: true, onTime });
-}
-
-function ofRun(room, run, color, onTime) {
+function ofRun(room, run, g, dashes, onTime) {
   room.replaceChildren();
-  const errors = run.errors, percent = (share) => (100 * share).toFixed(1) + " %";
-  if (errors) {
-    element("p", { class: "hint" }, room, `Estimate minus truth along the axes of world, with bounds of 3 sigma: ${percent(errors.inside)} inside.`);
-    const six = element("div", { class: "grid3" }, room);
-    for (let k = 0; k < 6; k++) {
-      const error = column(errors.error, 6, k), band = column(errors.band, 6, k), unit = k < 3 ? "m" : "°";
-      plot(six, `${k < 3 ? "position" : "rotation"} ${"xyz"[k % 3]}`, unit === "m" ? "m" : "degrees", {
-        height: 150, unit, level: 0, onTime, bands: [{ x: errors.time, low: band.map((v) => -v), high: band, color }],
-        series: [{ x: errors.time, y: error, color: "var(--ink)", kind: "thin", name: "error", around: (i) => `3 sigma: ${short(band[i])} ${unit}` }],
-      });
-    }
-  } else element("p", { class: "hint" }, room, "Without truth there are no errors to show.");
-  const two = element("div", { class: "grid2" }, room);
-  const region = (x, low, high) => ({ x, low, high });
-  if (errors && errors.nees.length)
-    plot(two, "Pose NEES", `6 expected, mean ${short(errors.neesMean)}; grey: 95 % of honest poses`, {
-      log: true, level: 6, onTime, series: [{ x: errors.neesTime, y: errors.nees, color, kind: "thin", name: "NEES" }],
-      bands: [region(errors.neesTime, errors.neesTime.map(() => errors.neesBounds[0]), errors.neesTime.map(() => errors.neesBounds[1]))],
-    });
-  if (run.nis)
-    plot(two, "NIS per degree of freedom", `1 expected, mean ${short(run.nis.mean)}; ${percent(run.nis.inside)} of frames within their 95 %, grey`, {
-      log: true, level: 1, onTime, bands: [region(run.nis.time, run.nis.low, run.nis.high)],
-      series: [{ x: run.nis.time, y: run.nis.value, color, kind: "dots", name: "NIS / dof" }],
-    });
-  if (!two.childNodes.length) element("p", { class: "hint" }, two, "This run has no innovations.");
+  element("p", { class: "hint" }, room, run.words);
+  const six = element("div", { class: "grid3" }, room), two = element("div", { class: "grid2" }, room);
+  for (const spec of run.errors) plot(six, { height: 150, ...spec }, g, dashes, onTime);
+  for (const spec of run.consistency) plot(two, spec, g, dashes, onTime);
+  if (!run.consistency.length) element("p", { class: "hint" }, two, "This run has no innovations.");
 }
 
-unpack(JSON.parse(document.getElementById("data").textContent)).forEach((recording, g) => {
-  const parent = document.querySelector(`.plots[data-recording="${g}"]`);
+const unpacked = (key, value) => (value && value.f32 !== undefined
+  ? new Float32Array(Uint8Array.from(atob(value.f32), (c) => c.charCodeAt(0)).buffer) : value);
+
+JSON.parse(document.getElementById("data").textContent, unpacked).forEach((recording, g) => {
+  const parent = document.querySelector(`.plots[data-recording="${g}"]`), dashes = recording.runs.map((run) => run.dash);
   const track = new Track(parent, recording, g), onTime = (time) => track.pin(time);
   element("h3", {}, parent, "Height and errors");
-  profiles(parent, recording, g, onTime);
+  const row = element("div", { class: "grid2" }, parent);
+  for (const spec of recording.plots) plot(row, spec, g, dashes, onTime);
   element("h3", {}, parent, "Consistency");
-  const room = element("div"), show = (j) => ofRun(room, recording.runs[j], colorOf(g, j), onTime);
+  const room = element("div"), show = (j) => ofRun(room, recording.runs[j], g, dashes, onTime);
   const first = Math.max(recording.runs.findIndex((run) => run.mode === "full"), 0);
   if (recording.runs.length > 1) choose(parent, "Run", recording.runs.map((run) => run.label), first, show);
   parent.appendChild(room);

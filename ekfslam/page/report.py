@@ -23,7 +23,7 @@ from ekfslam.evaluation.evidence import BLIND
 from ekfslam.evaluation.summary import merit_rows
 from ekfslam.evaluation.tables import MISSING
 from ekfslam.names import components, printable
-from ekfslam.page.content import PART, Recording, Run, plotted, recordings_of, remarks_of
+from ekfslam.page.content import PART, Run, Section, plotted, remarks_of, sections_of
 from ekfslam.runner import versions
 from ekfslam.storage.archive import Archive, read_archive
 
@@ -94,14 +94,14 @@ def is_report(path: Path) -> bool:
 
 def report_page(archives: Mapping[str, Archive], title: str = "") -> str:
     """The text of a page of archives by label."""
-    recordings = recordings_of(archives)
-    title = printable(title) or _title([recording.name for recording in recordings])
-    style = _file("report.css") + _colors(recordings)
+    sections = sections_of(archives)
+    title = printable(title) or _title([section.name for section in sections])
+    style = _file("report.css") + _colors(sections)
     script = _file("report.js")
-    data = json.dumps([plotted(recording) for recording in recordings], allow_nan=False).replace("<", "\\u003c")
+    data = json.dumps([plotted(section) for section in sections], allow_nan=False).replace("<", "\\u003c")
     policy = f"default-src 'none'; style-src '{_digest(style)}'; script-src '{_digest(script)}'; img-src data:"
-    body = "\n".join(_section(i, recording, len(recordings) == 1) for i, recording in enumerate(recordings))
-    runs = sum(len(recording.runs) for recording in recordings)
+    body = "\n".join(_section(i, section, len(sections) == 1) for i, section in enumerate(sections))
+    runs = sum(len(section.runs) for section in sections)
     return f"""<!doctype html>
 <html lang="en">
 <head>
@@ -117,10 +117,10 @@ def report_page(archives: Mapping[str, Archive], title: str = "") -> str:
 <header>
 <p class="kind">ekfslam report</p>
 <h1>{escape(title)}</h1>
-{_facts([_count(len(recordings), "recording"), _count(len(archives), "archive"), _count(runs, "run")])}
+{_facts([_count(len(sections), "recording"), _count(len(archives), "archive"), _count(runs, "run")])}
 </header>
 <main>
-{_overview(recordings) if len(recordings) > 1 else ""}
+{_overview(sections) if len(sections) > 1 else ""}
 {body}
 </main>
 <footer>Made by ekfslam {escape(versions()["version_ekfslam"])}. This page loads nothing from elsewhere.</footer>
@@ -137,31 +137,31 @@ def _title(names: Sequence[str]) -> str:
     return ", ".join(different[:3]) + more
 
 
-def _section(number: int, recording: Recording, is_alone: bool) -> str:
-    archive, time_s = recording.archive, recording.archive.time_s
+def _section(number: int, section: Section, is_alone: bool) -> str:
+    archive, time_s = section.archive, section.archive.time_s
     facts = [
         _count(len(time_s), "frame"),
         f"{time_s[-1] - time_s[0]:.1f} s",
-        f"{recording.length_m:.0f} m" if recording.length_m >= 10 else f"{recording.length_m:.2f} m",
+        f"{section.length_m:.0f} m" if section.length_m >= 10 else f"{section.length_m:.2f} m",
         f"truth of {_count(len(archive.truth.frame), 'pose')}" if archive.truth is not None else "no truth",
     ]
-    notes = _list([*remarks_of(recording), *archive.notes])
+    notes = _list([*remarks_of(section), *archive.notes])
     if notes:
         notes = f"<details><summary>Notes on the recording</summary><div>{notes}</div></details>"
-    heading = "" if is_alone else f"<h2>{escape(recording.name)}</h2>"
+    heading = "" if is_alone else f"<h2>{escape(section.name)}</h2>"
     return f"""<section id="recording-{number}">
 {heading}
 {_facts(facts)}
 {notes}
-<div class="cards">{"".join(map(_card, _carded(recording)))}</div>
+<div class="cards">{"".join(map(_card, _carded(section)))}</div>
 <p class="notes">{_JUDGED} {escape(BLIND)}</p>
 <noscript><p class="notes">A script in this page draws its plots; this browser does not run it.</p></noscript>
 <div class="plots" data-recording="{number}"></div>
-{_evidence(recording)}
+{_evidence(section)}
 <h3>Figures of merit</h3>
-{_table(["", *(run.label for run in recording.runs)], merit_rows(run.summary for run in recording.runs))}
+{_table(["", *(run.label for run in section.runs)], merit_rows(run.summary for run in section.runs))}
 <h3>Runs in detail</h3>
-{"".join(_detail(run) for run in recording.runs)}
+{"".join(_detail(run) for run in section.runs)}
 </section>"""
 
 
@@ -169,9 +169,9 @@ def _facts(facts: Iterable[str]) -> str:
     return f'<p class="facts">{" · ".join(facts)}</p>'
 
 
-def _carded(recording: Recording) -> list[Run]:
+def _carded(section: Section) -> list[Run]:
     """Runs that have a card: all, or of many those that innovations judge, or the last."""
-    runs = list(recording.runs)
+    runs = list(section.runs)
     if len(runs) <= _MOST_CARDS:
         return runs
     return [run for run in runs if run.honesty.shared is not None] or runs[-1:]
@@ -192,9 +192,9 @@ def _card(run: Run) -> str:
 </article>"""
 
 
-def _evidence(recording: Recording) -> str:
+def _evidence(section: Section) -> str:
     """Return a table of the evidence; expected values stand beside the name if all runs have the same one."""
-    found = [{name: cells for name, *cells in run.honesty.evidence} for run in recording.runs]
+    found = [{name: cells for name, *cells in run.honesty.evidence} for run in section.runs]
     rows = []
     for name in dict.fromkeys(name for evidence in sorted(found, key=len, reverse=True) for name in evidence):
         cells = [evidence.get(name, [MISSING, ""]) for evidence in found]
@@ -204,7 +204,7 @@ def _evidence(recording: Recording) -> str:
         else:
             rows.append([name, *(_expecting(value, own) for value, own in cells)])
     heading = "<h3>Evidence <small>found (expected)</small></h3>"
-    return f"{heading}\n{_table(['', *(run.label for run in recording.runs)], rows)}" if rows else ""
+    return f"{heading}\n{_table(['', *(run.label for run in section.runs)], rows)}" if rows else ""
 
 
 def _expecting(text: str, expected: str) -> str:
@@ -245,13 +245,13 @@ def _configuration(config: Mapping[str, Any]) -> str:
     return f"{own}<details><summary>all settings</summary>{_pairs(all_of_it)}</details>"
 
 
-def _overview(recordings: Sequence[Recording]) -> str:
-    """A table of all runs of several recordings."""
-    runs = [(i, recording, run) for i, recording in enumerate(recordings) for run in recording.runs]
+def _overview(sections: Sequence[Section]) -> str:
+    """Return a table of all runs."""
+    runs = [(i, section, run) for i, section in enumerate(sections) for run in section.runs]
     columns = merit_rows({key: run.summary[key] for key in _KEY_FIGURES} for _, _, run in runs)
     rows = []
-    for row, (i, recording, run) in enumerate(runs):
-        name = f'<a href="#recording-{i}">{escape(recording.name)}</a>'
+    for row, (i, section, run) in enumerate(runs):
+        name = f'<a href="#recording-{i}">{escape(section.name)}</a>'
         cells = "".join(f"<td>{escape(column[row + 1])}</td>" for column in columns)
         rows.append(f'<tr><th scope="row">{name}</th><th scope="row">{escape(run.label)}</th>{cells}</tr>')
     headings = ["recording", "run", *(column[0] for column in columns)]
@@ -299,10 +299,10 @@ def _count(number: int, what: str) -> str:
     return f"{number:,} {what}{'' if number == 1 else 's'}".replace(",", " ")
 
 
-def _colors(recordings: Sequence[Recording]) -> str:
+def _colors(sections: Sequence[Section]) -> str:
     """Colours of runs as variables of the style: ``--run-<recording>-<run>``."""
     named = "".join(
-        f"--run-{i}-{j}:{run.color};" for i, recording in enumerate(recordings) for j, run in enumerate(recording.runs)
+        f"--run-{i}-{j}:{run.color};" for i, section in enumerate(sections) for j, run in enumerate(section.runs)
     )
     return f"\n:root{{{named}}}\n"
 

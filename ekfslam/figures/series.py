@@ -1,0 +1,236 @@
+"""The table of series: each curve over a run with its unit, its bounds and its expected value.
+
+Figures and report pages draw the same series. Matplotlib draws them by `draw_series`; `ekfslam.page` packs them for its
+script.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from scipy.spatial.transform import Rotation
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.sequence import Truth
+from ekfslam.evaluation.consistency import (
+    chi2_bounds,
+    measured_truth,
+    pose_nees,
+    world_axes_errors,
+    world_axes_std,
+)
+from ekfslam.evaluation.trajectory import distance_along
+from ekfslam.figures.style import BAND_ALPHA, BOUNDS, EXPECTED, Style, log_axis
+from ekfslam.filters.result import Result
+
+BAND_SIGMAS = 3.0
+PROBABILITY = 0.95  # of the bounds of NIS and NEES
+_LOG_RATIO = 20.0  # largest over smallest value from which a logarithmic axis shows more
+_AXES = tuple(f"{kind} {axis}" for kind in ("position", "rotation") for axis in "xyz")
+_SCALES = np.repeat([1.0, np.degrees(1.0)], 3)  # m and rad to the units below
+_UNITS = ("m", "m", "m", "deg", "deg", "deg")
+
+
+@dataclass(frozen=True)
+class Series:
+    """A curve over time or distance.
+
+    Args:
+        name, unit: Label of the y axis.
+        x, y: (n,) the curve.
+        low, high: (n,) bounds; None without bounds.
+        bounds_expectation: Whether the bounds hold values of an honest run; otherwise they are those of the estimate.
+        levels: Values to compare with: expected ones, or bounds of the prior.
+        is_positive: Whether large ratios matter, so that the axis may be logarithmic.
+        is_dotted: Whether single points are drawn instead of a line.
+        mean: Mean by degrees of freedom, for titles.
+        x_name, x_unit: Label of the x axis.
+    """
+
+    name: str
+    unit: str
+    x: Array
+    y: Array
+    low: Array | None = None
+    high: Array | None = None
+    bounds_expectation: bool = False
+    levels: tuple[float, ...] = ()
+    is_positive: bool = False
+    is_dotted: bool = False
+    mean: float | None = None
+    x_name: str = "time"
+    x_unit: str = "s"
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Labels of the x axis and of the y axis."""
+        return f"{self.x_name} [{self.x_unit}]", f"{self.name} [{self.unit or '-'}]"
+
+    @property
+    def is_log(self) -> bool:
+        """Whether a logarithmic axis shows more."""
+        return self.is_positive and len(self.y) > 0 and bool(np.max(self.y) > _LOG_RATIO * np.min(self.y))
+
+    @property
+    def share_inside(self) -> float:
+        """Share of the values within their bounds."""
+        assert self.low is not None and self.high is not None
+        return float(np.mean((self.y >= self.low) & (self.y <= self.high)))
+
+    def only(self, rows: IntArray) -> Series:
+        """Return some points of the curve."""
+        low, high = (None if bound is None else bound[rows] for bound in (self.low, self.high))
+        return dataclasses.replace(self, x=self.x[rows], y=self.y[rows], low=low, high=high)
+
+    def without_bounds(self) -> Series:
+        """Return the curve alone."""
+        return dataclasses.replace(self, low=None, high=None)
+
+
+def draw_series(ax: Axes, series: Series, band: str, line: Style, levels: Style = EXPECTED, label: str = "_") -> None:
+    """Draw a curve, its bounds and levels with labelled axes.
+
+    Args:
+        ax: Where to.
+        series: What to draw.
+        band: Colour of the bounds of an estimate; bounds of expected values are grey.
+        line: Style of the curve.
+        levels: Style of the levels.
+        label: Label of the curve in legends, which leave out names that begin with ``_``.
+    """
+    if series.low is not None and series.high is not None:
+        if series.bounds_expectation:
+            words = f"{100 * PROBABILITY:g} % chi-square bounds"
+            ax.fill_between(series.x, series.low, series.high, step="mid", **BOUNDS, label=words)
+        else:
+            look: Style = {"facecolor": (band, BAND_ALPHA), "edgecolor": band, "linewidth": 0.6}
+            ax.fill_between(series.x, series.low, series.high, **look)
+    for level in series.levels:
+        ax.axhline(level, **levels, zorder=1, label="expected mean" if series.bounds_expectation else "_")
+    ax.plot(series.x, series.y, **line, label=label)
+    if series.is_log:
+        log_axis(ax, (1.0, 2.0, 5.0))
+    x_label, y_label = series.labels
+    ax.set_ylabel(y_label)
+    place = ax.get_subplotspec()
+    if place is None or place.is_last_row():
+        ax.set_xlabel(x_label)
+    ax.margins(x=0.01)
+
+
+def errors(result: Result, truth: Truth) -> list[Series]:
+    """Return estimate minus truth along the axes of world, three positions and three rotations, with 3-sigma bounds."""
+    T, x = result.T_world_imu[truth.frame], _time(result)[truth.frame]
+    error = _SCALES * world_axes_errors(T, truth.T_world_imu)
+    bound = BAND_SIGMAS * _SCALES * world_axes_std(T, result.covariance[truth.frame])
+    return [
+        Series(name, unit, x, error[:, i], -bound[:, i], bound[:, i], levels=(0.0,))
+        for i, (name, unit) in enumerate(zip(_AXES, _UNITS, strict=True))
+    ]
+
+
+def share_inside(series: Iterable[Series]) -> float:
+    """Return the share of the values of several series of equal length within their bounds."""
+    return float(np.mean([one.share_inside for one in series]))
+
+
+def nees(result: Result, truth: Truth, interpolated: BoolArray | None = None, with_truth_noise: bool = True) -> Series:
+    """Return the pose NEES of the frames that no ``interpolated`` interval (T,) leads to."""
+    judged = truth if interpolated is None else measured_truth(truth, interpolated, result.time_s)
+    frame, values = pose_nees(result, judged, with_truth_noise)
+    known = np.isfinite(values)
+    low, high = (np.full(known.sum(), bound) for bound in chi2_bounds(6, PROBABILITY))
+    x, y = _time(result)[frame[known]], values[known]
+    mean = float(y.mean()) if len(y) else None
+    return Series("pose NEES", "", x, y, low, high, True, (6.0,), is_positive=True, mean=mean)
+
+
+def nis(result: Result) -> Series:
+    """Return the NIS per degree of freedom of the frames with updates, with the chi-square bounds of each."""
+    innovation = result.innovation
+    seen = innovation.dof > 0
+    dof = innovation.dof[seen]
+    low, high = (bound / dof for bound in chi2_bounds(dof, PROBABILITY))
+    mean = float(innovation.nis.sum() / dof.sum()) if len(dof) else None
+    y = innovation.nis[seen] / dof
+    return Series(
+        "NIS per dof", "", _time(result)[seen], y, low, high, True, (1.0,), is_positive=True, is_dotted=True, mean=mean
+    )
+
+
+def distance_from_truth(result: Result, truth: Truth) -> Series:
+    """Return the distance of the estimated position from the true one, without alignment."""
+    off = result.T_world_imu[truth.frame, :3, 3] - truth.T_world_imu[:, :3, 3]
+    x = _time(result)[truth.frame]
+    return Series("distance from the truth", "m", x, np.linalg.norm(off, axis=1), is_positive=True)
+
+
+def height(T_world_imu: Array, covariance: Array | None = None) -> Series:
+    """Return z of world over the distance driven, with 3-sigma bounds if there is a covariance (T, 6, 6)."""
+    x, z = distance_along(T_world_imu), T_world_imu[:, 2, 3]
+    series = Series("z", "m", x, z, x_name="distance driven", x_unit="m")
+    if covariance is None:
+        return series
+    bound = BAND_SIGMAS * world_axes_std(T_world_imu, covariance)[:, 2]
+    return dataclasses.replace(series, low=z - bound, high=z + bound)
+
+
+def trajectory(result: Result, truth: Truth | None = None) -> list[tuple[Series, Series | None]]:
+    """Return x, y, z, roll, pitch and yaw with 3-sigma bounds, each with its true series."""
+    time_s, values = _time(result), _unwrapped(result.T_world_imu)
+    attitude = np.degrees(_attitude_std(result.T_world_imu, result.covariance))
+    bound = BAND_SIGMAS * np.hstack([result.position_std_world_m, attitude])
+    known = truth is not None and len(truth.frame) > 0
+    found = []
+    for i, (name, unit) in enumerate(zip(("x", "y", "z", "roll", "pitch", "yaw"), _UNITS, strict=True)):
+        y, true = values[:, i], None
+        if truth is not None and known:
+            of_truth = _unwrapped(truth.T_world_imu)[:, i]
+            turns = 360.0 * np.round((of_truth[0] - y[truth.frame[0]]) / 360.0) if unit == "deg" else 0.0
+            true = Series(name, unit, time_s[truth.frame], of_truth - turns)
+        found.append((Series(name, unit, time_s, y, y - bound[:, i], y + bound[:, i]), true))
+    return found
+
+
+def parameters(result: Result) -> list[Series]:
+    """Return the estimated parameters with 3-sigma bounds; levels are the 3-sigma bounds of the prior."""
+    found, x = result.parameters, _time(result)
+    if found is None:
+        return []
+    series = []
+    for i, name in enumerate(found.name):
+        unit, factor = ("deg", np.degrees(1.0)) if found.unit[i] == "rad" else (found.unit[i], 1.0)
+        y, bound = factor * found.value[:, i], factor * BAND_SIGMAS * found.std[:, i]
+        prior = float(factor * BAND_SIGMAS * found.prior_std[i])
+        series.append(Series(name, unit.removeprefix("1"), x, y, y - bound, y + bound, levels=(-prior, prior)))
+    return series
+
+
+def _time(result: Result) -> Array:
+    return result.time_s - result.time_s[0]
+
+
+def _unwrapped(T_world_imu: Array) -> Array:
+    """Return position (m), roll, pitch and yaw (degrees) of poses (T, 4, 4) as (T, 6), angles without jumps."""
+    yaw_pitch_roll = Rotation.from_matrix(T_world_imu[:, :3, :3]).as_euler("ZYX")
+    return np.hstack([T_world_imu[:, :3, 3], np.degrees(np.unwrap(yaw_pitch_roll[:, ::-1], axis=0))])
+
+
+def _attitude_std(T_world_imu: Array, covariance: Array) -> Array:
+    """Return standard deviations (T, 3) of roll, pitch and yaw, rad, to first order.
+
+    The rotation error ``theta`` is about the axes of the IMU, ``R_true = R exp(-theta^)``. The rows of E are the
+    derivatives of the angles with respect to it.
+    """
+    _, pitch, roll = Rotation.from_matrix(T_world_imu[:, :3, :3]).as_euler("ZYX").T
+    sin, cos, zero = np.sin(roll), np.cos(roll), np.zeros_like(roll)
+    level = np.maximum(np.cos(pitch), 1e-9)
+    E = np.stack(
+        [zero + 1.0, sin * np.tan(pitch), cos * np.tan(pitch), zero, cos, -sin, zero, sin / level, cos / level]
+    )
+    E = E.T.reshape(-1, 3, 3)
+    return np.sqrt(np.maximum(np.einsum("tij,tjk,tik->ti", E, covariance[:, 3:, 3:], E), 0.0))
