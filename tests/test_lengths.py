@@ -16,7 +16,6 @@ GOES = "the window in view: goes once the compiled filter replaces it"
 
 # Name to reason. The list may only become shorter.
 EXCEPTIONS: dict[str, str] = {
-    "ekfslam.data.hygiene.clean_tracks": TO_BE_SPLIT,
     "ekfslam.data.simulate.simulate": TO_BE_SPLIT,
     "ekfslam.filters.conditional.ConditionalGaussian": GOES,
     "ekfslam.filters.joint.JointEKF": TO_BE_SPLIT,

@@ -1,11 +1,11 @@
-"""Track hygiene: the one stage between a recording and the filters, in which tracks are cut and observations dropped.
+"""Track hygiene: the stage between a recording and the filters that cuts tracks and drops observations.
 
-Every rule looks at the tracks alone, at how much noise their pixels have, and at the measured velocities; none needs an
-estimate. What a rule did is listed observation by observation in a `HygieneReport`: nothing goes silently.
+The rules use tracks, their pixel noise, and measured velocities; none needs an estimate. A `HygieneReport` lists every
+observation that a rule changed.
 
 A rule either *drops* an observation, or *cuts* a track: from that observation on the track has an id of its own. Ids of
-new pieces count on from the largest. In a recording whose tracks have no gaps, a track is also cut where the dropping
-leaves one.
+new pieces count on from the largest. If the tracks of a recording have no gaps, a track is also cut at every gap that a
+rule makes.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import HygieneConfig
 from ekfslam.data.sequence import Noise, Observations, Sequence
 from ekfslam.data.tracks import cut_tracks, repeated_frames, successive
@@ -26,7 +25,7 @@ from ekfslam.geometry import motion, se3
 from ekfslam.stored import COUNTS, FRAMES, attribute, stored, whole, zeros
 
 # The rules in the order in which they are applied, with the key of ``[hygiene]`` that switches each. The index of a
-# rule is its code in `HygieneReport.rule`, also in archives: what is new comes last.
+# rule is its code in `HygieneReport.rule`, also in archives: new rules are added at the end.
 _SWITCHES: dict[str, str] = {
     "repeated frame": "restart_at_repeats",
     "jump": "jump_sigma",
@@ -47,14 +46,14 @@ _COMPANY = 5  # tracks of a frame that can tell how the frame as a whole moved
 
 @dataclass(frozen=True)
 class HygieneReport:
-    """What hygiene found and did, one row a finding, in the order of the rules and then of the frames.
+    """Findings of the rules, one row each, in the order of the rules and then of the frames.
 
     Args:
-        observations: Number of observations looked at.
+        observations: Number of observations examined.
         rule: (n,) index into `RULES`.
-        frame: (n,) frame of the observation that was dropped, or with which the new piece of a cut track begins.
-        landmark: (n,) id of its track in the recording.
-        continuation: (n,) id that a cut track has from there on; -1 where the observation was dropped.
+        frame: (n,) frame of the dropped observation, or first frame of the new piece of a cut track.
+        landmark: (n,) id of the track in the recording.
+        continuation: (n,) id of the new piece of a cut track; -1 for a dropped observation.
     """
 
     observations: int = field(metadata=attribute(int))
@@ -65,12 +64,12 @@ class HygieneReport:
 
     @property
     def dropped(self) -> int:
-        """Number of observations dropped, each by one rule."""
+        """Return the number of dropped observations."""
         return int((self.continuation < 0).sum())
 
     @property
     def counts(self) -> dict[str, int]:
-        """Findings by rule, and the observations dropped in all."""
+        """Return the number of findings by rule, and of all dropped observations."""
         found = np.bincount(self.rule, minlength=len(RULES)).tolist()
         return {
             "dropped by hygiene": self.dropped,
@@ -78,7 +77,7 @@ class HygieneReport:
         }
 
     def lines(self, config: Mapping[str, Any]) -> tuple[str, ...]:
-        """One line a rule: what was found, where, and what was done; or that ``config`` (``[hygiene]``) has it off."""
+        """Return one line a rule: its findings, or that ``config`` (``[hygiene]``) switches it off."""
         lines = []
         for code, (name, switch) in enumerate(_SWITCHES.items()):
             found = self.rule == code
@@ -92,87 +91,103 @@ class HygieneReport:
             lines.append(line)
         return (*lines, f"{self.dropped} of {self.observations} observations dropped in all")
 
-    @staticmethod
-    def empty(observations: int) -> HygieneReport:
-        """Return the report on clean tracks."""
-        return HygieneReport(observations, **zeros(HygieneReport, finding=0))
+
+class _Cleaning:
+    """Tracks from which rules drop observations, or which they cut.
+
+    Attributes:
+        kept: Observations that are left.
+        own: (K,) ids of their tracks in the recording.
+    """
+
+    def __init__(self, observations: Observations) -> None:
+        self.kept, self.own = observations, observations.landmark
+        self._looked_at = len(observations)
+        # If no track of the recording has a gap, dropping shall leave none.
+        self._has_gaps = bool(_after_gaps(observations).any())
+        self._findings: list[tuple[IntArray, ...]] = []
+
+    def drop(self, rule: int, bad: BoolArray) -> None:
+        """Drop the observations that ``bad`` (K,) marks."""
+        self._record(rule, bad, np.full(len(bad), -1))
+        kept = self.kept
+        self.kept, self.own = Observations(kept.frame[~bad], kept.landmark[~bad], kept.pixels_px[~bad]), self.own[~bad]
+        if not self._has_gaps and (gaps := _after_gaps(self.kept)).any():
+            self.cut(rule, gaps)
+
+    def cut(self, rule: int, starts: BoolArray) -> None:
+        """Cut tracks before the observations that ``starts`` (K,) marks."""
+        kept = self.kept
+        landmark = cut_tracks(kept, starts, int(kept.landmark.max(initial=-1)) + 1)
+        self._record(rule, starts, landmark)
+        self.own = self.own[np.lexsort((landmark, kept.frame))]  # the order of `Observations`
+        self.kept = Observations(kept.frame, landmark, kept.pixels_px)
+
+    def by_track(self) -> IntArray:
+        """Return the number (K,) of the track of each observation, counted from 0."""
+        return np.searchsorted(self.kept.ids, self.kept.landmark)
+
+    def report(self) -> HygieneReport:
+        """Return what was dropped and cut."""
+        if not self._findings:
+            return HygieneReport(self._looked_at, **zeros(HygieneReport, finding=0))
+        return HygieneReport(self._looked_at, *map(np.concatenate, zip(*self._findings, strict=True)))
+
+    def _record(self, rule: int, found: BoolArray, continuation: IntArray) -> None:
+        columns = (np.full(len(found), rule), self.kept.frame, self.own, continuation)
+        self._findings.append(tuple(column[found] for column in columns))
 
 
 def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tuple[Observations, HygieneReport]:
     """Apply the rules of ``config`` to the tracks of a sequence.
 
     Args:
-        sequence: The recording.
-        noise: What its pixels and velocities are worth; all limits are multiples of it.
-        config: Which rules, and how strict.
+        sequence: Recording.
+        noise: Noise of its pixels and velocities; all limits are multiples of it.
+        config: Rules that are on, and their limits.
 
     Returns:
         The tracks that are left, and the report.
     """
-    kept = sequence.observations
-    own = kept.landmark  # id in the recording
-    # Where no track ever comes back, none shall because of what is dropped here.
-    come_back = _after_gaps(kept).any()
-    rows: list[tuple[int, IntArray, IntArray, IntArray]] = []
-
-    def drop(rule: int, bad: NDArray[np.bool_]) -> None:
-        nonlocal kept, own
-        rows.append((rule, kept.frame[bad], own[bad], np.full(int(bad.sum()), -1)))
-        kept, own = Observations(kept.frame[~bad], kept.landmark[~bad], kept.pixels_px[~bad]), own[~bad]
-        if not come_back and (gaps := _after_gaps(kept)).any():
-            cut(rule, gaps)
-
-    def cut(rule: int, starts: NDArray[np.bool_]) -> None:
-        nonlocal kept, own
-        landmark = cut_tracks(kept, starts, int(kept.landmark.max(initial=-1)) + 1)
-        rows.append((rule, kept.frame[starts], own[starts], landmark[starts]))
-        order = np.lexsort((landmark, kept.frame))  # that of `Observations`
-        kept, own = Observations(kept.frame, landmark, kept.pixels_px), own[order]
-
-    std = noise.pixel_std_px
+    tracks, std = _Cleaning(sequence.observations), noise.pixel_std_px
     disparity_std, row_std = np.hypot(std[0], std[2]), np.hypot(std[1], std[3])
     if config.restart_at_repeats:
-        starts = _first_at_or_after(kept, repeated_frames(kept, sequence.twist))
-        cut(REPEATED_FRAME, starts & ~_is_slow(kept, config.restart_above_px))
+        starts = _first_at_or_after(tracks.kept, repeated_frames(tracks.kept, sequence.twist))
+        tracks.cut(REPEATED_FRAME, starts & ~_is_slow(tracks.kept, config.restart_above_px))
     if config.jump_sigma:
-        cut(JUMP, jumps(kept, noise, config.jump_sigma))
+        tracks.cut(JUMP, jumps(tracks.kept, noise, config.jump_sigma))
     if config.reused_id_sigma:
-        cut(REUSED_ID, reused_ids(sequence, kept, noise, config.reused_id_sigma))
-    least = config.min_disparity_sigma
-    if least is None or least > 0:
-        drop(DISPARITY, _disparity(kept) <= (1.0 if least is None else least) * disparity_std)
+        tracks.cut(REUSED_ID, reused_ids(sequence, tracks.kept, noise, config.reused_id_sigma))
+    least = 1.0 if config.min_disparity_sigma is None else config.min_disparity_sigma
+    if least > 0:
+        tracks.drop(DISPARITY, _disparity(tracks.kept) <= least * disparity_std)
     if config.max_row_mismatch_sigma:
-        mismatch = np.abs(kept.pixels_px[:, 1] - kept.pixels_px[:, 3])
-        drop(ROW_MISMATCH, mismatch > config.max_row_mismatch_sigma * row_std)
+        mismatch = np.abs(tracks.kept.pixels_px[:, 1] - tracks.kept.pixels_px[:, 3])
+        tracks.drop(ROW_MISMATCH, mismatch > config.max_row_mismatch_sigma * row_std)
     if config.max_depth_error:
-        # The relative error of a depth is that of its disparity; a track is as good as its nearest observation.
-        track = np.searchsorted(kept.ids, kept.landmark)
-        nearest = np.zeros(len(kept.ids))
-        np.maximum.at(nearest, track, _disparity(kept))
-        drop(DEPTH, (nearest * config.max_depth_error < disparity_std)[track])
+        # The relative error of a depth is that of its disparity; the nearest observation of a track decides.
+        track = tracks.by_track()
+        nearest = np.zeros(len(tracks.kept.ids))
+        np.maximum.at(nearest, track, _disparity(tracks.kept))
+        tracks.drop(DEPTH, (nearest * config.max_depth_error < disparity_std)[track])
     if config.min_observations:
-        track = np.searchsorted(kept.ids, kept.landmark)
-        drop(TOO_SHORT, np.bincount(track)[track] < config.min_observations)
+        track = tracks.by_track()
+        tracks.drop(TOO_SHORT, np.bincount(track)[track] < config.min_observations)
     if config.disparity_jump_sigma:
-        # Asked of the tracks as they were recorded: where far ones have lost observations, the jump is not seen.
+        # The recorded tracks decide: if far ones have lost observations, the jump does not show.
         jumped = disparity_jumps(sequence, noise, config.disparity_jump_sigma)
-        drop(DISPARITY_JUMP, np.isin(own, jumped))
-
-    if not rows:
-        return kept, HygieneReport.empty(len(sequence.observations))
-    rule = np.repeat([row[0] for row in rows], [len(row[1]) for row in rows])
-    frame, landmark, continuation = (np.concatenate([row[i] for row in rows]) for i in (1, 2, 3))
-    return kept, HygieneReport(len(sequence.observations), rule, frame, landmark, continuation)
+        tracks.drop(DISPARITY_JUMP, np.isin(tracks.own, jumped))
+    return tracks.kept, tracks.report()
 
 
-def jumps(observations: Observations, noise: Noise, sigma: float) -> NDArray[np.bool_]:
-    """Whether (K,) an observation shows another point than the track did before: its pixels jump and stay there.
+def jumps(observations: Observations, noise: Noise, sigma: float) -> BoolArray:
+    """Return whether (K,) the pixels of a track jump at an observation, and stay there: it shows another point.
 
-    Three observations before and three from there on (in successive frames) decide. The track's course is the median of
-    the two motions before and the two after; what the pixels have moved beyond it is taken over one, three and five
-    frames about the jump, and the median of the three is not moved by one bad observation. A jump exceeds the
-    differences within the course. Less what the frame's tracks have in common, it also exceeds ``sigma`` standard
-    deviations of pixel noise and of the scatter of the frame's tracks together.
+    Three observations before and three from there on, in successive frames, decide. The course of a track is the median
+    of the two motions before and the two after. The motion beyond this course is measured over one, three and five
+    frames about the jump; one bad observation does not change the median of the three. A jump exceeds the differences
+    within the course. After the common motion of the frame's tracks is subtracted, it also exceeds ``sigma`` standard
+    deviations of pixel noise and of the scatter of these tracks together.
     """
     order = np.lexsort((observations.frame, observations.landmark))
     frame, landmark = observations.frame[order], observations.landmark[order]
@@ -193,13 +208,12 @@ def jumps(observations: Observations, noise: Noise, sigma: float) -> NDArray[np.
     return found
 
 
-def reused_ids(sequence: Sequence, observations: Observations, noise: Noise, sigma: float) -> NDArray[np.bool_]:
-    """Whether (K,) an observation after a gap in its track shows a point that cannot be the one from before the gap.
+def reused_ids(sequence: Sequence, observations: Observations, noise: Noise, sigma: float) -> BoolArray:
+    """Return whether (K,) an observation after a gap in its track cannot show the point from before the gap.
 
-    Both points are put into the world by the velocities alone. They may be apart by ``sigma`` standard deviations: of
-    both triangulations, and of what the velocities' noise adds up to during the gap, in position and (over the way and
-    the distance to the point) in heading. After a long drive that forbids little, so a landmark that comes back is not
-    cut.
+    Velocities alone place both points in the world. They may be ``sigma`` standard deviations apart: those of both
+    triangulations, and of the velocity noise that accumulates during the gap, in position and (over the way and the
+    distance to the point) in heading. After a long drive this allows much, so a landmark that comes back is not cut.
     """
     found = np.zeros(len(observations), dtype=bool)
     earlier, later = successive(observations)
@@ -239,13 +253,13 @@ def reused_ids(sequence: Sequence, observations: Observations, noise: Noise, sig
 
 
 def disparity_jumps(sequence: Sequence, noise: Noise, sigma: float) -> IntArray:
-    """Ids (n,) of tracks that a frame sees together with another right image of their points than the frame before.
+    """Return the ids (n,) of tracks in frames in which the stereo matches of most tracks change at once.
 
-    The velocities say how the depth of a point changes, and so its disparity; a track jumps by what its disparity
-    changes otherwise, in standard deviations of both disparities and of the velocities, beyond twice what it does in
-    the intervals beside. Traffic does so over many frames, a stereo match that was made anew does it once. Where the
-    median of a frame's tracks jumps by more than ``sigma``, all that are seen across are affected. Tracks with less
-    than ``sigma`` deviations of disparity cannot tell, nor can those of two frames, and at least `_COMPANY` must.
+    Velocities predict the change of depth of a point, and so of its disparity. A track jumps by the rest of the change,
+    in standard deviations of both disparities and of the velocities, less twice the jumps in the two neighbouring
+    intervals: traffic changes over many frames, a new stereo match does once. If the median of a frame's tracks jumps
+    by more than ``sigma``, all tracks that lead into the frame are affected. Tracks with less than ``sigma`` deviations
+    of disparity do not count, nor do those of two frames; at least `_COMPANY` must be left.
     """
     o, camera = sequence.observations, sequence.camera
     earlier, later = successive(o)
@@ -277,10 +291,10 @@ def disparity_jumps(sequence: Sequence, noise: Noise, sigma: float) -> IntArray:
     return np.unique(o.landmark[later[np.isin(o.frame[later], frames)]])
 
 
-def _is_slow(observations: Observations, limit_px: float) -> NDArray[np.bool_]:
-    """Whether (K,) an observation's track moves by at most ``limit_px`` before and after the frame that leads to it.
+def _is_slow(observations: Observations, limit_px: float) -> BoolArray:
+    """Return whether (K,) a track moves by at most ``limit_px`` about the frame that leads to an observation.
 
-    Those are the motions to the frame before and from this one to the next; a track that has neither is not slow.
+    These are the motions to the frame before and from this one to the next; a track that has neither is not slow.
     """
     earlier, later = successive(observations)
     beside = observations.frame[later] - observations.frame[earlier] == 1
@@ -293,8 +307,8 @@ def _is_slow(observations: Observations, limit_px: float) -> NDArray[np.bool_]:
     return (fastest >= 0) & (fastest <= limit_px)
 
 
-def _after_gaps(observations: Observations) -> NDArray[np.bool_]:
-    """Whether (K,) an observation is the first after frames that did not see its track."""
+def _after_gaps(observations: Observations) -> BoolArray:
+    """Return whether (K,) an observation is the first after frames that did not see its track."""
     earlier, later = successive(observations)
     found = np.zeros(len(observations), dtype=bool)
     found[later[observations.frame[later] - observations.frame[earlier] > 1]] = True
@@ -305,8 +319,8 @@ def _disparity(observations: Observations) -> Array:
     return observations.pixels_px[:, 0] - observations.pixels_px[:, 2]
 
 
-def _first_at_or_after(observations: Observations, frames: IntArray) -> NDArray[np.bool_]:
-    """Whether (K,) an observation is the first of its track at or after one of ``frames``, but not of all the track."""
+def _first_at_or_after(observations: Observations, frames: IntArray) -> BoolArray:
+    """Return whether (K,) an observation is the first of its track at or after a frame of ``frames``, not of all."""
     piece = np.searchsorted(frames, observations.frame, side="right")
     earlier, later = successive(observations)
     found = np.zeros(len(observations), dtype=bool)
@@ -315,7 +329,7 @@ def _first_at_or_after(observations: Observations, frames: IntArray) -> NDArray[
 
 
 def _median_by(group: IntArray, values: Array) -> Array:
-    """For every row of ``values`` (n, m) the medians of all rows of its group (n,)."""
+    """Return for every row of ``values`` (n, m) the medians over the rows of its group (n,)."""
     _, which, count = np.unique(group, return_inverse=True, return_counts=True)
     start = np.cumsum(count) - count
     medians = np.empty((len(count), values.shape[1]))
