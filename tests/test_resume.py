@@ -16,7 +16,7 @@ from ekfslam.cli import main
 from ekfslam.errors import ArchiveError
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import SerialExecutor
-from ekfslam.studies.journal import Journal, _framed
+from ekfslam.studies.journal import Journal, framed
 from ekfslam.studies.study import Study, run_study
 
 
@@ -88,6 +88,21 @@ def test_a_journal_of_something_else_is_a_named_error(tmp_path, kind):
     if kind == "another study":
         journal = Journal(tmp_path / "a.h5", {"seed": 2}, lambda level: blank)
     else:
-        journal._write(_framed(bad[kind]))
+        with journal.path.open("ab") as file:
+            file.write(framed(bad[kind]))
     with pytest.raises(ArchiveError, match=r"a\.h5\.journal"):
         list(journal.entries())
+
+
+@pytest.mark.parametrize(("changed", "kept"), [(0, 0), (1, 1)])
+def test_an_entry_whose_content_does_not_fit_its_digest_ends_the_journal(tmp_path, changed, kept):
+    blank = {"invariant": {"pose_nees": np.zeros(3)}}
+    journal = Journal(tmp_path / "a.h5", {"seed": 1}, lambda level: blank)
+    ends = []
+    for run in range(2):
+        journal.append("mid", run, {"invariant": {"pose_nees": np.full(3, run + 1.0)}})
+        ends.append(journal.path.stat().st_size)
+    content = bytearray(journal.path.read_bytes())
+    content[ends[changed] - 1] ^= 1
+    journal.path.write_bytes(content)
+    assert [run for _, run, _ in journal.entries()] == list(range(kept))

@@ -35,6 +35,7 @@ BLACK, DARK_GREY, GREY = "black", "0.35", "0.60"
 BLUE, SKY_BLUE = "#0072B2", "#56B4E9"
 VERMILLION, ORANGE = "#D55E00", "#E69F00"
 GREEN, PURPLE = "#009E73", "#CC79A7"
+BROWN = "#8A5A00"
 
 RC: Mapping[Any, Any] = MappingProxyType(
     {
@@ -75,6 +76,7 @@ VARIANTS: Mapping[str, Style] = MappingProxyType(
         "invariant": _style(BLUE, "-", "o"),
         "fej": _style(GREEN, "-.", "s"),
         "standard": _style(VERMILLION, "--", "D"),
+        "textbook": _style(BROWN, (0, (6, 2)), "X"),
         "invariant-iterated": _style(SKY_BLUE, (0, (4, 1, 1, 1)), "v"),
         "standard-iterated": _style(ORANGE, ":", "P"),
     }
@@ -83,7 +85,7 @@ VARIANTS: Mapping[str, Style] = MappingProxyType(
 OTHER: Style = _style(SKY_BLUE, "-.", "v")
 
 TRUTH: Style = MappingProxyType({"color": BLACK, "linestyle": "-", "linewidth": 2.2})
-LANDMARK_COLOR, FIRST_LANDMARK_COLOR = "#8A5A00", SKY_BLUE  # as estimated last, and as initialised
+LANDMARK_COLOR, FIRST_LANDMARK_COLOR = BROWN, SKY_BLUE  # as estimated last, and as initialised
 
 # What a value is held against: its expected value, zero, and the region that it keeps with some probability.
 EXPECTED: Style = MappingProxyType({"color": BLACK, "linewidth": 0.8})

@@ -1,8 +1,8 @@
-"""The journal of a study: every finished run at once on the disk, until the archive holds it.
+"""The one engine for many runs: run what is missing, with every finished run on the disk at once.
 
-An archive is rewritten as a whole, which a large study cannot do after every run. The journal is a file beside it to
-which entries are appended, each with its length and digest: whatever a kill leaves of the last one is not read. Its
-first entry says which study it belongs to.
+An archive is written as a whole, which a large study cannot afford after every run. Finished runs are appended to a
+journal next to the archive instead, each with its length and digest: an entry that a kill left incomplete is not read.
+The first entry names the study that the journal belongs to.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +19,65 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.errors import ArchiveError, WriteError
+from ekfslam.progress import progress as with_progress
+from ekfslam.studies.executors import completed
 
 _LENGTH, _DIGEST = 8, 32  # bytes before an entry
 _LONGEST = 1 << 30
 
 Record = Mapping[str, Mapping[str, NDArray]]  # variant, field, value of one run
+Key = tuple[str, int]  # of a run: its level, or all that decides its numbers, and its number
+
+
+def run_missing(
+    journal: Journal,
+    tasks: Mapping[Key, Any],
+    submit: Callable[[Any], Future[Any]],
+    keep: Callable[[Key, Record], None],
+    save: Callable[[], None],
+    label: str,
+    progress: bool = True,
+) -> None:
+    """Run the tasks that the journal does not hold, and save all records at the end.
+
+    They are also saved when an exception interrupts the work. After a kill, the next call finds them in the journal.
+
+    Args:
+        journal: File for finished runs; it is removed once they are saved.
+        tasks: Runs that the archive does not hold.
+        submit: Function that hands a task to an executor.
+        keep: Function that takes the record of a run.
+        save: Function that writes the archive.
+        label: Name in the progress bar.
+        progress: Whether to show a progress bar on a terminal.
+
+    Raises:
+        ArchiveError: The journal belongs to another study or is damaged; nothing is changed then.
+        WriteError: Journal or archive cannot be written.
+    """
+    held: dict[Key, Record] = {(level, run): record for level, run, record in journal.entries()}
+    for key, record in held.items():
+        keep(key, record)
+    missing = [key for key in tasks if key not in held]
+    finished: Any = completed(missing, lambda key: submit(tasks[key]))
+    if progress:
+        finished = with_progress(finished, label, "run", total=len(missing))
+    try:
+        for (level, run), record in finished:
+            journal.append(level, run, record)
+            keep((level, run), record)
+    finally:
+        save()
+        journal.remove()
 
 
 class Journal:
-    """Finished runs of a study that its archive does not hold yet.
+    """File of finished runs that an archive does not hold yet.
 
     Args:
         archive: Path of the archive.
-        study: What decides the numbers of its runs, ready for JSON: entries of another study are not read.
-        blank: From a level to a record of it in which to put values: it says fields, shapes and types.
+        study: Everything that decides the numbers, ready for JSON; a journal of another study is refused.
+        blank: Function from a level to an empty record, which defines fields, shapes and types.
     """
 
     def __init__(self, archive: Path, study: Any, blank: Callable[[str], Record]) -> None:
@@ -39,10 +85,10 @@ class Journal:
         self._heading = json.dumps(study, sort_keys=True).encode()
 
     def entries(self) -> Iterator[tuple[str, int, Record]]:
-        """Level, number and record of the runs in it, up to the first that is not whole.
+        """Return level, number and record of each run, up to the first incomplete entry.
 
         Raises:
-            ArchiveError: It belongs to another study, or holds what is no run of this one.
+            ArchiveError: The journal belongs to another study, or an entry is no run of this one.
         """
         found = _read(self.path)
         if next(found, self._heading) != self._heading:
@@ -67,7 +113,7 @@ class Journal:
         return record
 
     def append(self, level: str, run: int, record: Record) -> None:
-        """Add a run; on return it is on the disk.
+        """Append a run and wait until it is on the disk.
 
         Raises:
             WriteError: The disk is full.
@@ -78,11 +124,11 @@ class Journal:
             for variant, fields in blank.items()
             for name, value in fields.items()
         ]
-        heading = b"" if self.path.exists() else _framed(self._heading)
-        self._write(heading + _framed(json.dumps([level, run]).encode() + b"\n" + b"".join(parts)))
+        heading = b"" if self.path.exists() else framed(self._heading)
+        self._write(heading + framed(json.dumps([level, run]).encode() + b"\n" + b"".join(parts)))
 
     def _write(self, content: bytes) -> None:
-        """Append on the disk; what a full disk took of it is cut off again."""
+        """Append bytes and flush them to the disk; remove a part that a full disk has taken."""
         before = self.path.stat().st_size if self.path.is_file() else 0
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -98,16 +144,26 @@ class Journal:
             raise WriteError(f"{self.path}: cannot be written: {error.strerror or error}") from None
 
     def remove(self) -> None:
-        """The archive holds everything."""
+        """Delete the file: the archive holds everything."""
         self.path.unlink(missing_ok=True)
 
 
-def _framed(content: bytes) -> bytes:
+def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Return the values of nested mappings under dotted names."""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{key}.{name}", inner) for name, inner in flat(value))
+        else:
+            yield key, value
+
+
+def framed(content: bytes) -> bytes:
+    """Return an entry as it is stored: length, digest, content."""
     return len(content).to_bytes(_LENGTH, "big") + hashlib.sha256(content).digest() + content
 
 
 def _read(path: Path) -> Iterator[bytes]:
-    """The entries of a file up to the first that is not whole."""
+    """Return the entries of a file up to the first incomplete one."""
     if not path.is_file():
         return
     with path.open("rb") as file:

@@ -5,29 +5,27 @@
         archive = run_study(study, "study.h5", executor)
     print(study_table(summarise_study(archive)))  # of ekfslam.studies.summary
 
-A realisation is decided by the study's seed, the name of its level and its number, by nothing else: neither the
-executor, nor the number of workers, nor the order in which they finish, nor an interruption changes one bit of the data
-sets. The first pose is drawn from the prior that the filters are given, no outlier is simulated, nothing is gated: a
-consistent filter has a mean NEES equal to its degrees of freedom.
+The study's seed, the name of the level and the number of the run decide a realisation. Executor, number of workers,
+order and interruptions do not change a bit of it. The first pose is drawn from the prior of the filters, no outlier is
+simulated and nothing is gated, so the mean NEES of a consistent filter equals its degrees of freedom.
 
 The archive is one HDF5 file:
 
     /                             attributes format, format_version, error_convention, study (JSON), seed, versions
     /levels/<level>               attribute world (JSON)
         time (T,)                 nominal stamps
-        done (runs,)              which runs are in
-        <variant>/<field>         (runs, T, ...) as in `FIELDS`; what is not in yet is NaN or 0
+        done (runs,)              whether a run is finished
+        <variant>/<field>         (runs, T, ...) as in `FIELDS`; NaN or 0 for a run that is not finished
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic
 from types import MappingProxyType
 from typing import Any
 from zlib import crc32
@@ -42,31 +40,36 @@ from ekfslam.config import VARIANTS, Config, FilterConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import Loop, simulate
 from ekfslam.errors import ArchiveError, ConfigError, FilterError
-from ekfslam.evaluation.consistency import (
-    joint_nees,
-    nees,
-    pose_error,
-    time_average,
-)
+from ekfslam.evaluation.consistency import joint_nees, nees, pose_error, time_average
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.filters.result import ERROR_CONVENTION
 from ekfslam.geometry import se3
 from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.sensors.stereo import Rig
-from ekfslam.progress import progress as with_progress
 from ekfslam.runner import versions
 from ekfslam.shown import Card, Shown, count
 from ekfslam.stored import COUNTS, FLAGS, NUMBERS_OR_NONE, Item, Shape, fixed_length
-from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed
-from ekfslam.studies.journal import Journal
+from ekfslam.studies.executors import ONE_RUN_AT_A_TIME
+from ekfslam.studies.journal import Journal, Key, Record, flat, run_missing
 
 FORMAT = "ekfslam-study"
 FORMAT_VERSION = 2  # 2 added coordinates of all dimensions
 
-ITERATIONS = 3
-ITERATED_SUFFIX = "-iterated"
-STUDY_VARIANTS: tuple[str, ...] = (*VARIANTS, *(v + ITERATED_SUFFIX for v in VARIANTS if v != "fej"))
+# Name of a variant in a study to its settings. The textbook filter has landmarks as positions in world.
+TEXTBOOK = "textbook"
+_VARIANTS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        **{variant: {"variant": variant} for variant in VARIANTS},
+        TEXTBOOK: {"variant": "standard", "landmark_coordinates": "xyz"},
+        **{f"{variant}-iterated": {"variant": variant, "iterations": 3} for variant in VARIANTS if variant != "fej"},
+    }
+)
+STUDY_VARIANTS: tuple[str, ...] = tuple(_VARIANTS)
+LABELS: Mapping[str, str] = MappingProxyType(
+    {name: name for name in STUDY_VARIANTS} | {TEXTBOOK: "textbook (standard, xyz)"}
+)
+COMPARED = (*VARIANTS, TEXTBOOK)  # by default
 
 _SMALL_PRIOR: dict[str, Any] = {"initial_position_std_m": 0.01, "initial_rotation_std_rad": 0.001}
 _LARGE_PRIOR: dict[str, Any] = {"initial_position_std_m": 0.5, "initial_rotation_std_rad": float(np.deg2rad(15.0))}
@@ -113,8 +116,6 @@ FIELDS: Mapping[str, tuple[Shape, type, str, str]] = MappingProxyType(
 JOINT_INSTANTS = 4  # equally spaced, the last one at the last frame
 
 MOST_VALUES = 10_000_000  # frames of all runs and variants: an archive of 1.4 GB
-CHECKPOINT_S = 5.0
-CHECKPOINT_SHARE = 0.05  # of the time may go into checkpoints of a large study
 
 # Data sets below a level, and below a variant of it.
 LEVEL_LAYOUT = (
@@ -127,21 +128,20 @@ VARIANT_LAYOUT = tuple(
     for name, (shape, kind, units, frame) in FIELDS.items()
 )
 
-Record = dict[str, dict[str, NDArray]]  # variant, field, value of one run
-
 
 @dataclass(frozen=True, repr=False)
 class Study(Shown):
-    """What to simulate and what to compare on it.
+    """A Monte Carlo study: simulated worlds and the filter variants to compare on them.
 
     Args:
-        levels: Name to world; a world's own seed is not used.
-        variants: Of `STUDY_VARIANTS`: the filter's variants, ``-iterated`` with three iterations an update.
-        runs: Realisations of each level.
-        seed: Of everything.
+        levels: Name to world; the seed of a world is not used.
+        variants: Names in `STUDY_VARIANTS`: the variants of the filter, ``-iterated`` with three iterations an update,
+            and ``textbook``, the standard variant with landmarks in ``xyz``.
+        runs: Number of realisations of each level.
+        seed: Seed of all realisations.
 
     Raises:
-        ConfigError: Nothing to do, or an unknown variant.
+        ConfigError: There is nothing to do, or a variant is unknown.
     """
 
     levels: Mapping[str, Loop] = dataclasses.field(default_factory=lambda: dict(LEVELS))
@@ -169,7 +169,7 @@ class Study(Shown):
             )
 
     def card(self) -> Card:
-        """What ``repr`` and a notebook show."""
+        """Return the content of ``repr``."""
         filters = self.runs * len(self.levels) * len(self.variants)
         facts = {"levels": ", ".join(self.levels), "variants": ", ".join(self.variants), "seed": str(self.seed)}
         title = f"{count(self.runs, 'run')} of each level, {count(filters, 'filter')} in all"
@@ -177,12 +177,12 @@ class Study(Shown):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Everything that decides the numbers, ready for JSON."""
+        """All that decides the numbers, ready for JSON."""
         return dataclasses.asdict(self)
 
 
 def levels_of(names: Iterable[str]) -> dict[str, Loop]:
-    """`LEVELS` by name; ``all`` stands for all of them.
+    """Return some of `LEVELS` by name; ``all`` stands for all of them.
 
     Raises:
         ConfigError: There is no such level.
@@ -197,21 +197,20 @@ def levels_of(names: Iterable[str]) -> dict[str, Loop]:
 
 
 def realisation(study: Study, level: str, run: int) -> Loop:
-    """The world of one run: the level with a seed of its own, hence with other landmarks and another road surface too.
+    """Return the world of one run: the level with its own seed, hence with its own landmarks and road surface.
 
-    A mean over runs is thus one over worlds as well, not a property of one lucky map. The seed depends on the study's
-    seed, the level's name and the run, whatever else the study holds.
+    So a mean over runs is also a mean over worlds. The seed depends on the study's seed, the level's name and the run
+    alone.
     """
     source = np.random.SeedSequence(entropy=study.seed, spawn_key=(crc32(level.encode()), run))
     return dataclasses.replace(study.levels[level], seed=int(source.generate_state(1, np.uint64)[0] >> 1))
 
 
 def filter_config(level: Loop, variant: str) -> FilterConfig:
-    """Settings of a variant in a study: the prior that the truth is drawn from, and no observation ever censored."""
+    """Return the settings of a variant: the prior that the truth is drawn from, and no rejected observation."""
     return Config(
         filter=FilterConfig(
-            variant=variant.removesuffix(ITERATED_SUFFIX),  # type: ignore[arg-type]
-            iterations=ITERATIONS if variant.endswith(ITERATED_SUFFIX) else 1,
+            **_VARIANTS[variant],
             retire="never",
             gate_probability=1.0,
             split_after=0,
@@ -221,8 +220,8 @@ def filter_config(level: Loop, variant: str) -> FilterConfig:
     ).filter
 
 
-def run_one(study: Study, level: str, run: int) -> Record:
-    """Simulate one realisation and run all variants on it: a pure function, to be called in any process.
+def run_one(study: Study, level: str, run: int) -> dict[str, dict[str, NDArray]]:
+    """Simulate one realisation and run all variants on it.
 
     Returns:
         Variant to field to value, shaped as in `FIELDS`. Values are NaN at frame 0, whose true pose is drawn and not
@@ -235,7 +234,7 @@ def run_one(study: Study, level: str, run: int) -> Record:
 
 
 def _blank(frames: int, runs: tuple[int, ...] = ()) -> dict[str, NDArray]:
-    """Every field of one variant without values: NaN, 0 or False."""
+    """Return every field of one variant without values: NaN, 0 or False."""
     sizes = {"T": frames, "J": JOINT_INSTANTS}
     return {
         name: np.full(
@@ -250,7 +249,7 @@ def _joint_frames(frames: int) -> list[int]:
 
 
 def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str, NDArray]:
-    """The record of one filter on one realisation, frame by frame; fields and shapes as in `FIELDS`."""
+    """Run one filter on one realisation and return its record frame by frame; fields and shapes as in `FIELDS`."""
     truth, noise = sequence.truth, sequence.noise
     assert truth is not None
     assert noise is not None
@@ -284,27 +283,31 @@ def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str,
                 record["joint_nees_per_dof"][joint_frames.index(k)] = value
     except (FilterError, np.linalg.LinAlgError):
         stopped = True
-
-    xi, P = pose_error(T_est[known], T_true[known]), P_pose[known]
-    record["pose_nees"][known] = nees(xi, P)
-    record["position_nees"][known] = nees(xi[:, :3], P[:, :3, :3])
-    record["orientation_nees"][known] = nees(xi[:, 3:], P[:, 3:, 3:])
-    record["position_error"][known] = T_est[known, :3, 3] - T_true[known, :3, 3]
-    record["rotation_error"][known] = se3.so3_log(T_est[known, :3, :3] @ np.swapaxes(T_true[known, :3, :3], 1, 2))
-    variance = np.hstack([np.diagonal(c, axis1=1, axis2=2) for c in world_axes_covariance(T_est[known], P)])
-    record["three_sigma"][known] = 3.0 * np.sqrt(np.maximum(variance, 0.0))
+    _put_errors(record, known, T_est[known], T_true[known], P_pose[known])
     left = np.linalg.norm(record["position_error"][-1]) > 2.0 * world.radius_m
     record["diverged"][()] = stopped or bool(left)
     return record
 
 
+def _put_errors(record: dict[str, NDArray], known: BoolArray, T_est: Array, T_true: Array, P: Array) -> None:
+    """Write errors, NEES and bounds of the poses of the known frames into a record."""
+    xi = pose_error(T_est, T_true)
+    record["pose_nees"][known] = nees(xi, P)
+    record["position_nees"][known] = nees(xi[:, :3], P[:, :3, :3])
+    record["orientation_nees"][known] = nees(xi[:, 3:], P[:, 3:, 3:])
+    record["position_error"][known] = T_est[:, :3, 3] - T_true[:, :3, 3]
+    record["rotation_error"][known] = se3.so3_log(T_est[:, :3, :3] @ np.swapaxes(T_true[:, :3, :3], 1, 2))
+    variance = np.hstack([np.diagonal(c, axis1=1, axis2=2) for c in world_axes_covariance(T_est, P)])
+    record["three_sigma"][known] = 3.0 * np.sqrt(np.maximum(variance, 0.0))
+
+
 @dataclass(frozen=True, repr=False)
 class StudyArchive(Shown):
-    """A study and what is there of its runs.
+    """A study and its finished runs.
 
     Args:
-        study: What was asked.
-        done: Level to mask (runs,).
+        study: The study.
+        done: Level to mask (runs,) of finished runs.
         data: Level to variant to field to values (runs, ...), see `FIELDS`.
     """
 
@@ -312,8 +315,17 @@ class StudyArchive(Shown):
     done: Mapping[str, BoolArray]
     data: Mapping[str, Mapping[str, Mapping[str, NDArray]]]
 
+    @staticmethod
+    def empty(study: Study) -> StudyArchive:
+        """Return an archive with room for all runs."""
+        data = {
+            level: {variant: _blank(world.frames, (study.runs,)) for variant in study.variants}
+            for level, world in study.levels.items()
+        }
+        return StudyArchive(study, {level: np.zeros(study.runs, dtype=bool) for level in study.levels}, data)
+
     def card(self) -> Card:
-        """What ``repr`` and a notebook show."""
+        """Return the content of ``repr``."""
         runs = self.study.runs
         facts = {level: f"{int(done.sum())} of {count(runs, 'run')}" for level, done in self.done.items()}
         facts["variants"] = ", ".join(self.study.variants)
@@ -324,125 +336,101 @@ class StudyArchive(Shown):
 
     @property
     def complete(self) -> bool:
+        """Whether all runs are finished."""
         return all(mask.all() for mask in self.done.values())
 
     def time_s(self, level: str) -> Array:
-        """(T,) nominal stamps of a level."""
+        """Return the nominal stamps (T,) of a level."""
         world = self.study.levels[level]
         return world.frame_period_s * np.arange(world.frames, dtype=float)
 
+    def finished(self, level: str) -> dict[str, dict[str, NDArray]]:
+        """Return the values of the finished runs of a level, by variant and field."""
+        done = self.done[level]
+        return {v: {field: value[done] for field, value in values.items()} for v, values in self.data[level].items()}
+
+    def put(self, key: Key, record: Record) -> None:
+        """Write the record of a run into the archive."""
+        level, run = key
+        for variant, values in record.items():
+            for field, value in values.items():
+                self.data[level][variant][field][run] = value
+        self.done[level][run] = True
+
 
 def run_study(study: Study, path: str | Path, executor: Executor, progress: bool = True) -> StudyArchive:
-    """Run what the archive at ``path`` does not hold yet, and keep it up to date meanwhile.
+    """Run what the archive at ``path`` does not hold.
 
-    The archive is replaced as a whole, by renaming: killed at any time, it is valid and at most some seconds old. Runs
-    that it does not hold yet are in a journal beside it. The next call goes on with all of them. A study may be
-    extended by asking for more runs.
+    Every finished run is in a journal next to the archive at once. The archive is written when all runs are finished or
+    an exception interrupts them. The next call resumes after an interruption or a kill. A larger number of runs extends
+    a study.
 
     Args:
-        study: What to run.
+        study: The study.
         path: Archive, made if missing, as is its folder.
-        executor: Where to run it, see `open_executor`.
-        progress: Whether to show a bar on a terminal.
+        executor: Executor of the runs, see `open_executor`.
+        progress: Whether to show a progress bar on a terminal.
 
     Raises:
-        ArchiveError: ``path`` holds another study (the message says what differs), is no archive of a study, or cannot
-            be written.
+        ArchiveError: ``path`` holds another study (the message names the difference), is no archive of a study, or
+            cannot be written.
     """
     path = Path(path)
-    archive = _resume(study, path)
+    archive = StudyArchive.empty(study)
+    if path.exists():
+        _take_over(archive, path)
+    before = {level: done.copy() for level, done in archive.done.items()}
     decides = {**study.parameters, "runs": None, **versions()}
-    journal = Journal(path, decides, lambda level: _record(study, level))
-    _take_in(archive, journal, path)
-    missing = [(level, run) for run in range(study.runs) for level in study.levels if not archive.done[level][run]]
-    finished: Any = completed(missing, lambda task: executor.submit(run_one, study, *task))
-    if progress:
-        finished = with_progress(finished, "consistency", "run", total=len(missing))
-    next_checkpoint = monotonic() + CHECKPOINT_S
-    for (level, run), record in finished:
-        journal.append(level, run, record)
-        _put(archive, level, run, record)
-        if monotonic() >= next_checkpoint and not archive.complete:
-            begin = monotonic()
+    journal = Journal(
+        path, decides, lambda level: {variant: _blank(study.levels[level].frames) for variant in study.variants}
+    )
+
+    def keep(key: Key, record: Record) -> None:
+        if key[1] < study.runs:  # the journal may be one of a longer study
+            archive.put(key, record)
+
+    def save() -> None:
+        if any((done != before[level]).any() for level, done in archive.done.items()):
             write_study(path, archive)
-            journal.remove()
-            end = monotonic()
-            next_checkpoint = end + max(CHECKPOINT_S, (end - begin) / CHECKPOINT_SHARE)
-    if missing:
-        write_study(path, archive)
-    journal.remove()
+
+    tasks = {
+        (level, run): (study, level, run)
+        for run in range(study.runs)
+        for level in study.levels
+        if not archive.done[level][run]
+    }
+    run_missing(journal, tasks, lambda task: executor.submit(run_one, *task), keep, save, "consistency", progress)
     return archive
 
 
-def _take_in(archive: StudyArchive, journal: Journal, path: Path) -> None:
-    """Put the runs of a journal into the archive and write it: a journal begins with an archive that holds all else."""
-    found = False
-    for level, run, record in journal.entries():
-        if run < archive.study.runs:
-            _put(archive, level, run, record)
-            found = True
-    if found:
-        write_study(path, archive)
-    journal.remove()
+def _take_over(archive: StudyArchive, path: Path) -> None:
+    """Copy the finished runs of an earlier archive of the same study.
 
-
-def _put(archive: StudyArchive, level: str, run: int, record: Mapping[str, Mapping[str, NDArray]]) -> None:
-    for variant, values in record.items():
-        for field, value in values.items():
-            archive.data[level][variant][field][run] = value
-    archive.done[level][run] = True
-
-
-def _record(study: Study, level: str) -> Record:
-    """An empty record of a run."""
-    return {variant: _blank(study.levels[level].frames) for variant in study.variants}
-
-
-def _resume(study: Study, path: Path) -> StudyArchive:
-    """The archive to go on with: that of ``path``, with room for further runs, or an empty one."""
-    data = {
-        level: {variant: _blank(world.frames, (study.runs,)) for variant in study.variants}
-        for level, world in study.levels.items()
-    }
-    archive = StudyArchive(study, {level: np.zeros(study.runs, dtype=bool) for level in study.levels}, data)
-    if not path.exists():
-        return archive
+    Raises:
+        ArchiveError: It is of another study.
+    """
     old, old_versions = _read(path)
+    study = archive.study
     wanted, found = study.parameters, old.study.parameters
-    if found["runs"] <= wanted["runs"]:
-        found["runs"] = wanted["runs"]
-    # Numbers of another version of the software may differ in the last bits; that only matters where they would mix.
+    found["runs"] = max(found["runs"], wanted["runs"])
+    # Numbers of another version of the software may differ in the last bits, which matters only if they would mix.
     if not (old.complete and old.study.runs == study.runs):
         wanted, found = {**wanted, **versions()}, {**found, **old_versions}
-    differences = list(_differences(wanted, found))
-    if differences:
-        more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
+    wanted, found = dict(flat(wanted)), dict(flat(found))
+    differing = [name for name in {**found, **wanted} if found.get(name) != wanted.get(name)]
+    if differing:
+        said = [f"{name} is {found.get(name)}, asked for {wanted.get(name)}" for name in differing[:3]]
+        more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise ArchiveError(
-            f"{path} holds another study: {'; '.join(differences[:3])}{more}; move it away or choose another folder"
+            f"{path} holds another study: {'; '.join(said)}{more}; move it away or choose another folder"
         )
-    for level, variants in old.data.items():
-        archive.done[level][: old.study.runs] = old.done[level]
-        for variant, values in variants.items():
-            for field, value in values.items():
-                archive.data[level][variant][field][: old.study.runs] = value
-    return archive
-
-
-def _differences(wanted: Any, found: Any, name: str = "") -> Iterator[str]:
-    """What differs between two nested dictionaries, in words."""
-    if isinstance(wanted, dict) and isinstance(found, dict):
-        for key in {**found, **wanted}:
-            yield from _differences(wanted.get(key), found.get(key), f"{name}.{key}" if name else key)
-    elif wanted != found:
-        spoken = [
-            "none" if v is None else "another" if isinstance(v, dict) else ", ".join(v) if isinstance(v, tuple) else v
-            for v in (found, wanted)
-        ]
-        yield f"{name} is {spoken[0]}, asked for {spoken[1]}"
+    for level, done in old.done.items():
+        for run in np.flatnonzero(done).tolist():
+            archive.put((level, run), {v: {f: x[run] for f, x in of.items()} for v, of in old.data[level].items()})
 
 
 def write_study(path: str | Path, archive: StudyArchive) -> None:
-    """Write a study's archive; it replaces an old one at once and only when it is complete on disk.
+    """Write the archive of a study; it replaces an older file only when it is complete on the disk.
 
     Raises:
         ArchiveError: The file cannot be written.
@@ -472,7 +460,7 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
 
 
 def read_study(path: str | Path) -> StudyArchive:
-    """The archive of a study, finished or not.
+    """Read the archive of a study, finished or not.
 
     Raises:
         ArchiveError: The file is missing or damaged, or holds something else.
@@ -481,6 +469,7 @@ def read_study(path: str | Path) -> StudyArchive:
 
 
 def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
+    """Read an archive and the versions of the software that wrote it."""
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         parameters = hdf5.json_table(h5file, "study")
         try:
@@ -488,20 +477,16 @@ def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
             study = Study(**{**parameters, "levels": levels})
         except ConfigError as error:
             raise ArchiveError(f"{path}: {error}") from None
-        done, data = {}, {}
+        archive = StudyArchive(study, done := {}, data := {})
         for level, world in study.levels.items():
             group = hdf5.subgroup(h5file, f"levels/{level}")
             sizes = {"runs": study.runs, "T": world.frames, "J": JOINT_INSTANTS}
             found = hdf5.read_fields(group, LEVEL_LAYOUT, sizes)
-            done[level], along = (
-                found["done"],
-                {"time": found["time"], "instant": np.array(_joint_frames(world.frames))},
-            )
+            done[level] = found["done"]
+            along = {"time": found["time"], "instant": np.array(_joint_frames(world.frames))}
             data[level] = {
                 variant: hdf5.read_fields(hdf5.subgroup(group, variant), VARIANT_LAYOUT, sizes, along)
                 for variant in study.variants
             }
-        found_versions = {
-            key: str(value) for key, value in hdf5.attributes(h5file).items() if key.startswith("version_")
-        }
-        return StudyArchive(study, done, data), found_versions
+        facts = hdf5.attributes(h5file)
+        return archive, {name: str(facts[name]) for name in facts if name.startswith("version_")}

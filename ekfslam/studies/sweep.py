@@ -1,10 +1,10 @@
-"""Sweeps: recordings x seeds x cases x variants x settings x modes, one row of figures of merit a run, in one table.
+"""Sweeps: recordings x seeds x cases x variants x settings x modes, one row of figures of merit a run.
 
     sweep = Sweep.from_toml("study.toml")
     with open_executor("processes") as executor:
         table = run_sweep(sweep, "sweep.h5", executor)
 
-A study is a TOML file. Whatever stands in a list is tried, each with each:
+A study is a TOML file. Every combination of listed values is run:
 
     recordings = ["builtin:city?frames=300", { data = "0027.npz", truth = "poses/07.txt" }]
     modes = ["dead-reckoning", "full"]
@@ -19,10 +19,10 @@ A study is a TOML file. Whatever stands in a list is tried, each with each:
     [cases."velocities alone"]
     mode = "dead-reckoning"
 
-A program may add columns of its own, and change recordings after they are read: see `Sweep` and `Recording`.
+A program may add columns and change recordings after they are read: see `Sweep` and `Recording`.
 
-A run is known by all that decides its numbers, the content of its recording and the versions of the software included.
-So an interrupted sweep goes on, and a study may be extended: what is there already is not run again.
+The key of a run is a digest of all that decides its numbers, with the content of its recording and the versions of the
+software. So an interrupted sweep resumes, and an extended one runs only what is new.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ import itertools
 import json
 import math
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -54,15 +54,14 @@ from ekfslam.filters.result import Result
 from ekfslam.frontend.opening import open_sequence
 from ekfslam.limits import DEFAULT_GB, limit_gb, reading_up_to, require_file
 from ekfslam.names import printable
-from ekfslam.progress import progress as with_progress
 from ekfslam.runner import run, versions
-from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed
-from ekfslam.studies.journal import Journal
+from ekfslam.studies.executors import ONE_RUN_AT_A_TIME
+from ekfslam.studies.journal import Journal, Key, Record, flat, run_missing
 from ekfslam.studies.sweep_table import SweepTable, read_table, write_table
 
 MOST_RUNS = 100_000
 _ERROR_BYTES = 400
-_KEYS = ("recordings", "modes", "variants", "seeds", "settings", "cases")
+_KEYS = {"recordings": list, "modes": list, "variants": list, "seeds": list, "settings": dict, "cases": dict}
 _FILES = ("data", "truth", "velocities")  # of a recording
 _RECORDING_KEYS = (*_FILES, "name", "extrinsics", "lateral", "velocity_frame", "frames")
 _TAKEN = ("key", "recording", "seed", "case", "mode", "error", "run", *KEYS)  # names of columns
@@ -172,7 +171,7 @@ class Sweep:
         recordings: On what.
         modes, variants: Of `MODES` and `VARIANTS`.
         seeds: Of built-in worlds, and of recordings that are prepared; none: their own.
-        settings: Table to key to the values to try.
+        settings: Table to key to the values to try; or dotted name, such as ``noise.sigma_px``, to these values.
         cases: Sets of settings, by names that become the column ``case``.
         columns: Figures of merit besides those of `summarise`, by name: functions as of `Recording`.
 
@@ -184,7 +183,7 @@ class Sweep:
     modes: tuple[str, ...] = ("full",)
     variants: tuple[str, ...] = ("invariant",)
     seeds: tuple[int, ...] = ()
-    settings: Mapping[str, Mapping[str, tuple[Any, ...]]] = dataclasses.field(default_factory=dict)
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     cases: Mapping[str, Case] = dataclasses.field(default_factory=dict)
     columns: Mapping[str, Column] = dataclasses.field(default_factory=dict)
 
@@ -199,10 +198,9 @@ class Sweep:
         for name in self.columns:
             if name in _TAKEN or not name or set(name) & set("./"):
                 raise ConfigError(f"a column of a sweep cannot have the name {name!r}")
-        choices = [values for table in self.settings.values() for values in table.values()]
         seeded = sum(max(len(self.seeds), 1) if recording.is_seeded else 1 for recording in self.recordings)
         ways = sum(1 if case.mode else len(self.modes) for case in self._cases.values())
-        count = seeded * ways * len(self.variants) * math.prod(map(len, choices))
+        count = seeded * ways * len(self.variants) * math.prod(len(values) for _, values in flat(self.settings))
         if not 1 <= count <= MOST_RUNS:
             raise ConfigError(f"a sweep is of 1 to {MOST_RUNS} runs, found {count}")
         names = [recording.name for recording in self.recordings]
@@ -219,18 +217,17 @@ class Sweep:
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
         """All runs, the mode changing fastest."""
-        names = [(table, key) for table, values in self.settings.items() for key in values]
-        choices = [self.settings[table][key] for table, key in names]
+        choices = dict(flat(self.settings))
         found = []
         for recording in self.recordings:
             for seed in self.seeds if recording.is_seeded and self.seeds else (None,):
                 seeded = recording if seed is None else recording.with_seed(seed)
                 for (name, case), variant, values in itertools.product(
-                    self._cases.items(), self.variants, itertools.product(*choices)
+                    self._cases.items(), self.variants, itertools.product(*choices.values())
                 ):
                     overrides: dict[str, dict[str, Any]] = {"filter": {"variant": variant}}
-                    for (table, key), value in zip(names, values, strict=True):
-                        _put(overrides, table, key, value)
+                    for setting, value in zip(choices, values, strict=True):
+                        _put(overrides, setting, value)
                     for table, own in case.overrides.items():
                         overrides.setdefault(table, {}).update(own)
                     modes = (case.mode,) if case.mode else self.modes
@@ -255,62 +252,71 @@ class Sweep:
 
 
 def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool = True) -> SweepTable:
-    """Run what the table at ``path`` does not hold yet.
+    """Run what the table at ``path`` does not hold.
 
-    Every finished run is at once in a journal beside the table. The table is written at the end, and where the sweep is
-    interrupted by anything but a kill. A run that a filter cannot finish is a row with an error and no figures.
+    Every finished run is in a journal next to the table at once. The table is written when all runs are finished or an
+    exception interrupts them. A run that a filter cannot finish is a row with an error and no figures.
 
     Args:
-        sweep: What to run.
+        sweep: The sweep.
         path: HDF5 file of the table, made if missing.
-        executor: Where to run it, see `ekfslam.studies.executors.open_executor`.
-        progress: Whether to show a bar with the time left, on a terminal.
+        executor: Executor of the runs, see `ekfslam.studies.executors.open_executor`.
+        progress: Whether to show a progress bar on a terminal.
 
     Raises:
-        ArchiveError: ``path`` holds runs that this sweep does not ask for, or cannot be written.
+        ArchiveError: ``path`` holds runs that are not part of this sweep, or cannot be written.
     """
     path = Path(path)
-    tasks = {task.key: task for task in sweep.tasks}
-    done = _taken_up(path, tasks)
-    journal = Journal(path, "sweep", lambda key: _blank(sweep.columns))
-    for key, _, record in journal.entries():
-        _require_wanted(path, key, tasks)
+    tasks = {(task.key, 0): task for task in sweep.tasks}
+    done: dict[Key, Mapping[str, NDArray]] = {}
+
+    def keep(key: Key, record: Record) -> None:
+        if key not in tasks:
+            raise ArchiveError(
+                f"{path} holds runs of another study, of other recordings or of another release; move it away or "
+                "choose another folder"
+            )
         done[key] = record["run"]
-    missing = [task for key, task in tasks.items() if key not in done]
-    finished: Any = completed(missing, lambda task: executor.submit(run_task, task, limit_gb()))
-    if progress:
-        finished = with_progress(finished, "sweep", "run", total=len(missing))
-    try:
-        for task, record in finished:
-            journal.append(task.key, 0, {"run": record})
-            done[task.key] = record
-    finally:
-        table = _table(sweep, done)
-        if len(table):
-            write_table(path, table)
-            journal.remove()
-    return table
+
+    def save() -> None:
+        if done:
+            write_table(path, _table(sweep, done))
+
+    if path.exists():
+        for row in read_table(path).rows():
+            keep((row["key"], 0), _record(sweep.columns, row, row["error"]))
+    journal = Journal(path, "sweep", lambda _: _record(sweep.columns))
+    missing = {key: task for key, task in tasks.items() if key not in done}
+    run_missing(
+        journal, missing, lambda task: executor.submit(run_task, task, limit_gb()), keep, save, "sweep", progress
+    )
+    return _table(sweep, done)
 
 
-def run_task(task: Task, read_gb: float = DEFAULT_GB) -> dict[str, NDArray]:
-    """Figures of merit of one run, those of `KEYS` and then its columns, NaN where there is none; why it failed, if so.
+def run_task(task: Task, read_gb: float = DEFAULT_GB) -> Record:
+    """Run one task and return its figures of merit, or the reason for having none.
 
     Args:
-        task: What to run.
-        read_gb: See `ekfslam.limits.reading_up_to`.
+        task: The run.
+        read_gb: Limit on what is read, see `ekfslam.limits.reading_up_to`.
     """
-    record = _blank(task.columns)["run"]
     try:
         with ONE_RUN_AT_A_TIME, reading_up_to(read_gb):
             sequence = _opened(task.recording, task.seed, task.config.front_end)
             sequence = with_truth_noise(sequence, task.config.truth)
             result = run(sequence, task.mode, task.config)  # type: ignore[arg-type]
-            found: dict[str, Any] = dict(summarise(sequence, result))
-            found |= {name: column(sequence, result) for name, column in task.columns.items()}
-        record["figures"][:] = [np.nan if value is None else value for value in found.values()]
+            figures: dict[str, Any] = dict(summarise(sequence, result))
+            figures |= {name: column(sequence, result) for name, column in task.columns.items()}
+        return _record(task.columns, figures)
     except EkfslamError as error:
-        record["error"] = np.array(printable(str(error)).encode()[:_ERROR_BYTES], dtype=record["error"].dtype)
-    return record
+        return _record(task.columns, error=printable(str(error)))
+
+
+def _record(columns: Mapping[str, Column], figures: Mapping[str, Any] | None = None, error: str = "") -> Record:
+    """Return the record of a run: figures, NaN if missing, and the reason for having none."""
+    values = [(figures or {}).get(name) for name in (*KEYS, *columns)]
+    numbers = np.array([np.nan if value is None else float(value) for value in values])
+    return {"run": {"figures": numbers, "error": np.array(error.encode()[:_ERROR_BYTES], dtype=f"S{_ERROR_BYTES}")}}
 
 
 @lru_cache(maxsize=2)
@@ -324,116 +330,62 @@ def _opened(recording: Recording, seed: int | None, front_end: FrontEndConfig) -
     return sequence if recording.prepare is None else recording.prepare(sequence, seed)
 
 
-def _blank(columns: Mapping[str, Column]) -> dict[str, dict[str, NDArray]]:
-    figures = np.full(len(KEYS) + len(columns), np.nan)
-    return {"run": {"figures": figures, "error": np.zeros((), dtype=f"S{_ERROR_BYTES}")}}
-
-
-def _taken_up(path: Path, tasks: Mapping[str, Task]) -> dict[str, Mapping[str, NDArray]]:
-    """The runs that the table of an earlier sweep holds."""
-    done: dict[str, Mapping[str, NDArray]] = {}
-    if not path.exists():
-        return done
-    columns = read_table(path).columns
-    for row, key in enumerate(columns["key"]):
-        _require_wanted(path, key, tasks)
-        own = tasks[key].columns
-        record = _blank(own)["run"]
-        record["figures"][:] = [columns[name][row] if name in columns else np.nan for name in (*KEYS, *own)]
-        record["error"] = np.array(columns["error"][row].encode(), dtype=record["error"].dtype)
-        done[key] = record
-    return done
-
-
-def _require_wanted(path: Path, key: str, tasks: Mapping[str, Task]) -> None:
-    if key not in tasks:
-        raise ArchiveError(
-            f"{path} holds runs of another study, of other recordings or of another release; move it away or choose "
-            "another folder"
-        )
-
-
-def _table(sweep: Sweep, done: Mapping[str, Mapping[str, NDArray]]) -> SweepTable:
-    """The runs that are done, in the order of the sweep."""
-    tasks = [task for task in sweep.tasks if task.key in done]
+def _table(sweep: Sweep, done: Mapping[Key, Mapping[str, NDArray]]) -> SweepTable:
+    """Return the finished runs in the order of the sweep."""
+    tasks = [task for task in sweep.tasks if (task.key, 0) in done]
     rows = []
     for task in tasks:
-        record = done[task.key]
+        record = done[task.key, 0]
+        settings = dataclasses.asdict(task.config)
+        settings.pop("tuning")  # a record of the past
         case = {"case": task.case} if sweep.cases else {}
         told = {"recording": task.recording.name, "seed": task.seed, **case, "mode": task.mode}
-        facts = {**told, **_settings(task.config)}
+        facts = {**told, **dict(flat(settings))}
         figures = dict(zip((*KEYS, *sweep.columns), record["figures"].tolist(), strict=True))
         rows.append({"key": task.key, **facts, **figures, "error": record["error"].item().decode(errors="replace")})
     swept = ["recording", *(["case"] if sweep.cases else []), "mode", "filter.variant"]
     swept += ["seed"] if sweep.seeds else []
-    swept += [f"{table}.{key}" for table, values in sweep.settings.items() for key in values]
+    swept += dict(flat(sweep.settings))
     return SweepTable.of_rows(rows, tuple(swept), len(sweep.tasks))
 
 
-def _settings(config: Config) -> dict[str, Any]:
-    """Every setting that a run may depend on, by ``table.key``."""
-    return {
-        f"{table}.{name}": value
-        for table, values in dataclasses.asdict(config).items()
-        if table != "tuning"  # a record, no setting
-        for name, value in _flat(values)
-    }
-
-
-def _flat(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from ((f"{key}.{name}", inner) for name, inner in _flat(value))
-        else:
-            yield key, value
-
-
-def _put(overrides: dict[str, dict[str, Any]], table: str, key: str, value: Any) -> None:
-    """Set a key of a table; of a state block, ``blocks.<name>``, too."""
-    first, _, block = table.partition(".")
-    settings = overrides.setdefault(first, {})
-    (settings.setdefault(block, {}) if block else settings)[key] = value
+def _put(overrides: dict[str, Any], name: str, value: Any) -> None:
+    """Set a value under a dotted name such as ``noise.sigma_px`` or ``blocks.twist_bias.sigma_v_m_s``."""
+    *tables, key = name.split(".")
+    for table in tables:
+        overrides = overrides.setdefault(table, {})
+    overrides[key] = value
 
 
 def _parsed(found: Mapping[str, Any], folder: Path) -> Sweep:
+    """Return the sweep of the tables of a file."""
     for key in found:
         if key not in _KEYS:
             raise ConfigError(f"unknown key {key!r}; known: {', '.join(_KEYS)}")
-    for key in _KEYS[:4]:
-        if not isinstance(found.get(key, []), list):
-            raise ConfigError(f"{key} must be a list, found {found[key]!r}")
-    settings: dict[str, dict[str, tuple[Any, ...]]] = {}
-    if not isinstance(found.get("settings", {}), dict):
-        raise ConfigError("[settings] must hold tables")
-    for table, values in found.get("settings", {}).items():
-        if not isinstance(values, dict):
-            raise ConfigError(f"[settings.{table}] must be a table, found {values!r}")
-        for key, value in values.items():
-            if isinstance(value, dict):  # of a state block
-                settings.setdefault(f"{table}.{key}", {}).update({k: _listed(v) for k, v in value.items()})
-            else:
-                settings.setdefault(table, {})[key] = _listed(value)
+    for key, kind in _KEYS.items():
+        if not isinstance(found.get(key, kind()), kind):
+            raise ConfigError(f"{key} must be a {'list' if kind is list else 'table'}, found {found[key]!r}")
+    settings = dict(flat(found.get("settings", {})))
+    for name, value in settings.items():
+        if "." not in name:
+            raise ConfigError(f"[settings.{name}] must be a table, found {value!r}")
+        settings[name] = tuple(value) if isinstance(value, list) else (value,)
     given: dict[str, Any] = {key: tuple(found[key]) for key in ("modes", "variants", "seeds") if key in found}
     recordings = tuple(_recording(entry, folder) for entry in found.get("recordings", []))
-    return Sweep(recordings, settings=settings, cases=_named_cases(found.get("cases", {})), **given)
+    cases = {printable(name): _case(name, case) for name, case in found.get("cases", {}).items()}
+    return Sweep(recordings, settings=settings, cases=cases, **given)
 
 
-def _named_cases(found: Any) -> dict[str, Case]:
-    """Cases of a file: tables of tables, and a mode."""
-    if not isinstance(found, dict) or not all(isinstance(case, dict) for case in found.values()):
-        raise ConfigError(f"[cases] must hold tables, found {found!r}")
-    cases = {}
-    for name, case in found.items():
-        tables = {key: value for key, value in case.items() if key != "mode"}
-        for table, values in tables.items():
-            if not isinstance(values, dict):
-                raise ConfigError(f"[cases.{name}.{table}] must be a table, found {values!r}")
-        cases[printable(name)] = Case(tables, case.get("mode", ""))
-    return cases
-
-
-def _listed(value: Any) -> tuple[Any, ...]:
-    return tuple(value) if isinstance(value, list) else (value,)
+def _case(name: str, found: Any) -> Case:
+    """Return a case of a file: tables of settings, and a mode."""
+    if not isinstance(found, dict):
+        raise ConfigError(f"[cases.{name}] must be a table, found {found!r}")
+    tables = {key: value for key, value in found.items() if key != "mode"}
+    try:
+        Config().with_overrides(tables)
+    except ConfigError as error:
+        raise ConfigError(f"[cases.{name}]: {error}") from None
+    return Case(tables, found.get("mode", ""))
 
 
 def _recording(entry: Any, folder: Path) -> Recording:

@@ -92,11 +92,12 @@ class SweepTable:
         return SweepTable(columns, self.swept, len(rows))
 
     def rows(self, *names: str) -> list[dict[str, Any]]:
-        """Some columns row by row as plain values, ready for JSON; None where there is no number.
+        """Return some columns (default: all) row by row as plain values, ready for JSON; None for NaN.
 
         Raises:
             ConfigError: There is no such column.
         """
+        names = names or tuple(self.columns)
         columns = [self.column(name).tolist() for name in names]
         return [
             {name: None if value != value else value for name, value in zip(names, values, strict=True)}

@@ -28,7 +28,7 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread
 from ekfslam.geometry import se3
 from ekfslam.models.sensors.stereo import Rig
-from ekfslam.studies.study import LEVELS, STUDY_VARIANTS, evaluate, filter_config, realisation
+from ekfslam.studies.study import LEVELS, STUDY_VARIANTS, TEXTBOOK, evaluate, filter_config, realisation
 
 Frozen = dict[str, np.ndarray]
 
@@ -46,7 +46,8 @@ RECORDINGS = ("0027", "0020")
 STARRY_NIGHT = "utias/dataset3.mat"
 WINDOWS, WINDOW_FRAMES = 6, 100
 STUDY_RUNS = 2
-STUDY = Study({"mid": dataclasses.replace(LEVELS["mid"], frames=100)}, STUDY_VARIANTS, runs=STUDY_RUNS)
+FROZEN_VARIANTS = tuple(variant for variant in STUDY_VARIANTS if variant != TEXTBOOK)
+STUDY = Study({"mid": dataclasses.replace(LEVELS["mid"], frames=100)}, FROZEN_VARIANTS, runs=STUDY_RUNS)
 
 COUNTS = (
     "accepted",
