@@ -98,6 +98,16 @@ def test_a_landmark_that_is_seen_again_by_then_has_never_left(after, revive, cou
         assert counts["revived"] + counts["reappeared"] == has_left
 
 
+def test_a_landmark_that_was_retired_twice_has_its_last_estimate():
+    once, twice = range(5), [*range(5), *range(10, 15)]
+    first, last = (filtered(scene(20, {7: seen}), retire_after=1, revive=0) for seen in (once, twice))
+    assert (first.counts["retired"], last.counts["retired"], last.counts["revived"]) == (1, 2, 1)
+    before, after = (result.landmarks.only(np.flatnonzero(result.landmarks.id == 7)) for result in (first, last))
+    assert (before.last_frame.item(), after.last_frame.item()) == (4, 14)
+    assert (before.observations.item(), after.observations.item()) == (5, 10)
+    assert np.trace(after.covariance[0]) < np.trace(before.covariance[0])
+
+
 # --- coming back ------------------------------------------------------------------------------------------------------
 
 RETURN = 59
