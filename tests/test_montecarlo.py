@@ -40,7 +40,17 @@ from ekfslam.runner import run
 from ekfslam.stored import AXES
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import SerialExecutor, open_executor
-from ekfslam.studies.study import FIELDS, LEVELS, Study, levels_of, read_study, realisation, run_one, run_study
+from ekfslam.studies.study import (
+    FIELDS,
+    LEVELS,
+    Study,
+    filter_config,
+    levels_of,
+    read_study,
+    realisation,
+    run_one,
+    run_study,
+)
 from ekfslam.studies.summary import study_table, summarise_study
 
 SMALL = Study({**short("mid"), **short("low")}, ("invariant", "standard"), runs=3, seed=5)
@@ -302,7 +312,7 @@ def test_the_joint_nees_at_the_first_instant_is_that_of_the_whole_state():
     sequence = simulate(world)
     ekf = JointEKF(
         Rig(sequence.camera, sequence.T_cam_imu, sequence.noise),
-        montecarlo.filter_config(world, "invariant"),
+        filter_config(world, "invariant"),
         np.eye(4),
     )
     for k in range(3):  # the first of four instants in 9 frames is frame 2
@@ -457,3 +467,16 @@ def test_invariant_is_consistent_over_twenty_runs_and_standard_is_not(tmp_path):
         nis_low, nis_high = chi2_bounds(dof, 0.999)
         assert nis_low < values["invariant"]["nis"][:, k].sum() < nis_high
     assert not values["invariant"]["diverged"].any()
+
+
+def test_the_textbook_filter_is_the_standard_variant_with_landmarks_in_xyz():
+    config = filter_config(LEVELS["mid"], "textbook")
+    assert (config.variant, config.landmark_coordinates) == ("standard", "xyz")
+    assert filter_config(LEVELS["mid"], "standard").landmark_coordinates == "image"
+
+
+def test_the_table_names_the_textbook_filter(tmp_path):
+    study = Study(short("mid"), ("standard", "textbook"), runs=1)
+    table = study_table(summarise_study(run_study(study, tmp_path / "s.h5", SerialExecutor())))
+    assert "| textbook (standard, xyz) |" in table
+    assert "All variants but the textbook one keep landmarks in image coordinates." in table

@@ -8,10 +8,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from ekfslam.arrays import Array
 from ekfslam.evaluation.consistency import anees, chi2_bounds, time_average
 from ekfslam.figures.style import BOUNDS, EXPECTED, WIDE_BOUNDS, line_of, log_axis, style_of, styled
-from ekfslam.studies.study import StudyArchive
+from ekfslam.studies.study import LABELS, StudyArchive
 from ekfslam.studies.summary import BOUND_PROBABILITY
 
 _BOUNDS = ((BOUND_PROBABILITY, WIDE_BOUNDS), (0.95, BOUNDS))  # the narrow ones are drawn over the wide ones
@@ -21,14 +20,14 @@ _SHOWN_PERCENT = 98.0  # of the errors are within the view; a run that diverges 
 
 @styled
 def plot_study_nees(archive: StudyArchive, level: str) -> Figure:
-    """Pose and landmark NEES against time: mean over runs of every variant, with its 95 % and 99.9 % bounds.
+    """Draw pose and landmark NEES against time: mean over runs of every variant, with its 95 % and 99.9 % bounds.
 
     The landmark NEES of a frame is itself a mean over landmarks, which share the pose's error: its bounds are those of
     a single landmark, and so err on the wide side.
     """
     figure = Figure(figsize=(9.0, 6.4))
     axes = figure.subplots(2, 1, sharex=True)
-    time_s, variants = archive.time_s(level), _done(archive, level)
+    time_s, variants = archive.time_s(level), archive.finished(level)
     runs = int(archive.done[level].sum())
     for ax, (field, name, dof) in zip(axes, (("pose_nees", "pose", 6), ("landmark_nees", "landmark", 3)), strict=True):
         for probability, style in _BOUNDS:
@@ -37,7 +36,7 @@ def plot_study_nees(archive: StudyArchive, level: str) -> Figure:
         ax.axhline(dof, **EXPECTED, label="expected")
         for variant, values in variants.items():
             mean, _, _ = anees(values[field], dof, BOUND_PROBABILITY)
-            ax.plot(time_s, mean, **line_of(variant), label=variant)
+            ax.plot(time_s, mean, **line_of(variant), label=LABELS[variant])
         log_axis(ax, (1.0, 3.0))
         ax.set_ylabel(f"{name} NEES ({dof} expected) [-]")
         ax.margins(x=0.01)
@@ -50,12 +49,12 @@ def plot_study_nees(archive: StudyArchive, level: str) -> Figure:
 
 @styled
 def plot_study_errors(archive: StudyArchive, level: str) -> Figure:
-    """Position errors (x, y) and yaw error of the first runs against time, one column a variant, same scales.
+    """Draw position errors (x, y) and yaw error of the first runs against time, one column a variant, same scales.
 
     Bounds are three sigma as the filter states them, median over runs; titles say how many errors of all runs are
     within their own run's bounds (99.7 % expected).
     """
-    variants = _done(archive, level)
+    variants = archive.finished(level)
     time_s = archive.time_s(level)
     rows = (("x [m]", "position_error", 0, 1.0), ("y [m]", "position_error", 1, 1.0), ("yaw [deg]", "", 2, 180 / np.pi))
     figure = Figure(figsize=(2.9 * len(variants) + 0.5, 6.6))
@@ -76,7 +75,7 @@ def plot_study_errors(archive: StudyArchive, level: str) -> Figure:
             ax.margins(x=0.01)
             if ax.get_subplotspec().is_first_col():
                 ax.set_ylabel(label)
-        column[0].set_title(f"{variant}\n{100 * np.concatenate(inside).mean():.1f} % inside own 3 sigma")
+        column[0].set_title(f"{LABELS[variant]}\n{100 * np.concatenate(inside).mean():.1f} % inside own 3 sigma")
         column[-1].set_xlabel("time [s]")
     for row, (_, field, axis, scale) in zip(axes, rows, strict=True):
         row[0].set_ylim(*_view(archive, level, field or "rotation_error", axis, scale))
@@ -89,13 +88,13 @@ def plot_study_errors(archive: StudyArchive, level: str) -> Figure:
 
 @styled
 def plot_study_boxes(archive: StudyArchive) -> Figure:
-    """Time-averaged pose NEES of every run: median, quartiles and all runs, per level and variant, on a log axis."""
+    """Draw the time-averaged pose NEES of every run with median and quartiles, per level and variant, on a log axis."""
     levels = [level for level, mask in archive.done.items() if mask.any()]
     variants = archive.study.variants
     figure = Figure(figsize=(2.4 + 1.9 * len(levels), 4.4))
     axes = figure.subplots(1, len(levels), sharey=True, squeeze=False)[0]
     for ax, level in zip(axes, levels, strict=True):
-        for place, (variant, values) in enumerate(_done(archive, level).items()):
+        for place, (variant, values) in enumerate(archive.finished(level).items()):
             averages = time_average(values["pose_nees"])
             averages = averages[np.isfinite(averages)]
             color = style_of(variant)["color"]
@@ -105,14 +104,14 @@ def plot_study_boxes(archive: StudyArchive) -> Figure:
                 widths=0.6,
                 showfliers=False,
                 medianprops={"color": color, "linewidth": 1.8},
-                boxprops={"color": color},
-                whiskerprops={"color": color},
-                capprops={"color": color},
+                **{part: {"color": color} for part in ("boxprops", "whiskerprops", "capprops")},
             )
             spread = np.linspace(-0.22, 0.22, len(averages))
             ax.plot(place + spread, averages, ".", color=color, markersize=3.0, alpha=0.6, markeredgewidth=0)
         ax.axhline(6.0, **EXPECTED, zorder=0.9)
-        ax.set_xticks(range(len(variants)), variants, rotation=40, ha="right", rotation_mode="anchor")
+        ax.set_xticks(
+            range(len(variants)), [LABELS[v] for v in variants], rotation=40, ha="right", rotation_mode="anchor"
+        )
         ax.grid(False, axis="x")
         ax.set_title(f"{level}, {int(archive.done[level].sum())} runs")
     log_axis(axes[0], (1.0, 3.0))
@@ -122,7 +121,7 @@ def plot_study_boxes(archive: StudyArchive) -> Figure:
 
 
 def draw_study_figures(archive: StudyArchive) -> dict[str, Figure]:
-    """``boxes``, and ``nees_<level>`` and ``errors_<level>`` of every level, by name."""
+    """Draw ``boxes``, and ``nees_<level>`` and ``errors_<level>`` of every level; return them by name."""
     figures = {"boxes": plot_study_boxes(archive)}
     for level in archive.study.levels:
         figures[f"nees_{level}"] = plot_study_nees(archive, level)
@@ -130,18 +129,9 @@ def draw_study_figures(archive: StudyArchive) -> dict[str, Figure]:
     return figures
 
 
-def _done(archive: StudyArchive, level: str) -> dict[str, dict[str, Array]]:
-    """The values of the runs that are in, variant by variant."""
-    done = archive.done[level]
-    return {
-        variant: {field: value[done] for field, value in values.items()}
-        for variant, values in archive.data[level].items()
-    }
-
-
 def _view(archive: StudyArchive, level: str, field: str, axis: int, scale: float) -> tuple[float, float]:
-    """Symmetric limits around the bulk of the errors of all variants."""
-    errors = np.concatenate([values[field][..., axis].ravel() for values in _done(archive, level).values()])
+    """Return symmetric limits around the bulk of the errors of all variants."""
+    errors = np.concatenate([values[field][..., axis].ravel() for values in archive.finished(level).values()])
     errors = np.abs(scale * errors[np.isfinite(errors)])
     limit = 1.4 * float(np.percentile(errors, _SHOWN_PERCENT)) if len(errors) else 1.0
     return -limit, limit

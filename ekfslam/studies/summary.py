@@ -12,48 +12,45 @@ from numpy.typing import NDArray
 from ekfslam.arrays import Array
 from ekfslam.evaluation.consistency import average_over_runs, chi2_bounds, time_average
 from ekfslam.evaluation.tables import document, markdown_table, plus_minus, significant
-from ekfslam.studies.study import StudyArchive
+from ekfslam.studies.study import LABELS, TEXTBOOK, StudyArchive
 
 BOUND_PROBABILITY = 0.999
 
-# Field, degrees of freedom of one value.
-_NEES = (
-    ("pose_nees", 6),
-    ("orientation_nees", 3),
-    ("position_nees", 3),
-    ("landmark_nees", 3),
-)
+# Averages per run: field, expected value, heading. The bounds of a NEES are those of its degrees of freedom.
+_NEES = {
+    "pose_nees": (6, "pose NEES (6)"),
+    "orientation_nees": (3, "orientation (3)"),
+    "position_nees": (3, "position (3)"),
+    "landmark_nees": (3, "landmark (3)"),
+}
+_RATIOS = {"joint_nees_per_dof": "joint / dof (1)", "nis_per_dof": "NIS / dof (1)"}
 
 
 def summarise_study(archive: StudyArchive) -> dict[str, Any]:
-    """Figures of merit per level and variant as plain Python numbers, ready for JSON; of the runs that are in.
+    """Return figures of merit per level and variant as plain Python numbers, ready for JSON.
 
-    Averages are over time first, then over runs: ``{"mean", "half_width", "median", "runs"}`` as in `RunAverage`, with
-    what a consistent filter is ``expected`` to have and, for NEES, the two-sided 99.9 % ``bounds`` of the mean of as
-    many values at one instant (a time average keeps well inside). A run that diverged counts as long as it has values.
+    Averages are over time first, then over finished runs: ``{"mean", "half_width", "median", "runs"}`` as in
+    `RunAverage`, with the ``expected`` value of a consistent filter and, for NEES, the two-sided 99.9 % ``bounds`` of
+    the mean of as many values at one instant (a time average varies less). A diverged run counts as long as it has
+    values.
     """
-    summary: dict[str, Any] = {"study": archive.study.parameters, "bound_probability": BOUND_PROBABILITY, "levels": {}}
-    for level, variants in archive.data.items():
-        done = archive.done[level]
-        summary["levels"][level] = {
-            variant: _summarise({field: value[done] for field, value in values.items()})
-            for variant, values in variants.items()
-        }
-    return summary
+    levels = {
+        level: {variant: _summarise(values) for variant, values in archive.finished(level).items()}
+        for level in archive.data
+    }
+    return {"study": archive.study.parameters, "bound_probability": BOUND_PROBABILITY, "levels": levels}
 
 
 def _summarise(values: Mapping[str, NDArray]) -> dict[str, Any]:
+    """Return the figures of merit of one variant from its fields (runs, ...)."""
     out: dict[str, Any] = {}
-    for field, dof in _NEES:
+    for field, (dof, _) in _NEES.items():
         average = average_over_runs(time_average(values[field]))
         bounds = [float(b) for b in chi2_bounds(dof, BOUND_PROBABILITY, max(average.runs, 1))]
         out[field] = {**dataclasses.asdict(average), "expected": dof, "bounds": bounds}
     dof_total = values["nis_dof"].sum(axis=1)
     per_dof = np.where(dof_total > 0, np.nansum(values["nis"], axis=1) / np.maximum(dof_total, 1), np.nan)
-    for name, per_run in (
-        ("joint_nees_per_dof", time_average(values["joint_nees_per_dof"])),
-        ("nis_per_dof", per_dof),
-    ):
+    for name, per_run in zip(_RATIOS, (time_average(values["joint_nees_per_dof"]), per_dof), strict=True):
         out[name] = {**dataclasses.asdict(average_over_runs(per_run)), "expected": 1}
     out["position_rmse_m"] = _rms(values["position_error"])
     rotation = _rms(values["rotation_error"])
@@ -64,21 +61,18 @@ def _summarise(values: Mapping[str, NDArray]) -> dict[str, Any]:
 
 
 def _rms(errors: Array) -> float | None:
-    """Root mean square length of (runs, T, 3) over all runs and frames that have a value."""
+    """Return the root mean square length of (runs, T, 3) over all runs and frames with a value."""
     squares = np.sum(errors**2, axis=-1)
     squares = squares[np.isfinite(squares)]
     return float(np.sqrt(squares.mean())) if len(squares) else None
 
 
-_HEADINGS = (
-    *("level", "variant", "pose NEES (6)", "median", "orientation (3)", "position (3)", "landmark (3)"),
-    *("joint / dof (1)", "NIS / dof (1)", "RMSE [m]", "RMSE [deg]", "diverged"),
-)
-_MEANS = ("orientation_nees", "position_nees", "landmark_nees", "joint_nees_per_dof", "nis_per_dof")
-
-
 def study_table(summary: Mapping[str, Any]) -> str:
-    """Markdown table of `summarise_study`, one row a level and variant."""
+    """Return `summarise_study` as a Markdown table, one row a level and variant."""
+    (_, first), *others = _NEES.values()
+    headings = ["level", "variant", first, "median", *(heading for _, heading in others), *_RATIOS.values()]
+    headings += ["RMSE [m]", "RMSE [deg]", "diverged"]
+    means = [*list(_NEES)[1:], *_RATIOS]
     rows = []
     for level, variants in summary["levels"].items():
         for variant, found in variants.items():
@@ -86,10 +80,10 @@ def study_table(summary: Mapping[str, Any]) -> str:
             rows.append(
                 [
                     level,
-                    variant,
+                    LABELS[variant],
                     plus_minus(significant(pose["mean"]), significant(pose["half_width"])),
                     significant(pose["median"]),
-                    *(significant(found[name]["mean"]) for name in _MEANS),
+                    *(significant(found[name]["mean"]) for name in means),
                     significant(found["position_rmse_m"]),
                     significant(found["rotation_rmse_deg"]),
                     f"{found['diverged']} of {found['runs']}",
@@ -103,4 +97,6 @@ def study_table(summary: Mapping[str, Any]) -> str:
         f"Two-sided {100 * BOUND_PROBABILITY:g} % bounds of the mean pose NEES of as many runs at one instant: "
         f"{low:.2f} to {high:.2f}."
     )
-    return document(markdown_table(_HEADINGS, rows, left=len(_HEADINGS), padded=True), note)
+    if TEXTBOOK in study["variants"]:
+        note += " All variants but the textbook one keep landmarks in image coordinates."
+    return document(markdown_table(headings, rows, left=len(headings), padded=True), note)

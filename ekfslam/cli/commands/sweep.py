@@ -1,4 +1,4 @@
-"""Run recordings x modes x variants x settings x seeds, and put one row a run into a table."""
+"""Run recordings x modes x variants x settings x seeds and write a table with one row a run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("study", nargs="?", type=Path, metavar="STUDY.toml", help="recordings, modes, variants, ...")
-    parser.add_argument("--table", action="store_true", help="run nothing: show what --out holds already")
+    parser.add_argument("--table", action="store_true", help="run nothing: show the table in --out")
     parser.add_argument(
         "--figures", nargs="+", default=list(SHOWN), metavar="COLUMN", help=f"to show (default: {' '.join(SHOWN)})"
     )
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=_chosen,
         metavar="COLUMN=VALUE",
-        help="show and draw only these runs: of one column any of the values, of all columns that are named",
+        help="show and draw only runs with one of the values in each named column",
     )
     parser.add_argument(
         "--plot",
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path("results/local/sweep"),
         metavar="DIR",
-        help="default: %(default)s; an interrupted sweep there goes on",
+        help="default: %(default)s; an interrupted sweep there resumes",
     )
 
 
