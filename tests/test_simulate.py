@@ -11,7 +11,8 @@ from scipy.linalg import expm
 from scipy.spatial import cKDTree
 
 from ekfslam.data.sequence import Sequence
-from ekfslam.data.simulate import BUILTIN, GROUND_M, IMAGE_SIZE_PX, OUTLIER_SHIFT_PX, builtin, simulate
+from ekfslam.data.simulate import BUILTIN, GROUND_M, IMAGE_SIZE_PX, builtin, simulate
+from ekfslam.data.worlds import OUTLIER_SHIFT_PX
 from ekfslam.errors import ConfigError, UnknownFormatError
 from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import project

@@ -102,6 +102,25 @@ class Observations:
 
 
 @dataclass(frozen=True)
+class TrueMotion:
+    """True velocities of the IMU and biases of its samples.
+
+    Args:
+        velocity_m_s: (F, 3) in world.
+        gyro_bias_rad_s: (F, 3).
+        accel_bias_m_s2: (F, 3).
+    """
+
+    velocity_m_s: Array = field(metadata=stored("F xyz", "m/s", "world"))
+    gyro_bias_rad_s: Array = field(metadata=stored("F xyz", "rad/s", "imu"))
+    accel_bias_m_s2: Array = field(metadata=stored("F xyz", "m/s^2", "imu"))
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, frozen(np.asarray(value, dtype=float)))
+
+
+@dataclass(frozen=True)
 class Truth:
     """Ground truth: poses of some or all frames, and of landmarks where known.
 
@@ -111,6 +130,7 @@ class Truth:
         landmark: (M,) ids of landmarks with known position (may be empty).
         position_m: (M, 3) their positions in world.
         noise: How far the poses themselves may be wrong; None: they are exact, or nothing is known of it.
+        motion: Velocities and biases of the same frames; None: unknown.
     """
 
     frame: IntArray = field(metadata=stored("F", "frame index", check=COUNTS))
@@ -124,12 +144,21 @@ class Truth:
         metadata=stored("M xyz", "m", "world", name="landmarks/position"),
     )
     noise: TruthNoise | None = None
+    motion: TrueMotion | None = None
 
     def __post_init__(self) -> None:
         for name, dtype in (("frame", np.int64), ("landmark", np.int64)):
             object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=dtype)))
         for name in ("T_world_imu", "position_m"):
             object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
+
+    def stretch(self, begin: int, end: int) -> Truth | None:
+        """Return the truth of frames ``begin`` to ``end - 1``, which count from 0 again; None: no pose is known."""
+        known = (self.frame >= begin) & (self.frame < end)
+        if not known.any():
+            return None
+        motion = None if self.motion is None else TrueMotion(*(value[known] for value in vars(self.motion).values()))
+        return replace(self, frame=self.frame[known] - begin, T_world_imu=self.T_world_imu[known], motion=motion)
 
 
 @dataclass(frozen=True, repr=False, init=False)
@@ -242,17 +271,12 @@ class Sequence(Shown):
             raise ShapeError(f"there are no frames {begin}:{end}, the sequence has {len(self)}", source=self.source)
         seen = (self.observations.frame >= begin) & (self.observations.frame < end)
         parts = (self.observations.landmark[seen], self.observations.pixels_px[seen])
-        truth = self.truth
-        if truth is not None:
-            known = (truth.frame >= begin) & (truth.frame < end)
-            frame, T_world_imu = truth.frame[known] - begin, truth.T_world_imu[known]
-            truth = replace(truth, frame=frame, T_world_imu=T_world_imu) if known.any() else None
         return replace(
             self,
             time_s=self.time_s[begin:end],
             inputs=tuple(samples.between(self.time_s[begin], self.time_s[end - 1]) for samples in self.inputs),
             observations=Observations(self.observations.frame[seen] - begin, *parts),
-            truth=truth,
+            truth=None if self.truth is None else self.truth.stretch(begin, end),
             attributes={
                 **attributes_of_part(self.attributes, self.interpolated[begin:end]),
                 "first_frame": int(self.attributes.get("first_frame", 0)) + begin,
@@ -478,6 +502,9 @@ def validate_truth(truth: Truth, frames: int) -> None:
         raise TruthError(f"frames must ascend within 0..{frames - 1}", field="truth.frame")
     require_finite(truth.T_world_imu, "truth.T_world_imu", _LARGEST_DISTANCE_M)
     require_rigid(truth.T_world_imu, "truth.T_world_imu", TruthError)
+    for name, value in vars(truth.motion).items() if truth.motion is not None else ():
+        require_shape(value, (len(truth.frame), 3), f"truth.motion.{name}")
+        require_finite(value, f"truth.motion.{name}", LARGEST_VELOCITY)
     if np.shape(truth.position_m) != (len(truth.landmark), 3):
         raise TruthError(
             f"{len(truth.landmark)} landmarks but positions of shape {np.shape(truth.position_m)}",

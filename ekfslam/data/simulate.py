@@ -1,11 +1,12 @@
 """Simulated drives with exact truth: the embedded default data, and the raw material of Monte Carlo studies.
 
-Two worlds are built in. ``city`` is a drive through streets, seen the way a feature tracker sees it: short tracks whose
-ids never come back, and some gross outliers. ``loop`` is a ring driven several times past the same few landmarks, which
-keep their ids. ``dataclasses.replace(BUILTIN["loop"], radius_m=10.0)`` makes another world of the same kind.
+Three worlds are built in. ``city`` is a drive through streets, seen the way a feature tracker sees it: short tracks
+whose ids never come back, and some gross outliers. ``loop`` is a ring driven several times past the same few landmarks,
+which keep their ids. ``room`` is hand-held, with inertial samples in place of velocities, see `ekfslam.data.room`.
+``dataclasses.replace(BUILTIN["loop"], radius_m=10.0)`` makes another world of the same kind.
 
-The truth obeys the model of the filters exactly: the velocity is constant over every interval and integrates by
-eq. (1). The world frame is the IMU frame of the first stamp, x forward, y left, z up.
+The truth of a drive obeys the model of the filters exactly: the velocity is constant over every interval and
+integrates by eq. (1). The world frame is the IMU frame of the first stamp, x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -19,16 +20,25 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.arrays import Array
+from ekfslam.data.room import Room, simulate_room
 from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
+from ekfslam.data.worlds import (
+    Recording,
+    View,
+    numbers_of,
+    outlier_shifts,
+    parameters_of,
+    track_ids,
+    tracked,
+    visible,
+)
 from ekfslam.errors import ConfigError, UnknownFormatError
 from ekfslam.geometry import motion, se3
-from ekfslam.geometry.camera import StereoCamera, project
+from ekfslam.geometry.camera import StereoCamera
 
 CAMERA = StereoCamera(fu_px=707.0, fv_px=707.0, cu_px=602.0, cv_px=183.0, baseline_m=0.537)
 IMAGE_SIZE_PX = (1241, 376)
-BORDER_PX = 5.0  # wide enough for the noise not to push a pixel out of the image
-
 _CAMERA_IN_IMU_M = np.array([1.1, -0.3, 0.7])
 _R_CAM_IMU = se3.so3_exp(np.deg2rad([0.8, -1.3, 0.6])) @ np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 T_CAM_IMU = se3.transform(_R_CAM_IMU, -_R_CAM_IMU @ _CAMERA_IN_IMU_M)
@@ -36,101 +46,32 @@ T_CAM_IMU = se3.transform(_R_CAM_IMU, -_R_CAM_IMU @ _CAMERA_IN_IMU_M)
 GROUND_M = -0.95  # height of the road in the IMU frame
 ROAD_HALF_WIDTH_M = 4.0
 TURN_SPEED_M_S = 5.0
-OUTLIER_SHIFT_PX = (5.0, 40.0)
-
 # Typical size of what keeps a drive from being flat: pitch, roll (rad), sideways and vertical speed per forward speed.
 _UNEVENNESS = np.array([0.025, 0.010, 0.004, 0.008])
-_FRAMES_PER_CHUNK = 100  # a stretch of road short enough for most landmarks of a long drive to be out of range
-
-
-# Beyond these a simulation would take hours or more memory than there is, or say nothing.
-_LEAST, _LARGEST = 1e-12, 1e6
-_MOST = {
-    "seed": float("inf"),
-    "frames": 100_000,
-    "frame_period_s": 1e3,
-    "max_tracks": 10_000,
-    "max_range_m": 1e4,
-    "landmarks": 20_000,
-    "landmarks_per_m": 100.0,
-    "radius_m": 1e5,
-    "speed_m_s": 1e3,
-    "sigma_v_m_s": 1e3,
-    "sigma_w_rad_s": 1e3,
-    "sigma_px": 1e3,
-    "initial_position_std_m": 1e4,
-    "initial_rotation_std_rad": 10.0,
-}
-_MOST_IN_VIEW = 20_000_000  # landmarks times frames
 _MOST_STREETS_M = 1e6
 _FASTEST_M_S = 15.0  # in the city
+_VIEW = View(CAMERA, IMAGE_SIZE_PX, T_CAM_IMU)
 
 
 @dataclass(frozen=True)
-class Recording:
-    """What every world has: sampling, noise, and the limits of the tracker.
+class Drive(Recording):
+    """What drives with measured velocities have.
 
     Args:
-        name: Becomes the name of the sequence.
-        seed: Seed of the one generator that everything is drawn from.
-        frames: Number of stamps, at least 2.
-        frame_period_s: Nominal time between stamps.
-        stamp_jitter_s: Standard deviation of a stamp (cut at a third of the period).
         sigma_v_m_s, sigma_w_rad_s: White noise of the velocities, per sample and axis.
-        sigma_px: White noise of each of the four pixels.
-        min_disparity_px, max_range_m: Landmarks with less disparity, or farther from the camera, are not tracked.
-        max_tracks: The tracker follows no more landmarks than this at a time.
-        loss_probability: Chance that the tracker misses a visible landmark in a frame.
-        outlier_fraction: Share of observations that are grossly displaced.
         initial_position_std_m, initial_rotation_std_rad: Prior of the first pose, each axis, which the truth is drawn
             from. Unless both are 0 the first pose is unknown: estimates start at identity, and the truth starts at
             frame 1.
     """
 
-    name: str
-    seed: int = 0
-    frames: int = 1000
-    frame_period_s: float = 0.1
-    stamp_jitter_s: float = 0.001
     sigma_v_m_s: float = 0.5
     sigma_w_rad_s: float = 0.05
-    sigma_px: float = 1.0
-    min_disparity_px: float = 6.0
-    max_range_m: float = 40.0
-    max_tracks: int = 1000
-    loss_probability: float = 0.0
-    outlier_fraction: float = 0.0
     initial_position_std_m: float = 0.0
     initial_rotation_std_rad: float = 0.0
 
-    def __post_init__(self) -> None:
-        for key, value in numbers_of(self).items():
-            most = _MOST.get(key, _LARGEST)
-            if not (value == 0 or _LEAST <= value <= most):
-                raise ConfigError(
-                    f"{self.name}: {key} must be finite and not negative: 0, or {_LEAST:g} to {most:g}, found {value}"
-                )
-            if value == 0 and key in ("frame_period_s", "radius_m"):
-                raise ConfigError(f"{self.name}: {key} must be positive")
-        if self.frames < 2:
-            raise ConfigError(f"{self.name}: frames must be at least 2, found {self.frames}")
-        for key in ("loss_probability", "outlier_fraction"):
-            if getattr(self, key) > 1:
-                raise ConfigError(f"{self.name}: {key} must be in [0, 1], found {getattr(self, key)}")
-        if self.frames * max(self.in_view, 1.0) > _MOST_IN_VIEW:
-            raise ConfigError(
-                f"{self.name}: {self.frames} frames of about {self.in_view:.0f} landmarks are too many, at most "
-                f"{_MOST_IN_VIEW} together"
-            )
-
-    @property
-    def in_view(self) -> float:
-        """About how many landmarks are within reach of a frame."""
-        return 0.0
-
 
 @dataclass(frozen=True)
-class City(Recording):
+class City(Drive):
     """Streets between crossings, left, left, right, right and so on, with a stop in every third.
 
     No landmark id ever comes back: each unbroken run of observations of a physical point is a track with its own id.
@@ -160,7 +101,7 @@ class City(Recording):
 
 
 @dataclass(frozen=True)
-class Loop(Recording):
+class Loop(Drive):
     """A ring driven at constant speed; landmarks keep their ids, loop after loop (157 frames each by default).
 
     Args:
@@ -192,18 +133,13 @@ class Loop(Recording):
         return float(self.landmarks)
 
 
-def numbers_of(world: Recording) -> dict[str, int | float]:
-    """The numeric parameters of a world by name."""
-    return {key: value for key, value in dataclasses.asdict(world).items() if type(value) in (int, float)}
+World = City | Loop | Room
 
-
-World = City | Loop
-
-BUILTIN: Mapping[str, World] = MappingProxyType({"city": City(), "loop": Loop()})
+BUILTIN: Mapping[str, World] = MappingProxyType({"city": City(), "loop": Loop(), "room": Room()})
 
 
 def builtin(name: str) -> Sequence:
-    """The sequence of a built-in world, ``city`` or ``loop``, or of a variation such as ``city?seed=3&frames=200``.
+    """Return the sequence of a built-in world such as ``city``, or of a variation such as ``city?seed=3&frames=200``.
 
     Raises:
         UnknownFormatError: There is no such world.
@@ -212,7 +148,7 @@ def builtin(name: str) -> Sequence:
     base, _, query = name.partition("?")
     if base not in BUILTIN:
         raise UnknownFormatError(f"no built-in world {base!r}; known: {', '.join(BUILTIN)}")
-    defaults = numbers_of(BUILTIN[base])
+    defaults = parameters_of(BUILTIN[base])
     changes: dict[str, Any] = {}
     for key, text in parse_qsl(query, keep_blank_values=True):
         if key not in defaults:
@@ -236,6 +172,8 @@ def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
         The recording, with the true noise, all true poses (but see `Recording` on the prior), and the true position of
         every landmark that was observed.
     """
+    if isinstance(world, Room):
+        return simulate_room(world, rng)
     geometry = np.random.default_rng(world.seed)
     noise = geometry if rng is None else rng
 
@@ -256,11 +194,13 @@ def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
     stated = Noise.isotropic(world.sigma_v_m_s, world.sigma_w_rad_s, world.sigma_px)
     measured_twist = twist + stated.twist_std * noise.standard_normal(twist.shape)
 
-    frame, point, pixels = _visible(world, T_imu_world, points_m)
-    kept = _tracked(world, frame, point, len(points_m), noise)
+    frame, point, pixels = visible(world, _VIEW, T_imu_world, points_m)
+    kept = tracked(world, frame, point, len(points_m), noise)
     frame, point, pixels = frame[kept], point[kept], pixels[kept]
-    pixels = pixels + _outlier_shifts(world, pixels, noise) + stated.pixel_std_px * noise.standard_normal(pixels.shape)
-    landmark = _track_ids(frame, point) if isinstance(world, City) else point
+    pixels = (
+        pixels + outlier_shifts(world, _VIEW, pixels, noise) + stated.pixel_std_px * noise.standard_normal(pixels.shape)
+    )
+    landmark = track_ids(frame, point) if isinstance(world, City) else point
     ids, an_observation = np.unique(landmark, return_index=True)
 
     return Sequence(
@@ -282,7 +222,7 @@ def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
     )
 
 
-def _stamps(world: World, rng: np.random.Generator) -> Array:
+def _stamps(world: City | Loop, rng: np.random.Generator) -> Array:
     """Stamps (T,) from 0, with a jitter too small to swap two of them."""
     limit = world.frame_period_s / 3
     jitter = np.clip(world.stamp_jitter_s * rng.standard_normal(world.frames), -limit, limit)
@@ -290,7 +230,7 @@ def _stamps(world: World, rng: np.random.Generator) -> Array:
     return time_s - time_s[0]
 
 
-def _drive(world: World, time_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def _drive(world: City | Loop, time_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Distance driven (T,) m and heading (T,) rad at the stamps, both 0 at the first."""
     if isinstance(world, Loop):
         distance = world.speed_m_s * time_s
@@ -358,7 +298,9 @@ def _integrate(twist: Array, tau_s: Array) -> Array:
     return T
 
 
-def _landmarks(world: World, distance_m: Array, yaw_rad: Array, position_m: Array, rng: np.random.Generator) -> Array:
+def _landmarks(
+    world: City | Loop, distance_m: Array, yaw_rad: Array, position_m: Array, rng: np.random.Generator
+) -> Array:
     """Landmark positions (N, 3) in world, given the drive (T,), (T,), (T, 3)."""
     if isinstance(world, Loop):
         # The camera's field of view never reaches points nearer to the centre than 0.77 radii.
@@ -401,73 +343,3 @@ def _line_streets(world: City, distance_m: Array, yaw_rad: Array, position_m: Ar
     points[:, :2] += np.where(side, 1.0, -1.0)[:, None] * lateral[:, None] * left
     points[:, 2] += GROUND_M + height
     return points
-
-
-def _visible(world: World, T_imu_world: Array, points_m: Array) -> tuple[IntArray, IntArray, Array]:
-    """Frame (K,), index of the point (K,) and exact pixels (K, 4), eq. (3), of all that the tracker could see."""
-    T_cam_world = T_CAM_IMU @ T_imu_world
-    camera_m = se3.inverse(T_cam_world)[:, :3, 3]
-    found = []
-    for start in range(0, len(T_cam_world), _FRAMES_PER_CHUNK):
-        chunk = slice(start, start + _FRAMES_PER_CHUNK)
-        low, high = camera_m[chunk].min(axis=0), camera_m[chunk].max(axis=0)
-        near = np.abs(points_m - (low + high) / 2) < (high - low) / 2 + world.max_range_m
-        candidates = np.flatnonzero(near.all(axis=-1))
-        q = T_cam_world[chunk, :3, :3] @ points_m[candidates].T + T_cam_world[chunk, :3, 3:]
-        frame, candidate = np.nonzero((q[:, 2] > 0) & (np.sum(q * q, axis=1) < world.max_range_m**2))
-        pixels = project(CAMERA, q[frame, :, candidate])
-        seen = _inside(pixels) & (pixels[:, 0] - pixels[:, 2] > world.min_disparity_px)
-        found.append((start + frame[seen], candidates[candidate[seen]], pixels[seen]))
-    frames, points, all_pixels = zip(*found, strict=True)
-    return np.concatenate(frames), np.concatenate(points), np.concatenate(all_pixels)
-
-
-def _tracked(world: World, frame: IntArray, point: IntArray, points: int, rng: np.random.Generator) -> BoolArray:
-    """Mask (K,) of the visible observations that the tracker makes: the points it prefers, less what it loses."""
-    preference = rng.random(points)
-    order = np.lexsort((preference[point], frame))
-    place = np.arange(len(order)) - np.searchsorted(frame[order], frame[order])
-    kept = rng.random(len(frame)) >= world.loss_probability
-    kept[order[place >= world.max_tracks]] = False
-    return kept
-
-
-def _inside(pixels: Array) -> BoolArray:
-    """Mask (K,) of pixels (K, 4) within both images, off the border."""
-    limit = np.tile(IMAGE_SIZE_PX, 2) - 1 - BORDER_PX
-    return np.asarray(((pixels >= BORDER_PX) & (pixels <= limit)).all(axis=-1))
-
-
-def _outlier_shifts(world: World, pixels: Array, rng: np.random.Generator) -> Array:
-    """What displaces the pixels (K, 4): 0, or for an outlier a jump of the point in both images and a wrong disparity.
-
-    Rows stay matched and disparities positive, as in what a stereo matcher lets through.
-    """
-    shifts = np.zeros_like(pixels)
-    wrong = np.flatnonzero(rng.random(len(pixels)) < world.outlier_fraction)
-    z = pixels[wrong]
-    size = rng.uniform(*OUTLIER_SHIFT_PX, len(wrong))
-    direction = rng.uniform(0.0, 2 * np.pi, len(wrong))
-    du, dv = size * np.cos(direction), size * np.sin(direction)
-    stretch = rng.uniform(-0.5, 0.5, len(wrong)) * np.minimum(np.abs(du), z[:, 0] - z[:, 2])
-    # A jump out of the image goes the other way; the image is wide enough for one of the two.
-    right = z[:, 2] - stretch
-    low, high = np.minimum(z[:, 0], right) + du, np.maximum(z[:, 0], right) + du
-    du = np.where((low < BORDER_PX) | (high > IMAGE_SIZE_PX[0] - 1 - BORDER_PX), -du, du)
-    row = z[:, 1] + dv
-    dv = np.where((row < BORDER_PX) | (row > IMAGE_SIZE_PX[1] - 1 - BORDER_PX), -dv, dv)
-    shifts[wrong] = np.stack([du, dv, du - stretch, dv], axis=-1)
-    return shifts
-
-
-def _track_ids(frame: IntArray, point: IntArray) -> IntArray:
-    """An id (K,) for each unbroken run of frames of the same point, counted from 0 in order of appearance."""
-    order = np.lexsort((frame, point))
-    starts = np.ones(len(order), dtype=bool)
-    starts[1:] = (np.diff(point[order]) != 0) | (np.diff(frame[order]) != 1)
-    appearance = np.lexsort((point[order][starts], frame[order][starts]))
-    rank = np.empty(len(appearance), dtype=np.int64)
-    rank[appearance] = np.arange(len(appearance))
-    ids = np.empty(len(order), dtype=np.int64)
-    ids[order] = rank[np.cumsum(starts) - 1]
-    return ids

@@ -265,5 +265,5 @@ def _with_extrinsics(recording: Sequence | ImageRecording, T_cam_imu: Array, not
     changes: dict[str, Any] = {"T_cam_imu": T_cam_imu, "notes": (*notes, note)}
     if recording.truth is not None:
         T_old_new = se3.inverse(recording.T_cam_imu) @ T_cam_imu
-        changes["truth"] = replace(recording.truth, T_world_imu=recording.truth.T_world_imu @ T_old_new)
+        changes["truth"] = replace(recording.truth, T_world_imu=recording.truth.T_world_imu @ T_old_new, motion=None)
     return changes

@@ -84,7 +84,9 @@ def measured_truth(truth: Truth, interpolated: BoolArray, time_s: Array) -> Trut
         invented_s = float(time_s[stretches(interpolated)[0][1]] - time_s[0])
         first_m = float(np.hypot(noise.first_position_m, GAP_STD[0] * invented_s))
         noise = dataclasses.replace(noise, first_position_m=first_m)
-    return dataclasses.replace(truth, frame=truth.frame[kept], T_world_imu=truth.T_world_imu[kept], noise=noise)
+    return dataclasses.replace(
+        truth, frame=truth.frame[kept], T_world_imu=truth.T_world_imu[kept], noise=noise, motion=None
+    )
 
 
 def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Array:

@@ -9,7 +9,8 @@
         attributes      the further facts, as attributes
         observations    frame (K,), landmark (K,), pixels (K, 4)
         noise           twist_std (6,), pixel_std (4,), the rest of `Noise` as attributes; only if noise is stated
-    /truth              frame (F,), T_world_imu (F, 4, 4), `TruthNoise` as attributes if any; only if there is truth
+    /truth              frame (F,), T_world_imu (F, 4, 4), `TruthNoise` as attributes if any; only if there is truth;
+        motion          the fields of `TrueMotion`; only if they are known
         landmarks       id (M,), position (M, 3)
 
 See `ekfslam.hdf5` for what all files have in common.
@@ -31,7 +32,7 @@ from ekfslam.data.inputs import InertialNoise, InertialSamples, Input, Velocitie
 from ekfslam.data.interpolation import interpolated_intervals
 from ekfslam.data.noise import Noise
 from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
-from ekfslam.data.sequence import Observations, Sequence, Truth
+from ekfslam.data.sequence import Observations, Sequence, TrueMotion, Truth
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import ArchiveError, ShapeError, UnknownFormatError
 from ekfslam.geometry.camera import StereoCamera
@@ -50,6 +51,7 @@ _SEQUENCE = _below("sequence", (*layout_of(Sequence), _TWIST))
 _OBSERVATIONS = _below("sequence/observations", layout_of(Observations))
 _NOISE = _below("sequence/noise", layout_of(Noise))
 _TRUTH = _below("truth", layout_of(Truth))
+_MOTION = _below("truth/motion", layout_of(TrueMotion))
 _INPUTS: dict[str, type[Input]] = {kind.__name__: kind for kind in (Velocities, InertialSamples)}
 _NOTES = (Item("sequence/notes", "notes", ("n",), "text", "none", TEXTS),)
 LAYOUT = (*_SEQUENCE, *_NOTES, *_NOISE, *_TRUTH)  # of an archive, too
@@ -226,6 +228,8 @@ def _read_inputs(group: h5py.Group, found: Mapping[str, Any]) -> dict[str, Any]:
 def write_truth_group(h5file: h5py.Group, truth: Truth) -> None:
     """Write ``/truth`` below an open file or group."""
     hdf5.write_fields(h5file, _TRUTH, truth)
+    if truth.motion is not None:
+        hdf5.write_fields(h5file, _MOTION, truth.motion)
     if truth.noise is not None:
         hdf5.write_attributes(
             h5file["truth"], {_TRUTH_NOISE + name: value for name, value in vars(truth.noise).items()}
@@ -240,6 +244,8 @@ def read_truth_group(h5file: h5py.Group, source: str) -> Truth:
     """
     with spelled_as_in(source):
         found, stored = _read(h5file, _TRUTH), _attributes(h5file, "truth")
+        if "truth/motion" in h5file:
+            found["motion"] = TrueMotion(**_read(h5file, _MOTION))
         noise = {f.name: stored[_TRUTH_NOISE + f.name] for f in fields(TruthNoise) if _TRUTH_NOISE + f.name in stored}
         for name, value in noise.items():
             if not isinstance(value, int | float):

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.models.blocks.base import StateBlock, optional_block
+from ekfslam.models.blocks.base import StateBlock
 
 
-@optional_block
 @dataclass(frozen=True)
 class AccelBias(StateBlock):
     """Bias (3,) of a accelerometer, m/s^2: measured = true + bias + white noise. The inertial process lets it walk.

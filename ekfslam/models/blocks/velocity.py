@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.models.blocks.base import StateBlock, optional_block
+from ekfslam.models.blocks.base import StateBlock
 
 
-@optional_block
 @dataclass(frozen=True)
 class Velocity(StateBlock):
     """``u = C v`` (3,), m/s in the IMU frame, moved by the inertial process.
