@@ -274,9 +274,12 @@ class Model:
     def widened(self, values: Values, step: Step) -> Transition:
         """Return a step of some blocks as a transition of all blocks."""
         Phi, Q = np.eye(self.layout.body), np.zeros((self.layout.body, self.layout.body))
-        columns = self.layout.columns(step.values)
-        Phi[columns] = step.Phi
-        Q[np.ix_(columns, columns)] = step.Q
+        if len(step.values) == 1:  # a view, and no index
+            at = self.layout[next(iter(step.values))]
+            Phi[at], Q[at, at] = step.Phi, step.Q
+        else:
+            columns = self.layout.columns(step.values)
+            Phi[columns], Q[np.ix_(columns, columns)] = step.Phi, step.Q
         return Transition({**values, **step.values}, Phi, Q, step.imu_twist)
 
     # --- to be replaced by the process in the smoother ----------------------------------------------------------------
