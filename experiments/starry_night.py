@@ -43,7 +43,6 @@ from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.evaluation.consistency import (
     chi2_bounds,
     first_pose_error_covariance,
-    invariant_landmark_error,
     nees,
     pose_error,
     pose_noise_covariance,
@@ -51,7 +50,7 @@ from ekfslam.evaluation.consistency import (
 from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.evaluation.trajectory import match_landmarks
 from ekfslam.figures.style import BOUNDS, EXPECTED, PURPLE, SERIES, SKY_BLUE, ZERO, log_axis, marker_of, styled
-from ekfslam.filters import JointEKF
+from ekfslam.filters import JointEKF, variants
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.geometry import camera, se3
@@ -250,10 +249,9 @@ def run_window(
     landmarks = ekf.landmarks()
     rows, known = match_landmarks(landmarks, truth)
     m_hat, m_true = landmarks.position_m[rows], truth.position_m[known]
-    if variant == "invariant":
-        d = invariant_landmark_error(m_hat, m_true, T_world_imu[-1], truth.T_world_imu[stop - 1])
-    else:
-        d = m_true - m_hat
+    d = variants.VARIANTS[variant or "standard"].landmark_error(
+        m_hat, m_true, T_world_imu[-1], truth.T_world_imu[stop - 1]
+    )
     along, honest = nees(error, covariance), nees(error, covariance + of_truth)
     return Window(along, honest, nees(d, landmarks.covariance[rows]), error[-1], nis, dof)
 

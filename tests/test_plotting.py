@@ -215,14 +215,8 @@ def test_nis_says_how_many_frames_are_inside_their_bounds(results):
 @pytest.mark.slow
 def test_files_are_written_and_small(sequence, results, tmp_path):
     paths = save_figures(tmp_path / "new" / "folder", results, sequence.truth)
-    assert [path.name for path in paths] == [
-        "map.png",
-        "side.png",
-        "errors.png",
-        "nis.png",
-        "landmarks_mapping-only.png",
-        "landmarks_full.png",
-    ]
+    names = {"map", "side", "errors", "nis", "landmarks_mapping-only", "landmarks_full"}
+    assert {path.name for path in paths} == {f"{name}.png" for name in names}
     for path in paths:
         assert path.read_bytes().startswith(b"\x89PNG")
         assert 5_000 < path.stat().st_size < 400_000, path.name

@@ -165,7 +165,7 @@ def landmark_nees(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, Array]:
 
     This is exact for filters whose landmark error is additive. The invariant variant's stored covariance is of ``d``
     only to first order in the rotation error of the pose at the same time; where that error is not small take
-    `invariant_landmark_error` and `nees` instead.
+    `ekfslam.filters.variants.Invariant.landmark_error` and `nees` instead.
     """
     rows, truth_rows = match_landmarks(landmarks, truth)
     error = truth.position_m[truth_rows] - landmarks.position_m[rows]
@@ -178,28 +178,6 @@ def joint_nees(xi: Array, landmark_error: Array, P: Array) -> float:
     ``xi`` (6,) and ``landmark_error`` (n, 3) in stored coordinates, P (6+3n, 6+3n) in the same order.
     """
     return float(nees(np.concatenate([xi, landmark_error.ravel()]), P))
-
-
-def invariant_landmark_error(m_hat: Array, m_true: Array, T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
-    """Landmark error in stored coordinates as the invariant variant defines it: (..., 3) m, shapes broadcast.
-
-    The right-invariant error couples a landmark to the rotation error ``e_theta`` of the pose of the same time,
-
-        R_true = exp(e_theta) R_est,    m_true = exp(e_theta) m_hat + J_l(e_theta) e_i,
-
-    and eq. (7) stores it as ``d_i = e_i - m_hat^ e_theta``, which is ``m_true - m_hat`` to first order.
-
-    Args:
-        m_hat: (..., 3) estimated positions in world.
-        m_true: (..., 3) true positions in world.
-        T_world_imu_est: (..., 4, 4) estimated poses at the time at which the landmark covariances hold.
-        T_world_imu_true: (..., 4, 4) true poses at that time.
-    """
-    R_error = T_world_imu_true[..., :3, :3] @ np.swapaxes(T_world_imu_est[..., :3, :3], -1, -2)
-    e_theta = se3.so3_log(R_error)
-    offset = m_true - (R_error @ m_hat[..., None])[..., 0]
-    e_i = (se3.so3_left_jacobian_inverse(e_theta) @ offset[..., None])[..., 0]
-    return e_i - np.cross(m_hat, e_theta)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from matplotlib.lines import Line2D
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.trajectory import distance_along
+from ekfslam.figures import registry
 from ekfslam.figures.series import BAND_SIGMAS, draw_series, height
 from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, line_of, style_of, styled
 from ekfslam.filters.result import Result
@@ -43,7 +44,7 @@ def ellipse_axes(covariance: Array, sigmas: float) -> tuple[Array, Array, Array]
     return lengths[..., 1], lengths[..., 0], angle
 
 
-@styled
+@registry.figure("map")
 def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
     """Map from above (x, y of world, metres): trajectories of all modes, landmarks and poses with 2-sigma ellipses.
 
@@ -98,7 +99,7 @@ def plot_trajectories(results: Mapping[str, Result], truth: Truth | None = None)
     return _figure_of(ax)
 
 
-@styled
+@registry.figure("landmarks_{mode}", needs={"landmarks"})
 def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
     """Landmarks from above (x, y of world, metres): from initialisation to final estimate, over the trajectory.
 
@@ -122,7 +123,7 @@ def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
     return _figure_of(ax)
 
 
-@styled
+@registry.figure("side")
 def plot_side(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
     """The drive from the side: height z of world against the distance driven, metres, with bands of 3 sigma.
 

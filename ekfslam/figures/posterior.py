@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.tables import MISSING
+from ekfslam.figures import registry
 from ekfslam.figures.maps import SIGMAS, add_ellipses, dot_size, draw_paths, spread
 from ekfslam.figures.style import LANDMARK_COLOR, style_of, styled
 from ekfslam.filters.result import Result
@@ -19,14 +20,14 @@ _POSES = 16  # with an ellipse
 _CELLS = 500  # across a picture of a sparsity pattern
 
 
-@styled
-def plot_map_before_and_after(before: Result, after: Result, truth: Truth | None = None) -> Figure:
+@registry.figure("map_before_and_after", needs={"full", "smoothed"})
+def plot_map_before_and_after(full: Result, smoothed: Result, truth: Truth | None = None) -> Figure:
     """Two maps from above at one scale, poses and landmarks with 2-sigma ellipses: the filter's, and the posterior's.
 
     The view is that of the smoothed trajectory's middle half of the drive. Where the drive closes a loop, it is the
     poses before that gain: the filter's last map knows of the loop already, its earlier poses do not.
     """
-    path = after.T_world_imu[:, :2, 3]
+    path = smoothed.T_world_imu[:, :2, 3]
     quarter = len(path) // 4
     low, high = path[quarter : 3 * quarter + 1].min(axis=0), path[quarter : 3 * quarter + 1].max(axis=0)
     margin = 0.1 * (high - low).max() + 5.0
@@ -34,7 +35,7 @@ def plot_map_before_and_after(before: Result, after: Result, truth: Truth | None
     aspect = float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 2.0))
     figure = Figure(figsize=(10.0, 4.6 * aspect + 1.5))
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
-    for ax, result, title in ((axes[0], before, "filter"), (axes[1], after, "posterior")):
+    for ax, result, title in ((axes[0], full, "filter"), (axes[1], smoothed, "posterior")):
         ax.set_aspect("equal", adjustable="box")
         ax.set_xlim(low[0], high[0])
         ax.set_ylim(low[1], high[1])
@@ -51,7 +52,9 @@ def plot_map_before_and_after(before: Result, after: Result, truth: Truth | None
         medians = f"position {_median_std(of_poses[:, :2, :2])} m, landmark {_median_std(covariance)} m"
         ax.set_title(f"{title}, median standard deviations:\n{medians}")
         ax.set_xlabel("x [m]")
-        ax.legend(loc="best")
+    found = [ax.get_legend_handles_labels() for ax in axes]
+    handles = {label: handle for handles, labels in found for handle, label in zip(handles, labels, strict=True)}
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=len(handles))
     axes[0].set_ylabel("y [m]")
     return figure
 

@@ -13,17 +13,16 @@ from matplotlib.figure import Figure
 
 from ekfslam.arrays import BoolArray
 from ekfslam.data.sequence import Truth
-from ekfslam.figures import series
-from ekfslam.figures.maps import plot_landmark_arrows, plot_map, plot_side
-from ekfslam.figures.posterior import plot_map_before_and_after
-from ekfslam.figures.registry import Runs, draw_all, figure
+from ekfslam.figures import maps as maps  # registers figures, as the next one does
+from ekfslam.figures import posterior as posterior
+from ekfslam.figures import registry, series
 from ekfslam.figures.series import BAND_SIGMAS, draw_series
-from ekfslam.figures.style import PRIOR, ZERO, Format, save_all, style_of, styled
+from ekfslam.figures.style import PRIOR, ZERO, Format, save_all, style_of
 from ekfslam.figures.style import save_figure as save_figure  # public name
 from ekfslam.filters.result import Result
 
 
-@styled
+@registry.figure("errors", needs={"truth"})
 def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolArray | None = None) -> Figure:
     """Draw estimate minus truth over time, world axes: position (m) and rotation (degrees) with 3-sigma bands.
 
@@ -61,7 +60,7 @@ def _nees_words(result: Result, truth: Truth, interpolated: BoolArray | None) ->
     return words if truth.noise is None else f"{words}, {noisy:.3g} with truth noise"
 
 
-@styled
+@registry.figure("nis", needs={"updates"})
 def plot_nis(results: Mapping[str, Result]) -> Figure:
     """Draw NIS per degree of freedom over time for each mode with updates, with each frame's 95 % chi-square bounds.
 
@@ -84,8 +83,8 @@ def plot_nis(results: Mapping[str, Result]) -> Figure:
     return figure
 
 
-@styled
-def plot_parameters(result: Result) -> Figure:
+@registry.figure("parameters", needs={"parameters"})
+def plot_parameters(full: Result) -> Figure:
     """Draw the estimated parameters (calibration, roll and pitch) over time with 3-sigma bands.
 
     Dashed lines are the 3-sigma bounds of the prior. A band that still fills them at the end has not been observed.
@@ -93,15 +92,15 @@ def plot_parameters(result: Result) -> Figure:
     Raises:
         ValueError: The run has no such parameters.
     """
-    drawn = series.parameters(result)
-    if result.parameters is None or not drawn:
+    drawn = series.parameters(full)
+    if full.parameters is None or not drawn:
         raise ValueError("there are no parameters to show")
     columns = min(len(drawn), 3)
     rows = -(-len(drawn) // columns)
     figure = Figure(figsize=(3.6 * columns, 0.6 + 2.2 * rows))
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    color = style_of(result.mode)["color"]
-    for ax, one, is_observed in zip(axes, drawn, result.parameters.is_observed, strict=False):
+    color = style_of(full.mode)["color"]
+    for ax, one, is_observed in zip(axes, drawn, full.parameters.is_observed, strict=False):
         draw_series(ax, one, color, {"color": color}, levels=PRIOR)
         ax.set(title=one.name + ("" if is_observed else " (not observable)"), ylabel=f"[{one.unit or '-'}]")
         ax.set_xlabel(one.labels[0])
@@ -110,51 +109,21 @@ def plot_parameters(result: Result) -> Figure:
     return figure
 
 
-@figure("map")
-def _map(runs: Runs) -> Figure:
-    return plot_map(runs.results, runs.truth)
-
-
-@figure("side")
-def _side(runs: Runs) -> Figure:
-    return plot_side(runs.results, runs.truth)
-
-
-@figure("errors", needs={"truth"})
-def _errors(runs: Runs) -> Figure:
-    assert runs.truth is not None
-    return plot_errors(runs.results, runs.truth, runs.interpolated)
-
-
-@figure("nis", needs={"updates"})
-def _nis(runs: Runs) -> Figure:
-    return plot_nis(runs.results)
-
-
-@figure("parameters", needs={"full", "parameters"})
-def _parameters(runs: Runs) -> Figure:
-    return plot_parameters(runs.results["full"])
-
-
-@figure("landmarks_{mode}", needs={"landmarks"})
-def _landmarks(runs: Runs) -> Figure:
-    return plot_landmark_arrows(runs.result, runs.truth)
-
-
-@figure("map_before_and_after", needs={"full", "smoothed"})
-def _before_and_after(runs: Runs) -> Figure:
-    return plot_map_before_and_after(runs.results["full"], runs.results["smoothed"], runs.truth)
-
-
 def draw_figures(
     results: Mapping[str, Result], truth: Truth | None = None, interpolated: BoolArray | None = None
 ) -> dict[str, Figure]:
-    """Draw the figures that the results allow, by name, see `ekfslam.figures.registry`.
+    """Draw the registered figures that the results allow, by name, see `ekfslam.figures.registry`.
 
     ``map`` and ``side`` always, ``errors`` with true poses, ``nis`` with updates, ``parameters`` if ``full`` estimated
     any, ``landmarks_<mode>`` for every mode with a map, ``map_before_and_after`` with ``full`` and ``smoothed``.
     """
-    return draw_all(Runs(results, truth, interpolated))
+    figures = {}
+    for name, entry in registry.FIGURES.items():
+        for some in [{mode: results[mode]} for mode in results] if "{mode}" in name else [results]:
+            found = registry.offered(some, truth, interpolated)
+            if all(found.get(need) is not None for need in entry.needs):
+                figures[name.format(mode=next(iter(some)))] = entry.draw(**{key: found[key] for key in entry.takes})
+    return figures
 
 
 def save_figures(

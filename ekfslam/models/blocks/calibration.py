@@ -60,7 +60,6 @@ class Calibration(StateBlock):
     std: Array
 
     name = "calibration"
-    coupling = "sensor"
     is_seen = True
 
     @cached_property

@@ -1,0 +1,204 @@
+"""The figures of merit of a run: functions with a key, a heading and a format, registered by `metric`.
+
+    @metric("longest_step_s", "longest step [s]", ".3f")
+    def longest_step(result: Result) -> float:
+        return float(np.diff(result.time_s).max())
+
+A file with such a function is all that a new one takes: once it is imported, summaries, tables, sweeps and report pages
+have it. Parameters are named after what a function takes of `offered`. If that is missing, the value is None.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray
+from ekfslam.data.sequence import Truth
+from ekfslam.evaluation import trajectory
+from ekfslam.evaluation.consistency import measured_truth, pose_nees, pose_nees_by_axis
+from ekfslam.evaluation.relative import FRAMES, PATHS_M, over_frames, over_path, relative_pose_nees
+from ekfslam.filters.result import Innovation, Result
+
+RPE_PATH_M = 10.0
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")  # of the error xi, in the IMU frame
+
+Value = float | int | None
+Function = Callable[..., Any]
+_NOISE = "(6), with truth noise"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A registered figure of merit.
+
+    Args:
+        heading: Heading in tables, with unit or expected value.
+        fmt: Format of the value in tables.
+        compute: Function that returns the value, or the values of several metrics.
+        place: Place of the value in what ``compute`` returns; None if it returns the value alone.
+    """
+
+    heading: str
+    fmt: str
+    compute: Function
+    place: int | None = None
+
+
+METRICS: dict[str, Metric] = {}  # by key, in the order of tables
+
+
+def metric(key: str, heading: str, fmt: str) -> Callable[[Function], Function]:
+    """Register a function that returns a figure of merit: its key in summaries, its heading and format in tables."""
+
+    def register(compute: Function) -> Function:
+        METRICS[key] = Metric(heading, fmt, compute)
+        return compute
+
+    return register
+
+
+def metrics(*rows: tuple[str, str, str]) -> Callable[[Function], Function]:
+    """Register a function that returns several figures of merit, or None: key, heading and format of each."""
+
+    def register(compute: Function) -> Function:
+        METRICS.update({key: Metric(heading, fmt, compute, i) for i, (key, heading, fmt) in enumerate(rows)})
+        return compute
+
+    return register
+
+
+def offered(result: Result, truth: Truth | None, interpolated: BoolArray) -> dict[str, Any]:
+    """Return what metrics may take by name, None for what is missing.
+
+    ``result``, its ``landmarks`` and ``innovation`` (None without an update), the ``interpolated`` intervals (T,) of
+    the recording, ``any_truth``; with true poses ``truth``, ``measured`` (the truth of frames that no interpolated
+    interval leads to), and ``T_est`` and ``T_true`` (n, 4, 4) at its frames.
+    """
+    known = truth if truth is not None and len(truth.frame) else None
+    return {
+        "result": result,
+        "landmarks": result.landmarks,
+        "innovation": result.innovation if result.innovation.dof.any() else None,
+        "interpolated": interpolated,
+        "any_truth": truth,
+        "truth": known,
+        "measured": known and measured_truth(known, interpolated, result.time_s),
+        "T_est": known and result.T_world_imu[known.frame],
+        "T_true": known and known.T_world_imu,
+    }
+
+
+def computed(found: dict[str, Any]) -> dict[str, Value]:
+    """Return every registered metric of a run, None for those without a value, of what is `offered`."""
+    values: dict[Function, Any] = {}
+    summary: dict[str, Value] = {}
+    for key, entry in METRICS.items():
+        if entry.compute not in values:
+            taken = {name: found[name] for name in inspect.signature(entry.compute).parameters}
+            is_missing = any(value is None for value in taken.values())
+            values[entry.compute] = None if is_missing else entry.compute(**taken)
+        value = values[entry.compute]
+        summary[key] = value if entry.place is None or value is None else value[entry.place]
+    return summary
+
+
+@metric("ate_m", "ATE [m], unaligned", ".3f")
+def ate(T_est: Array, T_true: Array) -> float:
+    """Return the absolute trajectory error in world."""
+    return trajectory.absolute_trajectory_error(T_est, T_true, align=False)
+
+
+@metric("ate_aligned_m", "ATE [m], SE(3)-aligned", ".3f")
+def ate_aligned(T_est: Array, T_true: Array) -> float:
+    """Return the absolute trajectory error after alignment."""
+    return trajectory.absolute_trajectory_error(T_est, T_true, align=True)
+
+
+metric("final_error_m", "final error [m]", ".3f")(trajectory.final_position_error)
+
+
+@metrics(("rpe_1_frame_m", "RPE [m], 1 frame", ".4f"), ("rpe_1_frame_deg", "RPE [deg], 1 frame", ".4f"))
+def rpe_of_frames(T_est: Array, T_true: Array) -> tuple[float, float] | None:
+    """Return the relative pose errors over one frame."""
+    return trajectory.relative_pose_error_over_frames(T_est, T_true)
+
+
+@metrics(*((f"rpe_10_m_{unit}", f"RPE [{unit}], {RPE_PATH_M:g} m", ".4f") for unit in ("m", "deg")))
+def rpe_of_path(T_est: Array, T_true: Array) -> tuple[float, float] | None:
+    """Return the relative pose errors over 10 m of true path."""
+    return trajectory.relative_pose_error_over_path(T_est, T_true, RPE_PATH_M)
+
+
+metrics(("t_rel_percent", "t_rel [%]", ".3f"), ("r_rel_deg_per_100m", "r_rel [deg/100 m]", ".4f"))(
+    trajectory.kitti_segment_errors
+)
+
+
+@metric("pose_nees_mean", "pose NEES (6)", ".2f")
+def nees(result: Result, measured: Truth) -> float | None:
+    """Return the mean pose NEES over the frames whose covariance is not singular; the truth counts as exact."""
+    return _mean(pose_nees(result, measured)[1])
+
+
+@metric("pose_nees_with_truth_noise_mean", f"pose NEES {_NOISE}", ".2f")
+def nees_with_truth_noise(result: Result, measured: Truth) -> float | None:
+    """Return the mean pose NEES, with the noise that the truth states."""
+    return _mean(pose_nees(result, measured, with_truth_noise=True)[1])
+
+
+@metrics(*((f"pose_nees_{axis}_mean", f"{axis} alone (1), with truth noise", ".2f") for axis in AXES))
+def nees_by_axis(result: Result, measured: Truth) -> list[float | None]:
+    """Return the mean squared error divided by its variance of each axis of ``xi``, truth noise included."""
+    return [_mean(values) for values in pose_nees_by_axis(result, measured).T]
+
+
+@metrics(
+    *((f"pose_nees_relative_{frames}_mean", f"over {frames} frames {_NOISE}", ".2f") for frames in FRAMES),
+    *((f"pose_nees_relative_{path_m:g}_m_mean", f"over {path_m:g} m {_NOISE}", ".2f") for path_m in PATHS_M),
+)
+def relative_nees(result: Result, truth: Truth, interpolated: BoolArray) -> list[float | None]:
+    """Return the mean NEES of the motion over some frames, and over some true path, truth noise included."""
+    pairs, values = relative_pose_nees(result, truth, interpolated)
+    chosen = [over_frames(pairs, frames) for frames in FRAMES]
+    chosen += [over_path(pairs, truth, path_m) for path_m in PATHS_M]
+    return [_mean(values[which]) for which in chosen]
+
+
+@metric("nis_per_dof", "NIS / dof (1)", ".3f")
+def nis_per_dof(innovation: Innovation) -> float:
+    """Return the sum of NIS divided by the sum of degrees of freedom."""
+    return float(innovation.nis.sum() / innovation.dof.sum())
+
+
+@metric("landmark_rmse_m", "landmark RMSE [m]", ".3f")
+def landmark_rmse(result: Result, any_truth: Truth) -> float | None:
+    """Return the root mean square error of the landmarks with known true position, without alignment."""
+    return trajectory.landmark_rmse(result.landmarks, any_truth)
+
+
+@metrics(("accepted", "accepted", "d"), ("rejected", "rejected", "d"))
+def observations(result: Result) -> tuple[int, int]:
+    """Return the numbers of accepted and rejected observations."""
+    return int(result.innovation.accepted.sum()), int(result.innovation.rejected.sum())
+
+
+@metrics(
+    ("ms_per_frame_median", "ms/frame median", ".2f"),
+    ("ms_per_frame_max", "ms/frame max", ".2f"),
+    ("total_s", "total [s]", ".2f"),
+)
+def times(result: Result) -> tuple[float, float, float]:
+    """Return the wall-clock time of frames: median and largest, ms, and the sum, s."""
+    ms = result.ms_per_frame
+    return float(np.median(ms)), float(ms.max()), float(ms.sum()) / 1e3
+
+
+def _mean(values: Array) -> float | None:
+    """Return the mean of the values that are not NaN, if there are any."""
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else None
