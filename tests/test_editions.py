@@ -23,7 +23,7 @@ from support.recordings import (
 )
 
 from ekfslam import open_sequence
-from ekfslam.data.dense import UNSEEN
+from ekfslam.data.observations import UNSEEN
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import (

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from ekfslam.arrays import Array
 from ekfslam.data.inputs import InertialNoise, InertialSamples
 from ekfslam.data.noise import Noise
-from ekfslam.data.sequence import Observations, Sequence, TrueMotion, Truth
+from ekfslam.data.observations import Observations, TrueMotion, Truth
+from ekfslam.data.sequence import Sequence
 from ekfslam.data.spline import PoseSpline, resampled
 from ekfslam.data.worlds import Recording, View, numbers_of, outlier_shifts, track_ids, tracked, visible
 from ekfslam.errors import ConfigError

@@ -26,7 +26,7 @@ from ekfslam.data.inputs import InertialSamples, Input, Velocities, VelocityFram
 from ekfslam.data.interpolation import INTERPOLATED, attributes_of_part, known_intervals
 from ekfslam.data.interval import Interval
 from ekfslam.data.noise import Noise
-from ekfslam.data.truth_noise import TruthNoise
+from ekfslam.data.observations import Observations, Truth, numbers, observations_of, truth_of
 from ekfslam.errors import (
     CalibrationError,
     DataError,
@@ -38,10 +38,10 @@ from ekfslam.errors import (
     TruthError,
 )
 from ekfslam.geometry import se3
-from ekfslam.geometry.camera import StereoCamera
+from ekfslam.geometry.camera import R_CAM_BODY, StereoCamera
 from ekfslam.names import printable
 from ekfslam.shown import Card, Shown, count, figure
-from ekfslam.stored import COUNTS, stored
+from ekfslam.stored import stored
 
 LARGEST_ID = 1 << 62  # pieces of cut tracks count on from the largest
 _LARGEST_DISTANCE_M, _LARGEST_PX = 1e9, 1e7
@@ -58,107 +58,6 @@ LEVEL_VELOCITIES_NOTE = (
     "The velocities are forward, left and up over level ground, whatever the vehicle's roll and pitch: full SLAM "
     "estimates these, dead reckoning takes them as none."
 )
-
-
-@dataclass(frozen=True)
-class Observations:
-    """Stereo observations of point landmarks as flat arrays, sorted by frame and, within a frame, by landmark id.
-
-    Args:
-        frame: (K,) frame index of each observation.
-        landmark: (K,) id of the landmark; any non-negative integers.
-        pixels_px: (K, 4) rectified pixels (uL, vL, uR, vR).
-    """
-
-    frame: IntArray = field(metadata=stored("K", "frame index", check=COUNTS))
-    landmark: IntArray = field(metadata=stored("K", "landmark id", check=COUNTS))
-    pixels_px: Array = field(metadata=stored("K pixels", "px", "image: uL, vL, uR, vR", name="pixels"))
-
-    def __post_init__(self) -> None:
-        frame = np.asarray(self.frame, dtype=np.int64).ravel()
-        landmark = np.asarray(self.landmark, dtype=np.int64).ravel()
-        pixels = np.asarray(self.pixels_px, dtype=float)
-        if not len(frame) == len(landmark) == len(pixels) or pixels.shape != (len(frame), 4):
-            raise ShapeError(
-                f"{len(frame)} frames, {len(landmark)} landmarks and pixels of shape {pixels.shape} do not agree",
-                field="observations",
-            )
-        order = np.lexsort((landmark, frame))
-        for name, value in (("frame", frame), ("landmark", landmark), ("pixels_px", pixels)):
-            object.__setattr__(self, name, frozen(value[order]))
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    @cached_property
-    def ids(self) -> IntArray:
-        """Distinct landmark ids, ascending."""
-        return np.unique(self.landmark)
-
-    def at(self, frame: int) -> tuple[IntArray, Array]:
-        """Landmark ids (n,) and pixels (n, 4) seen in one frame."""
-        start, stop = np.searchsorted(self.frame, (frame, frame + 1))
-        return self.landmark[start:stop], self.pixels_px[start:stop]
-
-
-@dataclass(frozen=True)
-class TrueMotion:
-    """True velocities of the IMU and biases of its samples.
-
-    Args:
-        velocity_m_s: (F, 3) in world.
-        gyro_bias_rad_s: (F, 3).
-        accel_bias_m_s2: (F, 3).
-    """
-
-    velocity_m_s: Array = field(metadata=stored("F xyz", "m/s", "world"))
-    gyro_bias_rad_s: Array = field(metadata=stored("F xyz", "rad/s", "imu"))
-    accel_bias_m_s2: Array = field(metadata=stored("F xyz", "m/s^2", "imu"))
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            object.__setattr__(self, name, frozen(np.asarray(value, dtype=float)))
-
-
-@dataclass(frozen=True)
-class Truth:
-    """Ground truth: poses of some or all frames, and of landmarks where known.
-
-    Args:
-        frame: (F,) ascending frame indices for which the pose is known.
-        T_world_imu: (F, 4, 4) true poses.
-        landmark: (M,) ids of landmarks with known position (may be empty).
-        position_m: (M, 3) their positions in world.
-        noise: How far the poses themselves may be wrong; None: they are exact, or nothing is known of it.
-        motion: Velocities and biases of the same frames; None: unknown.
-    """
-
-    frame: IntArray = field(metadata=stored("F", "frame index", check=COUNTS))
-    T_world_imu: Array = field(metadata=stored("F row column", "m (translation)", "world from imu"))
-    landmark: IntArray = field(
-        default_factory=lambda: np.empty(0, dtype=np.int64),
-        metadata=stored("M", "landmark id", check=COUNTS, name="landmarks/id"),
-    )
-    position_m: Array = field(
-        default_factory=lambda: np.empty((0, 3)),
-        metadata=stored("M xyz", "m", "world", name="landmarks/position"),
-    )
-    noise: TruthNoise | None = None
-    motion: TrueMotion | None = None
-
-    def __post_init__(self) -> None:
-        for name, dtype in (("frame", np.int64), ("landmark", np.int64)):
-            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=dtype)))
-        for name in ("T_world_imu", "position_m"):
-            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
-
-    def stretch(self, begin: int, end: int) -> Truth | None:
-        """Return the truth of frames ``begin`` to ``end - 1``, which count from 0 again; None: no pose is known."""
-        known = (self.frame >= begin) & (self.frame < end)
-        if not known.any():
-            return None
-        motion = None if self.motion is None else TrueMotion(*(value[known] for value in vars(self.motion).values()))
-        return replace(self, frame=self.frame[known] - begin, T_world_imu=self.T_world_imu[known], motion=motion)
 
 
 @dataclass(frozen=True, repr=False, init=False)
@@ -240,18 +139,11 @@ class Sequence(Shown):
         """What ``repr`` and a notebook show."""
         seconds, seen = float(self.time_s[-1] - self.time_s[0]), self.observations
         per_frame = figure(len(seen) / len(self))
-        truth = self.truth
-        known = (
-            "none"
-            if truth is None
-            else count(len(truth.frame), "pose")
-            + (f", {count(len(truth.landmark), 'landmark')}" if len(truth.landmark) else "")
-        )
         facts = {
             "source": self.source,
             "frames": f"{len(self)}, {figure(seconds)} s",
             "tracks": f"{count(len(seen.ids), 'landmark')}, {per_frame} a frame",
-            "truth": known,
+            "truth": "none" if self.truth is None else self.truth.text,
             "noise": "not stated" if self.noise is None else "stated",
         }
         facts |= {"notes": count(len(self.notes), "sentence") + " in .notes"} if self.notes else {}
@@ -269,13 +161,11 @@ class Sequence(Shown):
         begin, end, _ = frames.indices(len(self))
         if begin >= end:
             raise ShapeError(f"there are no frames {begin}:{end}, the sequence has {len(self)}", source=self.source)
-        seen = (self.observations.frame >= begin) & (self.observations.frame < end)
-        parts = (self.observations.landmark[seen], self.observations.pixels_px[seen])
         return replace(
             self,
             time_s=self.time_s[begin:end],
             inputs=tuple(samples.between(self.time_s[begin], self.time_s[end - 1]) for samples in self.inputs),
-            observations=Observations(self.observations.frame[seen] - begin, *parts),
+            observations=self.observations.stretch(begin, end),
             truth=None if self.truth is None else self.truth.stretch(begin, end),
             attributes={
                 **attributes_of_part(self.attributes, self.interpolated[begin:end]),
@@ -299,28 +189,41 @@ class Sequence(Shown):
         noise: Noise | None = None,
         name: str = "tracks",
     ) -> Sequence:
-        """A recording from plain arrays, with nothing in files.
+        """Build a recording from arrays.
 
         Args:
             time_s: (T,) stamps.
-            pixels_px: (T, M, 4) pixels (uL, vL, uR, vR) of M tracks, NaN where a frame does not see one; or (K, 4) with
-                ``frame`` and ``landmark``.
-            camera: Of the rectified pair.
+            pixels_px: (T, M, 4) pixels (uL, vL, uR, vR) of M tracks, NaN if unseen; or (K, 4) with ``frame`` and
+                ``landmark``.
             frame, landmark: (K,) frame index and id of each row of pixels.
-            twist: (T, 6) velocities, see `Sequence`; None if none were measured.
-            imu: Samples of a gyroscope and an accelerometer; None if there are none.
-            T_cam_imu: (4, 4). By default the body is the left camera, with axes forward, left and up. Required with
-                ``twist`` or ``imu``.
-            T_world_imu: (T, 4, 4) true poses, NaN where one is unknown.
-            velocity_frame, noise, name: See `Sequence`.
+            twist: (T, 6) measured velocities, see `Sequence`.
+            imu: Samples of a gyroscope and an accelerometer.
+            T_cam_imu: (4, 4), required with ``twist`` or ``imu``. By default the body is the left camera, with axes
+                forward, left and up.
+            T_world_imu: (T, 4, 4) true poses, NaN if unknown.
+            camera, velocity_frame, noise, name: See `Sequence`.
 
         Raises:
             DataError: An array is malformed, or does not fit the others; the subclass says how.
         """
-        from ekfslam.data.building import from_tracks
-
-        arrays = (time_s, pixels_px, frame, landmark, twist, imu, T_cam_imu, T_world_imu)
-        return from_tracks(*arrays, camera=camera, velocity_frame=velocity_frame, noise=noise, name=name)
+        stamps = numbers(time_s, "time_s")
+        validate_stamps(stamps)
+        observations, notes = observations_of(numbers(pixels_px, "pixels_px"), frame, landmark, len(stamps))
+        return Sequence(
+            name=name,
+            source="arrays",
+            time_s=stamps,
+            inputs=() if imu is None else (imu,),
+            twist=None if twist is None else numbers(twist, "twist"),
+            camera=camera,
+            T_cam_imu=_camera_pose(T_cam_imu, is_optional=twist is None and imu is None),
+            observations=observations,
+            truth=None if T_world_imu is None else truth_of(numbers(T_world_imu, "T_world_imu"), len(stamps)),
+            noise=noise,
+            velocity_frame=velocity_frame,
+            notes=notes,
+            attributes=WITHOUT_VELOCITIES if twist is None else {},
+        )
 
     def between(self, begin_s: float, end_s: float) -> Sequence:
         """The frames whose stamps are in ``[begin_s, end_s)``, on the clock of the recording.
@@ -407,6 +310,16 @@ class Sequence(Shown):
         if self.truth is not None and len(self.truth.frame) and self.truth.frame[0] == 0:
             return se3.nearest_rigid(self.truth.T_world_imu[0])
         return np.eye(4)
+
+
+def _camera_pose(T_cam_imu: ArrayLike | None, is_optional: bool) -> Array:
+    if T_cam_imu is not None:
+        return numbers(T_cam_imu, "T_cam_imu")
+    if not is_optional:
+        raise ExtrinsicsError(
+            "velocities and inertial samples need the pose of the camera in their frame", field="T_cam_imu"
+        )
+    return se3.transform(R_CAM_BODY, np.zeros(3))
 
 
 def validate_camera(camera: StereoCamera) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ekfslam.data.dense import UNSEEN
+from ekfslam.data.observations import UNSEEN
 from ekfslam.data.sequence import Sequence
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import R_CAM_BODY

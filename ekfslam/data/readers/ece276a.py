@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
-from ekfslam.data.dense import flat_observations
 from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
+from ekfslam.data.observations import flat_observations
 from ekfslam.data.readers.fields import (
     LATERAL_NOTES,
     checksum,

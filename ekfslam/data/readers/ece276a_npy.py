@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.data.dense import flat_observations
 from ekfslam.data.images import Image, ImageRecording, PairCalibration
 from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
+from ekfslam.data.observations import flat_observations
 from ekfslam.data.readers.ece276a import AS_STORED_NOTE, camera_of, stamps_of
 from ekfslam.data.readers.fields import checksum, require, require_numbers, spelled_as_in
 from ekfslam.data.readers.pickled import MAGIC, read_pickled

@@ -31,8 +31,9 @@ from ekfslam.arrays import Array
 from ekfslam.data.inputs import InertialNoise, InertialSamples, Input, Velocities
 from ekfslam.data.interpolation import interpolated_intervals
 from ekfslam.data.noise import Noise
+from ekfslam.data.observations import Observations, TrueMotion, Truth
 from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
-from ekfslam.data.sequence import Observations, Sequence, TrueMotion, Truth
+from ekfslam.data.sequence import Sequence
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import ArchiveError, ShapeError, UnknownFormatError
 from ekfslam.geometry.camera import StereoCamera

@@ -1,0 +1,216 @@
+"""Observations of tracks and ground truth, from flat or dense arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.checks import frozen, require_finite, require_shape
+from ekfslam.data.truth_noise import TruthNoise
+from ekfslam.errors import EmptyTracksError, NonFiniteError, ShapeError
+from ekfslam.shown import count
+from ekfslam.stored import COUNTS, stored
+
+UNSEEN = -1.0  # all four pixels of an unseen track in dense formats; or NaN
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Stereo observations of point landmarks as flat arrays, sorted by frame and, within a frame, by landmark id.
+
+    Args:
+        frame: (K,) frame index of each observation.
+        landmark: (K,) id of the landmark; any non-negative integers.
+        pixels_px: (K, 4) rectified pixels (uL, vL, uR, vR).
+    """
+
+    frame: IntArray = field(metadata=stored("K", "frame index", check=COUNTS))
+    landmark: IntArray = field(metadata=stored("K", "landmark id", check=COUNTS))
+    pixels_px: Array = field(metadata=stored("K pixels", "px", "image: uL, vL, uR, vR", name="pixels"))
+
+    def __post_init__(self) -> None:
+        frame = np.asarray(self.frame, dtype=np.int64).ravel()
+        landmark = np.asarray(self.landmark, dtype=np.int64).ravel()
+        pixels = np.asarray(self.pixels_px, dtype=float)
+        if not len(frame) == len(landmark) == len(pixels) or pixels.shape != (len(frame), 4):
+            raise ShapeError(
+                f"{len(frame)} frames, {len(landmark)} landmarks and pixels of shape {pixels.shape} do not agree",
+                field="observations",
+            )
+        order = np.lexsort((landmark, frame))
+        for name, value in (("frame", frame), ("landmark", landmark), ("pixels_px", pixels)):
+            object.__setattr__(self, name, frozen(value[order]))
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @cached_property
+    def ids(self) -> IntArray:
+        """Return the distinct landmark ids, ascending."""
+        return np.unique(self.landmark)
+
+    def at(self, frame: int) -> tuple[IntArray, Array]:
+        """Return landmark ids (n,) and pixels (n, 4) of one frame."""
+        start, stop = np.searchsorted(self.frame, (frame, frame + 1))
+        return self.landmark[start:stop], self.pixels_px[start:stop]
+
+    def stretch(self, begin: int, end: int) -> Observations:
+        """Return the observations of frames ``begin`` to ``end - 1``, which count from 0 again."""
+        seen = slice(*np.searchsorted(self.frame, (begin, end)))
+        return Observations(self.frame[seen] - begin, self.landmark[seen], self.pixels_px[seen])
+
+
+@dataclass(frozen=True)
+class TrueMotion:
+    """True velocities of the IMU and biases of its samples.
+
+    Args:
+        velocity_m_s: (F, 3) in world.
+        gyro_bias_rad_s: (F, 3).
+        accel_bias_m_s2: (F, 3).
+    """
+
+    velocity_m_s: Array = field(metadata=stored("F xyz", "m/s", "world"))
+    gyro_bias_rad_s: Array = field(metadata=stored("F xyz", "rad/s", "imu"))
+    accel_bias_m_s2: Array = field(metadata=stored("F xyz", "m/s^2", "imu"))
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, frozen(np.asarray(value, dtype=float)))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth: poses of some or all frames, and of landmarks where known.
+
+    Args:
+        frame: (F,) ascending frame indices for which the pose is known.
+        T_world_imu: (F, 4, 4) true poses.
+        landmark: (M,) ids of landmarks with known position (may be empty).
+        position_m: (M, 3) their positions in world.
+        noise: Errors of the poses themselves; None if they are exact, or their errors are unknown.
+        motion: Velocities and biases of the same frames; None if unknown.
+    """
+
+    frame: IntArray = field(metadata=stored("F", "frame index", check=COUNTS))
+    T_world_imu: Array = field(metadata=stored("F row column", "m (translation)", "world from imu"))
+    landmark: IntArray = field(
+        default_factory=lambda: np.empty(0, dtype=np.int64),
+        metadata=stored("M", "landmark id", check=COUNTS, name="landmarks/id"),
+    )
+    position_m: Array = field(
+        default_factory=lambda: np.empty((0, 3)),
+        metadata=stored("M xyz", "m", "world", name="landmarks/position"),
+    )
+    noise: TruthNoise | None = None
+    motion: TrueMotion | None = None
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("frame", np.int64), ("landmark", np.int64)):
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=dtype)))
+        for name in ("T_world_imu", "position_m"):
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
+
+    @property
+    def text(self) -> str:
+        """Return the numbers of poses and landmarks in words."""
+        landmarks = f", {count(len(self.landmark), 'landmark')}" if len(self.landmark) else ""
+        return count(len(self.frame), "pose") + landmarks
+
+    def stretch(self, begin: int, end: int) -> Truth | None:
+        """Return the truth of frames ``begin`` to ``end - 1``, which count from 0 again; None: no pose is known."""
+        known = (self.frame >= begin) & (self.frame < end)
+        if not known.any():
+            return None
+        motion = None if self.motion is None else TrueMotion(*(value[known] for value in vars(self.motion).values()))
+        return replace(self, frame=self.frame[known] - begin, T_world_imu=self.T_world_imu[known], motion=motion)
+
+
+def flat_observations(dense: Array, frame_axis: int, field: str) -> tuple[Observations, tuple[str, ...]]:
+    """Return the observations of a dense 4 x T x M (``frame_axis`` 1) or 4 x M x T (2) array of pixels.
+
+    The index of a track is its landmark id. A track is unseen if all four pixels are -1 or NaN. If only the right two
+    are, there is no depth: the observation is left out.
+
+    Returns:
+        The observations, and notes on tracks that no frame sees and on observations without right pixels.
+
+    Raises:
+        ShapeError: Other parts of the four pixels are missing.
+        NonFiniteError: A pixel is infinite, or other parts of the four are NaN.
+        EmptyTracksError: No track is ever seen.
+    """
+    missing = (dense == UNSEEN) | np.isnan(dense)
+    seen = ~missing.any(axis=0)
+    only_left = missing[2:].all(axis=0) & ~missing[:2].any(axis=0)
+    _require_whole(dense, missing, seen | only_left | missing.all(axis=0), field)
+    require_finite(np.where(missing, 0.0, dense), field)
+    never = np.flatnonzero(~(seen | only_left).any(axis=frame_axis - 1))
+    if dense.shape[3 - frame_axis] and not seen.any():
+        raise EmptyTracksError(f"{len(never)} tracks are never seen, which is all of them", field=field, index=0)
+    notes = []
+    if len(never):
+        notes.append(f"{len(never)} of {dense.shape[3 - frame_axis]} tracks are never seen and are left out.")
+    if only_left.any():
+        notes.append(f"{int(only_left.sum())} observations have no right pixels and are left out.")
+    first, second = np.nonzero(seen)
+    frame, landmark = (first, second) if frame_axis == 1 else (second, first)
+    return Observations(frame, landmark, dense[:, first, second].T), tuple(notes)
+
+
+def _require_whole(dense: Array, missing: BoolArray, is_known: BoolArray, field: str) -> None:
+    partly = np.argwhere(~is_known)
+    if not len(partly):
+        return
+    position = tuple(int(i) for i in partly[0])
+    pixels = dense[:, position[0], position[1]]
+    row = int(np.argmax(missing[:, position[0], position[1]]))
+    if np.isnan(pixels[row]):
+        raise NonFiniteError(
+            f"{len(partly)} observations are NaN in some of their pixels", field=field, index=(row, *position)
+        )
+    raise ShapeError(
+        f"{len(partly)} observations have some but not all of their four pixels equal to -1 (unseen)",
+        field=field,
+        index=(row, *position),
+    )
+
+
+def numbers(value: ArrayLike, name: str) -> Array:
+    """Return an array of floating-point numbers; raise `ShapeError` if it is none."""
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ShapeError(f"not an array of numbers ({error})", field=name) from None
+
+
+def observations_of(
+    pixels: Array, frame: ArrayLike | None, landmark: ArrayLike | None, frames: int
+) -> tuple[Observations, tuple[str, ...]]:
+    """Return the observations in arrays, and notes; for arguments and errors see `Sequence.from_tracks`."""
+    if frame is None and landmark is None:
+        require_shape(pixels, (frames, None, 4), "pixels_px")
+        return flat_observations(np.moveaxis(pixels, -1, 0), frame_axis=1, field="pixels_px")
+    if frame is None or landmark is None:
+        raise ShapeError("frame and landmark belong together", field="landmark" if landmark is None else "frame")
+    require_shape(pixels, (None, 4), "pixels_px")
+    indices: list[IntArray] = []
+    for name, value in (("frame", frame), ("landmark", landmark)):
+        whole = numbers(value, name)
+        require_shape(whole, (len(pixels),), name)
+        require_finite(whole, name)
+        if (whole != np.round(whole)).any():
+            raise ShapeError("not whole numbers", field=name, index=int(np.argmax(whole != np.round(whole))))
+        indices.append(np.asarray(value).astype(np.int64))
+    return Observations(indices[0], indices[1], pixels), ()
+
+
+def truth_of(T_world_imu: Array, frames: int) -> Truth | None:
+    """Return the poses (T, 4, 4) without NaN; None if there are none."""
+    require_shape(T_world_imu, (frames, 4, 4), "T_world_imu")
+    known = np.flatnonzero(~np.isnan(T_world_imu).any(axis=(1, 2)))
+    return Truth(known, T_world_imu[known]) if len(known) else None
