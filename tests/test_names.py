@@ -27,7 +27,7 @@ from ekfslam.figures import style
 from ekfslam.figures.run import plot_map
 from ekfslam.names import components, printable
 from ekfslam.storage.archive import read_archive, write_archive
-from ekfslam.studies.tuning import _toml_value, toml_heading
+from ekfslam.studies.tuning import toml_heading, toml_value
 
 QUICK = ["--modes", "dead-reckoning", "--no-figures"]
 NASTY = ["../../x", "/etc/x", "..", ".", "", "a/b\\c", "x\0y", "new\nline", "\x1b[31m", "$x_$", "{0.__class__}", "%n%s"]
@@ -137,14 +137,14 @@ def test_modes_of_an_archive_become_no_paths(tmp_path, undrawn):
 
 @pytest.mark.parametrize("name", [*NASTY, 'a"\n[noise]\nsigma_px = 9', "\x7f", "\udcff"])
 def test_no_name_becomes_toml(name):
-    text = f"{toml_heading(name)}\n[tuning]\nsequence = {_toml_value(name)}\n".encode("utf-8", "replace").decode()
+    text = f"{toml_heading(name)}\n[tuning]\nsequence = {toml_value(name)}\n".encode("utf-8", "replace").decode()
     assert set(tomllib.loads(text)) == {"tuning"}
     assert Config().with_overrides(tomllib.loads(text)).noise == Config().noise
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf, 1e-300, 3.0, 1e22])
 def test_numbers_of_toml_come_back(value):
-    assert tomllib.loads(f"a = {_toml_value(value)}")["a"] == value
+    assert tomllib.loads(f"a = {toml_value(value)}")["a"] == value
 
 
 @pytest.mark.parametrize("name", ["$x_$", "$\\frac{$", "a$b$c", "\\$"])

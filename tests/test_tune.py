@@ -32,8 +32,13 @@ from ekfslam.runner import run
 from ekfslam.storage.archive import open_result
 from ekfslam.studies import tuning
 from ekfslam.studies.tuning import (
+    LOG_WRONG,
     OUTLIER_SHARE,
+    Likelihood,
+    Peak,
+    estimates_of,
     log_likelihoods,
+    parts_of,
     sandwich,
     stretches,
     tune,
@@ -194,23 +199,22 @@ def test_what_is_rejected_counts_in_the_likelihood_of_a_round():
     world = builtin("city?frames=12&outlier_fraction=0.2")
     config = settings_of(world, Config())
     base = noise_of(world, config)
-    parts, gated, ungated = tuning.parts_of(world, config, base, 10_000)
-    problem = tuning._Problem(parts, base, ["sigma_px"], gated, ungated)
+    parts, gated, ungated = parts_of(world, config, base, 10_000)
+    likelihood = Likelihood(parts, base, ["sigma_px"], gated, ungated)
     x = np.log([1.0])
-    loose = tuning._loose(tuning._with(base, ["sigma_px"], x))
-    rejected = sum(tuning.without_rejected(part, loose, gated)[1] for part in parts)
+    noise = likelihood.noise(x)
+    loose = dataclasses.replace(noise, twist_std=3.0 * noise.twist_std, motion_std=3.0 * noise.motion_std)
+    rejected = sum(without_rejected(part, loose, gated)[1] for part in parts)
     assert rejected > 20
-    assert problem.judged(x)(x)[-1] == pytest.approx(rejected * tuning._LOG_WRONG)
+    assert likelihood.judged(x)(x)[-1] == pytest.approx(rejected * LOG_WRONG)
 
 
 def test_where_the_likelihood_has_no_maximum_the_differences_count():
     found = VelocityNoise(np.array([0.2, 0.0]), np.array([0.01, 0.0]), np.zeros(2), np.zeros(2))
     free = ["sigma_v_m_s", "sigma_w_rad_s", "sigma_px"]
     start = {"sigma_v_m_s": 0.2, "sigma_w_rad_s": 0.02, "sigma_px": 1.0}
-    flat = tuning._Peak(
-        np.log([0.3, 0.03, 2.0]), np.array([0, 2]), np.eye(2), np.zeros((2, 50)), 0.0, 9, converged=False
-    )
-    linear, angular, pixels = tuning._estimates(start, free, flat, found)
+    flat = Peak(np.log([0.3, 0.03, 2.0]), np.array([0, 2]), np.eye(2), np.zeros((2, 50)), 0.0, 9, converged=False)
+    linear, angular, pixels = estimates_of(start, free, flat, found)
     assert (linear.value, linear.error, linear.likely) == (0.2, 0.01, pytest.approx(0.3))
     assert (angular.value, angular.error) == (pytest.approx(0.03), None) and "at the bound" in angular.remark
     assert (pixels.value, pixels.error) == (pytest.approx(2.0), None) and "no maximum" in pixels.remark
@@ -328,7 +332,7 @@ def test_how_errors_of_tracks_walk_is_recovered(drift_px, size):
 def test_the_noise_added_to_a_recording_is_recovered(data_path, monkeypatch):
     """The reduced form filters 45 of 1106 frames; its likelihood alone has a relative error of 0.06."""
     if not WHOLE:
-        monkeypatch.setattr(tuning, "_STRETCH", 15)
+        monkeypatch.setattr(tuning, "STRETCH_FRAMES", 15)
     tuned = tune(open_sequence(data_path("ece276a/0027_dense_noisy.npz")), observations=15_000 if WHOLE else 1)
     for estimate, true in zip(tuned.estimates[:2], [0.5, 0.05], strict=True):
         assert abs(estimate.value / true - 1) < 0.15
@@ -339,7 +343,7 @@ def test_the_noise_added_to_a_recording_is_recovered(data_path, monkeypatch):
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["ece276a/0027.npz", "ece276a/0042.npz"])
 def test_clean_recordings_have_little_noise(data_path, name, monkeypatch):
-    monkeypatch.setattr(tuning, "_STRETCH", 10)  # what is looked at are the velocities, all of them
+    monkeypatch.setattr(tuning, "STRETCH_FRAMES", 10)  # what is looked at are the velocities, all of them
     tuned = tune(open_sequence(data_path(name)), observations=1)
     v, w, px = tuned.estimates
     assert v.value < 0.05 and w.value < 0.005

@@ -1,35 +1,26 @@
-"""`tune`: the noise under which a recording's innovations are most likely, found without truth.
+"""Tune the noise of a recording: find the noise under which its innovations are most likely, without truth.
 
-A filter that assumes the right noise predicts every observation with the right covariance. The log-likelihood of the
-parameters is the sum over frames of ``log N(r; 0, S)``, innovation r and its covariance S: the prediction error
+The log-likelihood is the sum over frames of ``log N(r; 0, S)``, innovation r and its covariance S: the prediction error
 decomposition (Schweppe, "Evaluation of likelihood functions for Gaussian signals", IEEE Trans. Information Theory 11,
-1965).
-
-What a filter accepts depends on the parameters, so every observation must count whether it is accepted or not:
+1965). What a filter accepts depends on the parameters, so rejected observations count, too:
 
     log L = sum over accepted     log N(r; 0, S) + log(1 - e)
           + sum over rejected     log(e / w^3)
 
 with a share e of wrong matches that fall anywhere within a window of w px in each of the three rows. Without the second
-sum the maximum would be at no noise at all, with everything rejected. An observation that starts a landmark counts as 0
-(its prior is flat), one that is rejected and splits its track is rejected first. Observations screened by their pixels
-alone are so under all parameters, and are left out. So are tracks that travel with the rig: they are told once, under
-the noise assumed without tuning.
+sum the maximum would be at no noise, with everything rejected. An observation that starts a landmark counts as 0, since
+its prior is flat. Observations screened by their pixels alone, and tracks that travel with the rig, are left out.
 
-The maximum over the logarithms of the parameters is found in rounds. Each decides anew, at the parameters so far, which
-observations are wrong matches (judged by each other: velocities count for little there, or the noisiest frames would
-be thrown away whole), and with these left out and no gate makes one Newton step: what is accepted is then the same for
-all runs of a round, and the likelihood as smooth as the filter is. A step after which log L, with all that is rejected
-by then, is less than before is halved. (With the gate inside of the likelihood, half a
-frame is turned down at once where a velocity is off by three deviations, and the maximum is where that happens least.)
+The maximum over the logarithms of the parameters is found in rounds. Each round decides at the present parameters which
+observations are wrong matches, with loose velocities, so that matches are judged by each other. Without these and
+without a gate it makes one Newton step: all runs of a round then accept the same observations, and the likelihood is
+smooth. A step that lowers log L, rejected observations included, is halved.
 
-What it can say on real tracks is limited. Errors of tracks agree among tracks for many frames, which no model here
-knows. So it wants far less pixel noise than serves the estimate, and what then does not fit is
-laid at the door of the velocities. Standard errors are therefore those of the `sandwich`: where the model holds, they
-are the inverse Hessian's, elsewhere the scatter of the frames' gradients makes them larger. Weighted by these,
-likelihood and the differences of the velocities (`ekfslam.models.noise`) are put together. Both know the velocities, so
-that the error of the two together is a little too small where they are in the state (`Noise.twist_walk_std`) and their
-own innovations count, too.
+Errors of real tracks agree among tracks for many frames, which no model here knows. So the likelihood wants less pixel
+noise than serves the estimate, and attributes the rest to the velocities. Standard errors are therefore those of the
+`sandwich`. Likelihood and the differences of the velocities (`ekfslam.models.noise`) are combined, weighted by their
+standard errors. Both know the velocities, so the error of the two together is a little too small where velocities are
+in the state (`Noise.twist_walk_std`).
 """
 
 from __future__ import annotations
@@ -61,15 +52,14 @@ from ekfslam.names import printable
 from ekfslam.progress import progress
 from ekfslam.resolve import found_attributes, noise_of, settings_of
 
-# Of wrong matches: how many there are, and how far off they may be.
+# Share of wrong matches, and the window in which they fall.
 OUTLIER_SHARE = 0.02
 OUTLIER_WINDOW_PX = 100.0
-
-_LOG_WRONG = float(np.log(OUTLIER_SHARE) - 3 * np.log(OUTLIER_WINDOW_PX))
+LOG_WRONG = float(np.log(OUTLIER_SHARE) - 3 * np.log(OUTLIER_WINDOW_PX))
 _LOG_RIGHT = float(np.log1p(-OUTLIER_SHARE))
-_WRONG = (GATE, BEHIND_CAMERA, MOVING)  # rejected for what the filter believes, not for what the pixels are
+_WRONG = (GATE, BEHIND_CAMERA, MOVING)  # rejected because of the filter's belief, not because of the pixels alone
 
-# What is looked for: its unit, and the range it is looked for in.
+# Parameters with unit and search range.
 PARAMETERS = {
     "sigma_v_m_s": ("m/s", (1e-3, 10.0)),
     "sigma_w_rad_s": ("rad/s", (1e-5, 1.0)),
@@ -77,27 +67,31 @@ PARAMETERS = {
     "drift": ("px", (0.01, 3.0)),
 }
 
-_STRETCH = 50  # frames, of which there are as many as keep below the limit of observations
+STRETCH_FRAMES = 50
 _LEAST_STRETCHES = 3
 _MOST_ROUNDS = 12
 _DIFFERENCE = 0.05  # of the logarithms, for derivatives
 _LONGEST_STEP = 0.7
-_SHORTEST_STEP = 0.05  # is the last: Newton's method leaves about its square
-_LOOSE = 3.0  # factor on the noise of the velocities where wrong matches are told
+_SHORTEST_STEP = 0.05  # the last step: Newton's method leaves about its square
+_LOOSE = 3.0  # factor on the noise of the velocities while wrong matches are found
 _BLOCK = 10  # frames whose gradients may be correlated
 _NEVER = 1e9  # deviations beyond which a track moves
+
+_NO_PART = "the likelihood does not depend on it where tracks err; not refined"
+_UNSEEN = "the differences see none; not refined"
+_BELOW_FLOOR = "below the errors of the motion that are assumed anyway; not refined"
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter.
+    """Estimate of one parameter.
 
     Args:
-        name: As in `NoiseConfig`.
-        value: The estimate, in the unit of `PARAMETERS`: likelihood and differences together, weighted by their errors.
-        error: Its standard error; None where there is none.
-        likely, likely_error: What the likelihood says alone; None where it was not asked, or has no maximum.
-        remark: Why not, or what else is to be said.
+        name: Name in `NoiseConfig`.
+        value: Likelihood and differences together, weighted by their errors, in the unit of `PARAMETERS`.
+        error: Standard error of the value, or None.
+        likely, likely_error: Estimate of the likelihood alone; None without a search or a maximum.
+        remark: Reason for a missing estimate, or another remark.
     """
 
     name: str
@@ -110,16 +104,16 @@ class Estimate:
 
 @dataclass(frozen=True)
 class TunedNoise:
-    """What `tune` found.
+    """Result of `tune`.
 
     Args:
         sequence: Name of the recording.
-        model: That the estimates belong to, as in `NoiseConfig`: ``tuned`` or ``white``.
-        estimates: The parameters, those that the likelihood did not look for included.
-        found: What the differences of the velocities say.
-        log_likelihood: At its maximum, without what the differences say.
-        frames, runs: How many frames were filtered, and how many times.
-        converged: False where the limit of runs came first.
+        model: Model of the noise as in `NoiseConfig`: ``tuned`` or ``white``.
+        estimates: All parameters, with those that the likelihood did not search.
+        found: Noise of the velocities by their differences.
+        log_likelihood: Maximum of the likelihood alone.
+        frames, runs: Number of frames in a run, and number of runs.
+        converged: Whether the maximum was found within the limit of runs.
     """
 
     sequence: str
@@ -133,24 +127,17 @@ class TunedNoise:
 
     @property
     def config(self) -> Config:
-        """Settings to run with: the noise found, and the record of it."""
+        """Settings with the tuned noise and the record of its origin."""
         values = {estimate.name: estimate.value for estimate in self.estimates}
         errors = {f"{estimate.name}_error": estimate.error for estimate in self.estimates}
-        record = {
-            "sequence": self.sequence,
-            "frames": self.frames,
-            "runs": self.runs,
-            "log_likelihood": self.log_likelihood,
-            **values,
-            **errors,
-            **found_attributes(self.found),
-            "remarks": "; ".join(self.remarks) or None,
-        }
+        facts = {name: getattr(self, name) for name in ("sequence", "frames", "runs", "log_likelihood")}
+        remarks = {"remarks": "; ".join(self.remarks) or None}
+        record = {**facts, **values, **errors, **found_attributes(self.found), **remarks}
         return Config().with_overrides({"noise": {"model": self.model, **values}, "tuning": record})
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What is to be said of the maximum, one sentence each."""
+        """Remarks on the maximum, one sentence each."""
         remarks = [f"{estimate.name}: {estimate.remark}" for estimate in self.estimates if estimate.remark]
         if not self.converged:
             remarks.append(f"stopped after {self.runs} runs before the maximum was found")
@@ -158,16 +145,16 @@ class TunedNoise:
 
     @property
     def toml(self) -> str:
-        """`config` as a TOML file: what of it is not a default."""
+        """`config` as a TOML file, without defaults."""
         lines = [toml_heading(self.sequence)]
         for table, values in (("noise", vars(self.config.noise)), ("tuning", self.config.tuning)):
             lines += ["", f"[{table}]"]
-            lines += [f"{key} = {_toml_value(value)}" for key, value in values.items() if value is not None]
+            lines += [f"{key} = {toml_value(value)}" for key, value in values.items() if value is not None]
         return "\n".join(lines) + "\n"
 
     @property
     def table(self) -> str:
-        """Estimates, their errors and units, by differences, by likelihood and together, as a Markdown table."""
+        """Estimates by differences, by likelihood and together, with errors and units, as a Markdown table."""
         differences = dict(zip(PARAMETERS, self.found.texts, strict=False))
         rows = []
         for estimate in self.estimates:
@@ -180,39 +167,35 @@ class TunedNoise:
         return document(markdown_table(headings, rows, left=len(headings)), "\n".join([fit, *self.remarks])).rstrip()
 
 
-def _toml_value(value: float | str) -> str:
+def toml_value(value: float | str) -> str:
+    """Return a number or a text in TOML."""
     if isinstance(value, float):
         return repr(value)  # TOML spells inf and nan as Python does
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def toml_heading(sequence: str) -> str:
-    """The first line of `TunedNoise.toml` for a recording of some name."""
+    """Return the first line of `TunedNoise.toml` for the name of a recording."""
     return f"# Noise of {printable(sequence)} as `ekfslam tune` found it; give this file to --config."
-
-
-_NO_PART = "the likelihood does not depend on it where tracks err; not refined"
-_UNSEEN = "the differences see none; not refined"
-_BELOW_FLOOR = "below the errors of the motion that are assumed anyway; not refined"
 
 
 @solvable()
 def tune(
     sequence: Sequence, config: Config | None = None, *, drift: bool = False, observations: int = 15_000
 ) -> TunedNoise:
-    """The noise under which the innovations of the joint filter are most likely.
+    """Find the noise under which the innovations of the joint filter are most likely.
 
-    Looked for are the pixel noise, the white noise of the velocities where the differences find more of it than is
-    there anyway, and on request the drift of tracks. All else of the noise is what `noise_of` says, the sigmas that the
-    recording states excepted. They start from the differences of the velocities,
-    and from twice the pixel noise assumed elsewhere: who starts with too little has good matches thrown away.
+    The parameters are the pixel noise, the white noise of the velocities if the differences find more of it than is
+    assumed anyway, and on request the drift of tracks. `noise_of` decides all else, without the stated sigmas. The
+    search starts from the differences of the velocities and from twice the usual pixel noise: with too little at the
+    start, good matches would be rejected.
 
     Args:
-        sequence: The recording; its truth is not looked at.
-        config: Settings of the filter, and the model of the noise; sigmas in it are ignored.
-        drift: Look for the drift of the tracks, too.
-        observations: A longer recording is cut into stretches of 50 frames, evenly spread over it, with about this
-            many observations together. Each is filtered on its own, from dead reckoning's pose, which is certain.
+        sequence: The recording; its truth is not used.
+        config: Settings of the filter and the model of the noise; sigmas in it are ignored.
+        drift: Whether to search the drift of the tracks, too.
+        observations: About how many observations are used. A longer recording is cut into stretches of 50 frames,
+            evenly spread over it, each filtered from the pose of dead reckoning, which is taken as certain.
 
     Raises:
         EmptyTracksError: The recording has no observations.
@@ -224,30 +207,24 @@ def tune(
     model: NoiseModel = "white" if config.noise.model == "white" else "tuned"
     base = noise_of(sequence, dataclasses.replace(config, noise=NoiseConfig(model=model, drift=config.noise.drift)))
     found = velocity_noise(sequence.twist)
-    start, free = _looked_for(base, found, drift)
+    start, free = _start(base, found, drift)
     parts, gated, ungated = parts_of(sequence, config, base, observations)
-    frames = sum(len(part) for part in parts)
     with one_thread():
-        if not free:
-            here = sum(float(log_likelihoods(part, base, gated).sum()) for part in parts)
-            given = tuple(_as_it_is(name, start[name], found) for name in start)
-            return TunedNoise(sequence.name, model, given, found, here, frames, len(parts), converged=True)
-        problem = _Problem(parts, base, free, gated, ungated)
-        peak = _climbed(problem, start, f"{sequence.name}: tuning")
+        peak = Likelihood(parts, base, free, gated, ungated).climb(start, f"{sequence.name}: tuning")
     return TunedNoise(
         sequence=sequence.name,
         model=model,
-        estimates=_estimates(start, free, peak, found),
+        estimates=estimates_of(start, free, peak, found),
         found=found,
         log_likelihood=peak.log_likelihood,
-        frames=frames,
+        frames=sum(len(part) for part in parts),
         runs=peak.runs,
         converged=peak.converged,
     )
 
 
-def _looked_for(base: Noise, found: VelocityNoise, drift: bool) -> tuple[dict[str, float], list[str]]:
-    """Where parameters start, and which of them the likelihood is asked for."""
+def _start(base: Noise, found: VelocityNoise, drift: bool) -> tuple[dict[str, float], list[str]]:
+    """Return the parameters at the start, and the names of those that the likelihood searches."""
     floor = base.motion_std[[0, 3]] if base.track_error is None else NOISY_FROM[[0, 3]]
     start = {
         "sigma_v_m_s": found.sigma[0] or base.twist_std[0],
@@ -263,39 +240,21 @@ def _looked_for(base: Noise, found: VelocityNoise, drift: bool) -> tuple[dict[st
     return start, free
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """What is filtered, under which noise, with which parameters free, with the gate and without it."""
-
-    parts: list[Sequence]
-    base: Noise
-    free: list[str]
-    gated: Config
-    ungated: Config
-
-    @property
-    def bounds(self) -> Array:
-        """(n, 2) of the logarithms of the free parameters."""
-        return np.log([PARAMETERS[name][1] for name in self.free])
-
-    def judged(self, x: Array) -> Callable[[Array], Array]:
-        """The terms of log L with what is rejected at x left out: of every frame, and last of all that is rejected."""
-        noise = _loose(_with(self.base, self.free, x))
-        kept, rejected = zip(*(without_rejected(part, noise, self.gated) for part in self.parts), strict=True)
-
-        def terms(x: Array) -> Array:
-            noise = _with(self.base, self.free, x)
-            by_frame = [log_likelihoods(part, noise, self.ungated) for part in kept]
-            return np.concatenate([*by_frame, [sum(rejected) * _LOG_WRONG]])
-
-        return terms
+# --- The maximum -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Peak:
-    """The maximum of the likelihood: logarithms x (n,), and which of them lie ``inside`` of their bounds (m,).
+class Peak:
+    """The maximum of a likelihood.
 
-    Of these are the Hessian H (m, m) and the gradients (m, T) of the frames.
+    Args:
+        x: (n,) logarithms of the free parameters.
+        inside: (m,) indices of the parameters inside of their search range.
+        H: (m, m) Hessian of these.
+        gradients: (m, T) gradients of the frames.
+        log_likelihood: Value at the maximum.
+        runs: Number of runs.
+        converged: Whether the last step was short.
     """
 
     x: Array
@@ -307,37 +266,122 @@ class _Peak:
     converged: bool
 
 
-def _climbed(problem: _Problem, start: dict[str, float], label: str) -> _Peak:
-    """The maximum, found in rounds as the module's docstring says."""
-    bounds = problem.bounds
-    x = np.clip(np.log([start[name] for name in problem.free]), *bounds.T)
-    best, step, here, converged, runs = x, np.zeros(len(x)), -np.inf, False, 0
-    for _ in progress(range(_MOST_ROUNDS), label, unit="round"):
-        terms = problem.judged(x)
-        now = terms(x)
-        runs += 2
-        if now.sum() <= here:
-            step = step / 2  # more was thrown away than the rest has won
-        else:
-            here, best, at_best = float(now.sum()), x, terms
-            gradients, curvature, beside = _derivatives(terms, x, here)
-            gradient = gradients.sum(axis=1)
-            runs += 2 * len(x)
-            step = np.clip(gradient / np.maximum(np.abs(curvature), 1e-9), -_LONGEST_STEP, _LONGEST_STEP)
-            step = np.clip(x + step, *bounds.T) - x
-        x = best + step
-        if np.abs(step).max() < _SHORTEST_STEP:
-            converged = True
-            break
-    H = _hessian(at_best, best, here, curvature, beside)
-    runs += len(x) * (len(x) - 1) // 2
-    x = x if converged else best
-    inside = np.flatnonzero((x > bounds[:, 0]) & (x < bounds[:, 1]))
-    return _Peak(x, inside, H[np.ix_(inside, inside)], gradients[inside, :-1], here, runs, converged)
+@dataclass(frozen=True)
+class Likelihood:
+    """Likelihood of the innovations as a function of the logarithms of some parameters.
+
+    Args:
+        parts: Stretches of the recording.
+        base: Noise whose parameters are replaced.
+        free: Names of the parameters.
+        gated, ungated: Settings of the filter that reject wrong matches, and that reject nothing.
+    """
+
+    parts: list[Sequence]
+    base: Noise
+    free: list[str]
+    gated: Config
+    ungated: Config
+
+    def noise(self, x: Array) -> Noise:
+        """Return the noise at logarithms (n,) of the parameters."""
+        value = dict(zip(self.free, np.exp(x).tolist(), strict=True))
+        twist = np.array(self.base.twist_std, dtype=float)
+        twist[:3] = value.get("sigma_v_m_s", twist[0])
+        twist[3:] = value.get("sigma_w_rad_s", twist[3])
+        pixels = np.full(4, value["sigma_px"]) if "sigma_px" in value else self.base.pixel_std_px
+        noise = dataclasses.replace(self.base, twist_std=twist, pixel_std_px=pixels)
+        return with_drift(noise, value["drift"]) if "drift" in value else noise
+
+    def judged(self, x: Array) -> Callable[[Array], Array]:
+        """Return a function for the terms of log L without the observations that are rejected at x.
+
+        The terms are one per frame, and last the sum over the rejected observations.
+        """
+        noise = self.noise(x)
+        # With velocities that say little, a wrong match is one that other matches contradict.
+        noise = dataclasses.replace(noise, twist_std=_LOOSE * noise.twist_std, motion_std=_LOOSE * noise.motion_std)
+        kept, rejected = zip(*(without_rejected(part, noise, self.gated) for part in self.parts), strict=True)
+
+        def terms(x: Array) -> Array:
+            noise = self.noise(x)
+            by_frame = [log_likelihoods(part, noise, self.ungated) for part in kept]
+            return np.concatenate([*by_frame, [sum(rejected) * LOG_WRONG]])
+
+        return terms
+
+    def climb(self, start: dict[str, float], label: str) -> Peak:
+        """Find the maximum in rounds, as the docstring of the module says.
+
+        Args:
+            start: Parameters at the start, by name.
+            label: Name in the progress bar.
+        """
+        if not self.free:
+            here = sum(float(log_likelihoods(part, self.base, self.gated).sum()) for part in self.parts)
+            none = np.zeros(0)
+            return Peak(none, none.astype(np.int64), none[:, None], none[:, None], here, len(self.parts), True)
+        bounds = np.log([PARAMETERS[name][1] for name in self.free])
+        x = np.clip(np.log([start[name] for name in self.free]), *bounds.T)
+        best, step, here, converged, runs = x, np.zeros(len(x)), -np.inf, False, 0
+        for _ in progress(range(_MOST_ROUNDS), label, unit="round"):
+            terms = self.judged(x)
+            now = terms(x)
+            runs += 2
+            if now.sum() <= here:
+                step = step / 2  # the newly rejected observations cost more than the rest has won
+            else:
+                here, best, at_best = float(now.sum()), x, terms
+                gradients, curvature, ahead = _derivatives(terms, x, here)
+                runs += 2 * len(x)
+                step = gradients.sum(axis=1) / np.maximum(np.abs(curvature), 1e-9)
+                step = np.clip(x + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP), *bounds.T) - x
+            x = best + step
+            if np.abs(step).max() < _SHORTEST_STEP:
+                converged = True
+                break
+        H = _hessian(at_best, best, here, curvature, ahead)
+        runs += len(x) * (len(x) - 1) // 2
+        x = x if converged else best
+        inside = np.flatnonzero((x > bounds[:, 0]) & (x < bounds[:, 1]))
+        return Peak(x, inside, H[np.ix_(inside, inside)], gradients[inside, :-1], here, runs, converged)
 
 
-def _estimates(start: dict[str, float], free: list[str], peak: _Peak, found: VelocityNoise) -> tuple[Estimate, ...]:
-    """All parameters with their standard errors: likelihood and differences, each alone and together."""
+def _derivatives(function: Callable[[Array], Array], x: Array, here: float) -> tuple[Array, Array, Array]:
+    """Differentiate a sum of m terms, given by a function of x (n,), by central differences.
+
+    Returns:
+        First differences (n, m) of the terms; second ones (n,) of the sum; the sum (n,) one step ahead.
+    """
+    steps = _DIFFERENCE * np.eye(len(x))
+    ahead, behind = (np.array([function(x + sign * step) for step in steps]) for sign in (1.0, -1.0))
+    sums = ahead.sum(axis=1), behind.sum(axis=1)
+    return (ahead - behind) / (2 * _DIFFERENCE), (sums[0] + sums[1] - 2 * here) / _DIFFERENCE**2, sums[0]
+
+
+def _hessian(function: Callable[[Array], Array], x: Array, here: float, diagonal: Array, ahead: Array) -> Array:
+    """Complete the second differences (n, n) of a sum of terms from the results of `_derivatives`."""
+    H = np.diag(diagonal)
+    steps = _DIFFERENCE * np.eye(len(x))
+    for i in range(len(x)):
+        for j in range(i):
+            both = float(function(x + steps[i] + steps[j]).sum())
+            H[i, j] = H[j, i] = (both + here - ahead[i] - ahead[j]) / _DIFFERENCE**2
+    return H
+
+
+# --- Estimates and their errors --------------------------------------------------------------------------------------
+
+
+def estimates_of(start: dict[str, float], free: list[str], peak: Peak, found: VelocityNoise) -> tuple[Estimate, ...]:
+    """Return all parameters with their standard errors: likelihood and differences, each alone and together.
+
+    Args:
+        start: Parameters at the start, by name.
+        free: Names of the parameters that the likelihood has searched.
+        peak: Its maximum.
+        found: Noise of the velocities by their differences.
+    """
     likely: dict[str, tuple[float, float]] = {}
     together, errors = np.exp(peak.x), np.full(len(free), np.nan)
     if len(peak.inside) and np.linalg.eigvalsh(peak.H)[-1] < 0:
@@ -354,7 +398,9 @@ def _estimates(start: dict[str, float], free: list[str], peak: _Peak, found: Vel
     for name in start:
         sigma, sigma_error = differences.get(name, (0.0, 0.0))
         if name not in free:
-            estimates.append(_as_it_is(name, start[name], found))
+            value = sigma if name in differences else start[name]
+            remark = _NO_PART if name == "sigma_px" else _BELOW_FLOOR if sigma else _UNSEEN
+            estimates.append(Estimate(name, value, sigma_error or None, remark=remark))
             continue
         i = free.index(name)
         if name in likely:
@@ -371,21 +417,51 @@ def _estimates(start: dict[str, float], free: list[str], peak: _Peak, found: Vel
     return tuple(estimates)
 
 
-def _as_it_is(name: str, start: float, found: VelocityNoise) -> Estimate:
-    """A parameter that the likelihood is not asked for."""
-    if name == "sigma_px":
-        return Estimate(name, start, None, remark=_NO_PART)
-    i = list(PARAMETERS).index(name)
-    sigma, error = float(found.sigma[i]), float(found.sigma_error[i])
-    return Estimate(name, sigma, error or None, remark=_BELOW_FLOOR if sigma else _UNSEEN)
+def sandwich(H: Array, scores: Array) -> Array:
+    """Return the covariance (n, n) of a maximum-likelihood estimate under a model that need not be right.
+
+    With A = -H and J the covariance of the gradient it is ``A^-1 J A^-1`` (Huber 1967; White, "Maximum likelihood
+    estimation of misspecified models", Econometrica 50, 1982), scaled up where its diagonal is less than that of
+    ``A^-1``. J is the scatter of the gradients of blocks of 10 frames. It misses longer correlations and all errors
+    that are the same everywhere.
+
+    Args:
+        H: (n, n) Hessian, negative definite.
+        scores: (n, T) gradient of the log-likelihood of each frame.
+    """
+    inverse = np.linalg.inv(-H)
+    centred = scores - scores.mean(axis=1, keepdims=True)
+    blocks = np.add.reduceat(centred, np.arange(0, centred.shape[1], _BLOCK), axis=1)
+    count = blocks.shape[1]
+    C = inverse @ (blocks @ blocks.T * (count / max(count - 1, 1))) @ inverse
+    scale = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(C), np.finfo(float).tiny)))
+    return np.where(np.diag(C).min() > 0, C * np.outer(scale, scale), inverse)
+
+
+def with_differences(x: Array, C: Array, names: list[str], found: VelocityNoise) -> tuple[Array, Array]:
+    """Combine logarithms (n,) of parameters and their covariance (n, n) with the differences of the velocities.
+
+    Both are taken as independent, though the likelihood has seen the velocities, too.
+    """
+    at, value, variance = [], [], []
+    for name, sigma, error in zip(PARAMETERS, found.sigma, found.sigma_error, strict=False):
+        if name in names and sigma > 0 and np.isfinite(error):
+            at.append(names.index(name))
+            value.append(np.log(sigma))
+            variance.append((error / sigma) ** 2)
+    gain = C[:, at] @ np.linalg.inv(C[np.ix_(at, at)] + np.diag(variance))
+    return x + gain @ (np.array(value) - x[at]), C - gain @ C[at]
+
+
+# --- The likelihood of one noise -------------------------------------------------------------------------------------
 
 
 def log_likelihoods(sequence: Sequence, noise: Noise, config: Config) -> Array:
-    """Log-likelihood of a noise, frame by frame (T,): of the joint filter's innovations, see the module's docstring.
+    """Return the log-likelihood of a noise frame by frame (T,), see the docstring of the module.
 
     Args:
-        sequence: Filtered from its first frame to its last.
-        noise: What the filter assumes; that of the sequence and of the configuration is not looked at.
+        sequence: Recording, filtered from its first frame to its last.
+        noise: Noise that the filter assumes; sequence and configuration do not matter for it.
         config: Resolved settings of the filter.
 
     Raises:
@@ -395,17 +471,14 @@ def log_likelihoods(sequence: Sequence, noise: Noise, config: Config) -> Array:
 
 
 def penalised(reports: list[FrameReport]) -> Array:
-    """Log-likelihoods (T,) of frames, all that was rejected included, see the module's docstring."""
+    """Return the log-likelihoods (T,) of frames with their rejected observations."""
     rejected = np.array([np.isin(report.reason, _WRONG).sum() + len(report.split) for report in reports])
     accepted = np.array([report.log_likelihood + report.dof // 3 * _LOG_RIGHT for report in reports])
-    return accepted + rejected * _LOG_WRONG
+    return accepted + rejected * LOG_WRONG
 
 
 def filter_reports(sequence: Sequence, noise: Noise, config: Config) -> list[FrameReport]:
-    """What a filter that assumes a noise, and has the state blocks of a configuration, did with every frame.
-
-    What comes back starts afresh.
-    """
+    """Return the reports of a filter that assumes a noise and has the state blocks of a configuration."""
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
     start, blocks = sequence.initial_T_world_imu, optional_blocks(config.blocks)
     ekf = JointEKF(rig, config.filter, start, calibration=config.calibration, blocks=blocks)
@@ -415,9 +488,9 @@ def filter_reports(sequence: Sequence, noise: Noise, config: Config) -> list[Fra
 def without_rejected(
     sequence: Sequence, noise: Noise, config: Config, reasons: tuple[int, ...] = _WRONG
 ) -> tuple[Sequence, int]:
-    """A sequence without the observations that a filter rejects for some of its reasons, and how many these are.
+    """Remove the observations that a filter rejects for some of its reasons, and count them.
 
-    A track that is split goes on under an id of its own, and counts as one more.
+    A split track continues under a new id and counts as one more.
 
     Raises:
         InnovationError: The filter breaks down.
@@ -435,136 +508,44 @@ def without_rejected(
     return dataclasses.replace(sequence, observations=kept), rejected
 
 
-def sandwich(H: Array, scores: Array) -> Array:
-    """Covariance (n, n) of an estimate at the maximum of the likelihood, also where the model is not quite right.
-
-    With A = -H and J the covariance of the gradient it is ``A^-1 J A^-1`` (Huber 1967; White, "Maximum likelihood
-    estimation of misspecified models", Econometrica 50, 1982), scaled up where its diagonal is less than that of
-    ``A^-1``. J comes from the scatter of the gradients of blocks of 10 frames. What is correlated for longer, it
-    misses, and all that is wrong everywhere alike.
-
-    Args:
-        H: (n, n) Hessian, negative definite.
-        scores: (n, T) gradient of the log-likelihood of each frame.
-    """
-    inverse = np.linalg.inv(-H)
-    centred = scores - scores.mean(axis=1, keepdims=True)
-    blocks = np.add.reduceat(centred, np.arange(0, centred.shape[1], _BLOCK), axis=1)
-    count = blocks.shape[1]
-    C = inverse @ (blocks @ blocks.T * (count / max(count - 1, 1))) @ inverse
-    scale = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(C), np.finfo(float).tiny)))
-    return np.where(np.diag(C).min() > 0, C * np.outer(scale, scale), inverse)
-
-
-def with_differences(x: Array, C: Array, names: list[str], found: VelocityNoise) -> tuple[Array, Array]:
-    """Logarithms (n,) of parameters and their covariance (n, n), together with what the differences say of them.
-
-    Both are taken as independent, though the likelihood has seen the velocities, too.
-    """
-    at, value, variance = [], [], []
-    for name, sigma, error in zip(PARAMETERS, found.sigma, found.sigma_error, strict=False):
-        if name in names and sigma > 0 and np.isfinite(error):
-            at.append(names.index(name))
-            value.append(np.log(sigma))
-            variance.append((error / sigma) ** 2)
-    gain = C[:, at] @ np.linalg.inv(C[np.ix_(at, at)] + np.diag(variance))
-    return x + gain @ (np.array(value) - x[at]), C - gain @ C[at]
-
-
-def _settings(config: Config) -> tuple[Config, Config, Config]:
-    """The filter's settings to tell moving tracks by, wrong matches, and those where nothing is rejected."""
-    # A landmark that comes back would cost a smoothing each time; it starts afresh. The first pose is certain.
-    gated = dataclasses.replace(
-        config.filter,
-        revive=-1,
-        initial_position_std_m=0.0,
-        initial_rotation_std_rad=0.0,
-        moving_sigma=_NEVER,
-    )
-    moving = dataclasses.replace(gated, moving_sigma=config.filter.moving_sigma, split_after=0)
-    ungated = dataclasses.replace(gated, gate_probability=1.0, split_after=0)
-    first, second, third = (dataclasses.replace(config, filter=settings) for settings in (moving, gated, ungated))
-    return first, second, third
-
-
 def parts_of(
     sequence: Sequence, config: Config, base: Noise, observations: int
 ) -> tuple[list[Sequence], Config, Config]:
-    """Stretches of a recording, its moving tracks left out; settings that tell wrong matches, and that reject nothing.
+    """Return stretches without moving tracks, and settings that reject wrong matches and that reject nothing.
 
     Args:
-        sequence, config, observations: As for `stretches`.
-        base: The noise by which tracks are found to move.
+        sequence, config, observations: Arguments of `stretches`.
+        base: Noise under which moving tracks are found.
     """
-    moving, gated, ungated = _settings(config)
-    parts = [without_rejected(part, base, moving, (MOVING,))[0] for part in stretches(sequence, config, observations)]
-    return parts, gated, ungated
+    # A revival would cost a smoothing each time, so landmarks that return start as new ones. The first pose is certain.
+    gated = {"revive": -1, "initial_position_std_m": 0.0, "initial_rotation_std_rad": 0.0, "moving_sigma": _NEVER}
+    moving = {**gated, "moving_sigma": config.filter.moving_sigma, "split_after": 0}
+    ungated = {**gated, "gate_probability": 1.0, "split_after": 0}
+    first, second, third = (config.with_overrides({"filter": settings}) for settings in (moving, gated, ungated))
+    parts = [without_rejected(part, base, first, (MOVING,))[0] for part in stretches(sequence, config, observations)]
+    return parts, second, third
 
 
 def stretches(sequence: Sequence, config: Config, observations: int) -> list[Sequence]:
-    """A recording as it is filtered by `tune`: whole if it is small, else stretches spread evenly over it.
+    """Cut a recording into stretches that are spread evenly over it; a small one stays whole.
 
-    Tracks are cleaned as in every run. Poses are those of dead reckoning, and the first of a stretch
-    is its truth by definition: nothing else of the truth is left.
+    Tracks are cleaned as in every run. Poses are those of dead reckoning, and the first pose of a stretch is its only
+    truth.
 
     Args:
         sequence: The recording.
         config: Resolved settings.
-        observations: About as many observations are in the stretches together.
+        observations: About how many observations the stretches have together.
     """
     noise = noise_of(sequence, config)
     tracks, _ = clean_tracks(sequence, noise, config.hygiene)
     T_imu_world, _ = dead_reckon(sequence, noise, config.filter.initial_covariance)
     T_world_imu = se3.inverse(T_imu_world)
     frames = len(sequence)
-    count = max(int(observations * frames / len(tracks)) // _STRETCH, _LEAST_STRETCHES)
+    count = max(int(observations * frames / len(tracks)) // STRETCH_FRAMES, _LEAST_STRETCHES)
     begins, length = np.zeros(1, dtype=np.int64), frames
-    if count * _STRETCH < frames:
-        begins, length = np.linspace(0, frames - _STRETCH, count).astype(np.int64), _STRETCH
+    if count * STRETCH_FRAMES < frames:
+        begins, length = np.linspace(0, frames - STRETCH_FRAMES, count).astype(np.int64), STRETCH_FRAMES
     cleaned = dataclasses.replace(sequence, observations=tracks)
     parts = (cut(cleaned, begin, begin + length, T_world_imu[begin]) for begin in begins.tolist())
     return [part for part in parts if part is not None]
-
-
-def _with(base: Noise, names: list[str], x: Array) -> Noise:
-    """The noise with some parameters replaced, given by their logarithms (n,)."""
-    value = dict(zip(names, np.exp(x).tolist(), strict=True))
-    twist = np.array(base.twist_std, dtype=float)
-    twist[:3] = value.get("sigma_v_m_s", twist[0])
-    twist[3:] = value.get("sigma_w_rad_s", twist[3])
-    pixels = np.full(4, value["sigma_px"]) if "sigma_px" in value else base.pixel_std_px
-    noise = dataclasses.replace(base, twist_std=twist, pixel_std_px=pixels)
-    return with_drift(noise, value["drift"]) if "drift" in value else noise
-
-
-def _loose(noise: Noise) -> Noise:
-    """The noise with velocities that are worth little: wrong is a match that other matches disagree with."""
-    return dataclasses.replace(noise, twist_std=_LOOSE * noise.twist_std, motion_std=_LOOSE * noise.motion_std)
-
-
-def _derivatives(function: Callable[[Array], Array], x: Array, here: float) -> tuple[Array, Array, Array]:
-    """Central differences of a sum of m terms, a function of x (n,) to (m,).
-
-    Args:
-        function: The terms.
-        x: Where.
-        here: The sum at x.
-
-    Returns:
-        First differences (n, m) of the terms; second ones (n,) of the sum; the sum (n,) one step ahead.
-    """
-    steps = _DIFFERENCE * np.eye(len(x))
-    ahead, behind = (np.array([function(x + sign * step) for step in steps]) for sign in (1.0, -1.0))
-    sums = ahead.sum(axis=1), behind.sum(axis=1)
-    return (ahead - behind) / (2 * _DIFFERENCE), (sums[0] + sums[1] - 2 * here) / _DIFFERENCE**2, sums[0]
-
-
-def _hessian(function: Callable[[Array], Array], x: Array, here: float, diagonal: Array, ahead: Array) -> Array:
-    """Second differences (n, n) of a sum of terms, given what `_derivatives` found."""
-    H = np.diag(diagonal)
-    steps = _DIFFERENCE * np.eye(len(x))
-    for i in range(len(x)):
-        for j in range(i):
-            both = float(function(x + steps[i] + steps[j]).sum())
-            H[i, j] = H[j, i] = (both + here - ahead[i] - ahead[j]) / _DIFFERENCE**2
-    return H

@@ -21,7 +21,7 @@ EXAMPLES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="DATA", help=f"default: {DEFAULT_DATA}")
     parser.add_argument(
-        "--out", type=Path, metavar="FILE.toml", help="write what was found, for --config of run and compare"
+        "--out", type=Path, metavar="FILE.toml", help="write the result, for --config of run and compare"
     )
     add_force(parser)
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of the filter; sigmas are ignored")
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=[model for model in get_args(NoiseModel) if model != "tuned"],
         help="auto: sigmas of the automatic model; white: of white noise alone (default: as configured)",
     )
-    parser.add_argument("--drift", action="store_true", help="look for the drift of the tracks, too")
+    parser.add_argument("--drift", action="store_true", help="search the drift of the tracks, too")
     add_data_options(parser)
 
 
