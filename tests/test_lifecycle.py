@@ -10,6 +10,7 @@ import pytest
 from ekfslam import Config, FilterConfig, HygieneConfig, run
 from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
 from ekfslam.data.simulate import CAMERA, T_CAM_IMU
+from ekfslam.filters.lifecycle import PATIENCE
 from ekfslam.geometry import se3
 
 RAW = HygieneConfig(
@@ -146,3 +147,15 @@ def test_those_seen_nearest_in_time_come_back_with_a_landmark(revive, variant):
     # What is out of the state keeps its last estimate, to the last bit; what came back has learned from what followed.
     changed = set(after.id[(after.covariance != before.covariance).any(axis=(1, 2))].tolist())
     assert changed - set(COMPANY) == set(RETURNING) | set(by_distance[:revive])
+
+
+@pytest.mark.parametrize("gap", [1, 4])
+def test_a_neighbour_that_came_back_waits_twice_its_distance_in_time_to_be_seen(gap):
+    first, back, after = 6, 12, 2
+    leaves = back + 2 * gap + PATIENCE + after
+    # Landmark 3 brings landmark 8 back, which was last seen so many frames before it and is not seen again.
+    world = scene(leaves + 1, {8: [first - gap], 3: [first, first + 1, back]})
+    early = filtered(until(world, leaves), retire_after=after, revive=1)
+    late = filtered(world, retire_after=after, revive=1)
+    assert early.counts["retired"] == 3, "landmark 8, and landmark 3 twice"
+    assert late.counts["retired"] == 4, "now landmark 8 as well"

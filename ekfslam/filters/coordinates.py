@@ -91,7 +91,7 @@ class CameraCoordinates:
         calibration, T_cam_imu = self.model.calibration, self._T_cam_imu(values)
         by_columns = np.asarray(se3.adjoint(T_cam_imu), dtype=float)
         if calibration is not None:
-            by_calibration = calibration.camera_by_extrinsic(values["calibration"])
+            by_calibration = calibration.camera_by_extrinsic(values[calibration.name])
             by_columns = np.concatenate([by_columns, by_calibration], axis=1)
         q = q_linear = se3.apply(T_cam_imu @ values[self.pose], positions_m)
         if T_linear is not values[self.pose]:
@@ -139,11 +139,11 @@ class CameraCoordinates:
         columns = layout.columns([self.pose])
         if calibration is None:
             return columns
-        return np.concatenate([columns, layout["calibration"].start + calibration.extrinsic])
+        return np.concatenate([columns, layout[calibration.name].start + calibration.extrinsic])
 
     def _T_cam_imu(self, values: Values) -> Array:
         """(4, 4) extrinsics as calibrated."""
-        return self.model.sensor_at(values.get("calibration", _GIVEN)).T_cam_imu
+        return self.model.sensor_at(self.model.parameters(values)).T_cam_imu
 
     def _is_in_image(self, q: Array) -> BoolArray:
         """Whether points (n, 3) are in front of the camera and near enough."""
@@ -153,6 +153,3 @@ class CameraCoordinates:
             furthest_m = sensor.camera.fu_px * sensor.camera.baseline_m / _LEAST_DISPARITY_PX
         is_ahead = np.abs(q[:, :2]).max(axis=1, initial=0.0) < _MOST_OBLIQUE * z
         return is_ahead & (z > self.min_depth_m) & (z < furthest_m)
-
-
-_GIVEN = np.zeros(9)

@@ -154,8 +154,8 @@ class Invariant(Standard):
         calibration = model.calibration
         if calibration is None or not len(calibration.turns_camera):
             return Change(slot, columns, by)
-        by_camera = calibration.landmarks_by_rotation(model.rig, before["calibration"], before["pose"], moved_m)
-        columns = np.concatenate([columns, model.layout["calibration"].start + calibration.turns_camera])
+        by_camera = calibration.landmarks_by_rotation(model.rig, before[calibration.name], before["pose"], moved_m)
+        columns = np.concatenate([columns, model.layout[calibration.name].start + calibration.turns_camera])
         return Change(slot, columns, np.concatenate([by, by_camera], axis=-1))
 
     def transport(

@@ -21,6 +21,7 @@ from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.observing import moment
 from ekfslam.geometry import se3
+from ekfslam.models.blocks import Anchor
 from ekfslam.models.model import Moment
 from ekfslam.models.sensors.base import DelayedSensor
 
@@ -64,7 +65,7 @@ class Waiting:
         """Those of the new tracks (n,) with rows (n, d) whose landmarks can be initialised now."""
         which = np.flatnonzero(np.isin(ids, self._ids))
         then = self._rows[np.searchsorted(self._ids, ids[which])] if len(which) else np.empty((0, rows.shape[1]))
-        T_cam_imu, T_anchor = e.sensor.T_cam_imu, e.values["anchor"]
+        T_cam_imu, T_anchor = e.sensor.T_cam_imu, e.values[Anchor.name]
         T_now_anchor = T_cam_imu @ e.T_imu_world @ se3.inverse(T_cam_imu @ T_anchor)
         q, is_ready = self._sensor.triangulate(then, rows[which], T_now_anchor)
         position = se3.apply(se3.inverse(T_cam_imu @ e.T_imu_world), q)
@@ -99,12 +100,12 @@ class Waiting:
 
     def _views(self, e: Estimate, position: Array, then: Array, now: Array) -> tuple[Array, Array, Array]:
         """Whitened rows over blocks (k, 2d, seen) and landmark (k, 2d, 3), and right sides (k, 2d), of both views."""
-        T_anchor, present = e.values["anchor"], moment(e, e.mean)
+        T_anchor, present = e.values[Anchor.name], moment(e, e.mean)
         T_linear = e.variant.linear(present.T_imu_world, e.motion.T_predicted)
         anchor = Moment(T_anchor, e.variant.linear(T_anchor, self._T_linear), present.calibration, present.twist)
         present = present.linearised_at(T_linear)
         views = (
-            (e.model.see(anchor, position, position, "anchor"), then),
+            (e.model.see(anchor, position, position, Anchor.name), then),
             (e.model.see(present, position, position), now),
         )
         H_x, H_m, r = [], [], []
@@ -124,7 +125,7 @@ class Waiting:
         # Everybody starts to wait anew, from here: the anchor takes the pose's place.
         layout = e.model.layout
         Phi = np.eye(layout.body)
-        Phi[layout["anchor"], layout["anchor"]], Phi[layout["anchor"], layout["pose"]] = 0.0, np.eye(6)
+        Phi[layout[Anchor.name], layout[Anchor.name]], Phi[layout[Anchor.name], layout["pose"]] = 0.0, np.eye(6)
         e.gaussian.propagate(Phi, np.zeros_like(Phi))
-        e.values = {**e.values, "anchor": e.T_imu_world}
+        e.values = {**e.values, Anchor.name: e.T_imu_world}
         self._ids, self._rows, self._step, self._T_linear = ids, rows, e.step, e.motion.T_predicted

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.interval import Interval
 from ekfslam.data.noise import Noise, TrackError
 from ekfslam.geometry import motion, se3
-from ekfslam.models.blocks import Calibration, Layout, PreviousPose, StateBlock, Values
+from ekfslam.models.blocks import Calibration, Layout, StateBlock, Values
 from ekfslam.models.observation import linearise
 from ekfslam.models.process import MakeProcess, Measured, Process, Step, VelocityInputs, velocities
 from ekfslam.models.sensors.base import Sensor
@@ -121,18 +122,14 @@ class Model:
         """The process model."""
         return self.make_process(self.layout, self.noise)
 
-    def block(self, name: str) -> StateBlock | None:
-        """A block by name; None where it is not in the state."""
-        return next((block for block in self.blocks if block.name == name), None)
-
     @cached_property
     def calibration(self) -> Calibration | None:
-        """The calibration, where it is in the state."""
-        return next((block for block in self.blocks if isinstance(block, Calibration)), None)
+        """The block of the sensor's parameters, if it is in the state."""
+        return cast(Calibration | None, next(iter(self.layout.coupled("sensor")), None))
 
     def parameters(self, values: Values) -> Array:
         """Return the calibration parameters (9,), which are 0 if they are not in the state."""
-        return values["calibration"] if self.calibration is not None else GIVEN
+        return GIVEN if self.calibration is None else values[self.calibration.name]
 
     @property
     def has_time_offset(self) -> bool:
@@ -147,7 +144,7 @@ class Model:
     @cached_property
     def has_clone(self) -> bool:
         """Whether the pose of the frame before is in the state."""
-        return any(isinstance(block, PreviousPose) for block in self.blocks)
+        return "pose" in self.layout.clones
 
     @cached_property
     def clones(self) -> tuple[tuple[str, str], ...]:
@@ -167,8 +164,7 @@ class Model:
 
     @cached_property
     def _moves_camera(self) -> tuple[StateBlock, ...]:
-        now = np.zeros(())
-        return tuple(block for block in self.shared if block.camera_share(now, now.astype(bool)) is not None)
+        return tuple(block for block in self.layout.coupled("camera") if block in self.shared)
 
     @cached_property
     def has_drift(self) -> bool:
@@ -274,9 +270,12 @@ class Model:
     def widened(self, values: Values, step: Step) -> Transition:
         """Return a step of some blocks as a transition of all blocks."""
         Phi, Q = np.eye(self.layout.body), np.zeros((self.layout.body, self.layout.body))
-        columns = self.layout.columns(step.values)
-        Phi[columns] = step.Phi
-        Q[np.ix_(columns, columns)] = step.Q
+        if len(step.values) == 1:  # a view, and no index
+            at = self.layout[next(iter(step.values))]
+            Phi[at], Q[at, at] = step.Phi, step.Q
+        else:
+            columns = self.layout.columns(step.values)
+            Phi[columns], Q[np.ix_(columns, columns)] = step.Phi, step.Q
         return Transition({**values, **step.values}, Phi, Q, step.imu_twist)
 
     # --- to be replaced by the process in the smoother ----------------------------------------------------------------
@@ -336,7 +335,7 @@ class Model:
         H_x = np.zeros((*H_pose.shape[:2], layout.seen))
         H_x[..., layout[pose]] = H_pose if offset is None else H_pose @ se3.adjoint(moved)
         if self.calibration is not None:
-            H_x[..., layout["calibration"]] = H_c
+            H_x[..., layout[self.calibration.name]] = H_c
         if offset is not None:
             H_offset = H_pose @ se3.left_jacobian(offset)
             for block, share in zip(self._moves_camera, shares, strict=True):
@@ -346,7 +345,7 @@ class Model:
 
     def _columns_in(self, block: StateBlock, pose: str) -> slice | None:
         """Return the columns of a shared block in a view from a pose; None: the view does not depend on the block."""
-        if pose != "previous_pose":
+        if pose != self.layout.clones.get("pose"):
             return self.layout[block.name]
         clone = self.layout.clones.get(block.name)
         return None if clone is None else self.layout[clone]

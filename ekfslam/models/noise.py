@@ -25,13 +25,11 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import VelocityFrame
+from ekfslam.models.blocks import OPTIONAL_BLOCKS
 
 # Velocities of an automotive GNSS/INS unit: the data sheets of OXTS's RT3000 family state 0.05 to 0.1 km/h (0.014 to
 # 0.028 m/s) and 0.01 deg/s. White errors of a sample are at least of that order, too.
 VELOCITY_STD = np.repeat([0.02, np.deg2rad(0.02)], 3)
-VELOCITY_BIAS_M_S, RATE_BIAS_RAD_S = 0.02, np.deg2rad(0.01)
-# A noisy sensor's bias is taken as a tenth of its noise: consumer units state no better.
-BIAS_SHARE = 0.1
 # What an interpolated sample is worth: a car changes its speed by 1 m/s and turns by 2 deg/s in a second or so.
 GAP_STD = np.array([1.0, 0.1, 0.1, *np.deg2rad([2.0, 2.0, 2.0])])
 
@@ -157,33 +155,18 @@ def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu", checked
 
 
 def shared_errors(twist: Array | None, checked: bool = False) -> dict[str, dict[str, float]]:
-    """Tables ``[blocks.<name>]`` of the errors that all samples or all tracks of a recording share.
+    """Return tables ``[blocks.<name>]`` of the errors that all samples or all tracks of a recording share.
 
-    - ``twist_bias``: of the unit's class where velocities are clean, a tenth of their noise where it is seen.
-    - ``camera_jitter``: the defaults of this block.
-    - ``vision_drift``: a tracker's own drift is about 1 % of the way and a few mdeg/m. Where velocities are clean a
-      larger, effective value leaves the low frequencies to them, as the long-term accuracy of such a unit deserves.
-      Tracks that are checked do not drift.
+    Each block says its own, see `StateBlock.automatic`.
 
     Args:
         twist: (T, 6) measured velocities; None: there are none.
         checked: As in `automatic_noise`.
     """
-    shared: dict[str, dict[str, float]] = {}
-    drift = {"translation_percent": 1.0, "rotation_deg_m": 0.004}
-    if twist is not None:
-        found = velocity_noise(twist)
-        bias = np.array([VELOCITY_BIAS_M_S, RATE_BIAS_RAD_S])
-        if found.is_clean:
-            drift = {"translation_percent": 4.0, "rotation_deg_m": 0.06}
-        else:
-            bias = np.maximum(BIAS_SHARE * found.sigma, bias)
-        shared["twist_bias"] = {"sigma_v_m_s": float(bias[0]), "sigma_w_rad_s": float(bias[1])}
-        shared["twist_bias"] |= {"time_v_s": 4.0, "time_w_s": 20.0} if found.is_clean else {"time_w_s": 200.0}
-    shared["camera_jitter"] = {}
-    if not checked:
-        shared["vision_drift"] = drift
-    return shared
+    found = None if twist is None else velocity_noise(twist)
+    white_std, is_clean = (None, False) if found is None else (found.sigma, found.is_clean)
+    tables = {name: block.automatic(white_std, is_clean, checked) for name, block in OPTIONAL_BLOCKS.items()}
+    return {name: table for name, table in tables.items() if table is not None}
 
 
 def with_drift(noise: Noise, drift_px: float) -> Noise:

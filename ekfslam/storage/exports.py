@@ -1,6 +1,8 @@
-"""What other programs read: trajectories, tables, point clouds, graphs and the information matrix.
+"""Files for other programs: trajectories, tables, point clouds, graphs and the information matrix.
 
-All poses are of the IMU in world. `EXPORTS` has every format of a result by name.
+All poses are of the IMU in world. `EXPORTS` has every format by name. A file that adds one needs nothing else::
+
+    EXPORTS["mine"] = Export("mine.txt", "last position: x y z", lambda result: str(result.T_world_imu[-1, :3, 3]))
 """
 
 from __future__ import annotations
@@ -8,9 +10,9 @@ from __future__ import annotations
 import csv
 import io
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -65,12 +67,7 @@ def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "
     Raises:
         ArchiveError: The file cannot be written.
     """
-    files.write(path, trajectory_text(result, format))
-
-
-def trajectory_text(result: Result, format: Literal["tum", "kitti"]) -> str:
-    """What `export_trajectory` writes."""
-    return _pose_text(result.time_s, result.T_world_imu, format)
+    export(result, path, format)
 
 
 def export_truth(archive: str | Path, path: str | Path, format: Literal["tum", "kitti"]) -> int:
@@ -89,7 +86,13 @@ def export_truth(archive: str | Path, path: str | Path, format: Literal["tum", "
 
 
 def truth_text(archive: Archive, place: str, format: Literal["tum", "kitti"]) -> tuple[int, str]:
-    """What `export_truth` writes of an archive read from a place, and the number of lines; raises as that does."""
+    """Return the number of lines and the text that `export_truth` writes for an archive; it raises the same errors.
+
+    Args:
+        archive: The archive.
+        place: Its path, for messages.
+        format: As for `export_truth`.
+    """
     truth, frames = archive.truth, len(archive.time_s)
     if truth is None or not len(truth.frame):
         raise ArchiveError(f"{place}: holds no true pose")
@@ -107,7 +110,7 @@ def _pose_text(time_s: Array, T: Array, format: Literal["tum", "kitti"]) -> str:
 
 
 def csv_text(result: Result, table: str = "trajectory") -> str:
-    """A table of `ekfslam.storage.tables` as comma-separated values with a heading; numbers come back bit for bit.
+    """Return a table of `ekfslam.storage.tables` as comma-separated values with a heading, every number exactly.
 
     Raises:
         ArchiveError: There is no such table.
@@ -120,7 +123,7 @@ def csv_text(result: Result, table: str = "trajectory") -> str:
 
 
 def ply_bytes(result: Result) -> bytes:
-    """The landmarks as a point cloud (PLY, binary, little endian), a vertex each.
+    """Return the landmarks as a point cloud (PLY, binary, little endian), a vertex each.
 
     Its properties are ``x y z`` (double, m), ``red green blue``, ``id``, ``observations``, and the covariance
     ``cov_xx`` to ``cov_zz`` (double, m^2). Colours run from blue (1 cm and less) to red (10 m and more) with the
@@ -145,14 +148,14 @@ def ply_bytes(result: Result) -> bytes:
 
 
 def _colours(covariance: Array) -> NDArray:
-    """Colours (n, 3) of covariances (n, 3, 3): blue at 1 cm, red at 10 m."""
+    """Return colours (n, 3) of covariances (n, 3, 3): blue at 1 cm, red at 10 m."""
     std = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 1e-12))
     share = np.clip((np.log10(std) + 2.0) / 3.0, 0.0, 1.0)[:, None]
     return np.round((1.0 - share) * np.array([0, 114, 178]) + share * np.array([213, 94, 0])).astype(np.uint8)
 
 
 def g2o_text(result: Result) -> str:
-    """The measurements of a full run as a graph for g2o: poses of the IMU and landmarks, as estimated, and edges.
+    """Return the measurements of a full run as a graph for g2o: estimated poses of the IMU and landmarks, and edges.
 
     - ``EDGE_SE3:QUAT``: the motion of a step, eq. (1), by the velocities that moved the filter. Its information is
       that of eq. (2) for white velocity noise; the error is g2o's own, translation and vector part of the quaternion.
@@ -194,7 +197,7 @@ def _graph(result: Result, log: Log) -> Iterator[str]:
 
 
 def _triangulated(result: Result, log: Log) -> tuple[Array, Array]:
-    """Points (K, 3) of the observations in the frame of the IMU, m, and their information (K, 3, 3)."""
+    """Return points (K, 3) of the observations in the frame of the IMU, m, and their information (K, 3, 3)."""
     rig = Rig(result.camera, result.T_cam_imu, result.noise)
     q = rig.invert(log.rows)
     first = np.zeros(log.landmarks, dtype=np.int64)
@@ -205,7 +208,7 @@ def _triangulated(result: Result, log: Log) -> tuple[Array, Array]:
 
 
 def _position_and_quaternion(T: Array) -> Array:
-    """``x y z qx qy qz qw`` (..., 7) of transforms (..., 4, 4)."""
+    """Return ``x y z qx qy qz qw`` (..., 7) of transforms (..., 4, 4)."""
     return np.concatenate([T[..., :3, 3], Rotation.from_matrix(T[..., :3, :3]).as_quat()], axis=-1)
 
 
@@ -214,10 +217,10 @@ def _numbers(values: Array) -> str:
 
 
 def information_bytes(result: Result, found: Posterior | None = None) -> bytes:
-    """The joint information matrix of a full run, for `scipy.sparse.load_npz`.
+    """Return the joint information matrix of a full run as a file for `scipy.sparse.load_npz`.
 
-    Beside what scipy reads, the file has the arrays ``kind``, ``frame``, ``id`` and ``axis`` that say of each column
-    what it is, see `Posterior.information_matrix`, and ``made_by``. No pickle is in it.
+    The file also has the arrays ``kind``, ``frame``, ``id`` and ``axis``, which say what each column is, see
+    `Posterior.information_matrix`, and ``made_by``. It contains no pickle.
 
     Args:
         result: A result of mode ``full``.
@@ -239,47 +242,53 @@ class Export(NamedTuple):
     """A format.
 
     Args:
-        ending: Of its files.
-        words: What it holds.
-        write: The content of the file of a result.
-        begins: How such a file begins, where that tells it from others.
+        ending: Ending of its files.
+        words: Contents of a file.
+        write: Function that returns the contents for a result.
+        begins: First bytes of a file, if they tell it from other formats.
+        columns: Number of columns of a table of numbers, which tells its files from other formats.
     """
 
     ending: str
     words: str
     write: Callable[[Result], str | bytes]
     begins: bytes = b""
+    columns: int = 0
 
 
 def is_export(path: Path, format: str) -> bool:
-    """Whether a file is an earlier export in a format of `EXPORTS`."""
-    if format in ("tum", "kitti"):
-        return len(first_line(path).split()) == (8 if format == "tum" else 12)
+    """Return whether a file is an earlier export in a format of `EXPORTS`."""
+    export = EXPORTS[format]
+    if export.columns:
+        return len(first_line(path).split()) == export.columns
     try:
         with path.open("rb") as file:
-            begin = file.read(1 << 12)
+            is_similar = file.read(len(export.begins)) == export.begins
         if format == "information":
             with zipfile.ZipFile(path) as archive:
                 return "made_by.npy" in archive.namelist()
     except (OSError, zipfile.BadZipFile):
         return False
-    return begin.startswith(EXPORTS[format].begins)
+    return is_similar
+
+
+def _poses(format: Literal["tum", "kitti"], words: str, columns: int) -> Export:
+    write = partial(_pose_text, format=format)
+    return Export(f"{format}.txt", words, lambda result: write(result.time_s, result.T_world_imu), columns=columns)
 
 
 def _csv(table: str, begins: bytes) -> Export:
-    return Export(f"{table}.csv", f"table {table}", lambda result: csv_text(result, table), begins)
+    return Export(f"{table}.csv", f"table {table}", partial(csv_text, table=table), begins)
 
 
-EXPORTS: Mapping[str, Export] = MappingProxyType(
-    {
-        "tum": Export("tum.txt", "poses: time tx ty tz qx qy qz qw", lambda result: trajectory_text(result, "tum")),
-        "kitti": Export("kitti.txt", "poses: twelve entries", lambda result: trajectory_text(result, "kitti")),
-        "csv": _csv("trajectory", b"time_s,x_m,"),
-        "csv-landmarks": _csv("landmarks", b"id,x_m,"),
-        "csv-innovation": _csv("innovation", b"time_s,nis,"),
-        "csv-rejections": _csv("rejections", b"frame,time_s,"),
-        "ply": Export("ply", "landmarks with covariances", ply_bytes, _PLY.encode()),
-        "g2o": Export("g2o", "poses, landmarks and measurements as a graph", g2o_text, _G2O.encode()),
-        "information": Export("information.npz", "joint information matrix, sparse", information_bytes),
-    }
-)
+EXPORTS: dict[str, Export] = {
+    "tum": _poses("tum", "poses: time tx ty tz qx qy qz qw", 8),
+    "kitti": _poses("kitti", "poses: twelve entries", 12),
+    "csv": _csv("trajectory", b"time_s,x_m,"),
+    "csv-landmarks": _csv("landmarks", b"id,x_m,"),
+    "csv-innovation": _csv("innovation", b"time_s,nis,"),
+    "csv-rejections": _csv("rejections", b"frame,time_s,"),
+    "ply": Export("ply", "landmarks with covariances", ply_bytes, _PLY.encode()),
+    "g2o": Export("g2o", "poses, landmarks and measurements as a graph", g2o_text, _G2O.encode()),
+    "information": Export("information.npz", "joint information matrix, sparse", information_bytes),
+}

@@ -21,12 +21,12 @@ EXAMPLES = (
     "export city.h5 --format csv-landmarks",
     "export city.h5 --format information",
 )
-_FORMATS = "; ".join(f"{name}: {export.words}" for name, export in EXPORTS.items())
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("archive", type=Path, metavar="ARCHIVE")
-    parser.add_argument("--format", choices=tuple(EXPORTS), required=True, help=_FORMATS)
+    formats = "; ".join(f"{name}: {export.words}" for name, export in EXPORTS.items())
+    parser.add_argument("--format", choices=tuple(EXPORTS), required=True, help=formats)
     parser.add_argument(
         "--mode", help=f"any in the archive (default: full, or else its first), or {TRUTH} for the true poses"
     )

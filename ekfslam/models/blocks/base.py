@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import ClassVar, TypeVar
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
@@ -13,12 +13,23 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 Values = Mapping[str, Array]
 
 
+# What depends on a block: the measured velocities (it is added to them), the frame that they are in (it turns them),
+# the camera's pose in the IMU frame, the sensor itself, or nothing of these.
+Coupling = Literal["none", "velocity", "level", "camera", "sensor"]
+_COUPLED_BY: dict[str, Coupling] = {
+    "velocity_offset": "velocity",
+    "turn_velocities": "level",
+    "camera_share": "camera",
+}
+
+
 class StateBlock:
     """A part of the state: by default a constant vector with an additive error, of which nothing else depends.
 
     Subclasses are frozen dataclasses that override what is different.
 
     Attributes:
+        coupling: What depends on it; set by the method that a subclass overrides.
         name: Key of its value, and of its columns in the `Layout`.
         size: Number of columns of its error.
         per_frame: Whether it has a value for each frame (in the batch problem: one unknown a frame), or one for the
@@ -29,9 +40,16 @@ class StateBlock:
         labels, units: Names and units of what `reported` returns; none is not reported.
     """
 
+    coupling: ClassVar[Coupling] = "none"
     per_frame: ClassVar[bool] = False
     is_seen: ClassVar[bool] = False
     is_pose: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        for method, coupling in _COUPLED_BY.items():
+            if method in vars(cls):
+                cls.coupling = coupling
 
     @property
     def name(self) -> str:
@@ -75,7 +93,7 @@ class StateBlock:
         return None
 
     def velocity_offset(self) -> Array | None:
-        """Derivative (6, size) of the measured velocities by a block that is added to them; None: it is not."""
+        """Return the derivative (6, size) of the measured velocities by a block that is added to them."""
         return None
 
     def turn_velocities(
@@ -100,6 +118,17 @@ class StateBlock:
 
         Returns:
             Shares (...); None: the block does not move the camera.
+        """
+        return None
+
+    @classmethod
+    def automatic(cls, white_std: Array | None, is_clean: bool, has_checked_tracks: bool) -> dict[str, float] | None:
+        """Return its settings in the automatic model of a recording; None: it is not part of that model.
+
+        Args:
+            white_std: (2,) white noise of linear (m/s) and angular velocities (rad/s); None: there are none.
+            is_clean: Whether these show no more noise than a good unit has.
+            has_checked_tracks: Whether tracks are compared with their first sight, so that they do not drift.
         """
         return None
 
@@ -138,6 +167,18 @@ class Layout(dict[str, slice]):
         self.poses = tuple(block.name for block in self.blocks if block.is_pose)
         self.clones = {block.clones: block.name for block in self.blocks if block.clones}
         self.seen = sum(block.size for block in self.blocks if block.is_seen)
+
+    def coupled(self, coupling: Coupling) -> tuple[StateBlock, ...]:
+        """Return the blocks with a coupling, in the order of their columns."""
+        return tuple(block for block in self.blocks if block.coupling == coupling)
+
+    def block(self, name: str) -> StateBlock:
+        """Return a block by name.
+
+        Raises:
+            KeyError: It is not in the state.
+        """
+        return {block.name: block for block in self.blocks}[name]
 
     def columns(self, names: Iterable[str]) -> IntArray:
         """Columns of some blocks, in the order given."""

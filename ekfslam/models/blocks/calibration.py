@@ -60,6 +60,7 @@ class Calibration(StateBlock):
     std: Array
 
     name = "calibration"
+    coupling = "sensor"
     is_seen = True
 
     @cached_property

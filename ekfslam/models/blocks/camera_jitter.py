@@ -38,5 +38,9 @@ class CameraJitter(GaussMarkov):
     def lengths(self, tau_s: Array | float, way_m: Array | float) -> Array:
         return np.asarray(tau_s)[..., None] / self.time_s
 
+    @classmethod
+    def automatic(cls, white_std: Array | None, is_clean: bool, has_checked_tracks: bool) -> dict[str, float] | None:
+        return {}
+
     def camera_share(self, way_m: Array, is_difference: BoolArray) -> Array | None:
         return np.ones(np.shape(is_difference))

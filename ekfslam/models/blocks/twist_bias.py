@@ -10,6 +10,11 @@ from ekfslam.arrays import Array
 from ekfslam.models.blocks.base import optional_block
 from ekfslam.models.blocks.gauss_markov import GaussMarkov
 
+# Biases of an automotive GNSS/INS unit: the data sheets of OXTS's RT3000 family state 0.05 to 0.1 km/h and 0.01 deg/s.
+_VELOCITY_BIAS_M_S, _RATE_BIAS_RAD_S = 0.02, np.deg2rad(0.01)
+# A noisy sensor's bias is taken as a tenth of its noise: consumer units state no better.
+_SHARE_OF_NOISE = 0.1
+
 
 @optional_block
 @dataclass(frozen=True)
@@ -36,6 +41,16 @@ class TwistBias(GaussMarkov):
 
     def lengths(self, tau_s: Array | float, way_m: Array | float) -> Array:
         return np.asarray(tau_s)[..., None] / np.repeat([self.time_v_s, self.time_w_s], 3)
+
+    @classmethod
+    def automatic(cls, white_std: Array | None, is_clean: bool, has_checked_tracks: bool) -> dict[str, float] | None:
+        """Return the bias of the unit's class for clean velocities, else a tenth of their noise."""
+        if white_std is None:
+            return None
+        least = np.array([_VELOCITY_BIAS_M_S, _RATE_BIAS_RAD_S])
+        v, w = (least if is_clean else np.maximum(_SHARE_OF_NOISE * white_std, least)).tolist()
+        times = {"time_v_s": 4.0, "time_w_s": 20.0} if is_clean else {"time_w_s": 200.0}
+        return {"sigma_v_m_s": v, "sigma_w_rad_s": w, **times}
 
     def velocity_offset(self) -> Array | None:
         return np.eye(6)

@@ -44,5 +44,18 @@ class VisionDrift(GaussMarkov):
     def lengths(self, tau_s: Array | float, way_m: Array | float) -> Array:
         return np.maximum(way_m, _LEAST_WAY_M)[..., None] / self.length_m
 
+    @classmethod
+    def automatic(cls, white_std: Array | None, is_clean: bool, has_checked_tracks: bool) -> dict[str, float] | None:
+        """Return a tracker's own drift: about 1 % of the way and a few mdeg/m. Tracks that are checked do not drift.
+
+        If velocities are clean, a larger value leaves the low frequencies to them, as the accuracy of a good unit
+        deserves.
+        """
+        if has_checked_tracks:
+            return None
+        if white_std is not None and is_clean:
+            return {"translation_percent": 4.0, "rotation_deg_m": 0.06}
+        return {"translation_percent": 1.0, "rotation_deg_m": 0.004}
+
     def camera_share(self, way_m: Array, is_difference: BoolArray) -> Array | None:
         return np.where(is_difference, np.maximum(way_m, _LEAST_WAY_M), 0.0)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
@@ -89,13 +90,13 @@ class VelocityInputs(Process):
     @cached_property
     def _offsets(self) -> tuple[tuple[StateBlock, Array], ...]:
         """Blocks that are added to the inputs, with their derivatives (6, size)."""
-        pairs = ((block, block.velocity_offset()) for block in self.layout.blocks)
+        pairs = ((block, block.velocity_offset()) for block in self.layout.coupled("velocity"))
         return tuple((block, J) for block, J in pairs if J is not None)
 
     @cached_property
     def _turning(self) -> tuple[StateBlock, ...]:
         """Blocks that turn velocities into the IMU frame."""
-        return tuple(b for b in self.layout.blocks if type(b).turn_velocities is not StateBlock.turn_velocities)
+        return self.layout.coupled("level")
 
     @cached_property
     def _depends_on_blocks(self) -> bool:
@@ -144,9 +145,7 @@ class VelocityWalk(VelocityInputs):
     @cached_property
     def _is_measured(self) -> bool:
         """Whether inputs measure the velocity in every interval, and not only start it."""
-        twist = next(block for block in self.layout.blocks if block.name == Twist.name)
-        assert isinstance(twist, Twist)
-        return twist.is_measured
+        return cast(Twist, self.layout.block(Twist.name)).is_measured
 
     def _driving(self, values: Values, inputs: Array) -> tuple[Array, Array]:
         by = np.zeros((*np.shape(inputs), self.layout.body))
