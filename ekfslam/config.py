@@ -221,8 +221,8 @@ class FilterConfig:
             when it moves along with the rig. Over all its observations it must do so by more than this share of the
             way, and by more than this many standard deviations (without their `Noise.margin`).
         min_depth_m: Observations of a landmark predicted nearer than this (or behind) are rejected.
-        relative_frames: Where truth is known, cross-covariances of reported poses up to so many frames apart are
-            kept, for the NEES of relative poses; 0 keeps none. Estimates do not depend on it.
+        relative_frames: If truth is known, keep cross-covariances of reported poses up to this many frames apart, for
+            the NEES of relative poses. 0 keeps none: the columns slow the filter down. Estimates do not depend on it.
         initial_position_std_m: Standard deviation of the first pose's translation, each axis.
         initial_rotation_std_rad: Standard deviation of the first pose's rotation, each axis.
     """
@@ -240,7 +240,7 @@ class FilterConfig:
     moving_sigma: float = field(default=1.5, metadata=_NOT_NEGATIVE)
     moving_share: float = field(default=0.05, metadata=_NOT_NEGATIVE)
     min_depth_m: float = field(default=0.1, metadata=_FINITE)
-    relative_frames: int = field(default=100, metadata=_whole(0))
+    relative_frames: int = field(default=0, metadata=_whole(0))
     initial_position_std_m: float = field(default=0.0, metadata=_FINITE)
     initial_rotation_std_rad: float = field(default=0.0, metadata=_FINITE)
 

@@ -57,10 +57,11 @@ def main() -> None:
     tracked, report, ms = _tracked(options.data, velocities=False)
     driven, _, _ = _tracked(options.data, velocities=True)
     given = attach_truth(ekfslam.open_sequence(options.data / GIVEN)[:FRAMES], options.data / TRUTH)
+    config = ekfslam.Config().with_overrides({"filter": {"relative_frames": 100}})
     runs = {
-        "front end, vision alone": (tracked, ekfslam.run(tracked)),
-        "front end, with velocities": (driven, ekfslam.run(driven)),
-        "given KLT, with velocities": (given, ekfslam.run(given)),
+        "front end, vision alone": (tracked, ekfslam.run(tracked, "full", config)),
+        "front end, with velocities": (driven, ekfslam.run(driven, "full", config)),
+        "given KLT, with velocities": (given, ekfslam.run(given, "full", config)),
     }
     poses = {
         "vision's": _camera_poses(tracked, runs["front end, vision alone"][1].T_world_imu),

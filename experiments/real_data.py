@@ -37,9 +37,10 @@ from ekfslam.filters.result import Result
 from ekfslam.studies.sweep import Case, Column, Recording, Sweep
 from ekfslam.studies.sweep_table import SweepTable
 
-CASES = {"dead reckoning": Case(mode="dead-reckoning"), "full": Case()}
-VARIANTS = {f"full, {variant}": Case({"filter": {"variant": variant}}) for variant in ("standard", "fej")}
-SMOOTHED = {"smoothed": Case(mode="smoothed")}
+RELATIVE = {"relative_frames": 100}
+CASES = {"dead reckoning": Case({"filter": RELATIVE}, "dead-reckoning"), "full": Case({"filter": RELATIVE})}
+VARIANTS = {f"full, {name}": Case({"filter": {"variant": name, **RELATIVE}}) for name in ("standard", "fej")}
+SMOOTHED = {"smoothed": Case({"filter": RELATIVE}, "smoothed")}
 # Headings, and columns of the sweep.
 SHARES = {
     "dropped by hygiene": "dropped by hygiene",

@@ -185,7 +185,7 @@ def test_estimates_do_not_depend_on_references():
 @pytest.mark.slow
 def test_pairs_across_a_map_revival_are_left_out():
     world = open_sequence("builtin:loop?frames=330")
-    settings = {"retire": "unseen", "retire_after": 3, "variant": "standard"}
+    settings = {"retire": "unseen", "retire_after": 3, "variant": "standard", "relative_frames": 100}
     result = run(world, "full", Config().with_overrides({"filter": settings}))
     assert result.counts["revived"] > 0
     first, second = relative_pairs(world.truth, 100)
@@ -222,7 +222,8 @@ def test_every_mode_has_pairs_whose_joint_covariance_is_one(mode):
 
 @pytest.mark.slow
 def test_smoothed_pairs_are_those_of_the_posterior():
-    result = run(open_sequence("builtin:loop?frames=60"), "full")
+    config = Config().with_overrides({"filter": {"relative_frames": 40}})
+    result = run(open_sequence("builtin:loop?frames=60"), "full", config)
     found = posterior(result)
     smoothed = smooth(result, found=found)
     for j, k, cross in zip(smoothed.pairs.first, smoothed.pairs.second, smoothed.pairs.cross, strict=True):

@@ -121,6 +121,12 @@ def add_filter_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--sigma-v", type=float, metavar="M_S", help="linear velocity noise per sample, m/s")
     group.add_argument("--sigma-w", type=float, metavar="RAD_S", help="angular velocity noise per sample, rad/s")
     group.add_argument("--sigma-px", type=float, metavar="PX", help="pixel noise")
+    group.add_argument(
+        "--relative-frames",
+        type=int,
+        metavar="N",
+        help="show the NEES of relative poses up to N frames apart, too (default: 0, since it slows the filter down)",
+    )
 
 
 def configured(options: argparse.Namespace) -> Config:
@@ -132,7 +138,12 @@ def configured(options: argparse.Namespace) -> Config:
                 "sigma_w_rad_s": options.sigma_w,
                 "sigma_px": options.sigma_px,
             },
-            "filter": {"variant": options.variant, "iterations": options.iterations, "retire": options.retire},
+            "filter": {
+                "variant": options.variant,
+                "iterations": options.iterations,
+                "retire": options.retire,
+                "relative_frames": options.relative_frames,
+            },
             "truth": dict(options.truth_noise),
         }
     )
