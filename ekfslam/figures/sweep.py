@@ -24,14 +24,14 @@ _PANELS_A_ROW = 3
 
 @styled
 def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
-    """A column of figures of merit against one of settings: a line for each choice of all else, means over seeds.
+    """Draw a column of figures of merit against a setting: one line for each choice of the others, means over seeds.
 
-    Every recording has a panel. Bands go from the least to the largest seed. Runs without the figure are left out; the
-    title says how many.
+    Every recording has a panel. Bands show the range over seeds. Runs without the figure are left out and counted in
+    the title.
 
     Raises:
         ConfigError: There is no such column.
-        ValueError: The figure is no number, or there are more than 24 lines in a panel, or 24 panels.
+        ValueError: The figure is no number, or there are more than 24 lines in a panel, or more than 24 panels.
     """
     y, x = table.column(figure), table.column(setting)
     if y.dtype.kind != "f":
@@ -76,7 +76,7 @@ def _draw_panel(
     choices: Sequence[tuple[Any, ...]],
     names: Sequence[str],
 ) -> None:
-    """The lines of one panel; a choice has the same style in all, and stands in the legend where it has no runs."""
+    """Draw the lines of one panel; a choice has the same style in all panels, and a legend entry even without runs."""
     parts = table.groups(*others) if others else {(): table}
     for i, choice in enumerate(choices):
         part = parts.get(choice)
@@ -97,12 +97,12 @@ def _draw_panel(
 
 
 def _names(x: Array) -> list[str]:
-    """The values of a setting that is text, in the order of their places on the axis."""
+    """Return the values of a setting that is text, in the order of their places on the axis."""
     return [] if x.dtype.kind == "f" else list(dict.fromkeys(x.tolist()))
 
 
 def _over_seeds(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Distinct x, and mean, least and largest y of each."""
+    """Return distinct x, and mean, least and largest y of each."""
     at: Array
     which: IntArray
     at, which = np.unique(x, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Where studies and sweeps run: processes of this machine, the calling thread, a Dask cluster, or MPI ranks."""
+"""Executors of studies and sweeps: processes of this machine, the calling thread, a Dask cluster, or MPI ranks."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ Outcome = TypeVar("Outcome")
 
 
 def completed(tasks: Iterable[Task], submit: Callable[[Task], Future[Outcome]]) -> Iterator[tuple[Task, Outcome]]:
-    """Tasks and their results as they come, with a bounded number handed to the executor at a time.
+    """Yield tasks and their results as they finish, with a bounded number handed to the executor at a time.
 
     Args:
-        tasks: What to do.
-        submit: Hands a task to an executor.
+        tasks: The tasks.
+        submit: Function that hands a task to an executor.
     """
     remaining, pending = iter(tasks), dict[Future[Outcome], Task]()
     try:
@@ -48,7 +48,7 @@ def completed(tasks: Iterable[Task], submit: Callable[[Task], Future[Outcome]]) 
 
 
 class SerialExecutor(Executor):
-    """Runs everything at once, in the calling thread."""
+    """Executor that runs each task immediately, in the calling thread."""
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -61,18 +61,18 @@ class SerialExecutor(Executor):
 
 @contextmanager
 def open_executor(spec: str = "processes", workers: int | None = None) -> Iterator[Executor]:
-    """Where to run a study.
+    """Open an executor.
 
     Args:
         spec: ``processes`` on this machine; ``serial``; ``tls://HOST:PORT``, the scheduler of a Dask cluster, with the
             certificates of Dask's configuration ``distributed.comm.tls`` (files, or variables of the environment such
-            as ``DASK_DISTRIBUTED__COMM__TLS__CA_FILE``); ``dask://HOST:PORT``, the same without them: whoever reaches
-            the scheduler's port, or poses as it, runs programs as you, so that this is for networks that only you
-            reach; ``mpi``, the ranks of ``mpiexec -n N python -m mpi4py.futures -m ekfslam.cli ...``.
+            as ``DASK_DISTRIBUTED__COMM__TLS__CA_FILE``); ``dask://HOST:PORT``, the same without certificates: anyone
+            who reaches the port of the scheduler, or poses as it, runs programs as you, so use it in private networks
+            only; ``mpi``, the ranks of ``mpiexec -n N python -m mpi4py.futures -m ekfslam.cli ...``.
         workers: Number of processes, by default one per core; Dask has its own number.
 
     Raises:
-        ConfigError: Unknown, not installed, not reachable, or no worker.
+        ConfigError: The executor is unknown, not installed or not reachable, or ``workers`` is out of range.
     """
     if workers is not None and not 1 <= workers <= _MOST_WORKERS:
         raise ConfigError(f"workers must be at least 1 and at most {_MOST_WORKERS}, found {workers}")
@@ -98,7 +98,7 @@ def open_executor(spec: str = "processes", workers: int | None = None) -> Iterat
 
 
 def _dask_client(spec: str) -> Any:
-    """A client of a Dask scheduler, with certificates or without."""
+    """Return a client of a Dask scheduler, with certificates or without."""
     try:
         from distributed import Client
         from distributed.security import Security
@@ -123,7 +123,7 @@ def _missing(spec: str, error: Exception) -> ConfigError:
 
 
 def _end_with_parent() -> None:
-    """In a worker: leave Ctrl-C to the parent, and do not outlive it if it is killed."""
+    """Leave Ctrl-C to the parent of a worker, and end with it if it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -75,11 +75,11 @@ class Recording:
 
     Args:
         data: Path, or ``builtin:NAME``.
-        name: In the table.
-        truth, extrinsics, lateral, velocities, velocity_frame: As of `ekfslam.open_sequence`.
-        frames: The stretch ``A:B`` of it, empty for all; ``prepare`` comes after.
-        prepare: From what was read and the seed, None without seeds, to what is run. For other processes it must be a
-            function of a module, or a `functools.partial` of one. What it draws, it draws from the seed.
+        name: Name in the table.
+        truth, extrinsics, lateral, velocities, velocity_frame: Arguments of `ekfslam.open_sequence`.
+        frames: Stretch ``A:B`` of the recording, empty for all of it; applied before ``prepare``.
+        prepare: Function from the sequence and the seed (None without seeds) to the sequence that is run. It must be a
+            function of a module, or a `functools.partial` of one, and draw random numbers from the seed alone.
     """
 
     data: str
@@ -98,18 +98,18 @@ class Recording:
 
     @property
     def is_seeded(self) -> bool:
-        """Whether a seed changes it."""
+        """Whether a seed changes the recording."""
         return self.is_simulated or self.prepare is not None
 
     def with_seed(self, seed: int) -> Recording:
-        """The built-in world with a seed of its own; anything else as it is."""
+        """Return the built-in world with a seed; return other recordings unchanged."""
         if not self.is_simulated:
             return self
         return dataclasses.replace(self, data=f"{self.data}{'&' if '?' in self.data else '?'}seed={seed}")
 
     @cached_property
     def content(self) -> str:
-        """What decides its numbers: digests of its files, or the name of the world; and how it is prepared.
+        """All that decides its numbers: digests of its files or the name of the world, and its preparation.
 
         Raises:
             UnknownFormatError: A file is missing.
@@ -129,8 +129,8 @@ class Case:
     """Settings that belong together.
 
     Args:
-        overrides: Table to key to value; they count more than those of the sweep.
-        mode: The only one it is run in; empty: those of the sweep.
+        overrides: Table to key to value; they take precedence over those of the sweep.
+        mode: Mode of its runs; empty for the modes of the sweep.
     """
 
     overrides: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
@@ -154,7 +154,7 @@ class Task:
 
     @cached_property
     def key(self) -> str:
-        """What decides its numbers, as 64 hexadecimal digits."""
+        """Digest of all that decides its numbers, as 64 hexadecimal digits."""
         facts: list[Any] = [self.recording.content, self.mode, dataclasses.asdict(self.config), versions()]
         if self.recording.prepare is not None:
             facts.append(self.seed)
@@ -165,15 +165,16 @@ class Task:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What to run.
+    """A product of recordings, modes, variants, seeds and settings to run.
 
     Args:
-        recordings: On what.
-        modes, variants: Of `MODES` and `VARIANTS`.
-        seeds: Of built-in worlds, and of recordings that are prepared; none: their own.
+        recordings: The recordings.
+        modes, variants: Names in `MODES` and `VARIANTS`.
+        seeds: Seeds of built-in worlds and of prepared recordings; none for their own.
         settings: Table to key to the values to try; or dotted name, such as ``noise.sigma_px``, to these values.
-        cases: Sets of settings, by names that become the column ``case``.
-        columns: Figures of merit besides those of `summarise`, by name: functions as of `Recording`.
+        cases: Sets of settings by name; the names become the column ``case``.
+        columns: Further figures of merit by name: functions of sequence and result, as restricted as
+            `Recording.prepare`.
 
     Raises:
         ConfigError: There is nothing to run, too much, or something unknown.
@@ -236,7 +237,7 @@ class Sweep:
 
     @staticmethod
     def from_toml(path: str | Path) -> Sweep:
-        """The sweep of a file; paths in it are relative to its folder.
+        """Read a sweep from a file; paths in it are relative to its folder.
 
         Raises:
             ConfigError: The file is missing, is not TOML, or holds something unknown.
@@ -321,7 +322,7 @@ def _record(columns: Mapping[str, Column], figures: Mapping[str, Any] | None = N
 
 @lru_cache(maxsize=2)
 def _opened(recording: Recording, seed: int | None, front_end: FrontEndConfig) -> Sequence:
-    """A recording, kept for the next run on it in the same process."""
+    """Open a recording and keep it for the next run in the same process."""
     names = ("truth", "extrinsics", "lateral", "velocities", "velocity_frame")
     options: dict[str, Any] = {name: getattr(recording, name) for name in names}
     sequence = open_sequence(recording.data, front_end=front_end, **options)
@@ -410,7 +411,7 @@ def _recording(entry: Any, folder: Path) -> Recording:
 
 
 def _source(value: Any) -> str:
-    """What decides the results of a function, as far as that can be told: its source, and what is bound to it."""
+    """Return the source of a function and the values bound to it."""
     if value is None or isinstance(value, str | int | float | Path):
         return repr(value)
     if isinstance(value, partial):
@@ -425,7 +426,7 @@ def _source(value: Any) -> str:
 
 @lru_cache(maxsize=256)
 def _digest(path: Path) -> str:
-    """Digest of a file, or of the names and sizes in a folder."""
+    """Return the digest of a file, or of the names and sizes in a folder."""
     if path.is_dir():
         listed = [f"{p.relative_to(path)} {p.stat().st_size}" for p in sorted(path.rglob("*")) if p.is_file()]
         return hashlib.sha256("\n".join(listed).encode()).hexdigest()

@@ -1,7 +1,7 @@
 """The table of a sweep: one row a run, every setting and figure of merit a column, in HDF5 and Parquet.
 
-/           attributes format, format_version, swept (names of columns), runs asked for, versions
-/table      a data set a column: numbers (NaN where there is none) or text; run, the dimension of all
+/           attributes format, format_version, swept (names of columns), requested runs, versions
+/table      one data set a column: numbers (NaN if missing) or text; run, their common dimension
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ SHOWN = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_d
 
 @dataclass(frozen=True)
 class SweepTable:
-    """What a sweep has found.
+    """The results of a sweep.
 
     Args:
-        columns: Name to values (n,): numbers as floats, NaN for none; all else as text, empty for none.
-        swept: Names of the columns that tell the runs apart.
-        asked: How many runs there shall be.
+        columns: Name to values (n,): numbers as floats, NaN if missing; all else as text, empty if missing.
+        swept: Names of the columns that distinguish the runs.
+        asked: Number of runs of the complete sweep.
     """
 
     columns: Mapping[str, NDArray]
@@ -50,22 +50,22 @@ class SweepTable:
 
     @staticmethod
     def of_rows(rows: Sequence[Mapping[str, Any]], swept: tuple[str, ...], asked: int) -> SweepTable:
-        """A table of rows; a column that one of them lacks is empty there."""
+        """Make a table of rows; a missing entry is empty."""
         names = dict.fromkeys(name for row in rows for name in row)
         return SweepTable({name: _column([row.get(name) for row in rows]) for name in names}, swept, asked)
 
     def column(self, name: str) -> NDArray:
-        """A column by name.
+        """Return a column by name.
 
         Raises:
-            ConfigError: There is none of that name.
+            ConfigError: There is no such column.
         """
         if name not in self.columns:
             raise ConfigError(f"the sweep has no column {name!r}; it has {', '.join(self.columns)}")
         return self.columns[name]
 
     def groups(self, *names: str) -> dict[tuple[Any, ...], SweepTable]:
-        """The table in parts, one for each choice of values in some columns, in the order in which they come.
+        """Split the table by the values in some columns, in the order of their first rows.
 
         Raises:
             ConfigError: There is no column of such a name.
@@ -76,7 +76,7 @@ class SweepTable:
         return {values: self._only(chosen) for values, chosen in rows.items()}
 
     def where(self, name: str, *values: str) -> SweepTable:
-        """The rows with one of some values in a column, values as `markdown` writes them.
+        """Return the rows with one of some values in a column, written as `markdown` writes them.
 
         Raises:
             ConfigError: There is no such column, or no such value in it.
@@ -105,7 +105,7 @@ class SweepTable:
         ]
 
     def markdown(self, figures: Sequence[str] = SHOWN) -> str:
-        """A Markdown table of what tells runs apart and of some figures of merit, then the errors.
+        """Return a Markdown table of the swept columns and of some figures of merit, with the errors.
 
         Raises:
             ConfigError: There is no such column.
@@ -125,10 +125,10 @@ class SweepTable:
 
 
 def table_image(table: SweepTable) -> bytes:
-    """What `write_table` writes as HDF5.
+    """Return a table as an HDF5 file.
 
     Raises:
-        ArchiveError: It would hold what cannot be read again.
+        ArchiveError: The file could not be read again.
     """
 
     def fill(h5file: h5py.File) -> None:
@@ -148,10 +148,10 @@ def table_image(table: SweepTable) -> bytes:
 
 
 def write_table(path: str | Path, table: SweepTable) -> list[Path]:
-    """Write a table as HDF5, and beside it as Parquet where ``pyarrow`` is installed; the paths written.
+    """Write a table as HDF5, and as Parquet if ``pyarrow`` is installed; return the paths.
 
     Raises:
-        WriteError: It cannot be written.
+        WriteError: A file cannot be written.
     """
     path = Path(path)
     contents: dict[Path, str | bytes] = {path: table_image(table)}
@@ -163,7 +163,7 @@ def write_table(path: str | Path, table: SweepTable) -> list[Path]:
 
 
 def read_table(path: str | Path) -> SweepTable:
-    """The table of a sweep.
+    """Read the table of a sweep.
 
     Raises:
         ArchiveError: The file is missing or damaged, or holds something else.
@@ -190,7 +190,7 @@ def _item(name: str, kind: str) -> Item:
 
 
 def _parquet(table: SweepTable) -> bytes | None:
-    """The table as Parquet, None where ``pyarrow`` is not installed."""
+    """Return the table as Parquet, None if ``pyarrow`` is not installed."""
     try:
         import pyarrow
         from pyarrow import parquet
@@ -203,7 +203,7 @@ def _parquet(table: SweepTable) -> bytes | None:
 
 
 def _column(values: Sequence[Any]) -> NDArray:
-    """Numbers and truth values as floats, if there is nothing else; all else as text."""
+    """Return numbers and truth values as floats if there is nothing else, otherwise all as text."""
     if all(value is None or isinstance(value, int | float) for value in values):
         return np.array([np.nan if value is None else float(value) for value in values])
     return np.array(["" if value is None else str(value) for value in values], dtype=object)
