@@ -83,7 +83,7 @@ def main() -> int:
 def with_true_motion(
     sequence: Sequence, seed: int | None, before: Callable[[Sequence, int | None], Sequence] | None
 ) -> Sequence:
-    """The recording with velocities that lead from each true pose to the next one, good to 1 cm/s and 0.1 mrad/s."""
+    """Return the recording with velocities that lead from each true pose to the next, good to 1 cm/s and 0.1 mrad/s."""
     sequence = sequence if before is None else before(sequence, seed)
     truth = truth_of(sequence)
     assert (np.diff(truth.frame) == 1).all()
@@ -117,7 +117,7 @@ def with_true_motion(
 
 
 def estimate(sequence: Sequence, result: ekfslam.Result, name: str, part: str) -> float | None:
-    """Of a calibration parameter: its last ``value`` or ``std``, or whether it ``is_observed``."""
+    """Return the last ``value`` or ``std`` of a calibration parameter, or whether it ``is_observed``."""
     parameters = result.parameters
     if parameters is None or name not in parameters.name:
         return None
@@ -141,7 +141,7 @@ ESTIMATES = {f"{name}, {part}": partial(estimate, name=name, part=part) for name
 
 
 def remains(drive: dict[str, float], highway: dict[str, float]) -> str:
-    """What it was on the two drives where vision used to lose to velocities alone."""
+    """Describe the two drives on which vision used to lose to velocities alone."""
     return (
         "On 09_30_0020 velocities are level ones. With roll and pitch in the state full SLAM is off by "
         f"{drive['all of it']:.1f} m, without them by {drive['no tilt']:.1f} m (dead reckoning: "
@@ -153,7 +153,7 @@ def remains(drive: dict[str, float], highway: dict[str, float]) -> str:
 
 
 def markdown(errors: dict[str, Row], calibration: dict[str, list[Row]]) -> str:
-    """The report of the experiment."""
+    """Return the report of the experiment."""
     headings = list(next(iter(errors.values())))
     return document(
         "# What each part of the model brings",
@@ -184,7 +184,7 @@ def markdown(errors: dict[str, Row], calibration: dict[str, list[Row]]) -> str:
 
 
 def calibration_cell(row: Row, name: str) -> str:
-    """An estimate in the unit of the table, in brackets where it was not observed."""
+    """Return an estimate in the unit of the table, in brackets if it was not observed."""
     value, std, seen = (row[f"{name}, {part}"] for part in PARTS)
     factor = SCALE[name][1]
     cell = plus_minus(f"{factor * value:.2g}", f"{factor * std:.1g}")

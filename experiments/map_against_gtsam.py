@@ -103,7 +103,7 @@ class Factors:
     observation: list[Any]
 
     def graph(self) -> Any:
-        """All of them."""
+        """All factors."""
         graph = gtsam.NonlinearFactorGraph()
         for factor in (self.first, *self.motion, *self.observation):
             graph.push_back(factor)
@@ -111,7 +111,7 @@ class Factors:
 
 
 def factors_of(result: Result, config: PosteriorConfig) -> Factors:
-    """GTSAM's factors of a run of the joint filter that knew its first pose exactly."""
+    """Make GTSAM's factors from a run of the joint filter that knew its first pose exactly."""
     log, rig = log_of(result), result.camera
     assert not log.initial_covariance.any() and (log.variance == log.variance[0]).all()
 
@@ -152,7 +152,7 @@ def factors_of(result: Result, config: PosteriorConfig) -> Factors:
 
 
 def to_gtsam(T_world_imu: Array, positions_m: Array) -> Any:
-    """Poses (T, 4, 4) and landmarks (M, 3) as GTSAM's values."""
+    """Return poses (T, 4, 4) and landmarks (M, 3) as GTSAM's values."""
     values = gtsam.Values()
     for k, T in enumerate(T_world_imu):
         values.insert(X(k), gtsam.Pose3(T))
@@ -162,13 +162,13 @@ def to_gtsam(T_world_imu: Array, positions_m: Array) -> Any:
 
 
 def from_gtsam(values: Any, frames: int, landmarks: int) -> tuple[Array, Array]:
-    """Poses (T, 4, 4) and landmarks (M, 3)."""
+    """Return poses (T, 4, 4) and landmarks (M, 3)."""
     T_world_imu = np.array([values.atPose3(X(k)).matrix() for k in range(frames)])
     return T_world_imu, np.array([values.atPoint3(L(j)) for j in range(landmarks)])
 
 
 def batch(graph: Any, start: Any, tolerance: float) -> tuple[Any, int, float]:
-    """GTSAM's Levenberg-Marquardt with its default damping: values, iterations and seconds."""
+    """Run GTSAM's Levenberg-Marquardt with its default damping: values, iterations and seconds."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(tolerance)
     parameters.setAbsoluteErrorTol(0.0)
@@ -188,7 +188,7 @@ def incremental(
     skip: int = RELINEARISE_SKIP,
     pose_covariance: bool = False,
 ) -> tuple[Any, Array]:
-    """iSAM2, frame by frame: its values after the last frame, and the seconds (T,) of each update.
+    """Run iSAM2 frame by frame: its values after the last frame, and the seconds (T,) of each update.
 
     Args:
         result: A run of the joint filter.
@@ -250,7 +250,7 @@ def log_of(result: Result) -> Log:
 
 
 def start_of(result: Result, rows: BatchProblem) -> tuple[Array, Array]:
-    """Where the posterior starts: the filter's poses and map, but landmarks left behind a camera as triangulated."""
+    """Return the start of the posterior: poses and map of the filter; landmarks behind a camera are triangulated."""
     log = log_of(result)
     q = rows.points(rows.filtered_state(result.landmarks.position_m))
     hidden = np.isin(np.arange(log.landmarks), log.landmark[q[:, 2] <= result.config["filter"]["min_depth_m"]])
@@ -260,7 +260,7 @@ def start_of(result: Result, rows: BatchProblem) -> tuple[Array, Array]:
 def cost_of(
     rows: BatchProblem, config: PosteriorConfig, T_world_imu: Array, positions_m: Array
 ) -> tuple[float | None, int]:
-    """The posterior's cost function anywhere, None where it is infinite, and the number of observations from behind."""
+    """Return the posterior's cost anywhere, None if infinite, and the number of observations from behind."""
     # White noise and a certain first pose: poses and landmarks are all there is.
     state = replace(rows.filtered_state(positions_m), T_imu_world=se3.inverse(T_world_imu), zeta=np.zeros(6))
     q = rows.points(state)
@@ -273,13 +273,13 @@ def cost_of(
 
 
 def orthonormal(T: Array) -> Array:
-    """The rigid transform next to one (..., 4, 4) whose rotation was printed with a few digits."""
+    """Return the rigid transform next to one (..., 4, 4) whose rotation was printed with a few digits."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     return se3.transform(U @ Vt, T[..., :3, 3])
 
 
 def open_set(data: Path, file: str) -> Sequence:
-    """A recording with rotations that are rotations to rounding.
+    """Return a recording whose rotations are exact to rounding.
 
     As printed they are off by 1e-7. Inverses by transposition and by GTSAM's product then differ by that, at positions
     some hundred metres from the origin enough to change the cost by 1e-4.
@@ -295,7 +295,7 @@ def open_set(data: Path, file: str) -> Sequence:
 
 
 def solve_all(sequence: Sequence, overrides: dict[str, dict[str, float]]) -> dict[str, Any]:
-    """Everything on one recording, as it goes into ``table.json``."""
+    """Measure everything on one recording, for ``table.json``."""
     # White noise, as GTSAM's factors have it; what is not stated is that of a clean recording.
     settings = ekfslam.Config().with_overrides({"noise": {"model": "white"}}).with_overrides(overrides)
     config = settings.posterior
@@ -311,7 +311,7 @@ def solve_all(sequence: Sequence, overrides: dict[str, dict[str, float]]) -> dic
     graph, start = factors.graph(), to_gtsam(*start_of(result, rows))
 
     def entry(T_world_imu: Array, positions_m: Array | None = None, **more: float | int) -> dict[str, Any]:
-        """One estimator: errors, and the cost in both functions."""
+        """Return errors of one estimator, and its cost in both functions."""
         values: dict[str, Any] = {"ate_m": None, "ate_aligned_m": None, **more}
         if sequence.truth is not None and len(sequence.truth.frame):
             values |= trajectory_errors(sequence, T_world_imu)
@@ -370,19 +370,19 @@ STYLES: dict[str, dict[str, Any]] = {
 
 
 def ratio(row: dict[str, Any], above: tuple[str, str], below: tuple[str, str]) -> float | None:
-    """Quotient of two figures of a set, each (estimator, key); None where one is missing."""
+    """Return the quotient of two figures of a set, each (estimator, key); None if one is missing."""
     a, b = (row["estimators"][name][key] for name, key in (above, below))
     return None if a is None or b is None else a / b
 
 
 def medians(table: dict[str, dict[str, Any]], above: tuple[str, str], below: tuple[str, str]) -> tuple[float, float]:
-    """Median and largest over the sets of a `ratio`."""
+    """Return median and largest of a `ratio` over the sets."""
     values = [value for row in table.values() if (value := ratio(row, above, below)) is not None]
     return median(values), max(values)
 
 
 def markdown(table: dict[str, dict[str, Any]], config: PosteriorConfig) -> str:
-    """The report of the experiment."""
+    """Return the report of the experiment."""
     kernel = config.kernel if config.kernel == "none" else f"{config.kernel}, width {config.kernel_width:g}"
     middle, largest = medians(table, ("MAP", "gtsam_cost"), ("GTSAM converged", "gtsam_cost"))
     return document(
@@ -415,7 +415,7 @@ def markdown(table: dict[str, dict[str, Any]], config: PosteriorConfig) -> str:
 
 
 def error_cells(row: dict[str, Any]) -> list[str]:
-    """Sizes and errors of one set."""
+    """Return the cells of sizes and errors of one set."""
     found = row["estimators"]
     stars = {name: " *" if found[name].get("weak_priors") else "" for name in COMPARED}
     quotients = (number(ratio(row, ("MAP", key), ("iSAM2", key)), ".3f") for key in ("ate_m", "ate_aligned_m"))
@@ -427,7 +427,7 @@ def error_cells(row: dict[str, Any]) -> list[str]:
 
 
 def error_summary(table: dict[str, dict[str, Any]], key: str, what: str) -> str:
-    """How one kind of error compares with iSAM2's, over all sets."""
+    """Return the cells that compare one kind of error with iSAM2's, over all sets."""
     middle, largest = medians(table, ("MAP", key), ("iSAM2", key))
     text = f"{what}, MAP / iSAM2: {middle:.3f} in the median over the sets, {largest:.3f} at the most;\n"
     middle, largest = medians(table, ("MAP", key), ("iSAM2, 0.01", key))
@@ -435,7 +435,7 @@ def error_summary(table: dict[str, dict[str, Any]], key: str, what: str) -> str:
 
 
 def cost_cells(row: dict[str, Any]) -> list[str]:
-    """Costs, iterations and seconds of one set."""
+    """Return the cells of costs, iterations and seconds of one set."""
     e = row["estimators"]
 
     def excess(estimator: str) -> str:
@@ -455,7 +455,7 @@ def cost_cells(row: dict[str, Any]) -> list[str]:
 
 @styled
 def plot(table: dict[str, dict[str, Any]]) -> Figure:
-    """ATE over iSAM2's for every set with truth, and seconds."""
+    """Draw ATE over iSAM2's for every set with truth, and seconds."""
     figure = Figure(figsize=(9.0, 0.6 + 0.33 * len(table)))
     error_ax, time_ax = figure.subplots(1, 2, sharey=True)
     place = np.arange(len(table))

@@ -57,7 +57,7 @@ SIGMAS = 3.0  # of the stated uncertainty of a mean
 
 @dataclass(frozen=True)
 class PositionSensor:
-    """A sensor that measures where a landmark is in the vehicle's own frame, ``h(q) = q``, for one frame.
+    """A sensor that measures the position of a landmark in the vehicle's frame, ``h(q) = q``, for one frame.
 
     Its noise grows with the true z, which only the experiment knows: every measurement comes with its own standard
     deviations. Were they taken from the noisy z instead, too small a z would weigh more than too large a one. The pull
@@ -109,7 +109,7 @@ class PositionSensor:
 
 @dataclass(frozen=True)
 class World:
-    """What a run is drawn from; steps last 1 s.
+    """The world from which runs are drawn; steps last 1 s.
 
     Args:
         T_world_imu: (T, 4, 4) true poses.
@@ -137,9 +137,9 @@ ROUNDS = 6
 
 
 def box_world(odometry_sigma: float, observation_sigma: float, steps: int, seed: int) -> World:
-    """Experiment (a): a closed path, six rounds in 500 steps, that climbs, sinks, rolls and looks about.
+    """Return the world of experiment (a): a closed path, six rounds in 500 steps, that climbs, sinks and rolls.
 
-    Landmarks are drawn anew for every seed. `steps` shorter than the paper's 500 cut the path off.
+    Every seed draws its own landmarks. Fewer `steps` than the paper's 500 cut the path off.
     """
     phase = 2 * np.pi * ROUNDS * np.arange(steps) / 500
     position = np.stack([19 * np.cos(phase), 14 * np.sin(phase), 6 * np.sin(2 * phase + 0.5)], axis=-1)
@@ -171,7 +171,7 @@ def _in_cone(q: Array) -> NDArray[np.bool_]:
 
 
 def circle_world(steps: int) -> World:
-    """Experiment (b): ten rounds in 2500 steps; the same circle and landmarks for every run."""
+    """Return the world of experiment (b): ten rounds in 2500 steps; the same circle and landmarks for every run."""
     speed, turn_rate = 0.25, np.deg2rad(1.5)
     radius = speed / turn_rate
     twist = np.array([speed, 0, 0, 0, 0, turn_rate])
@@ -212,7 +212,7 @@ class Track:
     position_m: Array
 
     def figures(self, planar: bool) -> dict[str, float]:
-        """NEES per degree of freedom, means over the steps with a regular covariance, and mean squared errors."""
+        """Return NEES per degree of freedom, averaged over steps with a regular covariance, and mean squared errors."""
         position, rotation = ([0, 1], [5]) if planar else ([0, 1, 2], [3, 4, 5])
         out = {}
         for name, part in (("pose", position + rotation), ("orientation", rotation), ("position", position)):
@@ -261,7 +261,7 @@ EXPERIMENTS: Mapping[str, Callable[[int], World]] = {
 
 
 def one_run(experiment: str, seed: int) -> dict[Variant, dict[str, float]]:
-    """The figures of every variant on the drive of one seed."""
+    """Return the figures of every variant on the drive of one seed."""
     # Small dense matrices: a second BLAS thread would only be in the other worker's way.
     with threadpool_limits(1, user_api="blas"):
         world = EXPERIMENTS[experiment](seed)
@@ -273,7 +273,7 @@ def one_run(experiment: str, seed: int) -> dict[Variant, dict[str, float]]:
 
 
 def summarise(runs: list[dict[Variant, dict[str, float]]]) -> dict[str, dict[str, list[float]]]:
-    """``{variant: {figure: [mean, 3 standard errors]}}`` over runs; roots of the mean squares; and the pose NEES
+    """Return ``{variant: {figure: [mean, 3 standard errors]}}`` over runs; roots of mean squares; and the pose NEES
     against the invariant variant's of the same runs, in which what makes a run hard or easy cancels."""
     summary: dict[str, dict[str, list[float]]] = {}
     for variant in VARIANTS:
@@ -335,7 +335,7 @@ than ours by a factor that we cannot explain.
 
 
 def markdown(experiment: str, summary: dict[str, dict[str, list[float]]], runs: int) -> str:
-    """Table of our variants and of what was published."""
+    """Return the table of our variants and of the published ones."""
     ours = (
         [NAMES[variant], *(mean_cell(table[key], spec) for key, (_, spec) in FIGURES.items())]
         for variant, table in summary.items()
@@ -346,13 +346,13 @@ def markdown(experiment: str, summary: dict[str, dict[str, list[float]]], runs: 
 
 
 def mean_cell(figure: list[float], spec: str) -> str:
-    """A mean and its three standard errors; only the mean shows its sign."""
+    """Return a mean and its three standard errors; only the mean shows its sign."""
     mean, bound = figure
     return plus_minus(f"{mean:{spec}}", f"{bound:{spec.lstrip('+')}}")
 
 
 def ordering(summary: dict[str, dict[str, list[float]]]) -> str:
-    """Says in words which variants state less consistent covariances than the invariant one, beyond sampling."""
+    """Say which variants are less consistent than the invariant one, beyond sampling."""
     verdicts = []
     for variant in ("fej", "standard"):
         difference, bound = summary[variant]["pose_nees_per_dof_minus_invariant"]

@@ -64,18 +64,18 @@ Row = dict[str, Any]
 
 
 def world_of(landmarks: int, seed: int = 0) -> City:
-    """The world with about that many landmarks."""
+    """Return the world with about that many landmarks."""
     return dataclasses.replace(CITY, frames=max(6, round((landmarks - IN_FIRST_FRAME) / NEW_PER_FRAME)), seed=seed)
 
 
 def timed(work: Callable[[], Value]) -> tuple[Value, float]:
-    """What ``work`` returns, and the CPU seconds it took."""
+    """Call ``work`` and return its result and its CPU seconds."""
     begin = process_time()
     return work(), process_time() - begin
 
 
 class PeakMemory:
-    """Peak resident memory, MB (10^6 bytes), since the last call; Linux only, elsewhere since the start."""
+    """Return the peak resident memory, MB (10^6 bytes), since the last call; Linux only, elsewhere since the start."""
 
     def __init__(self) -> None:
         self.overall = 0.0
@@ -93,7 +93,7 @@ class PeakMemory:
 
 
 def measure_size(landmarks: int) -> Row:
-    """Filter and both posteriors of one size."""
+    """Measure filter and both posteriors of one size."""
     memory = PeakMemory()
     sequence = simulate(world_of(landmarks))
     simulation_mb = memory()
@@ -144,14 +144,14 @@ def measure_size(landmarks: int) -> Row:
 
 
 def counted_ms(sequence: Sequence, result: Result) -> Array:
-    """Milliseconds of the frames that count; see the module."""
+    """Return the milliseconds of the frames that count; see the module."""
     in_view = np.bincount(sequence.observations.frame, minlength=len(sequence))
     second_half = np.arange(len(sequence)) >= len(sequence) // 2
     return result.ms_per_frame[second_half & (in_view >= IN_VIEW[0]) & (in_view <= IN_VIEW[1])]
 
 
 def measure_stages(result: Result) -> Row:
-    """Seconds of the steps of one linearisation (as filtered)."""
+    """Measure the seconds of the steps of one linearisation (as filtered)."""
     log = result.log
     assert log is not None
     rows = BatchProblem(log, model_of_result(result))
@@ -170,7 +170,7 @@ def measure_stages(result: Result) -> Row:
 
 
 def against_solves(found: Posterior) -> float:
-    """Largest difference between marginals and solves, of some poses and landmarks, by the scale of each block."""
+    """Return the largest difference between marginals and solves of some blocks, by the scale of each block."""
     frames = np.linspace(1, len(found.T_world_imu) - 1, CHECKED).astype(int)
     landmarks = np.linspace(0, len(found.id) - 1, CHECKED).astype(int)
     solved = found.joint_covariance(frames, landmarks)
@@ -188,14 +188,14 @@ def against_solves(found: Posterior) -> float:
 
 
 def position_error_m(sequence: Sequence, T_world_imu: Array) -> float:
-    """Root mean square position error, without alignment: the first pose is known."""
+    """Return the root mean square position error, without alignment: the first pose is known."""
     truth = truth_of(sequence)
     difference = T_world_imu[truth.frame, :3, 3] - truth.T_world_imu[:, :3, 3]
     return float(np.sqrt((difference**2).sum(axis=1).mean()))
 
 
 def steps(sequence: Sequence, retire: str, variant: str = "invariant") -> Iterator[tuple[JointEKF, float]]:
-    """The joint filter after each frame, with the CPU milliseconds of the frame."""
+    """Yield the joint filter after each frame, with the CPU milliseconds of the frame."""
     config = Config().with_overrides({"filter": {"retire": retire, "variant": variant, "covariance_form": "dense"}})
     problem = resolve(sequence, config, "dead-reckoning")
     model, settings = problem.model, problem.config.filter
@@ -205,7 +205,7 @@ def steps(sequence: Sequence, retire: str, variant: str = "invariant") -> Iterat
 
 
 def measure_in_turn(landmarks: int) -> Row:
-    """A frame at the end of a long drive against one of a short drive, measured one after the other."""
+    """Time a frame at the end of a long drive and one of a short drive, one after the other."""
     large = simulate(world_of(landmarks))
     pairs = 300
     large_steps = steps(large, "unseen")
@@ -232,7 +232,7 @@ def measure_in_turn(landmarks: int) -> Row:
 
 
 def measure_dense(landmarks: int) -> Row:
-    """The filter that never retires a landmark, and the dense inverse of the joint information matrix."""
+    """Measure the filter that never retires a landmark, and the dense inverse of the joint information matrix."""
     memory = PeakMemory()
     sequence = simulate(world_of(landmarks))
     ms: list[float] = []
@@ -250,7 +250,7 @@ def measure_dense(landmarks: int) -> Row:
 
 
 def dense_inverse(system: LinearSystem, frames: int) -> Array:
-    """Covariance of all poses and landmarks, (6T+3M, 6T+3M), with the first pose in units of its prior."""
+    """Return the covariance of all poses and landmarks, (6T+3M, 6T+3M), with the first pose in units of its prior."""
     J_from, J_x = system.J_from, system.J_x
     step, observation = np.arange(frames - 1), np.arange(len(system.r))
     width = 6 * frames + 3 * system.landmarks
@@ -278,7 +278,7 @@ def dense_inverse(system: LinearSystem, frames: int) -> Array:
 
 
 def measure_loop(landmarks: int) -> Row:
-    """CPU seconds of each lap of a ring, where retired landmarks come back, against never retiring any."""
+    """Measure the CPU seconds of each lap of a ring, with revived landmarks and without retirement."""
     sequence = simulate(Loop(landmarks=landmarks, radius_m=LOOP_RADIUS_M, frames=3 * LOOP_FRAMES))
     row: Row = {"landmarks": len(sequence.observations.ids), "filters": []}
     for variant, retire in (("standard", "never"), ("standard", "unseen"), ("invariant", "unseen")):
@@ -312,7 +312,7 @@ WORKERS: dict[str, Callable[[int], Row]] = {
 
 
 def in_own_process(worker: str, landmarks: int) -> Row:
-    """What a worker measures, in a process of its own."""
+    """Measure in a process of its own."""
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, __file__, "--worker", worker, str(landmarks)]
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
@@ -323,13 +323,13 @@ def in_own_process(worker: str, landmarks: int) -> Row:
 
 
 def slope(sizes: Array, values: Array) -> float:
-    """Exponent of the power law through the upper half of the points."""
+    """Return the exponent of the power law through the upper half of the points."""
     upper = slice(len(sizes) // 2, None)
     return float(np.polyfit(np.log(sizes[upper]), np.log(values[upper]), 1)[0])
 
 
 def table(found: Row) -> str:
-    """The results as Markdown."""
+    """Return the results as Markdown."""
     sizes, in_turn, loop = found["sizes"], found["in_turn"], found["loop"]
     return document(
         "# Cost against the size of the map",
@@ -383,7 +383,7 @@ def table(found: Row) -> str:
 
 
 def size_cells(r: Row) -> list[str]:
-    """Time and memory of one size."""
+    """Return the cells of time and memory of one size."""
     f, m = r["filtered"], r["map"]
     return [
         *(f"{r[key]}" for key in ("landmarks", "frames", "observations")),
@@ -394,7 +394,7 @@ def size_cells(r: Row) -> list[str]:
 
 
 def stage_cells(r: Row) -> list[str]:
-    """Steps of the posterior of one size, and how exact it is."""
+    """Return the cells of the posterior of one size: seconds of its steps and accuracy."""
     s, m = r["stages"], r["map"]
     return [
         f"{r['landmarks']}",
@@ -406,7 +406,7 @@ def stage_cells(r: Row) -> list[str]:
 
 
 def dense_cells(r: Row) -> list[str]:
-    """The dense reference of one size."""
+    """Return the cells of the dense reference of one size."""
     return [
         *(f"{r['landmarks']}", f"{r['ms_per_frame']:.1f}", f"{r['filter_mb']:.0f}"),
         *(f"{r['posterior_s']:.2f}", f"{r['posterior_mb']:.0f}"),
@@ -414,7 +414,7 @@ def dense_cells(r: Row) -> list[str]:
 
 
 def loop_cells(r: Row) -> list[str]:
-    """One filter on the ring."""
+    """Return the cells of one filter on the ring."""
     return [
         *(r["variant"], r["retire"]),
         *(f"{lap:.1f}" for lap in r["lap_s"]),
@@ -425,7 +425,7 @@ def loop_cells(r: Row) -> list[str]:
 
 @styled
 def plot(found: Row) -> Figure:
-    """Time of a frame, time of the posterior and memory against M, with the dense reference."""
+    """Draw time of a frame, time of the posterior and memory against M, with the dense reference."""
     sizes, dense = found["sizes"], found["dense"]
     M, M_dense = (np.array([r["landmarks"] for r in rows], dtype=float) for rows in (sizes, dense))
     figure = Figure(figsize=(12.0, 4.2))

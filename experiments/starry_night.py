@@ -76,7 +76,7 @@ AXES = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
 
 
 def pixel_residuals(sequence: Sequence) -> Array:
-    """Measured minus true pixels (K, 4) of every observation, all of whose landmarks are known."""
+    """Return measured minus true pixels (K, 4) of every observation; all landmarks are known."""
     truth, seen = truth_of(sequence), sequence.observations
     position = dict(zip(truth.landmark.tolist(), truth.position_m, strict=True))
     points = np.array([position[i] for i in seen.landmark.tolist()])
@@ -85,14 +85,14 @@ def pixel_residuals(sequence: Sequence) -> Array:
 
 
 def velocity_residuals(sequence: Sequence) -> Array:
-    """Measured minus true velocities (T-1, 6), m/s and rad/s, of the intervals that end at frames 1, 2, ..."""
+    """Return measured minus true velocities (T-1, 6), m/s and rad/s, of the intervals that end at frames 1, 2, ..."""
     T = se3.inverse(truth_of(sequence).T_world_imu)
     tau = np.diff(sequence.time_s)[:, None]
     return sequence.twist[1:] + se3.log(T[1:] @ se3.inverse(T[:-1])) / tau
 
 
 def autocorrelation(values: Array, lags: int, group: IntArray, index: IntArray) -> Array:
-    """Correlation (lags+1, n) of values (K, n) with themselves ``lag`` frames later, within groups.
+    """Return the correlation (lags+1, n) of values (K, n) with themselves ``lag`` frames later, within groups.
 
     Args:
         values: Residuals; their mean over all is taken off.
@@ -114,7 +114,7 @@ def autocorrelation(values: Array, lags: int, group: IntArray, index: IntArray) 
 
 
 def robust_std(values: Array) -> Array:
-    """Standard deviation (n,) of values (K, n), found from the median absolute deviation, which spares gross errors."""
+    """Return the standard deviation (n,) of values (K, n) from the median absolute deviation."""
     return np.median(np.abs(values - np.median(values, axis=0)), axis=0) / 0.6745
 
 
@@ -122,7 +122,7 @@ def robust_std(values: Array) -> Array:
 
 
 def camera_poses(sequence: Sequence) -> Array:
-    """``T_imu_world`` (T, 4, 4) from the pixels of each frame and the known landmarks; NaN where these are too few.
+    """Find ``T_imu_world`` (T, 4, 4) from the pixels of each frame and the known landmarks; NaN if these are too few.
 
     Gauss-Newton on ``T_imu_world = exp(n^) T_true`` with a prior on n that is wider than anything it finds.
     """
@@ -149,7 +149,7 @@ def camera_poses(sequence: Sequence) -> Array:
 
 
 def own_errors(sequence: Sequence) -> dict[str, Array]:
-    """Errors (6,), m and rad, of truth and camera (of one pose) and of the velocities (over `HAT_FRAMES`).
+    """Return errors (6,), m and rad, of truth and camera (of one pose) and of the velocities (over `HAT_FRAMES`).
 
     From the variances of their differences over so many frames; one that comes out negative is 0.
     """
@@ -176,7 +176,7 @@ def own_errors(sequence: Sequence) -> dict[str, Array]:
 
 
 def noise_of_truth(own: Array) -> TruthNoise:
-    """Errors (6,) of one true pose as the evaluation knows them: each axis alike but for the first attitude."""
+    """Return the errors (6,) of one true pose as the noise of the evaluation's truth."""
     position, attitude = np.sqrt(np.mean(own.reshape(2, 3) ** 2, axis=1)).tolist()
     roll, pitch, yaw = own[3:].tolist()
     return TruthNoise(roll, pitch, yaw, position, position_m=position, attitude_rad=attitude)
@@ -193,7 +193,7 @@ NOTHING_SEEN: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Window:
-    """One variant on one window: pose NEES (n,) after each frame, and what there is at the end.
+    """Run one variant on one window: pose NEES (n,) after each frame, and the state at the end.
 
     Args:
         pose_nees, with_truth_noise: Of each frame, the truth being exact or not.
@@ -220,7 +220,7 @@ def run_window(
     blocks: tuple[StateBlock, ...] = (),
     truth_noise: TruthNoise = EXACT,
 ) -> Window:
-    """Filter the frames ``start`` to ``stop - 1``; the variant None is dead reckoning, which sees nothing."""
+    """Filter the frames ``start`` to ``stop - 1``; the variant None is dead reckoning."""
     truth = truth_of(sequence)
     config = FilterConfig(
         variant or "invariant",
@@ -271,7 +271,7 @@ STYLES = {
 
 
 def noise_table(sequence: Sequence) -> dict[str, dict[str, dict[str, float]]]:
-    """Stated and real noise: ``{"pixels" or "velocities": {row or axis: {figure: value}}}``."""
+    """Return stated and real noise: ``{"pixels" or "velocities": {row or axis: {figure: value}}}``."""
     stated = sequence.noise
     assert stated is not None
     seen = sequence.observations
@@ -297,7 +297,7 @@ def noise_table(sequence: Sequence) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def inflation(rho: Array) -> Array:
-    """The factor (n,) on a standard deviation that makes the mean of correlated samples as uncertain as it is.
+    """Return the factor (n,) on a standard deviation that accounts for the correlation of samples in their mean.
 
     ``sqrt(1 + 2 sum rho)`` over the lags (lags+1, n) before the correlation first vanishes; white noise has 1.
     """
@@ -306,7 +306,7 @@ def inflation(rho: Array) -> Array:
 
 
 def consistency_table(windows: dict[str, list[Window]]) -> dict[str, dict[str, float]]:
-    """Means and medians over windows, the samples, for every filter."""
+    """Return means and medians over windows, the samples, for every filter."""
     table = {}
     for name, runs in windows.items():
         along = np.array([np.nanmean(run.pose_nees) for run in runs])
@@ -333,7 +333,7 @@ def consistency_table(windows: dict[str, list[Window]]) -> dict[str, dict[str, f
 
 @styled
 def plot_autocorrelation(sequence: Sequence) -> Figure:
-    """Autocorrelation of the pixel residuals of each landmark, and of the velocity residuals, over the lag."""
+    """Draw the autocorrelation of the pixel residuals of each landmark and of the velocity residuals."""
     seen = sequence.observations
     r, w = pixel_residuals(sequence), velocity_residuals(sequence)
     rho_r = autocorrelation(r, LAGS, seen.landmark, seen.frame)
@@ -359,7 +359,7 @@ def plot_autocorrelation(sequence: Sequence) -> Figure:
 
 @styled
 def plot_windows(windows: dict[str, list[Window]]) -> Figure:
-    """NEES of the pose at the end of every window, and of its landmarks there, with chi-square bounds."""
+    """Draw the NEES of pose and landmarks at the end of every window, with chi-square bounds."""
     figure = Figure(figsize=(9.0, 6.2))
     pose_ax, landmark_ax = figure.subplots(2, 1, sharex=True)
     bounds_label = f"{100 * PROBABILITY:g} % chi-square bounds"
@@ -392,7 +392,7 @@ def markdown(
     choices: dict[str, Choice],
     own: dict[str, Array],
 ) -> str:
-    """The report of the experiment."""
+    """Return the report of the experiment."""
     low, high = chi2_bounds(6, PROBABILITY, count)
     landmark_low, landmark_high = chi2_bounds(3, PROBABILITY, count)
     return document(
@@ -430,7 +430,7 @@ def markdown(
 
 
 def structure_section(choices: dict[str, Choice]) -> list[str]:
-    """What was chosen, and among what."""
+    """Return the section on the chosen structure and its alternatives."""
     return [
         "## The structure, chosen by innovations without truth",
         *("\n".join([f"{name}:\n", *(f"- {line}" for line in choice.lines)]) for name, choice in choices.items()),
@@ -443,7 +443,7 @@ def structure_section(choices: dict[str, Choice]) -> list[str]:
 
 
 def error_section(own: dict[str, Array]) -> list[str]:
-    """Errors of the three instruments, and what follows."""
+    """Return the section on the errors of the three instruments."""
     return [
         "## Whose error it is",
         markdown_table(
@@ -465,7 +465,7 @@ def error_section(own: dict[str, Array]) -> list[str]:
 
 
 def consistency_cells(row: dict[str, float]) -> list[str]:
-    """One filter of `consistency_table`."""
+    """Return the cells of one filter of `consistency_table`."""
 
     def with_median(mean: str, median: str) -> str:
         return f"{row[mean]:.2f} ({row[median]:.2f})" if mean in row else MISSING
@@ -482,12 +482,12 @@ def consistency_cells(row: dict[str, float]) -> list[str]:
 
 
 def own_cells(own: Array) -> list[str]:
-    """Errors (6,) of one instrument in mm and degrees."""
+    """Return the errors (6,) of one instrument in mm and degrees."""
     return [*(f"{1e3 * value:.1f}" for value in own[:3]), *(f"{np.rad2deg(value):.2f}" for value in own[3:])]
 
 
 def noise_cells(row: dict[str, float], digits: int) -> list[str]:
-    """One row or axis of `noise_table`."""
+    """Return the cells of one row or axis of `noise_table`."""
     sizes = [f"{row[key]:.{digits}f}" for key in ("stated_std", "std", "robust_std", "mean", "largest")]
     return [*sizes, *(f"{row[f'autocorrelation_{lag}']:.2f}" for lag in SHOWN_LAGS), f"{row['inflation']:.2f}"]
 
@@ -509,7 +509,7 @@ def choices_of(sequence: Sequence) -> dict[str, Choice]:
 
 
 def errors_of(sequence: Sequence, choice: Choice) -> tuple[Noise, tuple[StateBlock, ...]]:
-    """Noise and state blocks of a choice."""
+    """Return noise and state blocks of a choice."""
     config = Config().with_overrides(choice.overrides)
     return noise_of(sequence, config), optional_blocks(config.blocks)
 
