@@ -76,11 +76,6 @@ def _whole(least: int, most: int = 1_000_000) -> dict[str, Rule]:
     return _rule(int, f"be a whole number not below {least}, nor above {most}", lambda value: least <= value <= most)
 
 
-def _odd(least: int, most: int) -> dict[str, Rule]:
-    words = f"be an odd number from {least} to {most}"
-    return _rule(int, words, lambda value: least <= value <= most and value % 2 == 1)
-
-
 def _one_of(literal: Any) -> dict[str, Rule]:
     names = get_args(literal)
     return _rule(str, f"be one of {', '.join(names)}", lambda value: value in names)
@@ -111,10 +106,17 @@ _PROBABILITY = _rule(float, "be in (0, 1]", lambda value: 0 < value <= 1)
 _BETWEEN_0_AND_1 = _rule(float, "be between 0 and 1", lambda value: 0 < value < 1)
 
 
+_CONSTANTS_OF_THE_FRONT_END = (
+    *("refill", "refill_every", "corner_block", "corner_quality", "border", "bucket_columns", "bucket_rows"),
+    *("match_patch", "match_score", "match_margin", "row_limit", "window", "backward_limit"),
+    *("template", "template_score_left", "template_score_right", "template_shift", "kernel", "residual_limit"),
+    *("strikes", "residual_drop", "samples", "rotation_gap", "settling"),
+)
 # Settings of earlier versions: a file that names them is read, and a note says what became of them.
 RETIRED = {
     "blocks.stereo_rotation": "the block is gone: it improved nothing. Pitch and roll of the right camera are the mean "
     "of vL - vR over the tracks of a recording",
+    **{f"front_end.{name}": "it is a constant of the front end now" for name in _CONSTANTS_OF_THE_FRONT_END},
 }
 
 
@@ -282,71 +284,25 @@ class CalibrationConfig:
 
 @dataclass(frozen=True)
 class FrontEndConfig:
-    """How images become tracks, see `ekfslam.frontend`. Lengths are in pixels of the rectified images.
+    """Settings of the front end, which tracks images, see `ekfslam.frontend`. Lengths are in rectified pixels.
 
     Args:
-        features: How many are wanted in a frame; about two thirds are seen.
-        refill: Share of them below which new ones are detected,
-        refill_every: in every so many frames; or at once where less than half is left.
-        corner_block: Window of the structure tensor of a corner.
-        corner_quality: Least eigenvalue of a corner, as a share of the largest in the image.
+        features: Number of features wanted in a frame; about two thirds of them are seen.
         spacing: Least distance between features.
-        border: Least distance from the border of the image.
-        bucket_columns, bucket_rows: Of the grid over which new features are spread.
-        match_patch: Side of the patch that is sought along the row of the right image.
-        min_disparity, max_disparity: Of a new feature.
-        match_score: Least normalised cross-correlation of a new feature.
-        match_margin: By how much that must be above the second best.
-        row_limit: Largest row difference of a pair, after the rotation of the right camera is taken out.
-        window: Side of the window of Lucas-Kanade.
-        levels: Levels of its pyramid.
-        backward_limit: Largest error when a feature is tracked there and back.
-        template: Side of the patch of first sight.
-        template_score_left, template_score_right: Least correlation with it.
-        template_shift: How far alignment to it may move a feature.
-        pixel_std: Standard deviation of a row, in the motion of the rig.
-        kernel: Scale of the robust kernel there, in standard deviations.
-        residual_limit: Observations with larger residuals are not reported.
-        strikes: After so many of them in a row, a feature is dropped,
-        residual_drop: or at once with such a residual.
-        samples: Of three points each, where the motion is not known beforehand.
+        min_disparity, max_disparity: Limits of the disparity of a new feature.
+        levels: Number of levels of the image pyramid of Lucas-Kanade.
+        pixel_std: Standard deviation of a pixel in the motion of the rig.
         rotation_deg: Prior standard deviation of the right camera's rotation against its calibration, each axis.
-        rotation_gap: Frames between the two frames from which yaw is found.
-        settling: Frames at the start whose pixels are corrected by the rotation known after them.
-        seed: Of random samples.
+        seed: Seed of random samples.
     """
 
     features: int = field(default=120, metadata=_whole(8, 5000))
-    refill: float = field(default=0.9, metadata=_PROBABILITY)
-    refill_every: int = field(default=2, metadata=_whole(1))
-    corner_block: int = field(default=5, metadata=_whole(3, 31))
-    corner_quality: float = field(default=4e-4, metadata=_BETWEEN_0_AND_1)
     spacing: int = field(default=10, metadata=_whole(1, 1000))
-    border: int = field(default=9, metadata=_whole(1, 1000))
-    bucket_columns: int = field(default=12, metadata=_whole(1, 1000))
-    bucket_rows: int = field(default=4, metadata=_whole(1, 1000))
-    match_patch: int = field(default=11, metadata=_odd(3, 99))
     min_disparity: float = field(default=2.0, metadata=_POSITIVE)
     max_disparity: float = field(default=180.0, metadata=_POSITIVE)
-    match_score: float = field(default=0.75, metadata=_BETWEEN_0_AND_1)
-    match_margin: float = field(default=0.03, metadata=_FINITE)
-    row_limit: float = field(default=1.0, metadata=_POSITIVE)
-    window: int = field(default=15, metadata=_odd(5, 99))
     levels: int = field(default=3, metadata=_whole(1, 8))
-    backward_limit: float = field(default=0.7, metadata=_POSITIVE)
-    template: int = field(default=15, metadata=_odd(5, 99))
-    template_score_left: float = field(default=0.8, metadata=_BETWEEN_0_AND_1)
-    template_score_right: float = field(default=0.7, metadata=_BETWEEN_0_AND_1)
-    template_shift: float = field(default=2.0, metadata=_POSITIVE)
     pixel_std: float = field(default=0.2, metadata=_PIXELS)
-    kernel: float = field(default=2.0, metadata=_POSITIVE)
-    residual_limit: float = field(default=2.0, metadata=_POSITIVE)
-    strikes: int = field(default=2, metadata=_whole(1))
-    residual_drop: float = field(default=10.0, metadata=_POSITIVE)
-    samples: int = field(default=200, metadata=_whole(1, 100_000))
     rotation_deg: float = field(default=0.2, metadata=_POSITIVE)
-    rotation_gap: int = field(default=4, metadata=_whole(1, 100))
-    settling: int = field(default=30, metadata=_whole(0))
     seed: int = field(default=0, metadata=_whole(0))
 
 

@@ -214,9 +214,14 @@ def test_yaw_is_found_from_motion_alone(std):
     assert rotation.std[1] < 0.2
 
 
+def test_a_former_setting_is_accepted_with_a_note():
+    with pytest.warns(UserWarning, match=r"front_end\.window is ignored: it is a constant"):
+        assert ekfslam.Config().with_overrides({"front_end": {"window": 14}}) == ekfslam.Config()
+
+
 def test_settings_break_no_rule_and_are_kept(room):
-    with pytest.raises(ekfslam.EkfslamError, match=r"front_end\.window must be an odd number"):
-        ekfslam.Config().with_overrides({"front_end": {"window": 14}})
+    with pytest.raises(ekfslam.EkfslamError, match=r"front_end\.levels must be"):
+        ekfslam.Config().with_overrides({"front_end": {"levels": 9}})
     sequence, _ = track(first(room, 2), FrontEndConfig(features=40))
     assert sequence.attributes["front_end_features"] == 40
     assert len(sequence.observations) <= 80

@@ -1,4 +1,4 @@
-"""What is tracked, and how it is found again in the next pair of images."""
+"""Tracked features, and how they are found in the next pair of images."""
 
 from __future__ import annotations
 
@@ -7,24 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.config import FrontEndConfig
 from ekfslam.data.images import Image
 from ekfslam.frontend.flow import flow, returns
-from ekfslam.frontend.template import Templates
+from ekfslam.frontend.template import Rows, Templates
 
-_SCALES = 0.25, 4.0  # of a patch, that are sampled
+_SCALES = 0.25, 4.0  # smallest and largest scale of a sampled patch
 
 
 @dataclass(frozen=True)
-class Features:
-    """What is tracked.
+class Features(Rows):
+    """Tracked features.
 
     Args:
-        id: (n,) of the tracks.
-        left, right: (n, 2) pixels, right ones as seen, without the correction of the camera's rotation.
-        disparity: (n,) at first sight.
-        strikes: (n,) how many frames in a row they did not move as the rig.
-        patches_left, patches_right: Of first sight.
+        id: (n,) ids of the tracks.
+        left, right: (n, 2) pixels, without the correction of the right camera's rotation.
+        disparity: (n,) disparity at first sight.
+        strikes: (n,) number of frames in a row in which a feature did not move as the rig.
+        patches_left, patches_right: Patches of first sight.
     """
 
     id: IntArray
@@ -35,40 +34,16 @@ class Features:
     patches_left: Templates
     patches_right: Templates
 
-    def keep(self, kept: IntArray | BoolArray) -> Features:
-        """Some of them, by index or mask."""
-        return Features(
-            self.id[kept],
-            self.left[kept],
-            self.right[kept],
-            self.disparity[kept],
-            self.strikes[kept],
-            self.patches_left.keep(kept),
-            self.patches_right.keep(kept),
-        )
-
-    def and_more(self, others: Features) -> Features:
-        """These and others."""
-        return Features(
-            np.concatenate([self.id, others.id]),
-            np.concatenate([self.left, others.left]),
-            np.concatenate([self.right, others.right]),
-            np.concatenate([self.disparity, others.disparity]),
-            np.concatenate([self.strikes, others.strikes]),
-            self.patches_left.and_more(others.patches_left),
-            self.patches_right.and_more(others.patches_right),
-        )
-
 
 @dataclass(frozen=True)
 class Followed:
-    """Where features are in the next images.
+    """Features in the next images.
 
     Args:
         left, right: (n, 2) pixels, aligned to the patches of first sight.
-        is_found, is_found_back: (n,) by optical flow, and by it the way back.
+        is_found, is_found_back: (n,) whether optical flow found a feature, and its way back.
         score_left, score_right: (n,) correlation with first sight.
-        shift: (n,) how far the alignment moved them, px.
+        shift: (n,) shift by the alignment, px.
     """
 
     left: Array
@@ -86,23 +61,21 @@ def follow(
     now: tuple[Image, Image],
     guess: tuple[Array, Array],
     levels: int,
-    config: FrontEndConfig,
 ) -> Followed:
     """Find features in the next pair of images.
 
-    Optical flow finds them in the left image, and the way back; where a left feature went beside its prediction, the
-    right one did, and flow on the finest level finds it. Both are then aligned to the patches of first sight.
+    Optical flow finds them in the left image, and the way back. The right feature is sought at its prediction, shifted
+    by the error of the left one, on the finest level. Both are then aligned to the patches of first sight.
 
     Args:
-        features: As they are in the images before.
+        features: Features in the images before.
         before, now: Left and right images.
-        guess: (n, 2) pixels where they should be in both images now.
-        levels: Of the pyramid in the left image.
-        config: Settings.
+        guess: (n, 2) predicted pixels in both images now.
+        levels: Levels of the pyramid in the left image.
     """
-    found, is_found = flow(before[0], now[0], features.left, guess[0], config.window, levels)
-    back = returns(before[0], now[0], features.left, found, config.window, config.backward_limit)
-    seen, is_seen = flow(before[1], now[1], features.right, guess[1] + (found - guess[0]), config.window, 1)
+    found, is_found = flow(before[0], now[0], features.left, guess[0], levels)
+    back = returns(before[0], now[0], features.left, found)
+    seen, is_seen = flow(before[1], now[1], features.right, guess[1] + (found - guess[0]), 1)
     scale = np.clip((found[:, 0] - seen[:, 0]) / features.disparity, *_SCALES)
     left, score_left = features.patches_left.align(now[0].astype(np.float32), found, scale)
     right, score_right = features.patches_right.align(now[1].astype(np.float32), seen, scale)

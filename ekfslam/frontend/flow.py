@@ -8,20 +8,21 @@ from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.images import Image
 from ekfslam.frontend.opencv import opencv
 
+_WINDOW = 15  # side, px
 _STEPS, _LEAST_STEP_PX, _LEAST_EIGENVALUE = 30, 0.01, 1e-4
+_RETURN_PX = 0.7  # largest error of a feature that is tracked there and back
 
 
-def flow(
-    source: Image, target: Image, pixels: Array, guess: Array, window: int, levels: int
-) -> tuple[Array, BoolArray]:
-    """Pyramidal Lucas-Kanade (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001).
+def flow(source: Image, target: Image, pixels: Array, guess: Array, levels: int) -> tuple[Array, BoolArray]:
+    """Track features by pyramidal Lucas-Kanade.
+
+    J.-Y. Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001.
 
     Args:
-        source, target: Images.
+        source, target: First and second image.
         pixels: (n, 2) features of the source.
-        guess: (n, 2) where they may be in the target.
-        window: Side of the window, px.
-        levels: Of the pyramid; 1 is the image alone.
+        guess: (n, 2) predicted pixels in the target.
+        levels: Levels of the pyramid; 1 is the image alone.
 
     Returns:
         Pixels (n, 2) in the target, and whether they were found (n,).
@@ -34,7 +35,7 @@ def flow(
         target,
         pixels.astype(np.float32).reshape(-1, 1, 2),
         guess.astype(np.float32).reshape(-1, 1, 2).copy(),
-        winSize=(window, window),
+        winSize=(_WINDOW, _WINDOW),
         maxLevel=levels - 1,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _STEPS, _LEAST_STEP_PX),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -44,12 +45,12 @@ def flow(
     return found, (status.ravel() == 1) & np.isfinite(found).all(axis=1)
 
 
-def returns(source: Image, target: Image, pixels: Array, found: Array, window: int, limit_px: float) -> BoolArray:
-    """Whether features (n, 2) found in the target lead back to where they come from."""
-    back, status = flow(target, source, found, pixels, window, 1)
-    return status & (np.linalg.norm(back - pixels, axis=1) < limit_px)
+def returns(source: Image, target: Image, pixels: Array, found: Array) -> BoolArray:
+    """Return whether (n,) features found (n, 2) in the target lead back to their pixels (n, 2) in the source."""
+    back, status = flow(target, source, found, pixels, 1)
+    return status & (np.linalg.norm(back - pixels, axis=1) < _RETURN_PX)
 
 
 def inside(pixels: Array, size: tuple[int, int], border: float) -> BoolArray:
-    """Which pixels (n, 2) are in an image of this width and height, and so far from its border."""
+    """Return whether (n,) pixels (n, 2) are in an image of a width and height, and this far from its border."""
     return np.all((pixels >= border) & (pixels <= np.array(size) - 1 - border), axis=1)

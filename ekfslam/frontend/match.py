@@ -9,23 +9,29 @@ from ekfslam.config import FrontEndConfig
 from ekfslam.data.images import Image
 from ekfslam.frontend.flow import flow, inside, returns
 from ekfslam.frontend.opencv import opencv
+from ekfslam.frontend.template import SIDE
+
+ROW_LIMIT_PX = 1.0  # largest row difference of a pair, after the rotation of the right camera is taken out
+_PATCH = 11  # side of the patch that is sought along the row, px
+_LEAST_SCORE = 0.75  # normalised cross-correlation of a match
+_LEAST_MARGIN = 0.03  # to the second best
 
 
 def match_along_row(
     left: Image, right: Image, pixels: Array, row_offset: Array, config: FrontEndConfig
 ) -> tuple[Array, BoolArray]:
-    """Where features of the left image are in the right one, to a pixel.
+    """Find features of the left image in the right one, to a pixel.
 
     Args:
         left, right: Rectified images.
         pixels: (n, 2) features of the left one.
-        row_offset: (n,) ``vL - vR`` that the rotation of the right camera makes.
+        row_offset: (n,) ``vL - vR`` due to the rotation of the right camera.
         config: Settings.
 
     Returns:
-        Pixels (n, 2), and whether the match is good and the only one (n,).
+        Pixels (n, 2), and whether (n,) the match is good and unique.
     """
-    cv2, half = opencv(), config.match_patch // 2
+    cv2, half = opencv(), _PATCH // 2
     found, good = pixels.copy(), np.zeros(len(pixels), dtype=bool)
     corner = np.round(pixels).astype(np.int64)
     rows = np.round(pixels[:, 1] - row_offset).astype(np.int64)
@@ -33,36 +39,36 @@ def match_along_row(
         begin = max(u - half - int(config.max_disparity), 0)
         patch = left[v - half : v + half + 1, u - half : u + half + 1]
         strip = right[max(row - half, 0) : row + half + 1, begin : u + half + 1]
-        if u < half or patch.shape != (config.match_patch,) * 2 or strip.shape[0] != config.match_patch:
+        if u < half or patch.shape != (_PATCH, _PATCH) or strip.shape[0] != _PATCH:
             continue
         score = cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED)[0]
         best = int(np.argmax(score))
         found[i, 0] += begin + best + half - u
         found[i, 1] -= row_offset[i]
-        good[i] = score[best] >= config.match_score and score[best] > _second(score, best, half) + config.match_margin
+        good[i] = score[best] >= _LEAST_SCORE and score[best] > _second(score, best, half) + _LEAST_MARGIN
     return found, good
 
 
 def _second(score: Array, best: int, half: int) -> float:
-    """The largest score besides those of patches that overlap half of the best one; -1 where there is none."""
+    """Return the largest score of patches that overlap less than half of the best one; -1 if there is none."""
     return float(max(score[: max(best - half, 0)].max(initial=-1.0), score[best + half + 1 :].max(initial=-1.0)))
 
 
 def first_pairs(
     left: Image, right: Image, pixels: Array, row_offset: Array, config: FrontEndConfig
 ) -> tuple[Array, BoolArray]:
-    """Where features of the left image are in the right one, to a fraction of a pixel; arguments as before.
+    """Find features of the left image in the right one, to a fraction of a pixel; see `match_along_row`.
 
     Returns:
-        Pixels (n, 2), and whether they are to be trusted (n,).
+        Pixels (n, 2), and whether (n,) they can be trusted.
     """
     found, good = match_along_row(left, right, pixels, row_offset, config)
     refined = found.copy()
-    refined[good], status = flow(left, right, pixels[good], found[good], config.window, 1)
+    refined[good], status = flow(left, right, pixels[good], found[good], 1)
     good[good] = status
-    good[good] = returns(left, right, pixels[good], refined[good], config.window, config.backward_limit)
+    good[good] = returns(left, right, pixels[good], refined[good])
     size = (right.shape[1], right.shape[0])
-    good &= inside(refined, size, config.template // 2)
-    good &= np.abs(pixels[:, 1] - refined[:, 1] - row_offset) < config.row_limit
+    good &= inside(refined, size, SIDE // 2)
+    good &= np.abs(pixels[:, 1] - refined[:, 1] - row_offset) < ROW_LIMIT_PX
     good &= pixels[:, 0] - refined[:, 0] >= config.min_disparity
     return refined, good

@@ -1,4 +1,4 @@
-"""Patches of first sight, to which features are brought back in every frame, so that tracks do not creep.
+"""Patches of first sight, to which features are aligned in every frame, so that tracks do not creep.
 
 Inverse compositional alignment (Baker and Matthews, IJCV 2004) over translation, gain and bias: the image about a
 feature is ``I(p + s x) = g T(x + d) + b``, linear in ``(g d, g, b)`` with constant derivatives. One product with a
@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Self
 
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, Float32Array, IntArray
 from ekfslam.frontend.opencv import opencv
 
+SIDE = 15  # of a patch, px
 _ITERATIONS = 8
 _CONVERGED_PX = 0.005
 _RIDGE = 1e-6
@@ -22,7 +24,7 @@ _RIDGE = 1e-6
 
 @cache
 def grid(side: int) -> Float32Array:
-    """Offsets (side^2, 2) of the pixels of a patch from its centre, row by row, float32."""
+    """Return offsets (side^2, 2) of the pixels of a patch from its centre, row by row, float32."""
     offsets = np.arange(side) - side // 2
     v, u = np.meshgrid(offsets, offsets, indexing="ij")
     return np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32)
@@ -30,13 +32,13 @@ def grid(side: int) -> Float32Array:
 
 @cache
 def weights(side: int) -> Float32Array:
-    """(side^2,) Gaussian weights of the pixels of a patch, which sum to 1."""
+    """Return (side^2,) Gaussian weights of the pixels of a patch, which sum to 1."""
     weight = np.exp(-0.5 * (grid(side) ** 2).sum(axis=1) / (side / 4.0) ** 2)
     return (weight / weight.sum()).astype(np.float32)
 
 
 def sample(image: Float32Array, pixels: Array, scale: Array, side: int) -> Float32Array:
-    """Patches (n, side^2) about pixels (n, 2), bilinear, their pixels ``scale`` (n,) apart; all in one call."""
+    """Return patches (n, side^2) about pixels (n, 2), bilinear, with pixels ``scale`` (n,) apart."""
     cv2, offsets = opencv(), grid(side)
     if not len(pixels):
         return np.empty((0, side**2), dtype=np.float32)
@@ -45,11 +47,26 @@ def sample(image: Float32Array, pixels: Array, scale: Array, side: int) -> Float
 
 
 @dataclass(frozen=True)
-class Templates:
+class Rows:
+    """Base of dataclasses whose fields have one row for each feature."""
+
+    def keep(self, kept: IntArray | BoolArray) -> Self:
+        """Return some rows, by index or mask."""
+        fields = vars(self).values()
+        return type(self)(*(rows.keep(kept) if isinstance(rows, Rows) else rows[kept] for rows in fields))
+
+    def and_more(self, others: Self) -> Self:
+        """Return these rows and others."""
+        pairs = zip(vars(self).values(), vars(others).values(), strict=True)
+        return type(self)(*(a.and_more(b) if isinstance(a, Rows) else np.concatenate([a, b]) for a, b in pairs))
+
+
+@dataclass(frozen=True)
+class Templates(Rows):
     """Patches of one image.
 
     Args:
-        patch: (n, side^2) as first seen.
+        patch: (n, side^2) pixels of first sight.
         solver: (n, 4, side^2) least squares solution for ``(g d_u, g d_v, g, b)``.
     """
 
@@ -57,8 +74,9 @@ class Templates:
     solver: Float32Array
 
     @staticmethod
-    def of(image: Float32Array, pixels: Array, side: int) -> Templates:
-        """Patches about pixels (n, 2)."""
+    def of(image: Float32Array, pixels: Array) -> Templates:
+        """Return patches about pixels (n, 2)."""
+        side = SIDE
         wide = sample(image, pixels, np.ones(len(pixels)), side + 2).reshape(-1, side + 2, side + 2)
         T = wide[:, 1:-1, 1:-1].reshape(len(pixels), side**2)
         T_u = 0.5 * (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]).reshape(T.shape)
@@ -69,26 +87,18 @@ class Templates:
         solver = np.linalg.solve(normal + _RIDGE * np.eye(4), JW.astype(float))
         return Templates(T, solver.astype(np.float32))
 
-    def keep(self, kept: IntArray | BoolArray) -> Templates:
-        """Some of them, by index or mask."""
-        return Templates(self.patch[kept], self.solver[kept])
-
-    def and_more(self, others: Templates) -> Templates:
-        """These and others."""
-        return Templates(np.concatenate([self.patch, others.patch]), np.concatenate([self.solver, others.solver]))
-
     def align(self, image: Float32Array, pixels: Array, scale: Array) -> tuple[Array, Array]:
-        """Bring features back to their patches.
+        """Align features to their patches.
 
         Args:
-            image: In which they are.
-            pixels: (n, 2) where they seem to be.
-            scale: (n,) by how much larger than at first sight they look.
+            image: Image to search.
+            pixels: (n, 2) predicted pixels.
+            scale: (n,) size relative to first sight.
 
         Returns:
             Pixels (n, 2), and the weighted correlation (n,) with the patch there; -1 where alignment fails.
         """
-        side = int(np.sqrt(self.patch.shape[1]) + 0.5)
+        side = SIDE
         pixels, active = pixels.copy(), np.arange(len(pixels))
         fails = np.zeros(len(pixels), dtype=bool)
         for _ in range(_ITERATIONS):
@@ -107,7 +117,7 @@ class Templates:
 
 
 def correlation(a: Float32Array, b: Float32Array, weight: Float32Array) -> Array:
-    """Weighted, normalised cross-correlation (n,) of patches (n, side^2)."""
+    """Return the weighted, normalised cross-correlation (n,) of patches (n, side^2)."""
     a, b = a - (a @ weight)[:, None], b - (b @ weight)[:, None]
     norm = np.sqrt((a * a) @ weight * ((b * b) @ weight))
     return ((a * b) @ weight) / np.maximum(norm, 1e-9)

@@ -20,6 +20,8 @@ from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.progress import progress
 
+_SETTLING = 30  # first frames, whose pixels are corrected by the rotation known after them
+
 
 @dataclass(frozen=True)
 class TrackReport:
@@ -99,7 +101,7 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
             vectors.append(tracker.rotation.vector)
             stds.append(tracker.rotation.std)
     rotation, std = np.array(vectors), np.array(stds)
-    observations, single = _observations(seen, rotation, rectified.camera, config.settling)
+    observations, single = _observations(seen, rotation, rectified.camera, _SETTLING)
     if not len(observations):
         raise EmptyTracksError(
             "no feature is seen in both images of two frames: is left right, or max_disparity too small?",
