@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reprojection import reprojection_errors
 from support.npy import Runs, npy_fields, write_npy
 from support.recordings import (
     CAMERA_IN_IMU_M,
@@ -35,7 +36,6 @@ from ekfslam.errors import (
     ShapeError,
     UnknownFormatError,
 )
-from ekfslam.evaluation.reprojection import reprojection_errors
 from ekfslam.geometry import se3
 from ekfslam.limits import reading_up_to
 

@@ -18,7 +18,7 @@ GOES = "the window in view: goes once the compiled filter replaces it"
 EXCEPTIONS: dict[str, str] = {
     "ekfslam.data.simulate.simulate": TO_BE_SPLIT,
     "ekfslam.filters.conditional.ConditionalGaussian": GOES,
-    "ekfslam.filters.joint.JointEKF": TO_BE_SPLIT,
+    "ekfslam.models.build.model_of": TO_BE_SPLIT,
     "ekfslam.models.model.Model": TO_BE_SPLIT,
     "ekfslam.smoother.optimise.maximise": TO_BE_SPLIT,
     "ekfslam.smoother.sparse.information.JointInformation": TO_BE_SPLIT,

@@ -6,6 +6,7 @@ import json
 import h5py
 import numpy as np
 import pytest
+from reprojection import reprojection_errors
 from support.reference import small_world
 from support.running import WHOLE
 from support.same import assert_same
@@ -18,7 +19,6 @@ from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.data.tracks import cut_tracks, inspect_tracks, repeated_frames, successive
 from ekfslam.errors import ArchiveError, DuplicateObservationError, TruthError
-from ekfslam.evaluation.reprojection import reprojection_errors
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import project
 from ekfslam.resolve import noise_of

@@ -5,7 +5,8 @@
         return float(np.diff(result.time_s).max())
 
 A file with such a function is all that a new one takes: once it is imported, summaries, tables, sweeps and report pages
-have it. Parameters are named after what a function takes of `offered`. If that is missing, the value is None.
+have it. Parameters without default are named after what a function takes of `offered`. If that is missing, the value
+is None.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -99,7 +101,8 @@ def computed(found: dict[str, Any]) -> dict[str, Value]:
     summary: dict[str, Value] = {}
     for key, entry in METRICS.items():
         if entry.compute not in values:
-            taken = {name: found[name] for name in inspect.signature(entry.compute).parameters}
+            parameters = inspect.signature(entry.compute).parameters.items()
+            taken = {name: found[name] for name, one in parameters if one.default is one.empty}
             is_missing = any(value is None for value in taken.values())
             values[entry.compute] = None if is_missing else entry.compute(**taken)
         value = values[entry.compute]
@@ -107,33 +110,15 @@ def computed(found: dict[str, Any]) -> dict[str, Value]:
     return summary
 
 
-@metric("ate_m", "ATE [m], unaligned", ".3f")
-def ate(T_est: Array, T_true: Array) -> float:
-    """Return the absolute trajectory error in world."""
-    return trajectory.absolute_trajectory_error(T_est, T_true, align=False)
-
-
-@metric("ate_aligned_m", "ATE [m], SE(3)-aligned", ".3f")
-def ate_aligned(T_est: Array, T_true: Array) -> float:
-    """Return the absolute trajectory error after alignment."""
-    return trajectory.absolute_trajectory_error(T_est, T_true, align=True)
-
-
+metric("ate_m", "ATE [m], unaligned", ".3f")(partial(trajectory.absolute_trajectory_error, align=False))
+metric("ate_aligned_m", "ATE [m], SE(3)-aligned", ".3f")(partial(trajectory.absolute_trajectory_error, align=True))
 metric("final_error_m", "final error [m]", ".3f")(trajectory.final_position_error)
-
-
-@metrics(("rpe_1_frame_m", "RPE [m], 1 frame", ".4f"), ("rpe_1_frame_deg", "RPE [deg], 1 frame", ".4f"))
-def rpe_of_frames(T_est: Array, T_true: Array) -> tuple[float, float] | None:
-    """Return the relative pose errors over one frame."""
-    return trajectory.relative_pose_error_over_frames(T_est, T_true)
-
-
-@metrics(*((f"rpe_10_m_{unit}", f"RPE [{unit}], {RPE_PATH_M:g} m", ".4f") for unit in ("m", "deg")))
-def rpe_of_path(T_est: Array, T_true: Array) -> tuple[float, float] | None:
-    """Return the relative pose errors over 10 m of true path."""
-    return trajectory.relative_pose_error_over_path(T_est, T_true, RPE_PATH_M)
-
-
+metrics(("rpe_1_frame_m", "RPE [m], 1 frame", ".4f"), ("rpe_1_frame_deg", "RPE [deg], 1 frame", ".4f"))(
+    trajectory.relative_pose_error_over_frames
+)
+metrics(*((f"rpe_10_m_{unit}", f"RPE [{unit}], {RPE_PATH_M:g} m", ".4f") for unit in ("m", "deg")))(
+    partial(trajectory.relative_pose_error_over_path, path_m=RPE_PATH_M)
+)
 metrics(("t_rel_percent", "t_rel [%]", ".3f"), ("r_rel_deg_per_100m", "r_rel [deg/100 m]", ".4f"))(
     trajectory.kitti_segment_errors
 )

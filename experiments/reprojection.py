@@ -1,4 +1,4 @@
-"""How well the tracks of a recording fit the true poses: the measure of track hygiene, whatever any filter does."""
+"""How well the tracks of a recording fit the true poses: the measure of track hygiene, independent of any filter."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _ITERATIONS = 15
 
 
 def reprojection_errors(sequence: Sequence, observations: Observations | None = None) -> Array:
-    """Distance between each observation and its track's point in the left image, at the true poses.
+    """Return the distance of each observation from its track's point in the left image, at the true poses.
 
-    The point of a track is the one that fits all its stereo observations best: least squares of the four pixels with a
-    Huber kernel (Levenberg-Marquardt from the observation of largest disparity). A track that has shown several points
-    fits at most one of them.
+    The point of a track fits all its stereo observations best: least squares of the four pixels with a Huber kernel
+    (Levenberg-Marquardt from the observation of largest disparity). A track that has shown several points fits at most
+    one of them.
 
     Args:
         sequence: A recording with true poses.
@@ -58,7 +58,7 @@ def reprojection_errors(sequence: Sequence, observations: Observations | None = 
 
 
 def _points_seen(camera: cam.StereoCamera, T_cam_world: Array, pixels: Array, track: IntArray) -> Array:
-    """What each of k observations, sorted by ``track`` (k,), sees of its track's point: (k, 3) in its camera frame."""
+    """Return the point of its track in the camera frame of each of k observations, sorted by ``track`` (k,): (k, 3)."""
     _, starts, track = np.unique(track, return_index=True, return_inverse=True)
     disparity = pixels[:, 0] - pixels[:, 2]
     first = np.lexsort((-disparity, track))[starts]
