@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -16,15 +16,20 @@ class AccelBias(StateBlock):
 
     Args:
         std_m_s2: Standard deviation of the first bias, each axis.
+        first_m_s2: (3,) first estimate.
     """
 
     std_m_s2: float = 0.1
+    first_m_s2: Array = field(default_factory=lambda: np.zeros(3))
 
     name = "accel_bias"
     size = 3
     per_frame = True
     labels = ("bias of f_x", "bias of f_y", "bias of f_z")
     units = ("m/s^2",) * 3
+
+    def initial(self) -> Array:
+        return self.first_m_s2
 
     def prior_covariance(self) -> Array:
         return self.std_m_s2**2 * np.eye(3)
