@@ -35,13 +35,14 @@ import numpy as np
 
 from ekfslam.config import LEAST_PX, Config, Mode
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
+from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.noise import Noise
-from ekfslam.data.sequence import WITHOUT_TRACKS, Sequence
+from ekfslam.data.sequence import WITHOUT_TRACKS, WITHOUT_VELOCITIES, Sequence
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import StateBlock
+from ekfslam.models.blocks import OPTIONAL_BLOCKS, StateBlock
 from ekfslam.models.build import model_of, optional_blocks
 from ekfslam.models.form import is_conditional_cheaper
 from ekfslam.models.model import Model
@@ -55,6 +56,7 @@ from ekfslam.models.noise import (
     with_drift,
 )
 from ekfslam.models.odometry import stereo_odometry, vision_noise
+from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess, inertial, velocities
 from ekfslam.models.sensors.stereo import Rig
 
 # Number of dormant landmarks kept in the state of a recording whose landmarks come back: their covariance has 160 MB.
@@ -117,10 +119,14 @@ def resolve(
         ConfigError: An unknown block, an unknown setting of a block, or pixel noise that is too small.
     """
     if not sequence.has_velocities:
+        without = {**sequence.attributes, **WITHOUT_VELOCITIES}
+        sequence = dataclasses.replace(sequence, attributes=without)
         sequence = sequence.with_velocities(stereo_odometry(sequence), "imu")
     config = settings_of(sequence, config or Config())
     noise, hygiene = noise_of(sequence, config), None
     account = {**_found(sequence, config), **{f"tuned_{key}": value for key, value in config.tuning.items()}}
+    if is_inertial(sequence):
+        account |= {f"inertial_{name}": value for name, value in vars(_densities(sequence)).items()}
     if mode != "dead-reckoning":
         _require_pixel_noise(sequence, noise)
         observations, hygiene = clean_tracks(sequence, noise, config.hygiene)
@@ -168,6 +174,8 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
         stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
     if not sequence.has_velocities:
         stated = vision_noise(stated, sequence.twist)
+    if is_inertial(sequence):
+        stated = dataclasses.replace(stated, twist_walk_std=None)
     twist, pixels = np.array(stated.twist_std, dtype=float), np.array(stated.pixel_std_px, dtype=float)
     if given.sigma_v_m_s is not None:
         twist[:3] = given.sigma_v_m_s
@@ -180,6 +188,11 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
     tilt = stated.tilt_rad if given.tilt_deg is None else float(np.deg2rad(given.tilt_deg))
     noise = dataclasses.replace(stated, twist_std=twist, pixel_std_px=pixels, tilt_rad=tilt)
     return noise if given.drift is None else with_drift(noise, given.drift)
+
+
+def is_inertial(sequence: Sequence) -> bool:
+    """Return whether inertial samples move the state: the recording has some, and no measured velocities."""
+    return sequence.inertial is not None and not sequence.has_velocities
 
 
 def is_automatic(sequence: Sequence, config: Config) -> bool:
@@ -234,16 +247,30 @@ def _require_pixel_noise(sequence: Sequence, noise: Noise) -> None:
 
 
 def _model(sequence: Sequence, config: Config, noise: Noise, blocks: SequenceType[StateBlock]) -> Model:
+    known, tables = dict(OPTIONAL_BLOCKS), dict(config.blocks)
+    make_process: MakeProcess = velocities
+    if is_inertial(sequence):
+        known |= INERTIAL_BLOCKS
+        tables = {name: {} for name in INERTIAL_BLOCKS} | tables
+        make_process = inertial(_densities(sequence))
+    chosen = [block.begun_by(sequence) for block in optional_blocks(tables, known)]
     return model_of(
         Rig(sequence.camera, sequence.T_cam_imu, noise),
         noise,
         se3.inverse(sequence.initial_T_world_imu),
         config.filter.initial_covariance,
         config.calibration,
-        (*optional_blocks(config.blocks), *blocks),
+        (*chosen, *blocks),
         config.filter.landmark_coordinates,
         sequence.has_velocities,
+        make_process,
     )
+
+
+def _densities(sequence: Sequence) -> InertialNoise:
+    if sequence.inertial is None or sequence.inertial.noise is None:
+        raise ConfigError(f"{sequence.name}: the inertial samples state no densities of their noise (InertialNoise)")
+    return sequence.inertial.noise
 
 
 def _has_open_scale(sequence: Sequence, config: Config) -> bool:

@@ -311,6 +311,13 @@ class Sequence(Shown):
             return se3.nearest_rigid(self.truth.T_world_imu[0])
         return np.eye(4)
 
+    @property
+    def initial_velocity_m_s(self) -> Array:
+        """(3,) first velocity in the IMU frame that estimates start from: the true one if it is known, else 0."""
+        if self.truth is None or self.truth.motion is None or self.truth.frame[0] != 0:
+            return np.zeros(3)
+        return self.truth.T_world_imu[0, :3, :3].T @ self.truth.motion.velocity_m_s[0]
+
 
 def _camera_pose(T_cam_imu: ArrayLike | None, is_optional: bool) -> Array:
     if T_cam_imu is not None:

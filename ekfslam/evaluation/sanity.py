@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.data.sequence import WITHOUT_VELOCITIES, Sequence
+from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import MOVING_M_S, successive
 from ekfslam.evaluation.trajectory import absolute_trajectory_error, distance_along
 from ekfslam.filters.result import SANITY, SANITY_SEPARATOR, Result
@@ -117,7 +117,7 @@ def inspect_sequence(sequence: Sequence) -> Sanity:
     tau = np.diff(sequence.time_s, prepend=sequence.time_s[:1])
     if len(sequence) > 1:
         figures.insert(0, f"median step {np.median(tau[1:]):.4g} s, longest {tau[1:].max():.4g} s")
-    if len(sequence) < 2 or WITHOUT_VELOCITIES.items() <= sequence.attributes.items():
+    if len(sequence) < 2 or not sequence.has_velocities:
         return Sanity(tuple(figures), tuple(warnings))
     speed = np.linalg.norm(sequence.twist[:, :3], axis=1)
     path = f"path {float(speed @ tau):.4g} m by velocities"

@@ -96,20 +96,22 @@ def has_image_coordinates(sensor: Sensor, coordinates: LandmarkCoordinates) -> b
     return coordinates == "image" and isinstance(sensor, Rig | Monocular)
 
 
-def optional_blocks(settings: Mapping[str, Mapping[str, Any]]) -> tuple[StateBlock, ...]:
-    """Return the blocks of the tables ``[blocks.<name>]`` of a configuration.
+def optional_blocks(
+    settings: Mapping[str, Mapping[str, Any]], known_blocks: Mapping[str, type[StateBlock]] = OPTIONAL_BLOCKS
+) -> tuple[StateBlock, ...]:
+    """Return the blocks of the tables ``[blocks.<name>]`` of a configuration, given the classes by name.
 
     Raises:
         ConfigError: An unknown block, or a setting that it does not have.
     """
     chosen = []
     for name, values in settings.items():
-        if name not in OPTIONAL_BLOCKS:
-            raise ConfigError(f"unknown block blocks.{name}; known: {', '.join(OPTIONAL_BLOCKS)}")
-        known = [field.name for field in dataclasses.fields(OPTIONAL_BLOCKS[name])]  # type: ignore[arg-type]
+        if name not in known_blocks:
+            raise ConfigError(f"unknown block blocks.{name}; known: {', '.join(known_blocks)}")
+        known = [field.name for field in dataclasses.fields(known_blocks[name])]  # type: ignore[arg-type]
         for key in values:
             if key not in known:
                 raise ConfigError(f"unknown key blocks.{name}.{key}; known: {', '.join(known)}")
             require_setting(f"blocks.{name}.{key}", values[key], is_scale=key.startswith(("time", "length")))
-        chosen.append(OPTIONAL_BLOCKS[name](**values))
+        chosen.append(known_blocks[name](**values))
     return tuple(chosen)

@@ -243,6 +243,8 @@ def model_of_result(result: Result) -> Model:
     """
     assert result.log is not None
     stored, log = _config_of(result), result.log
+    if "inertial_gyro" in result.attributes:
+        raise PosteriorError(f"{result.sequence_name}: runs with inertial samples cannot be smoothed yet")
     if retired := set(result.config.get("blocks", {})) - set(stored.blocks):
         raise PosteriorError(
             f"{result.sequence_name}: this result had the state block {', '.join(sorted(retired))}, which no longer "

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal, TypeVar
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.sequence import Sequence
 
 # Estimates by name of their block; arrays may have leading dimensions (frames), so that a whole drive is one call.
 Values = Mapping[str, Array]
@@ -74,6 +75,10 @@ class StateBlock:
     def initial(self) -> Array:
         """Its value before the first frame."""
         return np.zeros(self.size)
+
+    def begun_by(self, sequence: Sequence) -> StateBlock:
+        """Return the block with the first value that a recording states, if it states one."""
+        return self
 
     def prior_covariance(self) -> Array:
         """(size, size) covariance of that value."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ekfslam.arrays import Array
+from ekfslam.data.sequence import Sequence
 from ekfslam.models.blocks.base import StateBlock
 
 
@@ -30,6 +31,9 @@ class Velocity(StateBlock):
     per_frame = True
     labels = ("v_x", "v_y", "v_z")
     units = ("m/s",) * 3
+
+    def begun_by(self, sequence: Sequence) -> Velocity:
+        return replace(self, first_m_s=sequence.initial_velocity_m_s)
 
     def initial(self) -> Array:
         return self.first_m_s

@@ -20,7 +20,7 @@ from ekfslam.data.interval import Interval, Intervals
 from ekfslam.data.noise import Noise
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
-from ekfslam.models.blocks.base import Layout, Values
+from ekfslam.models.blocks.base import Layout, StateBlock, Values
 from ekfslam.models.process.base import MakeProcess, Process, Residual, Step
 
 GRAVITY_M_S2 = 9.81
@@ -29,6 +29,7 @@ _GAP_FACTOR = 10.0  # by which densities of white noise grow in an interval with
 _PHI, _NU, _R, _BG, _BA = (slice(3 * i, 3 * i + 3) for i in range(5))  # of z
 _RHO, _THETA, _U = _PHI, _NU, _R  # of the blocks
 _EYE = np.eye(3)
+INERTIAL_BLOCKS: dict[str, type[StateBlock]] = {block.name: block for block in (Velocity, GyroBias, AccelBias)}
 
 
 def inertial(noise: InertialNoise, gravity_m_s2: float = GRAVITY_M_S2) -> MakeProcess:

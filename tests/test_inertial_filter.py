@@ -1,0 +1,118 @@
+"""The joint filter with the inertial process, on the world ``room``."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from inertial import FILTER, LARGE, Prior, model_from_prior, outcomes, run_once
+from support.gauge import gauge_directions
+
+import ekfslam
+from ekfslam.data.room import Room, simulate_room
+from ekfslam.errors import ConfigError, PosteriorError
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
+from ekfslam.resolve import resolve
+
+FREE = Prior(position_m=0.5, tilt_rad=0.2, yaw_rad=0.2, rest_s=0.0)
+
+
+@functools.cache
+def room(frames=60):
+    return simulate_room(Room(frames=frames, seed=2))
+
+
+def gauge_information(ekf):
+    """Information (4, 4) along position and turns about gravity."""
+    world = np.zeros((6, 4))
+    world[:3, :3], world[5, 3] = np.eye(3), 1.0
+    own, body = ekf.model.process.columns, ekf.model.layout.body
+    columns = np.concatenate([own, np.arange(body, len(ekf.P))])
+    directions = gauge_directions(ekf.linear_T_imu_world, ekf.linear_positions_m) @ world
+    N = np.vstack([directions[:6], np.zeros((9, 4)), directions[6:]])
+    return N.T @ np.linalg.solve(ekf.P[np.ix_(columns, columns)], N)
+
+
+def gauge_ratio(variant, coordinates):
+    """Eigenvalues of the information after the last frame over that before the first one."""
+    config = dataclasses.replace(FILTER, variant=variant, landmark_coordinates=coordinates, gate_probability=1.0)
+    model = model_from_prior(room(), FREE, np.random.default_rng(0), noise_free=True)
+    ekf = JointEKF(model, config)
+    first = gauge_information(ekf)
+    for _ in run_filter(ekf, room()):
+        pass
+    return np.sort(np.linalg.eigvals(np.linalg.solve(first, gauge_information(ekf))).real)
+
+
+@pytest.mark.parametrize("coordinates", ["image", "xyz"])
+@pytest.mark.parametrize("variant", ["invariant", "fej"])
+def test_consistent_variants_gain_no_information_about_position_and_heading(variant, coordinates):
+    np.testing.assert_allclose(gauge_ratio(variant, coordinates), 1.0, atol=1e-6)
+
+
+def test_the_standard_variant_gains_information_about_the_heading():
+    assert gauge_ratio("standard", "xyz").max() > 10.0
+
+
+def test_dense_and_conditional_form_agree():
+    forms = [dataclasses.replace(FILTER, covariance_form=form) for form in ("dense", "conditional")]
+    ekfs = [JointEKF(model_from_prior(room(), Prior(), np.random.default_rng(0)), config) for config in forms]
+    for _ in zip(*(run_filter(ekf, room()) for ekf in ekfs), strict=True):
+        pass
+    for name, value in ekfs[0].values.items():
+        np.testing.assert_allclose(ekfs[1].values[name], value, atol=1e-8, err_msg=name)
+
+
+def test_a_recording_with_samples_alone_runs_by_them():
+    sequence = room()
+    result = ekfslam.run(sequence, "full")
+    error_m = np.linalg.norm(result.T_world_imu[:, :3, 3] - sequence.truth.T_world_imu[:, :3, 3], axis=1)
+    assert error_m.max() < 0.05
+    assert 0.9 < result.innovation.nis.sum() / result.innovation.dof.sum() < 1.1
+    assert [label for label in result.parameters.name if "bias" in label] != []
+
+
+def test_priors_of_the_inertial_blocks_are_settings():
+    config = ekfslam.Config(blocks={"gyro_bias": {"std_rad_s": 0.02}})
+    model = resolve(room(), config).model
+    assert model.prior_covariance[model.layout["gyro_bias"], model.layout["gyro_bias"]][0, 0] == pytest.approx(4e-4)
+
+
+def test_samples_without_densities_are_refused():
+    samples = dataclasses.replace(room().inertial, noise=None)
+    with pytest.raises(ConfigError, match="no densities"):
+        ekfslam.run(dataclasses.replace(room(), inputs=(samples,)), "full")
+
+
+def test_runs_with_samples_are_not_smoothed_yet():
+    with pytest.raises(PosteriorError, match="cannot be smoothed yet"):
+        ekfslam.posterior(ekfslam.run(room()[:20], "full"))
+
+
+@pytest.mark.slow
+def test_errors_are_what_the_covariance_says():
+    """Six runs of 12 s: each mean NEES within three standard errors of `experiments/inertial.py` (20 runs)."""
+    found = outcomes(Room(frames=120), Prior(), FILTER, 6)
+    mean = {part: np.mean([outcome.nees[part] for outcome in found]) for part in found[0].nees}
+    assert 4.0 < mean["pose"] < 8.0 and 12.0 < mean["all"] < 18.0
+    assert all(1.8 < mean[part] < 4.2 for part in ("velocity", "gyro bias", "accel bias"))
+
+
+@pytest.mark.slow
+def test_only_the_invariant_variant_survives_a_large_tilt():
+    mean = {}
+    for variant in ("invariant", "standard"):
+        found = outcomes(Room(frames=150), LARGE, dataclasses.replace(FILTER, variant=variant), 6)
+        mean[variant] = np.mean([outcome.nees["pose"] for outcome in found])
+    assert 4.0 < mean["invariant"] < 8.0 and mean["standard"] > 100.0
+
+
+@pytest.mark.slow
+def test_densities_that_are_too_small_show():
+    sequence = simulate_room(Room(frames=120))
+    samples, noise = sequence.inertial, sequence.inertial.noise
+    small = dataclasses.replace(noise, **{name: value / 3 for name, value in vars(noise).items()})
+    dishonest = dataclasses.replace(sequence, inputs=(dataclasses.replace(samples, noise=small),))
+    model = model_from_prior(dishonest, Prior(), np.random.default_rng(0))
+    assert run_once(dishonest, model).nees["all"] > 30.0
