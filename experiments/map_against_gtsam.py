@@ -58,7 +58,7 @@ from ekfslam.figures.style import GREY, ORANGE, REFERENCE, marker_of, styled
 from ekfslam.filters.log import Log
 from ekfslam.filters.result import Result
 from ekfslam.geometry import camera, motion, se3
-from ekfslam.smoother.optimise import kernel_cost
+from ekfslam.smoother.optimise import evaluate
 from ekfslam.smoother.posterior import posterior
 from ekfslam.smoother.problem import BatchProblem
 
@@ -252,7 +252,7 @@ def log_of(result: Result) -> Log:
 def start_of(result: Result, rows: BatchProblem) -> tuple[Array, Array]:
     """Return the start of the posterior: poses and map of the filter; landmarks behind a camera are triangulated."""
     log = log_of(result)
-    q = rows.points(rows.filtered_state(result.landmarks.position_m))
+    q = rows.observations.points(rows.filtered_state(result.landmarks.position_m))
     hidden = np.isin(np.arange(log.landmarks), log.landmark[q[:, 2] <= result.config["filter"]["min_depth_m"]])
     return se3.inverse(log.T_updated), np.where(hidden[:, None], log.first_position_m, result.landmarks.position_m)
 
@@ -262,14 +262,10 @@ def cost_of(
 ) -> tuple[float | None, int]:
     """Return the posterior's cost anywhere, None if infinite, and the number of observations from behind."""
     # White noise and a certain first pose: poses and landmarks are all there is.
-    state = replace(rows.filtered_state(positions_m), T_imu_world=se3.inverse(T_world_imu), zeta=np.zeros(6))
-    q = rows.points(state)
-    behind = int((q[:, 2] <= 0.0).sum())
-    if behind:
-        return None, behind
-    s = np.linalg.norm(rows.observation_residual(q, state), axis=1)
-    pixels = kernel_cost(config.kernel, config.kernel_width, s).sum()
-    return float(pixels + 0.5 * (rows.motion_residual(state) ** 2).sum()), 0
+    start = rows.filtered_state(positions_m)
+    state = replace(start, T_imu_world=se3.inverse(T_world_imu), zeta=0 * start.zeta)
+    found = evaluate(rows, state, config, 0.0)
+    return found.cost if found else None, int((rows.observations.points(state)[:, 2] <= 0.0).sum())
 
 
 def orthonormal(T: Array) -> Array:

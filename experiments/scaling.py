@@ -28,7 +28,6 @@ from time import perf_counter, process_time
 from typing import Any, TypeVar
 
 import numpy as np
-import scipy.sparse as sp
 from common import argument_parser, truth_of, write
 from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
@@ -46,7 +45,9 @@ from ekfslam.resolve import resolve
 from ekfslam.smoother.posterior import Posterior, model_of_result, posterior
 from ekfslam.smoother.problem import BatchProblem
 from ekfslam.smoother.revival import MapRevival
-from ekfslam.smoother.sparse.information import JointInformation, LinearSystem
+from ekfslam.smoother.sparse.factors import LinearSystem
+from ekfslam.smoother.sparse.information import JointInformation
+from ekfslam.smoother.sparse.structure import Structure
 from ekfslam.storage.archive import write_archive
 
 SIZES = (100, 300, 1000, 3000, 10_000, 30_000, 100_000)
@@ -155,11 +156,11 @@ def measure_stages(result: Result) -> Row:
     log = result.log
     assert log is not None
     rows = BatchProblem(log, model_of_result(result))
-    elimination, structure_s = timed(rows.elimination)
     state = rows.filtered_state(result.landmarks.position_m)
     system, rows_s = timed(lambda: rows.relinearised(state))
-    information, first_s = timed(lambda: JointInformation(elimination, system))
-    _, again_s = timed(lambda: JointInformation(elimination, system, factor=information.factor))
+    structure, structure_s = timed(lambda: Structure(system))
+    information, first_s = timed(lambda: JointInformation(system, structure=structure))
+    _, again_s = timed(lambda: JointInformation(system, like=information))
     return {
         "structure_s": structure_s,
         "rows_s": rows_s,
@@ -244,37 +245,15 @@ def measure_dense(landmarks: int) -> Row:
 
     log = ekf.log()
     system = BatchProblem(log, ekf.model).as_filtered()
-    row["posterior_s"] = timed(lambda: dense_inverse(system, log.frames))[1]
+    row["posterior_s"] = timed(lambda: dense_inverse(system))[1]
     row["posterior_mb"] = memory()
     return row
 
 
-def dense_inverse(system: LinearSystem, frames: int) -> Array:
+def dense_inverse(system: LinearSystem) -> Array:
     """Return the covariance of all poses and landmarks, (6T+3M, 6T+3M), with the first pose in units of its prior."""
-    J_from, J_x = system.J_from, system.J_x
-    step, observation = np.arange(frames - 1), np.arange(len(system.r))
-    width = 6 * frames + 3 * system.landmarks
-    information = np.zeros((width, width))
-    information[:6, :6] = np.eye(6)
-    for row_of, height, parts in (
-        (step, 6, ((6 * step, J_from), (6 * step + 6, system.J_to))),
-        (observation, 3, ((6 * system.frame, J_x), (6 * frames + 3 * system.landmark, system.J_m))),
-    ):
-        values, rows, columns = [], [], []
-        for first_column, blocks in parts:
-            values.append(blocks.ravel())
-            rows.append(
-                np.broadcast_to(height * row_of[:, None, None] + np.arange(height)[:, None], blocks.shape).ravel()
-            )
-            columns.append(
-                np.broadcast_to(first_column[:, None, None] + np.arange(blocks.shape[2]), blocks.shape).ravel()
-            )
-        J = sp.csr_array(
-            (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
-            shape=(height * len(row_of), width),
-        )
-        information += (J.T @ J).toarray()
-    return np.asarray(np.linalg.inv(information))
+    J, _ = system.rows()
+    return np.asarray(np.linalg.inv((J.T @ J).toarray()))
 
 
 def measure_loop(landmarks: int) -> Row:

@@ -40,13 +40,12 @@ def drive(sequence, settings, blocks=ALL_BLOCKS):
 def assert_equal_to_frozen_rows(ekf):
     """Blocks, landmarks and the whole covariance, to 1e-8 of their standard deviations or better."""
     problem = BatchProblem(ekf.log(), ekf.model)
-    information = JointInformation(problem.elimination(), problem.as_filtered())
+    information, unknowns = JointInformation(problem.as_filtered()), problem.unknowns
     landmarks, layout = ekf.table.log_row, ekf.model.layout
     found = np.zeros(layout.body)
-    found[problem.frame_columns] = information.eps[-1]
-    cloned, clones = problem.cloned
-    found[clones] = information.eps[-2, cloned]
-    found[problem.aux_columns], found[problem.drive_columns] = information.aux[-1], information.drive
+    found[unknowns.frame_columns] = information.eps[-1]
+    found[unknowns.clone_columns] = information.eps[-2, unknowns.cloned]
+    found[unknowns.aux_columns], found[unknowns.drive_columns] = information.aux[-1], information.drive
     np.testing.assert_allclose(found, ekf.coordinates, atol=1e-8)
     np.testing.assert_allclose(
         problem.log.first_position_m[landmarks] + information.d[landmarks], ekf.positions_m, atol=1e-8

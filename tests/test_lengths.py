@@ -20,9 +20,6 @@ EXCEPTIONS: dict[str, str] = {
     "ekfslam.filters.conditional.ConditionalGaussian": GOES,
     "ekfslam.models.build.model_of": TO_BE_SPLIT,
     "ekfslam.models.model.Model": TO_BE_SPLIT,
-    "ekfslam.smoother.optimise.maximise": TO_BE_SPLIT,
-    "ekfslam.smoother.sparse.information.JointInformation": TO_BE_SPLIT,
-    "ekfslam.smoother.sparse.information.JointInformation._factorise": TO_BE_SPLIT,
 }
 
 

@@ -27,7 +27,8 @@ from ekfslam.smoother.optimise import kernel_cost, kernel_weight
 from ekfslam.smoother.posterior import posterior, posterior_of_log, smooth
 from ekfslam.smoother.problem import BatchProblem
 from ekfslam.smoother.revival import MapRevival
-from ekfslam.smoother.sparse.information import Elimination, JointInformation, LinearSystem
+from ekfslam.smoother.sparse.information import JointInformation
+from ekfslam.smoother.sparse.structure import Structure
 from ekfslam.storage.archive import open_result, write_archive
 
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
@@ -103,13 +104,11 @@ def test_as_filtered_equals_the_dense_filter_on_the_recordings(data_path, name):
 def test_where_landmarks_are_eliminated_makes_no_difference():
     world = small_world()
     ekf, _ = drive(world, OPEN, P0)
-    log = ekf.log()
-    problem = BatchProblem(log, ekf.model)
+    problem = BatchProblem(ekf.log(), ekf.model)
     system = problem.relinearised(problem.filtered_state(ekf.positions_m))
-    structure = log.frames, log.landmarks, log.frame, log.landmark, log.id
-    found = [JointInformation(Elimination(*structure, eliminate_up_to=up_to), system) for up_to in (0, 12, 1000)]
-    kept = [len(one.elimination.kept) for one in found]
-    assert kept[0] == log.landmarks > kept[1] > kept[2] == 0
+    found = [JointInformation(system, structure=Structure(system, up_to)) for up_to in (0, 12, 1000)]
+    kept = [len(one.structure.kept) for one in found]
+    assert kept[0] == problem.log.landmarks > kept[1] > kept[2] == 0
     for one in found[1:]:
         np.testing.assert_allclose(one.eps, found[0].eps, atol=1e-10)
         np.testing.assert_allclose(one.d, found[0].d, atol=1e-9)
@@ -118,184 +117,29 @@ def test_where_landmarks_are_eliminated_makes_no_difference():
         np.testing.assert_allclose(one.log_determinant, found[0].log_determinant, rtol=1e-12)
 
 
-def random_system(rng, frames, landmarks, share, aux=0, drive=0, chained=False, w=6):
-    """A random system whose landmarks are seen by a random, shuffled choice of frames, loops and all.
-
-    Chained observations touch the pose of the frame before, too, where their landmark was seen there.
-    """
-    seen = rng.uniform(size=(frames, landmarks)) < share
-    seen[rng.integers(frames, size=landmarks), np.arange(landmarks)] = True
-    frame, landmark = np.nonzero(seen)
-    order = rng.permutation(len(frame))
-    frame, landmark = frame[order], landmark[order]
-    K, steps = len(frame), frames - 1
-    place = {pair: i for i, pair in enumerate(zip(frame.tolist(), landmark.tolist(), strict=True))}
-    previous = np.array([place.get((k - 1, j), -1) if chained else -1 for k, j in place])
-    rows = 2 * frames if aux else 0
-    return LinearSystem(
-        landmarks=landmarks,
-        B=rng.normal(size=(w, w)),
-        r_prior=rng.normal(size=w),
-        J_from=rng.normal(size=(steps, w, w)),
-        J_to=rng.normal(size=(steps, w, w)),
-        r_motion=rng.normal(size=(steps, w)),
-        frame=frame,
-        landmark=landmark,
-        J_x=rng.normal(size=(K, 3, w)),
-        J_m=rng.normal(size=(K, 3, 3)),
-        r=rng.normal(size=(K, 3)),
-        previous=previous,
-        J_p=rng.normal(size=(K, 3, w)) * (previous >= 0)[:, None, None] if chained else None,
-        J_g=rng.normal(size=(K, 3, drive)),
-        J_motion_aux=rng.normal(size=(steps, w, aux)),
-        J_motion_drive=rng.normal(size=(steps, w, drive)),
-        aux_prior=rng.uniform(0.5, 2, size=aux),
-        r_aux_prior=rng.normal(size=aux),
-        phi=rng.uniform(0.5, 1, size=(steps, aux)),
-        aux_weight=rng.uniform(0.5, 2, size=(steps, aux)),
-        r_aux=rng.normal(size=(steps, aux)),
-        at=rng.integers(frames, size=rows),
-        J_at=rng.normal(size=(rows, aux)),
-        r_at=rng.normal(size=rows),
-        drive_prior=rng.uniform(0.5, 2, size=drive),
-        r_drive=rng.normal(size=drive),
-    )
-
-
-def dense_rows(system, frames):
-    """The same rows as one dense matrix over zeta, eps_1, ..., aux, drive, d_0, ..., and what turns zeta into eps_0."""
-    aux, drive, w = len(system.aux_prior), len(system.drive_prior), len(system.B)
-    at_aux, at_drive = w * frames, (w + aux) * frames
-    at_landmarks = at_drive + drive
-    width = at_landmarks + 3 * system.landmarks
-    rows, right = [], []
-
-    def add(blocks, r):
-        row = np.zeros((len(r), width))
-        for start, block in blocks:
-            row[:, start : start + block.shape[1]] += block
-        rows.append(row)
-        right.append(r)
-
-    add([(0, np.eye(w))], system.r_prior)
-    for k in range(frames - 1):
-        motion = [(w * k, system.J_from[k]), (w * (k + 1), system.J_to[k]), (at_drive, system.J_motion_drive[k])]
-        add([*motion, (at_aux + aux * (k + 1), system.J_motion_aux[k])], system.r_motion[k])
-    for i, (k, j) in enumerate(zip(system.frame, system.landmark, strict=True)):
-        blocks = [(w * k, system.J_x[i]), (at_landmarks + 3 * j, system.J_m[i]), (at_drive, system.J_g[i])]
-        if system.previous[i] >= 0:
-            blocks.append((w * (k - 1), system.J_p[i]))
-        add(blocks, system.r[i])
-    add([(at_aux, np.diag(system.aux_prior))], system.r_aux_prior)
-    for k in range(frames - 1):
-        weight, phi = np.diag(system.aux_weight[k]), np.diag(system.phi[k])
-        add([(at_aux + aux * k, -weight @ phi), (at_aux + aux * (k + 1), weight)], system.r_aux[k])
-    for k, J, r in zip(system.at, system.J_at, system.r_at, strict=True):
-        add([(at_aux + aux * k, J[None])], np.array([r]))
-    add([(at_drive, np.diag(system.drive_prior))], system.r_drive)
-    first = np.eye(width)
-    first[:w, :w] = system.B
-    return np.vstack(rows), np.concatenate(right), first
-
-
-SIZES = [(1, 3, 1.0), (12, 1, 0.3), (15, 25, 0.25), (30, 40, 0.05)]  # frames, landmarks, share that is seen
-STATES = [(0, 0, False, 6), (0, 2, True, 6), (5, 0, False, 6), (4, 3, True, 6), (0, 0, True, 8), (4, 3, True, 11)]
-
-
-@pytest.mark.parametrize(
-    ("size", "up_to", "state"),
-    [
-        (i, up_to, j)
-        for i in range(len(SIZES))
-        for j in range(len(STATES))
-        for k, up_to in enumerate((0, 4, 100))
-        if WHOLE or k == (i + j) % 3  # all pairs
-    ],
-)
-def test_information_equals_dense_least_squares(size, up_to, state):
-    (frames, landmarks, share), (aux, drive, chained, w) = SIZES[size], STATES[state]
-    rng = np.random.default_rng(frames)
-    system = random_system(rng, frames, landmarks, share, aux, drive, chained, w)
-    J, r, first = dense_rows(system, frames)
-    ids = rng.permutation(1000)[:landmarks]
-    structure = Elimination(frames, landmarks, system.frame, system.landmark, ids, aux, drive, up_to, w)
-    found = JointInformation(structure, system)
-    x = np.linalg.lstsq(J, r, rcond=None)[0]
-    mean, covariance = first @ x, first @ np.linalg.inv(J.T @ J) @ first.T
-    largest = np.abs(covariance).max()
-
-    np.testing.assert_allclose(found.eps.ravel(), mean[: w * frames], rtol=1e-8, atol=1e-9)
-    before = (w + aux) * frames + drive
-    np.testing.assert_allclose(found.aux.ravel(), mean[w * frames : (w + aux) * frames], rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(found.drive, mean[before - drive : before], rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(found.d.ravel(), mean[before:], rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(found.cost, 0.5 * ((J @ x - r) ** 2).sum(), rtol=1e-9, atol=1e-12 * (r @ r))
-    np.testing.assert_allclose(found.log_determinant, np.linalg.slogdet(covariance)[1], rtol=1e-9)
-    np.testing.assert_array_equal(found.pose_covariances(), found.frame_covariances()[:, :6, :6])
-    for k, block in enumerate(found.frame_covariances()):
-        np.testing.assert_allclose(block, covariance[w * k : w * k + w, w * k : w * k + w], atol=1e-9 * largest)
-    for j, block in enumerate(found.landmark_covariances()):
-        own = slice(before + 3 * j, before + 3 * j + 3)
-        np.testing.assert_allclose(block, covariance[own, own], atol=1e-9 * largest)
-
-    for k, block in enumerate(found.aux_covariances()):
-        own = slice(w * frames + aux * k, w * frames + aux * (k + 1))
-        np.testing.assert_allclose(block, covariance[own, own], atol=1e-9 * largest)
-    own = slice(before - drive, before)
-    np.testing.assert_allclose(found.drive_covariance(), covariance[own, own], atol=1e-9 * largest)
-
-    # A shuffled subset, the first pose not in front.
-    some_frames = rng.permutation(frames)[: max(1, frames // 2)]
-    some = rng.permutation(landmarks)[: max(1, landmarks // 2)]
-    parts = (
-        (w * some_frames[:, None] + np.arange(w)).ravel(),
-        (w * frames + aux * some_frames[:, None] + np.arange(aux)).ravel(),
-        np.arange(before - drive, before),
-        (before + 3 * some[:, None] + np.arange(3)).ravel(),
-    )
-    for chosen, options in (((0, 3), {}), ((0, 1, 2, 3), {"aux": some_frames, "drive": True})):
-        columns = np.concatenate([parts[i] for i in chosen])
-        expected = covariance[np.ix_(columns, columns)]
-        np.testing.assert_allclose(found.covariance(some_frames, some, **options), expected, atol=1e-9 * largest)
-
-
-@pytest.mark.slow
-def test_samples_have_the_covariance_they_are_drawn_from():
-    system = random_system(np.random.default_rng(3), 4, 5, 0.6)
-    structure = Elimination(4, 5, system.frame, system.landmark, np.arange(5), eliminate_up_to=3)
-    found = JointInformation(structure, system)
-    assert 0 < len(found.elimination.kept) < 5
-    # Standard errors are 0.014 of a mean and at most 0.02 of a covariance; the bounds are four and five of them.
-    eps, d = found.sample(np.random.default_rng(4), 5_000)
-    draws = np.concatenate([eps.reshape(len(eps), -1), d.reshape(len(d), -1)], axis=1)
-    expected = found.covariance(np.arange(4), np.arange(5))
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        (draws.mean(axis=0) - np.concatenate([found.eps.ravel(), found.d.ravel()])) / scale, 0, atol=0.056
-    )
-    np.testing.assert_allclose(np.cov(draws.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.1)
-
-
 CALIBRATION = CalibrationConfig(0.3, 0.05, 0.01, 0.3, 0.0)
 
 
 def numeric_rows(problem, state):
-    """Central differences of the residuals of a problem through `BatchProblem.moved`, in the layout of `dense_rows`."""
-    T, M, aux, drive = len(state.T_imu_world), len(state.positions_m), state.aux.shape[1], len(state.drive)
-    ends = np.cumsum([problem.width * T, aux * T, drive, 3 * M])
+    """Central differences of all residuals of a problem through `BatchProblem.moved`, in the columns of its rows."""
+    T, M, w, aux, drive = len(state.T_imu_world), len(state.positions_m), *widths(problem), len(state.drive)
+    ends = np.cumsum([w * T, aux * T, drive, 3 * M])
 
     def residuals(x):
         eps, of_frames, of_drive, d = np.split(x, ends[:-1])
-        eps = eps.reshape(T, problem.width).copy()
-        zeta, eps[0] = eps[0].copy(), 0.0
-        step = SimpleNamespace(eps=eps, zeta=zeta, aux=of_frames.reshape(T, aux), drive=of_drive, d=d.reshape(M, 3))
-        moved = problem.moved(state, step)
-        seen = problem.observation_residual(problem.points(moved), moved)
-        return np.concatenate([moved.zeta, problem.motion_residual(moved).ravel(), seen.ravel()])
+        eps, of_frames = eps.reshape(T, w), of_frames.reshape(T, aux)
+        zeta = np.concatenate([eps[0], of_frames[0]])
+        step = SimpleNamespace(eps=eps, zeta=zeta, aux=of_frames, drive=of_drive, d=d.reshape(M, 3))
+        return -problem.relinearised(problem.moved(state, step)).rows()[1]
 
     step = 1e-6
     columns = [(residuals(e) - residuals(-e)) / (2 * step) for e in step * np.eye(ends[-1])]
-    return np.column_stack(columns), residuals(np.zeros(ends[-1]))
+    return np.column_stack(columns)
+
+
+def widths(problem):
+    """Columns of a frame, and of its aux."""
+    return problem.unknowns.width, len(problem.unknowns.aux_columns)
 
 
 SHARED = [CameraJitter(time_s=0.3), VisionDrift(length_m=3.0)]
@@ -329,33 +173,22 @@ def test_relinearised_rows_are_derivatives_of_the_residuals(case):
         state,
         T_imu_world=se3.exp(0.03 * rng.normal(size=(len(world), 6))) @ state.T_imu_world @ se3.inverse(T_world),
         positions_m=se3.apply(T_world, state.positions_m) + 0.1 * rng.normal(size=state.positions_m.shape),
-        zeta=0.3 * rng.normal(size=problem.width),
+        zeta=0.3 * rng.normal(size=sum(widths(problem))),
         shared=state.shared + 0.003 * rng.normal(size=state.shared.shape),
     )
-    state.shared[0] = (problem.B @ state.zeta)[6:]
-    first = se3.inverse(se3.exp((problem.B @ state.zeta)[:6]) @ problem.log.T_predicted[0]) @ state.T_imu_world[0]
+    of_first = problem.unknowns.B @ state.zeta
+    state.shared[0], state.aux[0] = of_first[6 : widths(problem)[0]], of_first[widths(problem)[0] :]
+    first = se3.inverse(se3.exp(of_first[:6]) @ problem.log.T_predicted[0]) @ state.T_imu_world[0]
     state = dataclasses.replace(
         state,
         T_imu_world=state.T_imu_world @ se3.inverse(first),
         positions_m=se3.apply(first, state.positions_m),
     )
-    J, r, _ = dense_rows(problem.relinearised(state), len(world))
-    expected, residual = numeric_rows(problem, state)
-    # Pixel rows explain z - h, motion rows minus the error.
-    motion, size = slice(problem.width, len(world) * problem.width), len(residual)
-    expected[motion.stop :] *= -1
+    J = problem.relinearised(state).rows()[0].toarray()
+    expected = numeric_rows(problem, state)
     tolerance = 2e-6 * np.abs(expected).max(axis=1, keepdims=True)
-    assert (np.abs(J[:size] - expected) <= tolerance + 1e-6).all()
-    signed = np.concatenate([-residual[: motion.stop], residual[motion.stop :]])
-    np.testing.assert_allclose(signed, r[:size], atol=1e-8)
+    assert (np.abs(J - expected) <= tolerance + 1e-6).all()
     assert (np.abs(J).max(axis=0) > 0).all()
-    # Rows over blocks alone: the gradient of their cost is -J^T r.
-    if everything:
-        aux, start = state.aux.size, problem.width * len(world)
-        slope = -(J[size:].T @ r[size:])[start : start + aux].reshape(state.aux.shape)
-        h = 1e-6 * rng.normal(size=state.aux.shape)
-        above, below = (problem.block_cost(dataclasses.replace(state, aux=state.aux + s * h)) for s in (1, -1))
-        np.testing.assert_allclose(above - below, 2 * (slope * h).sum(), rtol=1e-5)
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy", "none"])

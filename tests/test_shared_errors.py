@@ -432,7 +432,11 @@ def test_residuals_of_the_batch_problem():
         values = {"pose": T[k], **drive_values, **dict(zip(names, np.split(shared[k], [6]), strict=True))}
         return log.rows[i] - literal_rows(values, m[None], way_m[k], [follows], twist[k])[0]
 
-    found, expected = problem.observation_residual(problem.points(state), state) * np.sqrt(log.variance), []
+    found, expected = np.zeros_like(log.rows), []
+    for factor in (factor for factor in problem.observations.factors(state) if factor.observation is not None):
+        found[factor.observation] = factor.r
+    np.testing.assert_allclose(problem.observations.norms(state), np.linalg.norm(found, axis=1), rtol=1e-9)
+    found *= np.sqrt(log.variance)
     for i, previous in enumerate(log.previous):
         expected.append(left(i, previous >= 0) - (0.9 * left(previous, False) if previous >= 0 else 0.0))
     assert (log.previous >= 0).sum() > 20
@@ -442,7 +446,8 @@ def test_residuals_of_the_batch_problem():
     for block, x in zip(SHARED, np.split(shared, [6], axis=1), strict=True):
         kept = np.exp(-lengths[block.name][1:, None])
         parts.append((x[1:] - kept * x[:-1]) / (block.stationary_std * np.sqrt(1 - kept**2)))
-    np.testing.assert_allclose(problem.motion_residual(state)[:, 6:], np.hstack(parts), rtol=1e-9)
+    walks = problem.process.factors(state)[1]
+    np.testing.assert_allclose(-walks.r, np.hstack(parts), rtol=1e-9)
 
 
 # --- recovery: worlds in which one error is put in ------------------------------------------------------------------

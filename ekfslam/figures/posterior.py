@@ -14,7 +14,7 @@ from ekfslam.figures.maps import SIGMAS, add_ellipses, dot_size, draw_paths, spr
 from ekfslam.figures.style import LANDMARK_COLOR, style_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.geometry.motion import world_axes_covariance
-from ekfslam.smoother.sparse.information import JointInformation
+from ekfslam.smoother.sparse.information import JointInformation, block_patterns
 
 _POSES = 16  # with an ellipse
 _CELLS = 500  # across a picture of a sparsity pattern
@@ -68,12 +68,11 @@ def _median_std(covariance: Array) -> str:
 def plot_sparsity(information: JointInformation) -> Figure:
     """Which blocks of the information matrix and of its Cholesky factor are not zero: one cell is many blocks."""
     figure = Figure(figsize=(10.0, 5.2))
-    e = information.elimination
-    size = e.frames + e.landmarks
+    own, of_factor, size = block_patterns(information)
     axes = figure.subplots(1, 2)
     for ax, (row, column), title, order in (
-        (axes[0], information.pattern(), "information matrix", "poses, then landmarks"),
-        (axes[1], information.factor_pattern(), "its Cholesky factor", "in the order of elimination"),
+        (axes[0], own, "information matrix", "poses, then landmarks"),
+        (axes[1], of_factor, "its Cholesky factor", "in the order of elimination"),
     ):
         _draw_pattern(ax, row, column, size)
         ax.set_title(f"{title}: {len(row):,} blocks, {100 * len(row) / (size * (size + 1) / 2):.2g} % of the triangle")

@@ -34,10 +34,8 @@ from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
 from ekfslam.shown import Card, Shown, count, figure
 from ekfslam.smoother.optimise import maximise
-from ekfslam.smoother.problem import BatchProblem
-from ekfslam.smoother.rows import State
+from ekfslam.smoother.problem import BatchProblem, State
 from ekfslam.smoother.sparse.information import JointInformation
-from ekfslam.smoother.sparse.matrix import information_matrix
 
 DENSE_LIMIT = 20_000  # columns of a dense covariance: 3.2 GB
 
@@ -106,10 +104,11 @@ class Posterior(Shown):
         Raises:
             PosteriorError: There is no such block.
         """
+        unknowns = self.problem.unknowns
         for blocks, covariance in (
-            (self.problem.aux_blocks, self.information.aux_covariances),
-            (self.problem.shared_blocks, lambda: self.information.frame_covariances()[:, 6:, 6:]),
-            (self.problem.drive_blocks, self.information.drive_covariance),
+            (unknowns.aux, self.information.aux_covariances),
+            (unknowns.shared, lambda: self.information.frame_covariances()[:, 6:, 6:]),
+            (unknowns.of_drive, self.information.drive_covariance),
         ):
             start = 0
             for block in blocks:
@@ -138,12 +137,12 @@ class Posterior(Shown):
         Raises:
             PosteriorError: There is no such frame or landmark.
         """
-        e = self.information.elimination
-        frame = _checked("frame", frames, e.frames)
-        P = self.information.covariance(frame, _checked("landmark row", landmarks, e.landmarks))
+        frame, width = _checked("frame", frames, len(self.T_world_imu)), self.problem.unknowns.width
+        landmark = _checked("landmark row", landmarks, len(self.id))
+        P = self.information.covariance(frames=frame, landmarks=landmark)
         # Of each frame its pose alone.
-        of_poses = (e.width * np.arange(len(frame))[:, None] + np.arange(6)).ravel()
-        kept = np.concatenate([of_poses, np.arange(e.width * len(frame), len(P))])
+        of_poses = (width * np.arange(len(frame))[:, None] + np.arange(6)).ravel()
+        kept = np.concatenate([of_poses, np.arange(width * len(frame), len(P))])
         return P[np.ix_(kept, kept)]
 
     def pairs(self, first: IntArray, second: IntArray) -> PosePairs:
@@ -161,14 +160,13 @@ class Posterior(Shown):
         Raises:
             PosteriorError: There is no such frame, or the matrix would be wider than 20000.
         """
-        e = self.information.elimination
-        width = 6 * np.size(frames) + 3 * e.landmarks
+        width = 6 * np.size(frames) + 3 * len(self.id)
         if width > DENSE_LIMIT:
             raise PosteriorError(
                 f"a dense covariance of {width} columns is too large (limit {DENSE_LIMIT}); "
                 "joint_covariance gives any block of it"
             )
-        return self.joint_covariance(frames, np.arange(e.landmarks))
+        return self.joint_covariance(frames, np.arange(len(self.id)))
 
     def information_matrix(self) -> tuple[sp.csc_array, dict[str, Array]]:
         """The joint information matrix (n, n), sparse: the inverse of the joint covariance of all unknowns.
@@ -185,12 +183,12 @@ class Posterior(Shown):
         """
         problem, frames = self.problem, len(self.T_world_imu)
         is_map = self.linearisation == "map"
-        system = problem.relinearised(self.state, self.weight) if is_map else problem.as_filtered()
-        matrix, kept = information_matrix(system, frames)
-        seen = [("pose", 6), *((block.name, block.size) for block in problem.shared_blocks)]
-        others = [(block.name, block.size) for block in problem.aux_blocks]
+        system = problem.relinearised(self.state).weighted(self.weight) if is_map else problem.as_filtered()
+        matrix, kept = system.information_matrix()
+        seen = [("pose", 6), *((block.name, block.size) for block in problem.unknowns.shared)]
+        others = [(block.name, block.size) for block in problem.unknowns.aux]
         rows = [(name, k, -1, size) for of_frame in (seen, others) for k in range(frames) for name, size in of_frame]
-        rows += [(block.name, -1, -1, block.size) for block in problem.drive_blocks]
+        rows += [(block.name, -1, -1, block.size) for block in problem.unknowns.of_drive]
         rows += [("landmark", -1, landmark, 3) for landmark in self.id.tolist()]
         kind, frame, landmark, size = (np.array(column) for column in zip(*rows, strict=True))
         axis = np.concatenate([np.arange(n) for n in size])
@@ -294,16 +292,15 @@ def posterior_of_log(
     """
     config = config or PosteriorConfig()
     problem = BatchProblem(log, model)
-    elimination = problem.elimination()
     weight, costs = np.ones(log.observations), tuple[float, ...]()
     if config.linearisation == "filtered":
-        information = JointInformation(elimination, problem.as_filtered())
+        information = JointInformation(problem.as_filtered())
         state = problem.solved_as_filtered(information)
         costs = (information.cost,)
     else:
         iterations = progress(range(config.max_iterations), f"{name}: smoothing")
         start = problem.filtered_state(positions_m)
-        found = maximise(problem, elimination, start, config, min_depth_m, iterations)
+        found = maximise(problem, start, config, min_depth_m, iterations)
         information, state, weight, costs = found.information, found.state, found.weight, found.costs
     return Posterior(
         config.linearisation,
@@ -313,7 +310,7 @@ def posterior_of_log(
         weight,
         costs,
         information,
-        problem.values(state),
+        problem.unknowns.values(state),
         problem,
         state,
     )

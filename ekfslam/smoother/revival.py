@@ -80,35 +80,34 @@ class MapRevival:
             IllPosedError: Something is undetermined; names landmark ids or frames.
         """
         problem = BatchProblem(log, self._model)
-        elimination = problem.elimination()
         if is_frozen_exactly(self._config):
-            information = JointInformation(elimination, problem.as_filtered())
+            information = JointInformation(problem.as_filtered())
             # The blocks' mean is the filter's already, but for rounding.
             positions = log.first_position_m[landmarks] + information.d[landmarks]
             none = np.empty(0, dtype=np.int64)
             return Marginal({}, none, np.empty(0), positions, self.covariance(problem, information, landmarks))
         start = self._start(problem, positions_m)
         iterations = range(_MAXIMUM.max_iterations)
-        found = maximise(problem, elimination, start, _MAXIMUM, self._config.min_depth_m, iterations)
+        found = maximise(problem, start, _MAXIMUM, self._config.min_depth_m, iterations)
         self._last = state = found.state
         return Marginal(
-            problem.last_values(state),
-            *problem.last_coordinates(state),
+            problem.unknowns.last_values(state),
+            *problem.unknowns.last_coordinates(state),
             state.positions_m[landmarks],
             self.covariance(problem, found.information, landmarks),
         )
 
     def covariance(self, problem: BatchProblem, information: JointInformation, landmarks: IntArray) -> Array:
         """Covariance (body+3n, body+3n) in the columns of the filter."""
-        last, width = problem.log.frames - 1, problem.width
+        last, u = problem.log.frames - 1, problem.unknowns
         has_clone = self._model.has_clone and last > 0
-        frames = np.array([last, last - 1] if has_clone else [last])
-        P = information.covariance(frames, landmarks, np.array([last]), drive=True)
+        frames = [last, last - 1] if has_clone else [last]
+        P = information.covariance(frames=frames, aux=[last], drive=[0], landmarks=landmarks)
         # Of the frame before only what is cloned counts.
-        before, of_clones = problem.cloned if has_clone else (np.empty(0, dtype=np.int64),) * 2
-        rest = np.arange(width * len(frames), len(P))
-        kept = np.concatenate([np.arange(width), width + before, rest])
-        columns = np.concatenate([problem.frame_columns, of_clones, problem.aux_columns, problem.drive_columns])
+        before, of_clones = (u.cloned, u.clone_columns) if has_clone else (np.empty(0, dtype=np.int64),) * 2
+        rest = np.arange(u.width * len(frames), len(P))
+        kept = np.concatenate([np.arange(u.width), u.width + before, rest])
+        columns = np.concatenate([u.frame_columns, of_clones, u.aux_columns, u.drive_columns])
         body = self._model.layout.body
         order = np.concatenate([columns, body + np.arange(3 * len(landmarks))])
         wide = np.zeros((body + 3 * len(landmarks),) * 2)

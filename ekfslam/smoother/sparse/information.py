@@ -1,12 +1,8 @@
-"""A Gaussian over poses, other blocks and landmarks in information form: whitened rows, normal equations, CHOLMOD.
+"""A Gaussian over all unknowns in information form: the solution of a list of factors, and its covariances.
 
-Unknowns are ``eps`` (T, w), one vector a frame: its pose, and what else of it observations depend on; ``aux`` (T, a),
-what else has a value for each frame; ``drive`` (g,), what has one value for the drive; and ``d`` (M, 3), one a
-landmark. Observations touch a frame, perhaps the one before, the drive and a landmark; motion touches consecutive
-frames, the aux of the later one and the drive. Landmarks know of each other only through frames and drive, so those
-with few observations are eliminated first, all at once, by their
-Schur complements. What remains goes to CHOLMOD. Both are steps of one sparse elimination: nothing is approximated, and
-no matrix as wide as the state is ever formed.
+Landmarks with few observations are eliminated by their Schur complements, and the rest is left to CHOLMOD (see
+`ekfslam.smoother.sparse.structure`). Both are steps of one sparse elimination: nothing is approximated, and no matrix
+as wide as the state is ever formed.
 
 Sources: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000, section 6 (Schur
 complement); Takahashi, Fagan, Chen, "Formation of a sparse bus impedance matrix", 1973 (selected inverse).
@@ -14,8 +10,7 @@ complement); Takahashi, Fagan, Chen, "Formation of a sparse bus impedance matrix
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -23,638 +18,272 @@ import scipy.sparse as sp
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.errors import IllPosedError
-from ekfslam.smoother.sparse.cholmod import NotPositiveDefiniteError, SparseCholesky, concatenated_ranges
+from ekfslam.smoother.sparse.cholmod import NotPositiveDefiniteError, SparseCholesky
+from ekfslam.smoother.sparse.factors import GROUPS, LinearSystem
+from ekfslam.smoother.sparse.normal_equations import NormalEquations, normal_equations, sum_by
 from ekfslam.smoother.sparse.selected_inverse import SelectedInverse
+from ekfslam.smoother.sparse.structure import AT_ONCE, REDUCED, Structure
 
-# Landmarks with more observations than this are left to CHOLMOD: eliminating one couples all poses that saw it, pair by
-# pair, and their number grows with the square.
-ELIMINATE_UP_TO = 40
-_AT_ONCE = 20_000  # observations or pairs of them, so that temporary arrays stay in the cache
-
-
-@dataclass(frozen=True)
-class LinearSystem:
-    """Whitened rows ``J x = r`` over all unknowns, to be solved in the least-squares sense.
-
-    The first frame is ``eps_0 = B zeta`` with ``zeta ~ N(0, I)``; its columns in all Jacobians are those of zeta.
-
-    Args:
-        landmarks: Number of landmarks M.
-        B: (w, w) see above; ``B B^T`` may be singular.
-        r_prior: (w,) right side of the rows ``zeta = r``.
-        J_from, J_to: (T-1, w, w) motion rows of step k over ``eps_k`` and ``eps_{k+1}``.
-        r_motion: (T-1, w) their right sides.
-        frame, landmark: (K,) pose and landmark of each observation.
-        J_x, J_m: (K, d, w) and (K, d, 3) rows of the observations.
-        r: (K, d) their right sides.
-        previous: (K,) observation whose pose the rows touch, too; -1: none.
-        J_p: (K, d, w) rows over that frame; None: there is no such observation.
-        J_g: (K, d, g) rows over the drive.
-        J_motion_aux, J_motion_drive: (T-1, w, a) over ``aux_{k+1}`` and (T-1, w, g).
-        aux_prior: (a,) weights of the rows ``weight aux_0 = r``, (a,) ``r_aux_prior``.
-        phi, aux_weight: (T-1, a) of the rows ``weight (aux_{k+1} - phi aux_k) = r_aux``, element by element.
-        r_aux: (T-1, a) their right sides.
-        at: (n,) frames of scalar rows over aux; J_at (n, a); r_at (n,).
-        landmark_weight: Weight of the rows ``weight d = r_landmark`` of every landmark; 0: there are none.
-        r_landmark: (M, 3) their right sides.
-        drive_prior: (g,) weights of the rows ``weight drive = r_drive``, (g,).
-    """
-
-    landmarks: int
-    B: Array
-    r_prior: Array
-    J_from: Array
-    J_to: Array
-    r_motion: Array
-    frame: IntArray
-    landmark: IntArray
-    J_x: Array
-    J_m: Array
-    r: Array
-    previous: IntArray
-    J_p: Array | None
-    J_g: Array
-    J_motion_aux: Array
-    J_motion_drive: Array
-    aux_prior: Array
-    r_aux_prior: Array
-    phi: Array
-    aux_weight: Array
-    r_aux: Array
-    at: IntArray
-    J_at: Array
-    r_at: Array
-    drive_prior: Array
-    r_drive: Array
-    landmark_weight: float = 0.0
-    r_landmark: Array | float = 0.0
-
-    @property
-    def half_square(self) -> float:
-        """Half the sum of squares of all right sides: the cost of leaving everything as it is."""
-        right = (self.r_prior, self.r_motion, self.r, self.r_aux_prior, self.r_aux, self.r_at, self.r_drive)
-        return 0.5 * (sum(float((r**2).sum()) for r in right) + float(np.square(self.r_landmark).sum()))
-
-
-class Elimination:
-    """What depends on nothing but which frame saw which landmark; computed once, used for every linearisation.
-
-    Args:
-        frames: Number of poses T.
-        landmarks: Number of landmarks M.
-        frame, landmark: (K,) of each observation; no pair may occur twice.
-        ids: (M,) landmark ids, for error messages.
-        aux, drive: Sizes a and g of the blocks of a frame besides its pose, and of those of the drive.
-        eliminate_up_to: Landmarks with at most this many observations are eliminated before CHOLMOD's turn.
-        width: Number w of unknowns of a frame: six of its pose, and what else observations depend on.
-    """
-
-    def __init__(
-        self,
-        frames: int,
-        landmarks: int,
-        frame: IntArray,
-        landmark: IntArray,
-        ids: IntArray,
-        aux: int = 0,
-        drive: int = 0,
-        eliminate_up_to: int = ELIMINATE_UP_TO,
-        width: int = 6,
-    ) -> None:
-        self.width = width
-        self.frames, self.landmarks, self.ids = frames, landmarks, ids
-        self.frame, self.landmark = frame, landmark
-        self.aux, self.drive = aux, drive
-        seen = np.bincount(landmark, minlength=landmarks)
-        if (seen == 0).any():
-            raise IllPosedError("landmarks without an observation", ids[seen == 0])
-        self.is_kept = seen > eliminate_up_to
-        self.kept = np.flatnonzero(self.is_kept)
-        # Blocks of the reduced system: poses, aux of the frames, the drive, kept landmarks.
-        counts = [frames, frames if aux else 0, 1 if drive else 0, len(self.kept)]
-        self.block_sizes = np.repeat([width, aux, drive, 3], counts)
-        self.start = np.concatenate([[0], np.cumsum(self.block_sizes)])
-        self.first_block = np.concatenate([[0], np.cumsum(counts)[:-1]])  # of each of the four kinds
-        self.block_of_landmark = np.full(landmarks, -1)
-        self.block_of_landmark[self.kept] = self.first_block[3] + np.arange(len(self.kept))
-
-        self.of_kept = np.flatnonzero(self.is_kept[landmark])
-        self.of_eliminated = np.flatnonzero(~self.is_kept[landmark])
-        self._pair_up()
-        self._lay_out()
-
-    def parts(self, x: Array) -> tuple[Array, Array, Array, Array]:
-        """Frames (T, w, ...), aux (T, a, ...), drive (g, ...), kept landmarks (n, 3, ...) of the reduced unknowns."""
-        ends = self.start[self.first_block[1:]]
-        poses, aux, drive, kept = np.split(x, ends)
-        rest = x.shape[1:]
-        return (
-            poses.reshape(self.frames, self.width, *rest),
-            aux.reshape(self.frames, self.aux, *rest),
-            drive,
-            kept.reshape(-1, 3, *rest),
-        )
-
-    def _pair_up(self) -> None:
-        """Pairs of observations (later, not later) of each eliminated landmark, together if they couple the same poses.
-
-        Groups of pairs are sorted by their sizes, so that many of one size can be summed in one matrix product.
-        """
-        order = self.of_eliminated[np.lexsort((self.frame[self.of_eliminated], self.landmark[self.of_eliminated]))]
-        counts = np.bincount(self.landmark[order], minlength=self.landmarks)
-        ends = np.cumsum(counts)
-        rank = np.arange(len(order)) - np.repeat(ends - counts, counts)  # 0 for a landmark's first observation
-        later = np.repeat(np.arange(len(order)), rank + 1)
-        earlier = concatenated_ranges(np.arange(len(order)) - rank, rank + 1)
-        later, earlier = order[later].astype(np.int32), order[earlier].astype(np.int32)
-        key = self.frame[later].astype(np.int64) * self.frames + self.frame[earlier]
-        by_key = np.argsort(key, kind="stable")
-        keys, starts, sizes = np.unique(key[by_key], return_index=True, return_counts=True)
-        by_size = np.argsort(sizes, kind="stable")
-        self.group_sizes = sizes[by_size]
-        by_key = by_key[concatenated_ranges(starts[by_size], self.group_sizes)]
-        self.later, self.earlier = later[by_key], earlier[by_key]
-        self.coupled = np.stack(np.divmod(keys[by_size], self.frames), axis=-1)  # (later frame, earlier) of each group
-
-    def groups(self) -> Iterator[tuple[slice, IntArray, IntArray]]:
-        """Portions of groups of pairs, all of one size in each portion, small enough for the cache.
-
-        Yields:
-            The slice of g groups; the observations (g, size) of their pairs, later ones and earlier ones.
-        """
-        starts = np.cumsum(self.group_sizes) - self.group_sizes
-        sizes, first = np.unique(self.group_sizes, return_index=True)
-        for size, begin, end in zip(sizes, first, np.append(first, len(starts))[1:], strict=True):
-            step = max(1, _AT_ONCE // size)
-            for group in range(begin, end, step):
-                stop = min(group + step, end)
-                pairs = slice(starts[group], starts[group] + size * (stop - group))
-                yield slice(group, stop), self.later[pairs].reshape(-1, size), self.earlier[pairs].reshape(-1, size)
-
-    def _lay_out(self) -> None:
-        """Where the entries of all blocks go in the reduced matrix: its lower triangle and whole diagonal blocks."""
-        pose, steps = np.arange(self.frames), np.arange(self.frames - 1)
-        own = np.arange(len(self.block_sizes))
-        aux = self.first_block[1] + (pose if self.aux else pose[:0])
-        drive = self.first_block[2] + np.arange(1 if self.drive else 0)
-        landmark = own[self.first_block[3] :]
-        of_drive = np.broadcast_to(drive, (len(pose),)) if self.drive else pose[:0]
-        seen = self.block_of_landmark[self.landmark[self.of_kept]]
-        w = self.width
-        kinds = (  # block rows, block columns, height, width
-            (pose, pose, w, w),
-            (steps + 1, steps, w, w),
-            (self.coupled[:, 0], self.coupled[:, 1], w, w),
-            (landmark, landmark, 3, 3),
-            (seen, self.frame[self.of_kept], 3, w),
-            (aux, aux, self.aux, self.aux),
-            (aux[1:], aux[:-1], self.aux, self.aux),
-            (aux, pose[: len(aux)], self.aux, w),
-            (aux[1:], steps[: len(aux[1:])], self.aux, w),
-            (drive, drive, self.drive, self.drive),
-            (of_drive, pose[: len(of_drive)], self.drive, w),
-            (of_drive[: len(aux)], aux[: len(of_drive)], self.drive, self.aux),
-            (landmark[: len(of_drive) * len(landmark)], np.repeat(drive, len(landmark)), 3, self.drive),
-        )
-        block_row, block_column = (np.concatenate([kind[i] for kind in kinds]) for i in (0, 1))
-        # Steps and diagonal blocks may be among the coupled ones: they share their place.
-        unique, place = np.unique(block_column * len(own) + block_row, return_inverse=True)
-        column, row = np.divmod(unique, len(own))
-        height = self.block_sizes[row]
-        column_height = np.bincount(column, weights=height, minlength=len(own)).astype(np.int64)
-        pointers = np.concatenate([[0], np.cumsum(np.repeat(column_height, self.block_sizes))])
-        above = np.cumsum(height) - height
-        above -= (np.cumsum(column_height) - column_height)[column]
-        origin, stride = pointers[self.start[column]] + above, column_height[column]
-
-        index_type = np.int32 if pointers[-1] < 2**31 else np.int64
-        self._pointers, self._indices = pointers.astype(index_type), np.empty(pointers[-1], dtype=index_type)
-        self._targets = []
-        for (block_row, _, high, wide), at in zip(
-            kinds, np.split(place, np.cumsum([len(kind[0]) for kind in kinds])[:-1]), strict=True
-        ):
-            target = origin[at, None, None] + np.arange(high)[:, None] + stride[at, None, None] * np.arange(wide)
-            target = target.astype(index_type)
-            self._indices[target] = self.start[block_row, None, None] + np.arange(high)[:, None]
-            self._targets.append(target)
-
-    def assemble(self, blocks: tuple[Array, ...]) -> sp.csc_array:
-        """The reduced matrix from the blocks (n, height, width) of each kind, in the order of `_lay_out`."""
-        data = np.zeros(len(self._indices))
-        for target, block in zip(self._targets, blocks, strict=True):
-            data[target] += block
-        size = int(self.start[-1])
-        return sp.csc_array((data, self._indices, self._pointers), shape=(size, size))
-
-    def sum_by_landmark(self, values: Array) -> Array:
-        """Sums (M, ...) of what belongs to observations (K, ...)."""
-        return _sum(self.landmark, self.landmarks, values)
-
-    def sum_by_frame(self, values: Array) -> Array:
-        """Sums (T, ...) of what belongs to observations (K, ...)."""
-        return _sum(self.frame, self.frames, values)
-
-
-def _sum(index: IntArray, groups: int, values: Array) -> Array:
-    """Sums (groups, ...) of the values (n, ...) of each index (n,)."""
-    n = len(index)
-    if not values.size:
-        return np.zeros((groups, *values.shape[1:]))
-    summation = sp.csc_array((np.ones(n), index, np.arange(n + 1)), shape=(groups, n))
-    return (summation @ values.reshape(n, -1)).reshape(groups, *values.shape[1:])
-
-
-def _sum_products(index: IntArray, groups: int, A: Array, B: Array) -> Array:
-    """Sums (groups, a, b) of ``A_k^T B_k`` for A (n, c, a), B (n, c, b), never all products at once."""
-    total = np.zeros((groups, A.shape[2], B.shape[2]))
-    for begin in range(0, len(index), _AT_ONCE):
-        part = slice(begin, begin + _AT_ONCE)
-        total += _sum(index[part], groups, A[part].swapaxes(1, 2) @ B[part])
-    return total
+_UNDETERMINED = {
+    "frames": "frame without enough information",
+    "aux": "frame whose velocities have not enough information",
+    "drive": "too little information about blocks of the whole drive",
+    "landmarks": "landmark without enough information",
+}
 
 
 class JointInformation:
     """The Gaussian that a `LinearSystem` describes, factorised.
 
     Args:
-        elimination: The structure; may be shared by systems with the same observations.
-        system: The rows.
+        system: All factors.
         damping: Levenberg-Marquardt: added to the diagonal (0: the posterior itself). Not in proportion to it: that
             crawls along the flat directions of a trajectory.
-        factor: CHOLMOD's factor of an earlier system with the same structure, whose analysis is used again.
+        like: A solution of another system with the same structure, whose analysis is used again.
+        structure: Structure of the system; by default that of ``like``, or a new one.
 
     Attributes:
-        eps: (T, w) mean of the unknowns of the frames, those of their poses first.
-        zeta: (w,) mean of the first frame in units of its prior.
-        aux: (T, a) mean of what else each frame has.
-        drive: (g,) mean of what the drive has.
-        d: (M, 3) mean of the landmark unknowns.
-        cost: Half the sum of squares that the rows leave (of a system without damping).
+        structure: As used.
+        factor: Factorisation of the reduced matrix.
+        zeta: (w+a,) mean of the first frame in units of its prior.
+        eps, aux: (T, w) and (T, a) mean of the unknowns of the frames.
+        drive: (g,) mean of the unknowns of the drive.
+        d: (M, 3) mean of the landmarks.
+        cost: Half the sum of squares that the solution leaves (of a system without damping).
+        square: Sum of squares of the mean, with zeta in place of the first frame: damping penalises it.
 
     Raises:
-        IllPosedError: The rows leave something undetermined; names landmark ids or frames.
+        IllPosedError: Something is undetermined; names landmark ids or frames.
     """
+
+    structure: Structure
+    factor: SparseCholesky
+    _Y: dict[str, Array]
+    _L_inverse: Array
 
     def __init__(
         self,
-        elimination: Elimination,
         system: LinearSystem,
         damping: float = 0.0,
-        factor: SparseCholesky | None = None,
+        like: JointInformation | None = None,
+        structure: Structure | None = None,
     ) -> None:
-        self.elimination, self._B = elimination, system.B  # not the rows: they take more memory than all else kept
-        e = elimination
-        self._factorise(system, damping, factor)
-        g_m, right = e.sum_by_landmark(_transposed(system.J_m, system.r)), _right_side(e, system)
-        g_m = g_m + system.landmark_weight * system.r_landmark
-        whitened = (self._L_inverse @ g_m[..., None])[..., 0]
-        reduced = right.copy()
-        reduced_poses, _, reduced_drive, reduced_kept = e.parts(reduced)
-        reduced_poses -= e.sum_by_frame((self._Y.swapaxes(1, 2) @ whitened[e.landmark, :, None])[..., 0])
-        reduced_drive -= (self._Y_drive.swapaxes(1, 2) @ whitened[..., None])[..., 0].sum(axis=0)
-        reduced_kept[...] = g_m[e.kept]
-        solution = self.factor.solve(reduced)
-        x, self.aux, self.drive, kept = e.parts(solution)
-        self.d = self._landmarks_given(x, self.drive, kept, whitened)
-        self.zeta = x[0].copy()
-        self.eps = self._with_first_pose(x)
+        self.structure = s = structure or (like.structure if like else Structure(system))
+        self._first = system.first  # not the factors: they take more memory than all else kept
+        equations = normal_equations(s, system.over_zeta())
+        self._factorise(equations, damping, like)
+        g = equations.gradient
+        whitened = (self._L_inverse @ g["landmarks"][..., None])[..., 0]
+        right = np.zeros(int(s.start[-1]))
+        reduced = s.reduced(right)
+        for group in REDUCED:
+            landmark, index = s.pairs[group].T
+            taken = (self._Y[group].swapaxes(1, 2) @ whitened[landmark, :, None])[..., 0]
+            reduced[group][...] = g[group] - sum_by(index, s.counts[group], taken)
+        reduced["landmarks"][...] = g["landmarks"][s.kept]
+        x = s.reduced(self.factor.solve(right))
+        self.zeta = np.concatenate([x["frames"][0], *x["aux"][:1]])
+        self.d = self._landmarks_given(x, whitened)
         # Half the sum of squares at the mean x: |r - J x|^2 = |r|^2 - g^T x.
-        without_kept = solution[: len(right) - kept.size] @ right[: len(right) - kept.size]
-        self.cost = system.half_square - 0.5 * float(without_kept + (self.d * g_m).sum())
-
-    def _factorise(self, system: LinearSystem, damping: float, factor: SparseCholesky | None) -> None:
-        """Schur complements of the eliminated landmarks, then CHOLMOD."""
-        e = self.elimination
-        H_mm = _sum_products(e.landmark, e.landmarks, system.J_m, system.J_m)
-        H_mm += system.landmark_weight**2 * np.eye(3)
-        blocks = _blocks(e, system)
-        if damping:
-            for H in (H_mm, blocks["pose"], blocks["aux"], blocks["drive"]):
-                H += damping * np.eye(H.shape[-1])
-        L = _cholesky_of_landmarks(H_mm, e.ids)
-        self._L_inverse = np.linalg.inv(L)
-        self._log_det_landmarks = 2.0 * float(np.log(np.diagonal(L[~e.is_kept], axis1=1, axis2=2)).sum())
-        # Y_k^T Y_l is what an eliminated landmark takes from the block of the poses of its observations k and l.
-        self._Y = _H_mx(system)
-        H_mx_kept = self._Y[e.of_kept]
-        for begin in range(0, len(e.landmark), _AT_ONCE):
-            part = slice(begin, begin + _AT_ONCE)
-            self._Y[part] = self._L_inverse[e.landmark[part]] @ self._Y[part]
-        self._Y[e.of_kept] = 0.0
-        coupling = np.empty((len(e.coupled), e.width, e.width))
-        for groups, later, earlier in e.groups():
-            stacked = len(later), 3 * later.shape[1], e.width
-            coupling[groups] = self._Y[later].reshape(stacked).swapaxes(1, 2) @ self._Y[earlier].reshape(stacked)
-        # The drive goes through every landmark.
-        H_md = _sum_products(e.landmark, e.landmarks, system.J_m, system.J_g)
-        self._Y_drive = self._L_inverse @ H_md
-        self._Y_drive[e.kept] = 0.0
-        if e.drive:
-            blocks["drive"] -= (self._Y_drive.swapaxes(1, 2) @ self._Y_drive).sum(axis=0)
-            blocks["drive pose"] -= _sum_products(e.frame, e.frames, self._Y_drive[e.landmark], self._Y)
-        matrix = e.assemble(
-            (
-                blocks["pose"],
-                blocks["pose step"],
-                -coupling,
-                H_mm[e.kept],
-                H_mx_kept,
-                blocks["aux"],
-                blocks["aux step"],
-                blocks["aux pose"],
-                blocks["aux pose before"],
-                blocks["drive"],
-                blocks["drive pose"],
-                blocks["drive aux"],
-                H_md[e.kept if e.drive else e.kept[:0]],
-            )
+        explained = sum(float((x[group] * g[group]).sum()) for group in REDUCED) + float(
+            (self.d * g["landmarks"]).sum()
         )
-        del coupling
-        try:
-            self.factor = SparseCholesky(matrix, e.block_sizes) if factor is None else factor.with_values(matrix)
-        except NotPositiveDefiniteError as error:
-            kind = int(np.searchsorted(e.first_block, error.block, side="right")) - 1
-            number = error.block - int(e.first_block[kind])
-            what = ("frame without enough information", "frame whose velocities have not enough information")
-            if kind == 2:
-                raise IllPosedError("too little information about blocks of the whole drive", []) from None
-            culprit = e.ids[e.kept[number]] if kind == 3 else number
-            raise IllPosedError("landmark without enough information" if kind == 3 else what[kind], [culprit]) from None
+        self.cost = system.half_square - 0.5 * explained
+        self.square = float(sum((x[group] ** 2).sum() for group in REDUCED) + (self.d**2).sum())
+        self.eps, self.aux = self._from_zeta(x)
+        self.drive = x["drive"].ravel()
 
-    def _landmarks_given(self, x: Array, drive: Array, kept: Array, whitened: Array) -> Array:
-        """Landmarks (M, 3): eliminated ones from the poses x (T, 6) and the drive (g,), the others as they are."""
-        e = self.elimination
-        seen = e.sum_by_landmark((self._Y @ x[e.frame, :, None])[..., 0]) + self._Y_drive @ drive
-        d = (self._L_inverse.swapaxes(1, 2) @ (whitened - seen)[..., None])[..., 0]
-        d[e.kept] = kept
+    def _factorise(self, equations: NormalEquations, damping: float, like: JointInformation | None) -> None:
+        """Take the Schur complements of the landmarks, then call CHOLMOD."""
+        s, own, self._Y = self.structure, dict(equations.own), equations.pairs
+        if damping:
+            for group in GROUPS:
+                own[group] += damping * np.eye(s.sizes[group])
+        L = _cholesky_of_landmarks(own["landmarks"], s.ids)
+        own["landmarks"] = own["landmarks"][s.kept]
+        self._L_inverse = np.asarray(np.linalg.inv(L), dtype=float)
+        self._log_det_landmarks = 2.0 * float(np.log(np.diagonal(L[~s.is_kept], axis1=1, axis2=2)).sum())
+        # Y_k^T Y_l is what an eliminated landmark takes from the block of the unknowns of its pairs k and l.
+        of_kept = []
+        for group, kept in s.kept_pairs.items():
+            Y, landmark = self._Y[group], s.pairs[group][:, 0]
+            of_kept.append(Y[kept])
+            for begin in range(0, len(Y), AT_ONCE):
+                part = slice(begin, begin + AT_ONCE)
+                Y[part] = self._L_inverse[landmark[part]] @ Y[part]
+            Y[kept] = 0.0
+        matrix = s.pattern.assemble((*own.values(), *equations.products, *self._complements(), *of_kept))
+        try:
+            self.factor = like.factor.with_values(matrix) if like else SparseCholesky(matrix, s.block_sizes)
+        except NotPositiveDefiniteError as error:
+            group = [group for group in GROUPS if s.first[group] <= error.block][-1]
+            number = error.block - s.first[group]
+            of_landmarks = s.ids[s.kept[number : number + 1]].tolist()
+            culprits = {"landmarks": of_landmarks, "drive": []}.get(group, [number])
+            raise IllPosedError(_UNDETERMINED[group], culprits) from None
+
+    def _complements(self) -> Iterator[Array]:
+        """Yield what elimination adds to the couples of unknowns of each coupling."""
+        for coupling in self.structure.couplings:
+            Y_row, Y_column = self._Y[coupling.row], self._Y[coupling.column]
+            found = np.empty((len(coupling.couples), Y_row.shape[2], Y_column.shape[2]))
+            for couples, later, earlier in coupling.portions():
+                n, rows = len(later), 3 * later.shape[1]
+                left, right = Y_row[later].reshape(n, rows, -1), Y_column[earlier].reshape(n, rows, -1)
+                found[couples] = left.swapaxes(1, 2) @ right
+            yield np.negative(found, out=found)
+
+    def _landmarks_given(self, x: dict[str, Array], whitened: Array) -> Array:
+        """Return landmarks (M, 3): eliminated ones from the reduced unknowns, the others as they are."""
+        s = self.structure
+        rest = whitened.copy()
+        for group in REDUCED:
+            landmark, index = s.pairs[group].T
+            rest -= sum_by(landmark, len(rest), (self._Y[group] @ x[group][index, :, None])[..., 0])
+        d = (self._L_inverse.swapaxes(1, 2) @ rest[..., None])[..., 0]
+        d[s.kept] = x["landmarks"]
         return d
 
-    def _with_first_pose(self, zeta_and_eps: Array) -> Array:
-        eps = zeta_and_eps.copy()
-        eps[0] = self._B @ zeta_and_eps[0]
-        return eps
-
-    @property
-    def square(self) -> float:
-        """Sum of squares of the mean: what damping penalises."""
-        parts = (self.zeta, self.eps[1:], self.aux, self.drive, self.d)
-        return float(sum((part**2).sum() for part in parts))
+    def _from_zeta(self, x: dict[str, Array]) -> tuple[Array, Array]:
+        """Return frames (T, w) and aux (T, a), the first frame in its own units."""
+        w, frames = self._first.width, x["frames"].copy()
+        aux = np.array(x["aux"]).reshape(len(frames), -1)
+        first = self._first.B @ np.concatenate([frames[0], aux[0]])
+        frames[0], aux[0] = first[:w], first[w:]
+        return frames, aux
 
     @property
     def log_determinant(self) -> float:
-        """Log of the determinant of the joint covariance, without directions of the first pose known for certain."""
-        scales = np.linalg.svd(self._B, compute_uv=False)
-        known = scales > 1e-12 * max(scales[0], 1.0)
-        return 2.0 * float(np.log(scales[known]).sum()) - self.factor.log_determinant - self._log_det_landmarks
+        """Log of the determinant of the joint covariance, without directions of the first frame known for certain."""
+        return self._first.log_determinant - self.factor.log_determinant - self._log_det_landmarks
 
     @cached_property
     def _selected(self) -> SelectedInverse:
         return SelectedInverse(self.factor)
 
     def frame_covariances(self) -> Array:
-        """Marginal covariances (T, w, w) of all frames, by selected inversion."""
-        own = np.arange(self.elimination.frames)
+        """Return the marginal covariances (T, w, w) of all frames, by selected inversion."""
+        own = np.arange(self.structure.counts["frames"])
         covariance = self._selected.blocks(own, own)
-        covariance[0] = self._B @ covariance[0] @ self._B.T
+        covariance[0] = self._first.frames @ covariance[0] @ self._first.frames.T
         return covariance
 
     def pose_covariances(self) -> Array:
-        """Marginal covariances (T, 6, 6) of all poses, by selected inversion."""
+        """Return the marginal covariances (T, 6, 6) of all poses, by selected inversion."""
         return self.frame_covariances()[:, :6, :6]
 
     def aux_covariances(self) -> Array:
-        """Marginal covariances (T, a, a) of what else each frame has, by selected inversion."""
-        e = self.elimination
-        own = e.first_block[1] + np.arange(e.frames)
-        return self._selected.blocks(own, own) if e.aux else np.empty((e.frames, 0, 0))
-
-    def drive_covariance(self) -> Array:
-        """Marginal covariance (g, g) of what the drive has."""
-        e = self.elimination
-        own = e.first_block[2:3]
-        return self._selected.blocks(own, own)[0] if e.drive else np.empty((0, 0))
-
-    def landmark_covariances(self) -> Array:
-        """Marginal covariances (M, 3, 3) of all landmarks, by selected inversion.
-
-        Of an eliminated landmark ``L^-T (I + sum_kl Y_k Z_kl Y_l^T) L^-1`` over its observations k and l and the drive,
-        Z being the selected inverse of the reduced matrix.
-        """
-        e = self.elimination
-        half = np.zeros((e.landmarks, 3, 3))
-        for groups, later, earlier in e.groups():
-            Z = self._selected.blocks(*e.coupled[groups].T)
-            YZ = (self._Y[later].reshape(len(later), -1, e.width) @ Z).reshape(-1, 3, e.width)
-            later, earlier = later.ravel(), earlier.ravel()
-            terms = YZ @ self._Y[earlier].swapaxes(1, 2)
-            terms[later == earlier] *= 0.5
-            half += _sum(e.landmark[later], e.landmarks, terms)
-        if e.drive:
-            drive = np.full(e.frames, e.first_block[2])
-            Z = self._selected.blocks(np.arange(e.frames), drive)
-            by_pose = e.sum_by_landmark(self._Y @ Z[e.frame])
-            half += (by_pose + 0.5 * self._Y_drive @ self.drive_covariance()) @ self._Y_drive.swapaxes(1, 2)
-        covariance = self._L_inverse.swapaxes(1, 2) @ (np.eye(3) + half + half.swapaxes(1, 2)) @ self._L_inverse
-        if len(e.kept):
-            covariance[e.kept] = self._selected.blocks(e.block_of_landmark[e.kept], e.block_of_landmark[e.kept])
-        return 0.5 * (covariance + covariance.swapaxes(1, 2))
-
-    def covariance(
-        self, frames: IntArray, landmarks: IntArray, aux: IntArray | None = None, drive: bool = False
-    ) -> Array:
-        """Joint covariance, by solves: of some poses, of the aux of some frames, of the drive, of some landmarks.
-
-        Args:
-            frames: (p,) frame numbers, w columns each.
-            landmarks: (b,) landmark numbers, not ids, three columns each; they come last.
-            aux: (q,) frames whose aux follows the poses, a columns each; None: of no frame.
-            drive: Whether the drive follows, with g columns.
-        """
-        e = self.elimination
-        frames, landmarks = np.asarray(frames, dtype=np.int64), np.asarray(landmarks, dtype=np.int64)
-        aux = np.empty(0, dtype=np.int64) if aux is None else np.asarray(aux, dtype=np.int64)
-        selection = self._selection(frames, aux, drive, landmarks)
-        half = self.factor.half_solve(selection.T.toarray())
-        covariance = half.T @ half
-        own = len(covariance) - 3 * len(landmarks) + 3 * np.arange(len(landmarks))
-        given_poses = self._L_inverse[landmarks].swapaxes(1, 2) @ self._L_inverse[landmarks]
-        given_poses[e.is_kept[landmarks]] = 0.0
-        place = own[:, None] + np.arange(3)
-        covariance[place[:, :, None], place[:, None, :]] += given_poses
+        """Return the marginal covariances (T, a, a) of the further blocks of the frames, by selected inversion."""
+        s, w = self.structure, self._first.width
+        if not s.counts["aux"]:
+            return np.empty((s.counts["frames"], 0, 0))
+        own = s.blocks("aux", np.arange(s.counts["aux"]))
+        covariance = self._selected.blocks(own, own)
+        first = np.zeros(2, dtype=np.int64)
+        joint = np.zeros((len(self._first.B),) * 2)
+        joint[:w, :w] = self._selected.blocks(first[:1], first[:1])[0]
+        joint[w:, :w] = self._selected.blocks(own[:1], first[:1])[0]
+        joint[:w, w:], joint[w:, w:] = joint[w:, :w].T, covariance[0]
+        by = self._first.B[w:]
+        covariance[0] = by @ joint @ by.T
         return covariance
 
-    def pattern(self) -> tuple[IntArray, IntArray]:
-        """Rows and columns of the blocks in the lower triangle of the information matrix: poses, then landmarks."""
-        e = self.elimination
-        own, step = np.arange(e.frames + e.landmarks), np.arange(e.frames - 1)
-        return np.concatenate([own, step + 1, e.frames + e.landmark]), np.concatenate([own, step, e.frame])
+    def drive_covariance(self) -> Array:
+        """Return the marginal covariance (g, g) of the drive."""
+        own = self.structure.blocks("drive", np.zeros(1, dtype=np.int64))
+        return self._selected.blocks(own, own)[0] if self.structure.counts["drive"] else np.empty((0, 0))
 
-    def factor_pattern(self) -> tuple[IntArray, IntArray]:
-        """Rows and columns of the blocks of its Cholesky factor, in the order of elimination."""
-        e = self.elimination
-        eliminated = np.flatnonzero(~e.is_kept)
-        rank = np.empty(e.landmarks, dtype=np.int64)
-        rank[eliminated] = np.arange(len(eliminated))
-        place = np.empty(len(e.block_sizes), dtype=np.int64)
-        place[self.factor.block_order] = len(eliminated) + np.arange(len(place))
-        L = self.factor.factor()
-        block = np.repeat(np.sort(place), e.block_sizes[self.factor.block_order])
-        column = np.repeat(np.arange(L.shape[1]), np.diff(L.indptr))
-        reduced = np.unique(block[L.indices] * (len(eliminated) + len(place)) + block[column])
-        reduced_row, reduced_column = np.divmod(reduced, len(eliminated) + len(place))
-        own = np.arange(len(eliminated))
-        return (
-            np.concatenate([own, place[e.frame[e.of_eliminated]], reduced_row]),
-            np.concatenate([own, rank[e.landmark[e.of_eliminated]], reduced_column]),
-        )
+    def landmark_covariances(self) -> Array:
+        """Return the marginal covariances (M, 3, 3) of all landmarks, by selected inversion.
+
+        That of an eliminated landmark is ``L^-T (I + sum_kl Y_k Z_kl Y_l^T) L^-1`` over its pairs k and l, Z being the
+        selected inverse of the reduced matrix.
+        """
+        s = self.structure
+        half = np.zeros_like(self._L_inverse)
+        for coupling in s.couplings:
+            Y_row, Y_column = self._Y[coupling.row], self._Y[coupling.column]
+            landmark = s.pairs[coupling.row][:, 0]
+            for couples, later, earlier in coupling.portions():
+                Z = self._selected.blocks(*coupling.couples[couples].T)
+                YZ = (Y_row[later].reshape(len(later), -1, Y_row.shape[2]) @ Z).reshape(-1, 3, Y_column.shape[2])
+                later, earlier = later.ravel(), earlier.ravel()
+                terms = YZ @ Y_column[earlier].swapaxes(1, 2)
+                if coupling.row == coupling.column:
+                    terms[later == earlier] *= 0.5
+                half += sum_by(landmark[later], len(half), terms)
+        covariance = self._L_inverse.swapaxes(1, 2) @ (np.eye(3) + half + half.swapaxes(1, 2)) @ self._L_inverse
+        if len(s.kept):
+            own = s.blocks("landmarks", s.kept)
+            covariance[s.kept] = self._selected.blocks(own, own)
+        return 0.5 * (covariance + covariance.swapaxes(1, 2))
+
+    def covariance(self, **wanted: IntArray | Sequence[int]) -> Array:
+        """Return the joint covariance of some unknowns, by solves.
+
+        Args:
+            wanted: Numbers (n,) of unknowns by group, such as ``frames=[3, 4], landmarks=[0]``. Columns are in the
+                order given.
+        """
+        index = {group: np.asarray(chosen, dtype=np.int64) for group, chosen in wanted.items()}
+        half = self.factor.half_solve(self._selection(index).T.toarray())
+        covariance = half.T @ half
+        start = 0
+        for group, chosen in index.items():
+            if group == "landmarks":
+                given_rest = self._L_inverse[chosen].swapaxes(1, 2) @ self._L_inverse[chosen]
+                given_rest[self.structure.is_kept[chosen]] = 0.0
+                place = start + 3 * np.arange(len(chosen))[:, None] + np.arange(3)
+                covariance[place[:, :, None], place[:, None, :]] += given_rest
+            start += self.structure.sizes[group] * len(chosen)
+        return covariance
+
+    def _selection(self, wanted: dict[str, IntArray]) -> sp.csr_array:
+        """Return the matrix that picks unknowns out of the reduced ones: an eliminated landmark follows its pairs."""
+        s, first, start = self.structure, self._first, 0
+        parts: list[tuple[IntArray, IntArray, Array]] = []  # rows, reduced blocks, and (n, ., .) between them
+        for group, index in wanted.items():
+            size = s.sizes[group]
+            row = start + size * np.arange(len(index))
+            start += size * len(index)
+            if not size:
+                continue
+            blocks = np.broadcast_to(np.eye(size), (len(index), size, size)).copy()
+            kept = np.flatnonzero(s.blocks(group, index) >= 0)
+            if group in ("frames", "aux"):
+                blocks[index == 0] = first.frames if group == "frames" else first.aux
+            parts.append((row[kept], s.blocks(group, index[kept]), blocks[kept]))
+            if group == "aux":
+                at = np.flatnonzero(index == 0)
+                parts.append((row[at], 0 * at, np.broadcast_to(first.coupling, (len(at), *first.coupling.shape))))
+            if group == "landmarks":
+                place = np.full(len(s.ids), -1)
+                place[index] = row
+                for other, pairs in s.pairs.items():
+                    at = np.flatnonzero((place[pairs[:, 0]] >= 0) & ~s.is_kept[pairs[:, 0]])
+                    landmark, unknown = pairs[at].T
+                    follow = -self._L_inverse[landmark].swapaxes(1, 2) @ self._Y[other][at]
+                    parts.append((place[landmark], s.blocks(other, unknown), follow))
+        rows = [np.broadcast_to(row[:, None, None] + np.arange(b.shape[1])[:, None], b.shape) for row, _, b in parts]
+        columns = [np.broadcast_to(s.start[at][:, None, None] + np.arange(b.shape[2]), b.shape) for _, at, b in parts]
+        entries = rows, columns, [block for *_, block in parts]
+        row, column, value = (np.concatenate([one.ravel() for one in many]) for many in entries)
+        return sp.csr_array((value, (row, column)), shape=(start, int(s.start[-1])))
 
     def sample(self, rng: np.random.Generator, size: int) -> tuple[Array, Array]:
-        """Independent draws of the unknowns: ``eps`` (size, T, w) and ``d`` (size, M, 3)."""
-        e = self.elimination
-        reduced = self.factor.sample_transform(rng.standard_normal((int(e.start[-1]), size)))
-        eps, d = np.empty((size, e.frames, e.width)), np.empty((size, e.landmarks, 3))
+        """Return independent draws of the unknowns: ``eps`` (size, T, w) and ``d`` (size, M, 3)."""
+        s = self.structure
+        reduced = self.factor.sample_transform(rng.standard_normal((int(s.start[-1]), size)))
+        eps, d = np.empty((size, *self.eps.shape)), np.empty((size, *self.d.shape))
         for i in range(size):
-            x, _, drive, kept = e.parts(reduced[:, i])
-            white = rng.standard_normal((e.landmarks, 3))
-            d[i] = self.d + self._landmarks_given(x, drive, kept, white)
-            eps[i] = self.eps + self._with_first_pose(x)
+            x = s.reduced(reduced[:, i])
+            d[i] = self.d + self._landmarks_given(x, rng.standard_normal(self.d.shape))
+            eps[i] = self.eps + self._from_zeta(x)[0]
         return eps, d
-
-    def _selection(self, frames: IntArray, aux: IntArray, drive: bool, landmarks: IntArray) -> sp.csr_array:
-        """What picks unknowns out of the reduced ones: an eliminated landmark follows its poses and the drive."""
-        e = self.elimination
-        w = e.width
-        pose_blocks = np.broadcast_to(np.eye(w), (len(frames), w, w)).copy()
-        pose_blocks[frames == 0] = self._B
-        before_aux = w * len(frames)
-        before_drive = before_aux + e.aux * len(aux)
-        before = before_drive + (e.drive if drive else 0)
-        at_drive = e.start[e.first_block[2]]
-
-        place = np.full(e.landmarks, -1)
-        place[landmarks] = before + 3 * np.arange(len(landmarks))
-        chosen = np.flatnonzero((place[e.landmark] >= 0) & ~e.is_kept[e.landmark])
-        follow = -self._L_inverse[e.landmark[chosen]].swapaxes(1, 2) @ self._Y[chosen]
-        follow_drive = -self._L_inverse[landmarks].swapaxes(1, 2) @ self._Y_drive[landmarks]
-        kept = landmarks[e.is_kept[landmarks]]
-        drives = np.arange(1 if drive and e.drive else 0)
-
-        parts = (
-            (w * np.arange(len(frames)), e.start[frames], pose_blocks),
-            (
-                before_aux + e.aux * np.arange(len(aux)),
-                e.start[e.first_block[1] + aux] if e.aux else aux,
-                np.broadcast_to(np.eye(e.aux), (len(aux), e.aux, e.aux)),
-            ),
-            (
-                before_drive + drives,
-                at_drive + drives,
-                np.broadcast_to(np.eye(e.drive), (len(drives), *(e.drive,) * 2)),
-            ),
-            (place[e.landmark[chosen]], e.start[e.frame[chosen]], follow),
-            (place[landmarks], np.full(len(landmarks), at_drive), follow_drive),
-            (place[kept], e.start[e.block_of_landmark[kept]], np.broadcast_to(np.eye(3), (len(kept), 3, 3))),
-        )
-        row, column, value = [], [], []
-        for first_row, first_column, block in parts:
-            shape = block.shape
-            row.append(np.broadcast_to(first_row[:, None, None] + np.arange(shape[1])[:, None], shape).ravel())
-            column.append(np.broadcast_to(first_column[:, None, None] + np.arange(shape[2]), shape).ravel())
-            value.append(block.ravel())
-        shape = before + 3 * len(landmarks), int(e.start[-1])
-        return sp.csr_array((np.concatenate(value), (np.concatenate(row), np.concatenate(column))), shape=shape)
-
-
-def _transposed(J: Array, r: Array) -> Array:
-    """``J^T r`` of many rows: (n, d, c), (n, d) to (n, c)."""
-    return (J.swapaxes(1, 2) @ r[..., None])[..., 0]
-
-
-def _blocks(e: Elimination, system: LinearSystem) -> dict[str, Array]:
-    """Blocks of the information of poses, aux and drive among themselves, before landmarks are eliminated."""
-    J_from, J_to, J_a, J_d = system.J_from, system.J_to, system.J_motion_aux, system.J_motion_drive
-    pose = _sum_products(e.frame, e.frames, system.J_x, system.J_x)
-    pose[0] += np.eye(e.width)
-    pose[:-1] += J_from.swapaxes(1, 2) @ J_from
-    pose[1:] += J_to.swapaxes(1, 2) @ J_to
-    step = J_to.swapaxes(1, 2) @ J_from
-    follows = np.flatnonzero(system.previous >= 0)
-    if system.J_p is not None and len(follows):
-        frame, J_p = e.frame[system.previous[follows]], system.J_p[follows]
-        pose += _sum_products(frame, e.frames, J_p, J_p)
-        step += _sum_products(frame, e.frames - 1, system.J_x[follows], J_p)
-    blocks = {"pose": pose, "pose step": step}
-
-    n_aux = e.frames if e.aux else 0
-    aux = np.zeros((n_aux, e.aux, e.aux))
-    if e.aux:
-        diagonal = np.arange(e.aux)
-        aux[0, diagonal, diagonal] += system.aux_prior**2
-        aux[:-1, diagonal, diagonal] += (system.aux_weight * system.phi) ** 2
-        aux[1:, diagonal, diagonal] += system.aux_weight**2
-        aux[1:] += J_a.swapaxes(1, 2) @ J_a
-        aux += _sum_products(system.at, e.frames, system.J_at[:, None], system.J_at[:, None])
-    blocks["aux"] = aux
-    blocks["aux step"] = -((system.aux_weight**2 * system.phi)[: max(n_aux - 1, 0), :, None] * np.eye(e.aux))
-    aux_pose = np.zeros((n_aux, e.aux, e.width))
-    if e.aux:
-        aux_pose[1:] = J_a.swapaxes(1, 2) @ J_to
-    blocks["aux pose"] = aux_pose
-    blocks["aux pose before"] = (J_a.swapaxes(1, 2) @ J_from)[: max(n_aux - 1, 0)]
-
-    n_drive = 1 if e.drive else 0
-    drive, drive_pose = np.zeros((n_drive, e.drive, e.drive)), np.zeros((n_drive * e.frames, e.drive, e.width))
-    drive_aux = np.zeros((n_drive * n_aux, e.drive, e.aux))
-    if e.drive:
-        flat = system.J_g.reshape(-1, e.drive)
-        drive[0] = np.diag(system.drive_prior**2) + flat.T @ flat + (J_d.swapaxes(1, 2) @ J_d).sum(axis=0)
-        drive_pose += _sum_products(e.frame, e.frames, system.J_g, system.J_x)
-        if system.J_p is not None and len(follows):
-            drive_pose += _sum_products(frame, e.frames, system.J_g[follows], J_p)
-        drive_pose[:-1] += J_d.swapaxes(1, 2) @ J_from
-        drive_pose[1:] += J_d.swapaxes(1, 2) @ J_to
-        if e.aux:
-            drive_aux[1:] = J_d.swapaxes(1, 2) @ J_a
-    blocks["drive"], blocks["drive pose"], blocks["drive aux"] = drive, drive_pose, drive_aux
-    return blocks
-
-
-def _right_side(e: Elimination, system: LinearSystem) -> Array:
-    """``J^T r`` of poses, aux and drive, in the order of the reduced unknowns; 0 for kept landmarks."""
-    right = np.zeros(int(e.start[-1]))
-    poses, aux, drive, _ = e.parts(right)
-    poses += e.sum_by_frame(_transposed(system.J_x, system.r))
-    poses[0] += system.r_prior
-    poses[:-1] += _transposed(system.J_from, system.r_motion)
-    poses[1:] += _transposed(system.J_to, system.r_motion)
-    follows = np.flatnonzero(system.previous >= 0)
-    if system.J_p is not None and len(follows):
-        poses += _sum(e.frame[system.previous[follows]], e.frames, _transposed(system.J_p[follows], system.r[follows]))
-    if e.aux:
-        weighted = system.aux_weight * system.r_aux
-        aux[0] += system.aux_prior * system.r_aux_prior
-        aux[1:] += weighted + _transposed(system.J_motion_aux, system.r_motion)
-        aux[:-1] -= system.phi * weighted
-        aux += _sum(system.at, e.frames, system.J_at * system.r_at[:, None])
-    if e.drive:
-        drive += system.drive_prior * system.r_drive
-        drive += system.J_g.reshape(-1, e.drive).T @ system.r.ravel()
-        drive += _transposed(system.J_motion_drive, system.r_motion).sum(axis=0)
-    return right
-
-
-def _H_mx(system: LinearSystem) -> Array:
-    """Blocks (K, 3, w) of the information between landmarks and the poses that observed them, one an observation."""
-    blocks = system.J_m.swapaxes(1, 2) @ system.J_x
-    follows = np.flatnonzero(system.previous >= 0)
-    if system.J_p is not None and len(follows):
-        # No observation has two successors, so that nothing is added twice to one block.
-        blocks[system.previous[follows]] += system.J_m[follows].swapaxes(1, 2) @ system.J_p[follows]
-    return blocks
 
 
 def _cholesky_of_landmarks(H_mm: Array, ids: IntArray) -> Array:
-    """Cholesky factors (M, 3, 3) of the landmarks' own information.
+    """Return the Cholesky factors (M, 3, 3) of the landmarks' own information.
 
     Raises:
         IllPosedError: Some are singular to working precision; names them.
@@ -667,3 +296,33 @@ def _cholesky_of_landmarks(H_mm: Array, ids: IntArray) -> Array:
     if weak.any():
         raise IllPosedError("landmarks with too little information", ids[weak])
     return np.asarray(np.linalg.cholesky(H_mm))
+
+
+def block_patterns(information: JointInformation) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray], int]:
+    """Return rows and columns of the blocks of the information matrix, of its Cholesky factor, and their number.
+
+    Of the information matrix those in the lower triangle: frames, aux, drive, landmarks. Those of the factor in the
+    order of elimination.
+    """
+    s, factor = information.structure, information.factor
+    before, eliminated = s.first["landmarks"], np.flatnonzero(~s.is_kept)
+    count = before + len(s.ids)
+    own = np.arange(count)
+    blocks = [product.places for product in s.products if product.places is not None]
+    blocks = [np.stack([own, own], axis=-1), *(places[places[:, 0] < before] for places in blocks)]
+    blocks += [pairs + np.array([before, s.first[group]]) for group, pairs in s.pairs.items()]
+    row, column = np.unique(np.concatenate(blocks), axis=0).T
+
+    rank, place = np.cumsum(~s.is_kept) - 1, np.empty(len(s.block_sizes), dtype=np.int64)
+    place[factor.block_order] = len(eliminated) + np.arange(len(place))
+    L = factor.factor()
+    block = np.repeat(np.sort(place), s.block_sizes[factor.block_order])
+    of_column = np.repeat(np.arange(L.shape[1]), np.diff(L.indptr))
+    rows, columns = ([part] for part in np.divmod(np.unique(block[L.indices] * count + block[of_column]), count))
+    for group, pairs in s.pairs.items():
+        landmark, index = pairs[~s.is_kept[pairs[:, 0]]].T
+        rows.append(place[s.blocks(group, index)])
+        columns.append(rank[landmark])
+    for side in (rows, columns):
+        side.append(np.arange(len(eliminated)))
+    return (row, column), (np.concatenate(rows), np.concatenate(columns)), count

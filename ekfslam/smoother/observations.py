@@ -1,0 +1,229 @@
+"""Factors of the observations of landmarks, where the filter linearised them or at any state.
+
+An observation whose track walks is a *difference* from the observation before, eq. (10): it touches two frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.filters.estimate import GIVEN
+from ekfslam.filters.log import Log
+from ekfslam.geometry import se3
+from ekfslam.models.model import Model, Moment, Seen
+from ekfslam.smoother.sparse.factors import Factor, Term
+from ekfslam.smoother.unknowns import State, Unknowns, split
+
+# How far a landmark may lie from where it was initialised: so weak that no landmark with a depth feels it.
+LANDMARK_PRIOR_M = 1e4
+
+
+class ObservationFactors:
+    """Factors of a log that concern landmarks.
+
+    Args:
+        log: Record of the filter.
+        model: Its blocks and sensor.
+        unknowns: Groups of the blocks.
+
+    Attributes:
+        first_frame: (M,) frame of each landmark's first observation.
+    """
+
+    def __init__(self, log: Log, model: Model, unknowns: Unknowns) -> None:
+        self._log, self._model, self._unknowns = log, model, unknowns
+        self._way_m = model.way_m(log.twist, log.tau_s)
+        self._is_difference = log.previous >= 0
+        self._follows = np.flatnonzero(self._is_difference)
+        self._previous = log.previous[self._follows]
+        self._memory = model.track_error.memory if model.track_error else 0.0
+        _, first = np.unique(log.landmark, return_index=True)
+        self._is_first = np.zeros(log.observations, dtype=bool)
+        self._is_first[first] = True
+        self.first_frame = np.empty(log.landmarks, dtype=np.int64)
+        self.first_frame[log.landmark[first]] = log.frame[first]
+
+    # --- at a state ---------------------------------------------------------------------------------------------------
+
+    def points(self, state: State) -> Array:
+        """Return every observed landmark (K, 3) m in the frame of the sensor."""
+        moment = self._moments(state).at(self._log.frame)
+        return self._model.points(moment, state.positions_m[self._log.landmark], self._is_difference)
+
+    def norms(self, state: State) -> Array:
+        """Return the norms (K,) of the whitened residuals at a state."""
+        log, moments, model = self._log, self._moments(state), self._model
+        now, before = moments.at(log.frame), moments.at(log.frame[self._previous])
+        positions = state.positions_m[log.landmark]
+        z = model.predicted(now, model.points(now, positions, self._is_difference))
+        z_before = model.predicted(before, model.points(before, positions[self._follows]))
+        return np.linalg.norm(self._residuals(z, z_before) / np.sqrt(log.variance), axis=1)
+
+    def _residuals(self, z: Array, z_before: Array) -> Array:
+        """Return what is left of the observations (K, d), given predicted ones, and those they are differences from."""
+        r = self._log.rows - z
+        r[self._follows] -= self._memory * (self._log.rows[self._previous] - z_before)
+        return r
+
+    def factors(self, state: State) -> list[Factor]:
+        """Return the factors linearised at a state."""
+        log, follows, moments = self._log, self._follows, self._moments(state)
+        positions = state.positions_m[log.landmark]
+        seen = self._model.see(moments.at(log.frame), positions, positions, "pose", self._is_difference)
+        H_x, H_m, z_before = seen.H_x, seen.H_m, seen.z[:0]
+        if len(follows):
+            # From the frame before, the landmark is where the observation before has seen it.
+            at, positions = moments.at(log.frame[self._previous]), positions[follows]
+            before = self._model.see(at, positions, positions, "previous_pose")
+            H_x[follows] -= self._memory * before.H_x
+            H_m[follows] -= self._memory * before.H_m
+            z_before = before.z
+        return [*self._whitened(H_x, H_m, self._residuals(seen.z, z_before)), *self._near(state)]
+
+    def _moments(self, state: State) -> Moment:
+        """Return what all frames observe from."""
+        log, T = self._log, state.T_imu_world
+        twist = np.zeros((len(T), 6))
+        if self._model.has_time_offset:
+            # Velocities as the trajectory has them; that they change with it is of second order.
+            tau = np.where(log.tau_s > 0, log.tau_s, 1.0)[1:, None]
+            twist = np.concatenate([log.seen_twist[:1], -se3.log(T[1:] @ se3.inverse(T[:-1])) / tau])
+        shared = split(self._unknowns.shared, state.shared)
+        return Moment(T, T, state.drive_values.get("calibration", GIVEN), twist, shared, self._way_m)
+
+    def _near(self, state: State) -> list[Factor]:
+        """Return weak priors of landmarks, where errors of tracks walk.
+
+        Differences of successive observations leave the disparity itself open: some tracks fit best at infinity.
+        """
+        if self._model.track_error is None:
+            return []
+        weight, landmarks = 1.0 / LANDMARK_PRIOR_M, np.arange(self._log.landmarks)
+        J = np.broadcast_to(weight * np.eye(3), (len(landmarks), 3, 3))
+        return [Factor(weight * (self._log.first_position_m - state.positions_m), (Term("landmarks", landmarks, J),))]
+
+    def _whitened(self, H_x: Array, H_m: Array, r: Array) -> list[Factor]:
+        """Return the factors of observations that stand alone, and of differences.
+
+        Args:
+            H_x: (K, d, seen) Jacobian by the filter's leading columns.
+            H_m: (K, d, 3) Jacobian by the landmarks.
+            r: (K, d) residuals.
+        """
+        log, u, scale = self._log, self._unknowns, 1.0 / np.sqrt(self._log.variance)
+        observed = u.drive_columns < H_x.shape[-1]
+        everything, factors = np.arange(log.observations), []
+        for is_difference in (False, True):
+            which: IntArray | slice = np.flatnonzero(self._is_difference == is_difference)
+            if not len(everything[which]):
+                continue
+            if len(everything[which]) == len(everything):
+                which = slice(None)  # does not copy
+            H, wide, n = H_x[which], scale[which][..., None], len(everything[which])
+            J_drive = np.zeros((*H.shape[:2], len(observed)))
+            J_drive[..., observed] = wide * H[..., u.drive_columns[observed]]
+            terms = [
+                Term("frames", log.frame[which], wide * H[..., u.frame_columns]),
+                Term("drive", np.zeros(n, dtype=np.int64), J_drive),
+                Term("landmarks", log.landmark[which], wide * H_m[which]),
+            ]
+            if is_difference:
+                J_before = np.zeros((*H.shape[:2], u.width))
+                J_before[..., u.cloned] = wide * H[..., u.clone_columns]
+                terms.append(Term("frames", log.frame[which] - 1, J_before))
+            factors.append(Factor(scale[which] * r[which], tuple(terms), everything[which]))
+        return factors
+
+    # --- as filtered --------------------------------------------------------------------------------------------------
+
+    def frozen(self) -> list[Factor]:
+        """Return the factors where the filter linearised them; residuals count from the coordinates of the log."""
+        log, first, layout = self._log, self._is_first, self._model.layout
+        position, first_position = log.position_m, log.first_position_m[log.landmark]
+        linear_position = first_position if log.first_estimates else position
+        # A new landmark is initialised after the update of its frame, all others are linearised before it.
+        T = np.where(first[:, None, None], log.T_updated[log.frame], log.T_linear[log.frame])
+        x = np.where(first[:, None], log.updated[log.frame], log.linear[log.frame])
+        T_linear = T
+        if log.first_estimates:
+            T_linear = np.where(first[:, None, None], T, log.T_predicted[log.frame])
+        group, seen_twist = 2 * log.frame + first, log.seen_twist[log.frame]
+        of_frame = self._way_m[log.frame]
+        seen = self._see(
+            group, T, T_linear, x, seen_twist, position, linear_position, of_frame, "pose", self._is_difference
+        )
+        H_x, H_m = seen.H_x, seen.H_m
+        if log.first_estimates:
+            # A new landmark follows the pose as it was predicted, whatever it is seen from.
+            T_first, place = log.T_predicted[log.frame[first]], first_position[first]
+            there = self._see(
+                group[first], T[first], T_first, x[first], seen_twist[first], place, place, of_frame[first]
+            )
+            H_x[first, :, layout["pose"]] = H_m[first] @ np.linalg.solve(there.H_m, there.H_x[..., layout["pose"]])
+        H_x = _carried_back(H_x, layout["pose"], log.T_linear, log.T_predicted, log.frame, ~first)
+        r = log.rows - seen.z + (H_x @ x[:, : layout.seen, None])[..., 0]
+        if len(self._follows):
+            self._subtract_frozen_before(H_x, H_m, r, x, linear_position)
+        r += (H_m @ (position - first_position)[..., None])[..., 0]
+        return self._whitened(H_x, H_m, r)
+
+    def _subtract_frozen_before(self, H_x: Array, H_m: Array, r: Array, x: Array, linear_position: Array) -> None:
+        """Turn observations into differences, in place: the same landmarks from the clones of the frames before."""
+        log, follows, layout, memory = self._log, self._follows, self._model.layout, self._memory
+        frame = log.frame[follows]
+        T = log.T_linear_before[frame]
+        T_linear = log.T_predicted[frame - 1] if log.first_estimates else T
+        positions = log.position_m[follows], linear_position[follows]
+        seen_twist, way_m = log.seen_twist[frame - 1], self._way_m[frame]
+        before = self._see(frame, T, T_linear, x[follows], seen_twist, *positions, way_m, "previous_pose")
+        B_x = _carried_back(before.H_x, layout["previous_pose"], log.T_linear_before, log.T_departed, frame)
+        shifted = (B_x @ x[follows, : layout.seen, None])[..., 0]
+        r[follows] -= memory * (log.rows[log.previous[follows]] - before.z + shifted)
+        H_x[follows] -= memory * B_x
+        H_m[follows] -= memory * before.H_m
+
+    def _see(
+        self,
+        group: IntArray,
+        T: Array,
+        T_linear: Array,
+        coordinates: Array,
+        twist: Array,
+        positions_m: Array,
+        linear_positions_m: Array,
+        way_m: Array,
+        pose: str = "pose",
+        is_difference: BoolArray | None = None,
+    ) -> Seen:
+        """Return landmarks (n, 3) as seen from poses (n, 4, 4), with blocks as coordinates (n, body) say.
+
+        Coordinates of the drive's blocks are alike within a group (n,).
+        """
+        model, calibration, layout = self._model, self._model.calibration, self._model.layout
+        clones = layout.clones if pose == "previous_pose" else {}
+        shared = {block.name: coordinates[:, layout[clones.get(block.name, block.name)]] for block in model.shared}
+        moment = Moment(T, T_linear, GIVEN, twist, shared, way_m)
+        if calibration is None:
+            return model.see(moment, positions_m, linear_positions_m, pose, is_difference)
+        parts, order = [], np.argsort(group, kind="stable")
+        for some in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+            found = calibration.retract(calibration.initial(), coordinates[some[0], layout["calibration"]])
+            here = replace(moment.at(some), calibration=found)
+            differs = None if is_difference is None else is_difference[some]
+            parts.append(model.see(here, positions_m[some], linear_positions_m[some], pose, differs))
+        back = np.argsort(order, kind="stable")
+        return Seen(*(np.concatenate([getattr(part, field.name) for part in parts])[back] for field in fields(Seen)))
+
+
+def _carried_back(
+    H_x: Array, at: slice, T_linear: Array, T_reference: Array, frame: IntArray, which: BoolArray | bool = True
+) -> Array:
+    """Return rows of iterated updates in the coordinates before the update: the chain rule, as the filter has it."""
+    shift = se3.log(T_linear @ se3.inverse(T_reference))
+    moved = np.any(np.abs(shift) > 1e-12, axis=1)[frame] & which
+    if moved.any():
+        H_x[moved, :, at] = H_x[moved, :, at] @ se3.left_jacobian(shift[frame[moved]])
+    return H_x

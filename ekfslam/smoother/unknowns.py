@@ -1,0 +1,138 @@
+"""Unknowns of the smoother: which block of the model belongs to which group, and a state of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.geometry import se3
+from ekfslam.models.blocks import StateBlock
+from ekfslam.models.model import Model
+from ekfslam.smoother.sparse.factors import FirstFrame
+
+
+@dataclass(frozen=True)
+class State:
+    """A trajectory, a map, and the other blocks.
+
+    Args:
+        T_imu_world: (T, 4, 4) poses.
+        positions_m: (M, 3) landmarks in world.
+        zeta: (w+a,) first frame in units of its prior: ``T_0 = exp((B zeta)^) T_prior``, and its blocks likewise.
+        shared: (T, w-6) values of the blocks of a frame that observations depend on, without its pose.
+        aux: (T, a) values of the further blocks of a frame. They are vectors.
+        drive: (g,) coordinates of the blocks of the drive: sums of corrections.
+        drive_values: Values of the blocks of the drive, by name.
+    """
+
+    T_imu_world: Array
+    positions_m: Array
+    zeta: Array
+    shared: Array
+    aux: Array
+    drive: Array
+    drive_values: Mapping[str, Array]
+
+
+class Unknowns:
+    """Blocks of a model in the groups of `ekfslam.smoother.sparse.factors`.
+
+    Args:
+        model: The model.
+        pose_covariance: (6, 6) covariance of the first pose.
+
+    Attributes:
+        shared, aux, of_drive: Blocks of ``frames`` (without the pose), of ``aux`` and of ``drive``.
+        frame_columns, aux_columns, drive_columns: Their columns in the model's layout, the pose's included.
+        width: Number of columns of a frame.
+        B: (w+a, w+a) root of the first frame's covariance, see `FirstFrame`.
+        cloned, clone_columns: Columns (c,) of a frame that the filter has clones of, and the layout's columns of these.
+    """
+
+    def __init__(self, model: Model, pose_covariance: Array) -> None:
+        layout = model.layout
+        self.shared: Sequence[StateBlock] = model.shared
+        self.aux = [block for block in layout.blocks if block.per_frame and not block.is_seen]
+        of_drive = (block for block in layout.blocks if not block.per_frame and not block.clones)
+        self.of_drive = [block for block in of_drive if not block.is_pose]
+        self.frame_columns = layout.columns(["pose", *(block.name for block in self.shared)])
+        self.aux_columns = layout.columns(block.name for block in self.aux)
+        self.drive_columns = layout.columns(block.name for block in self.of_drive)
+        self.width = len(self.frame_columns)
+        first = np.concatenate([self.frame_columns, self.aux_columns])
+        covariance = model.prior_covariance[np.ix_(first, first)]
+        covariance[:6, :6] = pose_covariance
+        self.B = root(covariance, self.width)
+        at = {column: i for i, column in enumerate(self.frame_columns.tolist())}
+        names = [name for name in layout.clones if name == "pose" or layout[name].start in at]
+        self.clone_columns = layout.columns(layout.clones[name] for name in names)
+        self.cloned = np.array([at[column] for column in layout.columns(names).tolist()], dtype=np.int64)
+        self._clones, self._has_previous_pose = model.clones, "previous_pose" in layout
+
+    def first_frame(self, zeta: Array) -> FirstFrame:
+        """Return the prior of the first frame, linearised at zeta (w+a,)."""
+        B = self.B.copy()
+        B[:6] = se3.left_jacobian(self.B[:6] @ zeta) @ B[:6]
+        return FirstFrame(B, zeta, self.width)
+
+    def drive_values(self, correction: Array, before: Mapping[str, Array] | None = None) -> dict[str, Array]:
+        """Return the values of the drive's blocks after a correction (g,), by default of their initial values."""
+        parts = split(self.of_drive, correction)
+        start = before or {block.name: block.initial() for block in self.of_drive}
+        return {block.name: block.retract(start[block.name], parts[block.name]) for block in self.of_drive}
+
+    def values(self, state: State) -> dict[str, Array]:
+        """Return the values of all blocks but the pose: of each frame (T, ...), or of the drive."""
+        return {**state.drive_values, **split(self.shared, state.shared), **split(self.aux, state.aux)}
+
+    def last_values(self, state: State) -> dict[str, Array]:
+        """Return the values of a filter's blocks at the last frame."""
+        of_frames = split(self.shared, state.shared) | split(self.aux, state.aux)
+        values = dict(state.drive_values) | {name: value[-1] for name, value in of_frames.items()}
+        values["pose"] = state.T_imu_world[-1]
+        if len(state.T_imu_world) > 1:
+            values |= {clone: of_frames[name][-2] for clone, name in self._clones}
+            if self._has_previous_pose:
+                values["previous_pose"] = state.T_imu_world[-2]
+        return values
+
+    def last_coordinates(self, state: State) -> tuple[IntArray, Array]:
+        """Return the columns (c,) of all blocks but poses, and their coordinates at the last frame."""
+        of_shared = self.cloned >= 6
+        columns = [self.aux_columns, self.drive_columns, self.frame_columns[6:]]
+        parts = [state.aux[-1], state.drive, state.shared[-1]]
+        if of_shared.any() and len(state.shared) > 1:
+            columns.append(self.clone_columns[of_shared])
+            parts.append(state.shared[-2, self.cloned[of_shared] - 6])
+        return np.concatenate(columns), np.concatenate(parts)
+
+
+def split(blocks: Sequence[StateBlock], array: Array) -> dict[str, Array]:
+    """Return the parts (..., size) of an array (..., n) that belong to each of some blocks, by name."""
+    ends = np.cumsum([block.size for block in blocks])[:-1]
+    return dict(zip((block.name for block in blocks), np.split(array, ends, axis=-1), strict=True)) if blocks else {}
+
+
+def root(covariance: Array, width: int) -> Array:
+    """Return B with ``B B^T = covariance`` (n, n), which may be singular.
+
+    The first rows by the columns from ``width`` on are 0, so that observations of the first frame do not depend on the
+    part of zeta that belongs to its aux.
+    """
+    std = np.sqrt(np.diag(covariance))
+    scale = np.where(std > 0, std, 1.0)
+    correlation = covariance / np.outer(scale, scale)
+    high, low = slice(0, width), slice(width, None)
+    B = np.zeros_like(correlation)
+    B[high, high] = _symmetric_root(correlation[high, high])
+    B[low, high] = correlation[low, high] @ np.linalg.pinv(B[high, high], rcond=1e-7)
+    B[low, low] = _symmetric_root(correlation[low, low] - B[low, high] @ B[low, high].T)
+    return scale[:, None] * B
+
+
+def _symmetric_root(A: Array) -> Array:
+    eigenvalues, vectors = np.linalg.eigh(A)
+    return np.asarray((vectors * np.sqrt(np.maximum(eigenvalues, 0.0))) @ vectors.T)
