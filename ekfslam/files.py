@@ -1,9 +1,7 @@
-"""The one way in which files are written, whatever they hold: as a whole or not at all.
+"""Atomic writing of all files of the package: a file is written as a whole or not at all.
 
-The content is complete in memory before anything is touched. It goes to a file beside the target, to the disk (fsync),
-and takes the place of the target by renaming. A full disk, a limit or a kill leaves the older file as it was.
-
-A leaf: readers of data use it as well as archives do, so it imports nothing of the package but the errors.
+The content is complete in memory before anything is touched. It goes to a file next to the target, to the disk (fsync),
+and replaces the target by renaming. A full disk, a limit or a kill leaves the older file as it was.
 """
 
 from __future__ import annotations
@@ -18,23 +16,23 @@ from pathlib import Path
 
 from ekfslam.errors import WriteError
 
-_PREFIX, _SUFFIX = ".ekfslam.", ".tmp"  # of unfinished files; the number of the process stands between
+_PREFIX, _SUFFIX = ".ekfslam.", ".tmp"  # names of unfinished files, with the number of the process between
 _counter = itertools.count()
 
 
 def write(path: str | Path, content: str | bytes) -> None:
-    """`write_all` of one file, into a folder that exists."""
+    """Write one file into a folder that exists, see `write_all`."""
     write_all({Path(path): content}, make_folders=False)
 
 
 def write_all(contents: Mapping[Path, str | bytes], make_folders: bool = True) -> None:
-    """Write files that belong together, in place of older ones: all are on the disk before the first takes its place.
+    """Write files that belong together: all are on the disk before the first one replaces an older file.
 
-    Permissions of older files stay. A symbolic link stays, and what it names is written.
+    Permissions of older files stay. A symbolic link stays, and the file that it names is written.
 
     Args:
-        contents: By path; text is encoded in UTF-8.
-        make_folders: Make folders that are missing; they go again where the writing fails.
+        contents: Contents by path; text is encoded in UTF-8.
+        make_folders: Whether to make missing folders; they are removed again if the writing fails.
 
     Raises:
         WriteError: A target is a folder, a device or protected, its folder is missing, or the disk is full.
@@ -67,7 +65,7 @@ def write_all(contents: Mapping[Path, str | bytes], make_folders: bool = True) -
 
 
 def require_writable(path: str | Path) -> None:
-    """Raise a `WriteError` where `write`, after making the folder, would fail for another reason than a full disk."""
+    """Raise a `WriteError` if `write_all` would fail for another reason than a full disk."""
     folder = _target(path).parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
@@ -78,13 +76,13 @@ def require_writable(path: str | Path) -> None:
 
 
 def is_free(path: str | Path) -> bool:
-    """Whether nothing is lost by writing there: there is no file, or an empty one."""
+    """Return whether there is no file at a path, or an empty one."""
     path = Path(path)
     return not path.exists() or (path.is_file() and path.stat().st_size == 0)
 
 
 def _make_folder(folder: Path) -> list[Path]:
-    """Make a folder and those above it where they are missing; those that were made, from the top."""
+    """Make a folder and its missing parents; return those that were made, the outermost first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()][::-1]
     for path in missing:
         path.mkdir(exist_ok=True)
@@ -93,7 +91,7 @@ def _make_folder(folder: Path) -> list[Path]:
 
 @contextmanager
 def alone(path: str | Path) -> Iterator[None]:
-    """Wait until nobody else who asks so works on files of the same folder, and keep it so meanwhile.
+    """Hold the lock of the folder of a path, so that callers change files of the same folder one after the other.
 
     Raises:
         WriteError: There is no such folder.
@@ -103,7 +101,7 @@ def alone(path: str | Path) -> Iterator[None]:
     except OSError as error:
         raise WriteError(f"{path}: {error.strerror or error}") from None
     try:
-        with suppress(OSError):  # some file systems have no locks: then nobody waits
+        with suppress(OSError):  # some file systems have no locks: then no caller waits
             fcntl.flock(folder, fcntl.LOCK_EX)
         yield
     finally:
@@ -111,7 +109,7 @@ def alone(path: str | Path) -> Iterator[None]:
 
 
 def _target(path: str | Path) -> Path:
-    """What is really written: the end of all symbolic links."""
+    """Return the file at the end of all symbolic links."""
     try:
         target = Path(path).resolve()
         mode = target.stat().st_mode if target.exists() else None
@@ -128,7 +126,7 @@ def _write_to_disk(unfinished: Path, data: bytes, target: Path) -> None:
     """Write a new file with the permissions of the target, and wait until it is on the disk."""
     with unfinished.open("xb") as file:
         with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_EX)  # says that its writer lives
+            fcntl.flock(file, fcntl.LOCK_EX)  # shows that its writer is alive
         if target.exists():
             older = target.stat()
             with suppress(OSError):
@@ -140,7 +138,7 @@ def _write_to_disk(unfinished: Path, data: bytes, target: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring the renaming to the disk, where the file system can."""
+    """Bring the renaming to the disk, if the file system can."""
     with suppress(OSError):
         number = os.open(folder, os.O_RDONLY)
         try:
@@ -150,7 +148,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove what dead processes have left unfinished."""
+    """Remove unfinished files of dead processes."""
     for scrap in folder.glob(f"{_PREFIX}*{_SUFFIX}"):
         number = scrap.name.removeprefix(_PREFIX).partition(".")[0]
         if not number.isdigit() or _is_alive(int(number)):

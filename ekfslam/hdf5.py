@@ -1,18 +1,13 @@
-"""The HDF5 dialect of result archives, studies and recordings.
+"""HDF5 files of results, studies and recordings.
 
 - A file is made in memory (`image`) and appears under its name only when it is complete.
-- Its attributes ``format`` and ``format_version`` say what it is; `opened` refuses what it is not, and whatever damage
-  shows while it is read becomes one named error.
-- Data sets are declared in layouts, next to the records that they hold. Each has the attributes ``units`` and ``frame``
-  (of reference), and a `Check` of its values, which holds for what is written as well as for what is read.
-- Every dimension has a name and a coordinate, see `ekfslam.stored`. Older files have none.
-- `opened` looks at everything in a file before anything is read. It refuses links, data that lie in other files, and
-  types of data that no file of ours has.
-- Text is read in both of HDF5's forms and written with fixed length: libhdf5 hangs on some damaged files with text of
-  variable length. Files have the newer layout, which carries checksums of all but the arrays. Long arrays
-  are compressed.
-
-A leaf: readers of data use it as well as archives do, so it imports nothing of the package but other leaves.
+- Its attributes ``format`` and ``format_version`` identify it. `opened` rejects other files, and inspects all of a file
+  before anything is read: no links, no data in other files, no types that our files do not have. Any damage found while
+  reading raises one named error.
+- Data sets follow from the records that they hold, see `ekfslam.stored`: attributes ``units`` and ``frame``, checks of
+  the values both when writing and when reading, and a coordinate for every dimension. Older files have no coordinates.
+- Text is read in both forms of HDF5 and written with fixed length: libhdf5 hangs on some damaged files with text of
+  variable length. Files have the newer layout, with checksums of all but the arrays. Long arrays are compressed.
 """
 
 from __future__ import annotations
@@ -38,31 +33,31 @@ from ekfslam.limits import Budget, require_file
 from ekfslam.names import printable
 from ekfslam.stored import Item
 
-# What h5py, zlib and json raise where a file is damaged.
+# Errors of h5py, zlib and json if a file is damaged.
 _DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError, MemoryError, zlib.error)
 _LONG = 10_000  # entries from which compression pays
-# Of compression. A drive of 1000 frames takes 7.3 MB in place of 13.2, and 0.2 s more to write; level 9: 7.2 MB, 1.9 s.
+# Level of compression. 1000 frames take 7.3 MB in place of 13.2, and 0.2 s more to write; level 9: 7.2 MB, 1.9 s.
 _LEVEL, _CHUNK_BYTES = 1, 1 << 20
-_MOST_OBJECTS = 100_000  # of a file: one of ours has some hundreds
+_MOST_OBJECTS = 100_000  # in a file; ours have some hundreds
 
 Coordinates = Mapping[str, NDArray]
 NONE: Coordinates = MappingProxyType({})
 
 
 def image(format: str, version: int, fill: Callable[[h5py.File], None]) -> bytes:
-    """The bytes of a new file of a format and version, for `ekfslam.files.write`.
+    """Return the bytes of a new file of a format and version, for `ekfslam.files.write`.
 
-    It is made in memory, since libhdf5 crashes the interpreter where a disk is full.
+    The file is made in memory, since libhdf5 crashes the interpreter if a disk is full.
 
     Args:
-        format, version: Its attributes.
-        fill: Writes what else is in it.
+        format, version: Attributes of the file.
+        fill: Function that writes the rest into the open file.
 
     Raises:
-        ArchiveError: It would hold what cannot be read again.
+        ArchiveError: The content could not be read again.
     """
     content = io.BytesIO()
-    # Not the image that HDF5 gives of an open file: until 2.0 the checksum of its first block is wrong.
+    # HDF5's own image of an open file will not do: until 2.0 the checksum of its first block is wrong.
     with h5py.File(content, "w", libver="v110") as h5file:
         write_attributes(h5file, {"format": format, "format_version": version})
         fill(h5file)
@@ -73,11 +68,11 @@ def image(format: str, version: int, fill: Callable[[h5py.File], None]) -> bytes
 def opened(
     path: str | Path, format: str, version: int, error: type[EkfslamError] = ArchiveError
 ) -> Iterator[h5py.File]:
-    """A file, open for reading, of a format and of at most a version.
+    """Open a file for reading; it must have this format, and at most this version.
 
     Raises:
         ArchiveError: A newer release wrote the file.
-        EkfslamError: Of type ``error``: it is missing, has another format, or turns out damaged while it is open.
+        EkfslamError: Of type ``error``: the file is missing, has another format, or proves damaged while it is open.
     """
     try:
         require_file(path)
@@ -99,7 +94,7 @@ def opened(
 
 
 def _reading(path: str | Path) -> h5py.File:
-    """A file, open for reading; also where this process has it open by other means, such as xarray."""
+    """Open a file for reading, even if this process has it open by other means, such as xarray."""
     try:
         # Files are replaced as a whole and never changed, so that they need no locks.
         return h5py.File(str(path), "r", locking=False)
@@ -111,18 +106,18 @@ def _reading(path: str | Path) -> h5py.File:
 
 
 def format_of(path: str | Path) -> str:
-    """The attribute ``format`` of an HDF5 file; empty if it has none, or is none."""
+    """Return the attribute ``format`` of an HDF5 file; empty for other files."""
     if not (Path(path).is_file() and h5py.is_hdf5(str(path))):
         return ""
     try:
         with _reading(path) as h5file:
             return str(plain(h5file.attrs.get("format", "")))
-    except _DAMAGE:  # who opens it will say how
+    except _DAMAGE:  # `opened` will name it
         return ""
 
 
 def _inspect(h5file: h5py.File, error: type[EkfslamError]) -> None:
-    """Refuse what no file of ours has, all over a file, before anything is read."""
+    """Raise an error if any object of a file is of a kind that our files do not have."""
     budget = Budget(h5file.filename, error)
     waiting, seen = [h5file], {h5py.h5o.get_info(h5file.id).addr}
     while waiting:
@@ -165,7 +160,7 @@ def _inspect_attributes(item: h5py.Group | h5py.Dataset, budget: Budget) -> None
 
 
 def _inspect_size(dataset: h5py.Dataset, place: str, budget: Budget) -> None:
-    """Refuse a data set that claims more than may be read, or more than the file has of it."""
+    """Raise an error if a data set claims more than may be read, or more than the file has of it."""
     size = math.prod(dataset.shape) * dataset.dtype.itemsize
     budget.take(size, dataset.name.strip("/"))
     if dataset.chunks is None:
@@ -189,19 +184,19 @@ def _inspect_size(dataset: h5py.Dataset, place: str, budget: Budget) -> None:
 
 
 def _is_of_scales(name: str, dtype: np.dtype) -> bool:
-    """Whether an attribute is one by which HDF5 ties dimensions to data sets. Nothing here follows them."""
+    """Return whether an attribute ties dimensions to data sets. Nothing here follows these references."""
     if name == "DIMENSION_LIST":
         return h5py.check_ref_dtype(h5py.check_vlen_dtype(dtype) or dtype) is h5py.Reference
     return name == "REFERENCE_LIST" and dtype.names == ("dataset", "dimension")
 
 
 def _is_known(dtype: np.dtype) -> bool:
-    """Whether a type is one of numbers, truth values or text."""
+    """Return whether a type is one of numbers, truth values or text."""
     return dtype.kind in "fiubS" or h5py.check_string_dtype(dtype) is not None
 
 
 def write_record(group: h5py.Group, record: Any, sizes: dict[str, int], coordinates: Coordinates = NONE) -> None:
-    """Write a record whose class says how it is stored: attributes, data sets, and a group for each record in it.
+    """Write a record as its class says: attributes, data sets, and a group for each record in it.
 
     Args:
         group: Group of the record.
@@ -423,18 +418,14 @@ def _checked(group: h5py.Group, layout: stored.Layout, values: list[Any], known:
 
 
 def subgroup(group: h5py.Group, name: str) -> h5py.Group:
-    """A group below another.
-
-    Raises:
-        ArchiveError: It is missing.
-    """
+    """Return a group below another; raise an `ArchiveError` if it is missing."""
     if not isinstance(group.get(name), h5py.Group):
         raise ArchiveError(f"{_place(group, name)} is missing")
     return group[name]
 
 
 def write_attributes(item: h5py.Group | h5py.Dataset, values: Mapping[str, Any]) -> None:
-    """Write attributes, text with fixed length; those that are None are left out."""
+    """Write attributes except those that are None, text with fixed length."""
     for name, value in values.items():
         if isinstance(value, str):
             item.attrs[name] = fixed_text(value)
@@ -445,27 +436,19 @@ def write_attributes(item: h5py.Group | h5py.Dataset, values: Mapping[str, Any])
 
 
 def attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
-    """All attributes as plain Python values; arrays stay arrays."""
+    """Return all attributes as plain Python values; arrays stay arrays."""
     return {name: plain(value) for name, value in item.attrs.items()}
 
 
 def attribute(item: h5py.Group | h5py.Dataset, name: str) -> Any:
-    """One attribute as a plain Python value.
-
-    Raises:
-        ArchiveError: It is missing.
-    """
+    """Return an attribute as a plain Python value; raise an `ArchiveError` if it is missing."""
     if name not in item.attrs:
         raise ArchiveError(f"{item.file.filename}: {_spoken(item, name)} is missing")
     return plain(item.attrs[name])
 
 
 def version_of(item: h5py.Group) -> int:
-    """The attribute ``format_version`` of a file or group.
-
-    Raises:
-        ArchiveError: It is missing, or no whole number.
-    """
+    """Return the attribute ``format_version``; raise an `ArchiveError` unless it is a whole number."""
     version = attribute(item, "format_version")
     if type(version) is not int:
         raise ArchiveError(f"{item.file.filename}: {_spoken(item, 'format_version')} is no whole number: {version!r}")
@@ -473,11 +456,7 @@ def version_of(item: h5py.Group) -> int:
 
 
 def facts(item: h5py.Group | h5py.Dataset) -> dict[str, str | int | float]:
-    """All attributes, each a text or a finite number.
-
-    Raises:
-        ArchiveError: One is something else.
-    """
+    """Return all attributes; raise an `ArchiveError` unless each is a text or a finite number."""
     found = attributes(item)
     for name, value in found.items():
         if not (isinstance(value, str) or (isinstance(value, int | float) and abs(value) < np.inf)):
@@ -486,11 +465,7 @@ def facts(item: h5py.Group | h5py.Dataset) -> dict[str, str | int | float]:
 
 
 def json_table(item: h5py.Group | h5py.Dataset, name: str) -> dict[str, Any]:
-    """One attribute that holds a JSON object.
-
-    Raises:
-        ArchiveError: It is missing, or holds something else.
-    """
+    """Return an attribute that holds a JSON object; raise an `ArchiveError` if it holds anything else."""
     text = attribute(item, name)
     try:
         table = json.loads(text)
@@ -502,24 +477,24 @@ def json_table(item: h5py.Group | h5py.Dataset, name: str) -> dict[str, Any]:
 
 
 def fixed_text(text: str) -> np.bytes_:
-    """Text in HDF5's form of fixed length."""
+    """Return a text in HDF5's form of fixed length."""
     return np.bytes_(text.encode(errors="backslashreplace"))
 
 
 def fixed_texts(texts: Iterable[str]) -> NDArray:
-    """Texts in that form, as an array."""
+    """Return texts in HDF5's form of fixed length, as an array."""
     return np.array([fixed_text(text) for text in texts], dtype=np.bytes_)
 
 
 def plain(value: Any) -> Any:
-    """A stored scalar as a plain Python value; of text, control characters but the end of a line are written out."""
+    """Return a stored scalar as a plain Python value, with control characters of a text written out."""
     value = value.item() if isinstance(value, np.generic) else value
     value = value.decode(errors="replace") if isinstance(value, bytes) else value
     return printable(value, keep="\n") if isinstance(value, str) else value
 
 
 def texts(values: Any) -> tuple[str, ...]:
-    """Stored texts as plain ones."""
+    """Return stored texts as plain ones."""
     return tuple(str(plain(text)) for text in np.ravel(values))
 
 

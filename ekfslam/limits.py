@@ -1,8 +1,6 @@
-"""How much a file may claim to hold, before anything of it is allocated, decompressed or read.
+"""Limits on the size of files, checked before anything of a file is allocated, decompressed or read.
 
-A file of some kilobytes can claim gigabytes. Readers ask a `Budget` for what headers claim, all of a file together.
-
-A leaf: it imports nothing of the package but the errors.
+A file of some kilobytes can claim gigabytes. Readers ask a `Budget` for the sizes that its headers claim, in all.
 """
 
 from __future__ import annotations
@@ -22,10 +20,10 @@ _limit: ContextVar[int] = ContextVar("limit", default=int(DEFAULT_GB * 1e9))
 
 @contextmanager
 def reading_up_to(gb: float) -> Iterator[None]:
-    """Let files hold up to so many gigabytes of numbers meanwhile.
+    """Let files hold up to so many gigabytes of numbers within the context.
 
     Raises:
-        ConfigError: That is no positive number.
+        ConfigError: The limit is no positive number.
     """
     if not 0 < gb <= 1e6:
         raise ConfigError(f"the limit of reading must be a positive number of gigabytes, found {gb}")
@@ -37,23 +35,23 @@ def reading_up_to(gb: float) -> Iterator[None]:
 
 
 def limit_gb() -> float:
-    """How many gigabytes of numbers a file may hold here, for `reading_up_to` in another process."""
+    """Return how many gigabytes of numbers a file may hold, for `reading_up_to` in another process."""
     return _limit.get() / 1e9
 
 
 class Budget:
-    """What is left for one file of what may be read.
+    """The bytes that one file may still claim.
 
     Args:
-        source: The file, for messages.
-        error: What to raise when it claims more.
+        source: Name of the file, for messages.
+        error: Type of the error if it claims more.
     """
 
     def __init__(self, source: str, error: type[EkfslamError] = UnknownFormatError) -> None:
         self.source, self.error, self.left = source, error, _limit.get()
 
     def take(self, size: int, what: str) -> None:
-        """Raise an error where a further ``size`` bytes are more than what is left."""
+        """Take ``size`` bytes; raise an error if fewer are left."""
         self.left -= size
         if size < 0 or self.left < 0:
             raise self.error(

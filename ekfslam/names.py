@@ -1,22 +1,19 @@
-"""Names that come from inside files or from paths: what of them may be shown, and what may become a path.
-
-A leaf: it imports nothing of the package.
-"""
+"""Names from inside files and from paths, made safe to print and to use in paths."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 _LONGEST = 100  # bytes of a path component, with room for endings
-_UNSAFE = frozenset('/\\:*?"<>|')  # somewhere they part paths, or name what is no file
+_UNSAFE = frozenset('/\\:*?"<>|')  # some system separates paths by them, or gives them a meaning
 
 
 def printable(text: str, keep: str = "") -> str:
-    """A text whose control characters, and bytes that are no UTF-8, are written out: ``\\x1b``.
+    """Return a text with control characters, and bytes that are no UTF-8, written out: ``\\x1b``.
 
     Args:
-        text: Any.
-        keep: Control characters that stay.
+        text: Any text.
+        keep: Control characters to keep.
     """
     return "".join(
         c if c.isprintable() or c in keep else c.encode("unicode_escape", "backslashreplace").decode() for c in text
@@ -24,7 +21,7 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def components(names: Iterable[str]) -> list[str]:
-    """One path component each that leads nowhere else; no two are the same, whatever the names are."""
+    """Return a path component for each name that stays in its folder; no two are the same."""
     taken: set[str] = set()
     found = []
     for name in names:

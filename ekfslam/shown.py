@@ -1,4 +1,4 @@
-"""How records show themselves at a prompt and in a notebook: a few lines in place of thousands of numbers."""
+"""Short views of records at a prompt and in a notebook: a few lines in place of thousands of numbers."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 
 class Card(NamedTuple):
-    """What a record says of itself.
+    """A short view of a record.
 
     Args:
-        title: What it is, in a few words.
-        facts: Its key figures, by name.
-        further: How to go on, as Python.
+        title: Kind and size of the record, in a few words.
+        facts: Key figures by name.
+        further: Python calls to go on with.
     """
 
     title: str
@@ -24,7 +24,7 @@ class Shown:
     """A record with a short ``repr`` and a table for notebooks, both from `card`."""
 
     def card(self) -> Card:
-        """What ``repr`` and a notebook show."""
+        """Return the card that ``repr`` and a notebook show."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -44,10 +44,10 @@ class Shown:
 
 
 def count(number: int, noun: str) -> str:
-    """``1 landmark``, ``12 034 landmarks``."""
+    """Return a number with its noun: ``1 landmark``, ``12 034 landmarks``."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}".replace(",", " ")
 
 
 def figure(value: float) -> str:
-    """A number with three digits."""
+    """Return a number with three digits."""
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

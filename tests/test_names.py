@@ -24,7 +24,7 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.tables import markdown_table
 from ekfslam.figures import style
-from ekfslam.figures.run import plot_map
+from ekfslam.figures.maps import plot_map
 from ekfslam.names import components, printable
 from ekfslam.storage.archive import read_archive, write_archive
 from ekfslam.studies.tuning import toml_heading, toml_value

@@ -1,4 +1,4 @@
-"""What a run leaves behind: trajectory, map, innovation statistics and bookkeeping of one mode on one sequence."""
+"""Results of a run: trajectory, map, innovation statistics and bookkeeping of one mode on one sequence."""
 
 from __future__ import annotations
 
@@ -42,29 +42,29 @@ ERROR_CONVENTION = (
     "covariances are of xi and d"
 )
 
-# Why a filter rejected an observation; the codes of `Rejections.reason`. Archives hold the codes: "row mismatch", now
-# the business of `ekfslam.data.hygiene`, keeps its place.
+# Reasons for rejecting an observation; `Rejections.reason` is an index. Archives hold the index, so "row mismatch" has
+# its place still, although `ekfslam.data.hygiene` looks for it today.
 REASONS: tuple[str, ...] = ("gate", "disparity", "row mismatch", "behind camera", "moving", "waiting")
 
 _POSE_COVARIANCE = "m^2, m rad, rad^2 (rho 0-2, theta 3-5)"
 _PARAMETER_UNITS = "see attribute unit of the group"
 
-# Pixel noise below which a linearised update gains more than it should. In both built-in worlds the pose NEES is the
-# same from 0.7 to 0.1 px, twice as large at 0.03 px, ten times at 0.01 px.
-# Attribute of results that keeps what looked wrong in a recording and a run, see `ekfslam.evaluation.sanity`.
-SANITY, SANITY_SEPARATOR = "sanity", " | "
+# Pixel noise below which a linearised update gains more information than it should. In both built-in worlds the pose
+# NEES is the same from 0.7 to 0.1 px, twice as large at 0.03 px, ten times at 0.01 px.
 LINEAR_FROM_PX = 0.1
+# Attribute with the doubts about a recording and a run, see `ekfslam.evaluation.sanity`.
+SANITY, SANITY_SEPARATOR = "sanity", " | "
 
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Every landmark a run has estimated (full mode: in the order of first sight, which is that of the log).
+    """Every landmark that a run has estimated (mode full: in the order of landmark initialisation, as in the log).
 
     Args:
-        id: (M,) landmark id; an id occurs again for each time a retired landmark started afresh.
+        id: (M,) landmark id; an id occurs again if a retired landmark was initialised again.
         position_m: (M, 3) last estimate in world.
         covariance: (M, 3, 3) of the position error d, m^2.
-        initial_position_m: (M, 3) triangulation at first sight.
+        initial_position_m: (M, 3) triangulation at landmark initialisation.
         first_frame, last_frame: (M,) frames of the first and last accepted observation.
         observations: (M,) number of accepted observations, the first included.
     """
@@ -119,19 +119,19 @@ class Innovation:
 
 @dataclass(frozen=True)
 class WhitenedInnovations:
-    """What `ekfslam.evaluation.honesty` judges by: innovations in units of what the filter expects.
+    """Innovations in units of their predicted deviations, from which `ekfslam.evaluation.honesty` judges a filter.
 
-    Of the K' accepted observations of landmarks that were known already, in the order of frames. Equations stand in
+    They belong to the K' accepted observations of known landmarks, in the order of frames. The equations are in
     `ekfslam.filters.innovations`.
 
     Args:
-        frame: (K',) frame of each.
+        frame: (K',) frame of the observation.
         landmark: (K',) row of its landmark in the log.
-        alone: (K', d) innovation by the Cholesky factor of its own covariance: u, v, disparity.
-        apart: (K', d) the same less the motion of the camera on which the frame's innovations agree, in its own
-            covariance; NaN where that leaves nothing.
+        alone: (K', d) innovation whitened by its own covariance: u, v, disparity.
+        apart: (K', d) innovation without the camera motion on which all innovations of the frame agree, whitened by its
+            own covariance; NaN if nothing is left.
         score: (T, 6) ``c = J^T S^-1 r`` of each frame, along the axes of the IMU: rho, then theta.
-        information: (T, 6, 6) its covariance ``C = J^T S^-1 J``; 0 where nothing was accepted.
+        information: (T, 6, 6) covariance ``C = J^T S^-1 J`` of the score; 0 if nothing was accepted.
     """
 
     frame: IntArray = field(metadata=stored("innovation", "frame index", check=FRAMES))
@@ -178,12 +178,12 @@ class Rejections:
 
 @dataclass(frozen=True)
 class Parameters:
-    """What the joint filter has estimated besides poses and landmarks, after each of T frames.
+    """Parameters that the joint filter has estimated, such as calibration, after each of T frames.
 
     Args:
-        name, unit: Of each of the p parameters.
-        prior_std: (p,) deviations before the first frame.
-        value, std: (T, p) estimates and their deviations.
+        name, unit: Names and units of the p parameters.
+        prior_std: (p,) standard deviations before the first frame.
+        value, std: (T, p) estimates and their standard deviations.
     """
 
     name: tuple[str, ...] = field(metadata=attribute(tuple, along="P"))
@@ -194,12 +194,12 @@ class Parameters:
 
     @property
     def is_observed(self) -> NDArray[np.bool_]:
-        """Whether (p,) the recording has said more about a parameter than its prior: its deviation has halved."""
+        """(p,) whether a parameter is observed: its standard deviation is below half of that of the prior."""
         return self.std[-1] < 0.5 * self.prior_std
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """One line a parameter: the last estimate, its deviation, and whether the recording told it."""
+        """One line a parameter: the last estimate, its standard deviation, and whether it is observed."""
         rows = zip(self.name, self.unit, self.prior_std, self.value[-1], self.std[-1], self.is_observed, strict=True)
         return tuple(
             f"{name}: {value:.3g} +- {std:.2g} {unit} (before: 0 +- {prior:.2g})"
@@ -210,7 +210,7 @@ class Parameters:
 
 @dataclass(frozen=True)
 class PosePairs:
-    """How the errors of reported poses hang together.
+    """Cross-covariances of the errors of reported poses.
 
     Args:
         first, second: (n,) frames j < k.
@@ -235,9 +235,9 @@ class PosePairs:
 
 
 class View:
-    """A method of `Result` that a room above provides: a function whose first argument is the result.
+    """A method of `Result` that a higher module provides: a function whose first argument is the result.
 
-    The function is named here and found at its first use, like an entry point. So results import no figures and no
+    The function is named here and found at its first use, like an entry point. So results import neither figures nor
     files, and ``help(Result.map)`` shows the function.
 
     Args:
@@ -266,18 +266,18 @@ class Result(Shown):
         innovation: Per-frame statistics.
         rejections: Every rejected observation.
         ms_per_frame: (T,) wall-clock time spent on each frame.
-        counts: Totals worth knowing: accepted, rejected per reason, retired, reappeared, findings of hygiene. What was
-            accepted, rejected, and dropped by hygiene adds up to all observations.
+        counts: Totals: accepted, rejected per reason, retired, reappeared, findings of hygiene. The observations that
+            were accepted, rejected, and dropped by hygiene add up to all.
         config: The resolved configuration as nested dictionaries.
         noise: The measurement noise that was assumed.
         camera, T_cam_imu: The calibration that was assumed.
-        log: What the joint filter conditioned on; ``landmarks`` are in its order (full mode only).
-        hygiene: What was done to the tracks before (None: nothing, as in dead reckoning).
-        parameters: What else was estimated: calibration, roll and pitch (None: nothing).
-        pairs: Cross-covariances of some of the poses (None: there is no truth to judge them by).
-        whitened: Innovations one by one and frame by frame (full mode only; older archives have none).
-        attributes: Sequence attributes, versions, seed, input checksum; ``log_likelihood`` of the innovations of
-            what was accepted (runs that reject alike may be compared by it).
+        log: Everything that the joint filter conditioned on, with the landmarks in the same order (mode full only).
+        hygiene: Report on the cleaning of the tracks (None: they were not cleaned, as in dead reckoning).
+        parameters: Estimates of calibration, roll and pitch (None: none were estimated).
+        pairs: Cross-covariances of some of the poses (None: there is no truth to compare with).
+        whitened: Whitened innovations (mode full only; older archives have none).
+        attributes: Sequence attributes, versions, seed, input checksum; ``log_likelihood`` of the accepted
+            innovations, by which runs that reject the same observations can be compared.
     """
 
     mode: str
@@ -319,7 +319,7 @@ class Result(Shown):
                 raise NonFiniteResultError(self.mode, name, int(np.argwhere(is_wrong)[0][0]))
 
     def card(self) -> Card:
-        """What ``repr`` and a notebook show."""
+        """Return the card that ``repr`` and a notebook show."""
         way_m = float(np.linalg.norm(np.diff(self.T_world_imu[:, :3, 3], axis=0), axis=1).sum())
         seconds = float(self.time_s[-1] - self.time_s[0])
         last = zip("xyz", self.T_world_imu[-1, :3, 3], self.position_std_world_m[-1], strict=True)
@@ -345,10 +345,9 @@ class Result(Shown):
     def position_covariance_world(self) -> Array:
         """(T, 3, 3) covariance of the position error of the IMU along the axes of world, m^2.
 
-        ``covariance`` is of ``xi``, whose axes are those of the IMU: an error ``xi`` moves the IMU by ``-R rho``
-        to first order, R being the rotation of ``T_world_imu``. So this is ``R P_rho R^T``. It holds for every
-        variant: stored covariances are of the same ``xi`` whatever variant has run. Landmarks need no such call:
-        ``landmarks.covariance`` is along the axes of world already.
+        ``covariance`` is of ``xi``, whose axes are those of the IMU: an error ``xi`` moves the IMU by ``-R rho`` to
+        first order, with the rotation R of ``T_world_imu``. So this is ``R P_rho R^T``, for every variant, since stored
+        covariances are always of ``xi``. ``landmarks.covariance`` is along the axes of world already.
         """
         return world_axes_covariance(self.T_world_imu, self.covariance)[0]
 
@@ -366,7 +365,7 @@ class Result(Shown):
         return np.sqrt(np.maximum(np.diagonal(self.position_covariance_world, axis1=1, axis2=2), 0.0))
 
     def frame_at(self, time_s: float) -> int:
-        """The frame whose stamp is nearest to a time on the clock of the recording, s.
+        """Return the frame whose stamp is nearest to a time on the clock of the recording, s.
 
         Raises:
             ShapeError: The time is before the first frame or after the last.
@@ -377,13 +376,13 @@ class Result(Shown):
         return int(np.argmin(np.abs(self.time_s - time_s)))
 
     def between(self, begin_s: float, end_s: float) -> Result:
-        """The frames whose stamps are in ``[begin_s, end_s)`` on the clock of the recording, as a result of its own.
+        """Return the frames with stamps in ``[begin_s, end_s)``, on the clock of the recording, as a result.
 
-        Estimates stay those of the whole run, and so do ``counts``, ``config`` and ``attributes``. The map has what was
-        seen in these frames. What belongs to the run as a whole goes: log, whitened innovations, findings of hygiene.
+        Estimates, ``counts``, ``config`` and ``attributes`` stay those of the whole run. The map has the landmarks that
+        were seen in these frames. Log, whitened innovations and hygiene belong to the whole run and are left out.
 
         Raises:
-            ShapeError: There are none.
+            ShapeError: There are no such frames.
         """
         begin, end = np.searchsorted(self.time_s, (begin_s, end_s)).tolist()
         if begin >= end:
@@ -411,7 +410,7 @@ class Result(Shown):
             whitened=None,
         )
 
-    # --- methods that rooms above provide
+    # --- methods that higher modules provide --------------------------------------------------------------------------
 
     map = View("ekfslam.figures.views:map_of")
     plot = View("ekfslam.figures.views:trajectory_of")
@@ -422,7 +421,7 @@ class Result(Shown):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What must be said of it beside its numbers, one sentence each."""
+        """Warnings about the run, one sentence each."""
         remarks = []
         if self.mode != "dead-reckoning" and not len(self.landmarks):
             remarks.append("not one observation was used: the trajectory is that of dead reckoning")

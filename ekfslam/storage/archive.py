@@ -1,4 +1,4 @@
-"""Result archives: one HDF5 file holds what every mode made of one sequence.
+"""Result archives: one HDF5 file holds the results of all modes on one sequence.
 
     /                       attributes format, format_version, source, error_convention
     /sequence, /truth       as in `ekfslam.data.readers.hdf5`, without the observations
@@ -7,8 +7,8 @@
         attributes          seed, input checksum, versions of the software, as attributes
         <field>             fields of the record in this field of `Result`
 
-`ekfslam.stored` says how fields are declared; docs/archive.md lists all of them.
-Reading gives back every number bit for bit. See `ekfslam.hdf5` for what all files have in common.
+docs/archive.md lists all fields, `ekfslam.stored` explains how records declare them, and `ekfslam.hdf5` describes all
+files of the package. Reading gives back every number bit for bit.
 """
 
 from __future__ import annotations
@@ -61,13 +61,12 @@ FORMAT_VERSION = 5
 
 @dataclass(frozen=True, repr=False)
 class Archive(Shown):
-    """What an archive holds: the sequence without its observations, and the results of its modes.
+    """The content of an archive: the sequence without its observations, and the results of its modes.
 
     Args:
         name, source, time_s, twist, camera, T_cam_imu, truth, noise, velocity_frame, notes, attributes: As in
             `Sequence`.
         results: Mode to result, in the order of writing.
-        interpolated: As in `Sequence`.
     """
 
     name: str
@@ -84,13 +83,14 @@ class Archive(Shown):
     results: Mapping[str, Result]
 
     def card(self) -> Card:
-        """What ``repr`` and a notebook show."""
+        """Return the card that ``repr`` and a notebook show."""
         facts = {mode: count(len(result.landmarks), "landmark") for mode, result in self.results.items()}
         title = f"{self.name}, {count(len(self.time_s), 'frame')}, {count(len(facts), 'run')}"
         return Card(title, facts, tuple(f"archive.results[{mode!r}]" for mode in list(facts)[:1]))
 
     @cached_property
     def interpolated(self) -> BoolArray:
+        """(T,) whether the velocities of an interval were interpolated."""
         return known_intervals(self.attributes, self.twist)
 
 
@@ -100,17 +100,13 @@ def write_archive(path: str | Path, sequence: Sequence | Archive, results: Mappi
     The file appears under its name only when it is complete: a run that is killed leaves the old archive or none.
 
     Raises:
-        ArchiveError: The file cannot be written, or would hold what cannot be read again (NaN, say).
+        ArchiveError: The file cannot be written, or its content could not be read again (NaN, say).
     """
     files.write(path, archive_image(sequence, results))
 
 
 def archive_image(sequence: Sequence | Archive, results: Mapping[str, Result]) -> bytes:
-    """What `write_archive` writes.
-
-    Raises:
-        ArchiveError: It would hold what cannot be read again (NaN, say).
-    """
+    """Return the bytes that `write_archive` writes; it raises an `ArchiveError` if they could not be read again."""
 
     def fill(h5file: h5py.File) -> None:
         hdf5.write_attributes(h5file, {"source": sequence.source, "error_convention": ERROR_CONVENTION})
@@ -125,10 +121,9 @@ def archive_image(sequence: Sequence | Archive, results: Mapping[str, Result]) -
 
 
 def require_same_origin(path: str | Path, sequence: Sequence) -> None:
-    """Raise a `WriteError` unless a path is free, or holds an archive of the same recording: of its content, or place.
+    """Raise a `WriteError` unless a path is free or holds an archive of the same recording.
 
-    Raises:
-        WriteError: It holds something else, or what cannot be read.
+    Recordings are the same if their checksums agree. Without checksums their sources and attributes must agree.
     """
     if files.is_free(path):
         return
@@ -156,14 +151,14 @@ def add_result(
 ) -> None:
     """Add the result of one more mode to an archive, replacing an older one of that mode.
 
-    The archive is read again and rewritten as a whole: it is never seen half written, and of two who add to it at the
-    same time none loses what the other adds.
+    The archive is read again and rewritten as a whole. It is never seen half written, and two processes that add to it
+    at the same time both succeed.
 
     Args:
-        path: The archive.
-        result: To be added.
-        of: A run of the archive that the result was made from, which must still be there.
-        beside: Further files that are written with it, see `ekfslam.files.write_all`.
+        path: Path of the archive.
+        result: Result to add.
+        of: Run of the archive that the result was made from, which must still be there.
+        beside: Further files to write with it, see `ekfslam.files.write_all`.
 
     Raises:
         ArchiveError: The archive cannot be read or written, or no longer holds the run.
@@ -184,11 +179,11 @@ def _is_same_run(found: Result | None, run: Result) -> bool:
 
 
 def read_archive(path: str | Path) -> Archive:
-    """Everything an archive holds.
+    """Read an archive.
 
     Raises:
-        ArchiveError: The file is missing, truncated, no ekfslam archive or of a newer format version, or something
-            in it is missing or malformed; the message names file and item.
+        ArchiveError: The file is missing, truncated, no ekfslam archive or of a newer format version, or an item in it
+            is missing or malformed; the message names file and item.
     """
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         sequence = {"noise": None, **_sequence_fields(h5file), "source": str(hdf5.attribute(h5file, "source"))}
@@ -197,7 +192,7 @@ def read_archive(path: str | Path) -> Archive:
 
 
 def open_result(path: str | Path, mode: str) -> Result:
-    """The result of one mode, read without the rest of the archive.
+    """Read the result of one mode, without the rest of the archive.
 
     Raises:
         ArchiveError: As `read_archive`, or the archive has no such mode.
@@ -224,7 +219,7 @@ def _write_result(group: h5py.Group, result: Result, frames: int) -> None:
 
 
 def _sequence_fields(h5file: h5py.File) -> dict[str, Any]:
-    """Arguments of `Archive` but the results, validated as those of `Sequence` are."""
+    """Return the arguments of `Archive` except the results, validated as a `Sequence`."""
     try:
         found = read_sequence_fields(h5file, h5file.filename)
         found.pop("observations", None)
@@ -259,7 +254,7 @@ def _read_result(h5file: h5py.File, mode: str, sequence: Mapping[str, Any]) -> R
 
 
 def _read_noise(group: h5py.Group) -> Noise:
-    # These two have no default, and no result is without.
+    # These two have no default, and every result has them.
     for name in ("noise_twist_std", "noise_pixel_std_px"):
         hdf5.attribute(group, name)
     noise = Noise(**noise_of_attributes(group.attrs, "noise_"))

@@ -35,7 +35,7 @@ def _named(names: tuple[str, ...], values: Array) -> Columns:
 
 
 def covariance_columns(P: Array, name: str = "cov_{}_m2") -> Columns:
-    """The six different entries of covariances (n, 3, 3)."""
+    """Return the six different entries of covariances (n, 3, 3)."""
     return {name.format(_XYZ[i] + _XYZ[j]): P[:, i, j] for i, j in _UPPER}
 
 
@@ -79,11 +79,7 @@ TABLES: Mapping[str, Callable[[Result], Columns]] = MappingProxyType(
 
 
 def columns(result: Result, table: str) -> Columns:
-    """The columns (n,) of a table by name.
-
-    Raises:
-        ArchiveError: There is no such table.
-    """
+    """Return the columns (n,) of a table by name; raise an `ArchiveError` if there is no such table."""
     if table not in TABLES:
         raise ArchiveError(f"{result.sequence_name}: there is no table {table!r}; known: {', '.join(TABLES)}")
     return TABLES[table](result)

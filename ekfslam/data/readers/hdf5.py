@@ -80,7 +80,7 @@ def write_sequence(sequence: Sequence, path: str | Path) -> None:
 
 
 def sequence_image(sequence: Sequence) -> bytes:
-    """What `write_sequence` writes."""
+    """Return the bytes that `write_sequence` writes."""
 
     def fill(h5file: h5py.File) -> None:
         write_sequence_group(h5file, sequence, sequence.observations)
@@ -91,7 +91,7 @@ def sequence_image(sequence: Sequence) -> bytes:
 
 
 def is_recording_of(path: str | Path, sequence: Sequence) -> bool:
-    """Whether a file of `write_sequence` holds a recording of the same name and the same further facts."""
+    """Return whether a file of `write_sequence` holds a recording with the same name and attributes."""
     try:
         with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
             name = hdf5.attribute(hdf5.subgroup(h5file, "sequence"), "name")
@@ -102,7 +102,7 @@ def is_recording_of(path: str | Path, sequence: Sequence) -> bool:
 
 
 def read_sequence(path: str | Path) -> Sequence:
-    """Read a file of `write_sequence`; all but ``source``, which is the file read, is as it was written.
+    """Read a file of `write_sequence`, as it was written except for ``source``, which is the file.
 
     Raises:
         UnknownFormatError: The file is missing, damaged, or HDF5 of another format.
@@ -117,9 +117,9 @@ def write_sequence_group(h5file: h5py.Group, sequence: Any, observations: Observ
     """Write ``/sequence`` below an open file or group; the truth is left to `write_truth_group`.
 
     Args:
-        h5file: To write below.
-        sequence: A `Sequence`, or what has its fields but the observations.
-        observations: Of it, where they are to be written.
+        h5file: File or group to write below.
+        sequence: A `Sequence`, or a record with the same fields except the observations.
+        observations: Observations to write; None writes neither observations nor inputs.
     """
     hdf5.write_fields(h5file, _SEQUENCE, sequence)
     hdf5.write_fields(h5file, _NOTES, {"notes": hdf5.fixed_texts(sequence.notes)})
@@ -138,10 +138,10 @@ def write_sequence_group(h5file: h5py.Group, sequence: Any, observations: Observ
 
 
 def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
-    """The sequence below an open file or group, with its truth if ``/truth`` exists.
+    """Read the sequence below an open file or group, with its truth if ``/truth`` exists.
 
     Raises:
-        ArchiveError: The group was written without observations; `read_sequence_fields` reads what there is.
+        ArchiveError: The group was written without observations, see `read_sequence_fields`.
         DataError: A field is missing or malformed; the subclass says how.
     """
     found = read_sequence_fields(h5file, source)
@@ -154,7 +154,7 @@ def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
 
 
 def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
-    """Arguments of `Sequence` as stored below an open file or group; ``observations`` only if they are stored.
+    """Read the arguments of `Sequence` below an open file or group; ``observations`` only if they are stored.
 
     Raises:
         DataError: A field is missing or malformed; the subclass says how.
@@ -238,11 +238,7 @@ def write_truth_group(h5file: h5py.Group, truth: Truth) -> None:
 
 
 def read_truth_group(h5file: h5py.Group, source: str) -> Truth:
-    """The truth below an open file or group.
-
-    Raises:
-        DataError: A field is missing or malformed; the subclass says how.
-    """
+    """Read the truth below an open file or group; raise a `DataError` if a field is missing or malformed."""
     with spelled_as_in(source):
         found, stored = _read(h5file, _TRUTH), _attributes(h5file, "truth")
         if "truth/motion" in h5file:
@@ -255,18 +251,18 @@ def read_truth_group(h5file: h5py.Group, source: str) -> Truth:
 
 
 def noise_attributes(noise: Noise, prefix: str = "") -> dict[str, Any]:
-    """Noise as attributes, ``<prefix><field>``."""
+    """Return noise as attributes, ``<prefix><field>``."""
     return {prefix + name: value for name, value in vars(noise).items() if value is not None}
 
 
 def noise_of_attributes(attributes: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Arguments of `Noise` among attributes; what an older file does not state has its default."""
+    """Return the arguments of `Noise` among attributes; fields that an older file lacks keep their default."""
     stored = {f.name: attributes.get(prefix + f.name) for f in fields(Noise)}
     return {name: float(value) if np.ndim(value) == 0 else value for name, value in stored.items() if value is not None}
 
 
 def _read(h5file: h5py.Group, layout: Layout) -> dict[str, Any]:
-    """The data sets of a layout by field, as finite numbers; that lengths agree, the record checks that takes them."""
+    """Return the data sets of a layout by field, as finite numbers; the record itself checks that lengths agree."""
     found = {
         item.field: require_numbers(
             h5file,
@@ -281,7 +277,7 @@ def _read(h5file: h5py.Group, layout: Layout) -> dict[str, Any]:
 
 
 def _attributes(h5file: h5py.Group, name: str) -> dict[str, Any]:
-    """Attributes of a group that must be there."""
+    """Return the attributes of a group that must be there."""
     return hdf5.attributes(_group(h5file, name))
 
 
