@@ -11,7 +11,6 @@ import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,8 +23,7 @@ from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.evaluation.honesty import judge
 from ekfslam.figures import series
 from ekfslam.filters.result import Innovation
-from ekfslam.page import report
-from ekfslam.page.content import packed, sections_of, thinned
+from ekfslam.page.content import PART, packed, sections_of, thinned, told_apart
 from ekfslam.page.report import read_archives, report_page, write_report
 from ekfslam.runner import run
 from ekfslam.storage.archive import read_archive, write_archive
@@ -190,11 +188,13 @@ def test_innovations_have_their_mean_a_degree_of_freedom(sequence):
     np.testing.assert_allclose(found.y, nis[20:] / dof[20:])
 
 
-def test_labels_are_the_shortest_ends_that_differ():
-    paths = [Path(f"/{drive}/full/archive.h5") for drive in ("a", "b")]
-    assert report._labels([Path("/some/where/one.h5"), Path("/some/where/two.h5")]) == ["one", "two"]
-    first, second = report._labels(paths)
-    assert first != second and first.startswith("a") and second.startswith("b")
+def test_labels_are_the_parts_of_paths_that_differ():
+    def labels(*paths: str) -> list[str]:
+        return told_apart([PART.join(path.split("/")) for path in paths])
+
+    assert labels("some/where/one", "some/where/two") == ["one", "two"]
+    assert labels("a/full/archive", "b/full/archive") == ["a", "b"]
+    assert labels("some/archive") == ["archive"]
 
 
 def test_archives_of_one_recording_stand_together(sequence, archive, tmp_path):
@@ -212,7 +212,7 @@ def test_archives_of_one_recording_stand_together(sequence, archive, tmp_path):
     assert together[2].label == "other: full"
     page = report_page(read_archives([archive, other, third]))
     assert page.count('href="#recording-0"') == 3
-    assert '<th scope="col">run</th><th scope="col">ATE [m], unaligned</th>' in page
+    assert '<th scope="col">recording, run</th><th scope="col">ATE [m], unaligned</th>' in page
 
 
 def test_long_series_are_thinned_with_their_ends_and_say_so():

@@ -1,6 +1,6 @@
-"""What a page shows of archives: series of every run for its plots, and the judgement of each.
+"""Content of a page of archives: the series of every run for its plots, and its judgement.
 
-Archives of the same recording, by stamps, stand together: their runs share maps and plots.
+Archives of the same recording, by name and stamps, stand together: their runs share maps and plots.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import base64
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import to_hex
@@ -44,6 +44,9 @@ POSES = 24  # with an ellipse or an arrow
 PART = " \u00b7 "  # between the parts of a label
 _DASHES = {"-": "", "--": "7 4", ":": "2 3", "-.": "8 3 2 3"}
 _COLORS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)
+# A series, its name in tooltips, its style in ``report.css`` (``truth``, ``thin``, ``dots`` or none), and the numbers
+# of the runs in whose colours the curve and its bounds are drawn (None: black and grey).
+Curve = tuple[Series, str, str, int | None, int | None]
 _PALETTE = tuple((color, dash) for dash in ("", "7 4", "2 3") for color in _COLORS)
 
 
@@ -52,10 +55,10 @@ class Run:
     """One mode of one archive.
 
     Args:
-        label: Names it on the page.
-        archive, result: What it is of.
-        color, dash: Of its lines: a colour as ``#rrggbb``, and lengths of dashes and gaps in SVG's way.
-        shown: Whether maps show it from the beginning.
+        label: Name on the page.
+        archive, result: The archive and its run.
+        color, dash: Colour of its lines as ``#rrggbb``, and lengths of dashes and gaps as in SVG.
+        shown: Whether maps show it at first.
     """
 
     label: str
@@ -108,27 +111,21 @@ class Section:
 
     @property
     def length_m(self) -> float:
-        """Way along the truth, or along the last run where there is none."""
+        """Distance driven by the truth; by the last run without truth."""
         T = self.runs[-1].result.T_world_imu if self.truth is None else self.truth.T_world_imu
         return float(distance_along(T)[-1])
 
 
 def sections_of(archives: Mapping[str, Archive]) -> list[Section]:
-    """Archives, by label, sorted by recording: those with the same name and stamps stand together."""
-    groups: list[dict[str, Archive]] = []
+    """Return archives, given by label, in sections: those with the same name and stamps stand together."""
+    groups: dict[tuple[str, bytes], dict[str, Archive]] = {}
     for label, archive in archives.items():
-        for group in groups:
-            first = next(iter(group.values()))
-            if first.name == archive.name and np.array_equal(first.time_s, archive.time_s):
-                group[label] = archive
-                break
-        else:
-            groups.append({label: archive})
-    return [Section(next(iter(group.values())).name, tuple(_runs(group))) for group in groups]
+        groups.setdefault((archive.name, archive.time_s.tobytes()), {})[label] = archive
+    return [Section(name, tuple(_runs(group))) for (name, _), group in groups.items()]
 
 
 def _runs(archives: Mapping[str, Archive]) -> Iterator[Run]:
-    """Runs of the archives of a recording: of one in the colours of their modes, of several each in its own."""
+    """Yield the runs of a recording: those of one archive in the colours of their modes, of several each in its own."""
     if len(archives) == 1:
         archive = next(iter(archives.values()))
         for mode, result in archive.results.items():
@@ -136,20 +133,22 @@ def _runs(archives: Mapping[str, Archive]) -> Iterator[Run]:
             yield Run(mode, archive, result, to_hex(style["color"]), _DASHES.get(style["linestyle"], ""), True)
         return
     best, others = iter(_PALETTE), iter(_PALETTE[len(archives) :] * len(MODES))
-    for label, archive in zip(_told_apart(list(archives)), archives.values(), strict=True):
+    for label, archive in zip(told_apart(list(archives)), archives.values(), strict=True):
         shown = "full" if "full" in archive.results else list(archive.results)[-1]
         for mode, result in archive.results.items():
             color, dash = next(best if mode == shown else others, (GREY, "1 3"))
             yield Run(f"{label}: {mode}", archive, result, to_hex(color), dash, mode == shown)
 
 
-def _told_apart(labels: Sequence[str]) -> list[str]:
-    """Labels without the parts at their beginnings and ends that all have in common."""
+def told_apart(labels: Sequence[str]) -> list[str]:
+    """Return labels without the parts at both ends that all have in common, cut to the shortest ends that differ."""
     parts = [label.split(PART) for label in labels]
     for end in (0, -1):
         while min(map(len, parts)) > 1 and len({part[end] for part in parts}) == 1:
             parts = [part[1:] if end == 0 else part[:-1] for part in parts]
-    return [PART.join(part) for part in parts]
+    shortened = ([part[-length:] for part in parts] for length in range(1, max(map(len, parts)) + 1))
+    ends = next(ends for ends in shortened if len(set(map(tuple, ends))) == len(set(map(tuple, parts))))
+    return [PART.join(end) for end in ends]
 
 
 def plotted(section: Section) -> dict[str, Any]:
@@ -175,14 +174,14 @@ def _compared(section: Section) -> list[dict[str, Any]]:
     """Return the plots that show several runs: heights, and distances from the truth."""
     shown, truth = [(j, run) for j, run in enumerate(section.runs) if run.shown], section.truth
     best = next((j for j, run in shown if run.result.mode == "full"), shown[0][0])
-    heights = [] if truth is None else [Curve(series.height(truth.T_world_imu), "truth", "truth")]
+    heights: list[Curve] = [] if truth is None else [(series.height(truth.T_world_imu), "truth", "truth", None, None)]
     for j, run in shown:
         one = series.height(run.result.T_world_imu, run.result.covariance)
-        heights.append(Curve(one if j == best else one.without_bounds(), run.label, "", j, j))
+        heights.append((one if j == best else one.without_bounds(), run.label, "", j, j))
     words = f"z in m over metres driven; band: {series.BAND_SIGMAS:g} sigma of {section.runs[best].label}"
     plots = [_plot("Height profile", words, heights)]
-    off = [
-        Curve(series.distance_from_truth(run.result, run.truth), run.label, "", j)
+    off: list[Curve] = [
+        (series.distance_from_truth(run.result, run.truth), run.label, "", j, None)
         for j, run in shown
         if run.truth is not None
     ]
@@ -214,7 +213,7 @@ def _plotted_run(section: Section, j: int, kept: IntArray) -> dict[str, Any]:
         },
         "landmarks": _landmarks(result.landmarks),
         "words": words,
-        "errors": [_plot(one.name, one.unit, [Curve(one, "error", "thin", None, j)]) for one in errors],
+        "errors": [_plot(one.name, one.unit, [(one, "error", "thin", None, j)]) for one in errors],
         "consistency": list(_consistency(run, j)),
     }
 
@@ -226,51 +225,32 @@ def _consistency(run: Run, j: int) -> Iterator[dict[str, Any]]:
         nees = series.nees(run.result, run.truth, run.archive.interpolated)
         if nees.mean is not None:
             words = f"6 expected, mean {nees.mean:.3g}; grey: {percent} of honest poses"
-            yield _plot("Pose NEES", words, [Curve(nees, "NEES", "thin", j)])
+            yield _plot("Pose NEES", words, [(nees, "NEES", "thin", j, None)])
     nis = series.nis(run.result)
     if nis.mean is not None:
         share = f"{100 * nis.share_inside:.1f} % of frames within their {percent}, grey"
         words = f"1 expected, mean {nis.mean:.3g}; {share}"
-        yield _plot("NIS per degree of freedom", words, [Curve(nis, "NIS / dof", "dots", j)])
-
-
-class Curve(NamedTuple):
-    """A series in a plot.
-
-    Args:
-        of: The series.
-        name: Name in tooltips.
-        kind: Style in ``report.css``: ``truth``, ``thin``, ``dots``, or none.
-        run, band: Number of the run in whose colour the curve and its bounds are drawn; None for black and grey.
-    """
-
-    of: Series
-    name: str
-    kind: str = ""
-    run: int | None = None
-    band: int | None = None
+        yield _plot("NIS per degree of freedom", words, [(nis, "NIS / dof", "dots", j, None)])
 
 
 def _plot(title: str, words: str, curves: Sequence[Curve]) -> dict[str, Any]:
-    """Return a plot of curves with common axes."""
-    first = curves[0].of
+    """Return a plot of curves with the axes of the first one."""
+    first, drawn = curves[0][0], []
+    for one, name, kind, run, band in curves:
+        some = one.only(thinned(len(one.x), POINTS))
+        arrays = {"x": some.x, "y": some.y, "low": some.low, "high": some.high}
+        found = {key: packed(values) for key, values in arrays.items() if values is not None}
+        drawn.append({"name": name, "kind": kind, "run": run, "band": band, **found})
     return {
         "title": title,
         "words": words,
         "unit": first.unit,
         "xUnit": first.x_unit,
         "xLabel": first.labels[0],
-        "log": any(curve.of.is_log for curve in curves),
+        "log": any(one.is_log for one, *_ in curves),
         "levels": first.levels,
-        "curves": [_packed_curve(curve) for curve in curves],
+        "curves": drawn,
     }
-
-
-def _packed_curve(curve: Curve) -> dict[str, Any]:
-    some = curve.of.only(thinned(len(curve.of.x), POINTS))
-    arrays = {"x": some.x, "y": some.y, "low": some.low, "high": some.high}
-    packed_arrays = {key: packed(values) for key, values in arrays.items() if values is not None}
-    return {"name": curve.name, "kind": curve.kind, "run": curve.run, "band": curve.band, **packed_arrays}
 
 
 def _landmarks(landmarks: Landmarks) -> dict[str, Any] | None:

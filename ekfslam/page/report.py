@@ -23,8 +23,9 @@ from ekfslam.evaluation.evidence import BLIND
 from ekfslam.evaluation.summary import merit_rows
 from ekfslam.evaluation.tables import MISSING
 from ekfslam.names import components, printable
-from ekfslam.page.content import PART, Run, Section, plotted, remarks_of, sections_of
+from ekfslam.page.content import PART, Run, Section, plotted, remarks_of, sections_of, told_apart
 from ekfslam.runner import versions
+from ekfslam.shown import count
 from ekfslam.storage.archive import Archive, read_archive
 
 MOST_ARCHIVES = 32
@@ -59,41 +60,31 @@ def write_report(archives: Sequence[str | Path], path: str | Path, title: str = 
 
 
 def read_archives(paths: Sequence[str | Path]) -> dict[str, Archive]:
-    """Archives by labels that tell them apart, made of their folders' and files' names.
+    """Read archives by labels that tell them apart, from names of folders and files.
 
     Raises:
         ArchiveError: There is none, there are too many, or one cannot be read or holds no run.
     """
     if not 1 <= len(paths) <= MOST_ARCHIVES:
         raise ArchiveError(f"a report is of 1 to {MOST_ARCHIVES} archives, found {len(paths)}")
-    found = {}
-    for label, path in zip(_labels([Path(path) for path in paths]), paths, strict=True):
-        found[label] = read_archive(path)
-        if not found[label].results:
+    # Not `Path.resolve`, which raises ValueError for invalid names of files.
+    parts = [(*Path(os.path.abspath(path)).parts[1:-1], Path(path).stem) for path in paths]  # noqa: PTH100
+    labels = components(told_apart([PART.join(part) for part in parts]))
+    found = {label: read_archive(path) for label, path in zip(labels, paths, strict=True)}
+    for path, archive in zip(paths, found.values(), strict=True):
+        if not archive.results:
             raise ArchiveError(f"{path}: holds no run")
     return found
 
 
-def _labels(paths: Sequence[Path]) -> list[str]:
-    """The shortest ends of the paths that differ."""
-    # Not `Path.resolve`, which raises ValueError for what can be no name of a file.
-    parts = [(*Path(os.path.abspath(path)).parts[1:-1], path.stem) for path in paths]  # noqa: PTH100
-    ends = parts
-    for length in range(1, max(map(len, parts)) + 1):
-        ends = [part[-length:] for part in parts]
-        if len(set(ends)) == len(ends):
-            break
-    return components(PART.join(end) for end in ends)
-
-
 def is_report(path: Path) -> bool:
-    """Whether a file is a page of `write_report`."""
+    """Return whether a file is a page of `write_report`."""
     with path.open("rb") as file:
         return _GENERATOR.encode() in file.read(4096)
 
 
 def report_page(archives: Mapping[str, Archive], title: str = "") -> str:
-    """The text of a page of archives by label."""
+    """Return the text of a page of archives by label."""
     sections = sections_of(archives)
     title = printable(title) or _title([section.name for section in sections])
     style = _file("report.css") + _colors(sections)
@@ -117,7 +108,7 @@ def report_page(archives: Mapping[str, Archive], title: str = "") -> str:
 <header>
 <p class="kind">ekfslam report</p>
 <h1>{escape(title)}</h1>
-{_facts([_count(len(sections), "recording"), _count(len(archives), "archive"), _count(runs, "run")])}
+{_facts([count(len(sections), "recording"), count(len(archives), "archive"), count(runs, "run")])}
 </header>
 <main>
 {_overview(sections) if len(sections) > 1 else ""}
@@ -140,10 +131,10 @@ def _title(names: Sequence[str]) -> str:
 def _section(number: int, section: Section, is_alone: bool) -> str:
     archive, time_s = section.archive, section.archive.time_s
     facts = [
-        _count(len(time_s), "frame"),
+        count(len(time_s), "frame"),
         f"{time_s[-1] - time_s[0]:.1f} s",
         f"{section.length_m:.0f} m" if section.length_m >= 10 else f"{section.length_m:.2f} m",
-        f"truth of {_count(len(archive.truth.frame), 'pose')}" if archive.truth is not None else "no truth",
+        f"truth of {count(len(archive.truth.frame), 'pose')}" if archive.truth is not None else "no truth",
     ]
     notes = _list([*remarks_of(section), *archive.notes])
     if notes:
@@ -159,7 +150,7 @@ def _section(number: int, section: Section, is_alone: bool) -> str:
 <div class="plots" data-recording="{number}"></div>
 {_evidence(section)}
 <h3>Figures of merit</h3>
-{_table(["", *(run.label for run in section.runs)], merit_rows(run.summary for run in section.runs))}
+{_runs_table(section, merit_rows(run.summary for run in section.runs))}
 <h3>Runs in detail</h3>
 {"".join(_detail(run) for run in section.runs)}
 </section>"""
@@ -170,7 +161,7 @@ def _facts(facts: Iterable[str]) -> str:
 
 
 def _carded(section: Section) -> list[Run]:
-    """Runs that have a card: all, or of many those that innovations judge, or the last."""
+    """Return the runs with a card: all; of many, those judged by innovations, or the last."""
     runs = list(section.runs)
     if len(runs) <= _MOST_CARDS:
         return runs
@@ -178,7 +169,7 @@ def _carded(section: Section) -> list[Run]:
 
 
 def _card(run: Run) -> str:
-    """Verdicts of a run, their evidence, and its errors."""
+    """Return the verdicts of a run, their evidence, and its errors."""
     head, *items = run.said
     figures = "".join(
         f"<div><dt>{escape(heading)}</dt><dd>{escape(value)}</dd></div>"
@@ -204,7 +195,12 @@ def _evidence(section: Section) -> str:
         else:
             rows.append([name, *(_expecting(value, own) for value, own in cells)])
     heading = "<h3>Evidence <small>found (expected)</small></h3>"
-    return f"{heading}\n{_table(['', *(run.label for run in section.runs)], rows)}" if rows else ""
+    return f"{heading}\n{_runs_table(section, rows)}" if rows else ""
+
+
+def _runs_table(section: Section, rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of texts with one column a run."""
+    return _table(["", *(run.label for run in section.runs)], [[escape(cell) for cell in row] for row in rows])
 
 
 def _expecting(text: str, expected: str) -> str:
@@ -218,12 +214,9 @@ def _detail(run: Run) -> str:
         ("Remarks", _list(result.remarks)),
         ("Counts", _pairs(result.counts)),
         ("Track hygiene", _list(hygiene)),
-        ("Estimated besides poses and map", _list(() if result.parameters is None else result.parameters.lines)),
+        ("Estimated parameters", _list(() if result.parameters is None else result.parameters.lines)),
         ("Configuration", _configuration(result.config)),
-        (
-            "Noise that was assumed",
-            _pairs({key: value for key, value in vars(result.noise).items() if value is not None}),
-        ),
+        ("Assumed noise", _pairs({key: value for key, value in vars(result.noise).items() if value is not None})),
         ("Attributes", _pairs(result.attributes)),
     ]
     shown = "".join(f"<h4>{heading}</h4>{content}" for heading, content in blocks if content)
@@ -231,7 +224,7 @@ def _detail(run: Run) -> str:
 
 
 def _configuration(config: Mapping[str, Any]) -> str:
-    """Settings that are not today's defaults, then all of them."""
+    """Return settings that differ from the defaults, then all of them."""
     default, changed, all_of_it = Config(), {}, {}
     for table, settings in config.items():
         if not isinstance(settings, Mapping):
@@ -250,23 +243,17 @@ def _overview(sections: Sequence[Section]) -> str:
     runs = [(i, section, run) for i, section in enumerate(sections) for run in section.runs]
     columns = merit_rows({key: run.summary[key] for key in _KEY_FIGURES} for _, _, run in runs)
     rows = []
-    for row, (i, section, run) in enumerate(runs):
-        name = f'<a href="#recording-{i}">{escape(section.name)}</a>'
-        cells = "".join(f"<td>{escape(column[row + 1])}</td>" for column in columns)
-        rows.append(f'<tr><th scope="row">{name}</th><th scope="row">{escape(run.label)}</th>{cells}</tr>')
-    headings = ["recording", "run", *(column[0] for column in columns)]
-    head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in headings)
-    return f"""<section><h2>All runs</h2>
-<div class="wide"><table class="names"><thead><tr>{head}</tr></thead>
-<tbody>{"".join(rows)}</tbody></table></div></section>"""
+    for row, (i, section, run) in enumerate(runs, 1):
+        link = f'<a href="#recording-{i}">{escape(section.name)}</a>, {escape(run.label)}'
+        rows.append([link, *(escape(column[row]) for column in columns)])
+    return f"<section><h2>All runs</h2>{_table(['recording, run', *(column[0] for column in columns)], rows)}</section>"
 
 
 def _table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table; cells are HTML, headings are text."""
     head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in headings)
-    body = "".join(
-        f'<tr><th scope="row">{escape(row[0])}</th>{"".join(f"<td>{escape(cell)}</td>" for cell in row[1:])}</tr>'
-        for row in rows
-    )
+    lines = (f'<th scope="row">{name}</th>' + "".join(f"<td>{cell}</td>" for cell in cells) for name, *cells in rows)
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
@@ -295,12 +282,8 @@ def _spoken(value: Any) -> str:
     return printable(str(value))
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}{'' if number == 1 else 's'}".replace(",", " ")
-
-
 def _colors(sections: Sequence[Section]) -> str:
-    """Colours of runs as variables of the style: ``--run-<recording>-<run>``."""
+    """Return colours of runs as variables of the style: ``--run-<recording>-<run>``."""
     named = "".join(
         f"--run-{i}-{j}:{run.color};" for i, section in enumerate(sections) for j, run in enumerate(section.runs)
     )
