@@ -19,7 +19,8 @@ from ekfslam.data.noise import Noise, TrackError
 from ekfslam.geometry import motion, se3
 from ekfslam.models.blocks import Calibration, Layout, StateBlock, Values
 from ekfslam.models.observation import linearise
-from ekfslam.models.process import MakeProcess, Measured, Process, Step, VelocityInputs, velocities
+from ekfslam.models.process import MakeProcess, Measured, Process, Step, VelocityInputs
+from ekfslam.models.process.velocities import velocities
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
 
