@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -480,3 +481,30 @@ def test_the_table_names_the_textbook_filter(tmp_path):
     table = study_table(summarise_study(run_study(study, tmp_path / "s.h5", SerialExecutor())))
     assert "| textbook (standard, xyz) |" in table
     assert "All variants but the textbook one keep landmarks in image coordinates." in table
+
+
+def test_the_nis_of_a_study_is_per_degree_of_freedom_of_a_whole_run(serial):
+    archive = read_study(serial)
+    values = archive.data["mid"]["invariant"]
+    expected = np.mean([np.nansum(nis) / dof.sum() for nis, dof in zip(values["nis"], values["nis_dof"], strict=True)])
+    found = summarise_study(archive)["levels"]["mid"]["invariant"]["nis_per_dof"]
+    assert found["mean"] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_the_pose_nees_that_the_first_page_quotes_is_that_of_the_program(tmp_path):
+    """Six drives of 50, full length: within three standard errors of the quoted means."""
+    page = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    quoted = re.search(
+        r"pose NEES is (\S+) ± (\S+), .*?has (\S+) ± (\S+) \(`ekfslam consistency --level mid --runs 50`",
+        page,
+        re.DOTALL,
+    )
+    ours, ours_width, textbook, textbook_width = map(float, quoted.groups())
+    runs = 6
+    study = Study(levels_of(["mid"]), ("invariant", "textbook"), runs=runs)
+    values = run_study(study, tmp_path / "s.h5", SerialExecutor()).data["mid"]
+    means = [time_average(values[variant]["pose_nees"]).mean() for variant in study.variants]
+    allowed = np.array([ours_width, textbook_width]) * np.sqrt(50 / runs)
+    assert (np.abs(means - np.array([ours, textbook])) < allowed).all(), means
+    assert means[1] > 2 * means[0]

@@ -14,10 +14,11 @@ from support.studies import short
 
 from ekfslam.cli import main
 from ekfslam.errors import ArchiveError
+from ekfslam.runner import versions
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import SerialExecutor
 from ekfslam.studies.journal import Journal, framed
-from ekfslam.studies.study import Study, run_study
+from ekfslam.studies.study import Study, run_one, run_study
 
 
 @pytest.mark.parametrize("arguments", [["run", "--out", "a.h5"], ["compare", "--out", ".", "--no-figures"]])
@@ -106,3 +107,13 @@ def test_an_entry_whose_content_does_not_fit_its_digest_ends_the_journal(tmp_pat
     content[ends[changed] - 1] ^= 1
     journal.path.write_bytes(content)
     assert [run for _, run, _ in journal.entries()] == list(range(kept))
+
+
+def test_a_journal_of_a_longer_study_serves_a_shorter_one(tmp_path):
+    longer = Study(short("mid", 6), ("invariant",), runs=3)
+    record = run_one(longer, "mid", 2)
+    journal = Journal(tmp_path / "a.h5", {**longer.parameters, "runs": None, **versions()}, lambda level: record)
+    journal.append("mid", 2, record)
+    shorter = Study(longer.levels, longer.variants, runs=2)
+    assert run_study(shorter, tmp_path / "a.h5", SerialExecutor(), False).complete
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]

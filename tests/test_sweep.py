@@ -407,31 +407,54 @@ def test_a_figure_has_no_more_lines_than_one_can_tell_apart():
     assert len(ax.lines) == 24
 
 
-@pytest.mark.slow
-def test_command(tmp_path, capsys):
-    study, out = tmp_path / "s.toml", tmp_path / "out"
-    study.write_text('recordings = ["builtin:loop?frames=8"]\nmodes = ["dead-reckoning"]\nseeds = [1, 2]')
-    assert main(["sweep", str(study), "--out", str(out), "--executor", "serial", "--plot", "ate_m", "seed"]) == 0
-    assert "2 of 2 runs" in capsys.readouterr().out
-    assert {"sweep.h5", "sweep.md", "ate_m-seed.png"} <= {path.name for path in out.iterdir()}
-    assert main(["sweep", "--table", "--out", str(out), "--figures", "ate_m"]) == 0
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """The folder of a sweep that the command has run."""
+    folder = tmp_path_factory.mktemp("command")
+    (folder / "s.toml").write_text('recordings = ["builtin:loop?frames=8"]\nmodes = ["dead-reckoning"]\nseeds = [1, 2]')
+    call = ["sweep", str(folder / "s.toml"), "--out", str(folder), "--executor", "serial", "--plot", "ate_m", "seed"]
+    assert main(call) == 0
+    return folder
+
+
+def test_the_command_writes_table_and_figures(finished):
+    assert {"sweep.h5", "sweep.md", "ate_m-seed.png"} <= {path.name for path in finished.iterdir()}
+    assert "2 of 2 runs" in (finished / "sweep.md").read_text()
+
+
+def test_the_command_shows_a_table_without_running_anything(finished, capsys):
+    assert main(["sweep", "--table", "--out", str(finished), "--figures", "ate_m"]) == 0
     shown = capsys.readouterr().out
     assert "| seed |" in shown
     assert "ms_per" not in shown
-    assert main(["sweep", "--out", str(out)]) == 2
-    assert main(["sweep", "--table", "--out", str(out), "--figures", "nothing"]) == 2
-    assert "no column 'nothing'" in capsys.readouterr().err
-    assert main(["sweep", "--table", "--out", str(out), "--only", "seed=2", "mode=dead-reckoning"]) == 0
+    assert "sweep.h5" in shown
+
+
+def test_the_command_shows_chosen_runs_only(finished, capsys):
+    assert main(["sweep", "--table", "--out", str(finished), "--only", "seed=2", "mode=dead-reckoning"]) == 0
     shown = capsys.readouterr().out
     assert "1 of 1 runs" in shown
     assert "chosen from 2 of 2 runs" in shown
-    assert "sweep.h5" in shown
-    assert main(["sweep", "--table", "--out", str(out), "--only", "seed=3"]) == 2
-    assert "the column seed has no '3'; it has 1, 2" in capsys.readouterr().err
-    assert main(["sweep", "--table", "--out", str(out), "--plot", "mode", "seed"]) == 2
-    found = capsys.readouterr()
-    assert "mode is no number" in found.err
-    assert "2 of 2 runs" in found.out, "the table is shown all the same"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "sweep needs a STUDY.toml, or --table"),
+        (["--table", "--figures", "nothing"], "no column 'nothing'"),
+        (["--table", "--only", "seed=3"], "the column seed has no '3'; it has 1, 2"),
+        (["--table", "--plot", "mode", "seed"], "mode is no number"),
+    ],
+)
+def test_the_command_names_a_mistake(finished, capsys, arguments, words):
+    assert main(["sweep", *arguments, "--out", str(finished)]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_seeds_of_a_prepared_recording_make_different_runs(tmp_path):
+    (tmp_path / "a.npz").write_bytes(b"any")
+    drive = Recording(str(tmp_path / "a.npz"), "drive", prepare=with_noise)
+    assert len({task.key for task in Sweep((drive,), seeds=(1, 2)).tasks}) == 2
 
 
 @pytest.mark.slow

@@ -209,6 +209,16 @@ def test_what_is_rejected_counts_in_the_likelihood_of_a_round():
     assert likelihood.judged(x)(x)[-1] == pytest.approx(rejected * LOG_WRONG)
 
 
+def test_without_free_parameters_the_likelihood_is_that_of_the_noise_as_it_is():
+    world = builtin("city?frames=12")
+    config = settings_of(world, Config())
+    base = noise_of(world, config)
+    parts, gated, ungated = parts_of(world, config, base, 10_000)
+    peak = Likelihood(parts, base, [], gated, ungated).climb({}, "")
+    assert peak.log_likelihood == sum(log_likelihoods(part, base, gated).sum() for part in parts) < 0
+    assert peak.runs == len(parts) and peak.converged
+
+
 def test_where_the_likelihood_has_no_maximum_the_differences_count():
     found = VelocityNoise(np.array([0.2, 0.0]), np.array([0.01, 0.0]), np.zeros(2), np.zeros(2))
     free = ["sigma_v_m_s", "sigma_w_rad_s", "sigma_px"]
