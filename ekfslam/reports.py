@@ -1,7 +1,7 @@
-"""Reports: a call runs, writes an archive, and says what it found in a table and figures.
+"""Reports: calls that run, write archives, tables and figures, and return what they found.
 
-`compare`: the modes side by side on one sequence. `check_consistency`: whether covariances hold what they promise, on
-simulations with their truth. `check`: the same of one run without truth, from its innovations.
+`compare` runs several modes on one sequence. `check_consistency` judges covariances on simulations, whose truth is
+known. `check` judges one run without truth, by its innovations.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ _KEY_FIGURES = {"ate_m": "ATE [m]", "pose_nees_mean": "pose NEES (6)", "nis_per_
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Shown):
-    """What `compare` found.
+    """Results of `compare`.
 
     Args:
         sequence: The recording.
-        results: Mode to result, in the order asked for.
+        results: Mode to result, in the order of the call.
         summary: The figures of merit as written to ``summary.json``.
-        skipped: Why there is no result of a mode asked for: an ill-posed posterior, or a filter that cannot go on, does
-            not keep the others.
+        skipped: Mode to the reason why it has no result: an ill-posed posterior, or a filter that cannot go on. The
+            other modes are run nevertheless.
     """
 
     sequence: Sequence
@@ -56,7 +56,7 @@ class Comparison(Shown):
     skipped: dict[str, str]
 
     def card(self) -> Card:
-        """What ``repr`` and a notebook show."""
+        """Return the card that ``repr`` and a notebook show."""
         facts = dict(self.skipped)
         for mode, found in self.summary["modes"].items():
             said = [(key, words) for key, words in _KEY_FIGURES.items() if found.get(key) is not None]
@@ -66,7 +66,7 @@ class Comparison(Shown):
 
     @property
     def table(self) -> str:
-        """The summary as a Markdown table, and what is missing in it."""
+        """The summary as a Markdown table, with reasons for missing modes and remarks."""
         lines = [f"No {mode}: {reason}" for mode, reason in self.skipped.items()]
         remarks: dict[str, list[str]] = {}
         for mode, result in self.results.items():
@@ -81,7 +81,7 @@ class Comparison(Shown):
         All are written or none. Figures of an earlier run in the folder go.
 
         Args:
-            directory: Where to; made if missing.
+            directory: Target folder, made if missing.
             force: Replace an archive of another recording, too.
             figures: Draw figures, too.
 
@@ -115,7 +115,7 @@ def compare(
 
     Args:
         sequence: The recording.
-        modes: What to run.
+        modes: Modes to run.
         config: Settings; defaults where None.
 
     Raises:
@@ -184,15 +184,15 @@ def compare_all(
     config: Config | None = None,
     **options: bool,
 ) -> Iterator[str]:
-    """`compare_into` of many recordings at once, by folder; what there is to say of each, as they finish.
+    """Run `compare_into` for many recordings in parallel, and yield what a terminal shows of each as it finishes.
 
     Args:
         recordings: Folder to recording.
-        executor: Where to run them, see `open_executor`.
-        modes, config, options: As of `compare_into`.
+        executor: Executor of the runs, see `open_executor`.
+        modes, config, options: Arguments of `compare_into`.
 
     Raises:
-        EkfslamError: Of recordings that cannot be compared, at the end, when all others are saved.
+        FilterError: Some recordings cannot be compared; raised after all others are saved.
     """
     modes, failed = tuple(modes), []
 
@@ -211,7 +211,7 @@ def compare_all(
 def _compared(
     sequence: Sequence, folder: Path, modes: Iterable[Mode], config: Config | None, options: Mapping[str, bool]
 ) -> tuple[str, str]:
-    """In a worker: what there is to say, or why there is nothing."""
+    """Return the text of `compare_into` and an empty string, or the other way round the reason for failure."""
     with ONE_RUN_AT_A_TIME:
         try:
             return compare_into(sequence, folder, modes, config, **options), ""
@@ -221,7 +221,7 @@ def _compared(
 
 @dataclass(frozen=True, repr=False)
 class ConsistencyReport(Shown):
-    """What `check_consistency` found.
+    """Results of `check_consistency`.
 
     Args:
         archive: All values of all runs.
@@ -234,7 +234,7 @@ class ConsistencyReport(Shown):
     paths: list[Path]
 
     def card(self) -> Card:
-        """What ``repr`` and a notebook show."""
+        """Return the card that ``repr`` and a notebook show."""
         facts = {"written": ", ".join(path.name for path in self.paths)}
         return Card(self.archive.card().title, facts, ("print(report.table)", "report.archive"))
 
@@ -247,11 +247,11 @@ class ConsistencyReport(Shown):
 def check_consistency(
     study: Study, directory: str | Path, executor: str = "processes", workers: int | None = None
 ) -> ConsistencyReport:
-    """Run a study, or what is missing of it, and write ``study.h5``, ``summary.json``, ``table.md`` and figures.
+    """Run the missing part of a study, and write ``study.h5``, ``summary.json``, ``table.md`` and figures.
 
     Args:
-        study: What to run.
-        directory: Where to; made if missing. A study that was interrupted there goes on.
+        study: The study.
+        directory: Target folder, made if missing. An interrupted study in it is resumed.
         executor, workers: See `open_executor`.
 
     Raises:
@@ -276,7 +276,7 @@ def check_consistency(
 
 @dataclass(frozen=True)
 class Check:
-    """What `check` found.
+    """Results of `check`.
 
     Args:
         honesty: Verdict and evidence.
@@ -288,12 +288,12 @@ class Check:
 
 
 def check(archive: str | Path, mode: str = "full", directory: str | Path | None = None) -> Check:
-    """Whether the covariance of a run is honest, without truth; writes ``check.json``, ``check.md``, ``check.png``.
+    """Judge the covariance of a run without truth, and write ``check.json``, ``check.md`` and ``check.png``.
 
     Args:
-        archive: As written by run or compare.
-        mode: Of the run in it.
-        directory: Where to; made if missing. By default the folder of the archive.
+        archive: Archive written by run or compare.
+        mode: Mode of the run in it.
+        directory: Target folder, made if missing; by default the folder of the archive.
 
     Raises:
         ArchiveError: The archive cannot be read or has no such mode.

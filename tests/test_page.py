@@ -22,8 +22,9 @@ from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.evaluation.honesty import judge
 from ekfslam.figures import series
+from ekfslam.figures.maps import spread
 from ekfslam.filters.result import Innovation
-from ekfslam.page.content import PART, packed, sections_of, thinned, told_apart
+from ekfslam.page.content import PART, packed, sections_of, told_apart
 from ekfslam.page.report import read_archives, report_page, write_report
 from ekfslam.runner import run
 from ekfslam.storage.archive import read_archive, write_archive
@@ -216,8 +217,8 @@ def test_archives_of_one_recording_stand_together(sequence, archive, tmp_path):
 
 
 def test_long_series_are_thinned_with_their_ends_and_say_so():
-    assert thinned(10, 4).tolist() == [0, 3, 6, 9]
-    assert thinned(3, 10).tolist() == [0, 1, 2]
+    assert spread(10, 4).tolist() == [0, 3, 6, 9]
+    assert spread(3, 10).tolist() == [0, 1, 2]
     assert numbers(packed(np.array([[1.5, -2.0]])), 2).tolist() == [1.5, -2.0]
 
 

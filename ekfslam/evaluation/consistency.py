@@ -1,4 +1,4 @@
-"""Does the covariance tell the truth about the error? NEES of poses and landmarks, averages over runs, their bounds.
+"""NEES of poses and landmarks, averages over runs, and their bounds.
 
 All errors are in the stored coordinates of `ekfslam.filters.result.ERROR_CONVENTION`, the ones the covariances are of.
 
@@ -28,7 +28,7 @@ from ekfslam.models.noise import GAP_STD
 
 
 def pose_error(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
-    """Stored pose error ``xi = log(T_imu_world_true T_imu_world_est^-1)``: (..., 4, 4) twice to (..., 6), m and rad.
+    """Return the pose error ``xi = log(T_imu_world_true T_imu_world_est^-1)`` (..., 6), m and rad.
 
     The same ``xi`` is the right coordinate for every variant: the right-invariant error of ``T_world_imu`` is
     ``log(T_world_imu_true T_world_imu_est^-1) = -Ad(T_world_imu_est) xi`` exactly, and NEES does not see a linear map.
@@ -37,7 +37,7 @@ def pose_error(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
 
 
 def world_axes_errors(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
-    """Estimate minus truth along world axes, (n, 4, 4) twice to (n, 6): position, m, and ``log(R_est R_true^T)``, rad.
+    """Return estimate minus truth along world axes (n, 6): position, m, and ``log(R_est R_true^T)``, rad.
 
     `world_axes_covariance` has their covariances.
     """
@@ -46,13 +46,13 @@ def world_axes_errors(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
 
 
 def world_axes_std(T_world_imu: Array, covariance: Array) -> Array:
-    """Standard deviations (T, 6) of `world_axes_errors`, m and rad: roots of the diagonals of the covariances."""
+    """Return the standard deviations (T, 6) of `world_axes_errors`, m and rad."""
     variance = [np.diagonal(c, axis1=1, axis2=2) for c in world_axes_covariance(T_world_imu, covariance)]
     return np.sqrt(np.maximum(np.hstack(variance), 0.0))
 
 
 def nees(error: Array, covariance: Array) -> Array:
-    """Normalised estimation error squared ``e^T P^-1 e``: (..., n) and (..., n, n) to (...).
+    """Return the normalised estimation error squared ``e^T P^-1 e`` (...) of (..., n) and (..., n, n).
 
     NaN where P is not positive definite to rounding, as at a first frame whose pose is known exactly. Units do not
     matter: definiteness is judged on the correlation matrix.
@@ -69,10 +69,10 @@ def nees(error: Array, covariance: Array) -> Array:
 
 
 def measured_truth(truth: Truth, interpolated: BoolArray, time_s: Array) -> Truth:
-    """The truth of the frames that no interpolated interval (T,) leads to: of the others nothing should be judged.
+    """Return the truth of the frames that no interpolated interval leads to; only these can be judged.
 
-    All poses are judged from the first one on. Where the recording begins with such a stretch, the first position is
-    invented, too: beside its noise it may err by what speeds across gaps err by until the stretch ends.
+    All poses are relative to the first one. If the recording begins with such a stretch, the first position is
+    interpolated, too. Its error then includes that of the speed across the gap.
 
     Args:
         truth: Of a recording.
@@ -90,10 +90,10 @@ def measured_truth(truth: Truth, interpolated: BoolArray, time_s: Array) -> Trut
 
 
 def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Array:
-    """What the error of the first true pose adds to the covariance of later errors: (n, 4, 4) to (n, 6, 6).
+    """Return the covariance (n, 6, 6) that the error of the first true pose adds to later errors.
 
-    An estimate starts at the first true pose. Where that is wrong by ``e0``, the whole estimate is moved, and with
-    ``T_hat`` the estimated ``T_imu_world``, the first of which comes first,
+    An estimate starts at the first true pose. An error ``e0`` of that moves the whole estimate. With ``T_hat`` the
+    estimated ``T_imu_world``,
 
         xi_k += Ad(T_hat_k T_hat_0^-1) e0,    e0 ~ N(0, P_0).
     """
@@ -104,10 +104,10 @@ def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Ar
 
 
 def pose_noise_covariance(noise: TruthNoise, T_world_imu_true: Array, time_s: Array) -> Array:
-    """Covariance of the errors of single true poses, in the coordinates of ``xi``: (n, 4, 4) and (n,) to (n, 6, 6).
+    """Return the covariance (n, 6, 6) of the errors of single true poses, in the coordinates of ``xi``.
 
-    A stamp that is off by dt gives the pose ``exp(-dt u^) T_imu_world`` for the velocities u of the IMU, which are
-    taken from the true poses on both sides. So the covariance is ``stamp^2 u u^T + diag(position^2, attitude^2)``.
+    A stamp that is off by dt gives the pose ``exp(-dt u^) T_imu_world``, with the velocities u of the IMU taken from
+    the true poses on both sides. The covariance is ``stamp^2 u u^T + diag(position^2, attitude^2)``.
     """
     white = np.diag(np.repeat([noise.position_m, noise.attitude_rad], 3) ** 2)
     if len(time_s) < 2:
@@ -119,7 +119,7 @@ def pose_noise_covariance(noise: TruthNoise, T_world_imu_true: Array, time_s: Ar
 
 
 def pose_errors(result: Result, truth: Truth, with_truth_noise: bool) -> tuple[Array, Array]:
-    """Errors ``xi`` (n, 6) at the frames of the truth, and their covariance (n, 6, 6).
+    """Return the errors ``xi`` (n, 6) at the frames of the truth, and their covariance (n, 6, 6).
 
     Args:
         result: The estimate; starts at the first true pose.
@@ -138,7 +138,7 @@ def pose_errors(result: Result, truth: Truth, with_truth_noise: bool) -> tuple[A
 
 
 def pose_nees(result: Result, truth: Truth, with_truth_noise: bool = False) -> tuple[IntArray, Array]:
-    """Frames with true pose (n,) and the pose NEES there (n,), 6 degrees of freedom; NaN where P is singular.
+    """Return the frames with true pose (n,) and the pose NEES there (n,), 6 degrees of freedom; NaN if P is singular.
 
     By default the truth counts as exact; ``with_truth_noise`` adds its noise to the covariance, see `pose_errors`. Both
     are of the same frames: those where the estimate's own P is not singular.
@@ -150,7 +150,7 @@ def pose_nees(result: Result, truth: Truth, with_truth_noise: bool = False) -> t
 
 
 def pose_nees_by_axis(result: Result, truth: Truth) -> Array:
-    """Squared errors over their variances (n, 6), truth noise included: 1 expected of each axis of ``xi``.
+    """Return squared errors divided by their variances (n, 6), truth noise included; 1 expected on each axis.
 
     NaN where the estimate's own variance is 0. Axes are those of the IMU: position x, y, z, then rotation about them.
     """
@@ -161,10 +161,10 @@ def pose_nees_by_axis(result: Result, truth: Truth) -> Array:
 
 
 def landmark_nees(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, Array]:
-    """Rows of the landmarks with known true position (n,) and the NEES of ``d = m - m_hat`` there (n,), 3 dof.
+    """Return rows of the landmarks with known true position (n,), and the NEES of ``d = m - m_hat`` (n,), 3 dof.
 
     This is exact for filters whose landmark error is additive. The invariant variant's stored covariance is of ``d``
-    only to first order in the rotation error of the pose at the same time; where that error is not small take
+    only to first order in the rotation error of the pose at the same time. If that error is not small, use
     `ekfslam.filters.variants.Invariant.landmark_error` and `nees` instead.
     """
     rows, truth_rows = match_landmarks(landmarks, truth)
@@ -173,7 +173,7 @@ def landmark_nees(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, Array]:
 
 
 def joint_nees(xi: Array, landmark_error: Array, P: Array) -> float:
-    """NEES of pose and landmarks at once, 6 + 3n degrees of freedom; NaN where P is singular.
+    """Return the NEES of pose and landmarks together, 6 + 3n degrees of freedom; NaN if P is singular.
 
     ``xi`` (6,) and ``landmark_error`` (n, 3) in stored coordinates, P (6+3n, 6+3n) in the same order.
     """
@@ -198,7 +198,7 @@ class RunAverage:
 
 
 def average_over_runs(per_run: Array) -> RunAverage:
-    """The average of one value per run (runs,); NaN stands for a run without a value."""
+    """Return the average of one value per run (runs,); NaN stands for a run without a value."""
     values = per_run[np.isfinite(per_run)]
     if len(values) == 0:
         return RunAverage(None, None, None, 0)
@@ -207,12 +207,12 @@ def average_over_runs(per_run: Array) -> RunAverage:
 
 
 def time_average(values: Array) -> Array:
-    """Mean over time of each run, (runs, T) to (runs,); NaN entries do not count, NaN if there are no others."""
+    """Return the mean over time of each run (runs,) of (runs, T); NaN entries do not count."""
     return _nanmean(values, axis=1)
 
 
 def anees(values: Array, dof: int, probability: float) -> tuple[Array, Array, Array]:
-    """Average over runs at every time, and the two-sided bounds it keeps with ``probability`` if P is true.
+    """Return the average over runs at every time, and its two-sided bounds with ``probability`` if P is true.
 
     Args:
         values: (runs, T) NEES; NaN entries (singular P, a filter that has stopped) do not count.
@@ -234,7 +234,7 @@ def _nanmean(values: Array, axis: int) -> Array:
 
 
 def chi2_bounds(dof: ArrayLike, probability: float, runs: ArrayLike = 1) -> tuple[Array, Array]:
-    """Two-sided bounds within which the mean of ``runs`` independent chi-square values lies with ``probability``.
+    """Return the two-sided bounds that hold the mean of ``runs`` independent chi-square values with ``probability``.
 
     ``dof`` are the degrees of freedom of one value (any shape); lower and upper bound have its shape.
     """

@@ -1,4 +1,4 @@
-"""Consistency of poses relative to earlier ones: which needs no first pose, and shows how a covariance grows."""
+"""Consistency of relative poses, which needs no first pose, and shows how a covariance grows."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ PATHS_M = (50.0, 100.0)
 
 
 def relative_pairs(truth: Truth, reach: int) -> tuple[IntArray, IntArray]:
-    """Pairs of frames (n,), (n,) whose relative pose shall be judged: the true poses of both are known.
+    """Return pairs of frames (n,), (n,) with known true poses, whose relative pose is to be judged.
 
-    The first frames are every quarter of ``reach``. The second ones come `FRAMES` later, or they are those, up to
-    ``reach`` frames later, whose true path from the first is nearest to `PATHS_M`, where it comes near enough.
+    The first frames are every quarter of ``reach``. The second ones come `FRAMES` later, or are the frames, at most
+    ``reach`` later, whose true path from the first is nearest to `PATHS_M`, within `PATH_TOLERANCE`.
     """
     frame, found = truth.frame, set[tuple[int, int]]()
     distance = distance_along(truth.T_world_imu)
@@ -37,7 +37,7 @@ def relative_pairs(truth: Truth, reach: int) -> tuple[IntArray, IntArray]:
 
 
 def dead_reckoned_pairs(first: IntArray, second: IntArray, T_world_imu: Array, covariance: Array) -> PosePairs:
-    """Cross-covariances of poses that were predicted alone: ``cov(xi_k, xi_j) = Ad(T_k T_j^-1) P_jj``, by eq. (2).
+    """Return cross-covariances of poses without updates: ``cov(xi_k, xi_j) = Ad(T_k T_j^-1) P_jj``, by eq. (2).
 
     Args:
         first, second: (n,) frames j and k.
@@ -48,7 +48,7 @@ def dead_reckoned_pairs(first: IntArray, second: IntArray, T_world_imu: Array, c
 
 
 def relative_covariance(result: Result, pairs: PosePairs) -> tuple[Array, Array]:
-    """Estimated motions ``T_hat_k T_hat_j^-1`` (n, 4, 4) of pairs j, k and the covariances (n, 6, 6) of their errors.
+    """Return the motions ``T_hat_k T_hat_j^-1`` (n, 4, 4) of pairs j, k, and the covariances (n, 6, 6) of their errors.
 
     The error of the motion ``T_k T_j^-1`` is, to first order in the stored errors,
 
@@ -62,7 +62,7 @@ def relative_covariance(result: Result, pairs: PosePairs) -> tuple[Array, Array]
 
 
 def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) -> tuple[PosePairs, Array]:
-    """Pairs with both true poses and the NEES (n,) of their relative pose, 6 degrees of freedom; NaN where singular.
+    """Return pairs with true poses and the NEES (n,) of their relative pose, 6 degrees of freedom; NaN if singular.
 
     The covariance is that of `relative_covariance` and, if the truth states noise, ``N_k + A N_j A^T`` with N that of
     single true poses; an error of the first pose cancels. Pairs with an ``interpolated`` interval (T,) between them are
@@ -83,12 +83,12 @@ def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) ->
 
 
 def over_frames(pairs: PosePairs, frames: int) -> BoolArray:
-    """Which of the pairs (n,) are so many frames apart."""
+    """Return a mask (n,) of the pairs that are so many frames apart."""
     return pairs.second - pairs.first == frames
 
 
 def over_path(pairs: PosePairs, truth: Truth, path_m: float) -> BoolArray:
-    """Which of the pairs (n,), of each first frame at most one, are nearest to so many metres of true path."""
+    """Return a mask (n,) of the pairs nearest to so many metres of true path, at most one for each first frame."""
     distance = np.full(truth.frame[-1] + 1 if len(truth.frame) else 0, np.nan)
     distance[truth.frame] = distance_along(truth.T_world_imu)
     off = np.abs(distance[pairs.second] - distance[pairs.first] - path_m)

@@ -1,10 +1,9 @@
-"""Whether a recording makes sense, and a run after it: what looks wrong is named, one line each.
+"""Sanity of a recording and of a run: likely mistakes are named, one line each.
 
 The evidence is the flow of the tracks. From one frame to the next a point that stereo has located moves in the image
-as velocities, stamps and ``T_cam_imu`` predict it. A mistake in one of these has its own signature: with the mistake
-undone the prediction fits, and with nothing else. So each known mistake is undone in turn, and named where the
-prediction errs much less then. Noise of velocities is no mistake: where a remedy makes velocities small, they must
-still explain more than none at all.
+as velocities, stamps and ``T_cam_imu`` predict it. If one of these is wrong in a known way, undoing that mistake makes
+the prediction fit. So each known mistake is undone in turn, and named if the prediction error falls much. Noise of
+velocities is no mistake: velocities that a remedy makes small must still explain more than none at all.
 """
 
 from __future__ import annotations
@@ -45,8 +44,8 @@ class Sanity:
     """What `inspect_sequence` found.
 
     Args:
-        figures: What is normal or not a user may judge, one line each.
-        warnings: What looks wrong, one line each.
+        figures: Facts for the user to judge, one line each.
+        warnings: Likely mistakes, one line each.
     """
 
     figures: tuple[str, ...]
@@ -55,12 +54,12 @@ class Sanity:
 
 @dataclass(frozen=True)
 class _Remedy:
-    """A mistake undone.
+    """The inverse of a mistake.
 
     Args:
         text: The mistake, in words.
-        undo: From extrinsics (4, 4), velocities (n, 6) and intervals (n,) to what they should have been.
-        shrinks: Which velocities (6,) become so small by that that their noise may go.
+        undo: Function from wrong to right extrinsics (4, 4), velocities (n, 6) and intervals (n,).
+        shrinks: Indices of the velocities that it makes small, so that their noise may vanish.
     """
 
     text: str
@@ -76,7 +75,7 @@ def _signs(*signs: float) -> Callable[[Array, Array, Array], tuple[Array, Array,
 
 
 def _turned(C: Array, u: Array, tau: Array) -> tuple[Array, Array, Array]:
-    """Velocities along right, down, forward as those along forward, left, up."""
+    """Return velocities along right, down, forward as velocities along forward, left, up."""
     return C, np.hstack([u[:, :3] @ cam.R_CAM_BODY, u[:, 3:] @ cam.R_CAM_BODY]), tau
 
 
@@ -111,7 +110,7 @@ _REMEDIES = (
 
 
 def inspect_sequence(sequence: Sequence) -> Sanity:
-    """Figures of a recording, and what looks wrong in it, before anything is run."""
+    """Return figures of a recording, and warnings about likely mistakes in it, before it is run."""
     figures, warnings = _tracks_in_front(sequence)
     tau = np.diff(sequence.time_s, prepend=sequence.time_s[:1])
     if len(sequence) > 1:
@@ -137,7 +136,7 @@ def inspect_sequence(sequence: Sequence) -> Sanity:
 
 
 def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]) -> tuple[str, ...]:
-    """What looks wrong after a run, one line each.
+    """Return warnings about a run, one line each.
 
     Args:
         sequence: The recording.
@@ -165,12 +164,12 @@ def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]
 
 
 def sanity_attributes(lines: tuple[str, ...]) -> dict[str, str]:
-    """Lines as an attribute of a result, which `Result.remarks` gives back; nothing where there are none."""
+    """Return warnings as an attribute of a result, which `Result.remarks` reads; empty without warnings."""
     return {SANITY: SANITY_SEPARATOR.join(lines)} if lines else {}
 
 
 def _tracks_in_front(sequence: Sequence) -> tuple[list[str], list[str]]:
-    """A figure and a warning on points without depth."""
+    """Return a figure and a warning on points without depth."""
     pixels = sequence.observations.pixels_px
     if not len(pixels):
         return [], []
@@ -182,7 +181,7 @@ def _tracks_in_front(sequence: Sequence) -> tuple[list[str], list[str]]:
 
 
 def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]:
-    """How far the velocities predict the flow of the tracks, and the mistake whose remedy predicts it."""
+    """Return how well velocities predict the flow of tracks, and the mistake whose remedy predicts it better."""
     earlier, later = _pairs(sequence)
     if len(earlier) < _LEAST_PAIRS:
         return [], []
@@ -194,14 +193,14 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]
     points = cam.triangulate(sequence.camera, cam.rectified_rows(pixels[earlier], np.ones(4))[0])
 
     def error_px(C: Array, u: Array, tau: Array) -> tuple[float, float]:
-        """Median distance of predicted and seen, along straight stretches and in turns."""
+        """Return the median distance of prediction and observation, on straight stretches and in turns."""
         moved = se3.apply(C @ motion.increment(u, tau) @ se3.inverse(C), points)
         return _off(sequence, moved, pixels[later, :2], turns)
 
     given = sequence.T_cam_imu, sequence.twist[at], tau[at]
 
     def without(remedy: _Remedy) -> float:
-        """The error without the velocities that a remedy makes small."""
+        """Return the error without the velocities that a remedy makes small."""
         none = np.where(np.isin(np.arange(6), remedy.shrinks), 0.0, given[1])
         return sum(error_px(given[0], none, given[2])) if remedy.shrinks else np.inf
 
@@ -220,7 +219,7 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]
 
 
 def _pairs(sequence: Sequence) -> tuple[IntArray, IntArray]:
-    """Observations of successive frames with depth, while the rig moves and is measured; a part of them, evenly."""
+    """Return a part of the observations with depth in successive frames, while the rig moves and is measured."""
     observations = sequence.observations
     earlier, later = successive(observations)
     pixels = observations.pixels_px
@@ -234,7 +233,7 @@ def _pairs(sequence: Sequence) -> tuple[IntArray, IntArray]:
 
 
 def _off(sequence: Sequence, points: Array, seen: Array, turns: BoolArray) -> tuple[float, float]:
-    """Median distance (px) of images of points (n, 3) from those seen (n, 2): along straight stretches, in turns."""
+    """Return the median distance (px) of projected points (n, 3) from images (n, 2): driving straight, in turns."""
     ahead = points[:, 2] > _NEAREST_M
     image = cam.project(sequence.camera, np.where(ahead[:, None], points, 1.0))[:, :2]
     off = np.where(ahead, np.minimum(np.linalg.norm(image - seen, axis=1), _BESIDE_PX), _BESIDE_PX)
@@ -243,7 +242,7 @@ def _off(sequence: Sequence, points: Array, seen: Array, turns: BoolArray) -> tu
 
 
 def _inspect_truth(sequence: Sequence) -> list[str]:
-    """Whether the truth moves as the velocities do, over stretches of some frames."""
+    """Return a warning if the truth moves differently from the velocities, over stretches of some frames."""
     truth = sequence.truth
     if truth is None or len(truth.frame) <= _WINDOW:
         return []
@@ -272,14 +271,14 @@ def _inspect_truth(sequence: Sequence) -> list[str]:
 
 
 def _noise_over_window(sequence: Sequence) -> tuple[float, float]:
-    """What white noise of the velocities may add up to over a stretch, m and rad, at most `_SURE` deviations of it."""
+    """Return bounds on the sum of white velocity noise over a stretch, m and rad: `_SURE` deviations."""
     changes = np.median(np.abs(np.diff(sequence.twist, axis=0)), axis=0)
     std = changes / (0.6745 * np.sqrt(2.0)) * np.median(np.diff(sequence.time_s)) * np.sqrt(_WINDOW)
     return _SURE * float(np.linalg.norm(std[:3])), _SURE * float(np.linalg.norm(std[3:]))
 
 
 def _disagreement(found: Array, true: Array, least: Array, noise: float) -> float:
-    """Median distance of motions (n, d), as a share of the larger one of both, where that exceeds ``least`` (n,).
+    """Return the median distance of motions (n, d), as a share of the larger one, of those above ``least`` (n,).
 
     Half of what noise may add up to does not count.
     """

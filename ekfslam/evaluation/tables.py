@@ -20,7 +20,7 @@ _NARROWEST = 4  # a rule needs three dashes and a colon
 def markdown_table(
     headings: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1, padded: bool = False
 ) -> str:
-    """A table without a line end at its end.
+    """Return a Markdown table without a final line end.
 
     Args:
         headings: Of the columns.
@@ -45,7 +45,7 @@ def markdown_table(
 
 
 def _rule(widths: Sequence[int], left: int, padded: bool) -> str:
-    """What separates the headings from the rows, and says how columns are aligned."""
+    """Return the rule between headings and rows, which aligns the columns."""
     dashes = ["-" * (width + 2) if padded else "---" for width in widths]
     # In a padded table the colon takes the place of a dash.
     right = [(text[:-1] if padded else text) + ":" for text in dashes]
@@ -53,22 +53,22 @@ def _rule(widths: Sequence[int], left: int, padded: bool) -> str:
 
 
 def number(value: float | None, spec: str = "") -> str:
-    """A number in a format such as ``.2f``; a dash for None."""
+    """Return a number in a format such as ``.2f``; a dash for None."""
     return MISSING if value is None else format(value, spec)
 
 
 def significant(value: float | None) -> str:
-    """A number with three significant digits or so, whatever its size; a dash for None."""
+    """Return a number with about three significant digits; a dash for None."""
     if value is None:
         return MISSING
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2f}" if abs(value) >= 1 else f"{value:.3f}"
 
 
 def plus_minus(value: str, error: str) -> str:
-    """A value and its error (standard errors, a standard deviation), as the text around the table says."""
+    """Return a value with its error, a standard error or deviation; a dash for a missing one."""
     return value if MISSING in (value, error) else f"{value} ± {error}"
 
 
 def document(*blocks: str) -> str:
-    """Headings, paragraphs and tables as the text of a file, a blank line between any two."""
+    """Return headings, paragraphs and tables as the text of a file, with blank lines between them."""
     return "\n\n".join(block.strip("\n") for block in blocks) + "\n"

@@ -19,7 +19,7 @@ PATH_TOLERANCE = 0.1  # of a path, by which that of a pair of poses may differ f
 
 
 def align_se3(points: Array, reference: Array) -> Array:
-    """Rigid transform (4, 4) that brings points (n, 3) closest to their reference (n, 3) in the least-squares sense.
+    """Return the rigid transform (4, 4) from points (n, 3) to their reference (n, 3) with least squared distances.
 
     Umeyama's method without scale. Points on a line leave the rotation about it undetermined; any optimum is returned.
     """
@@ -32,7 +32,7 @@ def align_se3(points: Array, reference: Array) -> Array:
 
 
 def absolute_trajectory_error(T_est: Array, T_true: Array, align: bool) -> float:
-    """ATE, root mean square of the position errors in metres: as they are, or after `align_se3` of the positions.
+    """Return the ATE, the root mean square of the position errors in metres, without or after `align_se3`.
 
     Sturm et al., *A Benchmark for the Evaluation of RGB-D SLAM Systems*, IROS 2012. Scale is never aligned.
     """
@@ -43,12 +43,12 @@ def absolute_trajectory_error(T_est: Array, T_true: Array, align: bool) -> float
 
 
 def final_position_error(T_est: Array, T_true: Array) -> float:
-    """Distance in metres between the last estimated and the last true position, no alignment."""
+    """Return the distance in metres of the last estimated position from the true one, without alignment."""
     return float(np.linalg.norm(T_est[-1, :3, 3] - T_true[-1, :3, 3]))
 
 
 def relative_pose_error_over_frames(T_est: Array, T_true: Array, frames: int = 1) -> tuple[float, float] | None:
-    """RPE over a fixed number of frames: root mean squares of the translation error, m, and of the rotation angle, deg.
+    """Return the RPE over a number of frames: root mean squares of translation error, m, and rotation angle, deg.
 
     The error of the motion from pose i to pose j = i + frames is ``E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`` with Q the true
     and P the estimated poses (Sturm et al. 2012). Every pair of the n poses counts, also one across a gap in the truth.
@@ -59,7 +59,7 @@ def relative_pose_error_over_frames(T_est: Array, T_true: Array, frames: int = 1
 
 
 def relative_pose_error_over_path(T_est: Array, T_true: Array, path_m: float) -> tuple[float, float] | None:
-    """RPE over a length of true path: root mean squares of the translation error, m, and of the rotation angle, deg.
+    """Return the RPE over a length of true path: root mean squares of translation error, m, and rotation angle, deg.
 
     As `relative_pose_error_over_frames`, but each pose is paired with the later one (the first, if there are several)
     whose distance from it along the true path comes nearest to ``path_m``, and left out where that differs by more than
@@ -76,12 +76,12 @@ def relative_pose_error_over_path(T_est: Array, T_true: Array, path_m: float) ->
 
 
 def distance_along(T: Array) -> Array:
-    """Distance driven in metres from the first pose to each: (n, 4, 4) to (n,)."""
+    """Return the distance driven in metres (n,) from the first pose to each of (n, 4, 4)."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1))])
 
 
 def _relative_errors(T_est: Array, T_true: Array, start: IntArray, end: IntArray) -> tuple[Array, Array]:
-    """Length, m, and angle, rad, of the error of the motions from ``start`` to ``end`` (pairs,): (pairs,) each."""
+    """Return length, m, and angle, rad, (pairs,) of the errors of the motions from ``start`` to ``end`` (pairs,)."""
     step_est = se3.inverse(T_est[start]) @ T_est[end]
     step_true = se3.inverse(T_true[start]) @ T_true[end]
     error = se3.inverse(step_true) @ step_est
@@ -89,7 +89,7 @@ def _relative_errors(T_est: Array, T_true: Array, start: IntArray, end: IntArray
 
 
 def _rms_relative_error(T_est: Array, T_true: Array, start: IntArray, end: IntArray) -> tuple[float, float] | None:
-    """Root mean squares in metres and degrees; None if there is no pair."""
+    """Return root mean squares in metres and degrees; None if there is no pair."""
     if not len(start):
         return None
     length, angle = _relative_errors(T_est, T_true, start, end)
@@ -97,7 +97,7 @@ def _rms_relative_error(T_est: Array, T_true: Array, start: IntArray, end: IntAr
 
 
 def kitti_segment_errors(T_est: Array, T_true: Array) -> tuple[float, float] | None:
-    """Relative errors of the KITTI odometry benchmark: ``(t_rel_percent, r_rel_deg_per_100m)``.
+    """Return the relative errors of the KITTI odometry benchmark: ``(t_rel_percent, r_rel_deg_per_100m)``.
 
     Mean over all segments of 100, 200, ..., 800 m of true path that start at every tenth pose, of the segment's
     translation and rotation error divided by its nominal length (Geiger et al., *Are we ready for autonomous driving?*,
@@ -116,7 +116,7 @@ def kitti_segment_errors(T_est: Array, T_true: Array) -> tuple[float, float] | N
 
 
 def match_landmarks(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, IntArray]:
-    """Rows of the estimated landmarks that have a known true position, and the rows of that truth: (n,), (n,).
+    """Return the rows of estimated landmarks with known true position, and their rows in the truth: (n,), (n,).
 
     An id that occurs several times in the estimate is matched every time.
     """
@@ -127,7 +127,7 @@ def match_landmarks(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, IntAr
 
 
 def landmark_rmse(landmarks: Landmarks, truth: Truth) -> float | None:
-    """Root mean square distance in metres of estimated landmarks from their true positions, no alignment.
+    """Return the root mean square distance in metres of landmarks from their true positions, without alignment.
 
     None if no estimated landmark has a known true position.
     """

@@ -11,7 +11,7 @@ from ekfslam.data.truth_noise import TruthNoise
 
 
 def with_truth_noise(sequence: Sequence, settings: TruthConfig) -> Sequence:
-    """The recording whose truth has the noise of the settings; what these leave open stays as its format states it."""
+    """Return the recording with the truth noise of the settings; open settings keep the noise of the format."""
     asked = {
         "first_roll_rad": _radians(settings.roll_deg),
         "first_pitch_rad": _radians(settings.pitch_deg),

@@ -17,10 +17,10 @@ _LARGEST_SCALE = 100.0  # of variances, that a gate still lets be told
 
 
 def autocovariance(series: Array, lags: int) -> Array:
-    """Second moments about 0 of samples 0 to ``lags`` apart: (T, n) to (lags+1, n); NaN samples do not count.
+    """Return second moments about 0 (lags+1, n) of samples (T, n) that are 0 to ``lags`` apart; NaN does not count.
 
-    Each is divided by the number of all samples that count, so that the sequence is positive semi-definite. Where the
-    series is shorter than a lag, 0.
+    Each is divided by the number of all samples that count, so that the sequence is positive semi-definite. It is 0
+    for lags beyond the length of the series.
     """
     known = np.isfinite(series)
     filled, count = np.where(known, series, 0.0), np.maximum(known.sum(axis=0), 1)
@@ -29,18 +29,18 @@ def autocovariance(series: Array, lags: int) -> Array:
 
 
 def long_run_variance(covariances: Array) -> Array:
-    """``gamma_0 + 2 sum w_l gamma_l`` (n,) of autocovariances (lags+1, n), with Bartlett's weights."""
+    """Return ``gamma_0 + 2 sum w_l gamma_l`` (n,) of autocovariances (lags+1, n), with Bartlett's weights."""
     weight = 1.0 - np.arange(len(covariances)) / len(covariances)
     return 2.0 * (weight @ covariances) - covariances[0]
 
 
 def relative_error(samples: int, lags: int) -> float:
-    """Relative standard error of a long-run variance; that of a variance where there are no lags."""
+    """Return the relative standard error of a long-run variance; of a plain variance for ``lags`` 0."""
     return float(np.sqrt(max(4.0 * lags / 3.0, 2.0) / max(samples, 1)))
 
 
 def along_tracks(frame: IntArray, landmark: IntArray, values: Array, lags: int) -> tuple[Array, IntArray]:
-    """Autocovariance along tracks, all tracks together, and the pairs behind it.
+    """Return the autocovariance along all tracks, and the number of pairs behind it.
 
     Args:
         frame, landmark: (K,) of each value; a landmark has at most one in a frame.
@@ -67,7 +67,7 @@ def along_tracks(frame: IntArray, landmark: IntArray, values: Array, lags: int) 
 
 
 def ratio_error(values: Array, dof: IntArray, lags: int) -> float:
-    """Standard error of ``sum values / sum dof`` that allows for correlation over time, (T,) each.
+    """Return the standard error of ``sum values / sum dof``, (T,) each, which allows for correlation over time.
 
     Never less than that of independent chi-square values.
     """
@@ -81,10 +81,10 @@ def ratio_error(values: Array, dof: IntArray, lags: int) -> float:
 
 
 def gated_scale(mean: float, dimension: int, probability: float) -> float:
-    """By how much variances are larger than stated, from the squares of what passed a gate.
+    """Return the ratio of variances to the stated ones, from the squares that passed a gate.
 
-    Squares of innovations whose variances are s times those stated are s times chi-square; the gate cuts off what is
-    large, so that their mean understates s.
+    If variances are s times the stated ones, squares are s times chi-square. The gate cuts off large ones, so that
+    their mean understates s.
 
     Args:
         mean: Of the accepted squares, divided by their dimension.
@@ -110,7 +110,7 @@ def gated_scale(mean: float, dimension: int, probability: float) -> float:
 
 
 def rejected_share(scale: float, dimension: int, probability: float) -> float:
-    """Share of observations that a gate rejects where their variances are ``scale`` times those stated."""
+    """Return the share of observations that a gate rejects if their variances are ``scale`` times the stated ones."""
     if probability >= 1.0:
         return 0.0
     gate = float(gammaincinv(dimension / 2.0, probability))

@@ -23,7 +23,7 @@ from ekfslam import files
 from ekfslam.arrays import IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.errors import ConfigError
-from ekfslam.figures.maps import SIGMAS, dot_size, ellipse_axes, map_axes, map_of
+from ekfslam.figures.maps import SIGMAS, dot_size, ellipse_axes, map_axes, map_of, spread
 from ekfslam.figures.style import LANDMARK_COLOR, TRUTH, line_of, style_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.geometry.motion import world_axes_covariance
@@ -45,8 +45,7 @@ def write_animation(
 ) -> None:
     """Write a drive as a moving map from above.
 
-    A landmark stands where it was estimated last, from the frame on in which it was first seen: archives do not hold
-    where it was thought to be in between.
+    A landmark appears in the frame of its first observation, at its last estimate: archives hold no earlier ones.
 
     Args:
         path: Ends in ``.gif``, or in ``.mp4``, for which the program ffmpeg is needed.
@@ -72,13 +71,13 @@ def write_animation(
 
 
 def animated(results: Mapping[str, Result], truth: Truth | None, pictures: int) -> Iterator[Image.Image]:
-    """At most so many pictures of a drive, the last of its last frame."""
+    """Yield at most so many pictures of a drive, the last of its last frame."""
     frames = len(next(iter(results.values())).time_s)
     figure, update = _moving_map(results, truth)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # places everything that does not move
     still = canvas.copy_from_bbox(figure.bbox)
-    for k in np.unique(np.linspace(0, frames - 1, min(pictures, frames)).astype(int)):
+    for k in spread(frames, pictures):
         canvas.restore_region(still)
         for artist in update(int(k)):
             figure.draw_artist(artist)
@@ -86,7 +85,7 @@ def animated(results: Mapping[str, Result], truth: Truth | None, pictures: int) 
 
 
 def _moving_map(results: Mapping[str, Result], truth: Truth | None) -> tuple[Figure, Callable[[int], Iterable[Artist]]]:
-    """A map without what moves, and what moves as of a frame."""
+    """Return a map without its moving parts, and a function that updates these to a frame."""
     parts: list[Callable[[int], Iterable[Artist]]] = []
 
     @styled
@@ -116,7 +115,7 @@ def _moving_map(results: Mapping[str, Result], truth: Truth | None) -> tuple[Fig
 
 
 def _landmarks(ax: Axes, mapper: Result) -> Callable[[int], Iterable[Artist]]:
-    """Dots of the landmarks seen so far; ellipses of those that are in view."""
+    """Return the updates of landmarks: dots of all seen so far, ellipses of all in view."""
     landmarks = mapper.landmarks
     points = landmarks.position_m[:, :2]
     (dots,) = ax.plot([], [], ".", color=LANDMARK_COLOR, markersize=1.5 * dot_size(len(points)), markeredgewidth=0)
@@ -134,7 +133,7 @@ def _landmarks(ax: Axes, mapper: Result) -> Callable[[int], Iterable[Artist]]:
 
 
 def _vehicle(ax: Axes, mode: str, result: Result) -> Callable[[int], Iterable[Artist]]:
-    """The way so far, the position with its ellipse, and the heading."""
+    """Return the updates of a run: path so far, position with ellipse, and heading."""
     xy, forward, color = result.T_world_imu[:, :2, 3], result.T_world_imu[:, :2, 0], style_of(mode)["color"]
     (line,) = ax.plot([], [], **line_of(mode), label=mode, animated=True)
     arrow = ax.quiver(*xy[0], *forward[0], color=color, angles="xy", scale=18, width=0.006, zorder=5, animated=True)
@@ -152,7 +151,7 @@ def _vehicle(ax: Axes, mode: str, result: Result) -> Callable[[int], Iterable[Ar
 def _ellipses(
     ax: Axes, rows: IntArray, centres: Any, long: Any, short: Any, angle: Any, color: str
 ) -> EllipseCollection:
-    """Ellipses of some rows, on no axes but ready to be drawn on these."""
+    """Return ellipses of some rows that are ready to be drawn on axes, but not added to them."""
     found = EllipseCollection(
         long[rows],
         short[rows],
@@ -183,7 +182,7 @@ def _clock(ax: Axes, result: Result) -> Callable[[int], Iterable[Artist]]:
 
 
 def _gif(pictures: Iterable[Image.Image], per_second: int) -> bytes:
-    """A gif with the palette of its last picture, which holds every colour."""
+    """Return a gif with the palette of its last picture, which has every colour."""
     drawn = list(pictures)
     palette = drawn[-1].quantize(64, Image.Quantize.MAXCOVERAGE)
     first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in drawn)
@@ -193,7 +192,7 @@ def _gif(pictures: Iterable[Image.Image], per_second: int) -> bytes:
 
 
 def _mp4(pictures: Iterable[Image.Image], per_second: int) -> bytes:
-    """An mp4 of ffmpeg, to which the pictures are piped as they are drawn."""
+    """Return an mp4 made by ffmpeg; pictures are piped to it as they are drawn."""
     with TemporaryDirectory() as folder:
         target = Path(folder) / "drive.mp4"
         iterator = iter(pictures)

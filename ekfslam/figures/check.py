@@ -1,4 +1,4 @@
-"""The figure of `ekfslam check`: what the innovations of a run say about its covariance."""
+"""The figure of `ekfslam check`: evidence of the innovations of a run on its covariance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BINS = 60  # of the time axis, in which rejections are counted
 
 @styled
 def plot_check(result: Result, found: Honesty) -> Figure:
-    """Six panels: NIS, rejections, autocorrelation along tracks and of shared innovations, and these over time.
+    """Draw six panels: NIS, rejections, autocorrelation along tracks and of shared innovations, and these over time.
 
     Args:
         result: With whitened innovations.
@@ -81,7 +81,7 @@ def _correlation(ax: Axes, found: Whiteness, samples: IntArray, names: tuple[str
 
 
 def _shared(result: Result) -> tuple[Array, Array]:
-    """Sums over `LAGS` frames (n, 6) by their expected deviation, and the times (n,) at their middle."""
+    """Return sums over `LAGS` frames (n, 6) divided by their expected deviation, and the times (n,) of their middle."""
     assert result.whitened is not None
     series, time_s = result.whitened.shared, result.time_s - result.time_s[0]
     known = np.isfinite(series).all(axis=1)

@@ -32,7 +32,7 @@ _HELD = f"{100 * (1 - np.exp(-(SIGMAS**2) / 2)):.0f} %"  # of a Gaussian in the 
 
 
 def ellipse_axes(covariance: Array, sigmas: float) -> tuple[Array, Array, Array]:
-    """Ellipse ``e^T P^-1 e = sigmas^2`` of 2x2 covariances (..., 2, 2): full axes and direction of the longer one.
+    """Return axes and direction of the ellipse ``e^T P^-1 e = sigmas^2`` of covariances (..., 2, 2).
 
     Returns:
         Length of the longer axis and of the shorter one (...), in the unit of the standard deviations, and the angle
@@ -46,7 +46,7 @@ def ellipse_axes(covariance: Array, sigmas: float) -> tuple[Array, Array, Array]
 
 @registry.figure("map")
 def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
-    """Map from above (x, y of world, metres): trajectories of all modes, landmarks and poses with 2-sigma ellipses.
+    """Draw the map from above (x, y of world, metres): trajectories, landmarks and poses with 2-sigma ellipses.
 
     Landmarks are those of the full mode, or of the last mode that has any. The view follows trajectories and the bulk
     of the landmarks; the legend says how many landmarks lie outside it. Ellipses longer than a tenth (poses:
@@ -86,7 +86,7 @@ def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figur
 
 @styled
 def plot_trajectories(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
-    """Trajectories from above (x, y of world, metres), with the direction of the IMU's x axis at start and end."""
+    """Draw trajectories from above (x, y of world, metres), with the direction of the IMU's x axis at start and end."""
     paths = {mode: result.T_world_imu for mode, result in results.items()}
     if truth is not None and len(truth.frame):
         paths["truth"] = truth.T_world_imu
@@ -101,7 +101,7 @@ def plot_trajectories(results: Mapping[str, Result], truth: Truth | None = None)
 
 @registry.figure("landmarks_{mode}", needs={"landmarks"})
 def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
-    """Landmarks from above (x, y of world, metres): from initialisation to final estimate, over the trajectory.
+    """Draw landmarks from above (x, y of world, metres): from initialisation to final estimate, over the trajectory.
 
     The view follows trajectory and the bulk of the final landmarks; the legend says how many lie outside it.
     """
@@ -125,10 +125,10 @@ def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
 
 @registry.figure("side")
 def plot_side(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
-    """The drive from the side: height z of world against the distance driven, metres, with bands of 3 sigma.
+    """Draw the drive from the side: height z of world over the distance driven, metres, with 3-sigma bands.
 
-    Landmarks, those of the map from above, stand where the vehicle was when it saw them last. The view is that of the
-    trajectories and the bulk of the landmarks.
+    Landmarks are those of the map from above. Each stands at the distance at which it was seen last. The view shows
+    the trajectories and the bulk of the landmarks.
     """
     mapper, figure = map_of(results), Figure(figsize=(9.0, 4.2))
     ax = figure.subplots()
@@ -157,7 +157,7 @@ def plot_side(results: Mapping[str, Result], truth: Truth | None = None) -> Figu
 
 
 def _add_arrows(ax: Axes, T_world_imu: Array, color: str) -> None:
-    """Arrows along the IMU's x axis, seen from above, at poses (n, 4, 4)."""
+    """Draw arrows along the IMU's x axis, seen from above, at poses (n, 4, 4)."""
     at, along = T_world_imu[:, :2, 3], T_world_imu[:, :2, 0]
     size: dict[str, Any] = {"units": "inches", "scale_units": "inches", "scale": 1 / 0.28, "width": 0.022}
     arrows = ax.quiver(*at.T, *along.T, color=color, angles="xy", zorder=4, clip_on=False, **size)
@@ -169,7 +169,7 @@ def _first(results: Mapping[str, Result]) -> Result:
 
 
 def map_of(results: Mapping[str, Result]) -> Result:
-    """The result whose map is shown: full, else the last one with landmarks, else any."""
+    """Return the result whose map is shown: full, else the last one with landmarks, else the last."""
     with_map = [result for result in results.values() if len(result.landmarks)]
     return results.get("full") or (with_map or list(results.values()))[-1]
 
@@ -181,12 +181,12 @@ def _figure_of(ax: Axes) -> Figure:
 
 
 def spread(length: int, count: int) -> IntArray:
-    """At most ``count`` indices spread over ``length``, first and last included."""
+    """Return at most ``count`` indices spread over ``length``, first and last included."""
     return np.unique(np.linspace(0, length - 1, count).astype(int))
 
 
 def map_axes(path: Array, points: Array) -> tuple[Axes, BoolArray]:
-    """Equal-aspect axes of a new figure around all of path and the bulk of points, and which points are outside."""
+    """Return equal-aspect axes of a new figure around a path and the bulk of points, and a mask of points outside."""
     bulk = np.percentile(points, [2, 98], axis=0) if len(points) else path[:0]
     shown = np.concatenate([path, bulk])
     low, high = shown.min(axis=0), shown.max(axis=0)
@@ -208,7 +208,7 @@ def map_axes(path: Array, points: Array) -> tuple[Axes, BoolArray]:
 
 
 def draw_paths(ax: Axes, results: Mapping[str, Result], truth: Truth | None) -> None:
-    """Truth and the modes' positions with marks; start as a circle, end as a cross."""
+    """Draw the paths of truth and modes with marks; start as a circle, end as a cross."""
     if truth is not None and len(truth.frame):
         ax.plot(*truth.T_world_imu[:, :2, 3].T, **TRUTH, label="truth")
     for i, (mode, result) in enumerate(results.items()):
@@ -244,7 +244,7 @@ def add_ellipses(
 
 
 def dot_size(count: int) -> float:
-    """Diameter in points at which ``count`` dots still show as dots."""
+    """Return the diameter in points at which ``count`` dots remain legible."""
     return float(np.clip(100.0 / np.sqrt(max(count, 1)), 1.2, 4.0))
 
 
@@ -253,7 +253,7 @@ def _outside_text(outside: BoolArray) -> str:
 
 
 def _outside_legend(ax: Axes) -> None:
-    """Legend below the axes, where it hides no data, with the marks of start and end where they are drawn."""
+    """Add a legend below the axes, where it hides no data, with marks of start and end if they are drawn."""
     handles, _ = ax.get_legend_handles_labels()
     if any(line.get_marker() == "X" for line in ax.lines):
         for marker, label in (("o", "start"), ("X", "end")):

@@ -12,7 +12,7 @@ MADE_BY = "ekfslam"  # in every figure
 
 
 def older_figures(directory: Path) -> list[Path]:
-    """The figures in a folder that `ekfslam.figures.style.png` has made."""
+    """Return the figures in a folder that `ekfslam.figures.style.png` has made."""
     found = []
     for path in sorted(directory.glob("*.png")):
         with suppress(OSError, ValueError, SyntaxError), Image.open(path) as picture:
@@ -22,7 +22,7 @@ def older_figures(directory: Path) -> list[Path]:
 
 
 def remove_figures(older: Iterable[Path], new: Iterable[Path]) -> None:
-    """Remove older figures in whose place there are no new ones, and with ``check.png`` the verdict beside it."""
+    """Remove older figures that no new ones replace, and with ``check.png`` its verdict."""
     for path in set(older) - set(new):
         verdict = [path.with_suffix(".md"), path.with_suffix(".json")] if path.name == "check.png" else []
         for old in (path, *verdict):

@@ -22,10 +22,10 @@ _CELLS = 500  # across a picture of a sparsity pattern
 
 @registry.figure("map_before_and_after", needs={"full", "smoothed"})
 def plot_map_before_and_after(full: Result, smoothed: Result, truth: Truth | None = None) -> Figure:
-    """Two maps from above at one scale, poses and landmarks with 2-sigma ellipses: the filter's, and the posterior's.
+    """Draw the maps of filter and posterior from above at one scale, poses and landmarks with 2-sigma ellipses.
 
-    The view is that of the smoothed trajectory's middle half of the drive. Where the drive closes a loop, it is the
-    poses before that gain: the filter's last map knows of the loop already, its earlier poses do not.
+    The view is the middle half of the smoothed drive. If the drive closes a loop, the poses before it gain most: the
+    last map of the filter knows of the loop, its earlier poses do not.
     """
     path = smoothed.T_world_imu[:, :2, 3]
     quarter = len(path) // 4
@@ -60,13 +60,13 @@ def plot_map_before_and_after(full: Result, smoothed: Result, truth: Truth | Non
 
 
 def _median_std(covariance: Array) -> str:
-    """Median of the standard deviations in the plane of covariances (n, 2, 2), as text."""
+    """Return the median standard deviation of covariances (n, 2, 2) in the plane, as text."""
     return f"{np.sqrt(np.median(np.trace(covariance, axis1=1, axis2=2))):.3g}" if len(covariance) else MISSING
 
 
 @styled
 def plot_sparsity(information: JointInformation) -> Figure:
-    """Which blocks of the information matrix and of its Cholesky factor are not zero: one cell is many blocks."""
+    """Draw the nonzero blocks of the information matrix and of its Cholesky factor; one cell is many blocks."""
     figure = Figure(figsize=(10.0, 5.2))
     own, of_factor, size = block_patterns(information)
     axes = figure.subplots(1, 2)
@@ -93,7 +93,7 @@ def _draw_pattern(ax: Axes, row: IntArray, column: IntArray, size: int) -> None:
 def draw_posterior_figures(
     before: Result, after: Result, information: JointInformation, truth: Truth | None = None
 ) -> dict[str, Figure]:
-    """``map_before_and_after`` and ``sparsity``, by name."""
+    """Draw ``map_before_and_after`` and ``sparsity``; return them by name."""
     return {
         "map_before_and_after": plot_map_before_and_after(before, after, truth),
         "sparsity": plot_sparsity(information),

@@ -1,4 +1,4 @@
-"""The one palette and style of all figures: whatever is the same has the same colour, line and marker everywhere.
+"""The one palette and style of all figures: a mode or variant has the same colour, line and marker everywhere.
 
 Colours are those of Okabe and Ito, which readers with colour-blindness tell apart, and greys. Line styles and markers
 differ as well, so that every figure is legible in grey. What belongs together looks alike: ``full`` is the filter whose
@@ -114,22 +114,22 @@ Format = Literal["png", "svg", "pdf"]  # of files
 
 
 def style_of(name: str) -> Style:
-    """Colour, line style and marker of a mode or variant; those of `OTHER` for any other name."""
+    """Return colour, line style and marker of a mode or variant; those of `OTHER` for any other name."""
     return MODES.get(name) or VARIANTS.get(name) or OTHER
 
 
 def line_of(name: str) -> Style:
-    """`style_of` without the marker, for lines of many points."""
+    """Return `style_of` without the marker, for lines of many points."""
     return {key: value for key, value in style_of(name).items() if key != "marker"}
 
 
 def marker_of(name: str) -> Style:
-    """`style_of` without the line, for single points."""
+    """Return `style_of` without the line, for single points."""
     return {**style_of(name), "linestyle": ""}
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorator: draw with the settings `RC`, whatever the caller's own are, and all names as they are."""
+    """Decorate a function to draw with the settings `RC`, whatever those of the caller are, and names as plain text."""
 
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -143,14 +143,14 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def _written(figure: Figure) -> list[Text]:
-    """Titles, legends and texts of a figure; the numbers of its axes may be formulas."""
+    """Return titles, legends and texts of a figure; the numbers of its axes may be formulas."""
     legends = [*figure.legends, *(ax.get_legend() for ax in figure.axes)]
     in_legends = [text for legend in legends if legend is not None for text in legend.get_texts()]
     return [*figure.texts, *in_legends, *(text for ax in figure.axes for text in (ax.title, *ax.texts))]
 
 
 def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
-    """A logarithmic y axis with plain numbers at ``ticks`` times the powers of ten."""
+    """Make the y axis logarithmic, with plain numbers at ``ticks`` times the powers of ten."""
     ax.set_yscale("log")
     ax.yaxis.set_major_locator(LogLocator(subs=ticks, numticks=20))
     ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -158,7 +158,7 @@ def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
 
 
 def png(figure: Figure, packed: bool = False) -> bytes:
-    """A figure as a file.
+    """Return a figure as a PNG file.
 
     Args:
         figure: Drawn at `DPI`.
@@ -180,7 +180,7 @@ def png(figure: Figure, packed: bool = False) -> bytes:
 
 
 def vector(figure: Figure, format: Literal["svg", "pdf"]) -> bytes:
-    """A figure as lines and text, the same bytes each time; text stays text."""
+    """Return a figure as lines and text, the same bytes each time; text stays text."""
     content = BytesIO()
     named = {"Creator": MADE_BY, "Date" if format == "svg" else "CreationDate": None}
     with mpl.rc_context({**RC, "svg.fonttype": "none", "svg.hashsalt": MADE_BY, "pdf.fonttype": 42}):
@@ -191,7 +191,7 @@ def vector(figure: Figure, format: Literal["svg", "pdf"]) -> bytes:
 def pngs(
     directory: str | Path, figures: Mapping[str, Figure], packed: bool = False, format: Format = "png"
 ) -> dict[Path, str | bytes]:
-    """Figures as the files ``<name>.<format>`` of a folder, for `ekfslam.files.write_all`; see `png` and `vector`."""
+    """Return figures as files ``<name>.<format>`` of a folder, for `ekfslam.files.write_all`."""
     paths = [Path(directory) / f"{name}.{format}" for name in components(figures)]
     drawn = (png(figure, packed) if format == "png" else vector(figure, format) for figure in figures.values())
     return dict(zip(paths, drawn, strict=True))

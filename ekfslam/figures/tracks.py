@@ -1,4 +1,4 @@
-"""The figure of `ekfslam track`: tracks drawn into frames, and what became of them."""
+"""The figure of `ekfslam track`: tracks drawn into frames, and how they ended."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _DEPTHS_M = (3.0, 60.0)
 
 @styled
 def plot_tracks(recording: ImageRecording, sequence: Sequence, report: TrackReport) -> Figure:
-    """Left images with tracks, above lengths of tracks, losses by reason, and the rotation of the right camera.
+    """Draw left images with tracks, track lengths, losses by reason, and the rotation of the right camera.
 
     Args:
-        recording: Of which the tracks are; its images are read again.
+        recording: Recording of the tracks; its images are read again.
         sequence: Its tracks.
-        report: What became of them.
+        report: Report on the tracks.
     """
     rectified = rectification(recording.calibration)
     frames = np.unique(np.linspace(min(_TRAIL, len(sequence) - 1), len(sequence) - 1, _SHOWN).round().astype(int))
@@ -51,7 +51,7 @@ def plot_tracks(recording: ImageRecording, sequence: Sequence, report: TrackRepo
 
 
 def _draw_frame(ax: Axes, image: Image, sequence: Sequence, frame: int) -> None:
-    """One left image, the features that are seen in it, and where they were in the frames before."""
+    """Draw a left image, its features, and their places in earlier frames."""
     observations, camera = sequence.observations, sequence.camera
     ids, pixels = observations.at(frame)
     ax.imshow(image, cmap="gray", vmin=0, vmax=255)

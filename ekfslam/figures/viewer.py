@@ -19,7 +19,7 @@ from ekfslam import files
 from ekfslam.arrays import Array
 from ekfslam.errors import ConfigError, MissingPackageError
 from ekfslam.evaluation.consistency import world_axes_errors
-from ekfslam.figures.maps import SIGMAS
+from ekfslam.figures.maps import SIGMAS, spread
 from ekfslam.figures.style import LANDMARK_COLOR, style_of
 from ekfslam.filters.result import Result
 from ekfslam.geometry import se3
@@ -44,7 +44,7 @@ def write_viewer_file(archive: Archive, path: str | Path) -> None:
 
 
 def is_viewer_file(path: Path) -> bool:
-    """Whether a file is one of Rerun."""
+    """Return whether a file is one of Rerun."""
     with path.open("rb") as file:
         return file.read(3) == b"RRF"
 
@@ -91,7 +91,7 @@ def log_archive(archive: Archive, recording: Any) -> None:
 
 
 def _log_pose(recording: Any, place: str, result: Result, time_s: Array, color: tuple[int, ...]) -> None:
-    """The IMU over time: axes, the ellipsoid of its position, and the camera's image plane."""
+    """Log the IMU over time: axes, the ellipsoid of its position, and the image plane of the camera."""
     rr = _rerun()
     T = result.T_world_imu
     moves = rr.Transform3D.columns(
@@ -116,7 +116,7 @@ def _log_landmarks(recording: Any, place: str, result: Result) -> None:
     landmarks, color = result.landmarks, _bytes(LANDMARK_COLOR)
     position = landmarks.position_m
     recording.log(place, rr.Points3D(position, colors=[color], radii=[rr.Radius.ui_points(1.5)]), static=True)
-    some = np.unique(np.linspace(0, len(landmarks) - 1, min(_ELLIPSOIDS, len(landmarks))).astype(int))
+    some = spread(len(landmarks), _ELLIPSOIDS)
     axes, turns = _ellipsoids(landmarks.covariance[some])
     drawn = rr.Ellipsoids3D(centers=position[some], half_sizes=axes, quaternions=turns, colors=[color])
     recording.log(f"{place}/ellipsoids", drawn, static=True)
@@ -138,7 +138,7 @@ def _log_scalars(recording: Any, part: str, archive: Archive, result: Result, ti
 
 
 def _ellipsoids(covariance: Array) -> tuple[Array, Array]:
-    """Half axes (n, 3) of `SIGMAS` and quaternions (n, 4), scalar last, of covariances (n, 3, 3)."""
+    """Return half axes (n, 3) of `SIGMAS` and quaternions (n, 4), scalar last, of covariances (n, 3, 3)."""
     values, vectors = np.linalg.eigh(covariance)
     vectors = vectors * np.sign(np.linalg.det(vectors))[:, None, None]
     turns = Rotation.from_matrix(vectors).as_quat()

@@ -77,7 +77,7 @@ def plot_trajectory(result: Result, truth: Truth | None = None) -> Figure:
 
 
 def _truth(of: Any) -> Truth | None:
-    """The truth, of itself or of what has one."""
+    """Return a truth as it is, or that of a record that has one."""
     found = getattr(of, "truth", of)
     if found is not None and not isinstance(found, Truth):
         raise TypeError(f"expected a Truth, a Sequence or an Archive, found {type(of).__name__}")

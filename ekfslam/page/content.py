@@ -22,7 +22,7 @@ from ekfslam.evaluation.honesty import Honesty, judge
 from ekfslam.evaluation.summary import summarise
 from ekfslam.evaluation.trajectory import distance_along
 from ekfslam.figures import series
-from ekfslam.figures.maps import SIGMAS
+from ekfslam.figures.maps import SIGMAS, spread
 from ekfslam.figures.series import Series
 from ekfslam.figures.style import (
     BLUE,
@@ -155,14 +155,14 @@ def plotted(section: Section) -> dict[str, Any]:
     """Return everything that the script of a page draws of a recording, ready for JSON; arrays as `packed`."""
     archive = section.archive
     time_s = archive.time_s - archive.time_s[0]
-    kept, truth = thinned(len(time_s), POINTS), section.truth
+    kept, truth = spread(len(time_s), POINTS), section.truth
     return {
         "sigmas": SIGMAS,
         "landmarkColor": to_hex(LANDMARK_COLOR),
         "time": packed(time_s[kept]),
         "truth": truth
         and {
-            "xyz": packed(truth.T_world_imu[thinned(len(truth.frame), POINTS), :3, 3]),
+            "xyz": packed(truth.T_world_imu[spread(len(truth.frame), POINTS), :3, 3]),
             "landmarks": packed(truth.position_m),
         },
         "plots": _compared(section),
@@ -193,7 +193,7 @@ def _compared(section: Section) -> list[dict[str, Any]]:
 def _plotted_run(section: Section, j: int, kept: IntArray) -> dict[str, Any]:
     run, truth = section.runs[j], section.runs[j].truth
     result, T = run.result, run.result.T_world_imu
-    some = thinned(len(T), POSES)
+    some = spread(len(T), POSES)
     errors = [] if truth is None else series.errors(result, truth)
     words = "Without truth there are no errors to show."
     if errors:
@@ -237,7 +237,7 @@ def _plot(title: str, words: str, curves: Sequence[Curve]) -> dict[str, Any]:
     """Return a plot of curves with the axes of the first one."""
     first, drawn = curves[0][0], []
     for one, name, kind, run, band in curves:
-        some = one.only(thinned(len(one.x), POINTS))
+        some = one.only(spread(len(one.x), POINTS))
         arrays = {"x": some.x, "y": some.y, "low": some.low, "high": some.high}
         found = {key: packed(values) for key, values in arrays.items() if values is not None}
         drawn.append({"name": name, "kind": kind, "run": run, "band": band, **found})
@@ -262,11 +262,6 @@ def _landmarks(landmarks: Landmarks) -> dict[str, Any] | None:
         "cov": packed(_upper(landmarks.covariance)),
         "count": landmarks.observations.tolist(),
     }
-
-
-def thinned(length: int, most: int) -> IntArray:
-    """Return at most ``most`` indices spread over ``length``, first and last included."""
-    return np.unique(np.linspace(0, length - 1, min(most, length)).astype(np.int64))
 
 
 def packed(values: Array) -> dict[str, str]:
