@@ -13,17 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
+from ekfslam.data.checks import frozen, require_finite, require_rigid, require_shape, validate_stamps
 from ekfslam.data.noise import Noise
-from ekfslam.data.sequence import (
-    Truth,
-    VelocityFrame,
-    frozen,
-    require_finite,
-    require_rigid,
-    require_shape,
-    validate_stamps,
-    validate_truth,
-)
+from ekfslam.data.sequence import Truth, VelocityFrame, validate_truth
 from ekfslam.errors import CalibrationError, DataError, ExtrinsicsError
 from ekfslam.geometry import se3
 from ekfslam.names import printable

@@ -25,9 +25,9 @@ from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
+from ekfslam.data.checks import require_finite, require_shape
 from ekfslam.data.interval import Interval
 from ekfslam.data.noise import Noise
-from ekfslam.data.sequence import require_finite, require_shape
 from ekfslam.errors import ConfigError, DuplicateObservationError, LateError, MissingVelocityError, StampError
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.joint import JointEKF

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
+from ekfslam.data.checks import require_rigid
 from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.observations import flat_observations
 from ekfslam.data.readers.fields import (
@@ -23,7 +24,7 @@ from ekfslam.data.readers.fields import (
 )
 from ekfslam.data.readers.pickled import npy_header
 from ekfslam.data.readers.registry import Extrinsics, Lateral, Reader
-from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Observations, Sequence, require_rigid, validate_camera
+from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Observations, Sequence, validate_camera
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import CalibrationError, ExtrinsicsError, UnknownFormatError
 from ekfslam.geometry import se3

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
+from ekfslam.data.checks import require_rigid
 from ekfslam.data.images import Image, ImageRecording, PairCalibration
 from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.observations import flat_observations
@@ -18,7 +19,7 @@ from ekfslam.data.readers.ece276a import AS_STORED_NOTE, camera_of, stamps_of
 from ekfslam.data.readers.fields import checksum, require, require_numbers, spelled_as_in
 from ekfslam.data.readers.pickled import MAGIC, read_pickled
 from ekfslam.data.readers.registry import Reader
-from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, require_rigid
+from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import CalibrationError, ExtrinsicsError, LostDataError, ShapeError, UnknownFormatError
 from ekfslam.geometry import se3

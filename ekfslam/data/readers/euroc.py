@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
+from ekfslam.data.checks import require_rigid
 from ekfslam.data.images import Distortion, DistortionModel, ImageRecording, PairCalibration
 from ekfslam.data.readers.fields import checksum, spelled_as_in
 from ekfslam.data.readers.pictures import PairFiles, pair_stamps
@@ -20,7 +21,6 @@ from ekfslam.data.readers.poses import Poses, stamped_poses, truth_of_frames
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import Table, first_row, line_of, parse_table, read_lines, rows_of
 from ekfslam.data.readers.yaml import Calibration, read_yaml
-from ekfslam.data.sequence import require_rigid
 from ekfslam.errors import (
     CalibrationError,
     ExtrinsicsError,

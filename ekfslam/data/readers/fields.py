@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
+from ekfslam.data.checks import require_finite, require_shape
 from ekfslam.data.readers.registry import Lateral
-from ekfslam.data.sequence import require_finite, require_shape
 from ekfslam.errors import DataError, ShapeError
 
 LATERAL_NOTES: dict[Lateral, str] = {

@@ -27,12 +27,12 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
+from ekfslam.data.checks import require_rigid
 from ekfslam.data.images import Distortion, ImageRecording, PairCalibration
 from ekfslam.data.readers.fields import checksum, spelled_as_in
 from ekfslam.data.readers.pictures import PairFiles, images_in, size_of
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
-from ekfslam.data.sequence import require_rigid
 from ekfslam.data.velocities import attach_velocities
 from ekfslam.errors import CalibrationError, DataError, ExtrinsicsError, LostDataError, UnknownFormatError
 from ekfslam.geometry import se3

@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ekfslam.data.checks import require_rigid
 from ekfslam.data.images import ImageRecording, PairCalibration
 from ekfslam.data.readers.pictures import PairFiles, in_order, numbered_images, size_of
 from ekfslam.data.readers.poses import Poses
 from ekfslam.data.readers.registry import Reader
 from ekfslam.data.readers.text import first_row, parse_table, read_keys, read_lines
-from ekfslam.data.sequence import Sequence, require_rigid
+from ekfslam.data.sequence import Sequence
 from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import CalibrationError, LostDataError, ShapeError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3

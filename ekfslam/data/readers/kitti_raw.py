@@ -23,6 +23,7 @@ from typing import Literal
 import numpy as np
 
 from ekfslam.arrays import Array
+from ekfslam.data.checks import require_rigid
 from ekfslam.data.images import ImageRecording, PairCalibration
 from ekfslam.data.readers.fields import checksum, spelled_as_in
 from ekfslam.data.readers.oxts import EXPECTED, Oxts, image_stamp_notes, read_oxts
@@ -30,7 +31,7 @@ from ekfslam.data.readers.pictures import PairFiles, in_order, numbered_images, 
 from ekfslam.data.readers.poses import Poses
 from ekfslam.data.readers.registry import Lateral, Reader, Source
 from ekfslam.data.readers.text import read_keys
-from ekfslam.data.sequence import WITHOUT_TRACKS, Observations, Sequence, require_rigid, validate_camera
+from ekfslam.data.sequence import WITHOUT_TRACKS, Observations, Sequence, validate_camera
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import CalibrationError, ConfigError, ExtrinsicsError, LostDataError, UnknownFormatError
