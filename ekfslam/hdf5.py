@@ -222,6 +222,7 @@ def read_record(
     sizes: dict[str, int],
     coordinates: Coordinates = NONE,
     complete: Callable[[type, dict[str, Any]], dict[str, Any]] = lambda record, found: found,
+    former: Mapping[type, stored.Layout] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Read the stored fields of a class of records, checked; see `write_record`.
 
@@ -231,6 +232,7 @@ def read_record(
         sizes: Known shared lengths; those found here are added.
         coordinates: Values along dimensions; coordinates in the file must equal them.
         complete: Function of class and fields that adds fields which older releases did not write.
+        former: Data sets that older releases wrote for a class, for ``complete``.
 
     Raises:
         ArchiveError: A field is missing, has another shape or type, or breaks its check.
@@ -239,7 +241,8 @@ def read_record(
     found = {name: _read_attribute(group, name, kind) for name, (kind, _) in stored.attributes_of(record).items()}
     coordinates = {**coordinates, **_named_entries(record, found)}
     present = tuple(item for item in layout if item.name in group)
-    found = complete(record, found | _read(group, present, sizes))
+    earlier = tuple(item for item in former.get(record, ()) if item.name in group)
+    found = complete(record, found | _read(group, (*present, *earlier), sizes))
     for item in layout:
         if item.field not in found:
             raise ArchiveError(f"{_place(group, item.name)} is missing")
@@ -252,7 +255,7 @@ def read_record(
     optional = {field.name for field in dataclasses.fields(record) if field.default is None}
     for name, part in stored.groups_of(record).items():
         is_there = name in group or name not in optional
-        below = read_record(subgroup(group, name), part, sizes, coordinates, complete) if is_there else None
+        below = read_record(subgroup(group, name), part, sizes, coordinates, complete, former) if is_there else None
         found[name] = None if below is None else part(**below)
     return found
 

@@ -145,7 +145,7 @@ AXES: Mapping[str, Axis] = MappingProxyType(
         "R": Axis("rejection", "rejected observations"),
         "K": Axis("observation", "observations"),
         "B": Axis("coordinate", "coordinates of the state blocks"),
-        "U": Axis("up_axis", "axes of the direction up; none where it is not estimated"),
+        "U": Axis("curved_axis", "values of blocks that are no sums of corrections"),
         "P": Axis("parameter", "parameters by name"),
         "F": Axis("frame", "frames of known pose; their numbers"),
         "d": Axis("sensor_row", "rows of a measurement"),

@@ -115,8 +115,9 @@ def factors_of(result: Result, config: PosteriorConfig) -> Factors:
     log, rig = log_of(result), result.camera
     assert not log.initial_covariance.any() and (log.variance == log.variance[0]).all()
 
-    measured = se3.inverse(motion.increment(log.twist, log.tau_s))
-    Q = motion.process_noise(log.twist, log.tau_s, result.noise.velocity_std, result.noise.misalignment_rad)
+    twist = np.concatenate([np.zeros((1, 6)), log.inputs])
+    measured = se3.inverse(motion.increment(twist, log.tau_s))
+    Q = motion.process_noise(twist, log.tau_s, result.noise.velocity_std, result.noise.misalignment_rad)
     Q = Q[:, ROTATION_FIRST][:, :, ROTATION_FIRST]
     # Not "smart", which would drop small covariances and with them 1e-5 of the cost.
     between = [
@@ -207,7 +208,7 @@ def incremental(
     parameters.relinearizeSkip = skip
     isam = gtsam.ISAM2(parameters)
 
-    measured = se3.inverse(motion.increment(log.twist, log.tau_s))
+    measured = se3.inverse(motion.increment(np.concatenate([np.zeros((1, 6)), log.inputs]), log.tau_s))
     T_imu_cam = se3.inverse(result.T_cam_imu)
     T_world_imu = se3.inverse(log.T_predicted[0])
     start_of_frame = np.searchsorted(log.frame, np.arange(log.frames + 1))

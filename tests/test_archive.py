@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.former import age_log
 from support.helpers import synthetic_result, synthetic_sequence
 from support.same import assert_same
 
@@ -38,9 +39,6 @@ OF_A_RUN = [
     for item in layout
     if group in ("", "landmarks", "innovation", "rejections")
 ]
-SINCE_VERSION_4 = ("imu_twist", "seen_twist", "T_imu_world_departed", "T_imu_world_linear_before", "departed", "linear")
-SINCE_VERSION_4 += ("updated", "up", "previous", "velocity_frame", "velocity_axis", "velocity_value", "velocity_std")
-SINCE_VERSION_4 += ("velocity_is_biased",)
 
 
 @pytest.fixture(scope="module")
@@ -305,8 +303,7 @@ def test_adding_to_an_archive_of_an_earlier_version_keeps_its_runs_readable(with
     path = Path(shutil.copy(with_log, tmp_path / "old.h5"))
     with h5py.File(path, "a") as h5file:
         h5file.attrs["format_version"] = 3
-        for name in SINCE_VERSION_4:
-            del h5file["runs/full/log"][name]
+        age_log(h5file["runs/full/log"], version=3)
     before = open_result(path, "full")
     for name in ("first", "second"):
         add_result(path, dataclasses.replace(added, mode=name))
@@ -314,6 +311,18 @@ def test_adding_to_an_archive_of_an_earlier_version_keeps_its_runs_readable(with
     with h5py.File(path) as h5file:
         assert h5file.attrs["format_version"] == FORMAT_VERSION
         assert "T_imu_world_departed" in h5file["runs/full/log"], "a file has one version"
+
+
+def test_a_log_with_velocities_alone_is_read_as_inputs_of_a_process(with_log, tmp_path):
+    path = Path(shutil.copy(with_log, tmp_path / "old.h5"))
+    with h5py.File(path, "a") as h5file:
+        h5file.attrs["format_version"] = 5
+        age_log(h5file["runs/full/log"], version=5)
+    before, found = open_result(with_log, "full").log, open_result(path, "full").log
+    for name in vars(before):
+        if name != "initial_covariance":
+            np.testing.assert_allclose(getattr(found, name), getattr(before, name), atol=1e-12, err_msg=name)
+    np.testing.assert_array_equal(found.initial_covariance, before.initial_covariance[:6, :6])
 
 
 def test_drift_of_an_earlier_version_is_not_taken_for_pixels(copy):

@@ -305,7 +305,8 @@ def test_what_was_found_is_kept_printed_and_used_by_the_posterior(tmp_path, caps
     # The posterior estimates it, too: with the calibration as given all would fit far worse.
     smoothed = posterior(result)
     noise, log = result.noise, result.log
-    as_given = model_of(Rig(world.camera, world.T_cam_imu, noise), noise, log.T_predicted[0], log.initial_covariance)
+    rig = Rig(world.camera, world.T_cam_imu, noise)
+    as_given = model_of(rig, noise, log.T_predicted[0], log.initial_covariance[:6, :6])
     assert smoothed.cost < 0.9 * posterior_of_log(log, as_given, result.landmarks.position_m).cost
     std = np.sqrt(np.diag(smoothed.block_covariance("calibration")))
     assert abs(smoothed.values["calibration"][6] - 0.05) < 3 * std[0]

@@ -143,7 +143,7 @@ def test_wheels_beside_an_imu_help_and_stay_consistent():
         )
         rig = Rig(CAMERA, T_CAM_IMU, sequence.noise)
         ekf, of_filter, _, of_smoother = drive(sequence, rig, further=wheels_of(sequence, twist, rng))
-        assert np.unique(ekf.log().velocity_axis[~ekf.log().velocity_is_biased]).tolist() == [0, 5]
+        assert np.unique(ekf.log().measured_axis[~ekf.log().measured_is_biased]).tolist() == [0, 5]
         before.append(of_filter.mean())
         behind.append(of_smoother.mean())
         variance["with"].append(np.trace(ekf.P[:6, :6]))
@@ -222,9 +222,9 @@ def test_velocities_by_every_block_against_central_differences(with_twist):
     model = model_of(Rig(CAMERA, T_CAM_IMU, noise), noise, T, np.eye(6), None, [BIAS])
     rng, measured = np.random.default_rng(0), np.array([6.0, 0.1, 0.2, 0.02, -0.03, 0.3])
     values = model.retract(model.initial_values(), 0.1 * rng.normal(size=model.layout.body))
-    _, by = model.imu_velocities(values, measured, values["pose"][:3, :3])
+    _, by = model.process.imu_velocities(values, measured, values["pose"][:3, :3])
     numeric = central(
-        lambda x: model.imu_velocities(model.retract(values, x), measured, T[:3, :3])[0], model.layout.body
+        lambda x: model.process.imu_velocities(model.retract(values, x), measured, T[:3, :3])[0], model.layout.body
     )
     np.testing.assert_allclose(by, numeric, atol=1e-8)
     assert np.abs(by[:, model.layout["twist_bias"]]).max() > 0.5 or with_twist

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from support.everything import BLOCKS, CALIBRATION, EVERYTHING, PRIOR, with_everything
+from support.frozen import assert_equal_to_frozen_rows
 from support.helpers import truth_error
 from support.running import WHOLE
 
@@ -17,9 +18,7 @@ from ekfslam.filters.loop import run_filter
 from ekfslam.resolve import resolve
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
-from ekfslam.smoother.problem import BatchProblem
 from ekfslam.smoother.revival import MapRevival
-from ekfslam.smoother.sparse.information import JointInformation
 
 SHARED = ["camera_jitter", "vision_drift", "previous_camera_jitter"]
 ALL_BLOCKS = ["pose", "previous_pose", "calibration", *SHARED, "twist", "up", "twist_bias"]
@@ -35,25 +34,6 @@ def drive(sequence, settings, blocks=ALL_BLOCKS):
     for _ in run_filter(ekf, problem.sequence):
         pass
     return ekf
-
-
-def assert_equal_to_frozen_rows(ekf):
-    """Blocks, landmarks and the whole covariance, to 1e-8 of their standard deviations or better."""
-    problem = BatchProblem(ekf.log(), ekf.model)
-    information, unknowns = JointInformation(problem.as_filtered()), problem.unknowns
-    landmarks, layout = ekf.table.log_row, ekf.model.layout
-    found = np.zeros(layout.body)
-    found[unknowns.frame_columns] = information.eps[-1]
-    found[unknowns.clone_columns] = information.eps[-2, unknowns.cloned]
-    found[unknowns.aux_columns], found[unknowns.drive_columns] = information.aux[-1], information.drive
-    np.testing.assert_allclose(found, ekf.coordinates, atol=1e-8)
-    np.testing.assert_allclose(
-        problem.log.first_position_m[landmarks] + information.d[landmarks], ekf.positions_m, atol=1e-8
-    )
-    P = MapRevival(ekf.model, ekf.config).covariance(problem, information, landmarks)
-    std = np.sqrt(np.diag(ekf.P))
-    assert (np.abs(P - ekf.P) <= 1e-8 * np.outer(std, std)).all()
-    assert (std > 0).all()
 
 
 @pytest.mark.parametrize("variant", ["standard", "fej"])

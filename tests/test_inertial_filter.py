@@ -6,14 +6,17 @@ import functools
 import numpy as np
 import pytest
 from inertial import FILTER, LARGE, Prior, model_from_prior, outcomes, run_once
+from support.frozen import assert_equal_to_frozen_rows
 from support.gauge import gauge_directions
 
 import ekfslam
 from ekfslam.data.room import Room, simulate_room
-from ekfslam.errors import ConfigError, PosteriorError
+from ekfslam.errors import ConfigError
+from ekfslam.evaluation.consistency import nees, pose_error
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.resolve import resolve
+from ekfslam.smoother.posterior import smooth
 
 FREE = Prior(position_m=0.5, tilt_rad=0.2, yaw_rad=0.2, rest_s=0.0)
 
@@ -85,9 +88,27 @@ def test_samples_without_densities_are_refused():
         ekfslam.run(dataclasses.replace(room(), inputs=(samples,)), "full")
 
 
-def test_runs_with_samples_are_not_smoothed_yet():
-    with pytest.raises(PosteriorError, match="cannot be smoothed yet"):
-        ekfslam.posterior(ekfslam.run(room()[:20], "full"))
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_frozen_steps_have_the_state_of_the_filter_as_solution(variant):
+    config = dataclasses.replace(FILTER, variant=variant, landmark_coordinates="xyz", retire="never")
+    prior = Prior(position_m=0.004, tilt_rad=0.02, yaw_rad=0.02, rest_s=0.0)
+    ekf = JointEKF(model_from_prior(room(), prior, np.random.default_rng(0)), config)
+    for _ in run_filter(ekf, room(), range(40)):
+        pass
+    assert_equal_to_frozen_rows(ekf)
+
+
+@pytest.mark.slow
+def test_a_run_with_samples_is_smoothed_from_its_archive(tmp_path):
+    sequence = room()
+    filtered = ekfslam.run(sequence, "full")
+    ekfslam.write_archive(tmp_path / "room.h5", sequence, {"full": filtered})
+    smoothed = smooth(ekfslam.read_archive(tmp_path / "room.h5").results["full"])
+    truth = sequence.truth.T_world_imu
+    error = nees(pose_error(smoothed.T_world_imu, truth), smoothed.covariance)[1:]
+    assert 2.0 < error.mean() < 12.0
+    trace = [np.trace(result.covariance[len(truth) // 2]) for result in (smoothed, filtered)]
+    assert trace[0] < 0.8 * trace[1]
 
 
 @pytest.mark.slow

@@ -12,6 +12,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import ekfslam
+from ekfslam.models import blocks
+from ekfslam.models.blocks import StateBlock
 
 # Rooms from the lowest to the highest: folders, and the modules that lie in ekfslam/ itself. A new one gets its place.
 ROOMS: tuple[tuple[str, ...], ...] = (
@@ -110,3 +112,39 @@ def test_a_lazy_import_closes_a_circle(tmp_path: Path) -> None:
     found = imports_of(package)
     assert circles(found) == [{"ekfslam.files", "ekfslam.config"}]
     assert upwards(found) == {("ekfslam.files", "ekfslam.config")}
+
+
+def block_names() -> set[str]:
+    """Return the names of all blocks of the package but the pose's."""
+    kinds = {kind for kind in vars(blocks).values() if isinstance(kind, type) and issubclass(kind, StateBlock)}
+    return {str(kind.name) for kind in kinds if isinstance(kind.name, str)} - {"pose"}
+
+
+def names_a_block(node: ast.AST, names: set[str], kinds: set[str]) -> bool:
+    """Return whether a node indexes by the name of a block, compares with it, or asks for its class."""
+    if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name | ast.Attribute):
+        where = node.value.id if isinstance(node.value, ast.Name) else node.value.attr
+        literal = isinstance(node.slice, ast.Constant) and node.slice.value in names
+        return literal and where in ("layout", "values", "before", "after", "shared")
+    if isinstance(node, ast.Compare):
+        parts = [node.left, *node.comparators]
+        asks = any(isinstance(part, ast.Attribute) and part.attr == "name" for part in parts)
+        return asks and any(isinstance(part, ast.Constant) and part.value in names for part in parts)
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("isinstance", "issubclass"):
+        return any(isinstance(part, ast.Name) and part.id in kinds for part in ast.walk(node.args[1]))
+    return False
+
+
+def test_no_other_file_names_a_block():
+    names = block_names()
+    kinds = {kind for kind in vars(blocks) if isinstance(vars(blocks)[kind], type)} - {"StateBlock", "Layout"}
+    assert {"twist", "calibration", "velocity", "previous_pose"} <= names
+    root = Path(ekfslam.__file__).parent
+    found = [
+        f"{path.relative_to(root)}:{node.lineno}"
+        for path in sorted(root.rglob("*.py"))
+        if root / "models" / "blocks" not in path.parents
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.expr) and names_a_block(node, names, kinds)
+    ]
+    assert found == []

@@ -329,9 +329,10 @@ def test_the_log_and_all_that_is_known_of_up_give_the_velocities_of_the_imu():
     assert np.abs(level.twist - world.twist).max() > 0.2
     ekf = end_of(level)
     log = ekf.log()
-    np.testing.assert_array_equal(log.twist[1:], level.twist[1:])
-    up = (log.T_departed[1:, :3, :3] @ log.up[1:, :, None])[..., 0]
-    np.testing.assert_allclose(log.imu_twist[1:], in_imu(log.twist[1:], up), atol=1e-12)
+    np.testing.assert_array_equal(log.inputs, level.twist[1:])
+    up = (log.T_departed[1:, :3, :3] @ log.curved[1:, :, None])[..., 0]
+    driven = se3.log(log.T_departed[1:] @ se3.inverse(log.T_predicted[1:])) / log.tau_s[1:, None]
+    np.testing.assert_allclose(driven, in_imu(log.inputs, up), atol=1e-12)
     values = {"pose": log.T_updated[:-1], "up": np.broadcast_to(ekf.values["up"], (len(world) - 1, 3))}
-    turned, _ = ekf.model.imu_velocities(values, log.twist[1:], log.T_updated[:-1, :3, :3])
+    turned, _ = ekf.model.process.imu_velocities(values, log.inputs, log.T_updated[:-1, :3, :3])
     np.testing.assert_allclose(turned, world.twist[1:], atol=0.03)

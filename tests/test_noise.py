@@ -148,7 +148,10 @@ def test_interpolated_velocities_are_trusted_less():
         pass
     log = ekf.log()
     assert np.flatnonzero(log.is_gap).tolist() == list(range(10, 21))
-    plain, wide = (problem.model.process_noise(log.imu_twist[11:12], 0.1, np.array([is_gap]))[0] for is_gap in (0, 1))
+    plain, wide = (
+        problem.model.process.step(ekf.values, Interval.of_one(log.inputs[10], 0.1, is_gap), ekf.T_imu_world, False).Q
+        for is_gap in (False, True)
+    )
     added = problem.model.noise.gap_std
     np.testing.assert_allclose(np.diag(wide - plain)[0], (0.1 * added[0]) ** 2, rtol=0.05)
     smoother = BatchProblem(log, problem.model)

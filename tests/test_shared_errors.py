@@ -424,7 +424,7 @@ def test_residuals_of_the_batch_problem():
     shared = state.shared + 0.01 * rng.normal(size=state.shared.shape)
     state = dataclasses.replace(state, shared=shared, drive_values=drive_values)
     names = ["camera_jitter", "vision_drift"]
-    T, tau, way_m = state.T_imu_world, log.tau_s, np.linalg.norm(log.twist[:, :3], axis=1) * log.tau_s
+    T, tau, way_m = state.T_imu_world, log.tau_s, log.way_m
     twist = [log.seen_twist[0], *(-se3.log(T[k] @ se3.inverse(T[k - 1])) / tau[k] for k in range(1, 9))]
 
     def left(i, follows):

@@ -18,7 +18,6 @@ from ekfslam.filters.landmarks import LandmarkTable
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
 from ekfslam.models.build import has_image_coordinates
-from ekfslam.models.model import GIVEN as GIVEN
 from ekfslam.models.model import Model
 from ekfslam.models.sensors.base import Sensor
 
@@ -97,7 +96,7 @@ class Estimate:
         self.model, self.config = model, config
         self.variant = VARIANTS[config.variant]
         self.values = model.initial_values()
-        self.coordinates, self.imu_twist = np.zeros(model.layout.body), np.zeros(6)
+        self.coordinates, self.imu_twist = model.initial_coordinates, np.zeros(6)
         self.table = LandmarkTable(model.sensor.dimension)
         form = ConditionalGaussian if config.covariance_form == "conditional" else DenseGaussian
         self.gaussian: Gaussian = form(model.prior_covariance, model.layout.seen)
@@ -172,9 +171,9 @@ class Estimate:
         return self.variant.linear(self.T_imu_world, self.motion.T_predicted)
 
     @property
-    def up_world(self) -> Array:
-        """(3,) direction against gravity where it is estimated, else (0,)."""
-        return self.values.get("up", np.empty(0))
+    def curved(self) -> Array:
+        """(v,) values of blocks whose value is no sum of corrections, as in the log."""
+        return np.concatenate([np.empty(0), *(self.values[block.name] for block in self.model.layout.curved)])
 
     def covariance_of(self, ids: IntArray) -> Array:
         """Joint covariance (b+3k, b+3k) of the blocks and of some active landmarks.

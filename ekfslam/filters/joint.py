@@ -92,7 +92,7 @@ class JointEKF(Estimate):
     def begin(self, inputs: Array) -> None:
         """Take the inputs (c,) at the first frame, to which no prediction leads; only a time offset needs them."""
         self.imu_twist = self.model.process.begin(self.values, np.asarray(inputs, dtype=float))
-        self._log.amend(imu_twist=self.imu_twist, seen_twist=self.imu_twist)
+        self._log.amend(seen_twist=self.imu_twist)
 
     def predict(
         self, inputs: Interval | Array, tau_s: float = 0.0, also: Measured | None = None, is_gap: bool = False

@@ -12,7 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.interval import Intervals
+from ekfslam.models.process.base import Measured
 from ekfslam.stored import (
     COUNTS,
     COVARIANCES,
@@ -24,7 +28,6 @@ from ekfslam.stored import (
     attribute,
     index_of,
     stored,
-    whole,
 )
 
 _COORDINATES = "see ekfslam.filters.log"
@@ -42,22 +45,26 @@ class Log:
 
     Args:
         first_estimates: Whether the filter took the landmark's place in H at its first estimate (FEJ).
-        initial_covariance: (6, 6) of the first pose's error ``xi``.
-        twist: (T, 6) measured velocities, m/s and rad/s.
-        tau_s: (T,) length of the interval that each twist drove; 0 for the first frame.
-        imu_twist: (T, 6) velocities of the IMU that moved the pose, as estimated at the prediction.
-        seen_twist: (T, 6) velocities of the IMU by which a time offset counted in the update.
+        initial_covariance: (body, body) of all blocks before the first frame. Archives of versions before 6 have that
+            of the first pose alone, (6, 6).
+        tau_s: (T,) length of the interval that led to each frame; 0 for the first one.
+        is_gap: (T,) whether its inputs were interpolated across a gap.
+        input_frame: (N,) frame to which each piece of the inputs led, ascending; none led to the first one.
+        input_dt_s, inputs: (N,), (N, c) durations and inputs of the pieces, see `ekfslam.data.interval.Interval`.
+        way_m: (T,) way driven during the interval.
+        seen_twist: (T, 6) velocity of the IMU by which a time offset counted in the update.
         T_departed: (T, 4, 4) ``T_imu_world`` of the frame before from which the prediction to this frame led.
         T_predicted: (T, 4, 4) ``T_imu_world`` before the update of each frame.
         T_linear: (T, 4, 4) ``T_imu_world`` at which the update was linearised: the predicted one, unless it was
             iterated or a landmark came back.
         T_linear_before: (T, 4, 4) the same of the clone of the frame before.
         T_updated: (T, 4, 4) ``T_imu_world`` after the update.
-        departed: (T, body) coordinates of the blocks before the pose moved to this frame: those of the pose are of the
-            frame before, those of all other blocks of this frame.
+        departed: (T, body) coordinates of the blocks before the process moved its own ones: these are of the frame
+            before, all others of this frame.
         linear: (T, body) coordinates at which the update was linearised.
         updated: (T, body) coordinates after the update.
-        up: (T, 3) direction against gravity in world, where it is estimated, at the prediction; else (T, 0).
+        curved: (T, v) values at the prediction of blocks whose value is no sum of corrections, in the order of their
+            columns.
         id: (M,) landmark ids in the order of landmark initialisation; an id occurs again where a track was split.
         first_position_m: (M, 3) position at landmark initialisation, in world.
         frame: (K,) frame of each accepted observation; ascending but for views that waited for a second one.
@@ -67,18 +74,20 @@ class Log:
         rows: (K, d) what was measured: the sensor's rows.
         variance: (K, d) variances of the rows, or of their differences.
         position_m: (K, 3) where the landmark was linearised, in world.
-        is_gap: (T,) whether the velocities that led to a frame were interpolated across a gap.
-        velocity_frame: (N,) frame of each scalar measurement of velocities, where these are estimated.
-        velocity_axis, velocity_value, velocity_std, velocity_is_biased: (N,) see `ekfslam.models.process.Measured`.
+        measured_frame: (S,) frame of each scalar measurement of blocks by inputs.
+        measured_axis, measured_value, measured_std, measured_is_biased: (S,) see `ekfslam.models.process.Measured`.
     """
 
     first_estimates: bool = field(metadata=attribute(bool))
     initial_covariance: Array = field(
-        metadata=stored("xi xi", "m^2, m rad, rad^2 (rho 0-2, theta 3-5)", "imu", COVARIANCES)
+        metadata=stored("prior_coordinate prior_coordinate", "squares of the units of the blocks", "imu", COVARIANCES)
     )
-    twist: Array = field(metadata=stored("T u", _VELOCITIES, "that of the velocities"))
     tau_s: Array = field(metadata=stored("T", "s", check=NOT_NEGATIVE, name="tau"))
-    imu_twist: Array = field(metadata=stored("T u", _VELOCITIES, "imu"))
+    is_gap: BoolArray = field(metadata=stored("T", "truth value", check=FLAGS))
+    input_frame: IntArray = field(metadata=stored("piece", "frame index", check=FRAMES))
+    input_dt_s: Array = field(metadata=stored("piece", "s", check=NOT_NEGATIVE, name="input_dt"))
+    inputs: Array = field(metadata=stored("piece input", "of the process: m/s and rad/s, or rad/s and m/s^2", "inputs"))
+    way_m: Array = field(metadata=stored("T", "m", check=NOT_NEGATIVE, name="way"))
     seen_twist: Array = field(metadata=stored("T u", _VELOCITIES, "imu"))
     T_departed: Array = field(metadata=_poses("T_imu_world_departed"))
     T_predicted: Array = field(metadata=_poses("T_imu_world_predicted"))
@@ -88,7 +97,7 @@ class Log:
     departed: Array = field(metadata=stored("T B", _COORDINATES, "imu"))
     linear: Array = field(metadata=stored("T B", _COORDINATES, "imu"))
     updated: Array = field(metadata=stored("T B", _COORDINATES, "imu"))
-    up: Array = field(metadata=stored("T U", "1", "world"))
+    curved: Array = field(metadata=stored("T U", "those of the blocks", "world"))
     id: IntArray = field(metadata=stored("L", "landmark id", check=COUNTS, name="landmark_id"))
     first_position_m: Array = field(metadata=stored("L xyz", "m", "world", name="first_position"))
     frame: IntArray = field(metadata=stored("K", "frame index", check=FRAMES))
@@ -97,17 +106,27 @@ class Log:
     rows: Array = field(metadata=stored("K d", "px, (uL, v, uR) or (u, v, disparity)", "image"))
     variance: Array = field(metadata=stored("K d", "px^2", "image", POSITIVE))
     position_m: Array = field(metadata=stored("K xyz", "m", "world", name="linear_position"))
-    velocity_frame: IntArray = field(metadata=stored("velocity", "frame index", check=FRAMES))
-    velocity_axis: IntArray = field(metadata=stored("velocity", "axis, 0 to 5", check=whole(0, 5)))
-    velocity_value: Array = field(metadata=stored("velocity", "m/s or rad/s", "that of the velocities"))
-    velocity_std: Array = field(metadata=stored("velocity", "m/s or rad/s", "that of the velocities", NOT_NEGATIVE))
-    velocity_is_biased: BoolArray = field(metadata=stored("velocity", "truth value", check=FLAGS))
-    is_gap: BoolArray = field(metadata=stored("T", "truth value", check=FLAGS))
+    measured_frame: IntArray = field(metadata=stored("measured", "frame index", check=FRAMES))
+    measured_axis: IntArray = field(metadata=stored("measured", "component of the process", check=COUNTS))
+    measured_value: Array = field(metadata=stored("measured", "of the component", "inputs"))
+    measured_std: Array = field(metadata=stored("measured", "of the component", "inputs", NOT_NEGATIVE))
+    measured_is_biased: BoolArray = field(metadata=stored("measured", "truth value", check=FLAGS))
 
     @property
     def frames(self) -> int:
         """Number of frames T."""
         return len(self.tau_s)
+
+    @property
+    def intervals(self) -> Intervals:
+        """The T-1 intervals between frames."""
+        start = np.searchsorted(self.input_frame, np.arange(1, self.frames + 1))
+        return Intervals(self.tau_s[1:], self.is_gap[1:], start, self.input_dt_s, self.inputs)
+
+    @property
+    def measured(self) -> Measured:
+        """Measurements of blocks by inputs."""
+        return Measured(self.measured_axis, self.measured_value, self.measured_std, self.measured_is_biased)
 
     @property
     def landmarks(self) -> int:

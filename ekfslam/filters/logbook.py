@@ -13,12 +13,11 @@ from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.log import Log
 from ekfslam.filters.prediction import Prediction
 from ekfslam.models.process import Measured
-from ekfslam.models.process.velocities import mean_velocity
 
 _PER_FRAME = (
-    "twist",
     "tau_s",
-    "imu_twist",
+    "is_gap",
+    "way_m",
     "seen_twist",
     "T_departed",
     "T_predicted",
@@ -28,8 +27,7 @@ _PER_FRAME = (
     "departed",
     "linear",
     "updated",
-    "up",
-    "is_gap",
+    "curved",
 )
 
 
@@ -42,7 +40,7 @@ class LogBook:
 
     def __init__(self, start: Estimate) -> None:
         self._first_estimates = start.variant.first_estimates
-        self._initial_covariance = start.gaussian.body_covariance[:6, :6]
+        self._initial_covariance = start.gaussian.body_covariance
         self._frames: dict[str, list] = {name: [] for name in _PER_FRAME}
         no_index, none, rows = np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, start.sensor.dimension))
         self._lists: dict[str, list] = {
@@ -54,27 +52,33 @@ class LogBook:
             "rows": [rows],
             "variance": [rows],
             "position_m": [np.empty((0, 3))],
-            "velocity_frame": [no_index],
-            "velocity_axis": [no_index],
-            "velocity_value": [none],
-            "velocity_std": [none],
-            "velocity_is_biased": [np.empty(0, dtype=bool)],
+            "input_frame": [no_index],
+            "input_dt_s": [none],
+            "inputs": [np.empty((0, 6))],
+            "measured_frame": [no_index],
+            "measured_axis": [no_index],
+            "measured_value": [none],
+            "measured_std": [none],
+            "measured_is_biased": [np.empty(0, dtype=bool)],
         }
         self._landmarks = self._observations = 0
-        self._add_frame(start, start.motion.interval, start.coordinates)
+        self._add_frame(start, start.coordinates)
 
     def predicted(self, now: Estimate, interval: Interval, found: Prediction) -> None:
         """Add a frame, reached by a prediction over an interval."""
         if found.measured is not None:
             self._measured(found.measured)
-        self._add_frame(now, interval, found.departed)
+        self._lists["input_frame"].append(np.full(len(interval.dt_s), now.step))
+        self._lists["input_dt_s"].append(interval.dt_s)
+        self._lists["inputs"].append(interval.inputs)
+        self._add_frame(now, found.departed)
 
-    def _add_frame(self, now: Estimate, interval: Interval, departed: Array) -> None:
+    def _add_frame(self, now: Estimate, departed: Array) -> None:
         T, coordinates = now.T_imu_world, now.coordinates.copy()
         values = {
-            "twist": mean_velocity(interval),
-            "tau_s": interval.tau_s,
-            "imu_twist": now.imu_twist,
+            "tau_s": now.motion.tau_s,
+            "is_gap": now.motion.interval.is_gap,
+            "way_m": now.motion.way_m,
             "seen_twist": now.imu_twist,
             "T_departed": now.motion.T_departed,
             "T_predicted": T,
@@ -84,8 +88,7 @@ class LogBook:
             "departed": departed,
             "linear": coordinates,
             "updated": coordinates,
-            "up": now.up_world,
-            "is_gap": interval.is_gap,
+            "curved": now.curved,
         }
         for name, value in values.items():
             self._frames[name].append(value)
@@ -97,9 +100,9 @@ class LogBook:
 
     def _measured(self, rows: Measured) -> None:
         """Add measurements of blocks during the interval to the next frame."""
-        self._lists["velocity_frame"].append(np.full(len(rows.axis), len(self._frames["tau_s"])))
+        self._lists["measured_frame"].append(np.full(len(rows.axis), len(self._frames["tau_s"])))
         for field in fields(rows):
-            self._lists[f"velocity_{field.name}"].append(getattr(rows, field.name))
+            self._lists[f"measured_{field.name}"].append(getattr(rows, field.name))
 
     def corrected(self, now: Estimate, found: Correction) -> None:
         """The correction of this frame, before the estimate takes it."""

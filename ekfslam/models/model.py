@@ -16,11 +16,10 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.interval import Interval
 from ekfslam.data.noise import Noise, TrackError
-from ekfslam.geometry import motion, se3
+from ekfslam.geometry import se3
 from ekfslam.models.blocks import Calibration, Layout, StateBlock, Values
 from ekfslam.models.observation import linearise
-from ekfslam.models.process import MakeProcess, Measured, Process, Step, VelocityInputs
-from ekfslam.models.process.velocities import velocities
+from ekfslam.models.process import MakeProcess, Process, Step, velocities
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
 
@@ -184,6 +183,15 @@ class Model:
             P[self.layout[block.name], self.layout[block.name]] = block.prior_covariance()
         return P
 
+    @cached_property
+    def initial_coordinates(self) -> Array:
+        """(body,) before the first frame: the values of vectors, and 0 for all other blocks."""
+        coordinates = np.zeros(self.layout.body)
+        for block in self.layout.blocks:
+            if not (block.is_pose or block.is_curved) and (value := block.initial()).shape == (block.size,):
+                coordinates[self.layout[block.name]] = value
+        return coordinates
+
     def initial_values(self) -> dict[str, Array]:
         """Value of every block before the first frame."""
         return {block.name: block.initial() for block in self.blocks}
@@ -278,26 +286,6 @@ class Model:
             columns = self.layout.columns(step.values)
             Phi[columns], Q[np.ix_(columns, columns)] = step.Phi, step.Q
         return Transition({**values, **step.values}, Phi, Q, step.imu_twist)
-
-    # --- to be replaced by the process in the smoother ----------------------------------------------------------------
-
-    def way_m(self, measured: Array, tau_s: Array | float) -> Array:
-        """Way (...) driven over intervals, by the measured velocities (..., 6)."""
-        return np.asarray(np.linalg.norm(measured[..., :3], axis=-1) * np.asarray(tau_s))
-
-    def velocity_jacobian(self, rows: Measured) -> Array:
-        """H (n, body) of velocity measurements by all blocks."""
-        return self.process.jacobian(rows)
-
-    def imu_velocities(self, values: Values, measured: Array, R_linear: Array) -> tuple[Array, Array]:
-        """See `ekfslam.models.process.velocities.VelocityInputs.imu_velocities`."""
-        assert isinstance(self.process, VelocityInputs)
-        return self.process.imu_velocities(values, measured, R_linear)
-
-    def process_noise(self, twist: Array, tau_s: Array | float, is_gap: BoolArray) -> Array:
-        """Q (n, 6, 6) of eq. (2) for the velocities (n, 6) that move the pose, some of which were interpolated."""
-        process = self.noise.process
-        return motion.process_noise(twist, tau_s, process.pose_std_during(is_gap), process.misalignment_rad)
 
     # --- observations of landmarks ------------------------------------------------------------------------------------
 

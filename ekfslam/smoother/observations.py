@@ -10,10 +10,9 @@ from dataclasses import fields, replace
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.filters.estimate import GIVEN
 from ekfslam.filters.log import Log
 from ekfslam.geometry import se3
-from ekfslam.models.model import Model, Moment, Seen
+from ekfslam.models.model import GIVEN, Model, Moment, Seen
 from ekfslam.smoother.sparse.factors import Factor, Term
 from ekfslam.smoother.unknowns import State, Unknowns, split
 
@@ -35,8 +34,9 @@ class ObservationFactors:
 
     def __init__(self, log: Log, model: Model, unknowns: Unknowns) -> None:
         self._log, self._model, self._unknowns = log, model, unknowns
-        self._way_m = model.way_m(log.twist, log.tau_s)
+        self._way_m = log.way_m
         self._is_difference = log.previous >= 0
+        self._clone = model.layout.clones.get("pose", "pose")  # differences need the clone
         self._follows = np.flatnonzero(self._is_difference)
         self._previous = log.previous[self._follows]
         self._memory = model.track_error.memory if model.track_error else 0.0
@@ -77,7 +77,7 @@ class ObservationFactors:
         if len(follows):
             # From the frame before, the landmark is where the observation before has seen it.
             at, positions = moments.at(log.frame[self._previous]), positions[follows]
-            before = self._model.see(at, positions, positions, "previous_pose")
+            before = self._model.see(at, positions, positions, self._clone)
             H_x[follows] -= self._memory * before.H_x
             H_m[follows] -= self._memory * before.H_m
             z_before = before.z
@@ -85,14 +85,15 @@ class ObservationFactors:
 
     def _moments(self, state: State) -> Moment:
         """Return what all frames observe from."""
-        log, T = self._log, state.T_imu_world
+        log, model, T = self._log, self._model, state.T_imu_world
         twist = np.zeros((len(T), 6))
-        if self._model.has_time_offset:
+        if model.has_time_offset:
             # Velocities as the trajectory has them; that they change with it is of second order.
-            tau = np.where(log.tau_s > 0, log.tau_s, 1.0)[1:, None]
-            twist = np.concatenate([log.seen_twist[:1], -se3.log(T[1:] @ se3.inverse(T[:-1])) / tau])
+            values = self._unknowns.all_values(state)
+            before, after = ({name: x[at] for name, x in values.items()} for at in (slice(-1), slice(1, None)))
+            twist = np.concatenate([log.seen_twist[:1], model.process.imu_twist(before, after, log.intervals)])
         shared = split(self._unknowns.shared, state.shared)
-        return Moment(T, T, state.drive_values.get("calibration", GIVEN), twist, shared, self._way_m)
+        return Moment(T, T, model.parameters(state.drive_values), twist, shared, self._way_m)
 
     def _near(self, state: State) -> list[Factor]:
         """Return weak priors of landmarks, where errors of tracks walk.
@@ -164,7 +165,7 @@ class ObservationFactors:
             )
             H_x[first, :, layout["pose"]] = H_m[first] @ np.linalg.solve(there.H_m, there.H_x[..., layout["pose"]])
         H_x = _carried_back(H_x, layout["pose"], log.T_linear, log.T_predicted, log.frame, ~first)
-        r = log.rows - seen.z + (H_x @ x[:, : layout.seen, None])[..., 0]
+        r = log.rows - seen.z + (H_x @ (x - log.departed[0])[:, : layout.seen, None])[..., 0]
         if len(self._follows):
             self._subtract_frozen_before(H_x, H_m, r, x, linear_position)
         r += (H_m @ (position - first_position)[..., None])[..., 0]
@@ -178,9 +179,9 @@ class ObservationFactors:
         T_linear = log.T_predicted[frame - 1] if log.first_estimates else T
         positions = log.position_m[follows], linear_position[follows]
         seen_twist, way_m = log.seen_twist[frame - 1], self._way_m[frame]
-        before = self._see(frame, T, T_linear, x[follows], seen_twist, *positions, way_m, "previous_pose")
-        B_x = _carried_back(before.H_x, layout["previous_pose"], log.T_linear_before, log.T_departed, frame)
-        shifted = (B_x @ x[follows, : layout.seen, None])[..., 0]
+        before = self._see(frame, T, T_linear, x[follows], seen_twist, *positions, way_m, self._clone)
+        B_x = _carried_back(before.H_x, layout[self._clone], log.T_linear_before, log.T_departed, frame)
+        shifted = (B_x @ (x[follows] - log.departed[0])[:, : layout.seen, None])[..., 0]
         r[follows] -= memory * (log.rows[log.previous[follows]] - before.z + shifted)
         H_x[follows] -= memory * B_x
         H_m[follows] -= memory * before.H_m
@@ -203,14 +204,14 @@ class ObservationFactors:
         Coordinates of the drive's blocks are alike within a group (n,).
         """
         model, calibration, layout = self._model, self._model.calibration, self._model.layout
-        clones = layout.clones if pose == "previous_pose" else {}
+        clones = layout.clones if pose == layout.clones.get("pose") else {}
         shared = {block.name: coordinates[:, layout[clones.get(block.name, block.name)]] for block in model.shared}
         moment = Moment(T, T_linear, GIVEN, twist, shared, way_m)
         if calibration is None:
             return model.see(moment, positions_m, linear_positions_m, pose, is_difference)
         parts, order = [], np.argsort(group, kind="stable")
         for some in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-            found = calibration.retract(calibration.initial(), coordinates[some[0], layout["calibration"]])
+            found = calibration.retract(calibration.initial(), coordinates[some[0], layout[calibration.name]])
             here = replace(moment.at(some), calibration=found)
             differs = None if is_difference is None else is_difference[some]
             parts.append(model.see(here, positions_m[some], linear_positions_m[some], pose, differs))

@@ -23,17 +23,20 @@ from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import Config, FilterConfig, PosteriorConfig
+from ekfslam.data.inputs import InertialNoise
 from ekfslam.errors import PosteriorError
 from ekfslam.filters.log import Log
 from ekfslam.filters.loop import solvable
 from ekfslam.filters.result import Innovation, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
+from ekfslam.models.blocks import OPTIONAL_BLOCKS
 from ekfslam.models.build import model_of, optional_blocks
 from ekfslam.models.model import Model
+from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess, inertial, velocities
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
 from ekfslam.shown import Card, Shown, count, figure
-from ekfslam.smoother.optimise import MOST_ITERATIONS, maximise
+from ekfslam.smoother.optimise import maximise
 from ekfslam.smoother.problem import BatchProblem, State
 from ekfslam.smoother.sparse.information import JointInformation
 
@@ -241,17 +244,21 @@ def model_of_result(result: Result) -> Model:
     """
     assert result.log is not None
     stored, log = _config_of(result), result.log
-    if "inertial_gyro" in result.attributes:
-        raise PosteriorError(f"{result.sequence_name}: runs with inertial samples cannot be smoothed yet")
     if retired := set(result.config.get("blocks", {})) - set(stored.blocks):
         raise PosteriorError(
             f"{result.sequence_name}: this result had the state block {', '.join(sorted(retired))}, which no longer "
             "exists: run the recording again to smooth it"
         )
-    start = log.T_predicted[0], log.initial_covariance
+    start = log.T_predicted[0], log.initial_covariance[:6, :6]
     rig = Rig(result.camera, result.T_cam_imu, result.noise)
-    blocks, coordinates = optional_blocks(stored.blocks), stored.filter.landmark_coordinates
-    model = model_of(rig, result.noise, *start, stored.calibration, blocks, coordinates)
+    known, tables = dict(OPTIONAL_BLOCKS), dict(stored.blocks)
+    make_process: MakeProcess = velocities
+    if "inertial_gyro" in result.attributes:
+        known, tables = known | INERTIAL_BLOCKS, {name: {} for name in INERTIAL_BLOCKS} | tables
+        densities = (float(result.attributes[f"inertial_{field.name}"]) for field in dataclasses.fields(InertialNoise))
+        make_process = inertial(InertialNoise(*densities))
+    blocks, coordinates = optional_blocks(tables, known), stored.filter.landmark_coordinates
+    model = model_of(rig, result.noise, *start, stored.calibration, blocks, coordinates, make_process=make_process)
     if model.layout.body == log.departed.shape[1]:
         return model
     # Archives before format version 4 know of poses alone: velocities are white there, and so are pixels.
@@ -298,7 +305,7 @@ def posterior_of_log(
         state = problem.solved_as_filtered(information)
         costs = (information.cost,)
     else:
-        iterations = progress(range(MOST_ITERATIONS), f"{name}: smoothing")
+        iterations = progress(range(config.max_iterations), f"{name}: smoothing")
         start = problem.filtered_state(positions_m)
         found = maximise(problem, start, config, min_depth_m, iterations)
         information, state, weight, costs = found.information, found.state, found.weight, found.costs

@@ -41,7 +41,7 @@ class BatchProblem:
 
     def __init__(self, log: Log, model: Model) -> None:
         self.log, self.model = log, model
-        self.unknowns = Unknowns(model, log.initial_covariance)
+        self.unknowns = Unknowns(model, log.initial_covariance, log.departed[0])
         self.process = ProcessFactors(log, model, self.unknowns)
         self.observations = ObservationFactors(log, model, self.unknowns)
 
@@ -75,7 +75,7 @@ class BatchProblem:
         T[0] = se3.exp(first[:6]) @ self.log.T_predicted[0]
         eps = np.concatenate([se3.log(T[:1] @ se3.inverse(before[:1])), step.eps[1:, :6]])
         shared, aux = state.shared + step.eps[:, 6:], state.aux + step.aux
-        shared[0], aux[0] = first[6 : u.width], first[u.width :]
+        shared[0], aux[0] = u.shared_mean + first[6 : u.width], u.aux_mean + first[u.width :]
         k = self.observations.first_frame
         s = se3.apply(before[k], state.positions_m)
         turned = np.cross(eps[k, 3:], s) + (before[k, :3, :3] @ d[..., None])[..., 0]
@@ -88,11 +88,13 @@ class BatchProblem:
         u, log = self.unknowns, self.log
         xi = se3.log(log.T_updated[0] @ se3.inverse(log.T_predicted[0]))
         drive, shared, aux = (log.updated[:, at] for at in (u.drive_columns, u.frame_columns[6:], u.aux_columns))
-        zeta = np.linalg.pinv(u.B) @ np.concatenate([xi, shared[0], aux[0]])
+        zeta = np.linalg.pinv(u.B) @ np.concatenate([xi, shared[0] - u.shared_mean, aux[0] - u.aux_mean])
         return State(log.T_updated, positions_m, zeta, shared, aux, drive[-1], u.drive_values(drive[-1]))
 
     def solved_as_filtered(self, solution: JointInformation) -> State:
         """Return the state that the solution of `as_filtered` stands for; its corrections add up as the filter's do."""
         T = se3.exp(solution.eps[:, :6]) @ self.log.T_predicted
-        positions, drive = self.log.first_position_m + solution.d, self.unknowns.drive_values(solution.drive)
-        return State(T, positions, solution.zeta, solution.eps[:, 6:], solution.aux, solution.drive, drive)
+        u = self.unknowns
+        positions, drive = self.log.first_position_m + solution.d, u.drive_values(solution.drive)
+        shared, aux = u.shared_mean + solution.eps[:, 6:], u.aux_mean + solution.aux
+        return State(T, positions, solution.zeta, shared, aux, solution.drive, drive)

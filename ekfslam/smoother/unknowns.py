@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
+from ekfslam.errors import PosteriorError
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import StateBlock
 from ekfslam.models.model import Model
@@ -21,7 +22,8 @@ class State:
     Args:
         T_imu_world: (T, 4, 4) poses.
         positions_m: (M, 3) landmarks in world.
-        zeta: (w+a,) first frame in units of its prior: ``T_0 = exp((B zeta)^) T_prior``, and its blocks likewise.
+        zeta: (w+a,) first frame in units of its prior: ``T_0 = exp((B zeta)^) T_prior``, and its blocks by addition to
+            their prior means.
         shared: (T, w-6) values of the blocks of a frame that observations depend on, without its pose.
         aux: (T, a) values of the further blocks of a frame. They are vectors.
         drive: (g,) coordinates of the blocks of the drive: sums of corrections.
@@ -42,17 +44,20 @@ class Unknowns:
 
     Args:
         model: The model.
-        pose_covariance: (6, 6) covariance of the first pose.
+        initial_covariance: Covariance before the first frame: of all blocks (body, body), or of the pose (6, 6).
+        mean: (body,) coordinates before the first frame.
 
     Attributes:
         shared, aux, of_drive: Blocks of ``frames`` (without the pose), of ``aux`` and of ``drive``.
         frame_columns, aux_columns, drive_columns: Their columns in the model's layout, the pose's included.
         width: Number of columns of a frame.
+        shared_mean, aux_mean: (w-6,), (a,) prior means of the first frame's blocks.
+        drive_covariance: (g, g) prior covariance of the drive's blocks.
         B: (w+a, w+a) root of the first frame's covariance, see `FirstFrame`.
         cloned, clone_columns: Columns (c,) of a frame that the filter has clones of, and the layout's columns of these.
     """
 
-    def __init__(self, model: Model, pose_covariance: Array) -> None:
+    def __init__(self, model: Model, initial_covariance: Array, mean: Array) -> None:
         layout = model.layout
         self.shared: Sequence[StateBlock] = model.shared
         self.aux = [block for block in layout.blocks if block.per_frame and not block.is_seen]
@@ -62,15 +67,20 @@ class Unknowns:
         self.aux_columns = layout.columns(block.name for block in self.aux)
         self.drive_columns = layout.columns(block.name for block in self.of_drive)
         self.width = len(self.frame_columns)
+        self.shared_mean, self.aux_mean = mean[self.frame_columns[6:]], mean[self.aux_columns]
         first = np.concatenate([self.frame_columns, self.aux_columns])
-        covariance = model.prior_covariance[np.ix_(first, first)]
-        covariance[:6, :6] = pose_covariance
-        self.B = root(covariance, self.width)
+        covariance = model.prior_covariance.copy()
+        known = len(initial_covariance)
+        covariance[:known, :known] = initial_covariance
+        self.B = root(covariance[np.ix_(first, first)], self.width)
+        self.drive_covariance = covariance[np.ix_(self.drive_columns, self.drive_columns)]
+        if covariance[np.ix_(first, self.drive_columns)].any():
+            raise PosteriorError("the prior couples blocks of the drive with blocks of the first frame")
         at = {column: i for i, column in enumerate(self.frame_columns.tolist())}
         names = [name for name in layout.clones if name == "pose" or layout[name].start in at]
         self.clone_columns = layout.columns(layout.clones[name] for name in names)
         self.cloned = np.array([at[column] for column in layout.columns(names).tolist()], dtype=np.int64)
-        self._clones, self._has_previous_pose = model.clones, "previous_pose" in layout
+        self._clones, self._previous_pose = model.clones, layout.clones.get("pose")
 
     def first_frame(self, zeta: Array) -> FirstFrame:
         """Return the prior of the first frame, linearised at zeta (w+a,)."""
@@ -88,6 +98,12 @@ class Unknowns:
         """Return the values of all blocks but the pose: of each frame (T, ...), or of the drive."""
         return {**state.drive_values, **split(self.shared, state.shared), **split(self.aux, state.aux)}
 
+    def all_values(self, state: State) -> dict[str, Array]:
+        """Return the values (T, ...) of all blocks in each frame."""
+        frames = len(state.T_imu_world)
+        of_drive = {name: np.broadcast_to(x, (frames, *x.shape)) for name, x in state.drive_values.items()}
+        return {**self.values(state), **of_drive, "pose": state.T_imu_world}
+
     def last_values(self, state: State) -> dict[str, Array]:
         """Return the values of a filter's blocks at the last frame."""
         of_frames = split(self.shared, state.shared) | split(self.aux, state.aux)
@@ -95,8 +111,8 @@ class Unknowns:
         values["pose"] = state.T_imu_world[-1]
         if len(state.T_imu_world) > 1:
             values |= {clone: of_frames[name][-2] for clone, name in self._clones}
-            if self._has_previous_pose:
-                values["previous_pose"] = state.T_imu_world[-2]
+            if self._previous_pose is not None:
+                values[self._previous_pose] = state.T_imu_world[-2]
         return values
 
     def last_coordinates(self, state: State) -> tuple[IntArray, Array]:

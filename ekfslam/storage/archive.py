@@ -55,8 +55,9 @@ from ekfslam.storage import older
 from ekfslam.storage.checks import require_agreement
 
 FORMAT = "ekfslam-archive"
-# 2 added log, 3 hygiene and parameters, 4 state blocks and track errors in the log, 5 coordinates of all dimensions
-FORMAT_VERSION = 5
+# 2 added log, 3 hygiene and parameters, 4 state blocks and track errors in the log, 5 coordinates of all dimensions,
+# 6 inputs of any process in the log
+FORMAT_VERSION = 6
 
 
 @dataclass(frozen=True, repr=False)
@@ -236,8 +237,9 @@ def _sequence_fields(h5file: h5py.File) -> dict[str, Any]:
 def _read_result(h5file: h5py.File, mode: str, sequence: Mapping[str, Any]) -> Result:
     group = hdf5.subgroup(h5file, f"runs/{mode}")
     version = hdf5.version_of(group if "format_version" in group.attrs else h5file)
+    complete, former = partial(older.completed, version=version), older.former(version)
     found = hdf5.read_record(
-        group, Result, {"T": len(sequence["time_s"])}, _stamps(group), partial(older.completed, version=version)
+        group, Result, {"T": len(sequence["time_s"])}, _stamps(group), complete=complete, former=former
     )
     require_agreement(found, f"{h5file.filename}: {group.name.strip('/')}")
     noise = _read_noise(group)

@@ -38,5 +38,3 @@ def _require_log(log: Log, landmarks: int, place: str) -> None:
         raise ArchiveError(
             f"{place}/previous[{follows[np.argmax(wrong)]}] is no observation of the same landmark in the frame before"
         )
-    if log.up.shape[1] not in (0, 3):
-        raise ArchiveError(f"{place}/up has {log.up.shape[1]} columns, expected 3, or 0 where it is not estimated")

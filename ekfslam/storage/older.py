@@ -1,22 +1,51 @@
 """Archives of older format versions in the terms of this release.
 
 The version of a run is that of the release that wrote it. Version 1 has no log. Version 3 added hygiene and parameters,
-version 4 the state blocks and the errors of tracks in the log, version 5 the coordinates of all dimensions.
+version 4 the state blocks and the errors of tracks in the log, version 5 the coordinates of all dimensions, version 6
+inputs of any process in the log.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import HygieneConfig
 from ekfslam.data.noise import Noise
 from ekfslam.filters.log import Log
 from ekfslam.geometry import se3
-from ekfslam.stored import zeros
+from ekfslam.stored import FLAGS, FRAMES, NOT_NEGATIVE, Layout, layout_of, stored, whole, zeros
+
+_VELOCITIES = "m/s (0-2), rad/s (3-5)"
+
+
+@dataclass(frozen=True)
+class VelocityLog:
+    """Fields of a log of versions before 6, in which velocities were the only inputs.
+
+    Args:
+        twist: (T, 6) velocity that led to each frame; that of the first frame drives nothing.
+        up: (T, 3) direction against gravity in world at the prediction, or (T, 0). From version 4 on.
+        velocity_frame, velocity_axis, velocity_value, velocity_std, velocity_is_biased: (S,) measurements of
+            velocities in the state. From version 4 on.
+    """
+
+    twist: Array = field(metadata=stored("T u", _VELOCITIES))
+    up: Array = field(metadata=stored("T U"))
+    velocity_frame: IntArray = field(metadata=stored("measured", check=FRAMES))
+    velocity_axis: IntArray = field(metadata=stored("measured", check=whole(0, 5)))
+    velocity_value: Array = field(metadata=stored("measured"))
+    velocity_std: Array = field(metadata=stored("measured", check=NOT_NEGATIVE))
+    velocity_is_biased: BoolArray = field(metadata=stored("measured", check=FLAGS))
+
+
+def former(version: int) -> Mapping[type, Layout]:
+    """Return the data sets of records that a release of this format version wrote, and this one does not."""
+    return {Log: layout_of(VelocityLog)} if version < 6 else {}
 
 
 def completed(record: type, found: dict[str, Any], version: int) -> dict[str, Any]:
@@ -24,12 +53,24 @@ def completed(record: type, found: dict[str, Any], version: int) -> dict[str, An
 
     A field that this version should have stays missing.
     """
-    if record is not Log:
+    if record is not Log or version > 5:
         return found
     if version < 4 and {"twist", "T_linear", "T_predicted", "T_updated", "frame"} <= found.keys():
         found = {**_blocks_of_a_pose(found), **found}
     if "tau_s" in found:
         found.setdefault("is_gap", np.zeros(len(found["tau_s"]), dtype=bool))  # some releases of version 4 lack it
+    return _generic(found)
+
+
+def _generic(log: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a log with velocities as the inputs of a process."""
+    found = {name.replace("velocity_", "measured_"): value for name, value in log.items()}
+    if "up" in found:
+        found["curved"] = found.pop("up")
+    if {"twist", "tau_s"} <= found.keys():
+        twist, tau_s = found.pop("twist"), found["tau_s"]
+        found |= {"input_frame": np.arange(1, len(tau_s)), "input_dt_s": tau_s[1:], "inputs": twist[1:]}
+        found["way_m"] = np.linalg.norm(twist[:, :3], axis=1) * tau_s
     return found
 
 
@@ -42,17 +83,17 @@ def _blocks_of_a_pose(log: dict[str, Any]) -> dict[str, Any]:
 
     departed = np.concatenate([predicted[:1], log["T_updated"][:-1]])
     updated = coordinates(log["T_updated"])
-    without = zeros(Log, T=len(predicted), B=6, U=0, L=0, K=len(log["frame"]), d=0, velocity=0)
+    sizes = {"T": len(predicted), "B": 6, "U": 0, "L": 0, "K": len(log["frame"]), "d": 0, "measured": 0}
+    velocities = zeros(VelocityLog, **sizes)
     return {
-        **{name: without[name] for name in without if name.startswith("velocity") or name == "up"},
-        "imu_twist": log["twist"],
+        **{name: velocities[name] for name in velocities if name != "twist"},
         "seen_twist": log["twist"],
         "T_departed": departed,
         "T_linear_before": departed,
         "departed": np.concatenate([np.zeros((1, 6)), updated[:-1]]),
         "linear": coordinates(log["T_linear"]),
         "updated": updated,
-        "previous": without["previous"] - 1,
+        "previous": np.full(len(log["frame"]), -1),
     }
 
 

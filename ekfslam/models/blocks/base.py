@@ -36,6 +36,7 @@ class StateBlock:
         per_frame: Whether it has a value for each frame (in the batch problem: one unknown a frame), or one for the
             whole drive.
         is_seen: Whether observations of landmarks depend on it.
+        is_curved: Whether its value is a vector but no sum of corrections, so that the log keeps it.
         is_pose: Whether it is a pose ``T_imu_world`` with the error of one: the pose itself, or a clone of it.
         clones: Name of the block whose value of the frame before it is; "" where it is no clone.
         labels, units: Names and units of what `reported` returns; none is not reported.
@@ -44,6 +45,7 @@ class StateBlock:
     coupling: ClassVar[Coupling] = "none"
     per_frame: ClassVar[bool] = False
     is_seen: ClassVar[bool] = False
+    is_curved: ClassVar[bool] = False
     is_pose: ClassVar[bool] = False
 
     def __init_subclass__(cls) -> None:
@@ -160,6 +162,7 @@ class Layout(dict[str, slice]):
         seen: Number of leading columns that observations of landmarks depend on.
         poses: Names of the pose and of its clones.
         clones: Name of the clone of each block that has one in the frame before.
+        curved: Blocks whose values are no sums of corrections.
     """
 
     def __init__(self, blocks: Iterable[StateBlock]) -> None:
@@ -171,6 +174,7 @@ class Layout(dict[str, slice]):
         self.body = end[-1]
         self.poses = tuple(block.name for block in self.blocks if block.is_pose)
         self.clones = {block.clones: block.name for block in self.blocks if block.clones}
+        self.curved = tuple(block for block in self.blocks if block.is_curved)
         self.seen = sum(block.size for block in self.blocks if block.is_seen)
 
     def coupled(self, coupling: Coupling) -> tuple[StateBlock, ...]:

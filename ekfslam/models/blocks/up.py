@@ -27,6 +27,7 @@ class Up(StateBlock):
     tilt_rad: float
 
     name = "up"
+    is_curved = True
     labels = ("roll", "pitch")
     units = ("rad", "rad")
 

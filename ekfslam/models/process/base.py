@@ -95,12 +95,14 @@ class Process(ABC):
         own: Names of the blocks that it moves, the pose first, in the order of the columns of ``Phi`` and ``Q``.
         layout: Columns of all blocks.
         takes: Kind of the inputs.
+        started: Names of the walking blocks that the first inputs start, see `start`.
         estimates_velocity: Whether velocities are in the state, so that further sensors can measure them.
     """
 
     own: tuple[str, ...] = ("pose",)
     layout: Layout
     takes: type[Velocities] | type[InertialSamples] = Velocities
+    started: tuple[str, ...] = ()
     estimates_velocity: bool = False
 
     @abstractmethod

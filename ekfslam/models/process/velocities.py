@@ -136,6 +136,7 @@ class VelocityInputs(Process):
 class VelocityWalk(VelocityInputs):
     """The velocity is the block `Twist`, which walks; the inputs measure it, or only start it."""
 
+    started = (Twist.name,)
     estimates_velocity = True
 
     @property

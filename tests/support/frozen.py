@@ -1,0 +1,29 @@
+"""The filter against the rows that it has conditioned on, frozen where it linearised them."""
+
+import numpy as np
+
+from ekfslam.smoother.problem import BatchProblem
+from ekfslam.smoother.revival import MapRevival
+from ekfslam.smoother.sparse.information import JointInformation
+
+
+def assert_equal_to_frozen_rows(ekf):
+    """Blocks, landmarks and the whole covariance, to 1e-8 of their standard deviations or better."""
+    problem = BatchProblem(ekf.log(), ekf.model)
+    information, unknowns = JointInformation(problem.as_filtered()), problem.unknowns
+    landmarks, layout = ekf.table.log_row, ekf.model.layout
+    found = np.zeros(layout.body)
+    found[unknowns.frame_columns] = information.eps[-1]
+    found[unknowns.clone_columns] = information.eps[-2, unknowns.cloned]
+    found[unknowns.aux_columns], found[unknowns.drive_columns] = (
+        unknowns.aux_mean + information.aux[-1],
+        information.drive,
+    )
+    np.testing.assert_allclose(found, ekf.coordinates, atol=1e-8)
+    np.testing.assert_allclose(
+        problem.log.first_position_m[landmarks] + information.d[landmarks], ekf.positions_m, atol=1e-8
+    )
+    P = MapRevival(ekf.model, ekf.config).covariance(problem, information, landmarks)
+    std = np.sqrt(np.diag(ekf.P))
+    assert (np.abs(P - ekf.P) <= 1e-8 * np.outer(std, std)).all()
+    assert (std > 0).all()
