@@ -1,6 +1,6 @@
 """Configuration: defaults in code, overridden by a TOML file, then by flags; stored resolved with every result.
 
-Every setting carries its `Rule` in the metadata of its field: what kind of value it is and what must hold for it.
+The metadata of each field hold the `Rule` of its setting.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _KINDS: dict[type, str] = {float: "number", int: "whole number", str: "string", 
 
 @dataclass(frozen=True)
 class Rule:
-    """What a setting may be.
+    """Rule for the value of a setting.
 
     Args:
         kind: ``float`` (any number), ``int``, ``str`` or ``bool``.
-        words: What else must hold, as it follows "must".
-        holds: Whether it holds for a value of the kind.
+        words: Further condition, as it follows "must" in a message.
+        holds: Function that returns whether a value of the kind meets this condition.
     """
 
     kind: type
@@ -51,16 +51,16 @@ class Rule:
     holds: Callable[[Any], bool] = lambda _: True
 
     def is_kind(self, value: object) -> bool:
-        """Whether a value is of the kind; a whole number is a number, a truth value is none."""
+        """Return whether a value is of the kind; a whole number is a number, a truth value is not."""
         kinds = (float, int) if self.kind is float else self.kind
         return isinstance(value, kinds) and isinstance(value, bool) == (self.kind is bool)
 
     def plain(self, value: Any) -> Any:
-        """A value as the kind has it: a file may write the whole number 2 as 2.0."""
+        """Return a value in its kind: a file may write the whole number 2 as 2.0."""
         return int(value) if self.kind is int and isinstance(value, float) and value.is_integer() else value
 
     def check(self, name: str, value: object) -> None:
-        """Raise a `ConfigError` that names the setting, the rule and the value, where the rule does not hold."""
+        """Raise a `ConfigError` that names setting, rule and value, unless the value follows the rule."""
         if not self.is_kind(value):
             raise ConfigError(f"{name} must be a {_KINDS[self.kind]}, found {value!r}")
         if not self.holds(value):
@@ -68,7 +68,7 @@ class Rule:
 
 
 def _rule(kind: type, words: str = "", holds: Callable[[Any], bool] = lambda _: True) -> dict[str, Rule]:
-    """Metadata of a field."""
+    """Return the metadata of a field with a `Rule`."""
     return {"rule": Rule(kind, words, holds)}
 
 
@@ -86,7 +86,7 @@ LEAST_PX = 1e-3  # pixel noise with which covariances of landmarks keep digits, 
 # No comparison holds for NaN, so the rules refuse it.
 _TEXT, _SWITCH = _rule(str), _rule(bool)
 _NUMBER = _rule(float, "be a number, not NaN", lambda value: abs(value) <= 1e300 or abs(value) == math.inf)
-# Of any standard deviation, in any unit: its square is a number, and so is what that divides.
+# Standard deviations of any unit: their squares, and quotients by these, stay within the range of numbers.
 _LEAST, _LARGEST = 1e-12, 1e6
 _POSITIVE = _rule(
     float, f"be positive, from {1 / _LARGEST:g} to {_LARGEST:g}", lambda value: 1 / _LARGEST <= value <= _LARGEST
@@ -105,7 +105,6 @@ _PIXELS = _rule(
 _PROBABILITY = _rule(float, "be in (0, 1]", lambda value: 0 < value <= 1)
 _BETWEEN_0_AND_1 = _rule(float, "be between 0 and 1", lambda value: 0 < value < 1)
 
-
 _CONSTANTS_OF_THE_FRONT_END = (
     *("refill", "refill_every", "corner_block", "corner_quality", "border", "bucket_columns", "bucket_rows"),
     *("match_patch", "match_score", "match_margin", "row_limit", "window", "backward_limit"),
@@ -122,25 +121,24 @@ RETIRED = {
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Standard deviations per sample; None takes what the sequence states.
+    """Standard deviations per sample; None takes the noise that the recording states.
 
     Args:
         sigma_v_m_s: Linear velocity, each axis.
         sigma_w_rad_s: Angular velocity, each axis.
         sigma_px: Pixels.
-        drift: How far the error of a track walks in the image from one frame to the next, px; 0 takes pixel noise as
-            white, None takes what the model says.
-        track_scale: Factor on how far errors of tracks walk in the automatic model; None: it is found by their
-            innovations, see `ekfslam.resolve`.
-        shared: Whether errors that all samples or all tracks share (`ekfslam.models.noise.shared_errors`) are in the
-            state of the automatic model.
-        tilt_deg: Of velocities in a level frame: prior standard deviation of roll and pitch, which the joint filter
-            estimates; 0 takes them as velocities of the IMU; None takes what the model says.
-        model: ``auto`` finds the noise from the data (`ekfslam.models.noise`) where the sequence states none and no
-            sigma is given here; sigmas given here are those of white noise. ``tuned`` is the same, but sigmas given
-            here only replace those found: they were found by `ekfslam.studies.tuning` within the automatic model and
-            mean nothing without the rest of it. ``white`` takes what is neither stated nor given from a clean
-            recording: 0.05 m/s, 0.001 rad/s, 1 px.
+        drift: Random walk of the error of a track in the image from frame to frame, px. 0 takes pixel noise as white;
+            None takes the walk of the model.
+        track_scale: Factor on the walk of track errors in the automatic model. None finds it from innovations, see
+            `ekfslam.resolve`.
+        shared: Whether the automatic model has state blocks for errors that all samples or all tracks share, see
+            `ekfslam.models.noise.shared_errors`.
+        tilt_deg: For velocities in a level frame, the prior standard deviation of roll and pitch, which the joint
+            filter estimates. 0 takes them as velocities of the IMU; None takes the tilt of the model.
+        model: ``auto`` finds the noise from the data (`ekfslam.models.noise`) if the recording states none and no sigma
+            is given here; sigmas given here are those of white noise. ``tuned`` is the same, but sigmas given here only
+            replace the automatic ones: `ekfslam.studies.tuning` found them within the automatic model. ``white`` takes
+            0.05 m/s, 0.001 rad/s and 1 px, unless the recording or this table states other values.
     """
 
     sigma_v_m_s: float | None = field(default=None, metadata=_FINITE)
@@ -155,30 +153,28 @@ class NoiseConfig:
 
 @dataclass(frozen=True)
 class HygieneConfig:
-    """What becomes of bad tracks before any filter sees them, see `ekfslam.data.hygiene`.
+    """Rules for bad tracks, applied before any filter sees them, see `ekfslam.data.hygiene`.
 
-    False or 0 switches a rule off. Sigmas are standard deviations by the pixel noise that the run assumes.
+    False or 0 switches a rule off. Sigmas are standard deviations by the pixel noise of the run. An id that is seen
+    twice in one frame raises a `DuplicateObservationError` instead, since nothing tells the right observation.
 
     Args:
-        min_disparity_sigma: Observations with less disparity, in sigmas of a disparity, are dropped: they have no
-            depth. (The filters reject observations without disparity.) By default 1; 3 in the automatic model, whose
-            tracks have a constant error of their disparity.
-        max_row_mismatch_sigma: So are those with larger ``|vL - vR|``, in sigmas of that difference.
-        restart_at_repeats: Where a frame repeats the pixels of the one before while the rig moves, every track is cut.
-        restart_above_px: Of these, tracks that move by no more than this in the frames beside it are not cut: they show
-            another point, but one close by. Where velocities are noisy the poses gain by it, the tracks lose.
-        jump_sigma: A track is cut where its pixels jump so many sigmas out of its course, and out of that of the
-            frame's other tracks.
-        reused_id_sigma: A track is cut where it comes back after a gap so many sigmas from where the velocities say
-            that it was.
-        max_depth_error: Tracks are dropped whose depth is never known better than this, as a share of the depth.
-        min_observations: Tracks, or pieces of tracks that were cut, with fewer observations are dropped.
-        disparity_jump_sigma: Tracks are dropped as a whole that are seen across a frame in which the disparities of
-            most tracks jump, by more than so many sigmas, away from what the velocities say: the right images are of
-            other points than before, and nobody knows which are right.
-
-    There is no rule for an id that is seen twice in one frame. Nobody can know which of the two is meant, so a
-    `Sequence` refuses it with a `DuplicateObservationError`.
+        min_disparity_sigma: Drop observations with less disparity, in sigmas of a disparity: they have no depth. By
+            default 1, but 3 in the automatic model, whose tracks have a constant error of their disparity. (The filters
+            reject observations without disparity.)
+        max_row_mismatch_sigma: Drop observations with larger ``|vL - vR|``, in sigmas of that difference.
+        restart_at_repeats: Cut every track at a frame that repeats the pixels of the previous one while the rig moves.
+        restart_above_px: Do not cut tracks there that move by no more than this in the adjacent frames: they show
+            another point, but a close one. With noisy velocities the poses gain and the tracks lose.
+        jump_sigma: Cut a track where its pixels jump this many sigmas off its course and that of the frame's other
+            tracks.
+        reused_id_sigma: Cut a track where it comes back after a gap this many sigmas off the pixels that the velocities
+            predict.
+        max_depth_error: Drop tracks whose depth is never known better than this, as a share of the depth.
+        min_observations: Drop tracks, or pieces of cut tracks, with fewer observations.
+        disparity_jump_sigma: Drop whole tracks that are seen across a frame in which the disparities of most tracks
+            jump by more than this many sigmas from the prediction of the velocities: the right images show other points
+            than before.
     """
 
     min_disparity_sigma: float | None = field(default=None, metadata=_FINITE)
@@ -194,35 +190,35 @@ class HygieneConfig:
 
 @dataclass(frozen=True)
 class FilterConfig:
-    """How the filters linearise, gate, start and retire landmarks.
+    """Linearisation, gates, start and retirement of landmarks.
 
     Args:
         variant: Linearisation rule of the joint filter, see `ekfslam.filters.variants`.
-        landmark_coordinates: In which coordinates a correction acts on landmarks. ``image``: as their images in the
-            last updated camera, where their errors are Gaussian, see `ekfslam.filters.coordinates`; sensors that are no
-            cameras have none and go by ``xyz``. ``xyz``: as positions in world, which is the textbook's form.
-        covariance_form: How the joint covariance is kept; estimates are the same. ``dense``: as one matrix.
-            ``conditional``: see `ekfslam.filters.conditional`, linear in the number of landmarks. ``auto`` takes what
-            costs less for a sequence.
-        iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. Not for ``fej``, nor for ``xyz``, where
-            they take the depth of landmarks at the wrong point and make all distances too short.
-        retire: ``unseen`` marginalises a landmark when it is out of view, ``never`` keeps all; ``auto`` is ``never``
-            for a sequence of at most 1500 landmarks some of which come back, else ``unseen``.
-        retire_after: Frames without a sighting after which ``unseen`` applies. By default 1, or 10 in a sequence some
-            of whose landmarks come back.
-        dormant: With ``unseen``, so many landmarks out of view stay in the state, those seen last. By default 0, or
-            1500 where ``auto`` has chosen ``unseen`` although landmarks come back.
+        landmark_coordinates: Coordinates in which a correction acts on landmarks. ``image``: their images in the last
+            updated camera, where their errors are Gaussian, see `ekfslam.filters.coordinates`; sensors that are not
+            cameras use ``xyz``. ``xyz``: positions in world, the textbook's form.
+        covariance_form: Form of the joint covariance; estimates are the same. ``dense``: one matrix. ``conditional``:
+            linear in the number of landmarks, see `ekfslam.filters.conditional`. ``auto`` takes the cheaper one.
+        iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. More than one is refused for ``fej``, and
+            for ``xyz``, where distances would become too short.
+        retire: ``unseen`` marginalises a landmark when it is out of view, ``never`` keeps all. ``auto`` is ``never``
+            for a recording of at most 1500 landmarks some of which come back, else ``unseen``.
+        retire_after: Frames without a sighting after which ``unseen`` applies. By default 1, or 10 if some landmarks of
+            the recording come back.
+        dormant: With ``unseen``, number of landmarks out of view that stay in the state, those seen last. By default 0,
+            or 1500 if ``auto`` has chosen ``unseen`` although landmarks come back.
         revive: A retired landmark that is seen again comes back with its exact mean, covariance and cross-covariance,
-            together with up to this many retired landmarks that were seen nearest to it in time. -1 starts it afresh.
+            together with up to this many retired landmarks seen nearest to it in time. -1 starts it again.
         gate_probability: Chi-square gate on each observation, once against the prediction and (joint filter) once
             against the prediction as corrected by the frame's other landmarks; 1 accepts everything.
-        split_after: A track is split, its landmark retired and a new one started, when this many observations in a row
-            fail the gate (or put it behind the camera): the tracker has jumped to another point. 0 never splits. By
-            default 3; 1 where errors of tracks walk, of which each observation continues that of the last frame.
-        moving_sigma, moving_share: Where the errors of tracks walk (`Noise.track_error`), a track is dropped for good
-            when it moves along with the rig. Over all its observations it must do so by more than this share of the
-            way, and by more than this many standard deviations (without their `Noise.margin`).
-        min_depth_m: Observations of a landmark predicted nearer than this (or behind) are rejected.
+        split_after: Number of observations in a row that fail the gate (or are behind the camera) after which a track
+            is split: its landmark is retired and a new one started, since the tracker has jumped to another point. 0
+            never splits. By default 3; 1 if errors of tracks walk, since each observation then continues the last one.
+        moving_sigma: If errors of tracks walk (`Noise.track_error`), a track that moves along with the rig is dropped
+            for good. Over all its observations it must do so by more than this many standard deviations, without their
+            `Noise.margin`,
+        moving_share: and by more than this share of the way.
+        min_depth_m: Reject observations of a landmark that is predicted nearer than this, or behind the camera.
         relative_frames: If truth is known, keep cross-covariances of reported poses up to this many frames apart, for
             the NEES of relative poses. 0 keeps none: the columns slow the filter down. Estimates do not depend on it.
         initial_position_std_m: Standard deviation of the first pose's translation, each axis.
@@ -248,11 +244,11 @@ class FilterConfig:
 
     @property
     def gate(self) -> float:
-        """Chi-square threshold of the gate, 3 degrees of freedom."""
+        """Chi-square threshold of the gate for 3 degrees of freedom."""
         return 2.0 * float(gammaincinv(1.5, self.gate_probability))
 
     def misses_to_split(self, tracks_walk: bool) -> int:
-        """`split_after`, or what is the default where errors of tracks walk, and where they do not; 0: never."""
+        """Return `split_after`, or its default if errors of tracks walk or do not; 0 means never."""
         if self.split_after is not None:
             return self.split_after
         return 1 if tracks_walk else 3
@@ -265,14 +261,14 @@ class FilterConfig:
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """What of the calibration the joint filter estimates, as prior standard deviations; 0 takes it as given.
+    """Prior standard deviations of the calibration that the joint filter estimates; 0 takes a parameter as given.
 
     Args:
         rotation_deg: Rotation of the camera against the IMU, each axis. By default 0.3 in the automatic model, else 0.
         lever_arm_m: Position of the IMU in the camera frame, each axis.
         baseline: Length of the stereo baseline, as a share of it.
         disparity_px: Offset of all disparities.
-        time_s: How much later than stamped the images are exposed.
+        time_s: Delay of the exposure of images after their stamps.
     """
 
     rotation_deg: float | None = field(default=None, metadata=_FINITE)
@@ -308,14 +304,14 @@ class FrontEndConfig:
 
 @dataclass(frozen=True)
 class PosteriorConfig:
-    """How the posterior over all poses and landmarks is linearised.
+    """Linearisation of the posterior over all poses and landmarks.
 
     Args:
         linearisation: ``map`` linearises all rows again at the maximum a posteriori, found from the filter's estimate;
-            ``filtered`` leaves them where the filter linearised them.
+            ``filtered`` keeps the linearisation of the filter.
         kernel: Robust kernel on the whitened residual of each observation (``map`` only), see
             `ekfslam.smoother.posterior`.
-        kernel_width: Where it leaves the parabola, in standard deviations. 5 % of Gaussian residuals exceed the
+        kernel_width: End of the kernel's parabola, in standard deviations. 5 % of Gaussian residuals exceed the
             default.
         max_iterations: Of Levenberg-Marquardt.
         tolerance: It stops when an iteration lowers the cost by a smaller share than this.
@@ -330,7 +326,7 @@ class PosteriorConfig:
 
 @dataclass(frozen=True)
 class TruthConfig:
-    """How far the true poses may be wrong, as standard deviations; None takes what their format states, if anything.
+    """Standard deviations of the true poses; None takes those that their format states, if any.
 
     Only the evaluation uses it, see `ekfslam.data.truth_noise.TruthNoise`.
 
@@ -353,14 +349,14 @@ class TruthConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that decides what a run does besides the data, and the record of what was tuned.
+    """All settings of a run, and the record of tuning.
 
     Args:
-        noise, filter, posterior, calibration, hygiene, front_end, truth: The tables of a file.
+        noise, filter, posterior, calibration, hygiene, front_end, truth: Tables of a file.
         tuning: Record of `ekfslam tune`: texts and numbers by name. It decides nothing and becomes attributes
             ``tuned_*`` of results.
-        blocks: Name of an optional state block to its settings, ``[blocks.<name>]`` in a file. Here they are only
-            plain values; `ekfslam.models.build` knows the blocks and what can be set of them.
+        blocks: Settings of optional state blocks by the name of the block, ``[blocks.<name>]`` in a file. Here they are
+            plain values; `ekfslam.models.build` checks them.
 
     Raises:
         ConfigError: A value breaks its rule; the message names table and key, the rule, and the value.
@@ -417,7 +413,7 @@ class Config:
 
     @staticmethod
     def from_toml(path: str | Path) -> Config:
-        """Defaults overridden by a TOML file with the tables that are the fields of `Config`.
+        """Return the defaults, overridden by a TOML file whose tables are the fields of `Config`.
 
         Raises:
             ConfigError: The file is missing, is not TOML, or holds something unknown.
@@ -431,6 +427,17 @@ class Config:
         except (OSError, ValueError, RecursionError, ConfigError) as error:  # ValueError: no UTF-8, no TOML
             raise ConfigError(f"{path}: {error}") from None
 
+    @staticmethod
+    def from_stored(tables: Mapping[str, Mapping[str, Any]]) -> Config:
+        """Return the configuration of a stored result; retired settings are skipped without a warning.
+
+        Raises:
+            ConfigError: As of `with_overrides`.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RetiredSettingWarning)
+            return Config().with_overrides(tables)
+
 
 def require_setting(name: str, value: object, is_scale: bool = False) -> None:
     """Raise a `ConfigError` unless a value is a finite standard deviation, or a positive time or length."""
@@ -438,7 +445,7 @@ def require_setting(name: str, value: object, is_scale: bool = False) -> None:
 
 
 def check_stored(tables: Mapping[str, Any]) -> None:
-    """Raise a `ConfigError` where what a result was stored with breaks today's rules; keys unknown today may stand."""
+    """Raise a `ConfigError` if a known setting of a stored configuration breaks its rule."""
     defaults = Config()
     for setting in dataclasses.fields(Config):
         settings = tables.get(setting.name, {})
@@ -469,7 +476,7 @@ def _require_table(name: str, value: object) -> None:
 
 
 def _check_table(table: str, settings: Any) -> None:
-    """Raise a `ConfigError` where a setting breaks its rule; None is allowed where it is the default."""
+    """Raise a `ConfigError` if a setting breaks its rule; None is allowed if it is the default."""
     for setting in dataclasses.fields(settings):
         value = getattr(settings, setting.name)
         if value is not None or setting.default is not None:
@@ -491,7 +498,7 @@ def _check_record(record: Mapping[str, Any]) -> None:
 
 
 def _check_blocks(blocks: Mapping[str, Any]) -> None:
-    """Raise a `ConfigError` where this is no table of tables of plain values."""
+    """Raise a `ConfigError` unless this is a table of tables of plain values."""
     _require_table("blocks", blocks)
     for name, settings in blocks.items():
         _require_table(f"blocks.{name}", settings)
@@ -501,7 +508,7 @@ def _check_blocks(blocks: Mapping[str, Any]) -> None:
 
 
 def _replaced(table: str, settings: Any, values: Mapping[str, Any]) -> Any:
-    """The settings of a table with the given values, those that are None left out."""
+    """Return the settings of a table with the given values replaced; None values are skipped."""
     rules = {setting.name: setting.metadata["rule"] for setting in dataclasses.fields(settings)}
     for key in values:
         if key not in rules:
@@ -511,7 +518,7 @@ def _replaced(table: str, settings: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _replaced_blocks(blocks: Mapping[str, Any], values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The same for state blocks, one by one."""
+    """Return the settings of state blocks with the given values replaced; None values are skipped."""
     merged = dict(blocks)
     for name, settings in values.items():
         _require_table(f"blocks.{name}", settings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import warnings
 
 import pytest
 
@@ -82,6 +83,13 @@ def test_a_retired_setting_is_skipped_with_a_warning(name):
     with pytest.warns(RetiredSettingWarning, match=rf"^{name} is ignored: "):
         config = Config().with_overrides({table: {key: {} if table == "blocks" else 1}})
     assert config == Config()
+
+
+def test_retired_settings_of_a_stored_configuration_are_skipped_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        stored = Config.from_stored({"front_end": {"settling": 20, "features": 90}, "filter": {"variant": "fej"}})
+    assert (stored.front_end.features, stored.filter.variant) == (90, "fej")
 
 
 def test_the_command_line_prints_a_retired_setting_as_a_note(tmp_path, capsys):

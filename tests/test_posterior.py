@@ -16,7 +16,7 @@ from ekfslam.config import CalibrationConfig, Config, FilterConfig, NoiseConfig,
 from ekfslam.data.sequence import Noise, Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.data.stretches import cut
-from ekfslam.errors import IllPosedError, PosteriorError, RetiredSettingWarning
+from ekfslam.errors import IllPosedError, PosteriorError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import CameraJitter, TwistBias, VisionDrift
@@ -397,5 +397,5 @@ def test_what_is_undetermined_is_named():
 def test_a_result_with_a_retired_state_block_is_not_smoothed():
     result = run(builtin("city?frames=3"), "full")
     old = dataclasses.replace(result, config={**result.config, "blocks": {"stereo_rotation": {}}})
-    with pytest.warns(RetiredSettingWarning), pytest.raises(PosteriorError, match="the state block stereo_rotation"):
+    with pytest.raises(PosteriorError, match="the state block stereo_rotation"):
         posterior(old)

@@ -272,7 +272,7 @@ def _config_of(result: Result) -> Config:
     """The configuration of a run, but for iterations of its updates: today's rules refuse some of older archives."""
     settings = dict(result.config.get("filter", {}))
     settings.pop("iterations", None)
-    return Config().with_overrides({**result.config, "filter": settings})
+    return Config.from_stored({**result.config, "filter": settings})
 
 
 @solvable()

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def command(options: argparse.Namespace) -> None:
     full = open_result(options.archive, "full")
     overrides = {"posterior": {"linearisation": options.linearisation, "kernel": options.kernel}}
-    config = Config().with_overrides(full.config).with_overrides(overrides).posterior
+    config = Config.from_stored(full.config).with_overrides(overrides).posterior
     directory = options.out or options.archive.parent
     for path in (options.archive, directory / "sparsity.png"):
         files.require_writable(path)
