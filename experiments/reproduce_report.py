@@ -23,14 +23,16 @@ these files is positive to the right, against the description of its format; it 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 from common import REPORT, argument_parser, has_recordings, open_recording, with_aligned
 
 import ekfslam
 from ekfslam import files
 from ekfslam.evaluation.tables import document, markdown_table
-from ekfslam.figures.maps import plot_landmark_arrows, plot_trajectories
+from ekfslam.figures.maps import plot_landmark_arrows, plot_map
 from ekfslam.figures.style import save_all
+from ekfslam.filters.result import Landmarks
 
 # Recording, and the report's figures of its trajectory and of its landmarks.
 FIGURES = (
@@ -62,9 +64,9 @@ def main() -> int:
 
         results, truth = comparison.results, comparison.sequence.truth
         as_reported = ekfslam.run(comparison.sequence, "mapping-only", AS_REPORTED)
-        paths = {mode: results[mode] for mode in ("dead-reckoning", "full")}
+        paths = {mode: replace(results[mode], landmarks=Landmarks.empty()) for mode in ("dead-reckoning", "full")}
         figures = {
-            trajectory_figure: plot_trajectories(paths, truth),
+            trajectory_figure: plot_map(paths, truth),
             landmark_figure: plot_landmark_arrows(as_reported, truth),
             f"{landmark_figure}_full": plot_landmark_arrows(results["full"], truth),
         }

@@ -151,7 +151,7 @@ def test_numbers_of_toml_come_back(value):
 def test_a_dollar_begins_no_formula(tmp_path, name):
     sequence = dataclasses.replace(synthetic_sequence(frames=20, landmarks=20), name=name)
     figure = plot_map({name: synthetic_result(sequence)}, sequence.truth)
-    style.save_figure(figure, tmp_path / "map.png")
+    style.save_all(tmp_path, {"map": figure})
     assert name in figure.axes[0].get_title()
     assert not figure.axes[0].title.get_parse_math()
     plt.close("all")

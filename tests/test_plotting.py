@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from support.helpers import synthetic_result, synthetic_sequence
 
 from ekfslam.figures import series
-from ekfslam.figures.maps import ellipse_axes, plot_landmark_arrows, plot_map, plot_trajectories
+from ekfslam.figures.maps import ellipse_axes, plot_landmark_arrows, plot_map
 from ekfslam.figures.run import plot_errors, plot_nis, plot_parameters, save_figures
 from ekfslam.figures.views import plot_trajectory
 from ekfslam.filters.result import Parameters, Result
@@ -74,11 +74,10 @@ def test_covariance_along_world_axes_is_that_of_sampled_errors(results):
         np.testing.assert_allclose(np.cov(sampled.T) / scale, expected / scale, atol=0.03)
 
 
-@pytest.mark.parametrize("kind", ["map", "trajectories", "landmarks"])
+@pytest.mark.parametrize("kind", ["map", "landmarks"])
 def test_views_from_above_have_equal_aspect_and_metres_on_their_axes(sequence, results, kind):
     figure = {
         "map": lambda: plot_map(results, sequence.truth),
-        "trajectories": lambda: plot_trajectories(results, sequence.truth),
         "landmarks": lambda: plot_landmark_arrows(results["full"], sequence.truth),
     }[kind]()
     (ax,) = figure.axes
@@ -137,7 +136,7 @@ def test_far_outliers_do_not_decide_the_view_but_are_counted(results, draw):
 def test_a_vehicle_that_stands_still_can_be_drawn(results):
     full = results["full"]
     still = dataclasses.replace(full, T_world_imu=np.tile(np.eye(4), (len(full.time_s), 1, 1)))
-    plot_trajectories({"full": still}).canvas.draw()
+    plot_map({"full": still}).canvas.draw()
 
 
 def test_arrows_lead_from_first_to_final_estimate(results):

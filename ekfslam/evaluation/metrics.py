@@ -78,8 +78,8 @@ def offered(result: Result, truth: Truth | None, interpolated: BoolArray) -> dic
     """Return what metrics may take by name, None for what is missing.
 
     ``result``, its ``landmarks`` and ``innovation`` (None without an update), the ``interpolated`` intervals (T,) of
-    the recording, ``any_truth``; with true poses ``truth``, ``measured`` (the truth of frames that no interpolated
-    interval leads to), and ``T_est`` and ``T_true`` (n, 4, 4) at its frames.
+    the recording, and the ``truth``; with true poses ``measured`` (the truth of frames that no interpolated interval
+    leads to), and ``T_est`` and ``T_true`` (n, 4, 4) at its frames.
     """
     known = truth if truth is not None and len(truth.frame) else None
     return {
@@ -87,8 +87,7 @@ def offered(result: Result, truth: Truth | None, interpolated: BoolArray) -> dic
         "landmarks": result.landmarks,
         "innovation": result.innovation if result.innovation.dof.any() else None,
         "interpolated": interpolated,
-        "any_truth": truth,
-        "truth": known,
+        "truth": truth,
         "measured": known and measured_truth(known, interpolated, result.time_s),
         "T_est": known and result.T_world_imu[known.frame],
         "T_true": known and known.T_world_imu,
@@ -160,10 +159,7 @@ def nis_per_dof(innovation: Innovation) -> float:
     return float(innovation.nis.sum() / innovation.dof.sum())
 
 
-@metric("landmark_rmse_m", "landmark RMSE [m]", ".3f")
-def landmark_rmse(result: Result, any_truth: Truth) -> float | None:
-    """Return the root mean square error of the landmarks with known true position, without alignment."""
-    return trajectory.landmark_rmse(result.landmarks, any_truth)
+metric("landmark_rmse_m", "landmark RMSE [m]", ".3f")(trajectory.landmark_rmse)
 
 
 @metrics(("accepted", "accepted", "d"), ("rejected", "rejected", "d"))

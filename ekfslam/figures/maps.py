@@ -20,7 +20,7 @@ from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.trajectory import distance_along
 from ekfslam.figures import registry
 from ekfslam.figures.series import BAND_SIGMAS, draw_series, height
-from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, line_of, style_of, styled
+from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, line_of, style_of
 from ekfslam.filters.result import Result
 from ekfslam.geometry.motion import world_axes_covariance
 
@@ -81,21 +81,6 @@ def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figur
     _outside_legend(ax)
     drawn = f"{SIGMAS:g}-sigma ellipses ({_HELD} of a Gaussian), arrows along the IMU's x axis"
     ax.set_title(f"{mapper.sequence_name}: map from above\n{drawn}")
-    return _figure_of(ax)
-
-
-@styled
-def plot_trajectories(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
-    """Draw trajectories from above (x, y of world, metres), with the direction of the IMU's x axis at start and end."""
-    paths = {mode: result.T_world_imu for mode, result in results.items()}
-    if truth is not None and len(truth.frame):
-        paths["truth"] = truth.T_world_imu
-    ax, _ = map_axes(np.concatenate([T[:, :2, 3] for T in paths.values()]), np.empty((0, 2)))
-    draw_paths(ax, results, truth)
-    for name, T in paths.items():
-        _add_arrows(ax, T[[0, -1]], (TRUTH if name == "truth" else style_of(name))["color"])
-    _outside_legend(ax)
-    ax.set_title(f"{_first(results).sequence_name}\ntrajectories from above, arrows along the IMU's x axis")
     return _figure_of(ax)
 
 
@@ -164,10 +149,6 @@ def _add_arrows(ax: Axes, T_world_imu: Array, color: str) -> None:
     arrows.set_in_layout(False)
 
 
-def _first(results: Mapping[str, Result]) -> Result:
-    return next(iter(results.values()))
-
-
 def map_of(results: Mapping[str, Result]) -> Result:
     """Return the result whose map is shown: full, else the last one with landmarks, else the last."""
     with_map = [result for result in results.values() if len(result.landmarks)]
@@ -217,7 +198,8 @@ def draw_paths(ax: Axes, results: Mapping[str, Result], truth: Truth | None) -> 
         step = max(len(xy) // _MARKS, 1)
         ax.plot(*xy.T, **style, markevery=(i * step // len(results), step), label=mode, zorder=3)
         ax.plot(*xy[-1], "X", color=style["color"], markeredgecolor="black", markersize=8, zorder=5)
-    ax.plot(*_first(results).T_world_imu[0, :2, 3], "o", color="white", markeredgecolor="black", markersize=8, zorder=5)
+    start = next(iter(results.values())).T_world_imu[0, :2, 3]
+    ax.plot(*start, "o", color="white", markeredgecolor="black", markersize=8, zorder=5)
 
 
 def add_ellipses(

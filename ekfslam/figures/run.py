@@ -18,7 +18,6 @@ from ekfslam.figures import posterior as posterior
 from ekfslam.figures import registry, series
 from ekfslam.figures.series import BAND_SIGMAS, draw_series
 from ekfslam.figures.style import PRIOR, ZERO, Format, save_all, style_of
-from ekfslam.figures.style import save_figure as save_figure  # public name
 from ekfslam.filters.result import Result
 
 

@@ -137,6 +137,7 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
             figure = draw(*args, **kwargs)
         for text in _written(figure):
             text.set_parse_math(False)  # a "$" in a name begins no formula
+        figure._repr_png_ = lambda: png(figure)  # type: ignore[attr-defined]  # how notebooks show it without pyplot
         return figure
 
     return drawn
@@ -195,11 +196,6 @@ def pngs(
     paths = [Path(directory) / f"{name}.{format}" for name in components(figures)]
     drawn = (png(figure, packed) if format == "png" else vector(figure, format) for figure in figures.values())
     return dict(zip(paths, drawn, strict=True))
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure, see `png`."""
-    files.write(path, png(figure))
 
 
 def save_all(

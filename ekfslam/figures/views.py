@@ -1,7 +1,4 @@
-"""Figures of one result: `Result.map`, `Result.plot` and `Result.errors`.
-
-Figures are shown by a notebook as they are: without pyplot, nothing else would tell it how.
-"""
+"""Figures of one result: `Result.map`, `Result.plot` and `Result.errors`."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from ekfslam.errors import TruthError
 from ekfslam.figures.maps import plot_map
 from ekfslam.figures.run import plot_errors
 from ekfslam.figures.series import BAND_SIGMAS, draw_series, trajectory
-from ekfslam.figures.style import TRUTH, line_of, png, styled
+from ekfslam.figures.style import TRUTH, line_of, styled
 from ekfslam.filters.result import Result
 
 
@@ -25,7 +22,7 @@ def map_of(result: Result, truth: Any = None) -> Figure:
         result: Any run.
         truth: `Truth`, or a record that has one (`Sequence`, `Archive`), drawn for comparison.
     """
-    return _in_notebooks(plot_map({result.mode: result}, _truth(truth)))
+    return plot_map({result.mode: result}, _truth(truth))
 
 
 def errors_of(result: Result, truth: Any) -> Figure:
@@ -44,7 +41,7 @@ def errors_of(result: Result, truth: Any) -> Figure:
     if found.frame[-1] >= len(result.time_s):
         message = f"the truth has frame {found.frame[-1]}, the result has {len(result.time_s)} frames"
         raise TruthError(message, source=result.sequence_name)
-    return _in_notebooks(plot_errors({result.mode: result}, found, getattr(truth, "interpolated", None)))
+    return plot_errors({result.mode: result}, found, getattr(truth, "interpolated", None))
 
 
 def trajectory_of(result: Result, truth: Any = None) -> Figure:
@@ -54,7 +51,7 @@ def trajectory_of(result: Result, truth: Any = None) -> Figure:
         result: Any run.
         truth: As for `map_of`.
     """
-    return _in_notebooks(plot_trajectory(result, _truth(truth)))
+    return plot_trajectory(result, _truth(truth))
 
 
 @styled
@@ -82,8 +79,3 @@ def _truth(of: Any) -> Truth | None:
     if found is not None and not isinstance(found, Truth):
         raise TypeError(f"expected a Truth, a Sequence or an Archive, found {type(of).__name__}")
     return found
-
-
-def _in_notebooks(figure: Figure) -> Figure:
-    figure._repr_png_ = lambda: png(figure)  # type: ignore[attr-defined]
-    return figure

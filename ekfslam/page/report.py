@@ -232,7 +232,7 @@ def _configuration(config: Mapping[str, Any]) -> str:
         for key, value in settings.items():
             name = f"{table}.{key}"
             all_of_it[name] = value
-            if value != getattr(getattr(default, table, None), key, None):
+            if value != getattr(getattr(default, table, None), key, value):
                 changed[name] = value
     own = _pairs(changed) if changed else "<p>Every setting has its default.</p>"
     return f"{own}<details><summary>all settings</summary>{_pairs(all_of_it)}</details>"
