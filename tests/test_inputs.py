@@ -162,3 +162,13 @@ def test_velocities_at_a_higher_rate_lead_to_the_frame_piece_by_piece():
 def test_a_recording_without_samples_has_no_inertial_intervals():
     with pytest.raises(LostDataError, match="no inertial samples"):
         world().interval(3, InertialSamples)
+
+
+def test_info_names_the_inputs(tmp_path, capsys):
+    from ekfslam.cli import main
+
+    ekfslam.write_sequence(world(inputs=(inertial(),)), tmp_path / "a.h5")
+    main(["info", str(tmp_path / "a.h5")])
+    shown = capsys.readouterr().out
+    assert "440 inertial samples, 200 Hz; gyroscope 0.00017 rad/s/sqrt(Hz)" in shown
+    assert "inertial samples move the state" in shown

@@ -54,6 +54,11 @@ class Velocities:
         require_shape(found, self.time_s.shape, "interpolated")
         object.__setattr__(self, "interpolated", frozen(np.asarray(found, dtype=bool)))
 
+    @property
+    def text(self) -> str:
+        """The samples in words."""
+        return f"{len(self.time_s)} velocities ({self.frame} frame), {_rate(self.time_s)}"
+
     def between(self, begin_s: float, end_s: float) -> Velocities:
         """Return the samples that drive the time from ``begin_s`` to ``end_s``."""
         begin, last = np.searchsorted(self.time_s, (begin_s, end_s)).tolist()
@@ -153,6 +158,15 @@ class InertialSamples:
             require_shape(getattr(self, name), (len(self.time_s), 3), name)
             require_finite(getattr(self, name), name, LARGEST_VELOCITY)
 
+    @property
+    def text(self) -> str:
+        """The samples in words."""
+        stated = "densities of noise not stated"
+        if self.noise is not None:
+            n = self.noise
+            stated = f"gyroscope {n.gyro:.3g} rad/s/sqrt(Hz), accelerometer {n.accel:.3g} m/s^2/sqrt(Hz)"
+        return f"{len(self.time_s)} inertial samples, {_rate(self.time_s)}; {stated}"
+
     def between(self, begin_s: float, end_s: float) -> InertialSamples:
         """Return the samples from ``begin_s`` to ``end_s``, with one more on each side to interpolate to both ends."""
         begin = int(np.searchsorted(self.time_s, begin_s, side="right")) - 1
@@ -206,6 +220,11 @@ def validate_inputs(inputs: tuple[Input, ...], time_s: Array) -> None:
 
 def _median_step(time_s: Array) -> float:
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+
+
+def _rate(time_s: Array) -> str:
+    step_s = _median_step(time_s)
+    return f"{1.0 / step_s:.4g} Hz" if step_s > 0 else "one instant"
 
 
 def _require_cover(samples: Input, begin_s: float, end_s: float) -> None:

@@ -69,6 +69,8 @@ def _print_recording(sequence: Sequence) -> None:
         f"camera        fu {camera.fu_px:g} fv {camera.fv_px:g} cu {camera.cu_px:g} cv {camera.cv_px:g} px, "
         f"baseline {camera.baseline_m:g} m"
     )
+    for samples in sequence.inputs:
+        print(f"inputs        {samples.text}")
     print(_noise_line(sequence))
     known = "none" if truth is None else f"{len(truth.frame)} poses, {len(truth.landmark)} landmarks"
     print(f"truth         {known}")
@@ -81,6 +83,8 @@ def _print_recording(sequence: Sequence) -> None:
 
 
 def _noise_line(sequence: Sequence) -> str:
+    if not sequence.has_velocities and sequence.inertial is not None:
+        return "velocities    not measured: inertial samples move the state"
     if not sequence.has_velocities:
         return "velocities    nobody measured any: the twist is a walk that starts from stereo odometry"
     if sequence.noise is None:
