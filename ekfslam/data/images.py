@@ -1,7 +1,4 @@
-"""What every source of stereo images gives: one validated recording of image pairs, with its calibration.
-
-Sources only read. `ekfslam.frontend` rectifies the pairs and makes tracks of them.
-"""
+"""Recordings of stereo images with their calibration. `ekfslam.frontend` rectifies and tracks them."""
 
 from __future__ import annotations
 
@@ -23,14 +20,14 @@ from ekfslam.names import printable
 Image = NDArray[np.uint8]
 DistortionModel = Literal["none", "radtan", "equidistant"]
 
-# How many coefficients a model may have.
+# Allowed numbers of coefficients of a model.
 _COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
-_LARGEST_SIDE_PX = 1 << 15  # what OpenCV can remap
+_LARGEST_SIDE_PX = 1 << 15  # limit of OpenCV's remap
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """How a lens departs from a pinhole.
+    """Distortion of a lens.
 
     Args:
         model: ``none``, ``radtan`` (radial and tangential, Brown 1966) or ``equidistant`` (Kannala and Brandt 2006).
@@ -64,7 +61,7 @@ class PairCalibration:
         size: Width and height of the images, px; the same for both.
         T_right_left: (4, 4) left optical frame to right optical frame; the right camera of a rectified pair is at
             ``-baseline`` along x.
-        distortion_left, distortion_right: Of the lenses.
+        distortion_left, distortion_right: Distortion of the lenses.
 
     Raises:
         CalibrationError: Intrinsics are singular or mirrored, the size is no size, or the cameras coincide.
@@ -118,20 +115,20 @@ class ImageRecording:
     """One recording of stereo images, with or without body velocities.
 
     Args:
-        name: Short name, used for folders and titles.
-        source: Where it came from, used in error messages.
+        name: Short name for folders and titles.
+        source: File or folder, named in error messages.
         time_s: (T,) strictly increasing stamps.
-        calibration: Of the pair.
-        load: Left and right image of frame k as (height, width) uint8; raises `UnknownFormatError` or `DataError`. It
-            keeps nothing, may be called in any order, and must not change.
-        T_cam_imu: (4, 4) IMU to the optical frame of the left camera, as it is before rectification.
+        calibration: Calibration of the pair.
+        load: Function that returns the left and right image of frame k as (height, width) uint8, in any order. It
+            raises `UnknownFormatError` or `DataError`.
+        T_cam_imu: (4, 4) IMU to the optical frame of the left camera before rectification.
         twist: (T, 6) measured velocities ``[v; w]`` in ``velocity_frame``, ``twist[k]`` drives ``(t[k-1], t[k]]``;
-            None where nobody measured any.
+            None if they were not measured.
         velocity_frame: See `ekfslam.Sequence`.
         truth: Ground truth, if there is any.
-        noise: Noise as stated by the source, if it states any.
-        notes: What the reader found and did about it, one sentence each.
-        attributes: Further facts to keep with every result.
+        noise: Noise that the source states, if it states any.
+        notes: Findings and repairs of the reader, one sentence each.
+        attributes: Further facts that every result keeps.
 
     Raises:
         DataError: A field is malformed; the subclass says how.

@@ -1,4 +1,4 @@
-"""Stretches of a recording, as recordings of their own."""
+"""Stretches of a recording as recordings."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ekfslam.data.sequence import Sequence, Truth
 
 
 def cut(sequence: Sequence, begin: int, end: int, T_world_imu: Array) -> Sequence | None:
-    """Frames ``begin`` to ``end - 1`` of a recording, without truth; None where nothing is observed in them.
+    """Return frames ``begin`` to ``end - 1`` of a recording, without truth; None if nothing is observed in them.
 
     Args:
-        sequence: The recording.
-        begin, end: Frames of it.
-        T_world_imu: (4, 4) pose that the stretch starts from, its truth by definition.
+        sequence: Recording.
+        begin, end: First frame, and frame after the last.
+        T_world_imu: (4, 4) first pose of the stretch, which counts as true.
     """
     seen = sequence.observations.frame
     if not ((seen >= begin) & (seen < end)).any():

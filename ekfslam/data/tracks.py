@@ -1,4 +1,4 @@
-"""What the tracks of a recording look like, and how to cut one: the ground that `ekfslam.data.hygiene` stands on."""
+"""Statistics of tracks, and cutting of tracks, for `ekfslam.data.hygiene`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOVING_RAD_S = 0.02
 
 @dataclass(frozen=True)
 class TrackReport:
-    """What `inspect_tracks` found.
+    """Findings of `inspect_tracks`.
 
     Args:
         tracks: Number of distinct landmark ids.
@@ -37,7 +37,7 @@ class TrackReport:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """The findings, one sentence each."""
+        """Return the findings, one sentence each."""
         frames, observations = len(self.observations_per_frame), int(self.observations_per_frame.sum())
         blind = int((self.observations_per_frame == 0).sum())
         return (
@@ -52,7 +52,7 @@ class TrackReport:
 
 
 def inspect_tracks(observations: Observations, twist: Array) -> TrackReport:
-    """Report on the tracks of a recording with velocities ``twist`` (T, 6) in m/s and rad/s, one for every frame."""
+    """Inspect the tracks of a recording with velocities ``twist`` (T, 6) in m/s and rad/s."""
     earlier, later = successive(observations)
     gap = observations.frame[later] - observations.frame[earlier] > 1
     pixels = observations.pixels_px
@@ -67,14 +67,14 @@ def inspect_tracks(observations: Observations, twist: Array) -> TrackReport:
 
 
 def cut_tracks(observations: Observations, starts: NDArray[np.bool_], first_id: int) -> IntArray:
-    """Landmark ids (K,) after every track is cut before its observations that ``starts`` (K,) marks.
+    """Return landmark ids (K,) after tracks are cut before the observations that ``starts`` (K,) marks.
 
     New pieces are numbered from ``first_id``, by track and then by frame; the first piece of a track keeps its id.
     """
     order = np.lexsort((observations.frame, observations.landmark))
     ids, marked = observations.landmark[order], starts[order]
     first = np.diff(ids, prepend=-1) != 0
-    # The number of the piece an observation belongs to; unmarked beginnings are those of the tracks themselves.
+    # Number of the piece of an observation; unmarked beginnings are those of the tracks themselves.
     piece = first_id - 1 + np.cumsum(marked)
     begins = np.maximum.accumulate(np.where(first | marked, np.arange(len(ids)), 0))
     landmark = np.empty_like(ids)
@@ -83,15 +83,14 @@ def cut_tracks(observations: Observations, starts: NDArray[np.bool_], first_id: 
 
 
 def repeated_frames(observations: Observations, twist: Array) -> IntArray:
-    """Ascending frames that show the previous frame's pixels again, bit for bit in every common track, while moving.
+    """Return ascending frames of a moving rig that repeat the previous frame's pixels in every common track.
 
     One common track is enough: a subpixel tracker does not return the same four numbers from another image, and in the
-    recordings no frame repeats some tracks but not others. ``twist[k]`` (T, 6) m/s and rad/s, which drives the interval
-    before frame k, tells whether the rig moves; standing still, pixels may well repeat.
+    recordings no frame repeats only some tracks. ``twist[k]`` (T, 6) m/s and rad/s drives the interval before frame k
+    and says whether the rig moves; at rest, pixels may repeat.
 
-    In such a frame the tracker has been restarted at the old pixels in the new image. The pixels are right for the
-    frame that they stand in (they predict the next one as well as any), but show other points than before: no track
-    leads across.
+    In such a frame the tracker was restarted at the old pixels in the new image. The pixels are right for this frame
+    and predict the next one, but show other points than before: no track leads across.
     """
     earlier, later = successive(observations)
     adjacent = observations.frame[later] - observations.frame[earlier] == 1
@@ -104,7 +103,7 @@ def repeated_frames(observations: Observations, twist: Array) -> IntArray:
 
 
 def successive(observations: Observations) -> tuple[IntArray, IntArray]:
-    """Index pairs (earlier, later) of observations that follow each other in the same track."""
+    """Return index pairs (earlier, later) of successive observations of the same track."""
     order = np.lexsort((observations.frame, observations.landmark))
     same_track = np.diff(observations.landmark[order]) == 0
     return order[:-1][same_track], order[1:][same_track]

@@ -1,4 +1,4 @@
-"""How far a ground truth itself may be wrong, as data: what NEES must allow for beside the estimate's covariance."""
+"""Noise of a ground truth itself, which NEES adds to the covariance of the estimate."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from dataclasses import dataclass
 class TruthNoise:
     """Standard deviations of a ground truth, all independent of each other.
 
-    An error of the first pose moves a whole estimate, which starts there; the others are those of each pose alone.
+    An error of the first pose moves the whole estimate, which starts there. The other errors belong to single poses.
 
     Args:
-        first_roll_rad, first_pitch_rad, first_yaw_rad: Of the first pose, about the axes of the IMU.
-        first_position_m: Of the first pose, each axis.
+        first_roll_rad, first_pitch_rad, first_yaw_rad: Attitude of the first pose, about the axes of the IMU.
+        first_position_m: Position of the first pose, each axis.
         stamp_s: Jitter of the stamps: an error along the motion, in proportion to the velocities.
-        position_m: Of each pose, each axis.
-        attitude_rad: Of each pose, each axis.
+        position_m: Position of each pose, each axis.
+        attitude_rad: Attitude of each pose, each axis.
     """
 
     first_roll_rad: float = 0.0
@@ -30,7 +30,7 @@ class TruthNoise:
 
     @property
     def text(self) -> str:
-        """All of it in one line, angles in degrees."""
+        """Return all values in one line, angles in degrees."""
         roll, pitch, yaw, attitude = (
             f"{math.degrees(value):.3g}"
             for value in (self.first_roll_rad, self.first_pitch_rad, self.first_yaw_rad, self.attitude_rad)

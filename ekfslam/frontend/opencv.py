@@ -1,4 +1,4 @@
-"""OpenCV, imported where it is used: it is an extra."""
+"""OpenCV, an extra that is imported on first use."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from ekfslam.errors import MissingPackageError
 
 
 def opencv() -> Any:
-    """The module ``cv2``.
+    """Return the module ``cv2``.
 
     Raises:
-        MissingPackageError: It is not installed.
+        MissingPackageError: OpenCV is not installed.
     """
     try:
         import cv2
@@ -24,7 +24,7 @@ def opencv() -> Any:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let OpenCV use one thread meanwhile: images are small, and a frame's time is then its own."""
+    """Limit OpenCV to one thread within the context: images are small, and times of frames stay comparable."""
     cv2 = opencv()
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)

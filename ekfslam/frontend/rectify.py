@@ -1,4 +1,4 @@
-"""Rectification: image pairs of any calibration as if both cameras were equal pinholes side by side."""
+"""Rectification of image pairs: both cameras become equal pinholes side by side."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _LEAST_COSINE = 0.5  # between the optical axes, and between them and the plane 
 
 @dataclass(frozen=True)
 class Rectification:
-    """How the images of a pair are warped.
+    """Warp of the images of a pair.
 
     Args:
-        camera: The rectified pair.
+        camera: Rectified pair.
         T_rectified_left: (4, 4) left optical frame to that of the rectified left camera: a rotation.
-        maps: Of the left and the right image, (height, width, 2) float32 pixels to read; None: as they are.
-        valid: Of both, (height, width) which pixels show something; None: all.
+        maps: Pixels (height, width, 2) float32 to read from the left and the right image; None leaves them as they are.
+        valid: Masks (height, width) of the rectified pixels that show something; None for all.
     """
 
     camera: StereoCamera
@@ -34,7 +34,7 @@ class Rectification:
     valid: tuple[BoolArray, BoolArray] | None
 
     def apply(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """The rectified pair."""
+        """Return the rectified images."""
         if self.maps is None:
             return left, right
         cv2 = opencv()
@@ -46,14 +46,14 @@ class Rectification:
 
 
 def rectification(calibration: PairCalibration) -> Rectification:
-    """How to rectify a pair.
+    """Return the rectification of a pair.
 
     The new x axis is along the baseline, the new optical axis is the mean of the two across it (Fusiello, Trucco and
     Verri, "A compact algorithm for rectification of stereo pairs", MVA 2000). The focal length is the mean of the
-    four, and the principal point puts the middle of both images into the middle.
+    four. The principal point centres both images.
 
     Raises:
-        CalibrationError: The cameras look into different directions, or along the baseline.
+        CalibrationError: The cameras look in different directions, or along the baseline.
     """
     T, K_left, K_right = calibration.T_right_left, calibration.K_left, calibration.K_right
     if calibration.is_rectified:
@@ -82,7 +82,7 @@ def rectification(calibration: PairCalibration) -> Rectification:
 
 
 def _rectifying_rotation(T_right_left: Array) -> Array:
-    """(3, 3) left optical frame to the rectified one."""
+    """Return the rotation (3, 3) from the left optical frame to the rectified one."""
     R_left_right = T_right_left[:3, :3].T
     x = -R_left_right @ T_right_left[:3, 3]  # position of the right camera in the left one
     x /= np.linalg.norm(x)
@@ -97,7 +97,7 @@ def _rectifying_rotation(T_right_left: Array) -> Array:
 
 
 def _direction_of_middle(K: Array, lens: Distortion, R: Array, size: tuple[int, int]) -> Array:
-    """(2,) normalised rectified coordinates of the middle of an image, the distortion inverted by Newton's method."""
+    """Return normalised rectified coordinates (2,) of the middle of an image, found by Newton's method."""
     target = (np.linalg.inv(K) @ (*(0.5 * (np.array(size) - 1.0)), 1.0))[:2]
     xy = target.copy()
     for _ in range(20):
@@ -109,7 +109,7 @@ def _direction_of_middle(K: Array, lens: Distortion, R: Array, size: tuple[int, 
 
 
 def _image(rays: Array, K: Array, lens: Distortion) -> Array:
-    """Pixels (..., 2) at which a camera images rays (..., 3); those behind it far outside."""
+    """Return the pixels (..., 2) of rays (..., 3); rays from behind are far outside of the image."""
     ahead = rays[..., 2:] > 1e-3
     xy = np.where(ahead, rays[..., :2] / np.where(ahead, rays[..., 2:], 1.0), 0.0)
     bent = np.concatenate([_distorted(xy, lens), np.ones((*xy.shape[:-1], 1))], axis=-1)
@@ -123,5 +123,5 @@ def _distorted(xy: Array, lens: Distortion) -> Array:
 
 
 def _shows(pixels: Float32Array, size: tuple[int, int]) -> BoolArray:
-    """Which pixels (height, width) of a map (height, width, 2) are inside the image that is read."""
+    """Return whether pixels (height, width) of a map (height, width, 2) are inside the image that is read."""
     return np.all((pixels >= 0) & (pixels <= np.array(size) - 1), axis=-1)

@@ -1,12 +1,12 @@
-"""Self-calibration: how the right camera is rotated against the calibration, found from the tracks alone.
+"""Self-calibration: rotation of the right camera against the calibration, estimated from tracks alone.
 
 A small rotation (pitch a, yaw y, roll b; all times the focal length, px) moves the pixels of the right image by
 
     d uR = a x y + yaw (1 + x^2) - b y        d vR = a (1 + y^2) + b x
 
-with x, y the normalised coordinates of a pixel. Rows tell pitch and roll, ``vL - vR = a (1 + y^2) + b x + c y``; c, a
-difference of focal lengths, is fitted and left alone. Yaw changes all disparities and shows only where the rig moves:
-depths of two frames and the flow between them must agree. Everything is Gaussian and causal: a prior, then the
+with x, y the normalised coordinates of a pixel. Rows show pitch and roll, ``vL - vR = a (1 + y^2) + b x + c y``; c, a
+difference of focal lengths, is fitted but not used. Yaw changes all disparities and shows only when the rig moves:
+depths of two frames and the flow between them must agree. The estimate is Gaussian and causal: a prior, then the
 information of each frame.
 """
 
@@ -18,24 +18,24 @@ from ekfslam.arrays import Array
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.geometry.stereo_motion import Alignment
 
-# What frames say is worth so much of what it would be worth if their errors were independent. Successive frames see the
-# same features with the same errors: the standard deviation of yaw came out five to ten times too small.
+# Share of the information of a frame that counts. Successive frames see the same features with the same errors: without
+# it, the standard deviation of yaw was five to ten times too small.
 _INDEPENDENT_SHARE = 0.04
 _ROBUST_PX = 1.0
 _LEAST_POINTS = 10
 
 
 class RightRotation:
-    """The estimate and its covariance.
+    """Estimate of the rotation and its covariance.
 
     Args:
-        camera: Of the rectified pair.
+        camera: Rectified pair.
         std_rad: Prior standard deviation of each axis.
         pixel_std: Standard deviation of one pixel.
 
     Attributes:
-        rows: (3,) a, b, c; px.
-        yaw: px.
+        rows: (3,) a, b, c, px.
+        yaw: Estimate of yaw, px.
     """
 
     def __init__(self, camera: StereoCamera, std_rad: float, pixel_std: float) -> None:
@@ -54,7 +54,7 @@ class RightRotation:
 
     @property
     def vector(self) -> Array:
-        """(3,) pitch, yaw and roll, px: what is added to the pixels of the right image."""
+        """(3,) pitch, yaw and roll, px, which `correction` adds to the pixels of the right image."""
         a, b, _ = self.rows
         return np.array([a, self.yaw, b])
 
@@ -65,11 +65,11 @@ class RightRotation:
         return np.sqrt([variance[0], 1.0 / self._yaw_information, variance[1]])
 
     def row_offset(self, left: Array) -> Array:
-        """``vL - vR`` (n,) that features at pixels (n, 2) of the left image should have."""
+        """Return the predicted ``vL - vR`` (n,) of features at pixels (n, 2) of the left image."""
         return _row_terms(self._camera, left) @ self.rows
 
     def observe_rows(self, left: Array, right: Array) -> None:
-        """Learn pitch and roll from pairs of pixels (n, 2)."""
+        """Update pitch and roll from pairs of pixels (n, 2)."""
         J = _row_terms(self._camera, left)
         r = left[:, 1] - right[:, 1] - J @ self.rows
         weight = (1.0 + (r / _ROBUST_PX) ** 2) ** -2 * _INDEPENDENT_SHARE / (2.0 * self._std**2)
@@ -77,11 +77,11 @@ class RightRotation:
         self._rows_vector = self._rows_vector + (J * weight[:, None]).T @ (r + J @ self.rows)
 
     def observe_motion(self, alignment: Alignment, before_px: Array, now_px: Array) -> None:
-        """Learn yaw from two frames, their motion eliminated.
+        """Update yaw from two frames, with their motion eliminated.
 
         Args:
-            alignment: Of the rows of the two frames, corrected by the present estimate.
-            before_px, now_px: (n, 3) these rows.
+            alignment: Alignment of the rows of the two frames, corrected by the present estimate.
+            before_px, now_px: (n, 3) rows of the two frames.
         """
         if len(before_px) < _LEAST_POINTS:
             return
@@ -100,18 +100,18 @@ class RightRotation:
 
 
 def yaw_shape(camera: StereoCamera, u_px: Array) -> Array:
-    """``1 + x^2``: by how much a yaw of 1 px moves columns (n,)."""
+    """Return ``1 + x^2``, the shift of columns (n,) by a yaw of 1 px."""
     return 1.0 + ((u_px - camera.cu_px) / camera.fu_px) ** 2
 
 
 def correction(camera: StereoCamera, vector: Array, right: Array) -> Array:
-    """What is to be added to pixels (n, 2) of the right image for pitch, yaw and roll (3,) or (n, 3), px."""
+    """Return the correction (n, 2) of pixels (n, 2) of the right image for pitch, yaw, roll (3,) or (n, 3), px."""
     x, y = (right[:, 0] - camera.cu_px) / camera.fu_px, (right[:, 1] - camera.cv_px) / camera.fv_px
     a, yaw, b = np.moveaxis(np.asarray(vector), -1, 0)
     return np.stack([a * x * y + yaw * (1.0 + x * x) - b * y, a * (1.0 + y * y) + b * x], axis=1)
 
 
 def _row_terms(camera: StereoCamera, left: Array) -> Array:
-    """(n, 3) derivatives of ``vL - vR`` by a, b and c."""
+    """Return derivatives (n, 3) of ``vL - vR`` by a, b and c."""
     x, y = (left[:, 0] - camera.cu_px) / camera.fu_px, (left[:, 1] - camera.cv_px) / camera.fv_px
     return np.stack([1.0 + y * y, x, y], axis=1)

@@ -1,4 +1,4 @@
-"""From images to tracks: `track` makes a `Sequence` of an `ImageRecording`."""
+"""Tracking of a whole recording: `track` makes a `Sequence` of an `ImageRecording`."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ _SETTLING = 30  # first frames, whose pixels are corrected by the rotation known
 
 @dataclass(frozen=True)
 class TrackReport:
-    """What became of the features.
+    """Statistics of the features.
 
     Args:
-        frames, tracks, observations: How many there are.
-        lengths: (tracks,) observations of each track.
-        losses: How many tracks ended, by reason; the others were there at the end.
-        withheld: Observations that did not move as the rig, and were not reported.
-        refused: Corners without a match in the right image.
-        single: Tracks that one frame alone saw, which are left out.
-        rotation_px: (T, 3) pitch, yaw and roll of the right camera as known after each frame, times the focal length.
-        rotation_std_px: (T, 3) their standard deviations.
+        frames, tracks, observations: Their numbers.
+        lengths: (tracks,) number of observations of each track.
+        losses: Number of tracks that ended, by reason; the others reached the last frame.
+        withheld: Number of observations that did not move as the rig, and were not reported.
+        refused: Number of corners without a match in the right image.
+        single: Number of tracks that only one frame saw, which are left out.
+        rotation_px: (T, 3) estimated pitch, yaw and roll of the right camera after each frame, times the focal length.
+        rotation_std_px: (T, 3) standard deviations of ``rotation_px``.
     """
 
     frames: int
@@ -51,7 +51,7 @@ class TrackReport:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """One sentence each."""
+        """The statistics, one sentence each."""
         shortest, middle, longest = np.percentile(self.lengths, (10, 50, 90))
         ended = sum(self.losses.values())
         reasons = ", ".join(f"{reason} {count}" for reason, count in sorted(self.losses.items(), key=lambda p: -p[1]))
@@ -77,14 +77,14 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
 
     Args:
         recording: Images, calibration, and velocities if there are any.
-        config: Settings; defaults where None.
+        config: Settings; None for the defaults.
 
     Returns:
-        The recording with tracks, whose camera is the rectified pair; and what became of the features. Where nobody
-        measured velocities, its attributes have `WITHOUT_VELOCITIES` and its velocities are 0.
+        The recording with tracks, whose camera is the rectified pair, and statistics of the features. If velocities
+        were not measured, the attributes contain `WITHOUT_VELOCITIES`.
 
     Raises:
-        MissingPackageError: There is no OpenCV.
+        MissingPackageError: OpenCV is not installed.
         CalibrationError: The pair cannot be rectified.
         EmptyTracksError: Not one feature is seen in both images.
         UnknownFormatError, DataError: An image cannot be read, or has another size.
@@ -101,7 +101,7 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
             vectors.append(tracker.rotation.vector)
             stds.append(tracker.rotation.std)
     rotation, std = np.array(vectors), np.array(stds)
-    observations, single = _observations(seen, rotation, rectified.camera, _SETTLING)
+    observations, single = _observations(seen, rotation, rectified.camera)
     if not len(observations):
         raise EmptyTracksError(
             "no feature is seen in both images of two frames: is left right, or max_disparity too small?",
@@ -122,21 +122,20 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
     return _sequence(recording, rectified.camera, T_cam_imu, observations, report, config), report
 
 
-def _observations(seen: list[Seen], rotation: Array, camera: StereoCamera, settling: int) -> tuple[Observations, int]:
-    """Observations with the rotation of the right camera taken out, and how many tracks one frame alone saw.
+def _observations(seen: list[Seen], rotation: Array, camera: StereoCamera) -> tuple[Observations, int]:
+    """Return corrected observations, and the number of tracks that only one frame saw.
 
-    Causal with a start: what is known of the rotation after the first frames is used for these, too.
+    The correction is causal except at the start: the first frames use the rotation known after them.
 
     Args:
-        seen: By frame.
-        rotation: (T, 3) of the right camera as known after each frame, px.
-        camera: Of the rectified pair.
-        settling: Frames at the start.
+        seen: Features of each frame.
+        rotation: (T, 3) rotation of the right camera, estimated after each frame, px.
+        camera: Rectified pair.
     """
     frame = np.repeat(np.arange(len(seen)), [len(found.id) for found in seen])
     ids = np.concatenate([found.id for found in seen])
     left, right = (np.vstack([getattr(found, side) for found in seen]) for side in ("left", "right"))
-    used = np.maximum(frame, min(settling, len(seen) - 1))
+    used = np.maximum(frame, min(_SETTLING, len(seen) - 1))
     pixels = np.hstack([left, right + correction(camera, rotation[used], right)])
     _, inverse, counts = np.unique(ids, return_inverse=True, return_counts=True)
     twice = counts[inverse] > 1
@@ -151,7 +150,7 @@ def _sequence(
     report: TrackReport,
     config: FrontEndConfig,
 ) -> Sequence:
-    """The recording with tracks instead of images."""
+    """Return the recording with tracks instead of images."""
     return Sequence(
         name=recording.name,
         source=recording.source,
@@ -173,7 +172,7 @@ def _sequence(
 
 
 def _prediction(recording: ImageRecording, T_cam_imu: Array, k: int) -> Array | None:
-    """(4, 4) motion of the camera in the interval before frame k, by the measured velocities; None without any."""
+    """Return the motion (4, 4) of the camera before frame k by the measured velocities; None if there are none."""
     if recording.twist is None or k == 0:
         return None
     tau_s = float(recording.time_s[k] - recording.time_s[k - 1])
@@ -181,7 +180,7 @@ def _prediction(recording: ImageRecording, T_cam_imu: Array, k: int) -> Array | 
 
 
 def _account(config: FrontEndConfig, report: TrackReport) -> dict[str, str | int | float]:
-    """Attributes that say how the tracks were made."""
+    """Return attributes with the changed settings and the rotation of the right camera."""
     settings = {
         f"front_end_{setting.name}": getattr(config, setting.name)
         for setting in dataclasses.fields(config)

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from ekfslam import files
 from ekfslam.arrays import Array
-from ekfslam.data.readers.text import first_line
+from ekfslam.data.readers.text import first_row
 from ekfslam.errors import ArchiveError
 from ekfslam.filters.log import Log
 from ekfslam.filters.result import Result
@@ -261,7 +261,7 @@ def is_export(path: Path, format: str) -> bool:
     """Return whether a file is an earlier export in a format of `EXPORTS`."""
     export = EXPORTS[format]
     if export.columns:
-        return len(first_line(path).split()) == export.columns
+        return len(first_row(path, comment=None).split()) == export.columns
     try:
         with path.open("rb") as file:
             is_similar = file.read(len(export.begins)) == export.begins

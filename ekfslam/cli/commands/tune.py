@@ -9,7 +9,7 @@ from typing import get_args
 from ekfslam import files
 from ekfslam.cli.options import DEFAULT_DATA, add_data_options, add_force, open_data, require_ours
 from ekfslam.config import Config, NoiseModel
-from ekfslam.data.readers.text import first_line
+from ekfslam.data.readers.text import first_row
 from ekfslam.studies.tuning import toml_heading, tune
 
 EXAMPLES = (
@@ -40,7 +40,7 @@ def command(options: argparse.Namespace) -> None:
     sequence = open_data(options, options.data)
     if options.out:
         files.require_writable(options.out)
-        require_ours(options, options.out, lambda path: first_line(path) == toml_heading(sequence.name))
+        require_ours(options, options.out, lambda path: first_row(path, comment=None) == toml_heading(sequence.name))
     tuned = tune(sequence, config, drift=options.drift)
     print(tuned.table)
     if options.out:

@@ -35,7 +35,7 @@ from ekfslam.data.readers.messages import (
 )
 from ekfslam.data.readers.pictures import pair_stamps
 from ekfslam.data.readers.registry import Reader, Source
-from ekfslam.data.readers.text import first_line
+from ekfslam.data.readers.text import first_row
 from ekfslam.data.velocities import Velocities, is_covered, resample
 from ekfslam.errors import CalibrationError, LostDataError, StampError, UnknownFormatError
 from ekfslam.geometry import se3
@@ -339,7 +339,9 @@ def _transform(bag: Bag, target: str, source: str) -> Array | None:
 def _recognises(source: Source) -> bool:
     if source.head.startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC)):
         return True
-    return source.path.is_dir() and first_line(source.path / "metadata.yaml").startswith("rosbag2_bagfile_information")
+    return source.path.is_dir() and first_row(source.path / "metadata.yaml", comment=None).startswith(
+        "rosbag2_bagfile_information"
+    )
 
 
 READER = Reader("bag", "a bag of ROS 1 or ROS 2, or MCAP", _recognises, images=lambda source: open_bag(source.path))

@@ -24,7 +24,7 @@ from ekfslam.data.readers.fields import (
 )
 from ekfslam.data.readers.pickled import npy_header
 from ekfslam.data.readers.registry import Extrinsics, Lateral, Reader
-from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Observations, Sequence, validate_camera
+from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, validate_camera
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import CalibrationError, ExtrinsicsError, UnknownFormatError
 from ekfslam.geometry import se3
@@ -49,7 +49,7 @@ _LATER_NOTE = (
     "The stored imu_T_cam is a pose in an IMU frame forward, right, down, while the velocities are forward, left, up: "
     "T_cam_imu = inv(imu_T_cam) diag(1, -1, -1, 1) is used."
 )
-AS_STORED_NOTE = "The lateral velocity is used as stored: nothing is known of a wrong sign in this edition."
+AS_STORED_NOTE = "The lateral velocity is used as stored: no wrong sign is known in this edition."
 _FLIPPED = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -57,11 +57,10 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
     """Read ``features`` (4 x M x T, -1 or NaN where unseen), velocities (3 x T), stamps, ``K``, ``b``, extrinsics.
 
     There are two editions. That of the report has ``rotational_velocity`` and ``cam_T_imu``. The later one, of
-    KITTI-360, has ``angular_velocity`` and ``imu_T_cam``, which is a true camera-to-IMU pose; neither option below
-    means anything for it.
+    KITTI-360, has ``angular_velocity`` and ``imu_T_cam``, a true camera-to-IMU pose; it ignores both options below.
 
     Args:
-        path: The .npz file.
+        path: Path of the .npz file.
         extrinsics: ``corrected`` takes ``T_cam_imu = [R, -R t]`` from the stored rotation and translation;
             ``as-stored`` takes the stored matrix, which reproduces the report.
         lateral: Sign of the lateral velocity, see `with_lateral`; ``as-stored`` reproduces the report.
@@ -98,28 +97,26 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
             T_cam_imu=T_cam_imu,
             observations=observations,
             velocity_frame="level",
-            notes=(notes[0], LEVEL_VELOCITIES_NOTE, notes[1], *found, *_notes_on(observations, twist)),
-            attributes=_attributes(path, twist, used, None if is_later else extrinsics),
+            notes=(
+                notes[0],
+                LEVEL_VELOCITIES_NOTE,
+                notes[1],
+                *found,
+                *interpolation_notes(twist),
+                *inspect_tracks(observations, twist).notes,
+            ),
+            attributes={
+                "checksum_sha256": checksum(path),
+                "reader": READER.name,
+                **({} if is_later else {"extrinsics": extrinsics}),
+                "lateral": used,
+                **interpolation_attributes(twist),
+            },
         )
 
 
-def _attributes(path: Path, twist: Array, lateral: str, extrinsics: Extrinsics | None) -> dict[str, str]:
-    """How the file was read; the later edition leaves no choice of extrinsics."""
-    return {
-        "checksum_sha256": checksum(path),
-        "reader": READER.name,
-        **({} if extrinsics is None else {"extrinsics": extrinsics}),
-        "lateral": lateral,
-        **interpolation_attributes(twist),
-    }
-
-
-def _notes_on(observations: Observations, twist: Array) -> tuple[str, ...]:
-    return (*interpolation_notes(twist), *inspect_tracks(observations, twist).notes)
-
-
 def stamps_of(fields: Mapping[str, NDArray], name: str) -> Array:
-    """Stamps (T,) that an edition of the data keeps as a row, a column or a vector.
+    """Return the stamps (T,) of a field that is a row, a column or a vector.
 
     Raises:
         DataError: They are missing, no finite numbers, or a table.
@@ -146,7 +143,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
 
 
 def _inspect(path: Path) -> None:
-    """Refuse arrays that claim more than may be read, or other than they have, before they are decompressed."""
+    """Refuse arrays that claim too much memory, or more than they have, before they are decompressed."""
     require_file(path)
     budget = Budget(str(path))
     with ZipFile(path) as archive:
@@ -163,7 +160,7 @@ def _inspect(path: Path) -> None:
 
 
 def camera_of(K: Array, baseline_m: float) -> StereoCamera:
-    """The camera of an intrinsic matrix (3, 3); raises a `DataError` for one that is none, or has skew."""
+    """Return the camera of an intrinsic matrix (3, 3); raise `DataError` if it is none, or has skew."""
     if abs(np.linalg.det(K)) < 1e-9:
         raise CalibrationError("the intrinsic matrix is singular", field="K")
     pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
@@ -181,7 +178,7 @@ def camera_of(K: Array, baseline_m: float) -> StereoCamera:
 
 
 def _with_camera_position(stored: Array) -> Array:
-    """``T_cam_imu`` from its rotation and the position of the camera in the IMU frame."""
+    """Return ``T_cam_imu`` from its rotation and the position of the camera in the IMU frame."""
     corrected = stored.copy()
     corrected[:3, 3] = -stored[:3, :3] @ stored[:3, 3]
     return corrected

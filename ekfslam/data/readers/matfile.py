@@ -1,4 +1,4 @@
-"""The numeric arrays of a MATLAB 5 file. `scipy.io.loadmat` crashes the interpreter on some damaged files; this raises.
+"""Numeric arrays of MATLAB 5 files. `scipy.io.loadmat` crashes the interpreter on some damaged files.
 
 A file is 128 bytes of header and then elements: a tag (type, number of bytes) and data. A matrix is an element whose
 data are elements again: flags, dimensions, name, values. Since MATLAB 7 every matrix comes compressed by zlib.
@@ -24,14 +24,14 @@ _MOST_DEFLATED = 1032  # bytes of one compressed byte
 
 
 def parse_mat(content: bytes, budget: Budget) -> dict[str, NDArray]:
-    """Every variable of a file by name; what is not a real numeric array becomes an empty array of objects.
+    """Return every variable of a file by name; an empty array of objects stands for other than real numbers.
 
     Args:
-        content: Of the file.
-        budget: What variables may be decompressed to.
+        content: Content of the file.
+        budget: Limit of the decompressed size.
 
     Raises:
-        EkfslamError: It claims more than that.
+        EkfslamError: The variables claim more than the limit.
         ValueError, struct.error, zlib.error: The file is damaged.
     """
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
@@ -49,7 +49,7 @@ def parse_mat(content: bytes, budget: Budget) -> dict[str, NDArray]:
 
 
 def _inflated(data: memoryview, order: str, budget: Budget) -> memoryview:
-    """A compressed element: as much as its tag claims, and that only if it may."""
+    """Decompress an element to the size that its tag claims, if that is allowed."""
     stream = zlib.decompressobj()
     tag = stream.decompress(data, 8)
     _, size = struct.unpack_from(order + "II", tag)
@@ -60,7 +60,7 @@ def _inflated(data: memoryview, order: str, budget: Budget) -> memoryview:
 
 
 def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """Type and data of each element."""
+    """Yield type and data of each element."""
     position = 0
     while position < len(data):
         kind, size = struct.unpack_from(order + "II", data, position)

@@ -1,10 +1,8 @@
-"""A pickled dictionary of NumPy arrays in an .npy file, read without running anything that the file names.
+"""Pickled dictionaries of NumPy arrays in .npy files, read without running code of the file.
 
-``numpy.save`` of a dictionary pickles it. `pickle` calls whatever a file asks for; here a file may ask for arrays,
-their types, scalars and plain containers, and nothing else.
-
-Every operation of the file is looked at before the first runs,
-so that none claims more memory than the file has bytes.
+``numpy.save`` pickles a dictionary. `pickle` calls any function that a file names; here only arrays, their types,
+scalars and plain containers are allowed. Every operation of the file is checked before the first one runs, so that none
+claims more memory than the file has bytes.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ MAGIC = b"\x93NUMPY"
 _MOST_OPERATIONS = 2_000_000  # a recording has some hundred, and ten for every image
 _KINDS = "biuf"
 
-# All that pickles of arrays and containers consist of.
+# Operations of pickled arrays and containers.
 _NUMBERS = {"NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG1", "FLOAT", "BINFLOAT"}
 _TEXTS = {"STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"}
 _BYTES = {"BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"}
@@ -42,11 +40,11 @@ _ALLOWED = _NUMBERS | _TEXTS | _BYTES | _LISTS | _DICTIONARIES | _MEMO | _CALLS 
 
 
 def read_pickled(path: Path, expected: str) -> dict[str, Any]:
-    """The dictionary in an .npy file: arrays of numbers, lists of such, or None by name.
+    """Return the dictionary in an .npy file: arrays of numbers, lists of them, or None by name.
 
     Raises:
         UnknownFormatError: The file is damaged, claims more than it has, names anything but arrays and containers, or
-            holds no dictionary; the message ends with what was ``expected``.
+            holds no dictionary; the message ends with ``expected``.
     """
     require_file(path)
     try:
@@ -75,7 +73,7 @@ def _clean(error: Exception) -> str:
 
 
 def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type that the header of an .npy file claims; the stream stands behind it afterwards.
+    """Return shape and type in the header of an .npy file, and advance the stream beyond it.
 
     Raises:
         ValueError: There is no such header.
@@ -90,7 +88,7 @@ def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def _header_end(stream: io.BytesIO) -> int:
-    """Where the header of the .npy ends, which must announce one object."""
+    """Return the end of the header of an .npy file, which must announce one object."""
     shape, dtype = npy_header(stream)
     if dtype != np.dtype(object) or shape != ():
         raise pickle.UnpicklingError(f"an array of {dtype} with the shape {shape} instead of a dictionary")
@@ -98,19 +96,19 @@ def _header_end(stream: io.BytesIO) -> int:
 
 
 def _inspect(stream: io.BytesIO) -> None:
-    """Refuse operations that arrays and containers do not need, too many of them, and places beyond all that exist."""
+    """Refuse operations that arrays and containers do not need, too many operations, and too large a memo."""
     for count, (operation, argument, _) in enumerate(pickletools.genops(stream), start=1):
         if operation.name not in _ALLOWED:
             raise pickle.UnpicklingError(f"the operation {operation.name} is not that of arrays and containers")
         if count > _MOST_OPERATIONS:
             raise pickle.UnpicklingError(f"more than {_MOST_OPERATIONS} operations")
-        # A memo grows to the largest place that is asked for.
+        # A memo grows to the largest place that is used.
         if operation.name.endswith("PUT") and not 0 <= int(argument or 0) <= count:
             raise pickle.UnpicklingError(f"a memo of {argument} entries after {count} operations")
 
 
 class _Known:
-    """Something that a file may call; it has no attributes to be changed."""
+    """Function that a file may call; it has no attributes that a file could change."""
 
     __slots__ = ("_make",)
 
@@ -125,7 +123,7 @@ class _Known:
 
 
 class _Type:
-    """A type of numbers, or of objects."""
+    """Type of numbers, or of objects."""
 
     __slots__ = ("code", "order")
 
@@ -144,7 +142,7 @@ class _Type:
 
 
 class _Array:
-    """An array; it takes its values when the file sets its state."""
+    """Array that takes its values when the file sets its state."""
 
     __slots__ = ("value",)
 
@@ -154,7 +152,7 @@ class _Array:
     def __setstate__(self, state: Any) -> None:
         _, shape, kind, is_fortran, values = state
         if kind.code.startswith("O"):
-            # That of a dictionary, as `numpy.save` wraps it, or a ragged list of images.
+            # A dictionary, as `numpy.save` wraps it, or a ragged list of images.
             if math.prod(shape) != len(values):
                 raise ValueError(f"{len(values)} objects for the shape {shape}")
             self.value = values[0] if shape == () else values
@@ -174,7 +172,7 @@ def _boxed(array: NDArray) -> _Array:
 
 
 def _known(ndarray: _Known) -> dict[tuple[str, str], _Known]:
-    """What pickles of arrays call, by module and name, for one file."""
+    """Return the functions that pickled arrays call, by module and name, for one file."""
 
     def reconstruct(kind: Any, shape: Any, code: Any) -> _Array:
         if kind is not ndarray:
@@ -188,7 +186,7 @@ def _known(ndarray: _Known) -> dict[tuple[str, str], _Known]:
         return _numbers(values, kind, (), "C").item()
 
     def encode(text: str, encoding: str) -> bytes:
-        return text.encode("latin-1")  # what `pickle` makes of bytes for Python 2
+        return text.encode("latin-1")  # bytes that were pickled for Python 2
 
     found = {("numpy", "ndarray"): ndarray, ("numpy", "dtype"): _Known(lambda code, *_: _Type(code))}
     found["_codecs", "encode"] = _Known(encode)
@@ -204,7 +202,7 @@ def _no_array(*_: Any) -> NoReturn:
 
 
 class _Restricted(pickle.Unpickler):
-    """An unpickler to which every name is unknown but those of `_known`."""
+    """Unpickler that knows only the names of `_known`."""
 
     def __init__(self, stream: io.BytesIO) -> None:
         super().__init__(stream, encoding="latin-1")
@@ -220,7 +218,7 @@ class _Restricted(pickle.Unpickler):
 
 
 def _plain(found: Any) -> Any:
-    """A dictionary with its arrays, one level of lists deep."""
+    """Return a dictionary with its arrays, one level of lists deep."""
     found = found.value if isinstance(found, _Array) else found
     if not isinstance(found, dict):
         return found

@@ -79,22 +79,12 @@ def rows_of(lines: Iterable[str], comment: str | None = "#") -> Iterable[tuple[i
             yield number, content
 
 
-def first_line(path: Path) -> str:
-    """Return the first line of a file; empty if there is none, or it is no text."""
-    try:
-        require_file(path)
-        with path.open(encoding="utf-8") as file:
-            return file.readline(1 << 16).rstrip("\n")
-    except (OSError, UnicodeDecodeError, UnknownFormatError):
-        return ""
-
-
-def first_row(path: Path) -> str:
-    """Return the first line that holds more than a comment, without that; empty if there is none, or no file."""
+def first_row(path: Path, comment: str | None = "#") -> str:
+    """Return the first line that holds more than a comment, without that; empty if there is none, or no text file."""
     try:
         require_file(path, is_text=True)
         with path.open(encoding="utf-8", errors="replace") as file:
-            return next((content for _, content in rows_of(file)), "")
+            return next((content for _, content in rows_of(file, comment)), "")
     except (OSError, UnknownFormatError):
         return ""
 

@@ -51,7 +51,7 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
     truth of a KITTI drive has the noise `KITTI_TRUTH_NOISE`; of that of Starry Night none is stated.
 
     Args:
-        path: The .mat file.
+        path: Path of the .mat file.
         lateral: Sign of the lateral velocity of a KITTI drive, see `with_lateral`; Starry Night has no level velocities
             and is read as it is.
 
@@ -107,7 +107,7 @@ def _load(path: Path) -> dict[str, NDArray]:
 
 
 def _columns(fields: dict[str, NDArray], frames: int) -> tuple[list[Array], list[str]]:
-    """The first ``frames`` columns of each of `COLUMN_FIELDS` as rows (T, n), and which of them had more."""
+    """Return the first ``frames`` columns of each of `COLUMN_FIELDS` as rows (T, n), and the names of longer ones."""
     columns = {name: require_numbers(fields, name, (1 if name == "t" else 3, None)) for name in COLUMN_FIELDS}
     for name, value in columns.items():
         if value.shape[1] < frames:
@@ -138,7 +138,7 @@ def _noise(fields: dict[str, NDArray]) -> Noise | None:
     return Noise(np.sqrt(np.concatenate([v, w])), np.sqrt(y))
 
 
-def _open(source: Source) -> Sequence:
+def _tracks(source: Source) -> Sequence:
     if source.head.startswith(b"MATLAB 7.3"):
         raise UnknownFormatError(f"{source.place}: a MATLAB 7.3 file, save it with -v7; expected {READER.expected}")
     return read_utias(source.path, source.lateral)
@@ -148,5 +148,5 @@ READER = Reader(
     "utias",
     "a .mat recording (UTIAS)",
     lambda source: source.head.startswith((b"MATLAB 5.0", b"MATLAB 7.3")),
-    _open,
+    _tracks,
 )
