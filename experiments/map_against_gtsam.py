@@ -180,6 +180,14 @@ def batch(graph: Any, start: Any, tolerance: float) -> tuple[Any, int, float]:
     return values, optimiser.iterations(), perf_counter() - begin
 
 
+def new_isam2(threshold: float, skip: int) -> Any:
+    """Return an iSAM2 that relinearises beyond a threshold at every ``skip``-th update."""
+    parameters = gtsam.ISAM2Params()
+    parameters.setRelinearizeThreshold(threshold)
+    parameters.relinearizeSkip = skip
+    return gtsam.ISAM2(parameters)
+
+
 def incremental(
     result: Result,
     factors: Factors,
@@ -194,20 +202,15 @@ def incremental(
     Args:
         result: A run of the joint filter.
         factors: Its `factors_of`.
-        threshold: Beyond which change (metres and radians alike) a variable is linearised again.
-        landmark_std_m: Of a prior on every landmark about its first guess; none by default.
-        skip: It looks for such variables at every so many updates.
-        pose_covariance: Whether to ask for the covariance of the last pose in every frame.
+        threshold: Change of a variable (metres and radians alike) beyond which it is linearised again.
+        landmark_std_m: Standard deviation of a prior on every landmark about its first guess; none by default.
+        skip: Number of updates between two searches for such variables.
+        pose_covariance: Whether to compute the covariance of the last pose in every frame.
 
     Raises:
         RuntimeError: iSAM2 met a system that it could not solve.
     """
-    log = log_of(result)
-    parameters = gtsam.ISAM2Params()
-    parameters.setRelinearizeThreshold(threshold)
-    parameters.relinearizeSkip = skip
-    isam = gtsam.ISAM2(parameters)
-
+    log, isam = log_of(result), new_isam2(threshold, skip)
     measured = se3.inverse(motion.increment(np.concatenate([np.zeros((1, 6)), log.inputs]), log.tau_s))
     T_imu_cam = se3.inverse(result.T_cam_imu)
     T_world_imu = se3.inverse(log.T_predicted[0])
@@ -323,35 +326,30 @@ def solve_all(sequence: Sequence, overrides: dict[str, dict[str, float]]) -> dic
         "start": entry(*start_of(result, rows)),
         "MAP": entry(found.T_world_imu, found.position_m, iterations=len(found.costs) - 1, seconds=seconds),
     }
-    values, iterations, seconds = batch(graph, start, config.tolerance)
-    estimators["GTSAM batch"] = entry(
-        *from_gtsam(values, log.frames, log.landmarks), iterations=iterations, seconds=seconds
-    )
-    values, iterations, seconds = batch(graph, values, 1e-14)
-    estimators["GTSAM converged"] = entry(
-        *from_gtsam(values, log.frames, log.landmarks), iterations=iterations, seconds=seconds
-    )
+    values = start
+    for name, tolerance in (("GTSAM batch", config.tolerance), ("GTSAM converged", 1e-14)):
+        values, iterations, seconds = batch(graph, values, tolerance)
+        estimators[name] = entry(*from_gtsam(values, log.frames, log.landmarks), iterations=iterations, seconds=seconds)
     for name, threshold in (("iSAM2", RELINEARISE), ("iSAM2, 0.01", RELINEARISE_OFTEN)):
-        tied = 0
-        try:
-            values, each = incremental(result, factors, threshold)
-        except RuntimeError as error:
-            print(f"{sequence.name}: {name} gave up, weak priors on landmarks added: {error}", file=sys.stderr)
-            values, each = incremental(result, factors, threshold, LANDMARK_STD_M)
-            tied = 1
-        estimators[name] = entry(
-            *from_gtsam(values, log.frames, log.landmarks),
-            seconds=float(each.sum()),
-            ms_per_frame_median=1e3 * float(np.median(each)),
-            ms_per_frame_max=1e3 * float(each.max()),
-            weak_priors=tied,
-        )
-    return {
-        "frames": log.frames,
-        "landmarks": log.landmarks,
-        "observations": log.observations,
-        "estimators": estimators,
-    }
+        values, figures = incremental_or_tied(f"{sequence.name}: {name}", result, factors, threshold)
+        estimators[name] = {**entry(*from_gtsam(values, log.frames, log.landmarks)), **figures}
+    sizes = {"frames": log.frames, "landmarks": log.landmarks, "observations": log.observations}
+    return {**sizes, "estimators": estimators}
+
+
+def incremental_or_tied(
+    label: str, result: Result, factors: Factors, threshold: float
+) -> tuple[Any, dict[str, float | int]]:
+    """Run `incremental`, with weak priors on landmarks if it fails without: its values and times."""
+    tied = 0
+    try:
+        values, each = incremental(result, factors, threshold)
+    except RuntimeError as error:
+        print(f"{label} gave up, weak priors on landmarks added: {error}", file=sys.stderr)
+        values, each = incremental(result, factors, threshold, LANDMARK_STD_M)
+        tied = 1
+    times = {"ms_per_frame_median": 1e3 * float(np.median(each)), "ms_per_frame_max": 1e3 * float(each.max())}
+    return values, {"seconds": float(each.sum()), **times, "weak_priors": tied}
 
 
 # --- Tables and figures ----------------------------------------------------------------------------------------------

@@ -313,9 +313,9 @@ def table(found: Row) -> str:
     return document(
         "# Cost against the size of the map",
         "Made by `experiments/scaling.py`; the world is `City` with short tracks, invariant variant. "
-        f"{found['machine']}, one core; times are CPU times of the process. A frame in ms, median over "
-        "frames of the second half with "
-        f"{IN_VIEW[0]} to {IN_VIEW[1]} landmarks in view. Memory is the peak of the process in that stage, 10^6 bytes.",
+        f"{found['machine']}, one core; times are CPU times of the process. A frame in ms, median over frames of the "
+        f"second half with {IN_VIEW[0]} to {IN_VIEW[1]} landmarks in view. Memory is the peak of the process in that "
+        "stage, 10^6 bytes.",
         markdown_table(
             [
                 *("M", "frames", "observations", "ms a frame", "filter s", "filter MB", "MAP s", "(iterations)"),
@@ -329,10 +329,9 @@ def table(found: Row) -> str:
         f"in one process (CPU): {in_turn['large_ms']:.2f} ms against {in_turn['small_ms']:.2f} ms, "
         f"ratio **{in_turn['ratio']:.2f}**.",
         "## Where the posterior's seconds go",
-        "Structure: which poses are coupled by which landmarks, once. Rows: linearisation. Solution: Schur "
-        "complements, CHOLMOD and mean; the first one with its symbolic analysis. Difference: largest "
-        "between marginals and solves, relative to the block. Error: root mean square "
-        "position error of the trajectory.",
+        "Structure: coupling of poses by landmarks, found once. Rows: linearisation. Solution: Schur complements, "
+        "CHOLMOD and mean; the first one with its symbolic analysis. Difference: largest between marginals and solves, "
+        "relative to the block. Error: root mean square position error of the trajectory.",
         markdown_table(
             [
                 *("M", "structure", "rows", "first solution", "next solution", "pose marginals"),
