@@ -11,9 +11,9 @@ import pytest
 import ekfslam
 from ekfslam import Observations, Sequence, StereoCamera, Truth, attach_velocities, open_sequence
 from ekfslam.cli import main
-from ekfslam.cli.options import _stretch
 from ekfslam.data.images import ImageRecording, PairCalibration
 from ekfslam.data.readers import write_sequence
+from ekfslam.data.sequence import stretch
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import (
     ConfigError,
@@ -135,7 +135,7 @@ def test_frames_on_the_command_line(tmp_path, capsys):
     assert "no frames 40:10" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["info", "builtin:loop", "--frames", "10"])
-    assert (_stretch(":5"), _stretch("-5:"), _stretch("2:8")) == (slice(None, 5), slice(-5, None), slice(2, 8))
+    assert (stretch(":5"), stretch("-5:"), stretch("2:8")) == (slice(None, 5), slice(-5, None), slice(2, 8))
 
 
 # Velocities

@@ -173,7 +173,7 @@ def step(rng):
 @pytest.mark.parametrize("form", FORMS)
 def test_all_verbs_over_many_frames(form, considered, certain, naps, monkeypatch):
     """Landmarks come, are seen in part and shuffled, and leave; coordinates change; all is compared in every frame."""
-    monkeypatch.setattr(dormant, "_WAITING", 20)
+    monkeypatch.setattr(dormant, "WAITING", 20)
     rng = np.random.default_rng(considered + certain)
     body = np.diag(rng.uniform(0.01, 0.1, BODY)) * (not certain)
     gaussian, naive = form(body, SEEN), Naive(body)

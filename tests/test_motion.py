@@ -64,7 +64,7 @@ def test_ellipsoids_have_the_axes_of_their_covariance():
     rng = np.random.default_rng(3)
     A = rng.normal(size=(20, 3, 3))
     P = A @ np.swapaxes(A, 1, 2)
-    axes, turns = viewer._ellipsoids(P)
+    axes, turns = viewer.ellipsoids(P)
     R = viewer.Rotation.from_quat(turns).as_matrix()
     again = np.einsum("nij,nj,nkj->nik", R, (axes / 2.0) ** 2, R)
     np.testing.assert_allclose(again, P, rtol=1e-4, atol=1e-4)

@@ -99,7 +99,7 @@ def _log_pose(recording: Any, place: str, result: Result, time_s: Array, color: 
     )
     when = [rr.TimeColumn("time", duration=time_s)]
     recording.send_columns(place, indexes=when, columns=moves)
-    axes, turns = _ellipsoids(result.covariance[:, :3, :3])  # rho is along the axes of the IMU
+    axes, turns = ellipsoids(result.covariance[:, :3, :3])  # rho is along the axes of the IMU
     columns = rr.Ellipsoids3D.columns(centers=np.zeros((len(T), 3)), half_sizes=axes, quaternions=turns)
     recording.log(f"{place}/ellipsoid", rr.Ellipsoids3D.from_fields(colors=[color]), static=True)
     recording.send_columns(f"{place}/ellipsoid", indexes=when, columns=columns)
@@ -117,7 +117,7 @@ def _log_landmarks(recording: Any, place: str, result: Result) -> None:
     position = landmarks.position_m
     recording.log(place, rr.Points3D(position, colors=[color], radii=[rr.Radius.ui_points(1.5)]), static=True)
     some = spread(len(landmarks), _ELLIPSOIDS)
-    axes, turns = _ellipsoids(landmarks.covariance[some])
+    axes, turns = ellipsoids(landmarks.covariance[some])
     drawn = rr.Ellipsoids3D(centers=position[some], half_sizes=axes, quaternions=turns, colors=[color])
     recording.log(f"{place}/ellipsoids", drawn, static=True)
 
@@ -137,7 +137,7 @@ def _log_scalars(recording: Any, part: str, archive: Archive, result: Result, ti
         recording.send_columns(f"nis/{part}", indexes=when, columns=columns)
 
 
-def _ellipsoids(covariance: Array) -> tuple[Array, Array]:
+def ellipsoids(covariance: Array) -> tuple[Array, Array]:
     """Return half axes (n, 3) of `SIGMAS` and quaternions (n, 4), scalar last, of covariances (n, 3, 3)."""
     values, vectors = np.linalg.eigh(covariance)
     vectors = vectors * np.sign(np.linalg.det(vectors))[:, None, None]

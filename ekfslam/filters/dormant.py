@@ -19,7 +19,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters.dense import add_square
 
 # Columns of squares that wait until S is written to: once for all of them is much cheaper.
-_WAITING = 192
+WAITING = 192
 
 
 class Dormant:
@@ -141,7 +141,7 @@ class Dormant:
         """``S += sign A A^T``."""
         self._squares = np.hstack([self._squares, A])
         self._sign = np.concatenate([self._sign, np.full(A.shape[1], sign)])
-        if len(self._sign) > _WAITING:
+        if len(self._sign) > WAITING:
             self._fold()
 
     def _fold(self) -> None:
