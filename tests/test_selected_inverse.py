@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from support.blocks import block_cholesky
 
-from ekfslam.smoother.sparse.cholmod import PatternError, SparseCholesky
-from ekfslam.smoother.sparse.selected_inverse import MissingBlockError, SelectedInverse, selected_inverse
+from ekfslam.smoother.sparse.selected_inverse import (
+    MissingBlockError,
+    PatternError,
+    SelectedInverse,
+    selected_inverse,
+)
 
 
 def band(count, width):
@@ -64,12 +69,12 @@ def correlation_error(actual, expected, sigma_i, sigma_j):
 
 def test_every_entry_in_the_pattern_is_that_of_the_dense_inverse(problem):
     A, sizes, _, dense = problem
-    cholesky = SparseCholesky(A, sizes)
+    cholesky = block_cholesky(A, sizes)
     L = cholesky.factor()
     Z = selected_inverse(L)
     np.testing.assert_array_equal(Z.indices, L.indices)
     np.testing.assert_array_equal(Z.indptr, L.indptr)
-    expected = dense[np.ix_(cholesky.permutation, cholesky.permutation)]
+    expected = dense[np.ix_(cholesky.pattern.permutation, cholesky.pattern.permutation)]
     row, column = Z.indices, np.repeat(np.arange(A.shape[0]), np.diff(Z.indptr))
     sigma = np.sqrt(np.diagonal(expected))
     assert np.abs((Z.data - expected[row, column]) / (sigma[row] * sigma[column])).max() < 1e-9
@@ -77,7 +82,7 @@ def test_every_entry_in_the_pattern_is_that_of_the_dense_inverse(problem):
 
 def test_blocks_are_those_of_the_dense_inverse_in_the_order_of_the_matrix(problem):
     A, sizes, edges, dense = problem
-    inverse = SelectedInverse(SparseCholesky(A, sizes))
+    inverse = SelectedInverse(block_cholesky(A, sizes))
     start, sigma = np.cumsum(sizes) - sizes, np.sqrt(np.diagonal(dense))
     pairs = np.array([*edges, *((j, i) for i, j in edges), *((i, i) for i in range(len(sizes)))])
     for s_i in np.unique(sizes):
@@ -95,7 +100,7 @@ def test_blocks_are_those_of_the_dense_inverse_in_the_order_of_the_matrix(proble
 
 def test_diagonal_blocks_are_exactly_symmetric(problem):
     A, sizes, _, _ = problem
-    inverse = SelectedInverse(SparseCholesky(A, sizes))
+    inverse = SelectedInverse(block_cholesky(A, sizes))
     for size in np.unique(sizes):
         own = np.flatnonzero(sizes == size)
         np.testing.assert_array_equal(inverse.blocks(own, own), inverse.blocks(own, own).swapaxes(1, 2))
@@ -123,21 +128,21 @@ def test_pattern_with_gaps_is_an_error():
 def test_block_outside_the_pattern_is_a_named_error():
     sizes = np.full(200, 6)
     lower = sp.block_diag([np.tril(np.ones((6, 6))) + 5.0 * np.eye(6)] * 200, format="csc")
-    inverse = SelectedInverse(SparseCholesky(lower, sizes))
+    inverse = SelectedInverse(block_cholesky(lower, sizes))
     with pytest.raises(MissingBlockError, match=r"\(199, 3\)") as caught:
         inverse.blocks([0, 199], [0, 3])
     assert (caught.value.i, caught.value.j) == (199, 3)
 
 
 def test_blocks_of_one_request_have_one_size():
-    inverse = SelectedInverse(SparseCholesky(sp.csc_array(np.eye(9)), [6, 3]))
+    inverse = SelectedInverse(block_cholesky(np.eye(9), [6, 3]))
     with pytest.raises(ValueError, match=r"\[3, 6\]"):
         inverse.blocks([0, 1], [0, 1])
 
 
 def test_no_blocks():
     none = np.empty(0, dtype=np.int64)
-    assert SelectedInverse(SparseCholesky(sp.csc_array(np.eye(9)), [6, 3])).blocks(none, none).shape == (0, 0, 0)
+    assert SelectedInverse(block_cholesky(np.eye(9), [6, 3])).blocks(none, none).shape == (0, 0, 0)
 
 
 @pytest.mark.slow
@@ -150,7 +155,7 @@ def test_rounding_does_not_grow_along_a_long_drive(window):
     start = sp.csr_array(([1e3, 1e3], ([0, 1], [0, 1])), shape=(2, blocks))
     rows = sp.vstack([bend, apart, start]).tocsr()
     A = sp.csc_array(sp.kron(rows.T @ rows, np.eye(6) + 0.1 * np.ones((6, 6))))
-    cholesky = SparseCholesky(A, np.full(blocks, 6))
+    cholesky = block_cholesky(A, np.full(blocks, 6))
     some = np.linspace(0, blocks - 1, 10).astype(int)
     unit = np.zeros((6 * blocks, 60))
     unit[(6 * some[:, None] + np.arange(6)).ravel(), np.arange(60)] = 1.0

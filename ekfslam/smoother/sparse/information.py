@@ -114,7 +114,7 @@ class JointInformation:
             Y[kept] = 0.0
         matrix = s.pattern.assemble((*own.values(), *equations.products, *self._complements(), *of_kept))
         try:
-            self.factor = like.factor.with_values(matrix) if like else SparseCholesky(matrix, s.block_sizes)
+            self.factor = SparseCholesky(s.pattern, matrix, like.factor if like else None)
         except NotPositiveDefiniteError as error:
             group = [group for group in GROUPS if s.first[group] <= error.block][-1]
             number = error.block - s.first[group]
@@ -314,9 +314,9 @@ def block_patterns(information: JointInformation) -> tuple[tuple[IntArray, IntAr
     row, column = np.unique(np.concatenate(blocks), axis=0).T
 
     rank, place = np.cumsum(~s.is_kept) - 1, np.empty(len(s.block_sizes), dtype=np.int64)
-    place[factor.block_order] = len(eliminated) + np.arange(len(place))
+    place[factor.pattern.order] = len(eliminated) + np.arange(len(place))
     L = factor.factor()
-    block = np.repeat(np.sort(place), s.block_sizes[factor.block_order])
+    block = np.repeat(np.sort(place), s.block_sizes[factor.pattern.order])
     of_column = np.repeat(np.arange(L.shape[1]), np.diff(L.indptr))
     rows, columns = ([part] for part in np.divmod(np.unique(block[L.indices] * count + block[of_column]), count))
     for group, pairs in s.pairs.items():

@@ -22,7 +22,11 @@ from scipy.linalg.lapack import dtrtri
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.errors import EkfslamError
-from ekfslam.smoother.sparse.cholmod import PatternError, SparseCholesky, concatenated_ranges
+from ekfslam.smoother.sparse.cholmod import SparseCholesky, concatenated_ranges
+
+
+class PatternError(EkfslamError):
+    """A sparse matrix does not have the pattern of a Cholesky factor."""
 
 
 class MissingBlockError(EkfslamError):
@@ -47,11 +51,11 @@ class SelectedInverse:
     def __init__(self, cholesky: SparseCholesky) -> None:
         inverse = selected_inverse(cholesky.factor())
         self._data, self._indptr = inverse.data, inverse.indptr.astype(np.int64)
-        self._sizes = cholesky.block_sizes
+        self._sizes = cholesky.pattern.sizes
         nb = len(self._sizes)
         self._rank = np.empty(nb, dtype=np.int64)
-        self._rank[cholesky.block_order] = np.arange(nb)
-        size = self._sizes[cholesky.block_order]
+        self._rank[cholesky.pattern.order] = np.arange(nb)
+        size = self._sizes[cholesky.pattern.order]
         self._start = np.cumsum(size) - size
 
         # The columns of a block have the same rows below it, so the first column locates every block of that column.

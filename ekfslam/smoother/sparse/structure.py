@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.errors import IllPosedError
-from ekfslam.smoother.sparse.cholmod import concatenated_ranges
+from ekfslam.smoother.sparse.cholmod import BlockPattern, concatenated_ranges
 from ekfslam.smoother.sparse.factors import GROUPS, Factor, LinearSystem
-from ekfslam.smoother.sparse.matrix import BlockPattern
 
 # Landmarks observed from more frames than this are kept for CHOLMOD: eliminating one couples all frames that observed
 # it, pair by pair, and their number grows with the square.
