@@ -134,7 +134,7 @@ def _dead_reckoned(problem: Problem, mode: Mode) -> _Estimate:
     ms = np.full(len(sequence), 1e3 * (perf_counter() - begin) / len(sequence))
     if mode == "dead-reckoning":
         return _Estimate(T_imu_world, covariance, ms, pairs)
-    mapper, reports = IndependentLandmarks(model.rig.with_white_pixels(), settings, T_imu_world), []
+    mapper, reports = IndependentLandmarks(model.observer.rig.with_white_pixels(), settings, T_imu_world), []
     frames = progress(range(len(sequence)), f"{sequence.name}: {mode}")
     for k, report, taken in run_filter(mapper, sequence, frames):
         reports.append(report)

@@ -21,8 +21,9 @@ from ekfslam.geometry import se3
 from ekfslam.models.blocks import Pose
 from ekfslam.models.blocks import calibration as cal
 from ekfslam.models.build import model_of
-from ekfslam.models.model import Model, Moment
+from ekfslam.models.model import Model
 from ekfslam.models.observation import linearise
+from ekfslam.models.observer import Moment
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, posterior_of_log, smooth
@@ -82,7 +83,7 @@ def test_new_landmarks_with_parameters(T, c):
     z = seen_rows(T, c, TWIST, points(T, c)) + np.array([0.5, -0.2, 0.3])
     model = Model(RIG, RIG.noise, (Pose(T, np.eye(6)), ALL))
     moment = Moment(T, T, c, TWIST)
-    positions, G, covariance = model.initialise(moment, model.inverted(moment, z)[0], RIG.variance(z))
+    positions, G, covariance = model.observer.initialise(moment, model.observer.inverted(moment, z)[0], RIG.variance(z))
     np.testing.assert_allclose(positions, sighted(T, c, TWIST, z), rtol=1e-9, atol=1e-9)
     _, H, H_m = linearised(T, c, positions, positions)
     V = np.diag(RIG.variance_px2)
@@ -133,7 +134,7 @@ def estimated(world, calibration, variant="invariant"):
     config = dataclasses.replace(OPEN, variant=variant, retire="unseen", retire_after=1)
     ekf, _, _ = run_joint(world, Rig(world.camera, world.T_cam_imu, world.noise), config, calibration)
     at = ekf.model.layout["calibration"]
-    return ekf.values["calibration"][ekf.model.calibration.free], ekf.P[at, at]
+    return ekf.values["calibration"][ekf.model.observer.calibration.free], ekf.P[at, at]
 
 
 DRIVE = "city?frames={}&outlier_fraction=0&max_tracks=12&sigma_v_m_s={}&sigma_w_rad_s={}"

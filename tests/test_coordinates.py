@@ -48,9 +48,9 @@ class Setup:
         T_last = se3.exp(np.array([-1.0, 0.2, 0.1, 0.02, -0.05, 0.1])) @ T
         self.values = {**self.model.initial_values(), "previous_pose": T_last, "pose": T}
         T_cam_imu = T_CAM_IMU
-        if self.model.calibration is not None:
+        if self.model.observer.calibration is not None:
             c = np.zeros(9)
-            c[self.model.calibration.free] = 0.05 * self.rng.normal(size=layout["calibration"].stop - 12)
+            c[self.model.observer.calibration.free] = 0.05 * self.rng.normal(size=layout["calibration"].stop - 12)
             self.values["calibration"] = c
             T_cam_imu = se3.exp(c[:6]) @ T_CAM_IMU
         self.m = se3.apply(se3.inverse(T_cam_imu @ T_last), POINTS)

@@ -18,8 +18,6 @@ GOES = "the window in view: goes once the compiled filter replaces it"
 EXCEPTIONS: dict[str, str] = {
     "ekfslam.data.simulate.simulate": TO_BE_SPLIT,
     "ekfslam.filters.conditional.ConditionalGaussian": GOES,
-    "ekfslam.models.build.model_of": TO_BE_SPLIT,
-    "ekfslam.models.model.Model": TO_BE_SPLIT,
 }
 
 

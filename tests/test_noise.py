@@ -128,11 +128,11 @@ def test_blocks_of_the_automatic_model_give_way_to_what_is_configured():
     unstated = without_noise(builtin("city?frames=60"))
     names = {"twist_bias", "camera_jitter", "vision_drift"}
     problem = resolve(unstated, Config().with_overrides({"blocks": {"camera_jitter": {"time_s": 2.0}}}))
-    assert set(problem.config.blocks) == names and problem.model.calibration is not None
+    assert set(problem.config.blocks) == names and problem.model.observer.calibration is not None
     assert problem.config.blocks["camera_jitter"] == {"time_s": 2.0}
     for settings in ({"noise": {"shared": False}}, {"noise": {"model": "white"}}):
         without = resolve(unstated, Config().with_overrides(settings))
-        assert not without.config.blocks and without.model.calibration is None
+        assert not without.config.blocks and without.model.observer.calibration is None
     assert not resolve(builtin("city?frames=60"), Config()).config.blocks
     # Run again with what was resolved: the same.
     assert resolve(unstated, problem.config).config == problem.config

@@ -35,7 +35,7 @@ from ekfslam.geometry import se3
 from ekfslam.models.blocks import CameraJitter, Previous, TwistBias, VisionDrift
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.build import model_of
-from ekfslam.models.model import Moment
+from ekfslam.models.observer import Moment
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.smoother.problem import BatchProblem
 
@@ -95,7 +95,7 @@ def everything(T, noise, blocks=BLOCKS):
 
 def moment_of(model, values, way_m, before=False):
     prefix = "previous_" if before else ""
-    shared = {block.name: values.get(prefix + block.name, values[block.name]) for block in model.shared}
+    shared = {block.name: values.get(prefix + block.name, values[block.name]) for block in model.observer.shared}
     T = values[prefix + "pose"]
     return Moment(T, T, values["calibration"], TWIST, shared, np.array(way_m))
 
@@ -133,15 +133,15 @@ def test_rows_by_every_block_and_landmark(T, noise, follows, way_m):
         moved = {**ERRORS, **model.retract(values, x[:body])}
         return literal_rows(moved, points, way_m, follow, TWIST, disparity=disparity).ravel()
 
-    seen = model.see(moment_of(model, values, way_m), m[slots], m[slots], is_difference=follow)
+    seen = model.observer.see(moment_of(model, values, way_m), m[slots], m[slots], is_difference=follow)
     nothing = np.zeros(body + 3 * len(m))
     np.testing.assert_allclose(seen.z.ravel(), rows(nothing), rtol=1e-11)
     H = wide(seen, body, slots, len(m))
     assert_equal_rows(H, central(rows, len(nothing)))
     drift = H[:, model.layout["vision_drift"]].reshape(4, 3, 6)
     assert (np.abs(drift).max(axis=(1, 2)) > 0).tolist() == follow.tolist()
-    q = model.points(moment_of(model, values, way_m), m[slots], follow)
-    np.testing.assert_allclose(model.predicted(moment_of(model, values, way_m), q), seen.z, rtol=1e-13)
+    q = model.observer.points(moment_of(model, values, way_m), m[slots], follow)
+    np.testing.assert_allclose(model.observer.predicted(moment_of(model, values, way_m), q), seen.z, rtol=1e-13)
 
 
 @poses
@@ -154,7 +154,7 @@ def test_rows_in_the_frame_before_by_every_block_and_landmark(T):
         points = (m + x[body:].reshape(-1, 3))[slots]
         return literal_rows(model.retract(values, x[:body]), points, 1.7, none, TWIST, before=True).ravel()
 
-    seen = model.see(moment_of(model, values, 0.0, before=True), m[slots], m[slots], "previous_pose")
+    seen = model.observer.see(moment_of(model, values, 0.0, before=True), m[slots], m[slots], "previous_pose")
     np.testing.assert_allclose(seen.z.ravel(), rows(np.zeros(body + 15)), rtol=1e-11)
     H = wide(seen, body, slots, len(m))
     assert_equal_rows(H, central(rows, body + 15))
@@ -202,7 +202,7 @@ def test_observations_of_the_filter_by_every_block_and_landmark(T, memory):
 
 
 def new_landmarks(model, moment, z, variance):
-    return model.initialise(moment, model.inverted(moment, z)[0], variance)
+    return model.observer.initialise(moment, model.observer.inverted(moment, z)[0], variance)
 
 
 @kinds
@@ -228,7 +228,7 @@ def test_new_landmarks_by_every_block(T, noise):
         by_row = central(lambda d, i=i: new_landmarks(model, moment, z + d, variance)[0][i], 3)
         expected = by_row @ np.diag(variance[i]) @ by_row.T
         np.testing.assert_allclose(covariance[i], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
-    assert model.inverted(moment, z)[1].all()
+    assert model.observer.inverted(moment, z)[1].all()
 
 
 # --- the model ------------------------------------------------------------------------------------------------------

@@ -88,7 +88,7 @@ class CameraCoordinates:
 
     def view(self, values: Values, positions_m: Array, T_linear: Array, linear_positions_m: Array) -> View:
         """Landmarks (n, 3) in world from the camera, at blocks; derivatives are of another pose and of others (FEJ)."""
-        calibration, T_cam_imu = self.model.calibration, self._T_cam_imu(values)
+        calibration, T_cam_imu = self.model.observer.calibration, self._T_cam_imu(values)
         by_columns = np.asarray(se3.adjoint(T_cam_imu), dtype=float)
         if calibration is not None:
             by_calibration = calibration.camera_by_extrinsic(values[calibration.name])
@@ -135,7 +135,7 @@ class CameraCoordinates:
     @cached_property
     def columns(self) -> IntArray:
         """Columns (c,) of pose and camera in the body."""
-        layout, calibration = self.model.layout, self.model.calibration
+        layout, calibration = self.model.layout, self.model.observer.calibration
         columns = layout.columns([self.pose])
         if calibration is None:
             return columns
@@ -143,7 +143,7 @@ class CameraCoordinates:
 
     def _T_cam_imu(self, values: Values) -> Array:
         """(4, 4) extrinsics as calibrated."""
-        return self.model.sensor_at(self.model.parameters(values)).T_cam_imu
+        return self.model.observer.sensor_at(self.model.observer.parameters(values)).T_cam_imu
 
     def _is_in_image(self, q: Array) -> BoolArray:
         """Whether points (n, 3) are in front of the camera and near enough."""

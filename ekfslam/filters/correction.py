@@ -13,7 +13,7 @@ from ekfslam.filters.gaussian import Conditioned, Projection, Rows, Solution
 from ekfslam.filters.innovations import FrameInnovations, innovations_of
 from ekfslam.filters.observing import observe
 from ekfslam.filters.retraction import carried_back, parts, retracted
-from ekfslam.models.model import Seen
+from ekfslam.models.observer import Seen
 from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, MOVING
 
 # Largest variance of an innovation, in those of the measurement, at which linearising still means anything.
@@ -66,7 +66,7 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     verdict[~e.sensor.in_view(seen.q, e.config.min_depth_m)] = BEHIND_CAMERA
     some, tried = _gate_alone(e, frame, rows, seen, verdict, gate)
     if len(some):
-        if e.model.has_time_offset and e.motion.tau_s:
+        if e.model.observer.has_time_offset and e.motion.tau_s:
             at = replace(at, imu_twist=_corrected_twist(e, frame, tried))
             _, rows = observe(e, at, slot, measured)
             tried = e.gaussian.project(rows.only(some), frame, e.ids[slot[some]])

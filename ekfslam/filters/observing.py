@@ -11,15 +11,15 @@ import scipy.sparse as sp
 from ekfslam.arrays import Array, IntArray
 from ekfslam.filters.estimate import Estimate, Mean
 from ekfslam.filters.gaussian import Rows
-from ekfslam.models.model import Moment, Seen
+from ekfslam.models.observer import Moment, Seen
 
 
 def moment(e: Estimate, at: Mean) -> Moment:
     """Return the moment of the present frame."""
-    shared = {block.name: at.values[block.name] for block in e.model.shared}
+    shared = {block.name: at.values[block.name] for block in e.model.observer.shared}
     T = at.values["pose"]
     T_linear = e.variant.linear(T, e.motion.T_predicted)
-    return Moment(T, T_linear, e.model.parameters(at.values), at.imu_twist, shared, e.motion.way_m)
+    return Moment(T, T_linear, e.model.observer.parameters(at.values), at.imu_twist, shared, e.motion.way_m)
 
 
 def moment_before(e: Estimate, at: Mean) -> Moment:
@@ -27,8 +27,8 @@ def moment_before(e: Estimate, at: Mean) -> Moment:
     clones = e.model.layout.clones
     T = at.values[clones["pose"]]
     T_linear = e.variant.linear(T, e.motion.T_predicted_before)
-    shared = {block.name: at.values[clones.get(block.name, block.name)] for block in e.model.shared}
-    return Moment(T, T_linear, e.model.parameters(at.values), e.motion.imu_twist_before, shared)
+    shared = {block.name: at.values[clones.get(block.name, block.name)] for block in e.model.observer.shared}
+    return Moment(T, T_linear, e.model.observer.parameters(at.values), e.motion.imu_twist_before, shared)
 
 
 def observe(e: Estimate, at: Mean, slot: IntArray, measured: Array) -> tuple[Seen, Rows]:
@@ -41,14 +41,16 @@ def observe(e: Estimate, at: Mean, slot: IntArray, measured: Array) -> tuple[See
     linear = e.variant.linear(positions, table.initial_m[slot])
     error = model.track_error
     is_difference = (table.last_step[slot] == e.step - 1) & (error is not None)
-    seen = model.see(moment(e, at), positions, linear, is_difference=is_difference)
+    seen = model.observer.see(moment(e, at), positions, linear, is_difference=is_difference)
     H_x, H_m, residual = seen.H_x, seen.H_m, measured - seen.z
     if error is None:
         return seen, Rows(slot, H_x, H_m, residual, e.sensor.variance(measured))
     variance = error.absolute_variance(e.step - table.first_step[slot])
     follows = np.flatnonzero(is_difference)
     if len(follows):
-        before = model.see(moment_before(e, at), positions[follows], linear[follows], model.layout.clones["pose"])
+        before = model.observer.see(
+            moment_before(e, at), positions[follows], linear[follows], model.layout.clones["pose"]
+        )
         rows_before = table.seen_rows[slot[follows]]
         H_x, H_m = H_x.copy(), H_m.copy()
         residual[follows] -= error.memory * (rows_before - before.z)
@@ -65,7 +67,7 @@ def measurement_jacobian(e: Estimate, ids: IntArray) -> sp.csr_array:
         KeyError: An id is not active.
     """
     slot = e.slots(ids)
-    seen = e.model.see(moment(e, e.mean), e.positions_m[slot], e.linear_positions_m[slot])
+    seen = e.model.observer.see(moment(e, e.mean), e.positions_m[slot], e.linear_positions_m[slot])
     k, d, width = seen.H_x.shape
     row = np.broadcast_to(np.arange(k * d).reshape(k, d, 1), (k, d, width + 3))
     body = np.broadcast_to(np.arange(width), (k, d, width))

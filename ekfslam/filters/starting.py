@@ -28,13 +28,13 @@ def start(e: Estimate, log: LogBook, waiting: Waiting | None, frame: int, ids: I
     if waiting is not None:
         return _start_after_waiting(e, log, waiting, frame, ids, rows)
     error, now = e.model.track_error, moment(e, e.mean)
-    q, has_depth = e.model.inverted(now, rows)
+    q, has_depth = e.model.observer.inverted(now, rows)
     ids, rows, q = ids[has_depth], rows[has_depth], q[has_depth]
     if len(ids):
         none = np.zeros(len(ids), dtype=np.int64)
         variance = e.sensor.variance(rows) if error is None else error.absolute_variance(none)
         linear = now.linearised_at(e.variant.linear(now.T_imu_world, e.motion.T_predicted))
-        positions, G, covariance = e.model.initialise(linear, q, variance)
+        positions, G, covariance = e.model.observer.initialise(linear, q, variance)
         e.gaussian.augment(G, covariance)
         _append(e, log, frame, ids, positions, rows, (e.step, rows, variance))
     return has_depth

@@ -151,10 +151,12 @@ class Invariant(Standard):
         """Of landmarks in xyz: new errors by rotations, of the pose and (where it is in the state) of the camera."""
         start = model.layout["pose"].start + 3
         columns, by = np.arange(start, start + 3), se3.skew(moved_m) @ before["pose"][:3, :3].T
-        calibration = model.calibration
+        calibration = model.observer.calibration
         if calibration is None or not len(calibration.turns_camera):
             return Change(slot, columns, by)
-        by_camera = calibration.landmarks_by_rotation(model.rig, before[calibration.name], before["pose"], moved_m)
+        by_camera = calibration.landmarks_by_rotation(
+            model.observer.rig, before[calibration.name], before["pose"], moved_m
+        )
         columns = np.concatenate([columns, model.layout[calibration.name].start + calibration.turns_camera])
         return Change(slot, columns, np.concatenate([by, by_camera], axis=-1))
 

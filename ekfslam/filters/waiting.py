@@ -22,7 +22,7 @@ from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.observing import moment
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import Anchor
-from ekfslam.models.model import Moment
+from ekfslam.models.observer import Moment
 from ekfslam.models.sensors.base import DelayedSensor
 
 
@@ -105,8 +105,8 @@ class Waiting:
         anchor = Moment(T_anchor, e.variant.linear(T_anchor, self._T_linear), present.calibration, present.twist)
         present = present.linearised_at(T_linear)
         views = (
-            (e.model.see(anchor, position, position, Anchor.name), then),
-            (e.model.see(present, position, position), now),
+            (e.model.observer.see(anchor, position, position, Anchor.name), then),
+            (e.model.observer.see(present, position, position), now),
         )
         H_x, H_m, r = [], [], []
         for seen, rows in views:

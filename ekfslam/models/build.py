@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as SequenceType
 from typing import Any
 
@@ -59,21 +59,15 @@ def model_of(
     Raises:
         ConfigError: A calibration to estimate without a stereo rig; a block twice; a block that the sensor cannot use.
     """
-    chosen: list[StateBlock] = [Pose(T_imu_world, covariance)]
-    if noise.track_error is not None or has_image_coordinates(sensor, coordinates):
-        chosen.append(PreviousPose())
-    std = prior_std(calibration or CalibrationConfig())
-    if std.any():
-        if not isinstance(sensor, Rig):
-            raise ConfigError(f"calibration: only a stereo rig has parameters to estimate, not {type(sensor).__name__}")
-        chosen.append(Calibration(std))
-    if noise.twist_walk_std is not None:
-        chosen.append(Twist(noise.twist_walk_std, measures_twist))
-    if noise.tilt_rad:
-        chosen.append(Up(T_imu_world[:3, :3].T @ np.array([0.0, 0.0, 1.0]), noise.tilt_rad))
-    if isinstance(sensor, DelayedSensor):
-        chosen.append(Anchor())
-    chosen.extend(blocks)
+    up = T_imu_world[:3, :3].T @ np.array([0.0, 0.0, 1.0])
+    chosen: list[StateBlock] = [
+        Pose(T_imu_world, covariance),
+        *_blocks_of(sensor, noise, calibration or CalibrationConfig(), coordinates),
+        *([Twist(noise.twist_walk_std, measures_twist)] if noise.twist_walk_std is not None else []),
+        *([Up(up, noise.tilt_rad)] if noise.tilt_rad else []),
+        *([Anchor()] if isinstance(sensor, DelayedSensor) else []),
+        *blocks,
+    ]
     shared = [block for block in blocks if block.is_seen and block.per_frame]
     if shared and isinstance(sensor, DelayedSensor):
         raise ConfigError(f"{shared[0].name}: not with landmarks that wait for a second view")
@@ -83,6 +77,19 @@ def model_of(
     if len(set(names)) < len(names):
         raise ConfigError(f"a state block is there twice: {', '.join(names)}")
     return Model(sensor, noise, tuple(chosen), make_process)
+
+
+def _blocks_of(
+    sensor: Sensor, noise: Noise, calibration: CalibrationConfig, coordinates: LandmarkCoordinates
+) -> Iterator[StateBlock]:
+    """Yield the blocks that observations of landmarks need: the clone of the last pose, and the calibration."""
+    if noise.track_error is not None or has_image_coordinates(sensor, coordinates):
+        yield PreviousPose()
+    std = prior_std(calibration)
+    if std.any():
+        if not isinstance(sensor, Rig):
+            raise ConfigError(f"calibration: only a stereo rig has parameters to estimate, not {type(sensor).__name__}")
+        yield Calibration(std)
 
 
 def _is_seen_before(block: StateBlock) -> bool:

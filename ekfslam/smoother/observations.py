@@ -12,7 +12,8 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters.log import Log
 from ekfslam.geometry import se3
-from ekfslam.models.model import GIVEN, Model, Moment, Seen
+from ekfslam.models.model import Model
+from ekfslam.models.observer import GIVEN, Moment, Seen
 from ekfslam.smoother.sparse.factors import Factor, Term
 from ekfslam.smoother.unknowns import State, Unknowns, split
 
@@ -51,15 +52,15 @@ class ObservationFactors:
     def points(self, state: State) -> Array:
         """Return every observed landmark (K, 3) m in the frame of the sensor."""
         moment = self._moments(state).at(self._log.frame)
-        return self._model.points(moment, state.positions_m[self._log.landmark], self._is_difference)
+        return self._model.observer.points(moment, state.positions_m[self._log.landmark], self._is_difference)
 
     def norms(self, state: State) -> Array:
         """Return the norms (K,) of the whitened residuals at a state."""
         log, moments, model = self._log, self._moments(state), self._model
         now, before = moments.at(log.frame), moments.at(log.frame[self._previous])
         positions = state.positions_m[log.landmark]
-        z = model.predicted(now, model.points(now, positions, self._is_difference))
-        z_before = model.predicted(before, model.points(before, positions[self._follows]))
+        z = model.observer.predicted(now, model.observer.points(now, positions, self._is_difference))
+        z_before = model.observer.predicted(before, model.observer.points(before, positions[self._follows]))
         return np.linalg.norm(self._residuals(z, z_before) / np.sqrt(log.variance), axis=1)
 
     def _residuals(self, z: Array, z_before: Array) -> Array:
@@ -72,12 +73,12 @@ class ObservationFactors:
         """Return the factors linearised at a state."""
         log, follows, moments = self._log, self._follows, self._moments(state)
         positions = state.positions_m[log.landmark]
-        seen = self._model.see(moments.at(log.frame), positions, positions, "pose", self._is_difference)
+        seen = self._model.observer.see(moments.at(log.frame), positions, positions, "pose", self._is_difference)
         H_x, H_m, z_before = seen.H_x, seen.H_m, seen.z[:0]
         if len(follows):
             # From the frame before, the landmark is where the observation before has seen it.
             at, positions = moments.at(log.frame[self._previous]), positions[follows]
-            before = self._model.see(at, positions, positions, self._clone)
+            before = self._model.observer.see(at, positions, positions, self._clone)
             H_x[follows] -= self._memory * before.H_x
             H_m[follows] -= self._memory * before.H_m
             z_before = before.z
@@ -87,13 +88,13 @@ class ObservationFactors:
         """Return what all frames observe from."""
         log, model, T = self._log, self._model, state.T_imu_world
         twist = np.zeros((len(T), 6))
-        if model.has_time_offset:
+        if model.observer.has_time_offset:
             # Velocities as the trajectory has them; that they change with it is of second order.
             values = self._unknowns.all_values(state)
             before, after = ({name: x[at] for name, x in values.items()} for at in (slice(-1), slice(1, None)))
             twist = np.concatenate([log.seen_twist[:1], model.process.imu_twist(before, after, log.intervals)])
         shared = split(self._unknowns.shared, state.shared)
-        return Moment(T, T, model.parameters(state.drive_values), twist, shared, self._way_m)
+        return Moment(T, T, model.observer.parameters(state.drive_values), twist, shared, self._way_m)
 
     def _near(self, state: State) -> list[Factor]:
         """Return weak priors of landmarks, where errors of tracks walk.
@@ -203,18 +204,20 @@ class ObservationFactors:
 
         Coordinates of the drive's blocks are alike within a group (n,).
         """
-        model, calibration, layout = self._model, self._model.calibration, self._model.layout
+        model, calibration, layout = self._model, self._model.observer.calibration, self._model.layout
         clones = layout.clones if pose == layout.clones.get("pose") else {}
-        shared = {block.name: coordinates[:, layout[clones.get(block.name, block.name)]] for block in model.shared}
+        shared = {
+            block.name: coordinates[:, layout[clones.get(block.name, block.name)]] for block in model.observer.shared
+        }
         moment = Moment(T, T_linear, GIVEN, twist, shared, way_m)
         if calibration is None:
-            return model.see(moment, positions_m, linear_positions_m, pose, is_difference)
+            return model.observer.see(moment, positions_m, linear_positions_m, pose, is_difference)
         parts, order = [], np.argsort(group, kind="stable")
         for some in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
             found = calibration.retract(calibration.initial(), coordinates[some[0], layout[calibration.name]])
             here = replace(moment.at(some), calibration=found)
             differs = None if is_difference is None else is_difference[some]
-            parts.append(model.see(here, positions_m[some], linear_positions_m[some], pose, differs))
+            parts.append(model.observer.see(here, positions_m[some], linear_positions_m[some], pose, differs))
         back = np.argsort(order, kind="stable")
         return Seen(*(np.concatenate([getattr(part, field.name) for part in parts])[back] for field in fields(Seen)))
 

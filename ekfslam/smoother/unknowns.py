@@ -59,7 +59,7 @@ class Unknowns:
 
     def __init__(self, model: Model, initial_covariance: Array, mean: Array) -> None:
         layout = model.layout
-        self.shared: Sequence[StateBlock] = model.shared
+        self.shared: Sequence[StateBlock] = model.observer.shared
         self.aux = [block for block in layout.blocks if block.per_frame and not block.is_seen]
         of_drive = (block for block in layout.blocks if not block.per_frame and not block.clones)
         self.of_drive = [block for block in of_drive if not block.is_pose]
