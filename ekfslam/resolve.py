@@ -175,7 +175,8 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
     if not sequence.has_velocities:
         stated = vision_noise(stated, sequence.twist)
     if is_inertial(sequence):
-        stated = dataclasses.replace(stated, twist_walk_std=None)
+        # The odometry does not move the state; its velocities err by as much as they walk.
+        stated = dataclasses.replace(stated, twist_std=np.asarray(stated.twist_walk_std), twist_walk_std=None)
     twist, pixels = np.array(stated.twist_std, dtype=float), np.array(stated.pixel_std_px, dtype=float)
     if given.sigma_v_m_s is not None:
         twist[:3] = given.sigma_v_m_s

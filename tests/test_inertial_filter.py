@@ -130,6 +130,15 @@ def test_only_the_invariant_variant_survives_a_large_tilt():
 
 
 @pytest.mark.slow
+def test_stamps_that_are_late_are_found():
+    sequence = simulate_room(Room(frames=150))
+    samples = dataclasses.replace(sequence.inertial, time_s=sequence.inertial.time_s - 0.005)
+    config = ekfslam.Config().with_overrides({"calibration": {"time_s": 0.01, "rotation_deg": 0.3}})
+    found = ekfslam.run(dataclasses.replace(sequence, inputs=(samples,)), "full", config).parameters
+    assert found.value[-1, found.name.index("time offset")] == pytest.approx(-0.005, abs=3e-4)
+
+
+@pytest.mark.slow
 def test_densities_that_are_too_small_show():
     sequence = simulate_room(Room(frames=120))
     samples, noise = sequence.inertial, sequence.inertial.noise
