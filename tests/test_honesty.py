@@ -214,6 +214,12 @@ def test_errors_of_any_size_are_found():
     np.testing.assert_allclose(found.factor, 2.5, rtol=0.4)
 
 
+def test_a_factor_is_exceeded_by_three_standard_errors_of_its_variance():
+    found = evidence.shared_innovations(shared_of(), np.ones(400, dtype=bool), np.full(400, 0.1))
+    error = np.sqrt(4 * 40 / 3 / 400)  # of a long-run variance over 40 lags
+    np.testing.assert_allclose(found.factor_low, found.factor / np.sqrt(1 + 3 * error))
+
+
 def test_blocks_that_follow_their_prior_agree_with_it():
     rng, pulls, steps = np.random.default_rng(5), [], []
     for _ in range(300):
