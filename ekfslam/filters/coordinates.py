@@ -48,7 +48,7 @@ class Change:
     M: Array | None = None
 
     def only(self, slot: IntArray) -> Change:
-        """The change of some of the landmarks."""
+        """Return the change of some of the landmarks."""
         at = np.searchsorted(self.slot, slot)
         return Change(slot, self.columns, self.B[at], None if self.M is None else self.M[at])
 
@@ -146,7 +146,7 @@ class CameraCoordinates:
         return self.model.observer.sensor_at(self.model.observer.parameters(values)).T_cam_imu
 
     def _is_in_image(self, q: Array) -> BoolArray:
-        """Whether points (n, 3) are in front of the camera and near enough."""
+        """Return whether points (n, 3) are in front of the camera and near enough."""
         sensor, z = self.model.sensor, q[:, 2]
         furthest_m = np.inf
         if isinstance(sensor, Rig):

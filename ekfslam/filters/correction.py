@@ -22,7 +22,7 @@ _MOST_BLURRED = 1e8
 
 @dataclass(frozen=True)
 class Correction:
-    """What a frame's known landmarks say.
+    """Correction by a frame's known landmarks.
 
     Args:
         solution: Eq. (6) solved, to be applied to the covariance; None: nothing was accepted.
@@ -165,7 +165,7 @@ def _gate_by_others(
 
 
 def _judges_motion(e: Estimate) -> bool:
-    """Whether tracks are tested for moving along: if they may err at all, from the second frame on."""
+    """Return whether tracks are tested for motion: if they have errors, from the second frame on."""
     return e.model.track_error is not None and e.motion.tau_s > 0
 
 

@@ -11,7 +11,7 @@ from ekfslam.geometry import motion, se3
 
 
 def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> tuple[Array, Array]:
-    """Poses and covariances from the velocities alone, eq. (1) and (2).
+    """Return poses and covariances from the velocities alone, eq. (1) and (2).
 
     Args:
         sequence: The recording; starts at its `initial_T_world_imu`. Velocities of its own odometry, where nobody

@@ -24,7 +24,7 @@ from ekfslam.models.sensors.base import Sensor
 
 @dataclass(frozen=True)
 class Mean:
-    """Where observations are linearised.
+    """Mean at which observations are linearised.
 
     Args:
         values: Of the blocks.
@@ -137,7 +137,7 @@ class Estimate:
 
     @property
     def sensor(self) -> Sensor:
-        """What observes the landmarks, with the calibration as given."""
+        """Sensor of the landmarks, with the calibration as given."""
         return self.model.sensor
 
     @property

@@ -40,7 +40,7 @@ def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> 
 
 
 def most_given_others(left: Rows, S: Array) -> Array:
-    """An upper bound (k,) of the squares of `agrees_with_others`: ``e_i^T V^-1 S_i V^-1 e_i``.
+    """Return an upper bound (k,) of the squares of `agrees_with_others`: ``e_i^T V^-1 S_i V^-1 e_i``.
 
     The others can only make an innovation more certain: ``((S^-1)_ii)^-1 <= S_i``. What passes the gate by this bound
     needs no solution for all.
@@ -81,7 +81,7 @@ def moves_along(
     sigma: float,
     share: float,
 ) -> BoolArray:
-    """Which landmarks (k,) travel with the rig or against it, by all that their tracks have shown so far.
+    """Return which landmarks (k,) travel with the rig or against it, by their whole tracks so far.
 
     A landmark that moves by a share b of the rig's step between two frames has innovations of mean ``b h``, with h the
     derivative of its rows by a motion of the landmark, times that step. Over a track ``N = sum h^T S^-1 r`` and
@@ -111,7 +111,7 @@ def evidence_alone(rows: Rows, S: Array, h: Array) -> tuple[Array, Array]:
 
 
 def evidence_given_others(left: Rows, C: Array, h: Array) -> tuple[Array, Array]:
-    """The same of the innovations given all others: ``h^T V^-1 e`` and ``h^T V^-1 C V^-1 h``.
+    """Return ``h^T V^-1 e`` and ``h^T V^-1 C V^-1 h`` (k,) of innovations given all others.
 
     Arguments as of `agrees_with_others`.
     """

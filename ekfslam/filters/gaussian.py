@@ -31,18 +31,18 @@ class Rows:
     variance: Array
 
     def only(self, which: BoolArray | IntArray) -> Rows:
-        """The rows of some of the landmarks."""
+        """Return the rows of some of the landmarks."""
         return Rows(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def corrected(self, x: Array, d: Array) -> Rows:
-        """The rows with the residuals ``r - H (x, d)`` that corrections (seen,) and (n, 3) leave."""
+        """Return the rows with the residuals ``r - H (x, d)`` that corrections (seen,) and (n, 3) leave."""
         residual = self.residual - self.H_x @ x - (self.H_m @ d[self.slot, :, None])[..., 0]
         return replace(self, residual=residual)
 
 
 @dataclass(frozen=True)
 class Conditioned:
-    """What conditioning on rows does.
+    """Effect of conditioning on rows.
 
     Args:
         correction: (body+3n,) of the mean.
@@ -71,7 +71,7 @@ class Projection(ABC):
 
     @abstractmethod
     def only(self, which: IntArray) -> Projection:
-        """The same of some of the landmarks."""
+        """Return the projection of some of the landmarks."""
 
 
 class Solution(ABC):
@@ -80,7 +80,7 @@ class Solution(ABC):
     @property
     @abstractmethod
     def done(self) -> Conditioned:
-        """What conditioning on the rows does."""
+        """Effect of conditioning on the rows."""
 
     @abstractmethod
     def given_others(self, which: IntArray) -> Array:
@@ -91,7 +91,7 @@ class Solution(ABC):
 
     @abstractmethod
     def without(self, out: BoolArray) -> Solution:
-        """The solution for all rows but those of the landmarks ``out`` (k,)."""
+        """Return the solution without the rows of the landmarks ``out`` (k,)."""
 
     @abstractmethod
     def information(self, J: Array) -> Array:
@@ -133,7 +133,7 @@ class Gaussian(ABC):
 
     @abstractmethod
     def landmark_blocks(self, slot: IntArray | None = None) -> Array:
-        """The landmarks' own covariances (k, 3, 3), of all or of those at the slots (k,). Not to be written to."""
+        """Return the landmarks' own covariances (k, 3, 3), of all or at slots (k,). Read only."""
 
     @abstractmethod
     def covariance_of(self, slot: IntArray) -> Array:
@@ -160,7 +160,7 @@ class Gaussian(ABC):
 
     @abstractmethod
     def project(self, rows: Rows, frame: int, ids: IntArray) -> Projection:
-        """The rows seen through P; frame and ids (k,) are for the error message.
+        """Return the rows seen through P; frame and ids (k,) are for the error message.
 
         Raises:
             InnovationError: The variance of some landmark's rows is not positive definite.
@@ -203,7 +203,7 @@ class Gaussian(ABC):
 
     @abstractmethod
     def rest(self, asleep: BoolArray) -> None:
-        """Which landmarks (n,) are asleep from now on: they are not seen before they wake. P stays as it is."""
+        """Set which landmarks (n,) are dormant: they are not observed before they wake. P stays unchanged."""
 
     @abstractmethod
     def marginalise(self, stay: BoolArray) -> None:
@@ -214,7 +214,7 @@ class Gaussian(ABC):
         """Another covariance of the same body and of other landmarks: when P is put back."""
 
     def start_over(self, P: Array) -> None:
-        """The same at a map revival: P has no columns of what is considered, whose covariance is lost."""
+        """Replace P at a map revival: it has no considered columns, whose covariance is lost."""
         columns, self.body = self.considered, self.body - self.considered
         self.considered = 0
         self.replace(P)

@@ -41,13 +41,13 @@ class FrameInnovations:
 
     @staticmethod
     def none(dimension: int) -> FrameInnovations:
-        """Of a frame without any."""
+        """Return the innovations of a frame without any."""
         rows = np.empty((0, dimension))
         return FrameInnovations(np.empty(0, dtype=np.int64), rows, rows, np.zeros(6), np.zeros((6, 6)))
 
 
 def innovations_of(solution: Solution, landmark: IntArray, rows: Rows, S: Array, left: Array) -> FrameInnovations:
-    """The innovations of one frame, see the module.
+    """Return the innovations of one frame, see the module.
 
     Args:
         solution: Of eq. (6) for the rows.
@@ -78,7 +78,7 @@ def _inverse(information: Array) -> Array:
 
 
 def collect_innovations(frames: SequenceType[FrameInnovations]) -> WhitenedInnovations:
-    """The innovations of a run as flat arrays."""
+    """Return the innovations of a run as flat arrays."""
     return WhitenedInnovations(
         frame=np.repeat(np.arange(len(frames)), [len(frame.landmark) for frame in frames]),
         landmark=np.concatenate([frame.landmark for frame in frames]),

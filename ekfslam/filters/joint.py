@@ -177,7 +177,7 @@ class JointEKF(Estimate):
         return FrameReport(frame, ids, reason, done.nis, found.dof, split, likelihood, found.innovations)
 
     def _rest(self, frame: int, ids: IntArray) -> None:
-        """Of landmarks out of view some sleep, and the others retire."""
+        """Let landmarks out of view sleep or retire."""
         out = lifecycle.out_of_view(self.table, ids, frame, self.config.retire_after or 1)
         limit = None if self.config.retire == "never" else self.config.dormant or 0
         asleep = lifecycle.at_rest(out, self.table, limit)
@@ -227,15 +227,15 @@ class JointEKF(Estimate):
             self.motion = replace(self.motion, T_predicted=self.T_imu_world, T_predicted_before=clone)
 
     def landmarks(self) -> Landmarks:
-        """Every landmark so far, in the order of landmark initialisation, which is that of the log."""
+        """Return every landmark so far, in the order of the log, which is that of landmark initialisation."""
         return self.retired.all_landmarks(self.table, self.gaussian.landmark_blocks())
 
     def log(self) -> Log:
-        """What the filter has conditioned on so far, for the posterior over all poses and landmarks."""
+        """Return the record of all conditioning so far, for the posterior over all poses and landmarks."""
         return self._log.log()
 
     def parameters(self) -> Parameters | None:
-        """What is estimated besides poses and landmarks and has labels, after each frame; None: nothing."""
+        """Return the estimates of blocks with labels after each frame; None: there are none."""
         name, unit, prior_std = self.model.labels
         if not name:
             return None

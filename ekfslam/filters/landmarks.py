@@ -26,7 +26,7 @@ _INTS = (
 
 
 def _column(name: str) -> Any:
-    """A named column (n,) of whole numbers: a view that can be written to."""
+    """Return a property for a named column (n,) of whole numbers: a view that can be written to."""
     at = _INTS.index(name)
     return property(lambda table: table._ints[at, : table._rows])
 
@@ -118,7 +118,7 @@ class LandmarkTable:
         self.misses[slot] = 0
 
     def snapshot(self, slot: IntArray, covariance: Array) -> Landmarks:
-        """Some landmarks as a result has them, with their covariances (k, 3, 3)."""
+        """Return some landmarks as records of a result, with their covariances (k, 3, 3)."""
         return Landmarks(
             self.id[slot],
             self.position_m[slot],
@@ -131,7 +131,7 @@ class LandmarkTable:
 
 
 def _wider(rows: NDArray, least: int) -> NDArray:
-    """A copy of the rows (n, k) with room for at least so many, and for half as many again."""
+    """Return a copy of the rows (n, k) with room for 1.5 times a least number of rows."""
     room = np.empty((least + least // 2, rows.shape[1]), dtype=rows.dtype)
     room[: len(rows)] = rows
     return room

@@ -35,13 +35,13 @@ class Marginal:
 
 
 class Revival(Protocol):
-    """What brings retired landmarks back: `ekfslam.smoother.revival.MapRevival`, handed to the filter by its caller."""
+    """Source of returning landmarks: `ekfslam.smoother.revival.MapRevival`, handed to the filter by its caller."""
 
     def neighbours(self, log: Log, returning: IntArray, candidates: IntArray) -> tuple[IntArray, IntArray]:
-        """Rows (c,) of candidates that come along, and their distances (c,) in frames from the returning landmarks."""
+        """Return rows (c,) of candidates that come along, and their distances (c,) in frames from returning ones."""
 
     def marginal(self, log: Log, positions_m: Array, landmarks: IntArray) -> Marginal:
-        """The marginal over the last frame's blocks and landmarks (n,), given as rows of the log."""
+        """Return the marginal over the last frame's blocks and landmarks (n,), given as rows of the log."""
 
 
 class Retired:
@@ -77,7 +77,7 @@ class Retired:
         }
 
     def add(self, table: LandmarkTable, covariance: Array, gone: BoolArray, may_return: bool) -> None:
-        """Landmarks (n,) of a table that are gone, with the covariances (k, 3, 3) of these."""
+        """Add landmarks (n,) of a table that are gone, with their covariances (k, 3, 3)."""
         slot = np.flatnonzero(gone)
         ids, rows = table.id[slot].tolist(), table.log_row[slot]
         self._parts.append(table.snapshot(slot, covariance))
@@ -88,18 +88,18 @@ class Retired:
             self._verdicts.update(zip(rows.tolist(), verdicts, strict=True))
 
     def among(self, ids: IntArray) -> list[int]:
-        """Those of the ids that were retired and may come back, ascending."""
+        """Return the ids that were retired and may come back, ascending."""
         return sorted(self.row_of.keys() & set(ids.tolist())) if self.row_of else []
 
     def start_afresh(self, ids: IntArray) -> None:
-        """Landmarks that are initialised: what was retired under their ids does not come back."""
+        """Mark ids that are initialised again: landmarks retired under them do not come back."""
         again = self.among(ids)
         self.reappeared.extend(again)
         for i in again:
             del self.row_of[i]
 
     def all_landmarks(self, table: LandmarkTable, covariance: Array) -> Landmarks:
-        """Every landmark so far, in the order of the log; those in the table have covariances (n, 3, 3)."""
+        """Return every landmark so far, in the order of the log; those in the table have covariances (n, 3, 3)."""
         row = np.concatenate([*self._rows, table.log_row])
         everything = Landmarks.concatenate([*self._parts, table.snapshot(np.arange(len(table)), covariance)])
         # A landmark that came back and was retired again is there twice; its last estimate counts.
@@ -145,13 +145,13 @@ class Retired:
 
 
 def _first_steps(log: Log, rows: IntArray) -> IntArray:
-    """Frames of the log (n,) with the first observation of landmarks, given by their rows."""
+    """Return the frames of the log (n,) with the first observation of landmarks, given by their rows."""
     _, first = np.unique(log.landmark, return_index=True)
     return log.frame[first][rows]
 
 
 def at_rest(out: BoolArray, table: LandmarkTable, limit: int | None) -> BoolArray:
-    """Which of the landmarks out of view (n,) stay in the state, asleep: the last seen, up to a limit; None: all."""
+    """Return which landmarks out of view (n,) stay, dormant: the last seen up to a limit; None: all."""
     stay = out.copy()
     if limit is not None and (excess := int(out.sum()) - limit) > 0:
         slot = np.flatnonzero(out)
@@ -160,6 +160,6 @@ def at_rest(out: BoolArray, table: LandmarkTable, limit: int | None) -> BoolArra
 
 
 def out_of_view(table: LandmarkTable, ids: IntArray, frame: int, after: int) -> BoolArray:
-    """Which landmarks (n,) have not been seen for ``after`` frames, and are not now, where ``ids`` are."""
+    """Return which landmarks (n,) have not been seen for ``after`` frames; ``ids`` are seen now."""
     unseen_for = frame - np.maximum(table.last_frame, table.stay_until)
     return (unseen_for >= after) & np.isin(table.id, ids, invert=True)

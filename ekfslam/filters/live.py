@@ -55,7 +55,7 @@ class Pose(NamedTuple):
 
 @dataclasses.dataclass
 class LiveCounts:
-    """What has come, and what became of it: nothing is dropped without being counted.
+    """Counts of all messages: none is dropped without being counted.
 
     Args:
         velocities, images: Messages that were not late.
@@ -112,7 +112,7 @@ class _Velocities:
         return Interval(end - begin, np.diff(bounds), twists, is_gap), is_held
 
     def forget(self, before: float) -> None:
-        """Those before a stamp, but for the last of them, which says since when the next one holds."""
+        """Drop velocities older than a stamp, but keep the newest of them: it marks where the next interval begins."""
         keep = max(bisect_right(self.stamps, before) - 1, 0)
         del self.stamps[:keep], self._twists[:keep]
 
@@ -164,7 +164,7 @@ class LiveEKF:
         config: FilterConfig | None = None,
         **window: Any,
     ) -> LiveEKF:
-        """The filter of a stereo rig with measured velocities.
+        """Return the live filter of a stereo rig with measured velocities.
 
         Args:
             camera: Of the rectified pair.
@@ -187,7 +187,7 @@ class LiveEKF:
         return max(self._newest.values())
 
     def predict(self, velocities: ArrayLike, t: float) -> list[FrameReport]:
-        """A measured velocity.
+        """Take a measured velocity.
 
         Args:
             velocities: (6,) ``[v; w]``, m/s and rad/s, which holds since the stamp of the one before.
@@ -211,7 +211,7 @@ class LiveEKF:
         return self._arrived("velocity", t)
 
     def update(self, ids: ArrayLike, pixels: ArrayLike, t: float) -> list[FrameReport]:
-        """An image: what the tracker sees in it.
+        """Take the tracks of an image.
 
         Args:
             ids: (n,) landmark ids, distinct.
@@ -256,7 +256,7 @@ class LiveEKF:
         return self._take_in(np.inf)
 
     def pose(self, t: float | None = None) -> Pose:
-        """The pose at a stamp, by default the newest one, given the images that were taken in until then.
+        """Return the pose at a stamp, by default the newest one, given the images processed until then.
 
         Args:
             t: From ``history_s`` before the last image that was taken in.
@@ -278,7 +278,7 @@ class LiveEKF:
         return Pose(t, then.T_world_imu, then.gaussian.body_covariance[:6, :6].copy(), is_held)
 
     def _in_time(self, kind: Literal["velocity", "image"], t: float) -> bool:
-        """Whether a message is of use; counts it, or raises, where it is not."""
+        """Return whether a message is in time; count it or raise if it is late."""
         require_finite(np.array(t, dtype=float), "t")
         if self.time_s is None or t > self.time_s:
             return True

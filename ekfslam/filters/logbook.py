@@ -105,7 +105,7 @@ class LogBook:
             self._lists[f"measured_{field.name}"].append(getattr(rows, field.name))
 
     def corrected(self, now: Estimate, found: Correction) -> None:
-        """The correction of this frame, before the estimate takes it."""
+        """Add the correction of this frame, before the estimate takes it."""
         table, slot = now.table, found.slot
         follows = (table.last_step[slot] == now.step - 1) & (now.model.track_error is not None)
         previous = np.where(follows, table.last_observation[slot], -1)
@@ -120,7 +120,7 @@ class LogBook:
         )
 
     def started(self, ids: IntArray, positions_m: Array, *views: tuple[int, Array, Array]) -> IntArray:
-        """New landmarks (n,) and the views that initialised them: frame, rows (n, d), variances (n, d).
+        """Add landmarks (n,) and the views that initialised them: frame, rows (n, d), variances (n, d).
 
         Returns:
             Their rows in the log.
@@ -153,7 +153,7 @@ class LogBook:
         self._observations += len(landmark)
 
     def log(self) -> Log:
-        """The log so far."""
+        """Return the log so far."""
         return Log(
             first_estimates=self._first_estimates,
             initial_covariance=self._initial_covariance,

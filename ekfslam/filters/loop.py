@@ -19,7 +19,7 @@ from ekfslam.models.process import Measured
 
 
 class Frame(NamedTuple):
-    """What one frame left behind: its number, the report on its observations, and the wall-clock time in ms."""
+    """One processed frame: its number, the report on its observations, and the wall-clock time in ms."""
 
     number: int
     report: FrameReport
@@ -27,20 +27,20 @@ class Frame(NamedTuple):
 
 
 class FurtherVelocities(Protocol):
-    """What further sensors measured: see `ekfslam.models.sensors.velocities.VelocitySource`."""
+    """Measurements by further sensors: see `ekfslam.models.sensors.velocities.VelocitySource`."""
 
     def during(self, begin_s: float, end_s: float) -> Measured | None:
         """Measurements of the velocities of one interval."""
 
 
 def one_thread() -> AbstractContextManager[object]:
-    """One BLAS thread: with small dense matrices a second one costs three times what it saves."""
+    """Limit BLAS to one thread: for small dense matrices a second one costs three times what it saves."""
     return threadpool_limits(1, user_api="blas")
 
 
 @contextmanager
 def solvable() -> Iterator[None]:
-    """Let a matrix that cannot be inverted or decomposed be a named error; serves as a decorator, too.
+    """Raise a named error for a matrix that cannot be inverted or decomposed; also a decorator.
 
     Raises:
         FilterError: There was one inside.
@@ -59,7 +59,7 @@ def run_filter(
     further: FurtherVelocities | None = None,
     clock: Callable[[], float] = perf_counter,
 ) -> Iterator[Frame]:
-    """Feed a recording to an estimator, frame by frame; it can be asked for its state in between.
+    """Feed a recording to an estimator frame by frame; its state can be read in between.
 
     Args:
         estimator: A new one: it begins at the first of the frames.

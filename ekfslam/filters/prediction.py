@@ -22,7 +22,7 @@ from ekfslam.models.process import Measured
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a prediction did besides moving the estimate.
+    """Results of a prediction that are not part of the estimate.
 
     Args:
         departed: (body,) coordinates before the process moved its blocks.

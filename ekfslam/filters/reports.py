@@ -15,7 +15,7 @@ from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, WAITING
 
 @dataclass(frozen=True)
 class FrameReport:
-    """What one frame's observations did.
+    """Outcome of one frame's observations.
 
     Args:
         frame: Frame index.
@@ -49,12 +49,12 @@ def log_density(nis: float, log_det: float, dof: int) -> float:
 
 
 def missed(reason: IntArray) -> BoolArray:
-    """Whether (n,) an observation speaks against its landmark, and not merely against itself."""
+    """Return whether (n,) an observation is evidence against its landmark, not merely against itself."""
     return (reason == GATE) | (reason == BEHIND_CAMERA)
 
 
 def collect(reports: SequenceType[FrameReport]) -> tuple[Innovation, Rejections, dict[str, int]]:
-    """The reports of a run as flat arrays, and the totals: accepted, rejected, and rejected per reason."""
+    """Return the reports of a run as flat arrays, and the totals: accepted, rejected, rejected per reason."""
     ids = np.concatenate([report.ids for report in reports])
     reason = np.concatenate([report.reason for report in reports])
     frame = np.repeat([report.frame for report in reports], [len(report.ids) for report in reports])

@@ -80,7 +80,7 @@ def _camera(e: Estimate) -> CameraCoordinates | None:
 
 
 def _changes(e: Estimate, moved: Moved, turned: Callable[[Array, Array], Array]) -> tuple[Change, ...]:
-    """How errors of landmarks change where a correction leads; landmarks that can be seen come first."""
+    """Return how a correction changes landmark errors, active landmarks first."""
     positions, values, after, camera = e.table.position_m, e.values, moved.mean.values, _camera(e)
     others, awake = moved.asleep, moved.awake
     in_world = e.variant.change(e.model, values, others, moved.mean.position_m[others] - positions[others])

@@ -43,7 +43,7 @@ def start(e: Estimate, log: LogBook, waiting: Waiting | None, frame: int, ids: I
 def _start_after_waiting(
     e: Estimate, log: LogBook, waiting: Waiting, frame: int, ids: IntArray, rows: Array
 ) -> BoolArray:
-    """The same for a sensor that needs two views: what these leave over is a measurement of the blocks."""
+    """Append landmarks that two views initialise; their remaining rows are a measurement of the blocks."""
     found = waiting.start(e, ids, rows)
     if found.which.any():
         now, variance = rows[found.which], e.sensor.variance(rows[found.which])

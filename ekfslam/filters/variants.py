@@ -41,7 +41,7 @@ class Standard:
     is_frozen_exactly = True
 
     def linear(self, estimate: Array, first: Array) -> Array:
-        """Where the Jacobian of a pose or of landmarks is taken, of the estimate and the first estimate."""
+        """Return the linearisation point of a pose or of landmarks, given estimate and first estimate."""
         return first if self.first_estimates else estimate
 
     def retract_landmarks(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> Array:
@@ -56,11 +56,11 @@ class Standard:
         return positions_m + d
 
     def turned(self, before: Array, after: Array) -> Array:
-        """How the stored error (6,) of a pose (4, 4) before a correction becomes that after it: here it stays."""
+        """Return the matrix (6, 6) from the stored error of a pose before a correction to that after it: here I."""
         return np.eye(6)
 
     def derivative(self, before: Array, after: Array) -> Array:
-        """The same (6, 6) for rows of an iterated update: the derivative of ``exp(xi^) T``."""
+        """Return the matrix (6, 6) for rows of an iterated update: the derivative of ``exp(xi^) T``."""
         return np.asarray(se3.left_jacobian(se3.log(after @ se3.inverse(before))), dtype=float)
 
     def change(self, model: Model, before: Values, slot: IntArray, moved_m: Array) -> Change:
@@ -148,7 +148,7 @@ class Invariant(Standard):
     derivative = turned
 
     def change(self, model: Model, before: Values, slot: IntArray, moved_m: Array) -> Change:
-        """Of landmarks in xyz: new errors by rotations, of the pose and (where it is in the state) of the camera."""
+        """Return the change of landmark errors in xyz by rotations: of the pose, and of the camera if estimated."""
         start = model.layout["pose"].start + 3
         columns, by = np.arange(start, start + 3), se3.skew(moved_m) @ before["pose"][:3, :3].T
         calibration = model.observer.calibration
@@ -187,7 +187,7 @@ VARIANTS: dict[str, Standard] = {variant.name: variant for variant in (Invariant
 
 
 def is_frozen_exactly(config: FilterConfig) -> bool:
-    """Whether rows frozen where the filter linearised them are the filter.
+    """Return whether rows frozen at the filter's linearisation points have the filter as solution.
 
     A landmark that comes back then takes its place among them, otherwise all rows are linearised again.
     """

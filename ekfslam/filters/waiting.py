@@ -62,7 +62,7 @@ class Waiting:
         self._step, self._T_linear = 0, np.eye(4)
 
     def start(self, e: Estimate, ids: IntArray, rows: Array) -> Started:
-        """Those of the new tracks (n,) with rows (n, d) whose landmarks can be initialised now."""
+        """Return the new tracks, of (n,) with rows (n, d), whose landmarks can be initialised now."""
         which = np.flatnonzero(np.isin(ids, self._ids))
         then = self._rows[np.searchsorted(self._ids, ids[which])] if len(which) else np.empty((0, rows.shape[1]))
         T_cam_imu, T_anchor = e.sensor.T_cam_imu, e.values[Anchor.name]
@@ -122,7 +122,7 @@ class Waiting:
         self._ids, self._rows = self._ids[still], self._rows[still]
         if len(self._ids) and e.step - self._step < self._sensor.patience:
             return
-        # Everybody starts to wait anew, from here: the anchor takes the pose's place.
+        # All tracks start to wait again, from here: the anchor takes the pose's place.
         layout = e.model.layout
         Phi = np.eye(layout.body)
         Phi[layout[Anchor.name], layout[Anchor.name]], Phi[layout[Anchor.name], layout["pose"]] = 0.0, np.eye(6)

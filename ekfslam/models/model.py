@@ -45,7 +45,7 @@ class Transition:
 
 @dataclass(frozen=True)
 class Model:
-    """What is believed: which blocks are in the state, what observes landmarks, and how noisy everything is.
+    """The blocks of the state, their process, the sensor of landmarks, and all noise.
 
     Args:
         sensor: Of landmarks.
@@ -118,11 +118,11 @@ class Model:
         return coordinates
 
     def initial_values(self) -> dict[str, Array]:
-        """Value of every block before the first frame."""
+        """Return the value of every block before the first frame."""
         return {block.name: block.initial() for block in self.blocks}
 
     def retract(self, values: Values, correction: Array) -> dict[str, Array]:
-        """Every block after a correction (body,) of all of them."""
+        """Return every block after a correction (body,) of all of them."""
         return {
             block.name: block.retract(values[block.name], correction[self.layout[block.name]]) for block in self.blocks
         }
@@ -138,7 +138,7 @@ class Model:
         )
 
     def reported(self, values: Values, covariance: Array) -> Array:
-        """Estimates and standard deviations (2, p) of what has labels; the covariance begins with the body."""
+        """Return estimates and standard deviations (2, p) by labels; the covariance begins with the body."""
         if not self.labels[0]:
             return np.empty((2, 0))
         blocks = [block for block in self.layout.blocks if block.labels]

@@ -59,7 +59,7 @@ _SPAN = 10  # samples over which the slow walk of the velocities is measured
 
 @dataclass(frozen=True)
 class VelocityNoise:
-    """What the differences of velocities say.
+    """Noise of velocities as their differences show it.
 
     Args:
         sigma: (2,) white noise per sample of the linear (m/s) and the angular velocities (rad/s), each axis.
@@ -121,7 +121,7 @@ def velocity_noise(twist: Array) -> VelocityNoise:
 
 
 def _jackknife(left_out: Array) -> Array:
-    """Standard errors of estimates from those (n, ...) with one of n parts left out."""
+    """Return standard errors of estimates, given those (n, ...) with one of n parts left out."""
     return np.sqrt((len(left_out) - 1) * left_out.var(axis=0))
 
 
@@ -131,7 +131,7 @@ def _white(lag_1: Array) -> Array:
 
 
 def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu", checked: bool = False) -> Noise:
-    """The noise that a filter shall assume for a recording that states none, from its velocities (T, 6).
+    """Return the noise for a recording that states none, from its velocities (T, 6).
 
     Args:
         twist, velocity_frame: As in the recording.
@@ -170,7 +170,7 @@ def shared_errors(twist: Array | None, checked: bool = False) -> dict[str, dict[
 
 
 def with_drift(noise: Noise, drift_px: float) -> Noise:
-    """The noise with tracks whose errors walk by ``drift_px`` a frame in u and v, in the proportions assumed else."""
+    """Return the noise with track errors that walk by ``drift_px`` a frame in u and v, in the usual proportions."""
     if not drift_px:
         return dataclasses.replace(noise, track_first_px=None, track_walk_px=None)
     first = TRACK_FIRST_PX if noise.track_first_px is None else noise.track_first_px
@@ -178,5 +178,5 @@ def with_drift(noise: Noise, drift_px: float) -> Noise:
 
 
 def with_error(value: float, error: float | None) -> str:
-    """A value and its standard error, if it has one, as text."""
+    """Return a value and its standard error, if it has one, as text."""
     return f"{value:.3g}" if error is None else f"{value:.3g} +- {error:.2g}"

@@ -22,7 +22,7 @@ GIVEN = np.zeros(9)
 
 @dataclass(frozen=True)
 class Moment:
-    """What observations of one frame depend on, besides landmarks.
+    """Everything but landmarks that observations of one frame depend on.
 
     Args:
         T_imu_world: (..., 4, 4) pose.
@@ -41,13 +41,13 @@ class Moment:
     way_m: Array = field(default_factory=lambda: np.zeros(()))
 
     def at(self, index: IntArray) -> Moment:
-        """The moments of some observations, given the frame of each, where poses and velocities are of all frames."""
+        """Return the moments of observations, given the frame (n,) of each, from a moment of all frames."""
         shared = {name: value[index] for name, value in self.shared.items()}
         way = self.way_m[index] if self.way_m.ndim else self.way_m
         return Moment(self.T_imu_world[index], self.T_linear[index], self.calibration, self.twist[index], shared, way)
 
     def linearised_at(self, T_linear: Array) -> Moment:
-        """The same moment, its error linearised at another pose."""
+        """Return the moment with its error linearised at another pose."""
         return dataclasses.replace(self, T_linear=T_linear)
 
 
@@ -101,7 +101,7 @@ class Observer:
 
     @cached_property
     def has_drift(self) -> bool:
-        """Whether what a difference of observations shows of the present frame is not what one alone would show."""
+        """Whether a difference of observations sees the present frame otherwise than a single one does."""
         one = np.ones(())
         differs = (block.camera_share(one, one > 0) != block.camera_share(one, one < 0) for block in self._moves_camera)
         return any(differs)
@@ -114,7 +114,7 @@ class Observer:
         pose: str = "pose",
         is_difference: BoolArray | None = None,
     ) -> Seen:
-        """Eq. (3), (4), (9) and (11): landmarks (n, 3) as the sensor sees them.
+        """Return landmarks (n, 3) as the sensor sees them, eq. (3), (4), (9) and (11).
 
         Args:
             moment: From where.
@@ -157,7 +157,7 @@ class Observer:
         return None if clone is None else self.layout[clone]
 
     def _camera_offset(self, moment: Moment, is_difference: BoolArray | None) -> tuple[Array, list[Array]]:
-        """Eq. (11): the tangent by which the shared blocks move the camera, and the share of each.
+        """Return the tangent by which shared blocks move the camera, and the share of each, eq. (11).
 
         Shapes are (n, 6) and (n,) only where observations of one frame differ, and otherwise without n.
         """
@@ -173,7 +173,7 @@ class Observer:
         return sum(parts[1:], parts[0]), [np.asarray(share) for share in shares]
 
     def points(self, moment: Moment, positions_m: Array, is_difference: BoolArray | None = None) -> Array:
-        """Landmarks (n, 3) in the frame of the sensor (n, 3); arguments as of `see`."""
+        """Return landmarks (n, 3) in the frame of the sensor; arguments as of `see`."""
         T = moment.T_imu_world
         if self._moves_camera:
             T = se3.exp(self._camera_offset(moment, is_difference)[0]) @ T
@@ -182,11 +182,11 @@ class Observer:
         return se3.apply(self.sensor_at(moment.calibration).T_cam_imu @ T, positions_m)
 
     def predicted(self, moment: Moment, q: Array) -> Array:
-        """Rows (n, d) of points (n, 3) in the frame of the sensor."""
+        """Return the rows (n, d) of points (n, 3) in the frame of the sensor."""
         return self.sensor_at(moment.calibration).predict(q)
 
     def inverted(self, moment: Moment, rows: Array) -> tuple[Array, BoolArray]:
-        """Points (n, 3) in the frame of the sensor that rows (n, 3) are those of, and whether (n,) they show its depth.
+        """Return the points (n, 3) in the sensor's frame that rows (n, 3) see, and whether (n,) they have a depth.
 
         The sensor's `screen` has judged that of the sensor as given. Where blocks change it, disparities may be less
         than that of a point at infinity.
@@ -199,7 +199,7 @@ class Observer:
         return q, sensor.has_depth(q)
 
     def initialise(self, moment: Moment, q: Array, variance: Array) -> tuple[Array, Array, Array]:
-        """Eq. (5): positions (n, 3) of new landmarks, G (n, 3, seen), and what the measurement adds (n, 3, 3).
+        """Return positions (n, 3) of new landmarks, G (n, 3, seen), and the measurement's part (n, 3, 3), eq. (5).
 
         What was seen stays as it is: ``H_x x + H_m d = 0``, hence ``G = -H_m^-1 H_x``.
 

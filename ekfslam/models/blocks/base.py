@@ -75,7 +75,7 @@ class StateBlock:
         return ()
 
     def initial(self) -> Array:
-        """Its value before the first frame."""
+        """Return its value before the first frame."""
         return np.zeros(self.size)
 
     def begun_by(self, sequence: Sequence) -> StateBlock:
@@ -83,15 +83,15 @@ class StateBlock:
         return self
 
     def prior_covariance(self) -> Array:
-        """(size, size) covariance of that value."""
+        """Return the covariance (size, size) of that value."""
         return np.zeros((self.size, self.size))
 
     def retract(self, value: Array, correction: Array) -> Array:
-        """The value after a correction (..., size) of its error."""
+        """Return the value after a correction (..., size) of its error."""
         return value + correction
 
     def transition(self, tau_s: Array | float, way_m: Array | float) -> tuple[Array, Array] | None:
-        """How value and error go from frame to frame: ``x+ = phi x + w``, element by element; None: it is constant.
+        """Return the walk from frame to frame, ``x+ = phi x + w`` element by element; None: it is constant.
 
         Returns:
             ``phi`` (..., size) and the standard deviation (..., size) of w over intervals of ``tau_s`` (...), in which
@@ -106,7 +106,7 @@ class StateBlock:
     def turn_velocities(
         self, twist: Array, by: Array, values: Values, R_linear: Array, layout: Layout
     ) -> tuple[Array, Array]:
-        """Velocities (..., 6) and their derivative (..., 6, body) by all blocks, after this block has acted on them.
+        """Return velocities (..., 6) and their derivative (..., 6, body), after this block has acted on them.
 
         Args:
             twist, by: Before.
@@ -117,7 +117,7 @@ class StateBlock:
         return twist, by
 
     def camera_share(self, way_m: Array, is_difference: BoolArray) -> Array | None:
-        """How the value (6,) moves the camera: ``T_imu_world`` seems to be ``exp((share value)^) T_imu_world``.
+        """Return the share of the value (6,) that moves the camera: ``exp((share value)^) T_imu_world``.
 
         Args:
             way_m: (...) way driven since the frame before, for each observation.
@@ -140,7 +140,7 @@ class StateBlock:
         return None
 
     def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
-        """Estimates and standard deviations (p,) of what `labels` name, given all blocks and their covariance."""
+        """Return estimates and standard deviations (p,) by `labels`, given all blocks and their covariance."""
         at = layout[self.name]
         return values[self.name], np.sqrt(np.diag(covariance)[at])
 
@@ -190,7 +190,7 @@ class Layout(dict[str, slice]):
         return {block.name: block for block in self.blocks}[name]
 
     def columns(self, names: Iterable[str]) -> IntArray:
-        """Columns of some blocks, in the order given."""
+        """Return the columns of some blocks, in the order given."""
         parts = [np.arange(self[name].start, self[name].stop) for name in names]
         return np.concatenate([np.empty(0, dtype=np.int64), *parts])
 

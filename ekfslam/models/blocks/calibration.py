@@ -100,7 +100,7 @@ class Calibration(StateBlock):
         return values[self.name][self.free], np.sqrt(np.diag(covariance)[layout[self.name]])
 
     def applied(self, rig: Rig, parameters: Array) -> Rig:
-        """The rig with parameters (9,), all but the time offset."""
+        """Return the rig with parameters (9,), all but the time offset."""
         return calibrated(rig, parameters)
 
     def delay(self, parameters: Array, twist: Array) -> Array:
@@ -156,7 +156,7 @@ class Calibration(StateBlock):
         return q, H_x @ se3.adjoint(delay), H[..., self.free], H_m
 
     def landmarks_by_rotation(self, rig: Rig, parameters: Array, T_imu_world: Array, moved_m: Array) -> Array:
-        """New landmark errors (n, 3, 3) by the camera's rotation, where a correction moves landmarks by ``moved_m``.
+        """Return the landmark errors (n, 3, 3) by the camera's rotation after a correction by ``moved_m`` (n, 3).
 
         A rig that turns its camera and all landmarks about it sees the same: their errors count in the camera's frame,
         as those of the invariant variant do in that of the IMU. In world they would be seen from ever new linearisation
@@ -169,7 +169,7 @@ class Calibration(StateBlock):
 
 
 def calibrated(rig: Rig, parameters: Array) -> Rig:
-    """The rig with parameters (9,) applied, all but the time offset."""
+    """Return the rig with parameters (9,) applied, all but the time offset."""
     camera = rig.camera
     return dataclasses.replace(
         rig,

@@ -36,7 +36,7 @@ class GaussMarkov(StateBlock):
         raise NotImplementedError
 
     def lengths(self, tau_s: Array | float, way_m: Array | float) -> Array:
-        """``l / L`` (..., size or 1) over intervals of ``tau_s`` (...) in which the rig drives ``way_m`` (...)."""
+        """Return ``l / L`` (..., size or 1) over intervals of ``tau_s`` (...) and ``way_m`` (...)."""
         raise NotImplementedError
 
     def prior_covariance(self) -> Array:

@@ -44,7 +44,7 @@ class Pose(StateBlock):
 
 @dataclass(frozen=True)
 class Clone(StateBlock):
-    """What clones of the pose have in common: they begin as a certain identity, until they take the pose's place."""
+    """Clone of a pose: it begins as a certain identity, until it takes the pose's place."""
 
     is_seen = True
     is_pose = True

@@ -34,10 +34,10 @@ class Sensor(Protocol):
         """Reason codes (n,) of what can be judged from the measurements alone."""
 
     def in_view(self, q: Array, min_depth_m: float) -> BoolArray:
-        """Whether (n,) points (n, 3) can be seen at all."""
+        """Return whether (n,) points (n, 3) can be seen at all."""
 
     def rows(self, measured: Array) -> Array:
-        """The rows (n, d) of each measurement."""
+        """Return the rows (n, d) of each measurement."""
 
     def variance(self, rows: Array) -> Array:
         """Variances (n, d) of the rows where noise is white."""
@@ -49,7 +49,7 @@ class Sensor(Protocol):
         """``dh/dq`` (n, d, 3)."""
 
     def invert(self, rows: Array) -> Array:
-        """The points (n, 3) m that rows (n, d) see; a `DelayedSensor` never is asked."""
+        """Return the points (n, 3) m that rows (n, d) see; never called for a `DelayedSensor`."""
 
 
 @runtime_checkable

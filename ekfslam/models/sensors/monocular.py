@@ -57,14 +57,14 @@ class Monocular:
         raise NotImplementedError("one view of one camera has no depth")
 
     def rays(self, rows: Array) -> Array:
-        """Unit vectors (n, 3) along which pixels (n, 2) lie, in the camera frame."""
+        """Return unit vectors (n, 3) along which pixels (n, 2) lie, in the camera frame."""
         x = (rows[:, 0] - self.camera.cu_px) / self.camera.fu_px
         y = (rows[:, 1] - self.camera.cv_px) / self.camera.fv_px
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def triangulate(self, rows_anchor: Array, rows: Array, T_now_anchor: Array) -> tuple[Array, BoolArray]:
-        """The middle of the shortest line between both rays: points (n, 3) now, and whether (n,) parallax suffices."""
+        """Return the middle of the shortest line between both rays (n, 3), and whether (n,) parallax suffices."""
         a, b = self.rays(rows_anchor) @ T_now_anchor[:3, :3].T, self.rays(rows)
         origin = T_now_anchor[:3, 3]
         cosine = (a * b).sum(axis=1)

@@ -39,7 +39,7 @@ class Rig:
     dimension = 3
 
     def with_white_pixels(self) -> Rig:
-        """The rig whose pixels have white noise alone."""
+        """Return the rig whose pixels have white noise alone."""
         return replace(self, noise=replace(self.noise, track_first_px=None, track_walk_px=None))
 
     @cached_property
@@ -79,11 +79,11 @@ class Rig:
         return _DISPARITY_ROWS @ A if self._sees_disparity else A
 
     def by_disparity(self, q: Array) -> Array:
-        """Derivative (n, 3) of the rows by an error of the disparity in px."""
+        """Return the derivative (n, 3) of the rows by an error of the disparity in px."""
         return np.broadcast_to([0.0, 0.0, 1.0 if self._sees_disparity else -1.0], q.shape)
 
     def by_log_baseline(self, q: Array) -> Array:
-        """Derivative (n, 3) of the rows by the logarithm of the baseline."""
+        """Return the derivative (n, 3) of the rows by the logarithm of the baseline."""
         return self.by_disparity(q) * (self.camera.fu_px * self.camera.baseline_m / q[:, 2:])
 
     def invert(self, rows: Array) -> Array:
@@ -92,5 +92,5 @@ class Rig:
         return cam.triangulate(self.camera, rows + np.array([0.0, 0.0, self.disparity_offset_px]))
 
     def has_depth(self, q: Array) -> BoolArray:
-        """Whether (n,) points (n, 3) of `invert` are in front of the rig, near enough to have a depth."""
+        """Return whether (n,) points (n, 3) of `invert` are in front of the rig and near enough to have a depth."""
         return (q[:, 2] > 0) & (q[:, 2] < self.camera.fu_px * self.camera.baseline_m / _NO_DEPTH_PX)

@@ -50,7 +50,7 @@ class VelocitySource:
             raise ConfigError(f"standard deviations of a velocity source must be positive, found {self.std}")
 
     def during(self, begin_s: float, end_s: float) -> Measured | None:
-        """Its measurements with stamps in ``(begin_s, end_s]``; None where there are none."""
+        """Return its measurements with stamps in ``(begin_s, end_s]``; None if there are none."""
         first, last = np.searchsorted(self.time_s, (begin_s, end_s), side="right")
         if first == last:
             return None
