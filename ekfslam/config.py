@@ -215,8 +215,7 @@ class FilterConfig:
             is split: its landmark is retired and a new one started, since the tracker has jumped to another point. 0
             never splits. By default 3; 1 if errors of tracks walk, since each observation then continues the last one.
         moving_sigma: If errors of tracks walk (`Noise.track_error`), a track that moves along with the rig is dropped
-            for good. Over all its observations it must do so by more than this many standard deviations, without their
-            `Noise.margin`,
+            for good. Over all its observations it must do so by more than this many standard deviations,
         moving_share: and by more than this share of the way.
         min_depth_m: Reject observations of a landmark that is predicted nearer than this, or behind the camera.
         relative_frames: If truth is known, keep cross-covariances of reported poses up to this many frames apart, for

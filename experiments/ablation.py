@@ -98,7 +98,6 @@ def with_true_motion(
         twist_std=np.zeros(6),
         twist_walk_std=None,
         motion_std=np.repeat([0.01, 0.0001], 3),
-        misalignment_rad=0.0,
         tilt_rad=0.0,
     )
     return dataclasses.replace(

@@ -117,7 +117,7 @@ def factors_of(result: Result, config: PosteriorConfig) -> Factors:
 
     twist = np.concatenate([np.zeros((1, 6)), log.inputs])
     measured = se3.inverse(motion.increment(twist, log.tau_s))
-    Q = motion.process_noise(twist, log.tau_s, result.noise.velocity_std, result.noise.misalignment_rad)
+    Q = motion.process_noise(twist, log.tau_s, result.noise.velocity_std)
     Q = Q[:, ROTATION_FIRST][:, :, ROTATION_FIRST]
     # Not "smart", which would drop small covariances and with them 1e-5 of the cost.
     between = [

@@ -227,7 +227,7 @@ def test_what_leads_out_of_the_file_or_round_in_it_is_refused(whole, tmp_path, k
         ("counts", h5py.Empty("S4"), "is empty"),
         ("noise_twist_std", np.full(6, np.nan), "twist_std"),
         ("noise_pixel_std_px", np.ones(3), "pixel_std_px"),
-        ("noise_track_memory", 7.0, "track_memory"),
+        ("noise_track_flow_px", -7.0, "track_flow_px"),
         ("format_version", "four", "format_version of runs/full is no whole number"),
     ],
 )

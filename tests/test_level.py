@@ -98,7 +98,6 @@ def test_transition_and_noise_of_everything(name, T, walks):
         np.ones(4),
         twist_walk_std=WALK if walks else None,
         motion_std=np.array([0.1, 0.2, 0.3, 0.04, 0.05, 0.06]) if walks else np.zeros(6),
-        misalignment_rad=0.02,
         tilt_rad=0.1,
         **TRACKS,
     )
@@ -124,17 +123,17 @@ def test_transition_and_noise_of_everything(name, T, walks):
         return difference(moved(se3.exp(e[..., :6]) @ T, W_e, v, tau)[0], T_next)
 
     size = 36 if walks else 30
-    Phi, G = np.eye(size), np.zeros((size, 9))
+    Phi, G = np.eye(size), np.zeros((size, 6))
     Phi[:6] = stencil(after, size)
     Phi[6:12] = np.eye(size)[:6]
-    G[:6] = stencil(lambda errors: difference(moved(T, W, twist, tau, errors)[0], T_next), 9)
+    G[:6] = stencil(lambda errors: difference(moved(T, W, twist, tau, errors)[0], T_next), 6)
     np.testing.assert_allclose(step.Phi, Phi, atol=1e-9)
-    std = np.concatenate([noise.motion_std if walks else noise.twist_std, np.full(3, noise.misalignment_rad)])
+    std = noise.motion_std if walks else noise.twist_std
     np.testing.assert_allclose(step.Q, G @ np.diag(std**2) @ G.T, atol=1e-11)
     assert np.abs(step.Phi[:6, -9:-6]).max() > 1e-3
 
 
-ERRORS = {"ar": TRACKS, "walk": {**TRACKS, "track_memory": 1.0}, "white": {}}
+ERRORS = {"walk": TRACKS, "white": {}}
 CASES = {
     f"{variant}-{coordinates}-{calibration}-{walks}-{tracks}": (variant, coordinates, calibration, walks, tracks)
     for variant in ("standard", "invariant")
@@ -143,16 +142,12 @@ CASES = {
     for walks in (True, False)
     for tracks in ERRORS
 }
-QUICK = ("standard-xyz-all-True-ar", "invariant-xyz-some-False-ar")
+QUICK = ("standard-xyz-all-True-walk", "invariant-xyz-some-False-walk")
 # In the reduced form: all pairs.
 SOME_CASES = [
-    "standard-xyz-all-True-ar",
-    "standard-image-some-True-ar",
-    "invariant-xyz-some-False-ar",
-    "invariant-image-all-False-ar",
     "standard-xyz-all-True-walk",
-    "standard-image-some-False-walk",
-    "invariant-xyz-some-True-walk",
+    "standard-image-some-True-walk",
+    "invariant-xyz-some-False-walk",
     "invariant-image-all-False-walk",
     "standard-xyz-all-False-white",
     "standard-image-some-True-white",
@@ -172,7 +167,6 @@ def test_filter_of_everything_equals_the_literal_one(case):
         TILTED,
         twist_walk_std=WALK if walks else None,
         motion_std=np.repeat([0.05, 0.01], 3),
-        misalignment_rad=0.02,
         tilt_rad=0.05,
         **tracks,
     )

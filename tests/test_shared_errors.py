@@ -162,11 +162,10 @@ def test_rows_in_the_frame_before_by_every_block_and_landmark(T):
         assert not H[:, model.layout[name]].any()
 
 
-@pytest.mark.parametrize("memory", [1.0, 0.9])
 @poses
-def test_observations_of_the_filter_by_every_block_and_landmark(T, memory):
+def test_observations_of_the_filter_by_every_block_and_landmark(T):
     """Some landmarks are seen again in the next frame, some after a gap, some not at all; the first one is not."""
-    model, values = everything(T, dataclasses.replace(KINDS["tracks"], track_memory=memory))
+    model, values = everything(T, KINDS["tracks"])
     ekf = JointEKF(model, OPEN)
     ids, m = np.array([40, 3, 17, 99, 8, 21]), visible_points(T, 6)
     zero = {name: np.zeros_like(value) for name, value in ERRORS.items()}
@@ -193,7 +192,7 @@ def test_observations_of_the_filter_by_every_block_and_landmark(T, memory):
         moved, points = model.retract(values, x[:body]), (ekf.positions_m + x[body:].reshape(-1, 3))[slots]
         now = measured - literal_rows(moved, points, way_m, follows, ekf.imu_twist)
         last = before - literal_rows(moved, points, way_m, follows, ekf.motion.imu_twist_before, before=True)
-        return (now - memory * follows[:, None] * last).ravel()
+        return (now - follows[:, None] * last).ravel()
 
     _, rows = observe(ekf, ekf.mean, slots, measured)
     size = body + 18
@@ -438,7 +437,7 @@ def test_residuals_of_the_batch_problem():
     np.testing.assert_allclose(problem.observations.norms(state), np.linalg.norm(found, axis=1), rtol=1e-9)
     found *= np.sqrt(log.variance)
     for i, previous in enumerate(log.previous):
-        expected.append(left(i, previous >= 0) - (0.9 * left(previous, False) if previous >= 0 else 0.0))
+        expected.append(left(i, previous >= 0) - (left(previous, False) if previous >= 0 else 0.0))
     assert (log.previous >= 0).sum() > 20
     np.testing.assert_allclose(found, expected, atol=1e-7)
     lengths = {"camera_jitter": tau / 0.6, "vision_drift": way_m / 20.0}

@@ -411,7 +411,7 @@ def test_the_models_of_noise():
     tuned = noise_of(world, Config(noise=NoiseConfig(sigma_px=2.0, model="tuned")))
     assert by_hand.track_error is None and by_hand.twist_walk_std is None
     assert automatic.track_error is not None
-    for name in ("track_first_px", "track_walk_px", "track_memory", "track_flow_px", "margin"):
+    for name in ("track_first_px", "track_walk_px", "track_flow_px"):
         np.testing.assert_array_equal(getattr(tuned, name), getattr(automatic, name))
     np.testing.assert_array_equal(tuned.twist_std, automatic.twist_std)
     np.testing.assert_array_equal(tuned.pixel_std_px, 2.0)

@@ -247,7 +247,7 @@ def reused_ids(sequence: Sequence, observations: Observations, noise: Noise, sig
     reach = way + np.linalg.norm(cam.triangulate(sequence.camera, rows[later]), axis=1)
     drift = over(tau**2 * (velocity[:3] ** 2).sum())
     turn = over(tau**2 * (velocity[3:] ** 2).sum())
-    allowed += drift + turn * reach**2 + (noise.misalignment_rad * way) ** 2
+    allowed += drift + turn * reach**2
     found[later] = np.linalg.norm(apart[1] - apart[0], axis=1) > sigma * np.sqrt(allowed)
     return found
 

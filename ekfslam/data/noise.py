@@ -20,14 +20,12 @@ class ProcessNoise:
     Args:
         twist_std: (6,) white noise of a sample, m/s and rad/s.
         motion_std: (6,) error of the motion beyond it, which no averaging of velocities removes.
-        misalignment_rad: Standard deviation of the angles between the frame of the velocities and the IMU frame.
         walk_std: (6,) change of the true velocities from one sample to the next. None: nothing is assumed of it.
         gap_std: (6,) further error of samples that were interpolated across a gap.
     """
 
     twist_std: Array
     motion_std: Array
-    misalignment_rad: float
     walk_std: Array | None
     gap_std: Array
 
@@ -48,23 +46,20 @@ class ProcessNoise:
 
 @dataclass(frozen=True)
 class TrackError:
-    """The error of a track in the image, eq. (10): it starts anew where the track does, and then walks.
+    """Error of a track in the image, eq. (10): it starts with the track and then walks.
 
     An observation is ``z(k) = h(k) + e(k)`` with ``e ~ N(0, first^2)`` at landmark initialisation and
-    ``e(k) = memory e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2))`` while the track goes on: the further pixels move
-    from one frame to the next, the worse they are followed, most along their motion. With memory 1 it is a random walk
-    about a constant error, with less an AR(1) process.
+    ``e(k) = e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2))`` while the track goes on: the further pixels move from one
+    frame to the next, the worse they are followed, most along their motion.
 
     Args:
         first_std: (3,) standard deviation at landmark initialisation, in the sensor's rows, px.
         walk_std: (3,) of the innovation from one frame to the next, px.
-        memory: Share of the error that stays from one frame to the next, in (0, 1].
         flow_px: Motion in the image at which the variance of the walk has doubled; infinite: it never grows.
     """
 
     first_std: Array
     walk_std: Array
-    memory: float
     flow_px: float
 
     def step_variance(self, motion_px: Array) -> Array:
@@ -82,9 +77,7 @@ class TrackError:
         At age 0 that of landmark initialisation. A track that missed a frame is matched anew: its error is drawn again,
         from what the error of a track of that age spreads over.
         """
-        kept = self.memory ** (2.0 * np.asarray(age, dtype=float))[:, None]
-        steps = age[:, None] if self.memory == 1.0 else (1.0 - kept) / (1.0 - self.memory**2)
-        return kept * self.first_std**2 + steps * self.walk_std**2
+        return self.first_std**2 + age[:, None] * self.walk_std**2
 
 
 @dataclass(frozen=True)
@@ -97,45 +90,36 @@ class Noise:
         twist_walk_std: (6,) how far the true velocities change from one sample to the next; the joint filter then
             estimates them, too. None: nothing is assumed of how they change.
         motion_std: (6,) error of the motion beyond ``twist_std``, which no averaging of velocities removes.
-        misalignment_rad: Standard deviation of the angles between the frame of the velocities and the IMU frame.
         tilt_rad: Of velocities in a level frame: standard deviation of the first roll and pitch against gravity; the
             joint filter then estimates them. 0: the velocities are taken as those of the IMU frame.
         track_first_px: (3,) error of a track at landmark initialisation (u, v, disparity), see `TrackError`. None:
             pixel noise is white.
         track_walk_px: (3,) how far that error walks from frame to frame (u, v, disparity).
-        track_memory: Share of that error that stays from frame to frame.
         track_flow_px: Motion in the image at which the variance of the walk has doubled.
         gap_std: (6,) further error of velocities that were interpolated across a gap.
-        margin: How much larger the errors of tracks are taken than those of single measurements, to make up for errors
-            that agree among tracks; what judges one track by itself need not allow for that.
     """
 
     twist_std: Array = field(metadata=stored("u", "m/s (0-2), rad/s (3-5)", "imu"))
     pixel_std_px: Array = field(metadata=stored("pixels", "px", "image: uL, vL, uR, vR", name="pixel_std"))
     twist_walk_std: Array | None = None
     motion_std: Array = field(default_factory=lambda: np.zeros(6))
-    misalignment_rad: float = 0.0
     tilt_rad: float = 0.0
     track_first_px: Array | None = None
     track_walk_px: Array | None = None
-    track_memory: float = 1.0
     track_flow_px: float = np.inf
     gap_std: Array = field(default_factory=lambda: np.zeros(6))
-    margin: float = 1.0
 
     @property
     def process(self) -> ProcessNoise:
         """The part that belongs to the velocities."""
-        return ProcessNoise(self.twist_std, self.motion_std, self.misalignment_rad, self.twist_walk_std, self.gap_std)
+        return ProcessNoise(self.twist_std, self.motion_std, self.twist_walk_std, self.gap_std)
 
     @property
     def track_error(self) -> TrackError | None:
         """The part that belongs to tracks; None where pixel noise is white."""
         if self.track_first_px is None or self.track_walk_px is None:
             return None
-        return TrackError(
-            np.asarray(self.track_first_px), np.asarray(self.track_walk_px), self.track_memory, self.track_flow_px
-        )
+        return TrackError(np.asarray(self.track_first_px), np.asarray(self.track_walk_px), self.track_flow_px)
 
     @property
     def velocity_std(self) -> Array:

@@ -175,8 +175,7 @@ def _motion(e: Estimate, seen: Seen, some: IntArray) -> Array:
 
 
 def _moving(e: Estimate, slot: IntArray, evidence: tuple[Array, Array], squares: Array, gate: float) -> BoolArray:
-    sigma = e.config.moving_sigma / e.model.noise.margin
-    return gates.moves_along(e.table, slot, *evidence, squares, gate, sigma, e.config.moving_share)
+    return gates.moves_along(e.table, slot, *evidence, squares, gate, e.config.moving_sigma, e.config.moving_share)
 
 
 def _corrected_twist(e: Estimate, frame: int, tried: Projection) -> Array:

@@ -30,7 +30,7 @@ def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> 
     if not sequence.has_velocities and noise.twist_walk_std is not None:
         own_std = noise.twist_walk_std
     velocity_std = np.hypot(own_std, gap_std)
-    Q = motion.process_noise(sequence.twist[1:], tau, velocity_std, noise.misalignment_rad)
+    Q = motion.process_noise(sequence.twist[1:], tau, velocity_std)
     covariance = np.empty((len(sequence), 6, 6))
     covariance[0] = initial_covariance
     for k in range(1, len(sequence)):

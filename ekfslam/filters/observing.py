@@ -53,9 +53,9 @@ def observe(e: Estimate, at: Mean, slot: IntArray, measured: Array) -> tuple[See
         )
         rows_before = table.seen_rows[slot[follows]]
         H_x, H_m = H_x.copy(), H_m.copy()
-        residual[follows] -= error.memory * (rows_before - before.z)
-        H_x[follows] -= error.memory * before.H_x
-        H_m[follows] -= error.memory * before.H_m
+        residual[follows] -= rows_before - before.z
+        H_x[follows] -= before.H_x
+        H_m[follows] -= before.H_m
         variance[follows] = error.step_variance(measured[follows] - rows_before)
     return seen, Rows(slot, H_x, H_m, residual, variance)
 

@@ -39,24 +39,18 @@ def twist_jacobian(twist: Array, tau_s: Array | float) -> Array:
     return tau[..., None] * se3.left_jacobian(-tau * twist)
 
 
-def process_noise(twist: Array, tau_s: Array | float, twist_std: Array, misalignment_rad: float = 0.0) -> Array:
-    """``Q = G W G^T`` with G of `twist_jacobian`, eq. (2): (..., 6) to (..., 6, 6).
+def process_noise(twist: Array, tau_s: Array | float, twist_std: Array) -> Array:
+    """Return ``Q = G W G^T`` with G of `twist_jacobian`, eq. (2): (..., 6) to (..., 6, 6).
 
     ``twist_std`` (..., 6) holds the standard deviations per sample, m/s and rad/s; ``W`` is the diagonal of their
-    squares, and where the frame of the velocities is turned by small angles of deviation ``misalignment_rad`` against
-    the IMU, ``B B^T misalignment_rad^2`` besides, with ``B = [v^; w^]``.
+    squares.
     """
-    twist = np.asarray(twist, dtype=float)
-    return process_noise_by(twist_jacobian(twist, tau_s), twist, twist_std, misalignment_rad)
+    return process_noise_by(twist_jacobian(np.asarray(twist, dtype=float), tau_s), twist_std)
 
 
-def process_noise_by(G: Array, twist: Array, twist_std: Array, misalignment_rad: float = 0.0) -> Array:
-    """`process_noise` where G is known."""
-    Q = (G * np.asarray(twist_std)[..., None, :] ** 2) @ np.swapaxes(G, -1, -2)
-    if misalignment_rad:
-        turned = misalignment_rad * G @ turned_by(twist)
-        Q = Q + turned @ np.swapaxes(turned, -1, -2)
-    return Q
+def process_noise_by(G: Array, twist_std: Array) -> Array:
+    """Return `process_noise` for a known G."""
+    return (G * np.asarray(twist_std)[..., None, :] ** 2) @ np.swapaxes(G, -1, -2)
 
 
 def level_frame(up: Array) -> tuple[Array, Array]:

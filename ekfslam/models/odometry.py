@@ -84,7 +84,6 @@ def vision_noise(noise: Noise, twist: Array) -> Noise:
         twist_std=_START_FACTOR * walk,
         twist_walk_std=walk,
         motion_std=np.full(6, 1e-6),
-        misalignment_rad=0.0,
         tilt_rad=0.0,
         gap_std=np.zeros(6),
     )

@@ -40,7 +40,6 @@ class ObservationFactors:
         self._clone = model.layout.clones.get("pose", "pose")  # differences need the clone
         self._follows = np.flatnonzero(self._is_difference)
         self._previous = log.previous[self._follows]
-        self._memory = model.track_error.memory if model.track_error else 0.0
         _, first = np.unique(log.landmark, return_index=True)
         self._is_first = np.zeros(log.observations, dtype=bool)
         self._is_first[first] = True
@@ -66,7 +65,7 @@ class ObservationFactors:
     def _residuals(self, z: Array, z_before: Array) -> Array:
         """Return what is left of the observations (K, d), given predicted ones, and those they are differences from."""
         r = self._log.rows - z
-        r[self._follows] -= self._memory * (self._log.rows[self._previous] - z_before)
+        r[self._follows] -= self._log.rows[self._previous] - z_before
         return r
 
     def factors(self, state: State) -> list[Factor]:
@@ -79,8 +78,8 @@ class ObservationFactors:
             # From the frame before, the landmark is where the observation before has seen it.
             at, positions = moments.at(log.frame[self._previous]), positions[follows]
             before = self._model.observer.see(at, positions, positions, self._clone)
-            H_x[follows] -= self._memory * before.H_x
-            H_m[follows] -= self._memory * before.H_m
+            H_x[follows] -= before.H_x
+            H_m[follows] -= before.H_m
             z_before = before.z
         return [*self._whitened(H_x, H_m, self._residuals(seen.z, z_before)), *self._near(state)]
 
@@ -174,7 +173,7 @@ class ObservationFactors:
 
     def _subtract_frozen_before(self, H_x: Array, H_m: Array, r: Array, x: Array, linear_position: Array) -> None:
         """Turn observations into differences, in place: the same landmarks from the clones of the frames before."""
-        log, follows, layout, memory = self._log, self._follows, self._model.layout, self._memory
+        log, follows, layout = self._log, self._follows, self._model.layout
         frame = log.frame[follows]
         T = log.T_linear_before[frame]
         T_linear = log.T_predicted[frame - 1] if log.first_estimates else T
@@ -183,9 +182,9 @@ class ObservationFactors:
         before = self._see(frame, T, T_linear, x[follows], seen_twist, *positions, way_m, self._clone)
         B_x = _carried_back(before.H_x, layout[self._clone], log.T_linear_before, log.T_departed, frame)
         shifted = (B_x @ (x[follows] - log.departed[0])[:, : layout.seen, None])[..., 0]
-        r[follows] -= memory * (log.rows[log.previous[follows]] - before.z + shifted)
-        H_x[follows] -= memory * B_x
-        H_m[follows] -= memory * before.H_m
+        r[follows] -= log.rows[log.previous[follows]] - before.z + shifted
+        H_x[follows] -= B_x
+        H_m[follows] -= before.H_m
 
     def _see(
         self,

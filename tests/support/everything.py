@@ -18,11 +18,9 @@ BLOCKS = {"twist_bias": {}, "camera_jitter": {}, "vision_drift": {}}
 EVERYTHING = {
     "twist_walk_std": np.repeat([0.3, 0.03], 3),
     "motion_std": np.repeat([0.02, 0.002], 3),
-    "misalignment_rad": 0.002,
     "tilt_rad": 0.03,
     "track_first_px": np.array([0.5, 0.6, 1.0]),
     "track_walk_px": np.array([0.3, 0.35, 0.2]),
-    "track_memory": 0.9,
     "track_flow_px": 20.0,
 }
 

@@ -216,7 +216,7 @@ def tracked(world, error, seed=1, movers=(), speed=0.3):
             u, v, right, _ = seen - seen_last
             growth = np.sqrt(grown(np.array([u, v, u - right]), error.flow_px))
             for _ in range(k_last, k):
-                e = error.memory * e + error.walk_std * growth * rng.normal(size=3)
+                e = e + error.walk_std * growth * rng.normal(size=3)
         last[j] = k, e, seen
         pixels[i] = seen + np.array([e[0], e[1], e[0] - e[2], e[1]])
     moved = Observations(observations.frame, observations.landmark, pixels)

@@ -21,7 +21,6 @@ EVERYTHING = CalibrationConfig(rotation_deg=0.5, lever_arm_m=0.1, baseline=0.02,
 TRACKS = {
     "track_first_px": np.array([0.3, 0.4, 0.8]),
     "track_walk_px": np.array([0.2, 0.25, 0.3]),
-    "track_memory": 0.9,
     "track_flow_px": 15.0,
 }
 X, Y, Z = np.eye(3)
@@ -57,11 +56,11 @@ def in_imu(level_twist, up):
 def moved(T, W, twist, tau, errors=None):
     """Pose and IMU velocities after one step at level velocities; up is the z axis of W, in world.
 
-    ``errors`` (9,) are those of the velocities, and the small angles that turn them.
+    ``errors`` (6,) are those of the velocities.
     """
     u = in_imu(twist, (T[..., :3, :3] @ W)[..., 2])
     if errors is not None:
-        u = rotated(se3.so3_exp(errors[..., 6:]), u) + errors[..., :6]
+        u = u + errors
     return se3.exp(-tau * u) @ T, u
 
 
@@ -166,14 +165,13 @@ class Literal:
             x = self.moved_by(e)
             return difference(moved(x["T"], x["W"], driven(x), tau)[0], T)
 
-        F, G = np.eye(len(self.P)), np.zeros((len(self.P), 9))
+        F, G = np.eye(len(self.P)), np.zeros((len(self.P), 6))
         F[:6] = stencil(after, len(self.P))
-        G[:6] = stencil(lambda errors: difference(moved(self.T, self.W, twist, tau, errors)[0], T), 9)
+        G[:6] = stencil(lambda errors: difference(moved(self.T, self.W, twist, tau, errors)[0], T), 6)
         if self.has_clone:
             F[self.at["before"]] = np.eye(len(self.P))[:6]
         std = self.noise.motion_std if self.walks else np.hypot(self.noise.twist_std, self.noise.motion_std)
-        variance = np.concatenate([std**2, np.full(3, self.noise.misalignment_rad**2)])
-        self.P = F @ self.P @ F.T + G @ np.diag(variance) @ G.T
+        self.P = F @ self.P @ F.T + G @ np.diag(std**2) @ G.T
         self.before, self.departed, self.updated = self.T, self.T, "before"
         self.T, self.u, self.u_before, self.tau, self.k = T, u, self.u, tau, self.k + 1
 
@@ -250,7 +248,7 @@ class Literal:
             else:
                 spread = self.noise.track_first_px**2
                 for _ in range(self.first[i], self.k):
-                    spread = self.noise.track_memory**2 * spread + self.noise.track_walk_px**2
+                    spread = spread + self.noise.track_walk_px**2
                 variance.append(spread)
 
         def left(e):
@@ -262,7 +260,7 @@ class Literal:
                 residual = z - self.look(x, own, follows=follows)
                 if follows:
                     before = self.rows[i] - self.look(x, own, before=True)
-                    residual = residual - self.noise.track_memory * before
+                    residual = residual - before
                 parts.append(residual[..., 0, :])
             return np.concatenate(parts, axis=-1)
 

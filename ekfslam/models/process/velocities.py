@@ -54,7 +54,7 @@ class VelocityInputs(Process):
         std = self.noise.pose_std
         if np.any(interval.is_gap):
             std = self.noise.pose_std_during(interval.is_gap)
-        Q = motion.process_noise_by(G, twist, std, self.noise.misalignment_rad)
+        Q = motion.process_noise_by(G, std)
         return Step({"pose": T_next}, twist, Phi, Q)
 
     def residual(self, before: Values, after: Values, intervals: Intervals) -> Residual:
