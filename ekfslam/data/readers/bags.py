@@ -1,6 +1,6 @@
 """Bags of ROS 1 and ROS 2, and MCAP: a stereo pair with CameraInfo, and velocities by Odometry or a stamped twist.
 
-They are read by the package rosbags, an extra: ``pip install 'ekfslam[bags]'``.
+The package rosbags reads them; it is an extra: ``pip install 'ekfslam[bags]'``.
 """
 
 from __future__ import annotations
@@ -55,23 +55,27 @@ class Camera:
     """A camera of a bag.
 
     Args:
-        topic: Of its images.
-        connection: Stream of its images.
-        info: Its first CameraInfo.
-        frame: Name of its optical frame.
+        stream: Connection of its images.
+        info: First CameraInfo.
     """
 
-    topic: str
-    connection: Any
+    stream: Any
     info: Any
-    frame: str
+
+    @property
+    def topic(self) -> str:
+        """Topic of the images."""
+        return str(self.stream.topic)
+
+    @property
+    def frame(self) -> str:
+        """Name of the optical frame."""
+        return _frame(self.info.header.frame_id)
 
     @property
     def is_rectified(self) -> bool:
-        """Whether its images are those after rectification."""
-        return (
-            "rect" in self.topic.rsplit("/", 1)[-1] or "rect" in self.topic.removesuffix("/compressed").rsplit("/")[-1]
-        )
+        """Whether the images are rectified, by the last part of their topic."""
+        return "rect" in _parts(self.topic)[1]
 
     @property
     def projection(self) -> Array:
@@ -79,14 +83,24 @@ class Camera:
         return matrix_of(self.info, "p", 3)
 
 
+def _parts(topic: str) -> tuple[str, str]:
+    """Return space and last part: ``/stereo/left`` and ``image_raw`` of ``/stereo/left/image_raw/compressed``."""
+    space, _, last = topic.removesuffix("/compressed").rpartition("/")
+    return space, last
+
+
+def _frame(name: object) -> str:
+    return str(name).lstrip("/")
+
+
 class BagPairs:
-    """`ImageRecording.load` of a bag, which is opened at the first call.
+    """The function `ImageRecording.load` of a bag, which it opens at the first call.
 
     Args:
-        path: The bag.
-        topics: Of the left and the right images.
-        places: When each image was written, ns, and its stamp, ns: (T, 2) for the left and the right ones.
-        size: Width and height that all must have.
+        path: Path of the bag.
+        topics: Topics of the left and the right images.
+        places: (T, 2) time of writing and stamp, ns, of the left and the right images.
+        size: Required width and height of all images.
     """
 
     def __init__(self, path: Path, topics: tuple[str, str], places: tuple[IntArray, IntArray], size: tuple[int, int]):
@@ -113,17 +127,17 @@ class BagPairs:
 
 
 def open_bag(path: Path) -> ImageRecording:
-    """The images of the one stereo pair of a bag, its calibration, and its velocities if it has any.
+    """Open the images of the stereo pair of a bag, its calibration, and its velocities if it has any.
 
-    The right camera is that whose CameraInfo has a baseline in P. Topics with ``rect`` in their last part are rectified
-    images, whose camera is P; others are as the lens sees them, with K, D and R. The body is the frame of the
-    velocities; ``/tf_static`` says where the camera is in it, otherwise the body is the left camera, its axes forward,
+    The CameraInfo of the right camera has a baseline in P. Topics with ``rect`` in their last part are rectified
+    images with the camera P; others are as the lens sees them, with K, D and R. The body is the frame of the
+    velocities. If ``/tf_static`` does not connect it to the camera, the body is the left camera, with axes forward,
     left and up.
 
     Raises:
         MissingPackageError: rosbags is not installed.
         UnknownFormatError: The bag is damaged.
-        CalibrationError: There is not exactly one pair of cameras, or a CameraInfo means none.
+        CalibrationError: There is not exactly one pair of cameras, or a CameraInfo is impossible.
         LostDataError: Images have no partner, or a stream is empty.
         StampError: Stamps do not increase.
     """
@@ -167,17 +181,12 @@ def _opened(bag: Bag) -> ImageRecording:
     )
 
 
-def _space(topic: str) -> str:
-    """Where a camera's topics are: ``/stereo/left`` of ``/stereo/left/image_raw/compressed``."""
-    return topic.removesuffix("/compressed").rpartition("/")[0]
-
-
 def _pair(bag: Bag) -> tuple[Camera, Camera]:
-    """Left and right camera."""
-    infos = {_space(connection.topic): connection for connection in bag.connections(CAMERA_INFO)}
+    """Return left and right camera."""
+    infos = {_parts(connection.topic)[0]: connection for connection in bag.connections(CAMERA_INFO)}
     streams: dict[str, Any] = {}
     for connection in bag.connections(IMAGE, COMPRESSED):
-        space = _space(connection.topic)
+        space = _parts(connection.topic)[0]
         # Rectified before raw, uncompressed before compressed.
         if space in infos and (space not in streams or _rank(connection) < _rank(streams[space])):
             streams[space] = connection
@@ -190,7 +199,7 @@ def _pair(bag: Bag) -> tuple[Camera, Camera]:
             f"{printable(', '.join(connection.topic for connection in streams.values())) or 'none'}",
             field="topics",
         )
-    cameras = [_camera(bag, streams[space], infos[space]) for space in sorted(streams)]
+    cameras = [Camera(streams[space], _first(bag, infos[space])) for space in sorted(streams)]
     shifts = [camera.projection[0, 3] for camera in cameras]
     rights = [i for i, shift in enumerate(shifts) if shift < 0]
     if len(rights) != 1 or shifts[1 - rights[0]] != 0:
@@ -203,21 +212,19 @@ def _pair(bag: Bag) -> tuple[Camera, Camera]:
 
 
 def _rank(connection: Any) -> tuple[bool, bool]:
-    return "rect" not in connection.topic.removesuffix("/compressed").rsplit("/", 1)[
-        -1
-    ], connection.msgtype == COMPRESSED
+    return "rect" not in _parts(connection.topic)[1], connection.msgtype == COMPRESSED
 
 
-def _camera(bag: Bag, stream: Any, info: Any) -> Camera:
-    first = next(bag.messages(info), None)
+def _first(bag: Bag, connection: Any) -> Any:
+    first = next(bag.messages(connection), None)
     if first is None:
-        raise LostDataError("there is no message", field=printable(info.topic))
-    return Camera(stream.topic, stream, first, str(first.header.frame_id).lstrip("/"))
+        raise LostDataError("there is no message", field=printable(connection.topic))
+    return first
 
 
 def _places(bag: Bag, camera: Camera) -> IntArray:
-    """When each image was written, ns, and its stamp, ns, in the order of stamps (T, 2)."""
-    found = np.array([(written, bag.stamp_ns(content)) for written, content in bag.raw(camera.connection)])
+    """Return time of writing and stamp (T, 2) of each image, ns, in the order of stamps."""
+    found = np.array([(written, bag.stamp_ns(content)) for written, content in bag.raw(camera.stream)])
     if not len(found):
         raise LostDataError("there is no message", field=printable(camera.topic))
     found = found[np.argsort(found[:, 1], kind="stable")].astype(np.int64)
@@ -229,7 +236,7 @@ def _places(bag: Bag, camera: Camera) -> IntArray:
 
 
 def _calibration(left: Camera, right: Camera) -> tuple[PairCalibration, Array]:
-    """The pair, and the rotation (3, 3) from the optical frame of the left camera to that of its images."""
+    """Return the calibration, and the rotation (3, 3) from the optical frame of the left camera to its images."""
     size = (int(left.info.width), int(left.info.height))
     if size != (int(right.info.width), int(right.info.height)):
         raise CalibrationError("the cameras have different sizes", field="CameraInfo")
@@ -249,7 +256,7 @@ def _calibration(left: Camera, right: Camera) -> tuple[PairCalibration, Array]:
 
 
 def _rotation(camera: Camera) -> Array:
-    """Optical frame to that of rectified images; all zeros stand for none."""
+    """Return the rotation from the optical frame to rectified images; all zeros stand for none."""
     R = matrix_of(camera.info, "r", 3)
     if not R.any():
         return np.eye(3)
@@ -272,11 +279,11 @@ def _lens(camera: Camera) -> Distortion:
 
 
 def _velocities(bag: Bag) -> tuple[Velocities | None, str, tuple[str, ...]]:
-    """Velocities, the name of their frame, and notes."""
+    """Return velocities, the name of their frame, and notes."""
     streams = bag.connections(*VELOCITIES)
     if not streams:
         return None, "", ("There are no velocities.",)
-    # A twist by itself is more likely to be measured than that of an estimate.
+    # A single twist is more likely to be measured than that of an estimate.
     chosen = min(streams, key=lambda connection: (VELOCITIES.index(connection.msgtype), connection.topic))
     others = [connection.topic for connection in streams if connection.topic != chosen.topic]
     notes = [f"Velocities are those of {printable(chosen.topic)}."]
@@ -286,7 +293,7 @@ def _velocities(bag: Bag) -> tuple[Velocities | None, str, tuple[str, ...]]:
         # With covariance a twist is one level further down.
         twist = message.twist if hasattr(message.twist, "linear") else message.twist.twist
         name = message.child_frame_id if chosen.msgtype == ODOMETRY else message.header.frame_id
-        frame = frame or str(name).lstrip("/")
+        frame = frame or _frame(name)
         linear, angular = twist.linear, twist.angular
         rows.append([stamp_of(message), linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
     table = np.array(rows, dtype=float).reshape(-1, 7)
@@ -302,7 +309,7 @@ def _velocities(bag: Bag) -> tuple[Velocities | None, str, tuple[str, ...]]:
 
 
 def _body(bag: Bag, left: Camera, frame: str) -> tuple[Array, str]:
-    """Body to the optical frame of the left camera (4, 4), and what it is, in words."""
+    """Return the transform (4, 4) from the body to the optical frame of the left camera, and a note on the body."""
     if frame and frame == left.frame:
         return np.eye(4), "The velocities are those of the left optical frame, which is the body."
     T = _transform(bag, left.frame, frame) if frame else None
@@ -314,14 +321,14 @@ def _body(bag: Bag, left: Camera, frame: str) -> tuple[Array, str]:
 
 
 def _transform(bag: Bag, target: str, source: str) -> Array | None:
-    """``T_target_source`` (4, 4) through the tree of static transforms; None where nothing connects them."""
+    """Return ``T_target_source`` (4, 4) through the tree of static transforms; None if they are not connected."""
     edges: dict[str, list[tuple[str, Array]]] = {}
     for connection in bag.connections(TRANSFORMS):
         if connection.topic.lstrip("/") != "tf_static":
             continue
         for message in bag.messages(connection):
             for entry in message.transforms:
-                parent, child = (str(name).lstrip("/") for name in (entry.header.frame_id, entry.child_frame_id))
+                parent, child = _frame(entry.header.frame_id), _frame(entry.child_frame_id)
                 T_parent_child = transform_of(entry.transform)
                 edges.setdefault(parent, []).append((child, T_parent_child))
                 edges.setdefault(child, []).append((parent, se3.inverse(T_parent_child)))

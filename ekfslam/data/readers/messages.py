@@ -1,7 +1,7 @@
 """Messages of ROS 1 and ROS 2 bags, and MCAP, by the package rosbags.
 
-Definitions of messages that a bag brings along are not used: rosbags would make code of them. The types that are read
-are those of the distributions that rosbags knows itself.
+Definitions of messages in a bag are not used, because rosbags would make code of them. Only types of the distributions
+that rosbags knows are read.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from ekfslam.arrays import Array
 from ekfslam.data.images import Image
 from ekfslam.data.readers.pictures import decode_gray
+from ekfslam.data.readers.registry import Source
 from ekfslam.errors import CalibrationError, EkfslamError, MissingPackageError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.names import printable
@@ -28,16 +29,16 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 VELOCITIES = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped", ODOMETRY)
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
-_CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
-_WORDS = {"mono16": 1, "16UC1": 1}
+# Bytes of a pixel.
+_BYTES = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "mono16": 2, "16UC1": 2}
 _LUMA = np.array([0.299, 0.587, 0.114])
 
 
 class Bag:
-    """An opened bag.
+    """An open bag.
 
     Args:
-        path: File, or folder with ``metadata.yaml``.
+        path: Path of a file, or of a folder with ``metadata.yaml``.
 
     Raises:
         MissingPackageError: rosbags is not installed.
@@ -51,7 +52,7 @@ class Bag:
             raise MissingPackageError("rosbags", "bags", f"{path}: reading a bag ({error})") from None
         self.path = path
         with self.named():
-            self.is_ros1 = path.is_file() and _head(path).startswith(ROS1_MAGIC)
+            self.is_ros1 = Source.at(path).head.startswith(ROS1_MAGIC)
             self._reader: Any = rosbag1.Reader(path) if self.is_ros1 else rosbag2.Reader(path)
             self._reader.open()
             self._types = message_types(self.is_ros1)
@@ -61,7 +62,7 @@ class Bag:
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
-        """Turn whatever the package raises for a damaged bag into an error that names it."""
+        """Turn any exception of the package for a damaged bag into an error that names it."""
         try:
             yield
         except EkfslamError:
@@ -73,31 +74,31 @@ class Bag:
             raise UnknownFormatError(f"{self.path}: damaged or unknown bag ({text})") from None
 
     def connections(self, *kinds: str) -> list[Any]:
-        """Streams of messages of these types, by topic."""
+        """Return the streams of messages of some types, by topic."""
         found = [connection for connection in self._reader.connections if connection.msgtype in kinds]
         return sorted(found, key=lambda connection: (connection.topic, connection.id))
 
     def raw(
         self, connection: Any, begin_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[tuple[int, bytes]]:
-        """When each message of a stream was written (ns), and its bytes."""
+        """Yield the time of writing (ns) and the bytes of each message of a stream."""
         with self.named():
             for _, written_ns, content in self._reader.messages([connection], begin_ns, end_ns):
                 yield written_ns, content
 
     def message(self, connection: Any, content: bytes) -> Any:
-        """A message of its bytes."""
+        """Return the message that bytes encode."""
         with self.named():
             decode = self._types.deserialize_ros1 if self.is_ros1 else self._types.deserialize_cdr
             return decode(content, connection.msgtype)
 
     def messages(self, connection: Any) -> Iterator[Any]:
-        """All messages of a stream."""
+        """Yield all messages of a stream."""
         for _, content in self.raw(connection):
             yield self.message(connection, content)
 
     def stamp_ns(self, content: bytes) -> int:
-        """The stamp of a message that begins with a header, without decoding the rest."""
+        """Return the stamp of a message that begins with a header, without decoding the rest."""
         with self.named():
             if self.is_ros1:
                 seconds, nanoseconds = struct.unpack_from("<II", content, 4)
@@ -107,13 +108,13 @@ class Bag:
             return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         with contextlib.suppress(Exception):
             self._reader.close()
 
 
 def message_types(is_ros1: bool) -> Any:
-    """The types of messages of a distribution, as rosbags knows them."""
+    """Return the types of messages of a distribution, as rosbags knows them."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
@@ -122,33 +123,28 @@ def message_types(is_ros1: bool) -> Any:
     return types
 
 
-def _head(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(32)
-
-
 def stamp_of(message: Any) -> float:
-    """Seconds of the stamp in the header of a message."""
+    """Return the stamp in the header of a message, s."""
     stamp = message.header.stamp
     return float(stamp.sec) + float(stamp.nanosec) / 1e9
 
 
 def matrix_of(info: Any, name: str, rows: int) -> Array:
-    """A matrix of a CameraInfo by its name in ROS 2 (``k``, ``r``, ``p``), whose names are larger in ROS 1."""
+    """Return a matrix of a CameraInfo by its name in ROS 2 (``k``, ``r``, ``p``), which is a capital in ROS 1."""
     return np.asarray(field_of(info, name), dtype=float).reshape(rows, -1)
 
 
 def field_of(info: Any, name: str) -> Any:
-    """A field of a CameraInfo, see `matrix_of`."""
+    """Return a field of a CameraInfo, see `matrix_of`."""
     return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
 
 
 def gray_of(message: Any, source: str, size: tuple[int, int]) -> Image:
-    """The pixels (height, width) of an Image or CompressedImage.
+    """Return the gray pixels (height, width) of an Image or CompressedImage.
 
     Raises:
-        UnknownFormatError: Its encoding is not read, or it is damaged.
-        CalibrationError: It has another size than the calibration.
+        UnknownFormatError: The encoding is not known, or the image is damaged.
+        CalibrationError: The image has another size than the calibration.
     """
     if hasattr(message, "format"):
         return decode_gray(bytes(message.data), source, size)
@@ -157,32 +153,26 @@ def gray_of(message: Any, source: str, size: tuple[int, int]) -> Image:
         raise CalibrationError(
             f"the image has {width} x {height} pixels, its CameraInfo {size[0]} x {size[1]}", source=source
         )
-    channels, bytes_each = _CHANNELS.get(encoding), 1
-    if channels is None:
-        channels, bytes_each = _WORDS.get(encoding), 2
-    if channels is None:
-        known = ", ".join((*_CHANNELS, *_WORDS))
-        raise UnknownFormatError(f"{source}: images encoded as {encoding!r} are not read; known: {known}")
+    if encoding not in _BYTES:
+        raise UnknownFormatError(f"{source}: images encoded as {encoding!r} are not read; known: {', '.join(_BYTES)}")
+    size_of_pixel = _BYTES[encoding]
     step, data = int(message.step), np.asarray(message.data, dtype=np.uint8)
-    used = width * channels * bytes_each
-    if step < used or len(data) != height * step:
+    if step < width * size_of_pixel or len(data) != height * step:
         raise UnknownFormatError(
             f"{source}: {len(data)} bytes and steps of {step} are no {width} x {height} {encoding}"
         )
-    rows = data.reshape(height, step)[:, :used].reshape(height, width, channels * bytes_each)
-    if bytes_each == 2:
-        return np.ascontiguousarray(rows[..., 0 if message.is_bigendian else 1])
-    if channels == 1:
-        return np.ascontiguousarray(rows[..., 0])
+    rows = data.reshape(height, step)[:, : width * size_of_pixel].reshape(height, width, size_of_pixel)
+    if size_of_pixel <= 2:  # 16 bits: their upper eight
+        return np.ascontiguousarray(rows[..., 0 if size_of_pixel == 1 or message.is_bigendian else 1])
     luma = _LUMA if encoding.startswith("rgb") else _LUMA[::-1]
     return np.round(rows[..., :3] @ luma).astype(np.uint8)
 
 
 def transform_of(transform: Any) -> Array:
-    """The pose (4, 4) of a Transform: that of the child frame in its parent.
+    """Return the pose (4, 4) of the child frame of a Transform in its parent.
 
     Raises:
-        CalibrationError: Its quaternion has not the length 1.
+        CalibrationError: The quaternion does not have the length 1.
     """
     t, q = transform.translation, transform.rotation
     quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
