@@ -42,8 +42,8 @@ from ekfslam.stored import AXES
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import SerialExecutor, open_executor
 from ekfslam.studies.study import (
-    FIELDS,
     LEVELS,
+    VARIANT_LAYOUT,
     Study,
     filter_config,
     levels_of,
@@ -249,11 +249,11 @@ def test_every_data_set_has_units_and_frame_and_the_shape_it_promises(serial):
     with h5py.File(serial) as h5file:
         assert h5file.attrs["format"] == b"ekfslam-study"
         assert json.loads(h5file.attrs["study"])["seed"] == 5
-        for field, (shape, _, units, frame) in FIELDS.items():
-            dataset = h5file["levels/mid/invariant"][field]
+        for item in VARIANT_LAYOUT:
+            dataset = h5file["levels/mid/invariant"][item.name]
             lengths = {"T": 8, "J": 4, **{name: len(axis.labels) for name, axis in AXES.items() if axis.labels}}
-            assert dataset.shape == (3, *(lengths.get(n, n) for n in shape))
-            assert (dataset.attrs["units"].decode(), dataset.attrs["frame"].decode()) == (units, frame)
+            assert dataset.shape == (3, *(lengths.get(n, n) for n in item.shape[1:]))
+            assert (dataset.attrs["units"].decode(), dataset.attrs["frame"].decode()) == (item.units, item.frame)
 
 
 def test_realisations_are_distinct_and_independent_of_what_else_the_study_holds():
@@ -263,8 +263,8 @@ def test_realisations_are_distinct_and_independent_of_what_else_the_study_holds(
     assert realisation(alone, "low", 2) == realisation(SMALL, "low", 2)
     assert realisation(dataclasses.replace(alone, seed=6), "low", 2) != realisation(alone, "low", 2)
     together, single = run_one(SMALL, "low", 2)["standard"], run_one(alone, "low", 2)["standard"]
-    for field in FIELDS:
-        np.testing.assert_array_equal(together[field], single[field])
+    for item in VARIANT_LAYOUT:
+        np.testing.assert_array_equal(together[item.name], single[item.name])
 
 
 @pytest.mark.parametrize("variant", ["invariant", "standard"])

@@ -15,7 +15,7 @@ The archive is one HDF5 file:
     /levels/<level>               attribute world (JSON)
         time (T,)                 nominal stamps
         done (runs,)              whether a run is finished
-        <variant>/<field>         (runs, T, ...) as in `FIELDS`; NaN or 0 for a run that is not finished
+        <variant>/<field>         (runs, T, ...) as in `VARIANT_LAYOUT`; NaN or 0 for a run that is not finished
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import versions
 from ekfslam.shown import Card, Shown, count
-from ekfslam.stored import COUNTS, FLAGS, NUMBERS_OR_NONE, Item, Shape, fixed_length
+from ekfslam.stored import COUNTS, FLAGS, NUMBERS_OR_NONE, Check, Item, Shape, fixed_length
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME
 from ekfslam.studies.journal import Journal, Key, Record, flat, run_missing
 
@@ -90,29 +90,6 @@ LEVELS: Mapping[str, Loop] = MappingProxyType(
     }
 )
 
-# Per run: shape after (runs,), type, units, what it is. T is the number of frames, J the number of instants at which
-# the joint NEES is taken.
-FIELDS: Mapping[str, tuple[Shape, type, str, str]] = MappingProxyType(
-    {
-        "pose_nees": (("T",), float, "1", "xi, 6 degrees of freedom"),
-        "orientation_nees": (("T",), float, "1", "theta of xi, 3 degrees of freedom"),
-        "position_nees": (("T",), float, "1", "rho of xi, 3 degrees of freedom"),
-        "landmark_nees": (("T",), float, "1", "mean over the landmarks in the state, 3 degrees of freedom each"),
-        "joint_nees_per_dof": (("J",), float, "1", "xi and all landmarks, divided by 6 + 3n"),
-        "nis": (("T",), float, "1", "innovations of the frame"),
-        "nis_dof": (("T",), int, "1", "degrees of freedom of nis"),
-        "position_error": (("T", "xyz"), float, "m", "estimate minus truth, world axes"),
-        "rotation_error": (("T", "xyz"), float, "rad", "log(R_estimate R_truth^T), world axes"),
-        "three_sigma": (
-            ("T", "error"),
-            float,
-            "m (0-2), rad (3-5)",
-            "bounds of position and rotation error, world axes",
-        ),
-        "diverged": ((), bool, "1", "stopped with an error, not finite, or left the ring altogether"),
-    }
-)
-
 JOINT_INSTANTS = 4  # equally spaced, the last one at the last frame
 
 MOST_VALUES = 10_000_000  # frames of all runs and variants: an archive of 1.4 GB
@@ -122,10 +99,26 @@ LEVEL_LAYOUT = (
     Item("time", "time", ("T",), "s", "nominal stamps"),
     Item("done", "done", ("runs",), "1", "runs that are in", FLAGS),
 )
-_CHECKS = {float: NUMBERS_OR_NONE, int: COUNTS, bool: FLAGS}
-VARIANT_LAYOUT = tuple(
-    Item(name, name, ("runs", *shape), units, frame, _CHECKS[kind])
-    for name, (shape, kind, units, frame) in FIELDS.items()
+
+
+def _field(name: str, shape: Shape, units: str, meaning: str, check: Check = NUMBERS_OR_NONE) -> Item:
+    """Return the data set of a value per run; the shape is that of one run."""
+    return Item(name, name, ("runs", *shape), units, meaning, check)
+
+
+# T is the number of frames, J the number of instants at which the joint NEES is taken.
+VARIANT_LAYOUT = (
+    _field("pose_nees", ("T",), "1", "xi, 6 degrees of freedom"),
+    _field("orientation_nees", ("T",), "1", "theta of xi, 3 degrees of freedom"),
+    _field("position_nees", ("T",), "1", "rho of xi, 3 degrees of freedom"),
+    _field("landmark_nees", ("T",), "1", "mean over the landmarks in the state, 3 degrees of freedom each"),
+    _field("joint_nees_per_dof", ("J",), "1", "xi and all landmarks, divided by 6 + 3n"),
+    _field("nis", ("T",), "1", "innovations of the frame"),
+    _field("nis_dof", ("T",), "1", "degrees of freedom of nis", COUNTS),
+    _field("position_error", ("T", "xyz"), "m", "estimate minus truth, world axes"),
+    _field("rotation_error", ("T", "xyz"), "rad", "log(R_estimate R_truth^T), world axes"),
+    _field("three_sigma", ("T", "error"), "m (0-2), rad (3-5)", "bounds of position and rotation error, world axes"),
+    _field("diverged", (), "1", "stopped with an error, not finite, or left the ring altogether", FLAGS),
 )
 
 
@@ -224,8 +217,8 @@ def run_one(study: Study, level: str, run: int) -> dict[str, dict[str, NDArray]]
     """Simulate one realisation and run all variants on it.
 
     Returns:
-        Variant to field to value, shaped as in `FIELDS`. Values are NaN at frame 0, whose true pose is drawn and not
-        part of a recording, and from the frame at which a filter stops.
+        Variant to field to value, shaped as in `VARIANT_LAYOUT`. Values are NaN at frame 0, whose true pose is drawn
+        and not part of a recording, and from the frame at which a filter stops.
     """
     world = realisation(study, level, run)
     with ONE_RUN_AT_A_TIME, one_thread(), np.errstate(all="ignore"):
@@ -235,12 +228,12 @@ def run_one(study: Study, level: str, run: int) -> dict[str, dict[str, NDArray]]
 
 def _blank(frames: int, runs: tuple[int, ...] = ()) -> dict[str, NDArray]:
     """Return every field of one variant without values: NaN, 0 or False."""
-    sizes = {"T": frames, "J": JOINT_INSTANTS}
+    sizes, empty = {"T": frames, "J": JOINT_INSTANTS}, {"f": np.nan, "i": 0, "b": False}
     return {
-        name: np.full(
-            (*runs, *(sizes.get(n) or fixed_length(n) or 0 for n in shape)), np.nan if kind is float else 0, dtype=kind
+        item.name: np.full(
+            (*runs, *(sizes.get(n) or fixed_length(n) or 0 for n in item.shape[1:])), empty[item.check.kinds]
         )
-        for name, (shape, kind, _, _) in FIELDS.items()
+        for item in VARIANT_LAYOUT
     }
 
 
@@ -249,7 +242,7 @@ def _joint_frames(frames: int) -> list[int]:
 
 
 def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str, NDArray]:
-    """Run one filter on one realisation and return its record frame by frame; fields and shapes as in `FIELDS`."""
+    """Run one filter on one realisation and return its record, with the fields and shapes of `VARIANT_LAYOUT`."""
     truth, noise = sequence.truth, sequence.noise
     assert truth is not None
     assert noise is not None
@@ -308,7 +301,7 @@ class StudyArchive(Shown):
     Args:
         study: The study.
         done: Level to mask (runs,) of finished runs.
-        data: Level to variant to field to values (runs, ...), see `FIELDS`.
+        data: Level to variant to field to values (runs, ...), see `VARIANT_LAYOUT`.
     """
 
     study: Study
