@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from pathlib import Path
 
@@ -171,6 +172,24 @@ def test_gaps_and_velocities_that_do_not_come_are_counted_and_worth_less():
         assert live.counts.held == len(left_out)
         assert live.counts.gaps == (1 if left_out else 0)
     assert traces[1] > 2.0 * traces[0]
+
+
+def test_a_held_velocity_is_trusted_as_little_as_one_across_a_gap():
+    world = builtin("city?frames=2")
+    noise = dataclasses.replace(world.noise, gap_std=np.repeat([1.0, 0.1], 3))
+    problem = resolve(dataclasses.replace(world, noise=noise))
+    twist, covariances = problem.sequence.twist[1], {}
+    for name, gap_s, arrives in (("measured", 1.0, True), ("across a gap", 0.25, True), ("held", 1.0, False)):
+        live = LiveEKF(filter_of(problem), gap_s=gap_s)
+        live.predict(twist, 0.0)
+        live.update([], [], 0.0)
+        if arrives:
+            live.predict(twist, 0.3)
+        pose = live.pose(0.3)
+        assert pose.is_held == (name == "held")
+        covariances[name] = pose.covariance
+    np.testing.assert_array_equal(covariances["held"], covariances["across a gap"])
+    assert (np.diag(covariances["held"]) > 1.1 * np.diag(covariances["measured"])).all()
 
 
 def test_what_comes_too_late_is_named_or_counted():

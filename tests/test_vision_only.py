@@ -5,18 +5,21 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from support.reference import CAMERA, T_CAM_IMU
 from support.running import seeds
 
 import ekfslam
 from ekfslam.config import Config
 from ekfslam.data.interval import Interval
+from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations
 from ekfslam.errors import NoVelocitiesError
 from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import motion, se3
-from ekfslam.models.odometry import stereo_odometry
+from ekfslam.geometry.camera import project
+from ekfslam.models.odometry import stereo_odometry, vision_noise
 from ekfslam.models.sensors.velocities import VelocitySource
 from ekfslam.resolve import resolve
 from ekfslam.runner import run
@@ -83,6 +86,48 @@ def test_one_motion_that_no_vehicle_has_is_left_out():
     found, true = stereo_odometry(spoiled), sequence.twist
     assert np.abs(found[1, :3] - true[1, :3]).max() < 2.0
     np.testing.assert_allclose(found[3:], stereo_odometry(sequence)[3:], atol=1e-4)
+
+
+def moved(twist, step_s=0.1):
+    """Recording of a rig that moves with velocities (T, 6) among points ahead, seen without noise."""
+    T_imu_world = motion.integrate(np.eye(4), twist, np.full(len(twist) - 1, step_s))
+    points = np.random.default_rng(0).uniform([8.0, -6.0, -2.0], [25.0, 6.0, 3.0], (40, 3))
+    pixels = project(CAMERA, se3.apply(T_CAM_IMU @ T_imu_world[:, None], points))
+    stamps = step_s * np.arange(len(twist))
+    return ekfslam.Sequence.from_tracks(stamps, pixels, CAMERA, T_cam_imu=T_CAM_IMU)
+
+
+@pytest.mark.parametrize(
+    ("column", "size", "frames", "stays"),
+    [
+        (0, 0.4, 1, True),
+        (0, 0.6, 1, False),
+        (2, -0.6, 2, False),
+        (2, -0.6, 3, True),
+        (5, 0.04, 1, True),
+        (5, 0.06, 1, False),
+    ],
+)
+def test_odometry_drops_jumps_of_ten_times_the_walk_for_at_most_two_frames(column, size, frames, stays):
+    steady = np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0], (14, 1))
+    jumping = steady.copy()
+    jumping[6 : 6 + frames, column] += size
+    np.testing.assert_allclose(stereo_odometry(moved(jumping)), jumping if stays else steady, atol=1e-4)
+
+
+def test_odometry_says_how_far_velocities_walk():
+    twist = np.zeros((8, 6))
+    twist[1:, 0] = np.cumsum([0.0, 0.1, 0.1, 0.2, -0.2, 0.1, 0.1])
+    twist[1:, 1] = twist[1:, 2] = twist[1:, 0]
+    noise = vision_noise(
+        dataclasses.replace(Noise.isotropic(0.3, 0.03, 0.7), tilt_rad=0.1, misalignment_rad=0.1), twist
+    )
+    walk = np.repeat([3.0 * 1.4826 * 0.1, 0.005], 3)
+    np.testing.assert_allclose(noise.twist_walk_std, walk)
+    np.testing.assert_allclose(noise.twist_std, 10.0 * walk)
+    np.testing.assert_array_equal(noise.pixel_std_px, 0.7)
+    assert noise.tilt_rad == noise.misalignment_rad == 0.0 and not noise.gap_std.any()
+    assert (noise.motion_std < 1e-5).all()
 
 
 def test_velocities_are_started_once_and_never_measured():
