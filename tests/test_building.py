@@ -203,12 +203,23 @@ def test_velocities_between_samples_are_linear(tmp_path, still):
     np.testing.assert_allclose(found.twist[:, 5], still.time_s, atol=1e-9)
 
 
-def test_dense_samples_become_means_over_the_interval(tmp_path, still):
+@pytest.mark.parametrize(("step_s", "is_dense"), [(0.007, True), (0.05, True), (0.06, False)])
+def test_two_samples_an_interval_become_means_over_it(tmp_path, still, step_s, is_dense):
     path = tmp_path / "velocities.txt"
-    smooth_samples(path, 0.007)
+    smooth_samples(path, step_s, begin_s=-0.513)
     found = attach_velocities(still, path)
     middle = 0.5 * (still.time_s[1:] + still.time_s[:-1])
-    np.testing.assert_allclose(found.twist[1:, 0], 3 + 2 * middle, atol=1e-9)
+    np.testing.assert_allclose(found.twist[1:, 0], 3 + 2 * (middle if is_dense else still.time_s[1:]), atol=1e-9)
+
+
+def test_samples_across_a_gap_of_less_than_a_second_are_linear(tmp_path, world, still):
+    path = tmp_path / "velocities.txt"
+    lines = velocities_text(world, " ").splitlines(keepends=True)
+    assert 0.8 < world.time_s[13] - world.time_s[4] < 1.0
+    path.write_text("".join([*lines[:5], *lines[13:]]))
+    found = attach_velocities(still, path)
+    share = (world.time_s[8] - world.time_s[4]) / (world.time_s[13] - world.time_s[4])
+    np.testing.assert_allclose(found.twist[8], world.twist[4] + share * (world.twist[13] - world.twist[4]), atol=1e-9)
 
 
 def test_velocities_of_another_recording_bring_its_extrinsics(tmp_path, world):
