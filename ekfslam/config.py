@@ -115,6 +115,7 @@ _CONSTANTS_OF_THE_FRONT_END = (
 RETIRED = {
     "blocks.stereo_rotation": "the block is gone: it improved nothing. Pitch and roll of the right camera are the mean "
     "of vL - vR over the tracks of a recording",
+    "posterior.max_iterations": "the optimiser stops after 50 iterations at most",
     **{f"front_end.{name}": "it is a constant of the front end now" for name in _CONSTANTS_OF_THE_FRONT_END},
 }
 
@@ -312,14 +313,12 @@ class PosteriorConfig:
             `ekfslam.smoother.posterior`.
         kernel_width: End of the kernel's parabola, in standard deviations. 5 % of Gaussian residuals exceed the
             default.
-        max_iterations: Of Levenberg-Marquardt.
-        tolerance: It stops when an iteration lowers the cost by a smaller share than this.
+        tolerance: Levenberg-Marquardt stops when an iteration lowers the cost by a smaller share than this.
     """
 
     linearisation: Linearisation = field(default="map", metadata=_one_of(Linearisation))
     kernel: Kernel = field(default="huber", metadata=_one_of(Kernel))
     kernel_width: float = field(default=2.8, metadata=_POSITIVE)
-    max_iterations: int = field(default=50, metadata=_whole(1, 10_000))
     tolerance: float = field(default=1e-6, metadata=_BETWEEN_0_AND_1)
 
 

@@ -23,7 +23,6 @@ from ekfslam.geometry import motion, se3
 
 _PAIRS = 5000  # observations that are looked at; more say the same
 _LEAST_PAIRS = 60
-_LEAST_DISPARITY_PX = 2.0
 _SHARE_TURNING = 0.2  # of the frames, in which rotations are looked at
 _BETTER = 0.7  # of the error, which a remedy must leave at most; what is right leaves less than any remedy
 _EXPLAINS = 0.85  # of the error without the velocities that a remedy makes small, which it must leave at most
@@ -225,7 +224,7 @@ def _pairs(sequence: Sequence) -> tuple[IntArray, IntArray]:
     earlier, later = successive(observations)
     pixels = observations.pixels_px
     beside = observations.frame[later] - observations.frame[earlier] == 1
-    near = pixels[earlier, 0] - pixels[earlier, 2] > _LEAST_DISPARITY_PX
+    near = pixels[earlier, 0] - pixels[earlier, 2] > cam.FLOW_FROM_PX
     moves = (pixels[later] != pixels[earlier]).any(axis=1)
     measured = ~sequence.interpolated[observations.frame[later]]
     chosen = np.flatnonzero(beside & near & moves & measured)

@@ -25,8 +25,6 @@ from ekfslam.models.sensors.stereo import Rig
 
 # A landmark is beside the camera where a ray is this much longer across than along the optical axis.
 _MOST_OBLIQUE = 3.0
-# What has less disparity (px) is too far for its image to say anything of its depth.
-_LEAST_DISPARITY_PX = 0.5
 # Largest factor by which a correction may change a disparity.
 _LARGEST_FACTOR = 4.0
 
@@ -148,8 +146,6 @@ class CameraCoordinates:
     def _is_in_image(self, q: Array) -> BoolArray:
         """Return whether points (n, 3) are in front of the camera and near enough."""
         sensor, z = self.model.sensor, q[:, 2]
-        furthest_m = np.inf
-        if isinstance(sensor, Rig):
-            furthest_m = sensor.camera.fu_px * sensor.camera.baseline_m / _LEAST_DISPARITY_PX
+        furthest_m = sensor.camera.furthest_m if isinstance(sensor, Rig) else np.inf
         is_ahead = np.abs(q[:, :2]).max(axis=1, initial=0.0) < _MOST_OBLIQUE * z
         return is_ahead & (z > self.min_depth_m) & (z < furthest_m)

@@ -17,10 +17,9 @@ from ekfslam.frontend.match import ROW_LIMIT_PX, first_pairs
 from ekfslam.frontend.rotation import RightRotation, correction
 from ekfslam.frontend.template import SIDE, Templates
 from ekfslam.geometry import se3
-from ekfslam.geometry.camera import StereoCamera, project, triangulate
+from ekfslam.geometry.camera import DEPTH_FROM_PX, StereoCamera, project, triangulate
 from ekfslam.geometry.stereo_motion import Alignment, agrees, align, sampled_motion
 
-LEAST_DISPARITY_PX = 0.5  # with less, a track has no depth for a prediction
 _LEAST_DEPTH_M = 0.1
 _AGREE_SHARE = 0.5  # of the points, below which the motion is sampled again
 _FOUND_SHARE = 0.4  # of the features, below which another prediction is tried
@@ -148,7 +147,7 @@ class Tracker:
             "unlike first sight": is_alike,
             "aligned too far": now.shift <= _LARGEST_SHIFT_PX,
             "rows differ": np.abs(row_error) < ROW_LIMIT_PX,
-            "no depth": now.left[:, 0] - now.right[:, 0] >= LEAST_DISPARITY_PX,
+            "no depth": now.left[:, 0] - now.right[:, 0] >= DEPTH_FROM_PX,
         }
         kept, losses = np.ones(len(row_error), dtype=bool), {}
         for reason, passes in tests.items():

@@ -18,6 +18,10 @@ from ekfslam.arrays import Array
 # Body axes forward, left, up to optical axes right, down, forward.
 R_CAM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
+# Least disparities, px: of a point with a depth, of one that shows the motion of the rig, and of one whose flow follows
+# from its depth to a fraction of a pixel.
+DEPTH_FROM_PX, MOTION_FROM_PX, FLOW_FROM_PX = 0.5, 1.0, 2.0
+
 
 @dataclass(frozen=True)
 class StereoCamera:
@@ -34,6 +38,11 @@ class StereoCamera:
         """The report's stereo calibration matrix M (4x4), rows uL, vL, uR, vR."""
         fu, fv, cu, cv, b = self.fu_px, self.fv_px, self.cu_px, self.cv_px, self.baseline_m
         return np.array([[fu, 0, cu, 0], [0, fv, cv, 0], [fu, 0, cu, -fu * b], [0, fv, cv, 0]])
+
+    @property
+    def furthest_m(self) -> float:
+        """Depth of a point with the least disparity that shows a depth."""
+        return self.fu_px * self.baseline_m / DEPTH_FROM_PX
 
 
 def project(camera: StereoCamera, q: Array) -> Array:

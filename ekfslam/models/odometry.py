@@ -16,11 +16,10 @@ from ekfslam.arrays import Array
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import Sequence
 from ekfslam.geometry import se3
-from ekfslam.geometry.camera import rectified_rows
+from ekfslam.geometry.camera import MOTION_FROM_PX, rectified_rows
 from ekfslam.geometry.stereo_motion import agrees, align, sampled_motion
 
 _LEAST_POINTS, _AGREE_SHARE, _AGREE_PX = 6, 0.5, 2.0
-_LEAST_DISPARITY_PX = 1.0
 _SAMPLES = 200
 _NEIGHBOURS = 5
 # Of the typical step: velocities change most where they are needed.
@@ -45,7 +44,7 @@ def stereo_odometry(sequence: Sequence) -> Array:
         _, i, j = np.intersect1d(ids, ids_now, assume_unique=True, return_indices=True)
         rows, rows_now = (rectified_rows(pixels, np.ones(4))[0] for pixels in (before[i], now[j]))
         disparity = np.minimum(rows[:, 0] - rows[:, 2], rows_now[:, 0] - rows_now[:, 2])
-        rows, rows_now = (some[disparity >= _LEAST_DISPARITY_PX] for some in (rows, rows_now))
+        rows, rows_now = (some[disparity >= MOTION_FROM_PX] for some in (rows, rows_now))
         if len(rows) < _LEAST_POINTS:
             continue
         found = None if guess is None else align(camera, rows, rows_now, guess)

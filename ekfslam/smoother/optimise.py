@@ -18,6 +18,8 @@ from ekfslam.smoother.problem import BatchProblem, State
 from ekfslam.smoother.sparse.factors import LinearSystem
 from ekfslam.smoother.sparse.information import JointInformation
 
+MOST_ITERATIONS = 50
+
 
 def kernel_cost(kernel: Kernel, width: float, s: Array) -> Array:
     """Return the cost of whitened residuals of norm s; see the module."""

@@ -36,7 +36,7 @@ from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess, inertial, veloc
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
 from ekfslam.shown import Card, Shown, count, figure
-from ekfslam.smoother.optimise import maximise
+from ekfslam.smoother.optimise import MOST_ITERATIONS, maximise
 from ekfslam.smoother.problem import BatchProblem, State
 from ekfslam.smoother.sparse.information import JointInformation
 
@@ -305,7 +305,7 @@ def posterior_of_log(
         state = problem.solved_as_filtered(information)
         costs = (information.cost,)
     else:
-        iterations = progress(range(config.max_iterations), f"{name}: smoothing")
+        iterations = progress(range(MOST_ITERATIONS), f"{name}: smoothing")
         start = problem.filtered_state(positions_m)
         found = maximise(problem, start, config, min_depth_m, iterations)
         information, state, weight, costs = found.information, found.state, found.weight, found.costs

@@ -24,7 +24,7 @@ from ekfslam.filters.lifecycle import Marginal
 from ekfslam.filters.log import Log
 from ekfslam.filters.variants import is_frozen_exactly
 from ekfslam.models.model import Model
-from ekfslam.smoother.optimise import maximise
+from ekfslam.smoother.optimise import MOST_ITERATIONS, maximise
 from ekfslam.smoother.problem import BatchProblem, State
 from ekfslam.smoother.sparse.information import JointInformation
 
@@ -87,7 +87,7 @@ class MapRevival:
             none = np.empty(0, dtype=np.int64)
             return Marginal({}, none, np.empty(0), positions, self.covariance(problem, information, landmarks))
         start = self._start(problem, positions_m)
-        iterations = range(_MAXIMUM.max_iterations)
+        iterations = range(MOST_ITERATIONS)
         found = maximise(problem, start, _MAXIMUM, self._config.min_depth_m, iterations)
         self._last = state = found.state
         return Marginal(

@@ -13,8 +13,6 @@ from ekfslam.geometry import camera as cam
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.models.sensors.base import ACCEPTED, DISPARITY
 
-# What has less disparity (px) says nothing of a depth.
-_NO_DEPTH_PX = 0.5
 _DISPARITY_ROWS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, -1.0]])
 
 
@@ -93,4 +91,4 @@ class Rig:
 
     def has_depth(self, q: Array) -> BoolArray:
         """Return whether (n,) points (n, 3) of `invert` are in front of the rig and near enough to have a depth."""
-        return (q[:, 2] > 0) & (q[:, 2] < self.camera.fu_px * self.camera.baseline_m / _NO_DEPTH_PX)
+        return (q[:, 2] > 0) & (q[:, 2] < self.camera.furthest_m)
