@@ -10,13 +10,14 @@ from support.jacobians import POSES, central
 from support.reference import CAMERA, T_CAM_IMU
 
 from ekfslam.data.inputs import InertialNoise, InertialSamples
-from ekfslam.data.interval import Interval, Intervals
+from ekfslam.data.interval import Intervals
 from ekfslam.data.noise import Noise
 from ekfslam.errors import LostDataError
 from ekfslam.geometry import se3
+from ekfslam.geometry.preintegration import gammas, increments
 from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
 from ekfslam.models.build import model_of
-from ekfslam.models.process.inertial import gammas, increments, inertial
+from ekfslam.models.process.inertial import inertial
 from ekfslam.models.sensors.stereo import Rig
 
 NOISE = Noise(np.full(6, 0.1), np.full(4, 1.0))
@@ -54,6 +55,14 @@ ALL = Intervals(
         for a, b in ((INTERVAL.dt_s[:12], INTERVAL.dt_s[12:]), (INTERVAL.inputs[:12], INTERVAL.inputs[12:]))
     ),
 )
+
+
+DENSITY = np.repeat([DENSITIES.gyro, DENSITIES.accel, 0.0, DENSITIES.gyro_walk, DENSITIES.accel_walk], 3)
+
+
+def pieces(which=slice(None)):
+    inputs = INTERVAL.inputs[which] - BIAS
+    return increments(INTERVAL.dt_s[which], inputs[:, :3], inputs[:, 3:], DENSITY)
 
 
 def values(T, u=U):
@@ -155,21 +164,20 @@ def test_the_step_is_exact_for_constant_pieces():
 
 def test_noise_equals_that_of_euler_steps():
     """Left-invariant errors by 4000 Euler steps a piece converge to Q at first order."""
-    piece = increments(Interval(0.05, INTERVAL.dt_s[3:4], INTERVAL.inputs[3:4]), DENSITIES, BIAS[:3], BIAS[3:])
+    piece = pieces(slice(3, 4))
     w, f = INTERVAL.inputs[3, :3] - BIAS[:3], INTERVAL.inputs[3, 3:] - BIAS[3:]
     A, at = np.zeros((15, 15)), [slice(3 * i, 3 * i + 3) for i in range(5)]
     A[at[0], at[0]] = A[at[1], at[1]] = A[at[2], at[2]] = -se3.skew(w)
     A[at[1], at[0]], A[at[2], at[1]], A[at[0], at[3]], A[at[1], at[4]] = -se3.skew(f), np.eye(3), -np.eye(3), -np.eye(3)
-    density = np.repeat([DENSITIES.gyro, DENSITIES.accel, 0.0, DENSITIES.gyro_walk, DENSITIES.accel_walk], 3)
     Q, dt = np.zeros((15, 15)), INTERVAL.dt_s[3] / 4000
     for _ in range(4000):
-        Q = Q + dt * (A @ Q + Q @ A.T + np.diag(density**2))
+        Q = Q + dt * (A @ Q + Q @ A.T + np.diag(DENSITY**2))
     std = np.sqrt(np.diag(Q))
     assert np.abs((piece.Q[0] - Q) / np.outer(std, std)).max() < 1e-3
 
 
 def test_the_tree_of_increments_equals_the_loop():
-    parts = increments(INTERVAL, DENSITIES, BIAS[:3], BIAS[3:])
+    parts = pieces()
     for n in (1, 2, 3, 8, len(parts.tau_s)):
         whole = parts[0]
         for k in range(1, n):
@@ -182,7 +190,7 @@ def test_the_tree_of_increments_equals_the_loop():
 
 
 def test_noise_has_full_rank_after_one_sample():
-    parts = increments(INTERVAL, DENSITIES, BIAS[:3], BIAS[3:])
+    parts = pieces()
     std = np.sqrt(np.diagonal(parts.Q[2]))
     assert np.linalg.cond(parts.Q[2] / np.outer(std, std)) < 100
 

@@ -17,7 +17,7 @@ LARGEST_VELOCITY = 1e6
 
 
 def frozen(array: NDArray) -> NDArray:
-    """The array, read-only, so that a frozen dataclass is frozen all through."""
+    """Return a read-only view of an array, so that a frozen dataclass has frozen arrays."""
     view = array.view()
     view.flags.writeable = False
     return view
@@ -34,7 +34,7 @@ def require_shape(value: ArrayLike, shape: tuple[int | None, ...], name: str) ->
 
 
 def require_finite(value: Array, name: str, largest: float = LARGEST) -> None:
-    """Raise `NonFiniteError` with the index of the first number that is NaN, infinite, or beyond all sense."""
+    """Raise `NonFiniteError` with the index of the first number that is NaN, infinite, or larger than ``largest``."""
     bad = np.argwhere(~(np.abs(value) <= largest))
     if len(bad):
         index = tuple(int(i) for i in bad[0])

@@ -20,7 +20,7 @@ _ROUNDING = 1e-9  # of the largest value; measured velocities bend by more than 
 
 
 def interpolated_intervals(twist: Array) -> BoolArray:
-    """Which intervals (T,) have interpolated velocities: ``[k]`` stands for that from frame k-1 to frame k.
+    """Return which intervals (T,) have interpolated velocities; ``[k]`` leads from frame k-1 to frame k.
 
     All six velocities of (T, 6) must have second differences of 0, to rounding, at `SHORTEST` samples in a row, and
     must change: a vehicle that stands still, and a simulation of constant velocity, have nothing interpolated. A line
@@ -40,13 +40,13 @@ def interpolated_intervals(twist: Array) -> BoolArray:
 
 
 def stretches(which: BoolArray) -> list[tuple[int, int]]:
-    """First and last index of every run of True."""
+    """Return first and last index of every run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
     return [(int(begin), int(end) - 1) for begin, end in edges.reshape(-1, 2)]
 
 
 def interpolation_attributes(twist: Array) -> dict[str, str]:
-    """The intervals as the attribute ``interpolated`` of a recording, such as ``1-12 178-182``; nothing if none.
+    """Return interpolated intervals as the attribute ``interpolated``, such as ``1-12 178-182``; empty if none.
 
     It stays with a recording whose velocities are changed, for instance turned or given noise.
     """
@@ -56,7 +56,7 @@ def interpolation_attributes(twist: Array) -> dict[str, str]:
 def attributes_of_part(
     attributes: Mapping[str, str | int | float], is_interpolated: BoolArray
 ) -> dict[str, str | int | float]:
-    """Attributes for a part of a recording, whose intervals have other numbers: which (T,) are interpolated."""
+    """Return attributes for a part of a recording, given which of its intervals (T,) are interpolated."""
     others = {name: value for name, value in attributes.items() if name != INTERPOLATED}
     return {**others, **_attributes(is_interpolated)}
 
@@ -67,7 +67,7 @@ def _attributes(is_interpolated: BoolArray) -> dict[str, str]:
 
 
 def known_intervals(attributes: Mapping[str, str | int | float], twist: Array) -> BoolArray:
-    """Interpolated intervals (T,) of a recording: as its attributes have them, or else as its velocities show."""
+    """Return interpolated intervals (T,) of a recording, by its attributes or else by its velocities."""
     text = str(attributes.get(INTERPOLATED, ""))
     if not re.fullmatch(r"\d+-\d+( \d+-\d+)*", text):
         return interpolated_intervals(twist)
@@ -78,7 +78,7 @@ def known_intervals(attributes: Mapping[str, str | int | float], twist: Array) -
 
 
 def interpolation_notes(twist: Array) -> tuple[str, ...]:
-    """One sentence a stretch of interpolated velocities."""
+    """Return one sentence for each stretch of interpolated velocities."""
     return tuple(
         f"The velocities of intervals {begin} to {end} are interpolated, and so probably are true poses there: no NEES "
         "is taken of them."

@@ -1,4 +1,4 @@
-"""What measurements are worth: standard deviations of velocities, pixels and tracks, as data."""
+"""Standard deviations of velocities, pixels and tracks."""
 
 from __future__ import annotations
 
@@ -128,5 +128,5 @@ class Noise:
 
     @staticmethod
     def isotropic(sigma_v_m_s: float, sigma_w_rad_s: float, sigma_px: float) -> Noise:
-        """The same standard deviation for the linear velocities, the angular velocities, and the four pixels."""
+        """Return white noise with one standard deviation each for linear velocities, angular velocities and pixels."""
         return Noise(np.repeat([sigma_v_m_s, sigma_w_rad_s], 3), np.full(4, float(sigma_px)))

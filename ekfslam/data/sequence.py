@@ -136,7 +136,7 @@ class Sequence(Shown):
         return len(self.time_s)
 
     def card(self) -> Card:
-        """What ``repr`` and a notebook show."""
+        """Return the content of ``repr`` and of the table in a notebook."""
         seconds, seen = float(self.time_s[-1] - self.time_s[0]), self.observations
         per_frame = figure(len(seen) / len(self))
         facts = {
@@ -150,7 +150,7 @@ class Sequence(Shown):
         return Card(self.name, facts, ("ekfslam.run(sequence)", "sequence[100:300]", "sequence.between(10.0, 20.0)"))
 
     def __getitem__(self, frames: slice) -> Sequence:
-        """A stretch of successive frames as a recording of its own, ``sequence[100:300]``; frames count from 0 again.
+        """Return a stretch of successive frames, ``sequence[100:300]``, as a recording whose frames count from 0.
 
         Raises:
             ShapeError: Not a slice, or one that skips frames or has none.
@@ -226,7 +226,7 @@ class Sequence(Shown):
         )
 
     def between(self, begin_s: float, end_s: float) -> Sequence:
-        """The frames whose stamps are in ``[begin_s, end_s)``, on the clock of the recording.
+        """Return the frames whose stamps are in ``[begin_s, end_s)``, on the clock of the recording.
 
         Raises:
             ShapeError: There are none.
@@ -458,7 +458,7 @@ def validate_noise(noise: Noise) -> None:
 
 
 def stretch(text: str) -> slice:
-    """The frames that ``A:B`` names, to take of a sequence; either may be left out, as in Python.
+    """Return the slice of frames that ``A:B`` names; either may be left out, as in Python.
 
     Raises:
         ValueError: It is something else.

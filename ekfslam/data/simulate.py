@@ -55,7 +55,7 @@ _VIEW = View(CAMERA, IMAGE_SIZE_PX, T_CAM_IMU)
 
 @dataclass(frozen=True)
 class Drive(Recording):
-    """What drives with measured velocities have.
+    """Settings of drives with measured velocities.
 
     Args:
         sigma_v_m_s, sigma_w_rad_s: White noise of the velocities, per sample and axis.
@@ -161,7 +161,7 @@ def builtin(name: str) -> Sequence:
 
 
 def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
-    """Drive through a world once and record it; the same bits on every call.
+    """Record a world once; every call gives the same bits.
 
     Args:
         world: What to simulate. Its seed decides the stamps, the drive and the landmarks.
@@ -223,7 +223,7 @@ def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
 
 
 def _stamps(world: City | Loop, rng: np.random.Generator) -> Array:
-    """Stamps (T,) from 0, with a jitter too small to swap two of them."""
+    """Return stamps (T,) from 0, with a jitter too small to swap two of them."""
     limit = world.frame_period_s / 3
     jitter = np.clip(world.stamp_jitter_s * rng.standard_normal(world.frames), -limit, limit)
     time_s = world.frame_period_s * np.arange(world.frames) + jitter
@@ -231,7 +231,7 @@ def _stamps(world: City | Loop, rng: np.random.Generator) -> Array:
 
 
 def _drive(world: City | Loop, time_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Distance driven (T,) m and heading (T,) rad at the stamps, both 0 at the first."""
+    """Return distance driven (T,) m and heading (T,) rad at the stamps, both 0 at the first."""
     if isinstance(world, Loop):
         distance = world.speed_m_s * time_s
         return distance, distance / world.radius_m
@@ -239,7 +239,7 @@ def _drive(world: City | Loop, time_s: Array, rng: np.random.Generator) -> tuple
 
 
 def _drive_streets(time_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """`_drive` of a city: a chain of manoeuvres, each with a duration, a speed at its end and an angle to turn by."""
+    """Return `_drive` of a city: manoeuvres, each with a duration, a speed at its end and an angle to turn by."""
     accelerate_s, brake_s, stand_s, start_s, turn_s = 3.5, 3.5, 3.0, 3.0, 5.0
     streets = int(time_s[-1] / (accelerate_s + brake_s + turn_s)) + 1
     cruise_m_s = rng.uniform(9.0, 12.0, (streets, 2))
@@ -268,7 +268,7 @@ def _drive_streets(time_s: Array, rng: np.random.Generator) -> tuple[Array, Arra
 
 
 def _twists(time_s: Array, distance_m: Array, yaw_rad: Array, wavelength_m: float, rng: np.random.Generator) -> Array:
-    """True velocities (T, 6): the drive on an uneven road, whose waves repeat every ``wavelength_m``.
+    """Return true velocities (T, 6) of the drive on an uneven road, whose waves repeat every ``wavelength_m``.
 
     Unevenness depends on the place, not on the time, so that a vehicle that stands stands still.
     """
@@ -290,7 +290,7 @@ def _twists(time_s: Array, distance_m: Array, yaw_rad: Array, wavelength_m: floa
 
 
 def _integrate(twist: Array, tau_s: Array) -> Array:
-    """Eq. (1) from the identity: velocities (T, 6) and intervals (T-1,) to ``T_imu_world`` (T, 4, 4)."""
+    """Return ``T_imu_world`` (T, 4, 4) by eq. (1), from velocities (T, 6) and intervals (T-1,)."""
     T = np.empty((len(twist), 4, 4))
     T[0] = np.eye(4)
     for k, E in enumerate(motion.increment(twist[1:], tau_s), start=1):
@@ -301,7 +301,7 @@ def _integrate(twist: Array, tau_s: Array) -> Array:
 def _landmarks(
     world: City | Loop, distance_m: Array, yaw_rad: Array, position_m: Array, rng: np.random.Generator
 ) -> Array:
-    """Landmark positions (N, 3) in world, given the drive (T,), (T,), (T, 3)."""
+    """Return landmark positions (N, 3) in world, given the drive (T,), (T,), (T, 3)."""
     if isinstance(world, Loop):
         # The camera's field of view never reaches points nearer to the centre than 0.77 radii.
         verge, inner, outer = ROAD_HALF_WIDTH_M / 2, 0.2 * world.radius_m, world.landmark_offset_m
@@ -314,7 +314,7 @@ def _landmarks(
 
 
 def _line_streets(world: City, distance_m: Array, yaw_rad: Array, position_m: Array, rng: np.random.Generator) -> Array:
-    """`_landmarks` of a city: facades on both sides, street furniture in front of them, and kerbs."""
+    """Return `_landmarks` of a city: facades on both sides, street furniture in front of them, and kerbs."""
     # The street goes on past the last frame, or the vehicle would end up looking into the void.
     ahead = np.array([np.cos(yaw_rad[-1]), np.sin(yaw_rad[-1]), 0.0])
     path_s = np.append(distance_m, distance_m[-1] + world.max_range_m)

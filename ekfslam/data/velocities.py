@@ -35,17 +35,17 @@ _DENSE = 2.0  # samples an interval from which their mean over it is taken
 
 
 @dataclass(frozen=True)
-class Velocities:
+class VelocitySamples:
     """Samples of body velocities.
 
     Args:
-        source: Where they came from.
-        time_s: (N,) stamps, which increase.
+        source: File.
+        time_s: (N,) increasing stamps.
         twist: (N, 6) ``[v; w]`` in ``velocity_frame``.
         velocity_frame: See `ekfslam.Sequence`.
-        T_cam_imu: (4, 4) extrinsics of the recording that they are from; None: they are from none.
-        attributes: Of that recording, as far as they concern velocities.
-        notes: What was found, one sentence each.
+        T_cam_imu: (4, 4) extrinsics of the recording that holds them; None for a text file.
+        attributes: Attributes of that recording that concern velocities.
+        notes: Findings, one sentence each.
     """
 
     source: str
@@ -64,19 +64,19 @@ def attach_velocities(
     velocity_frame: VelocityFrame | None = None,
     lateral: Lateral = "corrected",
 ) -> Recording:
-    """A recording, of tracks or of images, with the velocities of a file in place of those it had.
+    """Return a recording, of tracks or of images, with the velocities of a file in place of its own.
 
-    Each frame gets the velocity of its stamp, linear between samples; where samples come at least twice as often as
-    frames, the mean over the interval that ends at the frame. A frame may be one step outside of the samples.
+    Each frame gets the velocity at its stamp, linear between samples. If samples come at least twice as often as
+    frames, it gets the mean over the interval that ends at the frame. A frame may be one step outside of the samples.
 
-    Of another recording (any that `ekfslam.open_sequence` knows, or one of images), ``T_cam_imu`` comes along, as its
-    velocities are those of its own IMU; the truth is then of that IMU, too. Where the stamps have nothing in common and
-    one of both counts from 0, the first frame and the first sample are taken as the same instant, and a note says so.
+    Another recording (any that `ekfslam.open_sequence` knows, or one of images) also brings ``T_cam_imu``: its
+    velocities are those of its own IMU. The truth then becomes that of this IMU. If the stamps have nothing in common
+    and one clock counts from 0, first frame and first sample are taken as simultaneous, and a note says so.
 
     Args:
-        recording: What lacks velocities.
+        recording: Recording without velocities, or with others.
         path: Text (see this module) or another recording.
-        velocity_frame: In which frame the velocities are; by default as the file says, and ``imu`` where it does not.
+        velocity_frame: Frame of the velocities; by default that of the file, or ``imu`` if it states none.
         lateral: How to take the lateral velocity of KITTI, see `ekfslam.open_sequence`.
 
     Raises:
@@ -91,7 +91,7 @@ def attach_velocities(
     samples = read_velocities(Path(path), lateral)
     if velocity_frame is not None:
         samples = replace(samples, velocity_frame=velocity_frame)
-    found: Velocities = _on_clock_of(samples, recording.time_s, recording.source)
+    found: VelocitySamples = _on_clock_of(samples, recording.time_s, recording.source)
     twist, how = resample(found, recording.time_s)
     own = {name: value for name, value in recording.attributes.items() if name not in (*WITHOUT_VELOCITIES, "lateral")}
     gaps = _interpolated_attributes(found, recording.time_s, twist)
@@ -107,8 +107,8 @@ def attach_velocities(
     return replace(recording, **changes)
 
 
-def read_velocities(path: Path, lateral: Lateral = "corrected") -> Velocities:
-    """The samples of a text file or of a recording; see `attach_velocities` for the arguments and errors."""
+def read_velocities(path: Path, lateral: Lateral = "corrected") -> VelocitySamples:
+    """Return the samples of a text file or of a recording; see `attach_velocities` for arguments and errors."""
     row = first_row(path) if path.is_file() else ""
     if len(_words(row)) == len(COLUMNS):
         return _of_text(path)
@@ -126,7 +126,7 @@ def _words(row: str) -> list[str]:
     return row.replace(",", " ").split()
 
 
-def _of_text(path: Path) -> Velocities:
+def _of_text(path: Path) -> VelocitySamples:
     lines = read_lines(path, f"expected {EXPECTED}")
     rows, stated = list(lines), ""
     for number, line in enumerate(lines):
@@ -145,10 +145,10 @@ def _of_text(path: Path) -> Velocities:
     frame = cast(VelocityFrame, stated or "imu")
     notes = () if stated else (f"{path.name} does not say in which frame its velocities are: they are taken as imu.",)
     attributes: dict[str, str | int | float] = {"velocities_sha256": checksum(path)}
-    return Velocities(str(path), table.values[:, 0], table.values[:, 1:], frame, None, attributes, notes)
+    return VelocitySamples(str(path), table.values[:, 0], table.values[:, 1:], frame, None, attributes, notes)
 
 
-def _of_recording(recording: Sequence | ImageRecording, path: str) -> Velocities:
+def _of_recording(recording: Sequence | ImageRecording, path: str) -> VelocitySamples:
     twist = recording.twist
     if twist is None or WITHOUT_VELOCITIES.items() <= recording.attributes.items():
         raise UnknownFormatError(f"{path}: this recording has no velocities")
@@ -158,13 +158,13 @@ def _of_recording(recording: Sequence | ImageRecording, path: str) -> Velocities
     if "checksum_sha256" in recording.attributes:
         attributes["velocities_sha256"] = recording.attributes["checksum_sha256"]
     notes = tuple(f"{recording.name}: {note}" for note in recording.notes if "velocit" in note)
-    return Velocities(
+    return VelocitySamples(
         path, recording.time_s, twist, recording.velocity_frame, recording.T_cam_imu, dict(attributes), notes
     )
 
 
-def _on_clock_of(found: Velocities, time_s: Array, source: str) -> Velocities:
-    """The samples with their stamps on the clock of the frames."""
+def _on_clock_of(found: VelocitySamples, time_s: Array, source: str) -> VelocitySamples:
+    """Return the samples with their stamps on the clock of the frames."""
     if time_s[0] <= found.time_s[-1] and found.time_s[0] <= time_s[-1]:
         return found
     step = _step(time_s)
@@ -179,8 +179,8 @@ def _on_clock_of(found: Velocities, time_s: Array, source: str) -> Velocities:
     return replace(found, time_s=shifted, notes=(*found.notes, note))
 
 
-def resample(found: Velocities, time_s: Array) -> tuple[Array, str]:
-    """Velocities (T, 6) at the stamps of frames (T,), see `attach_velocities`, and how they were taken, in words.
+def resample(found: VelocitySamples, time_s: Array) -> tuple[Array, str]:
+    """Return velocities (T, 6) at the stamps of frames (T,), see `attach_velocities`, and their origin in words.
 
     Raises:
         LostDataError: A frame lies outside of the samples by more than a step, or in a gap of more than `MAX_GAP_S`.
@@ -199,17 +199,17 @@ def resample(found: Velocities, time_s: Array) -> tuple[Array, str]:
 
 
 def is_covered(stamps: Array, time_s: Array) -> BoolArray:
-    """Which frames (T,) lie within samples (N,), or at most one step outside."""
+    """Return which frames (T,) lie within samples (N,), or at most one step outside."""
     reach_s = _step(stamps, time_s) * (1.0 + _SAME)
     return (time_s >= stamps[0] - reach_s) & (time_s <= stamps[-1] + reach_s)
 
 
 def _step(*stamps: Array) -> float:
-    """The longest of the median steps."""
+    """Return the longest of the median steps."""
     return max((float(np.median(np.diff(each))) for each in stamps if len(each) > 1), default=0.0)
 
 
-def _require_cover(found: Velocities, time_s: Array) -> None:
+def _require_cover(found: VelocitySamples, time_s: Array) -> None:
     stamps = found.time_s
     outside = ~is_covered(stamps, time_s)
     if outside.any():
@@ -236,7 +236,7 @@ def _linear(stamps: Array, twist: Array, time_s: Array) -> Array:
 
 
 def _means(stamps: Array, twist: Array, time_s: Array) -> Array:
-    """Mean over each interval of the line through the samples; the first frame has that of its own stamp."""
+    """Return the mean over each interval of the line through the samples; for the first frame, its value there."""
     grid = np.union1d(stamps, time_s)
     values = _linear(stamps, twist, grid)
     area = 0.5 * (values[1:] + values[:-1]) * np.diff(grid)[:, None]
@@ -245,8 +245,8 @@ def _means(stamps: Array, twist: Array, time_s: Array) -> Array:
     return np.vstack([values[np.searchsorted(grid, time_s[0])], means])
 
 
-def _interpolated_attributes(found: Velocities, time_s: Array, twist: Array) -> dict[str, str | int | float]:
-    """Which intervals of frames were never measured: where those of the samples were not."""
+def _interpolated_attributes(found: VelocitySamples, time_s: Array, twist: Array) -> dict[str, str | int | float]:
+    """Return the attributes that state which intervals of frames have interpolated samples."""
     if "interpolated" not in found.attributes:
         return dict(interpolation_attributes(twist))
     gaps = known_intervals(found.attributes, found.twist)
@@ -255,12 +255,12 @@ def _interpolated_attributes(found: Velocities, time_s: Array, twist: Array) -> 
 
 
 def _still_true(notes: tuple[str, ...]) -> tuple[str, ...]:
-    """Notes of a recording, once it has velocities."""
+    """Return the notes that remain true once a recording has velocities."""
     return tuple(note for note in notes if not note.startswith(NO_VELOCITIES))
 
 
 def _with_extrinsics(recording: Sequence | ImageRecording, T_cam_imu: Array, notes: tuple[str, ...]) -> dict[str, Any]:
-    """Changes to a recording whose body becomes the IMU of another."""
+    """Return the changes to a recording whose body becomes the IMU of another."""
     note = "The body is the IMU of the recording that the velocities are from, and T_cam_imu is its own."
     changes: dict[str, Any] = {"T_cam_imu": T_cam_imu, "notes": (*notes, note)}
     if recording.truth is not None:

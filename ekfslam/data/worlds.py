@@ -40,11 +40,11 @@ _MOST_IN_VIEW = 20_000_000  # landmarks times frames
 
 @dataclass(frozen=True)
 class Recording:
-    """What every world has: sampling, noise, and the limits of the tracker.
+    """Settings of every world: sampling, noise, and the limits of the tracker.
 
     Args:
-        name: Becomes the name of the sequence.
-        seed: Seed of the one generator that everything is drawn from.
+        name: Name of the sequence.
+        seed: Seed of the generator.
         frames: Number of stamps, at least 2.
         frame_period_s: Nominal time between stamps.
         stamp_jitter_s: Standard deviation of a stamp (cut at a third of the period).
@@ -89,7 +89,7 @@ class Recording:
 
     @property
     def in_view(self) -> float:
-        """About how many landmarks are within reach of a frame."""
+        """Approximate number of landmarks within reach of a frame."""
         return 0.0
 
 
@@ -102,7 +102,7 @@ class View(NamedTuple):
 
 
 def numbers_of(world: Recording) -> dict[str, int | float]:
-    """The numeric parameters of a world by name."""
+    """Return the numeric parameters of a world by name."""
     return {key: value for key, value in dataclasses.asdict(world).items() if type(value) in (int, float)}
 
 
@@ -113,7 +113,7 @@ def parameters_of(world: Recording) -> dict[str, str | int | float]:
 
 
 def visible(world: Recording, view: View, T_imu_world: Array, points_m: Array) -> tuple[IntArray, IntArray, Array]:
-    """Frame (K,), index of the point (K,) and exact pixels (K, 4), eq. (3), of all that the tracker could see."""
+    """Return frame (K,), index of the point (K,) and exact pixels (K, 4), eq. (3), of all visible points."""
     T_cam_world = view.T_cam_imu @ T_imu_world
     camera_m = se3.inverse(T_cam_world)[:, :3, 3]
     found = []
@@ -132,7 +132,7 @@ def visible(world: Recording, view: View, T_imu_world: Array, points_m: Array) -
 
 
 def tracked(world: Recording, frame: IntArray, point: IntArray, points: int, rng: np.random.Generator) -> BoolArray:
-    """Mask (K,) of the visible observations that the tracker makes: the points it prefers, less what it loses."""
+    """Return which visible observations (K,) the tracker makes: those of preferred points, some of which it loses."""
     preference = rng.random(points)
     order = np.lexsort((preference[point], frame))
     place = np.arange(len(order)) - np.searchsorted(frame[order], frame[order])
@@ -142,15 +142,15 @@ def tracked(world: Recording, frame: IntArray, point: IntArray, points: int, rng
 
 
 def _inside(view: View, pixels: Array) -> BoolArray:
-    """Mask (K,) of pixels (K, 4) within both images, off the border."""
+    """Return which pixels (K, 4) are within both images, off the border."""
     limit = np.tile(view.size_px, 2) - 1 - BORDER_PX
     return np.asarray(((pixels >= BORDER_PX) & (pixels <= limit)).all(axis=-1))
 
 
 def outlier_shifts(world: Recording, view: View, pixels: Array, rng: np.random.Generator) -> Array:
-    """What displaces the pixels (K, 4): 0, or for an outlier a jump of the point in both images and a wrong disparity.
+    """Return displacements of pixels (K, 4): 0, or for an outlier a jump in both images and a wrong disparity.
 
-    Rows stay matched and disparities positive, as in what a stereo matcher lets through.
+    Rows stay matched and disparities positive, as after a stereo matcher.
     """
     shifts = np.zeros_like(pixels)
     wrong = np.flatnonzero(rng.random(len(pixels)) < world.outlier_fraction)
@@ -170,7 +170,7 @@ def outlier_shifts(world: Recording, view: View, pixels: Array, rng: np.random.G
 
 
 def track_ids(frame: IntArray, point: IntArray) -> IntArray:
-    """An id (K,) for each unbroken run of frames of the same point, counted from 0 in order of appearance."""
+    """Return an id (K,) for each unbroken run of frames of a point, counted from 0 in order of appearance."""
     order = np.lexsort((frame, point))
     starts = np.ones(len(order), dtype=bool)
     starts[1:] = (np.diff(point[order]) != 0) | (np.diff(frame[order]) != 1)

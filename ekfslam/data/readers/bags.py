@@ -36,7 +36,7 @@ from ekfslam.data.readers.messages import (
 from ekfslam.data.readers.pictures import pair_stamps
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row
-from ekfslam.data.velocities import Velocities, is_covered, resample
+from ekfslam.data.velocities import VelocitySamples, is_covered, resample
 from ekfslam.errors import CalibrationError, LostDataError, StampError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import R_CAM_BODY
@@ -278,7 +278,7 @@ def _lens(camera: Camera) -> Distortion:
     return Distortion(_MODELS[name], coefficients)
 
 
-def _velocities(bag: Bag) -> tuple[Velocities | None, str, tuple[str, ...]]:
+def _velocities(bag: Bag) -> tuple[VelocitySamples | None, str, tuple[str, ...]]:
     """Return velocities, the name of their frame, and notes."""
     streams = bag.connections(*VELOCITIES)
     if not streams:
@@ -305,7 +305,7 @@ def _velocities(bag: Bag) -> tuple[Velocities | None, str, tuple[str, ...]]:
     if (np.diff(table[:, 0]) <= 0).any():
         index = int(np.argmax(np.diff(table[:, 0]) <= 0)) + 1
         raise StampError("the stamp does not increase", field=topic, index=index)
-    return Velocities(str(bag.path), table[:, 0], table[:, 1:], "imu", None, {}, ()), frame, tuple(notes)
+    return VelocitySamples(str(bag.path), table[:, 0], table[:, 1:], "imu", None, {}, ()), frame, tuple(notes)
 
 
 def _body(bag: Bag, left: Camera, frame: str) -> tuple[Array, str]:
