@@ -166,7 +166,9 @@ def test_damping_adds_to_the_diagonal_in_units_of_the_prior():
     x = np.linalg.solve((J.T @ J).toarray() + 0.7 * np.eye(J.shape[1]), J.T @ r)
     found = JointInformation(system, damping=0.7)
     np.testing.assert_allclose(found.d.ravel(), x[-36:], rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(found.square, (x**2).sum(), rtol=1e-9)
+    left = 0.5 * ((J @ x - r) ** 2).sum()
+    np.testing.assert_allclose(found.cost, left, rtol=1e-9)
+    np.testing.assert_allclose(found.gain, 0.5 * (r**2).sum() - left, rtol=1e-9)
 
 
 @pytest.mark.parametrize("certain", [[], [2], [0, 1, 7]])

@@ -115,14 +115,13 @@ def maximise(
         step = JointInformation(here.system, damping, like=step)
         there = evaluate(problem, problem.moved(here.state, step), config, min_depth_m)
         gain = here.cost - there.cost if there else -np.inf
-        promised = here.system.half_square - step.cost + 0.5 * damping * step.square
         if there is None or not gain >= 0:
             damping, growth = damping * growth, 2.0 * growth
-            if promised <= config.tolerance * here.cost:
+            if step.gain <= config.tolerance * here.cost:
                 break
             continue
         # Nielsen, "Damping parameter in Marquardt's method", 1999: by how much of what was promised has come.
-        share = gain / max(promised, np.finfo(float).tiny)
+        share = gain / max(step.gain, np.finfo(float).tiny)
         damping, growth = damping * max(1 / 3, 1 - (2 * min(share, 1.0) - 1) ** 3), 2.0
         here = there
         costs.append(here.cost)

@@ -86,7 +86,9 @@ class MapRevival:
             positions = log.first_position_m[landmarks] + information.d[landmarks]
             none = np.empty(0, dtype=np.int64)
             return Marginal({}, none, np.empty(0), positions, self.covariance(problem, information, landmarks))
-        start = self._start(problem, positions_m)
+        start = problem.filtered_state(positions_m)
+        if self._last is not None:
+            start = continued(self._last, start, log)
         iterations = range(MOST_ITERATIONS)
         found = maximise(problem, start, _MAXIMUM, self._config.min_depth_m, iterations)
         self._last = state = found.state
@@ -114,18 +116,23 @@ class MapRevival:
         wide[np.ix_(order, order)] = P[np.ix_(kept, kept)]
         return wide
 
-    def _start(self, problem: BatchProblem, positions_m: Array) -> State:
-        """The last maximum, continued by the filter's estimates of what has been seen since."""
-        state, log, last = problem.filtered_state(positions_m), problem.log, self._last
-        if last is None:
-            return state
-        known = len(last.T_imu_world)
-        unseen = np.ones(len(last.positions_m), dtype=bool)
-        since = log.landmark[log.frame >= known - 1]
-        unseen[since[since < len(unseen)]] = False
-        positions = state.positions_m.copy()
-        positions[: len(unseen)][unseen] = last.positions_m[unseen]
-        T = np.concatenate([last.T_imu_world, state.T_imu_world[known:]])
-        aux = np.concatenate([last.aux, state.aux[known:]])
-        shared = np.concatenate([last.shared, state.shared[known:]])
-        return State(T, positions, last.zeta, shared, aux, last.drive, last.drive_values)
+
+def continued(last: State, state: State, log: Log) -> State:
+    """Return the maximum of an earlier revival, continued by the filter's estimates of everything seen since.
+
+    Args:
+        last: That maximum, of the log up to the prediction to its last frame.
+        state: The filter's estimates now.
+        log: Everything so far.
+    """
+    known = len(last.T_imu_world)
+    unseen = np.ones(len(last.positions_m), dtype=bool)
+    # Observations of the last frame of the maximum came after it.
+    since = log.landmark[log.frame >= known - 1]
+    unseen[since[since < len(unseen)]] = False
+    positions = state.positions_m.copy()
+    positions[: len(unseen)][unseen] = last.positions_m[unseen]
+    T, shared, aux = (
+        np.concatenate([getattr(last, name), getattr(state, name)[known:]]) for name in ("T_imu_world", "shared", "aux")
+    )
+    return State(T, positions, last.zeta, shared, aux, last.drive, last.drive_values)

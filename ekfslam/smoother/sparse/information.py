@@ -49,8 +49,8 @@ class JointInformation:
         eps, aux: (T, w) and (T, a) mean of the unknowns of the frames.
         drive: (g,) mean of the unknowns of the drive.
         d: (M, 3) mean of the landmarks.
-        cost: Half the sum of squares that the solution leaves (of a system without damping).
-        square: Sum of squares of the mean, with zeta in place of the first frame: damping penalises it.
+        gain: Decrease of half the sum of squares from the linearisation point to the mean, damped or not.
+        cost: Half the sum of squares there.
 
     Raises:
         IllPosedError: Something is undetermined; names landmark ids or frames.
@@ -84,12 +84,10 @@ class JointInformation:
         x = s.reduced(self.factor.solve(right))
         self.zeta = np.concatenate([x["frames"][0], *x["aux"][:1]])
         self.d = self._landmarks_given(x, whitened)
-        # Half the sum of squares at the mean x: |r - J x|^2 = |r|^2 - g^T x.
-        explained = sum(float((x[group] * g[group]).sum()) for group in REDUCED) + float(
-            (self.d * g["landmarks"]).sum()
-        )
-        self.cost = system.half_square - 0.5 * explained
-        self.square = float(sum((x[group] ** 2).sum() for group in REDUCED) + (self.d**2).sum())
+        # With (H + damping I) x = g: |r|^2 - |r - J x|^2 = 2 g^T x - x^T H x = g^T x + damping x^T x.
+        solved = {**x, "landmarks": self.d}
+        self.gain = 0.5 * sum(float((solved[group] * (g[group] + damping * solved[group])).sum()) for group in GROUPS)
+        self.cost = system.half_square - self.gain
         self.eps, self.aux = self._from_zeta(x)
         self.drive = x["drive"].ravel()
 
