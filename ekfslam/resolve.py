@@ -56,7 +56,9 @@ from ekfslam.models.noise import (
     with_drift,
 )
 from ekfslam.models.odometry import stereo_odometry, vision_noise
-from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess, inertial, velocities
+from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess
+from ekfslam.models.process.inertial import inertial
+from ekfslam.models.process.velocities import velocities
 from ekfslam.models.sensors.stereo import Rig
 
 # Number of dormant landmarks kept in the state of a recording whose landmarks come back: their covariance has 160 MB.

@@ -27,7 +27,7 @@ from ekfslam.geometry import se3
 from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
 from ekfslam.models.build import model_of
 from ekfslam.models.model import Model
-from ekfslam.models.process import inertial
+from ekfslam.models.process.inertial import inertial
 from ekfslam.models.sensors.stereo import Rig
 
 FILTER = FilterConfig(covariance_form="dense", retire="unseen", retire_after=1, revive=-1)

@@ -26,7 +26,8 @@ from ekfslam.models.blocks import (
 )
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.model import Model
-from ekfslam.models.process import MakeProcess, velocities
+from ekfslam.models.process import MakeProcess
+from ekfslam.models.process.velocities import velocities
 from ekfslam.models.sensors.base import DelayedSensor, Sensor
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig

@@ -17,7 +17,8 @@ from ekfslam.data.interval import Interval
 from ekfslam.data.noise import Noise, TrackError
 from ekfslam.models.blocks import Layout, StateBlock, Values
 from ekfslam.models.observer import Observer
-from ekfslam.models.process import MakeProcess, Process, Step, velocities
+from ekfslam.models.process import MakeProcess, Process, Step
+from ekfslam.models.process.velocities import velocities
 from ekfslam.models.sensors.base import Sensor
 
 

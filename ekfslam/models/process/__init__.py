@@ -1,8 +1,8 @@
 """Process models: how the state gets from one frame to the next. One file a process; see `base` for the contract."""
 
 from ekfslam.models.process.base import MakeProcess, Measured, Process, Residual, Step
-from ekfslam.models.process.inertial import INERTIAL_BLOCKS, Inertial, inertial
-from ekfslam.models.process.velocities import VelocityInputs, VelocityWalk, velocities
+from ekfslam.models.process.inertial import INERTIAL_BLOCKS, Inertial
+from ekfslam.models.process.velocities import VelocityInputs, VelocityWalk
 
 __all__ = [
     "INERTIAL_BLOCKS",
@@ -14,6 +14,4 @@ __all__ = [
     "Step",
     "VelocityInputs",
     "VelocityWalk",
-    "inertial",
-    "velocities",
 ]
