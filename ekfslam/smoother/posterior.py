@@ -32,7 +32,9 @@ from ekfslam.geometry import se3
 from ekfslam.models.blocks import OPTIONAL_BLOCKS
 from ekfslam.models.build import model_of, optional_blocks
 from ekfslam.models.model import Model
-from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess, inertial, velocities
+from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess
+from ekfslam.models.process.inertial import inertial
+from ekfslam.models.process.velocities import velocities
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
 from ekfslam.shown import Card, Shown, count, figure
