@@ -263,7 +263,7 @@ class Sequence(Shown):
         begin_s, end_s = float(self.time_s[frame - 1]), float(self.time_s[frame])
         velocities = self.velocities
         if kind is InertialSamples:
-            return self._samples.interval(begin_s, end_s)
+            return _samples_of(self).interval(begin_s, end_s)
         if velocities is None or velocities.has_stamps(self.time_s):
             return Interval.of_one(self.twist[frame], end_s - begin_s, bool(self.interpolated[frame]))
         return velocities.interval(begin_s, end_s)
@@ -274,13 +274,7 @@ class Sequence(Shown):
         Raises:
             LostDataError: There are no inputs of this kind.
         """
-        return self._samples.at(self.time_s[frame]) if kind is InertialSamples else self.twist[frame]
-
-    @property
-    def _samples(self) -> InertialSamples:
-        if self.inertial is None:
-            raise LostDataError("the recording has no inertial samples", source=self.source, field="inputs")
-        return self.inertial
+        return _samples_of(self).at(self.time_s[frame]) if kind is InertialSamples else self.twist[frame]
 
     @property
     def velocity_frame(self) -> VelocityFrame:
@@ -317,6 +311,12 @@ class Sequence(Shown):
         if self.truth is None or self.truth.motion is None or self.truth.frame[0] != 0:
             return np.zeros(3)
         return self.truth.T_world_imu[0, :3, :3].T @ self.truth.motion.velocity_m_s[0]
+
+
+def _samples_of(sequence: Sequence) -> InertialSamples:
+    if sequence.inertial is None:
+        raise LostDataError("the recording has no inertial samples", source=sequence.source, field="inputs")
+    return sequence.inertial
 
 
 def _camera_pose(T_cam_imu: ArrayLike | None, is_optional: bool) -> Array:

@@ -82,12 +82,18 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
         features = require_numbers(fields, "features", (4, None, frames), finite=False)
         observations, found = flat_observations(features, frame_axis=2, field="features")
         if is_later:
-            require_rigid(stored, stored_name, ExtrinsicsError)
-            T_cam_imu, used, notes = se3.inverse(stored) @ _FLIPPED, "as-stored", (_LATER_NOTE, AS_STORED_NOTE)
+            T_cam_imu, notes, choices = (
+                _later_extrinsics(stored),
+                (_LATER_NOTE, AS_STORED_NOTE),
+                {"lateral": "as-stored"},
+            )
         else:
-            twist, used = with_lateral(twist, lateral), lateral
+            twist = with_lateral(twist, lateral)
             T_cam_imu = stored if extrinsics == "as-stored" else _with_camera_position(stored)
             notes = (_EXTRINSICS_NOTES[extrinsics], LATERAL_NOTES[lateral])
+            choices = {"extrinsics": extrinsics, "lateral": lateral}
+        notes = (notes[0], LEVEL_VELOCITIES_NOTE, notes[1], *found, *interpolation_notes(twist))
+        attributes = {"checksum_sha256": checksum(path), "reader": READER.name}
         return Sequence(
             name=path.stem,
             source=source,
@@ -97,21 +103,8 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
             T_cam_imu=T_cam_imu,
             observations=observations,
             velocity_frame="level",
-            notes=(
-                notes[0],
-                LEVEL_VELOCITIES_NOTE,
-                notes[1],
-                *found,
-                *interpolation_notes(twist),
-                *inspect_tracks(observations, twist).notes,
-            ),
-            attributes={
-                "checksum_sha256": checksum(path),
-                "reader": READER.name,
-                **({} if is_later else {"extrinsics": extrinsics}),
-                "lateral": used,
-                **interpolation_attributes(twist),
-            },
+            notes=(*notes, *inspect_tracks(observations, twist).notes),
+            attributes={**attributes, **choices, **interpolation_attributes(twist)},
         )
 
 
@@ -175,6 +168,12 @@ def camera_of(K: Array, baseline_m: float) -> StereoCamera:
     camera = StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), baseline_m)
     validate_camera(camera)
     return camera
+
+
+def _later_extrinsics(stored: Array) -> Array:
+    """Return ``T_cam_imu`` of the later edition from its pose ``imu_T_cam``."""
+    require_rigid(stored, LATER_FIELDS[-1], ExtrinsicsError)
+    return se3.inverse(stored) @ _FLIPPED
 
 
 def _with_camera_position(stored: Array) -> Array:
