@@ -69,34 +69,29 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
         UnknownFormatError: The file is damaged, or an .npz of other content.
         DataError: A field is missing or malformed; the subclass says how.
     """
-    source = str(path)
     fields = _load(path)
     is_later = FIELDS[-1] not in fields and any(name in fields for name in LATER_FIELDS[-2:])
     turning, stored_name = LATER_FIELDS[-2:] if is_later else FIELDS[-2:]
-    with spelled_as_in(source, {"time_s": "time_stamps", "T_cam_imu": stored_name, "baseline": "b"}):
+    with spelled_as_in(str(path), {"time_s": "time_stamps", "T_cam_imu": stored_name, "baseline": "b"}):
         time_s = stamps_of(fields, "time_stamps")
-        frames = len(time_s)
-        twist = np.concatenate([require_numbers(fields, name, (3, frames)) for name in ("linear_velocity", turning)]).T
+        frames, names = len(time_s), ("linear_velocity", turning)
+        twist = np.concatenate([require_numbers(fields, name, (3, frames)) for name in names]).T
         camera = camera_of(require_numbers(fields, "K", (3, 3)), float(require_numbers(fields, "b", ())))
         stored = require_numbers(fields, stored_name, (4, 4))
         features = require_numbers(fields, "features", (4, None, frames), finite=False)
         observations, found = flat_observations(features, frame_axis=2, field="features")
         if is_later:
-            T_cam_imu, notes, choices = (
-                _later_extrinsics(stored),
-                (_LATER_NOTE, AS_STORED_NOTE),
-                {"lateral": "as-stored"},
-            )
+            T_cam_imu, choices = _later_extrinsics(stored), {"lateral": "as-stored"}
+            how, sign = _LATER_NOTE, AS_STORED_NOTE
         else:
-            twist = with_lateral(twist, lateral)
+            twist, choices = with_lateral(twist, lateral), {"extrinsics": extrinsics, "lateral": lateral}
             T_cam_imu = stored if extrinsics == "as-stored" else _with_camera_position(stored)
-            notes = (_EXTRINSICS_NOTES[extrinsics], LATERAL_NOTES[lateral])
-            choices = {"extrinsics": extrinsics, "lateral": lateral}
-        notes = (notes[0], LEVEL_VELOCITIES_NOTE, notes[1], *found, *interpolation_notes(twist))
+            how, sign = _EXTRINSICS_NOTES[extrinsics], LATERAL_NOTES[lateral]
+        notes = (how, LEVEL_VELOCITIES_NOTE, sign, *found, *interpolation_notes(twist))
         attributes = {"checksum_sha256": checksum(path), "reader": READER.name}
         return Sequence(
             name=path.stem,
-            source=source,
+            source=str(path),
             time_s=time_s,
             twist=twist,
             camera=camera,
