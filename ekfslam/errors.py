@@ -109,7 +109,7 @@ class FilterError(EkfslamError):
 
 
 class NoVelocitiesError(FilterError):
-    """Dead reckoning is asked for, but nobody measured velocities."""
+    """Dead reckoning was requested for a recording without measured velocities."""
 
 
 class InnovationError(FilterError):

@@ -33,7 +33,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekfslam.config import LEAST_PX, Config, Mode
+from ekfslam.config import LEAST_PX, BlockSetting, Config, Mode
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.noise import Noise
@@ -104,6 +104,20 @@ class Problem:
             revived = "come back exactly" if settings.revive >= 0 else "start again when seen again"
             back = f"landmarks leave {settings.retire_after} frames after they were seen last, and {revived}"
         return f"{blocks}, 3 for each landmark", tracks, back
+
+    @property
+    def decisions(self) -> tuple[str, ...]:
+        """The resolved values of settings that may be automatic, one line for each table."""
+        config = self.config
+        chosen = {
+            "noise": ("track_scale",),
+            "filter": ("retire", "retire_after", "dormant", "covariance_form"),
+            "hygiene": ("min_disparity_sigma",),
+            "calibration": ("rotation_deg",),
+        }
+        tables = {name: {key: getattr(getattr(config, name), key) for key in keys} for name, keys in chosen.items()}
+        tables |= {f"blocks.{name}": dict(settings) for name, settings in config.blocks.items()}
+        return tuple(f"{name}: {line}" for name, table in tables.items() if (line := _settings(table)))
 
 
 def resolve(
@@ -301,6 +315,14 @@ def _track_scale(sequence: Sequence, config: Config, model: Model) -> float:
     except InnovationError:  # the run itself raises it, if it breaks down there too
         return 1.0
     return 1.0 if dof < _LEAST_DOF else float(np.clip((nis / dof / TARGET) ** _EXPONENT, *_SCALES))
+
+
+def _settings(table: Mapping[str, BlockSetting | None]) -> str:
+    """Return the settings of a table that have a value as text."""
+    given = {key: value for key, value in table.items() if value is not None}
+    return ", ".join(
+        f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in given.items()
+    )
 
 
 def _with_form(config: Config, sequence: Sequence, model: Model) -> Config:

@@ -1,4 +1,4 @@
-"""`run`: one mode on one sequence, from configuration to `Result`."""
+"""Run one mode on one recording, from configuration to `Result`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def run(
     """Estimate trajectory and map of a sequence.
 
     Args:
-        sequence: The recording.
+        sequence: Recording.
         mode: ``dead-reckoning`` (prediction only), ``mapping-only`` (the report: independent landmark EKFs on dead
             reckoning's poses), ``full`` (joint EKF SLAM) or ``smoothed`` (the posterior of a full run).
         config: Settings; defaults where None.
@@ -62,7 +62,7 @@ def run(
         raise ConfigError(f"unknown mode {mode!r}; known: {', '.join(MODES)}")
     if mode == "dead-reckoning" and not sequence.has_velocities:
         raise NoVelocitiesError(
-            f"{sequence.name}: nobody measured velocities, so there is no dead reckoning; the other modes go by vision"
+            f"{sequence.name}: no measured velocities, so no dead reckoning; the other modes use vision"
         )
     if mode == "smoothed":
         return smooth(run(sequence, "full", config, further))
@@ -77,13 +77,13 @@ def run(
 
 @dataclasses.dataclass(frozen=True)
 class _Estimate:
-    """What a mode has estimated; fields are those of `Result`, but for the direction of the poses.
+    """Estimate of a mode; fields are those of `Result`, except for the direction of the poses.
 
     Args:
-        T_imu_world: (T, 4, 4).
-        covariance: (T, 6, 6).
+        T_imu_world: (T, 4, 4) poses.
+        covariance: (T, 6, 6) covariances of their errors.
         ms: (T,) time spent on each frame.
-        reports: Of each frame; none without observations.
+        reports: Report of each frame; empty without observations.
     """
 
     T_imu_world: Array
@@ -98,7 +98,7 @@ class _Estimate:
 
 
 def _judged(problem: Problem) -> tuple[IntArray, IntArray] | None:
-    """Pairs of frames whose relative pose the truth judges, if there are any."""
+    """Return the pairs of frames whose relative pose is compared with the truth, if requested."""
     truth, reach = problem.sequence.truth, problem.config.filter.relative_frames
     return relative_pairs(truth, reach) if truth is not None and reach else None
 
@@ -125,7 +125,7 @@ def _joint(problem: Problem, further: FurtherVelocities | None) -> _Estimate:
 
 
 def _dead_reckoned(problem: Problem, mode: Mode) -> _Estimate:
-    """The prediction's, and in mode ``mapping-only`` the map on it."""
+    """Return the prediction and, in mode ``mapping-only``, the map built on it."""
     sequence, model, settings = problem.sequence, problem.model, problem.config.filter
     judged, begin = _judged(problem), perf_counter()
     T_imu_world, covariance = dead_reckon(sequence, model.noise, settings.initial_covariance)
@@ -180,7 +180,7 @@ def _result(problem: Problem, mode: Mode, estimate: _Estimate) -> Result:
 
 
 def versions() -> dict[str, str]:
-    """Versions of the software whose numbers these are, as attributes ``version_<name>``."""
+    """Return the versions of the software that computes results, as attributes ``version_<name>``."""
     return {
         "version_ekfslam": version("ekfslam"),
         "version_python": platform.python_version(),

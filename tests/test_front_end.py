@@ -73,7 +73,7 @@ def test_from_images_to_poses_without_velocities(tracked):
     assert found["rejected"] < 0.02 * found["accepted"]
     mapping = summarise(sequence, run(sequence, "mapping-only"))
     assert mapping["ate_m"] < 0.15
-    with pytest.raises(NoVelocitiesError, match="room: nobody measured velocities"):
+    with pytest.raises(NoVelocitiesError, match="room: no measured velocities"):
         run(sequence, "dead-reckoning")
 
 
@@ -276,7 +276,7 @@ def test_every_command_takes_a_folder(folder, tmp_path, capsys):
     assert main(["info", str(folder)]) == 0
     assert "nobody measured" in capsys.readouterr().out
     assert main(["run", str(out), "--mode", "dead-reckoning", "--out", str(tmp_path / "run.h5")]) == 2
-    assert "nobody measured velocities" in capsys.readouterr().err
+    assert "no measured velocities" in capsys.readouterr().err
 
 
 def _truncate(path):

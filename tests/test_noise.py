@@ -187,6 +187,12 @@ def test_a_recording_that_states_its_noise_has_no_track_scale():
     assert scale_of(builtin("city?frames=10")) is None
 
 
+def test_the_problem_says_what_was_resolved():
+    decisions = resolve(without_noise(builtin("city?frames=10"))).decisions
+    assert "noise: track_scale 3" in decisions
+    assert "filter: retire unseen, retire_after 1, dormant 0, covariance_form dense" in decisions
+
+
 def test_too_few_innovations_leave_the_track_scale_at_one():
     assert scale_of(walking_tracks(4.0)[:1]) == 1.0
 

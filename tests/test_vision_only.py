@@ -161,7 +161,7 @@ def test_dead_reckoning_is_left_out_of_a_comparison(tmp_path):
     sequence = without_velocities(ekfslam.open_sequence("builtin:city?frames=8"))
     found = ekfslam.compare(sequence)
     assert set(found.results) == {"mapping-only", "full", "smoothed"}
-    assert "nobody measured velocities" in found.skipped["dead-reckoning"]
+    assert "no measured velocities" in found.skipped["dead-reckoning"]
     assert "No dead-reckoning: " in found.table
     with pytest.raises(NoVelocitiesError):
         run(sequence, "dead-reckoning")

@@ -1,4 +1,4 @@
-"""Say what is in a recording or an archive, and what is wrong with it."""
+"""Show the content of a recording or an archive, and its defects."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ EXAMPLES = ("info 0027.npz", "info results/local/city/archive.h5")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="FILE", help=f"default: {DEFAULT_DATA}")
-    parser.add_argument("--build", action="store_true", help="say instead which form of the kernels runs, and on what")
+    parser.add_argument(
+        "--build", action="store_true", help="show the kernels, libraries and threads of this installation instead"
+    )
     add_data_options(parser)
 
 
@@ -59,7 +61,6 @@ def _print_archive(path: str) -> None:
 
 
 def _print_recording(sequence: Sequence) -> None:
-    """What is in it."""
     camera, truth = sequence.camera, sequence.truth
     tracks = inspect_tracks(sequence.observations, sequence.twist)
     print(f"name          {sequence.name} ({sequence.source})")
@@ -86,7 +87,7 @@ def _noise_line(sequence: Sequence) -> str:
     if not sequence.has_velocities and sequence.inertial is not None:
         return "velocities    not measured: inertial samples move the state"
     if not sequence.has_velocities:
-        return "velocities    nobody measured any: the twist is a walk that starts from stereo odometry"
+        return "velocities    none: motion is a random walk started by stereo odometry"
     if sequence.noise is None:
         v, w = velocity_noise(sequence.twist).texts
         return f"noise         not stated; white noise of the velocities, from the data: {v} m/s, {w} rad/s"
@@ -94,7 +95,7 @@ def _noise_line(sequence: Sequence) -> str:
 
 
 def _print_findings(sequence: Sequence) -> None:
-    """What is wrong with it, and which model it would get."""
+    """Print notes, warnings, and the model that `resolve` chooses."""
     for note in sequence.notes:
         print(f"note          {note}")
     sanity = inspect_sequence(sequence)
@@ -106,6 +107,8 @@ def _print_findings(sequence: Sequence) -> None:
     assert problem.hygiene is not None
     for line in problem.lines:
         print(f"state         {line}")
+    for line in problem.decisions:
+        print(f"resolved      {line}")
     for line in problem.hygiene.lines(dataclasses.asdict(problem.config.hygiene)):
         print(f"hygiene       {line}")
 
