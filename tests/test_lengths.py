@@ -16,8 +16,6 @@ GOES = "the window in view: goes once the compiled filter replaces it"
 
 # Name to reason. The list may only become shorter.
 EXCEPTIONS: dict[str, str] = {
-    "ekfslam.data.readers.ece276a.read_ece276a": TO_BE_SPLIT,
-    "ekfslam.data.sequence.Sequence": TO_BE_SPLIT,
     "ekfslam.data.simulate.simulate": TO_BE_SPLIT,
     "ekfslam.filters.conditional.ConditionalGaussian": GOES,
 }

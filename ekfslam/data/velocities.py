@@ -1,60 +1,28 @@
-"""Velocities from elsewhere: a text file, or another recording, brought to the stamps of a recording.
-
-Text is one sample a line: seconds, three linear and three angular velocities (m/s, rad/s), with blanks between them as
-in files of TUM, or with commas. A comment line ``# frame: level`` (or ``imu``) says in which frame they are.
-"""
+"""Velocities from elsewhere: samples of a file, or of another recording, brought to the stamps of a recording."""
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, cast, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.interpolation import attributes_of_part, interpolation_attributes, known_intervals
-from ekfslam.data.readers.fields import checksum
 from ekfslam.data.readers.registry import Lateral, Source, expected, read_as
-from ekfslam.data.readers.text import first_row, parse_table, read_lines
+from ekfslam.data.samples import VelocitySamples
 from ekfslam.data.sequence import WITHOUT_VELOCITIES, Sequence, VelocityFrame
 from ekfslam.errors import ConfigError, LostDataError, UnknownFormatError
 from ekfslam.geometry import se3
 
 Recording = TypeVar("Recording", Sequence, ImageRecording)
 
-COLUMNS = ("time", "vx", "vy", "vz", "wx", "wy", "wz")
-EXPECTED = f"a text file of {' '.join(COLUMNS)} (s, m/s, rad/s; blanks or commas)"
 MAX_GAP_S = 1.0  # over longer, a velocity is not linear in time
 NO_VELOCITIES = "There are no velocities"  # how a note begins that is true no more when there are some
-_FRAME_LINE = re.compile(r"#\s*frame\s*[:=]\s*(\S+)\s*", re.IGNORECASE)
 _SAME = 1e-3  # of a step, by which stamps of the same instants may differ
 _DENSE = 2.0  # samples an interval from which their mean over it is taken
-
-
-@dataclass(frozen=True)
-class VelocitySamples:
-    """Samples of body velocities.
-
-    Args:
-        source: File.
-        time_s: (N,) increasing stamps.
-        twist: (N, 6) ``[v; w]`` in ``velocity_frame``.
-        velocity_frame: See `ekfslam.Sequence`.
-        T_cam_imu: (4, 4) extrinsics of the recording that holds them; None for a text file.
-        attributes: Attributes of that recording that concern velocities.
-        notes: Findings, one sentence each.
-    """
-
-    source: str
-    time_s: Array
-    twist: Array
-    velocity_frame: VelocityFrame
-    T_cam_imu: Array | None
-    attributes: dict[str, str | int | float]
-    notes: tuple[str, ...]
 
 
 def attach_velocities(
@@ -109,43 +77,17 @@ def attach_velocities(
 
 def read_velocities(path: Path, lateral: Lateral = "corrected") -> VelocitySamples:
     """Return the samples of a text file or of a recording; see `attach_velocities` for arguments and errors."""
-    row = first_row(path) if path.is_file() else ""
-    if len(_words(row)) == len(COLUMNS):
-        return _of_text(path)
     source = Source.at(path, lateral=lateral)
+    samples: VelocitySamples | None = read_as(source, "inputs")
+    if samples is not None:
+        return samples
     recording: Sequence | ImageRecording | None = read_as(source, "tracks")
     if recording is None:
         recording = read_as(source, "images")
     if recording is None:
         problem = source.problem or "unknown content"
-        raise UnknownFormatError(f"{path}: no velocities ({problem}); {expected('tracks', 'images')}, or {EXPECTED}")
+        raise UnknownFormatError(f"{path}: no velocities ({problem}); {expected('inputs', 'tracks', 'images')}")
     return _of_recording(recording, str(path))
-
-
-def _words(row: str) -> list[str]:
-    return row.replace(",", " ").split()
-
-
-def _of_text(path: Path) -> VelocitySamples:
-    lines = read_lines(path, f"expected {EXPECTED}")
-    rows, stated = list(lines), ""
-    for number, line in enumerate(lines):
-        match = _FRAME_LINE.fullmatch(line.strip())
-        stated = match.group(1) if match else stated
-        # A header names the columns; it may stand there without the mark of a comment.
-        if re.match(r"\s*[A-Za-z_]", line) and not any(row.split("#")[0].strip() for row in rows[:number]):
-            rows[number] = ""
-    if stated and stated not in get_args(VelocityFrame):
-        raise ConfigError(f"{path}: the frame of velocities must be imu or level, found {stated!r}")
-    separator = "," if "," in "".join(row.split("#")[0] for row in rows) else None
-    table = parse_table(rows, path, columns=len(COLUMNS), separator=separator)
-    if not len(table.values):
-        raise UnknownFormatError(f"{path}: holds no velocities; expected {EXPECTED}")
-    table.require_increasing()
-    frame = cast(VelocityFrame, stated or "imu")
-    notes = () if stated else (f"{path.name} does not say in which frame its velocities are: they are taken as imu.",)
-    attributes: dict[str, str | int | float] = {"velocities_sha256": checksum(path)}
-    return VelocitySamples(str(path), table.values[:, 0], table.values[:, 1:], frame, None, attributes, notes)
 
 
 def _of_recording(recording: Sequence | ImageRecording, path: str) -> VelocitySamples:

@@ -4,7 +4,7 @@
   (`utias`), ekfslam's own HDF5 files (`own`), and simulated worlds (`simulated`).
 - Stereo images: KITTI (`kitti_odometry`, `kitti_raw`), EuRoC and TUM-VI (`euroc`), bags of ROS and MCAP (`bags`), plain
   folders (`image_folders`), and the course data (`ece276a_npy`).
-- True poses: `kitti_odometry`, `kitti_raw`, `tum`, `euroc`.
+- True poses: `kitti_odometry`, `kitti_raw`, `tum`, `euroc`. Velocities: `velocity_text`.
 
 A drive folder of KITTI raw without images is a recording without tracks, which serves dead reckoning.
 """

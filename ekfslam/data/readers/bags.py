@@ -36,7 +36,8 @@ from ekfslam.data.readers.messages import (
 from ekfslam.data.readers.pictures import pair_stamps
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row
-from ekfslam.data.velocities import VelocitySamples, is_covered, resample
+from ekfslam.data.samples import VelocitySamples
+from ekfslam.data.velocities import is_covered, resample
 from ekfslam.errors import CalibrationError, LostDataError, StampError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import R_CAM_BODY

@@ -20,11 +20,12 @@ from typing import Any, Literal
 
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.readers.poses import Poses
+from ekfslam.data.samples import VelocitySamples
 from ekfslam.data.sequence import Sequence
 
 Extrinsics = Literal["corrected", "as-stored"]
 Lateral = Literal["corrected", "as-stored"]
-Kind = Literal["tracks", "images", "truth"]
+Kind = Literal["tracks", "images", "truth", "inputs"]
 
 _HEAD_BYTES = 128
 
@@ -79,6 +80,7 @@ class Reader:
         tracks: Reader of stereo tracks.
         images: Reader of stereo images.
         truth: Reader of true poses, for a sequence whose extrinsics it may need.
+        inputs: Reader of velocities for another recording.
     """
 
     name: str
@@ -87,6 +89,7 @@ class Reader:
     tracks: Callable[[Source], Sequence | None] | None = None
     images: Callable[[Source], ImageRecording | None] | None = None
     truth: Callable[[Source, Sequence], Poses | None] | None = None
+    inputs: Callable[[Source], VelocitySamples | None] | None = None
 
 
 def readers(*kinds: Kind) -> tuple[Reader, ...]:
