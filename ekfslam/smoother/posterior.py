@@ -1,4 +1,4 @@
-"""The joint posterior over the whole trajectory and the whole map, from what the filter logged.
+"""Joint posterior over the whole trajectory and the whole map, from the log of the filter.
 
 The filter carries only what is in view; its log is one sparse system over all poses and all landmarks. Two
 linearisations of it are offered. *As filtered* the rows stay where the filter linearised them: for the standard and the
@@ -61,8 +61,8 @@ class Posterior(Shown):
         costs: Cost (half the sum of squares, under the kernel) before each iteration and at the end.
         information: The factorised system.
         values: Estimates of the further state blocks by name: of each frame (T, ...), or of the drive.
-        problem: The rows.
-        state: Where they are linearised.
+        problem: Factors of the log.
+        state: State at which they are linearised.
     """
 
     linearisation: str
@@ -77,7 +77,7 @@ class Posterior(Shown):
     state: State
 
     def card(self) -> Card:
-        """What ``repr`` and a notebook show; computes nothing."""
+        """Return the facts that ``repr`` and a notebook show, without computing anything."""
         frames, landmarks = len(self.T_world_imu), len(self.id)
         facts = {
             "of": f"{count(frames, 'pose')}, {count(landmarks, 'landmark')}, {count(len(self.weight), 'observation')}",
@@ -104,7 +104,7 @@ class Posterior(Shown):
         return self.information.landmark_covariances()
 
     def block_covariance(self, name: str) -> Array:
-        """Marginal covariance of a further state block: of each frame (T, n, n), or of the drive (n, n).
+        """Return the marginal covariance of a further state block: of each frame (T, n, n), or of the drive (n, n).
 
         Raises:
             PosteriorError: There is no such block.
@@ -124,7 +124,7 @@ class Posterior(Shown):
         raise PosteriorError(f"there is no state block {name!r}; there are {', '.join(self.values) or 'none'}")
 
     def rows_of(self, ids: ArrayLike) -> IntArray:
-        """Rows (n,) of landmarks given by their ids; of a track that was split, the row of its last piece.
+        """Return the rows (n,) of landmarks given by their ids; a track that was split has the row of its last piece.
 
         Raises:
             PosteriorError: There is no landmark of such an id.
@@ -137,7 +137,7 @@ class Posterior(Shown):
         return np.array([row[landmark] for landmark in wanted], dtype=np.int64)
 
     def joint_covariance(self, frames: ArrayLike = (), landmarks: ArrayLike = ()) -> Array:
-        """Covariance (6a+3b, 6a+3b) of a poses and b landmarks, given by frame and by row, in that order.
+        """Return the covariance (6a+3b, 6a+3b) of a poses and b landmarks, given by frame and by row, in that order.
 
         Raises:
             PosteriorError: There is no such frame or landmark.
@@ -151,7 +151,7 @@ class Posterior(Shown):
         return P[np.ix_(kept, kept)]
 
     def pairs(self, first: IntArray, second: IntArray) -> PosePairs:
-        """Cross-covariances of pairs of smoothed poses, given by the frames (n,) of each."""
+        """Return the cross-covariances of pairs of smoothed poses, given by the frames (n,) of each."""
         cross = np.empty((len(first), 6, 6))
         for j in np.unique(first):
             own = np.flatnonzero(first == j)
@@ -160,7 +160,7 @@ class Posterior(Shown):
         return PosePairs(first, second, cross)
 
     def dense_covariance(self, frames: ArrayLike = (-1,)) -> Array:
-        """Covariance of some poses (by default the last: the state of the EKF) and of all landmarks, in their order.
+        """Return the covariance of some poses and of all landmarks, in their order; by default that of the EKF's state.
 
         Raises:
             PosteriorError: There is no such frame, or the matrix would be wider than 20000.
@@ -174,7 +174,7 @@ class Posterior(Shown):
         return self.joint_covariance(frames, np.arange(len(self.id)))
 
     def information_matrix(self) -> tuple[sp.csc_array, dict[str, Array]]:
-        """The joint information matrix (n, n), sparse: the inverse of the joint covariance of all unknowns.
+        """Return the sparse joint information matrix (n, n): the inverse of the joint covariance of all unknowns.
 
         Columns are those of all poses, ``xi`` of the first frame first, then of what else each frame has, of the
         drive, and of all landmarks. What is known for certain of the first frame has no column.
@@ -206,7 +206,7 @@ class Posterior(Shown):
         return self.information.log_determinant
 
     def sample(self, rng: np.random.Generator, size: int = 1) -> tuple[Array, Array]:
-        """Independent draws: poses ``T_world_imu`` (size, T, 4, 4) and landmarks (size, M, 3)."""
+        """Return independent draws: poses ``T_world_imu`` (size, T, 4, 4) and landmarks (size, M, 3)."""
         eps, d = self.information.sample(rng, size)
         return (
             se3.inverse(se3.exp((eps - self.information.eps)[..., :6]) @ se3.inverse(self.T_world_imu)),
@@ -215,7 +215,7 @@ class Posterior(Shown):
 
 
 def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterior:
-    """The joint posterior of a run of the joint filter, from its `Result` (read from an archive or not).
+    """Return the joint posterior of a run of the joint filter, from its `Result` (read from an archive or not).
 
     Args:
         result: A result of mode ``full``.
@@ -271,7 +271,7 @@ def model_of_result(result: Result) -> Model:
 
 
 def _config_of(result: Result) -> Config:
-    """The configuration of a run, but for iterations of its updates: today's rules refuse some of older archives."""
+    """Return the configuration of a run without iterations of its updates: some of older archives are refused today."""
     settings = dict(result.config.get("filter", {}))
     settings.pop("iterations", None)
     return Config.from_stored({**result.config, "filter": settings})
@@ -327,7 +327,7 @@ def posterior_of_log(
 
 @solvable()
 def smooth(result: Result, config: PosteriorConfig | None = None, found: Posterior | None = None) -> Result:
-    """The posterior of a full run as a `Result` of its own: smoothed trajectory, map, and all their marginals.
+    """Return the posterior of a full run as a `Result`: smoothed trajectory, map, and all their marginals.
 
     Its mode is ``smoothed`` (``as filtered`` if linearised so). Arguments and errors are those of `posterior`, whose
     return value may be given as ``found`` if it is known already.

@@ -44,7 +44,7 @@ class MapRevival:
         self._last: State | None = None
 
     def neighbours(self, log: Log, returning: IntArray, candidates: IntArray) -> tuple[IntArray, IntArray]:
-        """Of the candidates those ``config.revive`` that were seen nearest in time to returning landmarks.
+        """Return the ``config.revive`` candidates that were seen nearest in time to returning landmarks.
 
         Args:
             log: Everything so far.
@@ -69,7 +69,7 @@ class MapRevival:
         return chosen, nearest[chosen]
 
     def marginal(self, log: Log, positions_m: Array, landmarks: IntArray) -> Marginal:
-        """Mean and covariance of the last frame's blocks and some landmarks, given everything in the log.
+        """Return mean and covariance of the last frame's blocks and of some landmarks, given everything in the log.
 
         Args:
             log: Everything so far, the prediction to the current frame included.
@@ -100,7 +100,7 @@ class MapRevival:
         )
 
     def covariance(self, problem: BatchProblem, information: JointInformation, landmarks: IntArray) -> Array:
-        """Covariance (body+3n, body+3n) in the columns of the filter."""
+        """Return the covariance (body+3n, body+3n) in the columns of the filter."""
         last, u = problem.log.frames - 1, problem.unknowns
         has_clone = self._model.has_clone and last > 0
         frames = [last, last - 1] if has_clone else [last]
