@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ekfslam
-from ekfslam.config import Config, FilterConfig
+from ekfslam.config import Config, FilterConfig, PosteriorConfig
 from ekfslam.evaluation.consistency import nees, pose_error
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
@@ -17,6 +17,7 @@ from ekfslam.models.build import model_of
 from ekfslam.models.process import Process, Residual, Step
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import run
+from ekfslam.smoother.posterior import posterior_of_log
 
 # --- a block ------------------------------------------------------------------------------------------
 
@@ -130,7 +131,7 @@ class ConstantSpeed(Process):
 ACCELERATION = np.repeat([3.0, 1.0], 3)
 
 
-def test_a_process_from_outside_finds_the_velocity_by_the_images():
+def test_a_process_from_outside_finds_the_velocity_in_filter_and_smoother():
     world = ekfslam.open_sequence("builtin:city?frames=40&outlier_fraction=0&seed=3")
     speed = Speed(np.repeat([10.0, 1.0], 3))
     model = model_of(
@@ -154,3 +155,7 @@ def test_a_process_from_outside_finds_the_velocity_by_the_images():
     assert (np.abs(ekf.values["speed"] - true) < 4 * np.sqrt(np.diag(ekf.P)[model.layout["speed"]])).all()
     found = np.sqrt(np.diag(ekf.P)[model.layout["speed"]])
     assert (found < 0.2 * speed.prior_std).all()
+    smoothed = posterior_of_log(ekf.log(), model, ekf.landmarks().position_m, PosteriorConfig(kernel="none"))
+    behind = nees(pose_error(smoothed.T_world_imu, world.truth.T_world_imu)[1:], smoothed.pose_covariance[1:])
+    assert behind.mean() < 12.0  # the world accelerates less than this process allows
+    assert np.trace(smoothed.pose_covariance[20]) < 0.9 * np.trace(P[20])

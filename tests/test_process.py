@@ -4,11 +4,16 @@ import dataclasses
 
 import numpy as np
 import pytest
+from support.frozen import assert_equal_to_frozen_rows
 from support.jacobians import central
 from support.reference import CAMERA, T_CAM_IMU
 
+from ekfslam.config import FilterConfig
 from ekfslam.data.interval import Interval, Intervals
 from ekfslam.data.noise import Noise
+from ekfslam.data.simulate import builtin
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import motion, se3
 from ekfslam.models.blocks import TwistBias
 from ekfslam.models.build import model_of
@@ -99,3 +104,23 @@ def test_intervals_with_several_pieces_have_the_mean_velocity_of_each():
     np.testing.assert_array_equal(found[1], TWISTS[2])
     np.testing.assert_array_equal(found[0], mean_velocity(intervals[0]))
     assert np.abs(found[0] - TWISTS[0]).max() > 0.1
+
+
+def test_a_prior_that_couples_blocks_is_that_of_filter_log_and_smoother():
+    world = builtin("city?frames=10&outlier_fraction=0")
+    rig = Rig(world.camera, world.T_cam_imu, world.noise)
+    model = model_of(rig, world.noise, se3.inverse(world.initial_T_world_imu), 1e-4 * np.eye(6), blocks=[TwistBias()])
+    at, prior = model.layout["twist_bias"], model.prior_covariance.copy()
+    prior[:6, at] = 0.5 * np.sqrt(np.outer(np.diag(prior)[:6], np.diag(prior)[at])) * np.eye(6)
+    prior[at, :6] = prior[:6, at].T
+    config = FilterConfig(variant="standard", landmark_coordinates="xyz", retire="never", gate_probability=1.0)
+    ekf = JointEKF(dataclasses.replace(model, joint_prior=prior), config)
+    np.testing.assert_array_equal(ekf.P, prior)
+    for _ in run_filter(ekf, world):
+        pass
+    np.testing.assert_array_equal(ekf.log().initial_covariance, prior)
+    assert_equal_to_frozen_rows(ekf)
+    apart = JointEKF(model, config)
+    for _ in run_filter(apart, world):
+        pass
+    assert np.abs(apart.coordinates - ekf.coordinates)[at].max() > 1e-5
