@@ -42,6 +42,7 @@ class Prior:
     Args:
         position_m, tilt_rad, yaw_rad, velocity_m_s, gyro_bias_rad_s, accel_bias_m_s2: Before anything is measured.
         rest_s: Time for which the accelerometer has seen gravity alone, which couples tilt and its bias; 0: none.
+        exact_tilt_rad: Size of the first tilt, in a random direction; 0: it is drawn like all other errors.
     """
 
     position_m: float = 0.001
@@ -51,6 +52,7 @@ class Prior:
     gyro_bias_rad_s: float = 0.01
     accel_bias_m_s2: float = 0.1
     rest_s: float = 1.0
+    exact_tilt_rad: float = 0.0
 
     def covariance(self, R_imu_world: Array, accel_density: float) -> Array:
         """Return the covariance (15, 15) at a rotation (3, 3)."""
@@ -64,8 +66,19 @@ class Prior:
             P = (np.eye(15) - K @ H) @ P
         return (P + P.T) / 2
 
+    def drawn(self, P: Array, R_imu_world: Array, rng: np.random.Generator) -> Array:
+        """Return first errors (15,), given their covariance."""
+        error = np.linalg.cholesky(P) @ rng.standard_normal(15)
+        if self.exact_tilt_rad:
+            in_world = R_imu_world.T @ error[3:6]
+            in_world[:2] *= self.exact_tilt_rad / np.linalg.norm(in_world[:2])
+            error[3:6] = R_imu_world @ in_world
+        return error
 
-LARGE = Prior(tilt_rad=0.15, yaw_rad=0.1, velocity_m_s=0.5, accel_bias_m_s2=0.3, rest_s=0.0)
+
+# A tilt of 8.6 degrees, which is the root mean square of two axes with this prior.
+TILT_RAD = 0.15
+LARGE = Prior(0.1, TILT_RAD / np.sqrt(2), 0.1, 0.5, accel_bias_m_s2=0.3, rest_s=0.0, exact_tilt_rad=TILT_RAD)
 
 
 def true_values(sequence: Sequence, frame: int) -> list[Array]:
@@ -90,7 +103,7 @@ def model_from_prior(sequence: Sequence, prior: Prior, rng: np.random.Generator,
     assert sequence.inertial is not None and sequence.inertial.noise is not None and sequence.noise is not None
     densities = sequence.inertial.noise
     P = prior.covariance(T[:3, :3], densities.accel)
-    error = np.linalg.cholesky(P) @ rng.standard_normal(15)
+    error = prior.drawn(P, T[:3, :3], rng)
     if noise_free:
         densities = dataclasses.replace(densities, gyro=0.0, accel=0.0, gyro_walk=0.0, accel_walk=0.0)
     blocks = (

@@ -256,6 +256,11 @@ def test_the_residual_of_a_step_is_zero_and_has_its_transition():
     np.testing.assert_allclose(found.by_before, -step.Phi, atol=1e-12)
 
 
+def test_the_way_is_driven_at_the_speed_before_the_interval():
+    found = model().process.way_m(values(np.eye(4)), INTERVAL)
+    assert found == pytest.approx(np.linalg.norm(U) * (0.3021 - 0.2013))
+
+
 def test_the_rate_at_the_image_is_that_of_the_samples_there():
     before = values(np.eye(4))
     found = model().process.imu_twist(before, before, INTERVAL)
