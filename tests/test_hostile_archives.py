@@ -153,6 +153,11 @@ def test_fields_of_a_log_that_contradict_each_other_are_named(whole, tmp_path):
     previous[later] = before[0]  # in the frame before, but another landmark
     with pytest.raises(ArchiveError, match=rf"previous\[{later}\] is no observation of the same landmark"):
         read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
+    with pytest.raises(ArchiveError, match="up has 2 columns"):
+        path = altered(whole, tmp_path, "runs/full/log/up", np.zeros((12, 2)))
+        with h5py.File(path, "a") as h5file:
+            del h5file["runs/full/log/up_axis"]
+        read_archive(path)
 
 
 @pytest.mark.parametrize("kind", ["text", "empty", "compound", "reference", "variable length"])

@@ -82,8 +82,8 @@ def test_a_killed_study_keeps_every_finished_run(tmp_path):
 def test_a_journal_of_something_else_is_a_named_error(tmp_path, kind):
     blank = {"invariant": {"pose_nees": np.zeros(3), "diverged": np.zeros((), dtype=bool)}}
     journal = Journal(tmp_path / "a.h5", {"seed": 1}, lambda level: {"mid": blank}[level])
-    journal.append("mid", 0, blank)
-    assert [entry[:2] for entry in journal.entries()] == [("mid", 0)]
+    journal.append(("mid", 0), blank)
+    assert [key for key, _ in journal.entries()] == [("mid", 0)]
     bad = {"level": b'["x", 1]\n', "run": b'["mid", []]\n', "short": b'["mid", 1]\n1234', "no JSON": b"[" * 100_000}
     bad["long"] = b'["mid", 1]\n' + bytes(26)
     if kind == "another study":
@@ -101,19 +101,19 @@ def test_an_entry_whose_content_does_not_fit_its_digest_ends_the_journal(tmp_pat
     journal = Journal(tmp_path / "a.h5", {"seed": 1}, lambda level: blank)
     ends = []
     for run in range(2):
-        journal.append("mid", run, {"invariant": {"pose_nees": np.full(3, run + 1.0)}})
+        journal.append(("mid", run), {"invariant": {"pose_nees": np.full(3, run + 1.0)}})
         ends.append(journal.path.stat().st_size)
     content = bytearray(journal.path.read_bytes())
     content[ends[changed] - 1] ^= 1
     journal.path.write_bytes(content)
-    assert [run for _, run, _ in journal.entries()] == list(range(kept))
+    assert [run for (_, run), _ in journal.entries()] == list(range(kept))
 
 
 def test_a_journal_of_a_longer_study_serves_a_shorter_one(tmp_path):
     longer = Study(short("mid", 6), ("invariant",), runs=3)
     record = run_one(longer, "mid", 2)
     journal = Journal(tmp_path / "a.h5", {**longer.parameters, "runs": None, **versions()}, lambda level: record)
-    journal.append("mid", 2, record)
+    journal.append(("mid", 2), record)
     shorter = Study(longer.levels, longer.variants, runs=2)
     assert run_study(shorter, tmp_path / "a.h5", SerialExecutor(), False).complete
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]

@@ -24,12 +24,7 @@ Outcome = TypeVar("Outcome")
 
 
 def completed(tasks: Iterable[Task], submit: Callable[[Task], Future[Outcome]]) -> Iterator[tuple[Task, Outcome]]:
-    """Yield tasks and their results as they finish, with a bounded number handed to the executor at a time.
-
-    Args:
-        tasks: The tasks.
-        submit: Function that hands a task to an executor.
-    """
+    """Submit tasks to an executor, at most `IN_FLIGHT` at a time, and yield each with its result as it finishes."""
     remaining, pending = iter(tasks), dict[Future[Outcome], Task]()
     try:
         while True:
@@ -38,7 +33,7 @@ def completed(tasks: Iterable[Task], submit: Callable[[Task], Future[Outcome]]) 
                 pending[submit(task)] = task
             elif not pending:
                 return
-            # While there is more to hand out, only look: an executor in this process has finished by now.
+            # Do not wait while there is more to submit: an executor in this process has finished by now.
             finished, _ = wait(pending, timeout=None if task is None else 0, return_when=FIRST_COMPLETED)
             for future in finished:
                 yield pending.pop(future), future.result()
@@ -64,11 +59,10 @@ def open_executor(spec: str = "processes", workers: int | None = None) -> Iterat
     """Open an executor.
 
     Args:
-        spec: ``processes`` on this machine; ``serial``; ``tls://HOST:PORT``, the scheduler of a Dask cluster, with the
-            certificates of Dask's configuration ``distributed.comm.tls`` (files, or variables of the environment such
-            as ``DASK_DISTRIBUTED__COMM__TLS__CA_FILE``); ``dask://HOST:PORT``, the same without certificates: anyone
-            who reaches the port of the scheduler, or poses as it, runs programs as you, so use it in private networks
-            only; ``mpi``, the ranks of ``mpiexec -n N python -m mpi4py.futures -m ekfslam.cli ...``.
+        spec: ``processes`` on this machine; ``serial``, in the calling thread; ``tls://HOST:PORT``, the scheduler of a
+            Dask cluster, with the certificates of Dask's configuration ``distributed.comm.tls``; ``dask://HOST:PORT``,
+            the same without certificates, for private networks only, since anyone who reaches the port runs programs
+            as you; ``mpi``, the ranks of ``mpiexec -n N python -m mpi4py.futures -m ekfslam.cli ...``.
         workers: Number of processes, by default one per core; Dask has its own number.
 
     Raises:

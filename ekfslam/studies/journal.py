@@ -1,8 +1,7 @@
-"""The one engine for many runs: run what is missing, with every finished run on the disk at once.
+"""Run the missing runs of a study or sweep, and save each finished run to the disk at once.
 
-An archive is written as a whole, which a large study cannot afford after every run. Finished runs are appended to a
-journal next to the archive instead, each with its length and digest: an entry that a kill left incomplete is not read.
-The first entry names the study that the journal belongs to.
+An archive is written as a whole, which a large study cannot afford after every run. So finished runs are appended to a
+journal next to the archive, each with its length and digest. An entry that a kill left incomplete is not read.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ _LENGTH, _DIGEST = 8, 32  # bytes before an entry
 _LONGEST = 1 << 30
 
 Record = Mapping[str, Mapping[str, NDArray]]  # variant, field, value of one run
-Key = tuple[str, int]  # of a run: its level, or all that decides its numbers, and its number
+Key = tuple[str, int]  # of a run: level and number in a study; digest and 0 in a sweep
 
 
 def run_missing(
@@ -38,9 +37,9 @@ def run_missing(
     label: str,
     progress: bool = True,
 ) -> None:
-    """Run the tasks that the journal does not hold, and save all records at the end.
+    """Run the tasks that the journal does not hold, and save the archive at the end or when an exception interrupts.
 
-    They are also saved when an exception interrupts the work. After a kill, the next call finds them in the journal.
+    After a kill, the next call finds the finished runs in the journal.
 
     Args:
         journal: File for finished runs; it is removed once they are saved.
@@ -55,17 +54,17 @@ def run_missing(
         ArchiveError: The journal belongs to another study or is damaged; nothing is changed then.
         WriteError: Journal or archive cannot be written.
     """
-    held: dict[Key, Record] = {(level, run): record for level, run, record in journal.entries()}
+    held = dict(journal.entries())
     for key, record in held.items():
         keep(key, record)
     missing = [key for key in tasks if key not in held]
-    finished: Any = completed(missing, lambda key: submit(tasks[key]))
+    finished: Iterable[tuple[Key, Record]] = completed(missing, lambda key: submit(tasks[key]))
     if progress:
         finished = with_progress(finished, label, "run", total=len(missing))
     try:
-        for (level, run), record in finished:
-            journal.append(level, run, record)
-            keep((level, run), record)
+        for key, record in finished:
+            journal.append(key, record)
+            keep(key, record)
     finally:
         save()
         journal.remove()
@@ -76,7 +75,8 @@ class Journal:
 
     Args:
         archive: Path of the archive.
-        study: Everything that decides the numbers, ready for JSON; a journal of another study is refused.
+        study: Everything that decides the numbers, ready for JSON. It is the first entry; a journal of another study is
+            refused.
         blank: Function from a level to an empty record, which defines fields, shapes and types.
     """
 
@@ -84,8 +84,8 @@ class Journal:
         self.path, self.blank = archive.with_name(f".{archive.name}.journal"), blank
         self._heading = json.dumps(study, sort_keys=True).encode()
 
-    def entries(self) -> Iterator[tuple[str, int, Record]]:
-        """Return level, number and record of each run, up to the first incomplete entry.
+    def entries(self) -> Iterator[tuple[Key, Record]]:
+        """Yield key and record of each run, up to the first incomplete entry.
 
         Raises:
             ArchiveError: The journal belongs to another study, or an entry is no run of this one.
@@ -97,7 +97,7 @@ class Journal:
             try:
                 heading, _, content = entry.partition(b"\n")
                 level, run = json.loads(heading)
-                yield str(level), int(run), self._filled(level, content)
+                yield (str(level), int(run)), self._filled(level, content)
             except (ValueError, TypeError, LookupError, RecursionError) as error:
                 raise ArchiveError(f"{self.path}: damaged ({error})") from None
 
@@ -112,24 +112,21 @@ class Journal:
             raise ValueError(f"a run of {len(content)} bytes, expected {at}")
         return record
 
-    def append(self, level: str, run: int, record: Record) -> None:
+    def append(self, key: Key, record: Record) -> None:
         """Append a run and wait until it is on the disk.
 
         Raises:
             WriteError: The disk is full.
         """
-        blank = self.blank(level)
         parts = [
             np.asarray(record[variant][name], dtype=value.dtype).tobytes()
-            for variant, fields in blank.items()
+            for variant, fields in self.blank(key[0]).items()
             for name, value in fields.items()
         ]
-        heading = b"" if self.path.exists() else framed(self._heading)
-        self._write(heading + framed(json.dumps([level, run]).encode() + b"\n" + b"".join(parts)))
-
-    def _write(self, content: bytes) -> None:
-        """Append bytes and flush them to the disk; remove a part that a full disk has taken."""
+        content = framed(json.dumps(key).encode() + b"\n" + b"".join(parts))
         before = self.path.stat().st_size if self.path.is_file() else 0
+        if before == 0:
+            content = framed(self._heading) + content
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("ab") as file:
@@ -137,10 +134,8 @@ class Journal:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            if before:
+            if self.path.is_file():  # without the part that a full disk has taken
                 os.truncate(self.path, before)
-            elif self.path.is_file():
-                self.remove()
             raise WriteError(f"{self.path}: cannot be written: {error.strerror or error}") from None
 
     def remove(self) -> None:
@@ -149,7 +144,7 @@ class Journal:
 
 
 def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Return the values of nested mappings under dotted names."""
+    """Yield the values of nested mappings under dotted names."""
     for key, value in values.items():
         if isinstance(value, Mapping):
             yield from ((f"{key}.{name}", inner) for name, inner in flat(value))
@@ -163,7 +158,7 @@ def framed(content: bytes) -> bytes:
 
 
 def _read(path: Path) -> Iterator[bytes]:
-    """Return the entries of a file up to the first incomplete one."""
+    """Yield the entries of a file up to the first incomplete one."""
     if not path.is_file():
         return
     with path.open("rb") as file:

@@ -1,15 +1,7 @@
 """Monte Carlo studies of consistency: many simulated drives, several filter variants on each, one archive.
 
-    study = Study({"mid": LEVELS["mid"]}, ("invariant", "standard"), runs=50)
-    with open_executor("processes") as executor:
-        archive = run_study(study, "study.h5", executor)
-    print(study_table(summarise_study(archive)))  # of ekfslam.studies.summary
-
-The study's seed, the name of the level and the number of the run decide a realisation. Executor, number of workers,
-order and interruptions do not change a bit of it. The first pose is drawn from the prior of the filters, no outlier is
-simulated and nothing is gated, so the mean NEES of a consistent filter equals its degrees of freedom.
-
-The archive is one HDF5 file:
+The first pose is drawn from the prior of the filters, no outlier is simulated and nothing is gated, so the mean NEES of
+a consistent filter equals its degrees of freedom. Results are bit-equal for any executor and after interruptions.
 
     /                             attributes format, format_version, error_convention, study (JSON), seed, versions
     /levels/<level>               attribute world (JSON)
@@ -56,19 +48,15 @@ from ekfslam.studies.journal import Journal, Key, Record, flat, run_missing
 FORMAT = "ekfslam-study"
 FORMAT_VERSION = 2  # 2 added coordinates of all dimensions
 
-# Name of a variant in a study to its settings. The textbook filter has landmarks as positions in world.
+# Settings of each variant of a study. The textbook filter has landmarks as positions in world.
 TEXTBOOK = "textbook"
-_VARIANTS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {
-        **{variant: {"variant": variant} for variant in VARIANTS},
-        TEXTBOOK: {"variant": "standard", "landmark_coordinates": "xyz"},
-        **{f"{variant}-iterated": {"variant": variant, "iterations": 3} for variant in VARIANTS if variant != "fej"},
-    }
-)
+_VARIANTS: dict[str, dict[str, Any]] = {
+    **{variant: {"variant": variant} for variant in VARIANTS},
+    TEXTBOOK: {"variant": "standard", "landmark_coordinates": "xyz"},
+    **{f"{variant}-iterated": {"variant": variant, "iterations": 3} for variant in VARIANTS if variant != "fej"},
+}
 STUDY_VARIANTS: tuple[str, ...] = tuple(_VARIANTS)
-LABELS: Mapping[str, str] = MappingProxyType(
-    {name: name for name in STUDY_VARIANTS} | {TEXTBOOK: "textbook (standard, xyz)"}
-)
+LABELS: Mapping[str, str] = {name: name for name in STUDY_VARIANTS} | {TEXTBOOK: "textbook (standard, xyz)"}
 COMPARED = (*VARIANTS, TEXTBOOK)  # by default
 
 _SMALL_PRIOR: dict[str, Any] = {"initial_position_std_m": 0.01, "initial_rotation_std_rad": 0.001}
@@ -91,7 +79,6 @@ LEVELS: Mapping[str, Loop] = MappingProxyType(
 )
 
 JOINT_INSTANTS = 4  # equally spaced, the last one at the last frame
-
 MOST_VALUES = 10_000_000  # frames of all runs and variants: an archive of 1.4 GB
 
 # Data sets below a level, and below a variant of it.
@@ -126,10 +113,15 @@ VARIANT_LAYOUT = (
 class Study(Shown):
     """A Monte Carlo study: simulated worlds and the filter variants to compare on them.
 
+        study = Study({"mid": LEVELS["mid"]}, ("invariant", "standard"), runs=50)
+        with open_executor("processes") as executor:
+            archive = run_study(study, "study.h5", executor)
+        print(study_table(summarise_study(archive)))  # of ekfslam.studies.summary
+
     Args:
         levels: Name to world; the seed of a world is not used.
-        variants: Names in `STUDY_VARIANTS`: the variants of the filter, ``-iterated`` with three iterations an update,
-            and ``textbook``, the standard variant with landmarks in ``xyz``.
+        variants: Names in `STUDY_VARIANTS`: the variants of the filter, ``-iterated`` with three iterations per
+            update, and ``textbook``, the standard variant with landmarks in ``xyz``.
         runs: Number of realisations of each level.
         seed: Seed of all realisations.
 
@@ -170,7 +162,7 @@ class Study(Shown):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """All that decides the numbers, ready for JSON."""
+        """Everything that decides the numbers, ready for JSON."""
         return dataclasses.asdict(self)
 
 
@@ -190,10 +182,9 @@ def levels_of(names: Iterable[str]) -> dict[str, Loop]:
 
 
 def realisation(study: Study, level: str, run: int) -> Loop:
-    """Return the world of one run: the level with its own seed, hence with its own landmarks and road surface.
+    """Return the world of one run: the level with a seed from the study's seed, the level's name and the run.
 
-    So a mean over runs is also a mean over worlds. The seed depends on the study's seed, the level's name and the run
-    alone.
+    Landmarks and road surface depend on the seed, so a mean over runs is also a mean over worlds.
     """
     source = np.random.SeedSequence(entropy=study.seed, spawn_key=(crc32(level.encode()), run))
     return dataclasses.replace(study.levels[level], seed=int(source.generate_state(1, np.uint64)[0] >> 1))
@@ -201,16 +192,15 @@ def realisation(study: Study, level: str, run: int) -> Loop:
 
 def filter_config(level: Loop, variant: str) -> FilterConfig:
     """Return the settings of a variant: the prior that the truth is drawn from, and no rejected observation."""
-    return Config(
-        filter=FilterConfig(
-            **_VARIANTS[variant],
-            retire="never",
-            gate_probability=1.0,
-            split_after=0,
-            initial_position_std_m=level.initial_position_std_m,
-            initial_rotation_std_rad=level.initial_rotation_std_rad,
-        )
-    ).filter
+    settings = FilterConfig(
+        **_VARIANTS[variant],
+        retire="never",
+        gate_probability=1.0,
+        split_after=0,
+        initial_position_std_m=level.initial_position_std_m,
+        initial_rotation_std_rad=level.initial_rotation_std_rad,
+    )
+    return Config(filter=settings).filter  # checked
 
 
 def run_one(study: Study, level: str, run: int) -> dict[str, dict[str, NDArray]]:
@@ -323,14 +313,18 @@ class StudyArchive(Shown):
         facts = {level: f"{int(done.sum())} of {count(runs, 'run')}" for level, done in self.done.items()}
         facts["variants"] = ", ".join(self.study.variants)
         title = "complete" if self.complete else "not complete"
-        return Card(
-            title, facts, ("study_table(summarise_study(archive))", 'archive.data[level][variant]["pose_nees"]')
-        )
+        calls = ("study_table(summarise_study(archive))", 'archive.data[level][variant]["pose_nees"]')
+        return Card(title, facts, calls)
+
+    @property
+    def runs(self) -> int:
+        """Number of finished runs of all levels."""
+        return sum(int(mask.sum()) for mask in self.done.values())
 
     @property
     def complete(self) -> bool:
         """Whether all runs are finished."""
-        return all(mask.all() for mask in self.done.values())
+        return self.runs == self.study.runs * len(self.study.levels)
 
     def time_s(self, level: str) -> Array:
         """Return the nominal stamps (T,) of a level."""
@@ -352,11 +346,9 @@ class StudyArchive(Shown):
 
 
 def run_study(study: Study, path: str | Path, executor: Executor, progress: bool = True) -> StudyArchive:
-    """Run what the archive at ``path`` does not hold.
+    """Run everything that the archive at ``path`` does not hold; see `run_missing` for interruptions.
 
-    Every finished run is in a journal next to the archive at once. The archive is written when all runs are finished or
-    an exception interrupts them. The next call resumes after an interruption or a kill. A larger number of runs extends
-    a study.
+    A larger number of runs extends a study.
 
     Args:
         study: The study.
@@ -372,7 +364,7 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
     archive = StudyArchive.empty(study)
     if path.exists():
         _take_over(archive, path)
-    before = {level: done.copy() for level, done in archive.done.items()}
+    before = archive.runs
     decides = {**study.parameters, "runs": None, **versions()}
     journal = Journal(
         path, decides, lambda level: {variant: _blank(study.levels[level].frames) for variant in study.variants}
@@ -383,7 +375,7 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
             archive.put(key, record)
 
     def save() -> None:
-        if any((done != before[level]).any() for level, done in archive.done.items()):
+        if archive.runs > before:
             write_study(path, archive)
 
     tasks = {
@@ -423,7 +415,7 @@ def _take_over(archive: StudyArchive, path: Path) -> None:
 
 
 def write_study(path: str | Path, archive: StudyArchive) -> None:
-    """Write the archive of a study; it replaces an older file only when it is complete on the disk.
+    """Write the archive of a study.
 
     Raises:
         ArchiveError: The file cannot be written.
@@ -431,15 +423,9 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
     study = archive.study
 
     def fill(h5file: h5py.File) -> None:
-        hdf5.write_attributes(
-            h5file,
-            {
-                "error_convention": ERROR_CONVENTION,
-                "study": json.dumps(study.parameters),
-                "seed": str(study.seed),  # as text: a seed may be larger than any integer of HDF5
-                **versions(),
-            },
-        )
+        # The seed is text: it may be larger than any integer of HDF5.
+        facts = {"error_convention": ERROR_CONVENTION, "study": json.dumps(study.parameters), "seed": str(study.seed)}
+        hdf5.write_attributes(h5file, {**facts, **versions()})
         for level, world in study.levels.items():
             group = h5file.create_group(f"levels/{level}")
             hdf5.write_attributes(group, {"world": json.dumps(dataclasses.asdict(world))})

@@ -93,8 +93,7 @@ def study_table(summary: Mapping[str, Any]) -> str:
     low, high = chi2_bounds(6, BOUND_PROBABILITY, study["runs"])
     note = (
         f"{study['runs']} runs, seed {study['seed']}. Expected values in brackets; ± is three standard errors over "
-        "runs. "
-        f"Two-sided {100 * BOUND_PROBABILITY:g} % bounds of the mean pose NEES of as many runs at one instant: "
+        f"runs. Two-sided {100 * BOUND_PROBABILITY:g} % bounds of the mean pose NEES of as many runs at one instant: "
         f"{low:.2f} to {high:.2f}."
     )
     if TEXTBOOK in study["variants"]:

@@ -4,25 +4,8 @@
     with open_executor("processes") as executor:
         table = run_sweep(sweep, "sweep.h5", executor)
 
-A study is a TOML file. Every combination of listed values is run:
-
-    recordings = ["builtin:city?frames=300", { data = "0027.npz", truth = "poses/07.txt" }]
-    modes = ["dead-reckoning", "full"]
-    variants = ["invariant", "standard"]
-    seeds = [0, 1, 2]            # of built-in worlds; a recording is run once
-
-    [settings.noise]             # tables and keys of a configuration, see `ekfslam.config`
-    sigma_px = [1.0, 2.0, 4.0]
-
-    [cases."no tilt".noise]      # settings that belong together, under a name
-    tilt_deg = 0.0
-    [cases."velocities alone"]
-    mode = "dead-reckoning"
-
-A program may add columns and change recordings after they are read: see `Sweep` and `Recording`.
-
-The key of a run is a digest of all that decides its numbers, with the content of its recording and the versions of the
-software. So an interrupted sweep resumes, and an extended one runs only what is new.
+The format of the file is described in ``docs/sweep.md``. The key of a run is a digest of everything that decides its
+numbers, so an interrupted sweep resumes, and an extended one runs only new combinations.
 """
 
 from __future__ import annotations
@@ -63,7 +46,8 @@ MOST_RUNS = 100_000
 _ERROR_BYTES = 400
 _KEYS = {"recordings": list, "modes": list, "variants": list, "seeds": list, "settings": dict, "cases": dict}
 _FILES = ("data", "truth", "velocities")  # of a recording
-_RECORDING_KEYS = (*_FILES, "name", "extrinsics", "lateral", "velocity_frame", "frames")
+_READ_AS = ("truth", "extrinsics", "lateral", "velocities", "velocity_frame")  # arguments of `open_sequence`
+_RECORDING_KEYS = ("data", "name", "frames", *_READ_AS)
 _TAKEN = ("key", "recording", "seed", "case", "mode", "error", "run", *KEYS)  # names of columns
 
 Column = Callable[[Sequence, Result], float | None]
@@ -101,27 +85,26 @@ class Recording:
         """Whether a seed changes the recording."""
         return self.is_simulated or self.prepare is not None
 
-    def with_seed(self, seed: int) -> Recording:
+    def with_seed(self, seed: int | None) -> Recording:
         """Return the built-in world with a seed; return other recordings unchanged."""
-        if not self.is_simulated:
+        if seed is None or not self.is_simulated:
             return self
         return dataclasses.replace(self, data=f"{self.data}{'&' if '?' in self.data else '?'}seed={seed}")
 
     @cached_property
     def content(self) -> str:
-        """All that decides its numbers: digests of its files or the name of the world, and its preparation.
+        """Everything that decides its numbers: digests of its files or the name of the world, and its preparation.
 
         Raises:
             UnknownFormatError: A file is missing.
         """
-        prepared = [] if self.prepare is None else [_source(self.prepare)]
-        other = {"velocities": self.velocities and _digest(Path(self.velocities)), "frames": self.frames}
-        other |= {"velocity_frame": self.velocity_frame}
-        prepared += [f"{name} {value}" for name, value in other.items() if value]
-        if self.is_simulated:
-            return " ".join([self.data, *prepared])
-        files = [_digest(Path(p)) for p in (self.data, self.truth) if p]
-        return " ".join([self.extrinsics, self.lateral, *files, *prepared])
+        further = {"velocities": self.velocities and _digest(Path(self.velocities)), "frames": self.frames}
+        further |= {"velocity_frame": self.velocity_frame}
+        facts = [self.data] if self.is_simulated else [self.extrinsics, self.lateral]
+        if not self.is_simulated:
+            facts += [_digest(Path(path)) for path in (self.data, self.truth) if path]
+        facts += [] if self.prepare is None else [_source(self.prepare)]
+        return " ".join([*facts, *(f"{name} {value}" for name, value in further.items() if value)])
 
 
 @dataclass(frozen=True)
@@ -146,7 +129,7 @@ class Task:
     case: str
     mode: str
     overrides: Mapping[str, Mapping[str, Any]]
-    columns: Mapping[str, Column] = dataclasses.field(default_factory=dict)
+    columns: Mapping[str, Column]
 
     @cached_property
     def config(self) -> Config:
@@ -154,7 +137,7 @@ class Task:
 
     @cached_property
     def key(self) -> str:
-        """Digest of all that decides its numbers, as 64 hexadecimal digits."""
+        """Digest of everything that decides its numbers, as 64 hexadecimal digits."""
         facts: list[Any] = [self.recording.content, self.mode, dataclasses.asdict(self.config), versions()]
         if self.recording.prepare is not None:
             facts.append(self.seed)
@@ -199,7 +182,7 @@ class Sweep:
         for name in self.columns:
             if name in _TAKEN or not name or set(name) & set("./"):
                 raise ConfigError(f"a column of a sweep cannot have the name {name!r}")
-        seeded = sum(max(len(self.seeds), 1) if recording.is_seeded else 1 for recording in self.recordings)
+        seeded = sum(len(self._seeds_of(recording)) for recording in self.recordings)
         ways = sum(1 if case.mode else len(self.modes) for case in self._cases.values())
         count = seeded * ways * len(self.variants) * math.prod(len(values) for _, values in flat(self.settings))
         if not 1 <= count <= MOST_RUNS:
@@ -207,32 +190,32 @@ class Sweep:
         names = [recording.name for recording in self.recordings]
         if len(set(names)) < len(names):
             raise ConfigError(f"recordings of a sweep need different names, found {', '.join(names)}")
-        keys = [task.key for task in self.tasks]
-        if len(set(keys)) < len(keys):
+        if len({task.key for task in self.tasks}) < count:
             raise ConfigError("a sweep holds the same run twice: a value or recording stands in it twice")
 
     @property
     def _cases(self) -> Mapping[str, Case]:
         return self.cases or {"": Case()}
 
+    def _seeds_of(self, recording: Recording) -> tuple[int | None, ...]:
+        return self.seeds if self.seeds and recording.is_seeded else (None,)
+
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
-        """All runs, the mode changing fastest."""
+        """All runs; the mode changes fastest."""
         choices = dict(flat(self.settings))
         found = []
-        for recording in self.recordings:
-            for seed in self.seeds if recording.is_seeded and self.seeds else (None,):
-                seeded = recording if seed is None else recording.with_seed(seed)
-                for (name, case), variant, values in itertools.product(
-                    self._cases.items(), self.variants, itertools.product(*choices.values())
-                ):
-                    overrides: dict[str, dict[str, Any]] = {"filter": {"variant": variant}}
-                    for setting, value in zip(choices, values, strict=True):
-                        _put(overrides, setting, value)
-                    for table, own in case.overrides.items():
-                        overrides.setdefault(table, {}).update(own)
-                    modes = (case.mode,) if case.mode else self.modes
-                    found += [Task(seeded, seed, name, mode, overrides, self.columns) for mode in modes]
+        seeded = [(recording, seed) for recording in self.recordings for seed in self._seeds_of(recording)]
+        for (recording, seed), (name, case), variant, values in itertools.product(
+            seeded, self._cases.items(), self.variants, list(itertools.product(*choices.values()))
+        ):
+            overrides: dict[str, dict[str, Any]] = {"filter": {"variant": variant}}
+            for setting, value in zip(choices, values, strict=True):
+                _put(overrides, setting, value)
+            for table, own in case.overrides.items():
+                overrides.setdefault(table, {}).update(own)
+            modes = (case.mode,) if case.mode else self.modes
+            found += [Task(recording.with_seed(seed), seed, name, mode, overrides, self.columns) for mode in modes]
         return tuple(found)
 
     @staticmethod
@@ -244,8 +227,7 @@ class Sweep:
         """
         try:
             require_file(path, is_text=True)
-            found = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-            return _parsed(found, Path(path).parent)
+            return _parsed(tomllib.loads(Path(path).read_text(encoding="utf-8")), Path(path).parent)
         except UnknownFormatError as error:  # names the file
             raise ConfigError(str(error)) from None
         except (OSError, ValueError, RecursionError, ConfigError) as error:  # ValueError: no UTF-8, no TOML
@@ -253,10 +235,9 @@ class Sweep:
 
 
 def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool = True) -> SweepTable:
-    """Run what the table at ``path`` does not hold.
+    """Run every task that the table at ``path`` does not hold; see `run_missing` for interruptions.
 
-    Every finished run is in a journal next to the table at once. The table is written when all runs are finished or an
-    exception interrupts them. A run that a filter cannot finish is a row with an error and no figures.
+    A run that a filter cannot finish is a row with an error and no figures.
 
     Args:
         sweep: The sweep.
@@ -286,7 +267,7 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
     if path.exists():
         for row in read_table(path).rows():
             keep((row["key"], 0), _record(sweep.columns, row, row["error"]))
-    journal = Journal(path, "sweep", lambda _: _record(sweep.columns))
+    journal = Journal(path, "sweep", lambda _: _record(sweep.columns, {}))
     missing = {key: task for key, task in tasks.items() if key not in done}
     run_missing(
         journal, missing, lambda task: executor.submit(run_task, task, limit_gb()), keep, save, "sweep", progress
@@ -299,7 +280,7 @@ def run_task(task: Task, read_gb: float = DEFAULT_GB) -> Record:
 
     Args:
         task: The run.
-        read_gb: Limit on what is read, see `ekfslam.limits.reading_up_to`.
+        read_gb: Limit on the size of files, see `ekfslam.limits.reading_up_to`.
     """
     try:
         with ONE_RUN_AT_A_TIME, reading_up_to(read_gb):
@@ -310,12 +291,12 @@ def run_task(task: Task, read_gb: float = DEFAULT_GB) -> Record:
             figures |= {name: column(sequence, result) for name, column in task.columns.items()}
         return _record(task.columns, figures)
     except EkfslamError as error:
-        return _record(task.columns, error=printable(str(error)))
+        return _record(task.columns, {}, printable(str(error)))
 
 
-def _record(columns: Mapping[str, Column], figures: Mapping[str, Any] | None = None, error: str = "") -> Record:
+def _record(columns: Mapping[str, Column], figures: Mapping[str, Any], error: str = "") -> Record:
     """Return the record of a run: figures, NaN if missing, and the reason for having none."""
-    values = [(figures or {}).get(name) for name in (*KEYS, *columns)]
+    values = [figures.get(name) for name in (*KEYS, *columns)]
     numbers = np.array([np.nan if value is None else float(value) for value in values])
     return {"run": {"figures": numbers, "error": np.array(error.encode()[:_ERROR_BYTES], dtype=f"S{_ERROR_BYTES}")}}
 
@@ -323,8 +304,7 @@ def _record(columns: Mapping[str, Column], figures: Mapping[str, Any] | None = N
 @lru_cache(maxsize=2)
 def _opened(recording: Recording, seed: int | None, front_end: FrontEndConfig) -> Sequence:
     """Open a recording and keep it for the next run in the same process."""
-    names = ("truth", "extrinsics", "lateral", "velocities", "velocity_frame")
-    options: dict[str, Any] = {name: getattr(recording, name) for name in names}
+    options: dict[str, Any] = {name: getattr(recording, name) for name in _READ_AS}
     sequence = open_sequence(recording.data, front_end=front_end, **options)
     if recording.frames:
         sequence = sequence[stretch(recording.frames)]
@@ -333,20 +313,19 @@ def _opened(recording: Recording, seed: int | None, front_end: FrontEndConfig) -
 
 def _table(sweep: Sweep, done: Mapping[Key, Mapping[str, NDArray]]) -> SweepTable:
     """Return the finished runs in the order of the sweep."""
-    tasks = [task for task in sweep.tasks if (task.key, 0) in done]
     rows = []
-    for task in tasks:
-        record = done[task.key, 0]
+    for task in sweep.tasks:
+        record = done.get((task.key, 0))
+        if record is None:
+            continue
         settings = dataclasses.asdict(task.config)
         settings.pop("tuning")  # a record of the past
         case = {"case": task.case} if sweep.cases else {}
-        told = {"recording": task.recording.name, "seed": task.seed, **case, "mode": task.mode}
-        facts = {**told, **dict(flat(settings))}
+        facts = {"recording": task.recording.name, "seed": task.seed, **case, "mode": task.mode, **dict(flat(settings))}
         figures = dict(zip((*KEYS, *sweep.columns), record["figures"].tolist(), strict=True))
         rows.append({"key": task.key, **facts, **figures, "error": record["error"].item().decode(errors="replace")})
     swept = ["recording", *(["case"] if sweep.cases else []), "mode", "filter.variant"]
-    swept += ["seed"] if sweep.seeds else []
-    swept += dict(flat(sweep.settings))
+    swept += [*(["seed"] if sweep.seeds else []), *dict(flat(sweep.settings))]
     return SweepTable.of_rows(rows, tuple(swept), len(sweep.tasks))
 
 
@@ -358,8 +337,10 @@ def _put(overrides: dict[str, Any], name: str, value: Any) -> None:
     overrides[key] = value
 
 
+# --- The file --------------------------------------------------------------------------------------------------------
+
+
 def _parsed(found: Mapping[str, Any], folder: Path) -> Sweep:
-    """Return the sweep of the tables of a file."""
     for key in found:
         if key not in _KEYS:
             raise ConfigError(f"unknown key {key!r}; known: {', '.join(_KEYS)}")
@@ -378,7 +359,6 @@ def _parsed(found: Mapping[str, Any], folder: Path) -> Sweep:
 
 
 def _case(name: str, found: Any) -> Case:
-    """Return a case of a file: tables of settings, and a mode."""
     if not isinstance(found, dict):
         raise ConfigError(f"[cases.{name}] must be a table, found {found!r}")
     tables = {key: value for key, value in found.items() if key != "mode"}
@@ -398,16 +378,19 @@ def _recording(entry: Any, folder: Path) -> Recording:
             raise ConfigError(f"unknown key {key!r} of a recording; known: {', '.join(_RECORDING_KEYS)}")
     if "data" not in given:
         raise ConfigError(f"a recording has no data: {entry!r}")
+    data = given["data"]
     try:
         stretch(given.get("frames", ":"))
     except ValueError as error:
-        raise ConfigError(f"frames of {given['data']}: {error}") from None
-    is_simulated = given["data"].startswith(BUILTIN)
-    usual = given["data"].removeprefix(BUILTIN) if is_simulated else Path(given["data"]).stem
+        raise ConfigError(f"frames of {data}: {error}") from None
     places = {key: str((folder / given[key]).resolve()) for key in _FILES if key in given}
-    if is_simulated:
-        places["data"] = given["data"]
-    return Recording(**{**given, **places, "name": printable(given.get("name", usual))})
+    name = Path(data).stem
+    if data.startswith(BUILTIN):
+        places["data"], name = data, data.removeprefix(BUILTIN)
+    return Recording(**{**given, **places, "name": printable(given.get("name", name))})
+
+
+# --- Digests ---------------------------------------------------------------------------------------------------------
 
 
 def _source(value: Any) -> str:

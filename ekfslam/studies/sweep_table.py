@@ -1,13 +1,14 @@
 """The table of a sweep: one row a run, every setting and figure of merit a column, in HDF5 and Parquet.
 
 /           attributes format, format_version, swept (names of columns), requested runs, versions
-/table      one data set a column: numbers (NaN if missing) or text; run, their common dimension
+/table      one data set per column: numbers (NaN if missing) or text; run, their common dimension
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -50,9 +51,15 @@ class SweepTable:
 
     @staticmethod
     def of_rows(rows: Sequence[Mapping[str, Any]], swept: tuple[str, ...], asked: int) -> SweepTable:
-        """Make a table of rows; a missing entry is empty."""
-        names = dict.fromkeys(name for row in rows for name in row)
-        return SweepTable({name: _column([row.get(name) for row in rows]) for name in names}, swept, asked)
+        """Make a table of rows. A column of numbers and truth values holds floats, any other holds text."""
+        columns: dict[str, NDArray] = {}
+        for name in dict.fromkeys(name for row in rows for name in row):
+            values = [row.get(name) for row in rows]
+            if all(value is None or isinstance(value, int | float) for value in values):
+                columns[name] = np.array([np.nan if value is None else float(value) for value in values])
+            else:
+                columns[name] = np.array(["" if value is None else str(value) for value in values], dtype=object)
+        return SweepTable(columns, swept, asked)
 
     def column(self, name: str) -> NDArray:
         """Return a column by name.
@@ -76,7 +83,7 @@ class SweepTable:
         return {values: self._only(chosen) for values, chosen in rows.items()}
 
     def where(self, name: str, *values: str) -> SweepTable:
-        """Return the rows with one of some values in a column, written as `markdown` writes them.
+        """Return the rows with one of the values in a column, formatted as in `markdown`.
 
         Raises:
             ConfigError: There is no such column, or no such value in it.
@@ -97,11 +104,10 @@ class SweepTable:
         Raises:
             ConfigError: There is no such column.
         """
-        names = names or tuple(self.columns)
-        columns = [self.column(name).tolist() for name in names]
+        columns = {name: self.column(name).tolist() for name in names or self.columns}
         return [
-            {name: None if value != value else value for name, value in zip(names, values, strict=True)}
-            for values in zip(*columns, strict=True)
+            {name: None if values[i] != values[i] else values[i] for name, values in columns.items()}
+            for i in range(len(self))
         ]
 
     def markdown(self, figures: Sequence[str] = SHOWN) -> str:
@@ -132,17 +138,9 @@ def table_image(table: SweepTable) -> bytes:
     """
 
     def fill(h5file: h5py.File) -> None:
-        facts = {"swept": json.dumps(table.swept), "runs": table.asked, **versions()}
-        hdf5.write_attributes(h5file, facts)
-        group = h5file.create_group("table", track_order=True)
-        layout = [_item(name, values.dtype.kind) for name, values in table.columns.items()]
-        stored = {
-            name: values
-            if values.dtype.kind == "f"
-            else np.array([text.encode() for text in values.tolist()], dtype="S")
-            for name, values in table.columns.items()
-        }
-        hdf5.write_fields(group, layout, stored)
+        hdf5.write_attributes(h5file, {"swept": json.dumps(table.swept), "runs": table.asked, **versions()})
+        columns = {name: x if x.dtype.kind == "f" else hdf5.fixed_texts(x) for name, x in table.columns.items()}
+        hdf5.write_fields(h5file.create_group("table", track_order=True), _layout(columns), columns)
 
     return hdf5.image(FORMAT, FORMAT_VERSION, fill)
 
@@ -155,9 +153,13 @@ def write_table(path: str | Path, table: SweepTable) -> list[Path]:
     """
     path = Path(path)
     contents: dict[Path, str | bytes] = {path: table_image(table)}
-    parquet = _parquet(table)
-    if parquet is not None:
-        contents[path.with_suffix(".parquet")] = parquet
+    with suppress(ImportError):
+        import pyarrow
+        from pyarrow import parquet
+
+        columns = {name: values.tolist() for name, values in table.columns.items()}
+        parquet.write_table(pyarrow.table(columns), packed := BytesIO())
+        contents[path.with_suffix(".parquet")] = packed.getvalue()
     files.write_all(contents)
     return list(contents)
 
@@ -170,14 +172,10 @@ def read_table(path: str | Path) -> SweepTable:
     """
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         group = hdf5.subgroup(h5file, "table")
-        items = [_item(name, "f" if group[name].dtype.kind == "f" else "S") for name in group if name != _ROW]
-        found = hdf5.read_fields(group, items)
-        columns = {
-            name: value
-            if value.dtype.kind == "f"
-            else np.array([printable(text) for text in hdf5.texts(value)], dtype=object)
-            for name, value in found.items()
-        }
+        columns = hdf5.read_fields(group, _layout({name: group[name] for name in group if name != _ROW}))
+        for name, values in columns.items():
+            if values.dtype.kind != "f":
+                columns[name] = np.array([printable(text) for text in hdf5.texts(values)], dtype=object)
         swept = json.loads(str(hdf5.attribute(h5file, "swept")))
         missing = [name for name in ("key", "error", *swept, *KEYS) if name not in columns]
         if missing:
@@ -185,28 +183,11 @@ def read_table(path: str | Path) -> SweepTable:
         return SweepTable(columns, tuple(swept), int(hdf5.attribute(h5file, "runs")))
 
 
-def _item(name: str, kind: str) -> Item:
-    return Item(name, name, (_RUNS,), "see the name", "none", _ANY_NUMBER if kind == "f" else TEXTS)
-
-
-def _parquet(table: SweepTable) -> bytes | None:
-    """Return the table as Parquet, None if ``pyarrow`` is not installed."""
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError:
-        return None
-    packed = BytesIO()
-    columns = {name: values.tolist() for name, values in table.columns.items()}
-    parquet.write_table(pyarrow.table(columns), packed)
-    return packed.getvalue()
-
-
-def _column(values: Sequence[Any]) -> NDArray:
-    """Return numbers and truth values as floats if there is nothing else, otherwise all as text."""
-    if all(value is None or isinstance(value, int | float) for value in values):
-        return np.array([np.nan if value is None else float(value) for value in values])
-    return np.array(["" if value is None else str(value) for value in values], dtype=object)
+def _layout(columns: Mapping[str, Any]) -> list[Item]:
+    return [
+        Item(name, name, (_RUNS,), "see the name", "none", _ANY_NUMBER if values.dtype.kind == "f" else TEXTS)
+        for name, values in columns.items()
+    ]
 
 
 def _spoken(value: Any) -> str:

@@ -1,26 +1,10 @@
 """Tune the noise of a recording: find the noise under which its innovations are most likely, without truth.
 
-The log-likelihood is the sum over frames of ``log N(r; 0, S)``, innovation r and its covariance S: the prediction error
-decomposition (Schweppe, "Evaluation of likelihood functions for Gaussian signals", IEEE Trans. Information Theory 11,
-1965). What a filter accepts depends on the parameters, so rejected observations count, too:
-
-    log L = sum over accepted     log N(r; 0, S) + log(1 - e)
-          + sum over rejected     log(e / w^3)
-
-with a share e of wrong matches that fall anywhere within a window of w px in each of the three rows. Without the second
-sum the maximum would be at no noise, with everything rejected. An observation that starts a landmark counts as 0, since
-its prior is flat. Observations screened by their pixels alone, and tracks that travel with the rig, are left out.
-
-The maximum over the logarithms of the parameters is found in rounds. Each round decides at the present parameters which
-observations are wrong matches, with loose velocities, so that matches are judged by each other. Without these and
-without a gate it makes one Newton step: all runs of a round then accept the same observations, and the likelihood is
-smooth. A step that lowers log L, rejected observations included, is halved.
-
-Errors of real tracks agree among tracks for many frames, which no model here knows. So the likelihood wants less pixel
-noise than serves the estimate, and attributes the rest to the velocities. Standard errors are therefore those of the
-`sandwich`. Likelihood and the differences of the velocities (`ekfslam.models.noise`) are combined, weighted by their
-standard errors. Both know the velocities, so the error of the two together is a little too small where velocities are
-in the state (`Noise.twist_walk_std`).
+The log-likelihood is the prediction error decomposition, the sum of ``log N(r; 0, S)`` over frames (Schweppe,
+"Evaluation of likelihood functions for Gaussian signals", IEEE Trans. Information Theory 11, 1965), with a term for
+each rejected observation, see `penalised`. `Likelihood.climb` finds its maximum, `sandwich` the standard errors.
+`with_differences` combines both with the differences of the velocities (`ekfslam.models.noise`). The likelihood knows
+the velocities, too, so the combined error is slightly too small with velocities in the state.
 """
 
 from __future__ import annotations
@@ -59,7 +43,7 @@ LOG_WRONG = float(np.log(OUTLIER_SHARE) - 3 * np.log(OUTLIER_WINDOW_PX))
 _LOG_RIGHT = float(np.log1p(-OUTLIER_SHARE))
 _WRONG = (GATE, BEHIND_CAMERA, MOVING)  # rejected because of the filter's belief, not because of the pixels alone
 
-# Parameters with unit and search range.
+# Parameters with unit and search range. The first two are also found by differences.
 PARAMETERS = {
     "sigma_v_m_s": ("m/s", (1e-3, 10.0)),
     "sigma_w_rad_s": ("rad/s", (1e-5, 1.0)),
@@ -88,7 +72,7 @@ class Estimate:
 
     Args:
         name: Name in `NoiseConfig`.
-        value: Likelihood and differences together, weighted by their errors, in the unit of `PARAMETERS`.
+        value: Likelihood and differences combined, in the unit of `PARAMETERS`.
         error: Standard error of the value, or None.
         likely, likely_error: Estimate of the likelihood alone; None without a search or a maximum.
         remark: Reason for a missing estimate, or another remark.
@@ -109,7 +93,7 @@ class TunedNoise:
     Args:
         sequence: Name of the recording.
         model: Model of the noise as in `NoiseConfig`: ``tuned`` or ``white``.
-        estimates: All parameters, with those that the likelihood did not search.
+        estimates: All parameters, also those that the likelihood did not search.
         found: Noise of the velocities by their differences.
         log_likelihood: Maximum of the likelihood alone.
         frames, runs: Number of frames in a run, and number of runs.
@@ -154,7 +138,7 @@ class TunedNoise:
 
     @property
     def table(self) -> str:
-        """Estimates by differences, by likelihood and together, with errors and units, as a Markdown table."""
+        """Estimates by differences, by likelihood and combined, with errors and units, as a Markdown table."""
         differences = dict(zip(PARAMETERS, self.found.texts, strict=False))
         rows = []
         for estimate in self.estimates:
@@ -186,16 +170,14 @@ def tune(
     """Find the noise under which the innovations of the joint filter are most likely.
 
     The parameters are the pixel noise, the white noise of the velocities if the differences find more of it than is
-    assumed anyway, and on request the drift of tracks. `noise_of` decides all else, without the stated sigmas. The
-    search starts from the differences of the velocities and from twice the usual pixel noise: with too little at the
-    start, good matches would be rejected.
+    assumed anyway, and on request the drift of tracks. `noise_of` decides all else, without the stated sigmas.
 
     Args:
-        sequence: The recording; its truth is not used.
+        sequence: Recording; its truth is not used.
         config: Settings of the filter and the model of the noise; sigmas in it are ignored.
         drift: Whether to search the drift of the tracks, too.
-        observations: About how many observations are used. A longer recording is cut into stretches of 50 frames,
-            evenly spread over it, each filtered from the pose of dead reckoning, which is taken as certain.
+        observations: Approximate number of observations used. A longer recording is cut into stretches of 50 frames,
+            evenly spread over it. Each is filtered from the pose of dead reckoning, which is taken as certain.
 
     Raises:
         EmptyTracksError: The recording has no observations.
@@ -211,32 +193,27 @@ def tune(
     parts, gated, ungated = parts_of(sequence, config, base, observations)
     with one_thread():
         peak = Likelihood(parts, base, free, gated, ungated).climb(start, f"{sequence.name}: tuning")
+    estimates, frames = estimates_of(start, free, peak, found), sum(len(part) for part in parts)
     return TunedNoise(
-        sequence=sequence.name,
-        model=model,
-        estimates=estimates_of(start, free, peak, found),
-        found=found,
-        log_likelihood=peak.log_likelihood,
-        frames=sum(len(part) for part in parts),
-        runs=peak.runs,
-        converged=peak.converged,
+        sequence.name, model, estimates, found, peak.log_likelihood, frames, peak.runs, converged=peak.converged
     )
 
 
 def _start(base: Noise, found: VelocityNoise, drift: bool) -> tuple[dict[str, float], list[str]]:
-    """Return the parameters at the start, and the names of those that the likelihood searches."""
+    """Return the parameters at the start, and the names of those to search."""
     floor = base.motion_std[[0, 3]] if base.track_error is None else NOISY_FROM[[0, 3]]
     start = {
         "sigma_v_m_s": found.sigma[0] or base.twist_std[0],
         "sigma_w_rad_s": found.sigma[1] or base.twist_std[3],
+        # White noise starts from twice the usual pixel noise: with too little, good matches would be rejected.
         "sigma_px": (2.0 if base.track_error is None else 1.0) * float(base.pixel_std_px.mean()),
     }
     free = [name for name, sigma, least in zip(start, found.sigma, floor, strict=False) if sigma > least or not least]
-    if base.track_error is None and not drift:
-        free.append("sigma_px")
     if drift:
         start["drift"] = 0.2 if base.track_walk_px is None else float(base.track_walk_px[0])
         free.append("drift")
+    elif base.track_error is None:
+        free.append("sigma_px")
     return start, free
 
 
@@ -249,7 +226,7 @@ class Peak:
 
     Args:
         x: (n,) logarithms of the free parameters.
-        inside: (m,) indices of the parameters inside of their search range.
+        inside: (m,) indices of the parameters inside their search range.
         H: (m, m) Hessian of these.
         gradients: (m, T) gradients of the frames.
         log_likelihood: Value at the maximum.
@@ -294,7 +271,7 @@ class Likelihood:
         return with_drift(noise, value["drift"]) if "drift" in value else noise
 
     def judged(self, x: Array) -> Callable[[Array], Array]:
-        """Return a function for the terms of log L without the observations that are rejected at x.
+        """Return a function for the terms of log L, without the observations that are rejected at x.
 
         The terms are one per frame, and last the sum over the rejected observations.
         """
@@ -311,7 +288,11 @@ class Likelihood:
         return terms
 
     def climb(self, start: dict[str, float], label: str) -> Peak:
-        """Find the maximum in rounds, as the docstring of the module says.
+        """Find the maximum in rounds.
+
+        A round first rejects wrong matches, with loose velocities. Then it makes one Newton step without them and
+        without a gate: all its runs accept the same observations, so the likelihood is smooth. A step that lowers
+        log L, rejected observations included, is halved.
 
         Args:
             start: Parameters at the start, by name.
@@ -319,11 +300,12 @@ class Likelihood:
         """
         if not self.free:
             here = sum(float(log_likelihoods(part, self.base, self.gated).sum()) for part in self.parts)
-            none = np.zeros(0)
-            return Peak(none, none.astype(np.int64), none[:, None], none[:, None], here, len(self.parts), True)
+            none, empty = np.zeros(0), np.zeros((0, 0))
+            return Peak(none, none.astype(np.int64), empty, empty, here, len(self.parts), converged=True)
         bounds = np.log([PARAMETERS[name][1] for name in self.free])
         x = np.clip(np.log([start[name] for name in self.free]), *bounds.T)
         best, step, here, converged, runs = x, np.zeros(len(x)), -np.inf, False, 0
+        steps = _DIFFERENCE * np.eye(len(x))
         for _ in progress(range(_MOST_ROUNDS), label, unit="round"):
             terms = self.judged(x)
             now = terms(x)
@@ -332,49 +314,31 @@ class Likelihood:
                 step = step / 2  # the newly rejected observations cost more than the rest has won
             else:
                 here, best, at_best = float(now.sum()), x, terms
-                gradients, curvature, ahead = _derivatives(terms, x, here)
+                ahead, behind = (np.array([terms(x + sign * step) for step in steps]) for sign in (1.0, -1.0))
                 runs += 2 * len(x)
+                gradients = (ahead - behind) / (2 * _DIFFERENCE)
+                curvature = (ahead.sum(axis=1) + behind.sum(axis=1) - 2 * here) / _DIFFERENCE**2
                 step = gradients.sum(axis=1) / np.maximum(np.abs(curvature), 1e-9)
                 step = np.clip(x + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP), *bounds.T) - x
             x = best + step
             if np.abs(step).max() < _SHORTEST_STEP:
                 converged = True
                 break
-        H = _hessian(at_best, best, here, curvature, ahead)
-        runs += len(x) * (len(x) - 1) // 2
+        H = np.diag(curvature)
+        for i, j in zip(*np.tril_indices(len(x), -1), strict=True):
+            both = float(at_best(best + steps[i] + steps[j]).sum())
+            H[i, j] = H[j, i] = (both + here - ahead[i].sum() - ahead[j].sum()) / _DIFFERENCE**2
+            runs += 1
         x = x if converged else best
         inside = np.flatnonzero((x > bounds[:, 0]) & (x < bounds[:, 1]))
         return Peak(x, inside, H[np.ix_(inside, inside)], gradients[inside, :-1], here, runs, converged)
-
-
-def _derivatives(function: Callable[[Array], Array], x: Array, here: float) -> tuple[Array, Array, Array]:
-    """Differentiate a sum of m terms, given by a function of x (n,), by central differences.
-
-    Returns:
-        First differences (n, m) of the terms; second ones (n,) of the sum; the sum (n,) one step ahead.
-    """
-    steps = _DIFFERENCE * np.eye(len(x))
-    ahead, behind = (np.array([function(x + sign * step) for step in steps]) for sign in (1.0, -1.0))
-    sums = ahead.sum(axis=1), behind.sum(axis=1)
-    return (ahead - behind) / (2 * _DIFFERENCE), (sums[0] + sums[1] - 2 * here) / _DIFFERENCE**2, sums[0]
-
-
-def _hessian(function: Callable[[Array], Array], x: Array, here: float, diagonal: Array, ahead: Array) -> Array:
-    """Complete the second differences (n, n) of a sum of terms from the results of `_derivatives`."""
-    H = np.diag(diagonal)
-    steps = _DIFFERENCE * np.eye(len(x))
-    for i in range(len(x)):
-        for j in range(i):
-            both = float(function(x + steps[i] + steps[j]).sum())
-            H[i, j] = H[j, i] = (both + here - ahead[i] - ahead[j]) / _DIFFERENCE**2
-    return H
 
 
 # --- Estimates and their errors --------------------------------------------------------------------------------------
 
 
 def estimates_of(start: dict[str, float], free: list[str], peak: Peak, found: VelocityNoise) -> tuple[Estimate, ...]:
-    """Return all parameters with their standard errors: likelihood and differences, each alone and together.
+    """Return all parameters with their standard errors: likelihood and differences, alone and combined.
 
     Args:
         start: Parameters at the start, by name.
@@ -382,38 +346,34 @@ def estimates_of(start: dict[str, float], free: list[str], peak: Peak, found: Ve
         peak: Its maximum.
         found: Noise of the velocities by their differences.
     """
-    likely: dict[str, tuple[float, float]] = {}
-    together, errors = np.exp(peak.x), np.full(len(free), np.nan)
-    if len(peak.inside) and np.linalg.eigvalsh(peak.H)[-1] < 0:
-        names = [free[i] for i in peak.inside]
-        C = sandwich(peak.H, peak.gradients)
-        alone = together[peak.inside], np.sqrt(np.diag(C))
-        likely = {name: (value, value * error) for name, value, error in zip(names, *alone, strict=True)}
-        x, C = with_differences(peak.x[peak.inside], C, names, found)
-        together[peak.inside] = np.exp(x)
-        errors[peak.inside] = together[peak.inside] * np.sqrt(np.diag(C))
     pairs = zip(found.sigma.tolist(), found.sigma_error.tolist(), strict=True)
     differences = dict(zip(PARAMETERS, pairs, strict=False))
+    at_peak = dict(zip(free, np.exp(peak.x).tolist(), strict=True))
+    combined: dict[str, list[float]] = {}  # value and error, then those of the likelihood alone
+    if len(peak.inside) and np.linalg.eigvalsh(peak.H)[-1] < 0:
+        names, columns = [free[i] for i in peak.inside], []
+        alone = peak.x[peak.inside], sandwich(peak.H, peak.gradients)
+        for x, C in (with_differences(*alone, names, found), alone):
+            columns += [np.exp(x), np.exp(x) * np.sqrt(np.diag(C))]
+        rows = zip(names, np.transpose(columns), strict=True)
+        combined = {name: [float(f"{number:.6g}") for number in row] for name, row in rows}
     estimates = []
-    for name in start:
+    for name, value in start.items():
         sigma, sigma_error = differences.get(name, (0.0, 0.0))
-        if name not in free:
-            value = sigma if name in differences else start[name]
-            remark = _NO_PART if name == "sigma_px" else _BELOW_FLOOR if sigma else _UNSEEN
-            estimates.append(Estimate(name, value, sigma_error or None, remark=remark))
-            continue
-        i = free.index(name)
-        if name in likely:
-            value, error = likely[name]
-            apart = abs(value - sigma) / np.hypot(error, sigma_error)
+        if name in combined:
+            value, total_error, likely, error = combined[name]
+            apart = abs(likely - sigma) / np.hypot(error, sigma_error)
             remark = f"likelihood and differences are {apart:.1f} standard errors apart" if sigma and apart > 3 else ""
-            a, b, c, d = (float(f"{number:.6g}") for number in (together[i], errors[i], value, error))
-            estimates.append(Estimate(name, a, b, c, d, remark))
+            estimates.append(Estimate(name, value, total_error, likely, error, remark))
+        elif name in free:
+            at_bound = free.index(name) not in peak.inside
+            remark = "at the bound of the search range" if at_bound else "the likelihood has no maximum here"
+            likely = float(f"{at_peak[name]:.6g}")
+            estimates.append(Estimate(name, sigma or likely, sigma_error or None, likely, remark=remark))
         else:
-            at_bound = i not in peak.inside
-            remark = "at the bound of what is looked for" if at_bound else "the likelihood has no maximum here"
-            value = float(f"{together[i]:.6g}")
-            estimates.append(Estimate(name, sigma or value, sigma_error or None, value, remark=remark))
+            remark = _NO_PART if name == "sigma_px" else _BELOW_FLOOR if sigma else _UNSEEN
+            value = sigma if name in differences else value
+            estimates.append(Estimate(name, value, sigma_error or None, remark=remark))
     return tuple(estimates)
 
 
@@ -422,8 +382,8 @@ def sandwich(H: Array, scores: Array) -> Array:
 
     With A = -H and J the covariance of the gradient it is ``A^-1 J A^-1`` (Huber 1967; White, "Maximum likelihood
     estimation of misspecified models", Econometrica 50, 1982), scaled up where its diagonal is less than that of
-    ``A^-1``. J is the scatter of the gradients of blocks of 10 frames. It misses longer correlations and all errors
-    that are the same everywhere.
+    ``A^-1``. J is the scatter of the gradients of blocks of 10 frames. It misses longer correlations, and errors that
+    all frames share.
 
     Args:
         H: (n, n) Hessian, negative definite.
@@ -439,9 +399,9 @@ def sandwich(H: Array, scores: Array) -> Array:
 
 
 def with_differences(x: Array, C: Array, names: list[str], found: VelocityNoise) -> tuple[Array, Array]:
-    """Combine logarithms (n,) of parameters and their covariance (n, n) with the differences of the velocities.
+    """Combine logarithms (n,) of parameters, with covariance (n, n), with the differences of the velocities.
 
-    Both are taken as independent, though the likelihood has seen the velocities, too.
+    Both are taken as independent.
     """
     at, value, variance = [], [], []
     for name, sigma, error in zip(PARAMETERS, found.sigma, found.sigma_error, strict=False):
@@ -457,11 +417,11 @@ def with_differences(x: Array, C: Array, names: list[str], found: VelocityNoise)
 
 
 def log_likelihoods(sequence: Sequence, noise: Noise, config: Config) -> Array:
-    """Return the log-likelihood of a noise frame by frame (T,), see the docstring of the module.
+    """Return the log-likelihood of a noise frame by frame (T,), see `penalised`.
 
     Args:
         sequence: Recording, filtered from its first frame to its last.
-        noise: Noise that the filter assumes; sequence and configuration do not matter for it.
+        noise: Noise that the filter assumes, in place of that of the recording and the configuration.
         config: Resolved settings of the filter.
 
     Raises:
@@ -471,7 +431,13 @@ def log_likelihoods(sequence: Sequence, noise: Noise, config: Config) -> Array:
 
 
 def penalised(reports: list[FrameReport]) -> Array:
-    """Return the log-likelihoods (T,) of frames with their rejected observations."""
+    """Return the log-likelihoods (T,) of frames with their rejected observations.
+
+    What a filter accepts depends on the noise, so rejected observations count, too. Without them the maximum would be
+    at no noise, with everything rejected. A share e of wrong matches falls anywhere in a window of w px in each of
+    three rows: an accepted match adds ``log(1 - e)``, a rejected one ``log(e / w^3)``. Observations that start a
+    landmark count as 0, since its prior is flat. Observations rejected by their pixels alone are left out.
+    """
     rejected = np.array([np.isin(report.reason, _WRONG).sum() + len(report.split) for report in reports])
     accepted = np.array([report.log_likelihood + report.dof // 3 * _LOG_RIGHT for report in reports])
     return accepted + rejected * LOG_WRONG
@@ -529,13 +495,12 @@ def parts_of(
 def stretches(sequence: Sequence, config: Config, observations: int) -> list[Sequence]:
     """Cut a recording into stretches that are spread evenly over it; a small one stays whole.
 
-    Tracks are cleaned as in every run. Poses are those of dead reckoning, and the first pose of a stretch is its only
-    truth.
+    Tracks are cleaned as in every run. The first pose of a stretch, by dead reckoning, is its only truth.
 
     Args:
-        sequence: The recording.
+        sequence: Recording.
         config: Resolved settings.
-        observations: About how many observations the stretches have together.
+        observations: Approximate number of observations of all stretches.
     """
     noise = noise_of(sequence, config)
     tracks, _ = clean_tracks(sequence, noise, config.hygiene)
