@@ -2,7 +2,8 @@
 
 ``python tests/frozen/automatic.py`` writes ``automatic.npz``: the first frames of every recording that is present, and
 the built-in worlds, filtered and smoothed with the default configuration. The factor on track errors is given, since
-finding it is no part of the filter. The module `make` says what is kept of a result.
+finding it is no part of the filter. The module `make` says what is kept of a result. The program that froze them was
+corrected in one place: its smoother mixed two maps when it chose where landmarks start.
 """
 
 from __future__ import annotations
