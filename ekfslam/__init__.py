@@ -13,10 +13,10 @@ Conventions, everywhere:
 - ``T_a_b`` maps coordinates of frame b into frame a, ``p_a = T_a_b p_b``. Frames: ``world``, ``imu`` (x forward in a
   car), ``cam`` (left optical frame: x right, y down, z forward). The report's inverse IMU pose is ``T_imu_world``.
 - Tangent vectors are translation first: twist ``u = [v; w]`` (m/s, rad/s, IMU frame), pose error ``xi = [rho; theta]``.
-- Errors: ``T_imu_world = exp(xi^) T_hat``, landmark ``m = m_hat + d`` (world, metres). Covariances are of ``(xi, d)``,
-  whatever variant of the filter runs. `Result.position_covariance_world` is along the axes of world.
+- Errors: ``T_imu_world = exp(xi^) T_hat``, landmark ``m = m_hat + d`` (world, metres). Covariances are of ``(xi, d)``
+  in every variant of the filter. `Result.position_covariance_world` is along the axes of world.
 - ``twist[k]`` at stamp ``t[k]`` drives the interval ``(t[k-1], t[k]]``.
-- ``V`` is pixel noise, ``R`` a rotation. Units stand in names where a reader could doubt (``_s``, ``_px``, ``_m``).
+- ``V`` is pixel noise, ``R`` a rotation. Names carry units if a reader could doubt them (``_s``, ``_px``, ``_m``).
 
 Equations (docstrings cite these numbers)::
 
@@ -40,31 +40,37 @@ Equations (docstrings cite these numbers)::
     z(k) - f z(k-1) = h(k) - f h(k-1) + w  over pose k, pose k-1 and landmark        (10) errors of tracks
     q = T_cam_imu exp((n + l b)^) T_imu_world m, l the way in z(k) of a difference (10),
     else 0                                                                           (11) errors that landmarks share
+    R1 = R0 dR,  v1 = v0 + g tau + R0 dv,  p1 = p0 + v0 tau + g tau^2 / 2 + R0 dp,  u1 = R1^T v1,
+    F = S(u1)^-1 Phi S(u0),  Q = S(u1)^-1 Q_z S(u1)^-T                               (12) inertial samples
 
 Glossary:
 
-- *state block*: a part of the state besides landmarks: pose, twist, up, calibration, ... (`ekfslam.models.blocks`).
-- *body*: all blocks; *layout*: which columns of the covariance each has.
-- *sensor*: what observes landmarks (`ekfslam.models.sensors`); its *rows* are the numbers that one observation gives.
+- *state block*: a part of the state other than landmarks: pose, twist, up, calibration, ... (`ekfslam.models.blocks`).
+- *body*: all blocks; *layout*: the columns of each block in the covariance.
+- *input*: velocities or inertial samples of a recording; *process*: the model that moves blocks by them
+  (`ekfslam.models.process`).
+- *sensor*: a model of observations of landmarks (`ekfslam.models.sensors`); its *rows* are an observation's numbers.
 - *landmark initialisation*: eq. (5). A *delayed* one waits for a second view.
 - *innovation*: measured rows minus predicted ones; *gate*: the chi-square limit on its normalised square.
 - *shared innovation*: the motion of the camera on which all innovations of a frame agree; white if the model is true.
-- *NIS*, *NEES*: normalised innovation, estimation error squared; honest if their means are their degrees of freedom.
-- *truth noise*: how far the true poses may be wrong (`ekfslam.data.truth_noise`); *relative* NEES: of the motion
-  between two reported poses (`ekfslam.evaluation.relative`), whatever the error of the first.
+- *NIS*, *NEES*: normalised innovation or estimation error squared. A covariance is *consistent*, or honest, if their
+  means are their degrees of freedom.
+- *truth noise*: the errors of the true poses (`ekfslam.data.truth_noise`); *relative* NEES: that of the motion between
+  two reported poses (`ekfslam.evaluation.relative`), independent of the error of the first.
 - *considered*: in the covariance, but never corrected (`ekfslam.filters.references`).
-- *variant*: where the joint filter linearises and how a correction acts: invariant, fej, standard.
+- *variant*: linearisation point of the joint filter, and action of a correction: invariant, fej, standard.
 - *image coordinates*: (7') for landmarks, T_p the last updated pose, Y_x and Y_m derivatives of y; else *xyz*.
-- *gauge*: directions that nothing observes: where the world's origin is, and which way it is turned.
-- *track*: observations under one id; *hygiene*: cutting and dropping tracks before any estimator sees them.
-- *retire*: marginalise a landmark out of view; *map revival*: bring it back from the batch problem.
+- *gauge*: directions that no observation depends on: position and heading of the world, with (1) its whole rotation.
+- *track*: observations under one id; *hygiene*: cutting and dropping tracks before an estimator uses them.
+- *retire*: marginalise a landmark out of view; *dormant*: out of view, but still in the state; *map revival*: bring a
+  retired landmark back from the batch problem.
 - *batch problem*: all rows of a log over all frames and landmarks; *posterior*: its Gaussian.
-- *as filtered*: rows frozen where the filter linearised them; *map*: relinearised at the maximum a posteriori.
+- *as filtered*: rows frozen at the filter's linearisation; *map*: relinearised at the maximum a posteriori.
 - *coordinates* of a block: the sum of its corrections; those of vectors are their values.
 - *standard deviation*: of a Gaussian error, always one sigma.
 """
 
-# Names are imported when they are first used, so that `import ekfslam` takes no time: they stand in `__init__.pyi`.
+# `__init__.pyi` lists the names. They are imported on first use, so that `import ekfslam` is fast.
 import lazy_loader as _lazy
 
 _from_stub, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -495,12 +495,9 @@ def test_the_nis_of_a_study_is_per_degree_of_freedom_of_a_whole_run(serial):
 def test_the_pose_nees_that_the_first_page_quotes_is_that_of_the_program(tmp_path):
     """Six drives of 50, full length: within three standard errors of the quoted means."""
     page = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    quoted = re.search(
-        r"pose NEES is (\S+) ± (\S+), .*?has (\S+) ± (\S+) \(`ekfslam consistency --level mid --runs 50`",
-        page,
-        re.DOTALL,
-    )
-    ours, ours_width, textbook, textbook_width = map(float, quoted.groups())
+    row = r"^\| {} .*?\| (\S+) ± (\S+) \|"
+    quoted = [re.search(row.format(name), page, re.MULTILINE).groups() for name in ("invariant", "textbook")]
+    (ours, ours_width), (textbook, textbook_width) = np.array(quoted, dtype=float)
     runs = 6
     study = Study(levels_of(["mid"]), ("invariant", "textbook"), runs=runs)
     values = run_study(study, tmp_path / "s.h5", SerialExecutor()).data["mid"]

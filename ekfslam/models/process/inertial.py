@@ -1,4 +1,4 @@
-"""A gyroscope and an accelerometer move pose and velocity; their biases walk.
+"""A gyroscope and an accelerometer move pose and velocity, eq. (12); their biases walk.
 
 Inputs are the mean samples ``[w; f]`` of short pieces, rad/s and m/s^2, see `ekfslam.geometry.preintegration`. Errors
 of the state are those of its blocks: ``T_imu_world = exp(xi^) T_hat``, and additive ones of body velocity and biases.
