@@ -14,7 +14,6 @@ from support.helpers import FULL_SCALE, SUMMARY_KEYS, synthetic_result, syntheti
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.consistency import (
     chi2_bounds,
-    landmark_nees,
     nees,
     pose_error,
     pose_nees,
@@ -256,18 +255,6 @@ def test_pose_nees_uses_the_frames_that_truth_has():
     frames, values = pose_nees(result, Truth(some, sequence.truth.T_world_imu[some]))
     np.testing.assert_array_equal(frames, some)
     np.testing.assert_allclose(values, pose_nees(result, sequence.truth)[1][some], rtol=1e-12)
-
-
-def test_landmark_nees_takes_rows_by_id_and_is_three_on_average():
-    sequence = synthetic_sequence()
-    landmarks = synthetic_result(sequence).landmarks
-    rows, values = landmark_nees(landmarks, sequence.truth)
-    np.testing.assert_array_equal(rows, np.arange(len(landmarks)))
-    low, high = chi2_bounds(3, 0.999, runs=len(rows))
-    assert low < values.mean() < high
-    i = 17
-    d = sequence.truth.position_m[landmarks.id[i]] - landmarks.position_m[i]
-    assert values[i] == pytest.approx(d @ np.linalg.solve(landmarks.covariance[i], d), rel=1e-9)
 
 
 def test_invariant_landmark_error_inverts_the_retraction_of_equation_7():

@@ -1,16 +1,14 @@
 """NEES of poses and landmarks, averages over runs, and their bounds.
 
-All errors are in the stored coordinates of `ekfslam.filters.result.ERROR_CONVENTION`, the ones the covariances are of.
-
-NEES is correlated over some sixty frames, so that the frames of one run are nowhere near independent samples. Runs are:
-`average_over_runs` bounds an average by their scatter alone, and `chi2_bounds` is for one instant of several runs.
+Errors and covariances are in the coordinates of `ekfslam.filters.result.ERROR_CONVENTION`. The NEES is correlated over
+some sixty frames of a run, so only runs count as independent samples.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,8 +18,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.interpolation import stretches
 from ekfslam.data.sequence import Truth
 from ekfslam.data.truth_noise import TruthNoise
-from ekfslam.evaluation.trajectory import match_landmarks
-from ekfslam.filters.result import Landmarks, Result
+from ekfslam.filters.result import Result
 from ekfslam.geometry import se3
 from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.noise import GAP_STD
@@ -30,17 +27,14 @@ from ekfslam.models.noise import GAP_STD
 def pose_error(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
     """Return the pose error ``xi = log(T_imu_world_true T_imu_world_est^-1)`` (..., 6), m and rad.
 
-    The same ``xi`` is the right coordinate for every variant: the right-invariant error of ``T_world_imu`` is
-    ``log(T_world_imu_true T_world_imu_est^-1) = -Ad(T_world_imu_est) xi`` exactly, and NEES does not see a linear map.
+    It serves every variant: the right-invariant error of ``T_world_imu`` is ``-Ad(T_world_imu_est) xi``, and NEES is
+    the same in all linear coordinates.
     """
     return se3.log(se3.inverse(T_world_imu_true) @ T_world_imu_est)
 
 
 def world_axes_errors(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
-    """Return estimate minus truth along world axes (n, 6): position, m, and ``log(R_est R_true^T)``, rad.
-
-    `world_axes_covariance` has their covariances.
-    """
+    """Return estimate minus truth along world axes (n, 6): position, m, and ``log(R_est R_true^T)``, rad."""
     R_error = T_world_imu_est[:, :3, :3] @ np.swapaxes(T_world_imu_true[:, :3, :3], 1, 2)
     return np.hstack([T_world_imu_est[:, :3, 3] - T_world_imu_true[:, :3, 3], se3.so3_log(R_error)])
 
@@ -54,14 +48,14 @@ def world_axes_std(T_world_imu: Array, covariance: Array) -> Array:
 def nees(error: Array, covariance: Array) -> Array:
     """Return the normalised estimation error squared ``e^T P^-1 e`` (...) of (..., n) and (..., n, n).
 
-    NaN where P is not positive definite to rounding, as at a first frame whose pose is known exactly. Units do not
-    matter: definiteness is judged on the correlation matrix.
+    NaN if P is not positive definite to rounding, such as that of a known first pose. The correlation matrix decides,
+    so units do not matter.
     """
     size = error.shape[-1]
     std = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     scale = np.where(std > 0, std, 1.0)
     correlation = covariance / (scale[..., :, None] * scale[..., None, :])
-    # Bound on the smallest eigenvalue from which rounding cannot make a Cholesky factorisation fail.
+    # Above this bound on the smallest eigenvalue, rounding cannot make a Cholesky factorisation fail.
     definite = np.linalg.eigvalsh(correlation)[..., 0] > size**2 * np.finfo(float).eps
     L = np.linalg.cholesky(np.where(definite[..., None, None], correlation, np.eye(size)))
     whitened = np.linalg.solve(L, (error / scale)[..., None])[..., 0]
@@ -69,15 +63,10 @@ def nees(error: Array, covariance: Array) -> Array:
 
 
 def measured_truth(truth: Truth, interpolated: BoolArray, time_s: Array) -> Truth:
-    """Return the truth of the frames that no interpolated interval leads to; only these can be judged.
+    """Return the truth of the frames (T,) that no interpolated interval leads to; only these can be judged.
 
-    All poses are relative to the first one. If the recording begins with such a stretch, the first position is
-    interpolated, too. Its error then includes that of the speed across the gap.
-
-    Args:
-        truth: Of a recording.
-        interpolated: (T,) its interpolated intervals.
-        time_s: (T,) its stamps.
+    If the recording begins with interpolated intervals, its first position is uncertain by the speed over that gap, and
+    all other positions are relative to it.
     """
     kept, noise = ~interpolated[truth.frame], truth.noise
     if noise is not None and interpolated[1:2].any():
@@ -90,12 +79,10 @@ def measured_truth(truth: Truth, interpolated: BoolArray, time_s: Array) -> Trut
 
 
 def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Array:
-    """Return the covariance (n, 6, 6) that the error of the first true pose adds to later errors.
+    """Return the covariance (n, 6, 6) that the error ``e0 ~ N(0, P_0)`` of the first true pose adds to later errors.
 
-    An estimate starts at the first true pose. An error ``e0`` of that moves the whole estimate. With ``T_hat`` the
-    estimated ``T_imu_world``,
-
-        xi_k += Ad(T_hat_k T_hat_0^-1) e0,    e0 ~ N(0, P_0).
+    An estimate starts at the first true pose, so with ``T_hat`` the estimated ``T_imu_world``,
+    ``xi_k += Ad(T_hat_k T_hat_0^-1) e0``.
     """
     first = np.array([noise.first_roll_rad, noise.first_pitch_rad, noise.first_yaw_rad])
     variance = np.concatenate([np.full(3, noise.first_position_m), first]) ** 2
@@ -104,10 +91,10 @@ def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Ar
 
 
 def pose_noise_covariance(noise: TruthNoise, T_world_imu_true: Array, time_s: Array) -> Array:
-    """Return the covariance (n, 6, 6) of the errors of single true poses, in the coordinates of ``xi``.
+    """Return the covariance ``stamp^2 u u^T + diag(position^2, attitude^2)`` (n, 6, 6) of single true poses.
 
-    A stamp that is off by dt gives the pose ``exp(-dt u^) T_imu_world``, with the velocities u of the IMU taken from
-    the true poses on both sides. The covariance is ``stamp^2 u u^T + diag(position^2, attitude^2)``.
+    A stamp that is off by dt gives the pose ``exp(-dt u^) T_imu_world``. The velocities u of the IMU are taken from
+    the true poses on both sides.
     """
     white = np.diag(np.repeat([noise.position_m, noise.attitude_rad], 3) ** 2)
     if len(time_s) < 2:
@@ -121,11 +108,8 @@ def pose_noise_covariance(noise: TruthNoise, T_world_imu_true: Array, time_s: Ar
 def pose_errors(result: Result, truth: Truth, with_truth_noise: bool) -> tuple[Array, Array]:
     """Return the errors ``xi`` (n, 6) at the frames of the truth, and their covariance (n, 6, 6).
 
-    Args:
-        result: The estimate; starts at the first true pose.
-        truth: Its truth.
-        with_truth_noise: Whether the covariance is of estimate *and* truth, whose errors are independent. A truth
-            that states no noise is exact.
+    With truth noise it is the covariance of estimate and truth, whose errors are independent. The estimate starts at
+    the first true pose. A truth that states no noise is exact.
     """
     frame = truth.frame
     error = pose_error(result.T_world_imu[frame], truth.T_world_imu)
@@ -138,10 +122,9 @@ def pose_errors(result: Result, truth: Truth, with_truth_noise: bool) -> tuple[A
 
 
 def pose_nees(result: Result, truth: Truth, with_truth_noise: bool = False) -> tuple[IntArray, Array]:
-    """Return the frames with true pose (n,) and the pose NEES there (n,), 6 degrees of freedom; NaN if P is singular.
+    """Return the frames with true pose (n,) and the pose NEES there (n,), 6 degrees of freedom.
 
-    By default the truth counts as exact; ``with_truth_noise`` adds its noise to the covariance, see `pose_errors`. Both
-    are of the same frames: those where the estimate's own P is not singular.
+    NaN if the estimate's own P is singular, with truth noise and without.
     """
     values = nees(*pose_errors(result, truth, with_truth_noise=False))
     if with_truth_noise and truth.noise is not None:
@@ -152,7 +135,7 @@ def pose_nees(result: Result, truth: Truth, with_truth_noise: bool = False) -> t
 def pose_nees_by_axis(result: Result, truth: Truth) -> Array:
     """Return squared errors divided by their variances (n, 6), truth noise included; 1 expected on each axis.
 
-    NaN where the estimate's own variance is 0. Axes are those of the IMU: position x, y, z, then rotation about them.
+    Axes are those of the IMU: position x, y, z, then rotation about them. NaN if the estimate's own variance is 0.
     """
     error, covariance = pose_errors(result, truth, with_truth_noise=True)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
@@ -160,83 +143,33 @@ def pose_nees_by_axis(result: Result, truth: Truth) -> Array:
     return np.where(is_uncertain, error**2 / np.where(is_uncertain, variance, 1.0), np.nan)
 
 
-def landmark_nees(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, Array]:
-    """Return rows of the landmarks with known true position (n,), and the NEES of ``d = m - m_hat`` (n,), 3 dof.
+def average_over_runs(per_run: Array) -> dict[str, Any]:
+    """Return mean, half width, median and number of runs of one value per run (runs,); NaN stands for no value.
 
-    This is exact for filters whose landmark error is additive. The invariant variant's stored covariance is of ``d``
-    only to first order in the rotation error of the pose at the same time. If that error is not small, use
-    `ekfslam.filters.variants.Invariant.landmark_error` and `nees` instead.
+    ``half_width`` is three standard errors of the mean, None for fewer than two runs. One run that diverges spoils the
+    mean, but not the median.
     """
-    rows, truth_rows = match_landmarks(landmarks, truth)
-    error = truth.position_m[truth_rows] - landmarks.position_m[rows]
-    return rows, nees(error, landmarks.covariance[rows])
-
-
-def joint_nees(xi: Array, landmark_error: Array, P: Array) -> float:
-    """Return the NEES of pose and landmarks together, 6 + 3n degrees of freedom; NaN if P is singular.
-
-    ``xi`` (6,) and ``landmark_error`` (n, 3) in stored coordinates, P (6+3n, 6+3n) in the same order.
-    """
-    return float(nees(np.concatenate([xi, landmark_error.ravel()]), P))
-
-
-@dataclass(frozen=True)
-class RunAverage:
-    """Average of independent runs, each of which counts once.
-
-    Args:
-        mean: Over runs; None if no run has a value.
-        half_width: Three standard errors, ``3 sd / sqrt(runs)``; None for fewer than two runs.
-        median: Over runs; one run that diverges spoils the mean, but not this.
-        runs: How many have a value.
-    """
-
-    mean: float | None
-    half_width: float | None
-    median: float | None
-    runs: int
-
-
-def average_over_runs(per_run: Array) -> RunAverage:
-    """Return the average of one value per run (runs,); NaN stands for a run without a value."""
     values = per_run[np.isfinite(per_run)]
-    if len(values) == 0:
-        return RunAverage(None, None, None, 0)
-    half_width = float(3.0 * values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
-    return RunAverage(float(values.mean()), half_width, float(np.median(values)), len(values))
+    runs = len(values)
+    return {
+        "mean": float(values.mean()) if runs else None,
+        "half_width": float(3.0 * values.std(ddof=1) / np.sqrt(runs)) if runs > 1 else None,
+        "median": float(np.median(values)) if runs else None,
+        "runs": runs,
+    }
 
 
-def time_average(values: Array) -> Array:
-    """Return the mean over time of each run (runs,) of (runs, T); NaN entries do not count."""
-    return _nanmean(values, axis=1)
-
-
-def anees(values: Array, dof: int, probability: float) -> tuple[Array, Array, Array]:
-    """Return the average over runs at every time, and its two-sided bounds with ``probability`` if P is true.
-
-    Args:
-        values: (runs, T) NEES; NaN entries (singular P, a filter that has stopped) do not count.
-        dof: Degrees of freedom of one value.
-        probability: Of the bounds, at one time.
-
-    Returns:
-        Mean, lower and upper bound, (T,) each; NaN where no run has a value.
-    """
-    runs = np.isfinite(values).sum(axis=0)
-    low, high = chi2_bounds(np.full(len(runs), dof), probability, np.maximum(runs, 1))
-    return _nanmean(values, axis=0), np.where(runs > 0, low, np.nan), np.where(runs > 0, high, np.nan)
-
-
-def _nanmean(values: Array, axis: int) -> Array:
+def nanmean(values: Array, axis: int) -> Array:
+    """Return the mean over an axis; NaN entries do not count, and the mean of none is NaN."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # NaN is the answer where there is nothing to average
+        warnings.simplefilter("ignore", RuntimeWarning)
         return np.asarray(np.nanmean(values, axis=axis))
 
 
 def chi2_bounds(dof: ArrayLike, probability: float, runs: ArrayLike = 1) -> tuple[Array, Array]:
     """Return the two-sided bounds that hold the mean of ``runs`` independent chi-square values with ``probability``.
 
-    ``dof`` are the degrees of freedom of one value (any shape); lower and upper bound have its shape.
+    ``dof`` are the degrees of freedom of one value (any shape).
     """
     tails = (1.0 - probability) / 2.0
     runs = np.asarray(runs)

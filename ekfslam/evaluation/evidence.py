@@ -1,9 +1,9 @@
 """Evidence on the covariance of a run, from its innovations, its smoother and its truth.
 
 A correct model has innovations that are white over frames, along tracks and between landmarks. Each deviation points at
-a part of the model. Shared innovations (`ekfslam.filters.result.WhitenedInnovations`) that are too large or persistent
-are errors of the velocities, or errors common to all tracks. The remainder of an observation, without its shared part,
-is an error of that track alone. `ekfslam.evaluation.honesty` turns the evidence into a judgement.
+a part of the model: large or persistent shared innovations (`ekfslam.filters.result.WhitenedInnovations`) at the
+velocities or at errors common to all tracks, the remainder of an observation at its track alone.
+`ekfslam.evaluation.honesty` judges the evidence.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ekfslam.geometry import se3
 from ekfslam.smoother.posterior import Posterior
 
 LAGS = 20  # frames over which autocorrelation is shown
-_LAGS_OF_SUMS = 60  # upper limit of the frames over which it is summed, besides a tenth of the drive
+_LAGS_OF_SUMS = 60  # frames over which it is summed: a tenth of the drive, at most this
 AXES = ("forward", "lateral", "vertical", "roll", "pitch", "yaw")  # x, y, z of the IMU
 ROWS = ("u", "v", "disparity")
 BLIND = (
@@ -51,13 +51,13 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Whiteness:
-    """How far n series of innovations are from white noise of the stated size.
+    """Deviation of n series of innovations from white noise of the stated size.
 
     Args:
         size: Mean square per degree of freedom.
         correlation: (21, n) autocorrelation, lags 0 to 20 frames.
         factor: (n,) square root of the long-run variance: ratio of errors to covariance.
-        persistence: (n,) long-run variance about the mean, divided by the variance: 1 is white.
+        persistence: (n,) long-run variance about the mean, divided by the variance; 1 if white.
     """
 
     size: Ratio
@@ -70,13 +70,13 @@ class Whiteness:
 class SharedInnovations(Whiteness):
     """Errors common to the landmarks of a frame, along `AXES`.
 
-    The axes are examined in the order of ``factor``. Each is corrected for the axes before it, because an error in yaw
-    resembles one in lateral position. ``std`` and ``correlation`` are of each axis alone.
+    Axes are examined by falling ``factor``, each corrected for the axes before it, because an error in yaw resembles
+    one in lateral position. ``std`` and ``correlation`` are of each axis alone.
 
     Args:
         std: (6,) standard deviation about 0; 1 expected.
         order: (6,) axes, worst first.
-        factor_low: (6,) lower bound of ``factor``, three standard errors below it.
+        factor_low: (6,) ``factor`` minus three standard errors.
         mean, mean_error: (6,) means in standard deviations of a frame, and their standard errors.
         rate: (6,) mean motion in m/s and rad/s: lower bound of a constant bias of the velocities.
         frames: Number of frames examined.
@@ -96,7 +96,7 @@ class TrackInnovations(Whiteness):
     """Errors of single observations, without the shared motion, along tracks, by `ROWS`.
 
     Args:
-        scale: Ratio of the variances of single observations to the stated ones, corrected for the cut of the gate.
+        scale: Ratio of the variances to the stated ones, corrected for the cut of the gate.
         pairs: (21,) number of pairs of observations behind ``correlation``.
     """
 
@@ -110,9 +110,8 @@ class RejectedShares:
 
     Args:
         reasons: Share of all observations by reason.
-        gate: Share of the observations of known landmarks that the gates rejected in calm frames; None without whitened
-            innovations.
-        expected: Expected value of ``gate`` under the model with the variances that accepted innovations show.
+        gate: Share of known landmarks that the gates rejected in calm frames; None without whitened innovations.
+        expected: Value of ``gate`` expected from the variances of accepted innovations.
     """
 
     reasons: Mapping[str, float]
@@ -122,13 +121,13 @@ class RejectedShares:
 
 @dataclass(frozen=True)
 class PriorAgreement:
-    """A reported parameter against its prior.
+    """Agreement of a reported parameter with its prior.
 
     Args:
         name: Name of the parameter.
         pull: Last estimate divided by ``sqrt(prior^2 - std^2)``; None if nothing was learnt.
-        increment: Root mean square of the changes over tenths of the drive, divided by
-            ``sqrt(std_before^2 - std_after^2)``; None if the deviation does not fall: the parameter is not constant.
+        increment: Root mean square of the changes over tenths of the drive, each divided by
+            ``sqrt(std_before^2 - std_after^2)``; None if the parameter is not constant, as its deviation does not fall.
     """
 
     name: str
@@ -141,8 +140,8 @@ class SmootherAgreement:
     """Filtered minus smoothed poses, whose covariance is ``P_filter - P_smoothed``.
 
     Args:
-        size: Normalised square per degree of freedom, over the directions in which the smoother gained. Its error
-            allows for correlation over a fifth of the drive, and is rough.
+        size: Normalised square per degree of freedom, over the directions in which the smoother gained. Its error is
+            rough, and allows for correlation over a fifth of the drive.
         std: (6,) root mean square of each axis alone; NaN if the smoother gained nothing there.
         frames: Number of frames compared.
     """
@@ -154,10 +153,7 @@ class SmootherAgreement:
 
 @dataclass(frozen=True)
 class TruthAgreement:
-    """Mean pose NEES over the frames (6 expected), truth noise included, and the 95 % bounds of a single pose.
-
-    Errors persist over the frames of a drive, so one drive counts as one sample.
-    """
+    """Mean pose NEES, truth noise included, and the 95 % bounds of a single pose: errors persist over a drive."""
 
     nees: float
     low: float
@@ -176,7 +172,7 @@ def examined_frames(result: Result) -> BoolArray:
 
 
 def partial(whitened: WhitenedInnovations, axis: int, given: IntArray) -> Array:
-    """Return score ``axis`` (T,) without its regression on the scores ``given``, by its deviation; NaN if that is 0."""
+    """Return score ``axis`` (T,) minus its regression on the scores ``given``, in deviations; NaN if that is 0."""
     c, C = whitened.score, whitened.information
     mean, variance = c[:, axis], C[:, axis, axis]
     if len(given):
@@ -192,7 +188,7 @@ def partial(whitened: WhitenedInnovations, axis: int, given: IntArray) -> Array:
 
 
 def shared_innovations(whitened: WhitenedInnovations, examined: BoolArray, tau_s: Array) -> SharedInnovations:
-    """Return the errors common to all landmarks in the frames examined (T,), whose intervals are ``tau_s`` (T,)."""
+    """Return the errors common to all landmarks in the frames examined (T,), with intervals ``tau_s`` (T,)."""
     kept = dataclasses.replace(whitened, score=whitened.score[examined], information=whitened.information[examined])
     frames = int(examined.sum())
     lags = max(LAGS, min(_LAGS_OF_SUMS, frames // 10))
@@ -244,7 +240,7 @@ def track_innovations(result: Result, examined: BoolArray, gate: float) -> Track
 
 
 def reasons_of(result: Result) -> dict[str, float]:
-    """Return the share of all observations that was rejected, by reason; reasons without any are left out."""
+    """Return the share of all observations rejected for each reason that occurs."""
     total = max(int((result.innovation.accepted + result.innovation.rejected).sum()), 1)
     counts = np.bincount(result.rejections.reason, minlength=len(REASONS)).tolist()
     return {name: number / total for name, number in zip(REASONS, counts, strict=True) if number}
@@ -257,7 +253,7 @@ def rejected_shares(result: Result, examined: BoolArray, gate: float, own_scale:
     """
     assert result.whitened is not None
     whitened, rejections, frames = result.whitened, result.rejections, len(result.time_s)
-    # If the shared innovations of a frame are large, the gates reject good observations, too.
+    # If the shared innovation of a frame is large, the gates reject good observations, too.
     nis = whitened.shared_nis
     calm = examined & (nis <= np.median(nis[examined]))
     known = np.bincount(whitened.frame, minlength=frames)[calm].sum()
@@ -266,15 +262,12 @@ def rejected_shares(result: Result, examined: BoolArray, gate: float, own_scale:
     squares = whitened.alone[calm[whitened.frame]] ** 2
     dimension = squares.shape[1]
     scale = max(whiteness.gated_scale(float(np.nanmean(squares)), dimension, gate), own_scale)
-    return RejectedShares(
-        reasons_of(result),
-        float(at_gate / max(at_gate + known, 1)),
-        whiteness.rejected_share(scale, dimension, gate),
-    )
+    share = float(at_gate / max(at_gate + known, 1))
+    return RejectedShares(reasons_of(result), share, whiteness.rejected_share(scale, dimension, gate))
 
 
 def prior_agreement(parameters: Parameters) -> tuple[PriorAgreement, ...]:
-    """Return every parameter against its prior, and its changes against the changes of its deviation."""
+    """Return the agreement of every parameter with its prior."""
     at = np.linspace(0, len(parameters.value) - 1, 11).astype(int)
     found = []
     for i, name in enumerate(parameters.name):
@@ -290,7 +283,7 @@ def prior_agreement(parameters: Parameters) -> tuple[PriorAgreement, ...]:
 
 
 def smoother_agreement(result: Result, smoothed: Posterior) -> SmootherAgreement:
-    """Compare filtered with smoothed poses, see `SmootherAgreement`."""
+    """Compare filtered with smoothed poses."""
     difference = pose_error(result.T_world_imu, smoothed.T_world_imu)
     turned = se3.adjoint(se3.exp(-difference))
     P, after = result.covariance, turned @ smoothed.pose_covariance @ turned.swapaxes(1, 2)
@@ -299,7 +292,7 @@ def smoother_agreement(result: Result, smoothed: Posterior) -> SmootherAgreement
     std = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
     correlation = P / (std[:, :, None] * std[:, None, :])
     values, axes = np.linalg.eigh(correlation)
-    # W^T P W = I, so that the shares are the relative gain of the smoother in each direction.
+    # W^T P W = I, so the shares are the relative gain of the smoother in each direction.
     W = axes / np.sqrt(np.maximum(values, 1e-12))[:, None, :] / std[:, :, None]
     shares, directions = np.linalg.eigh(W.swapaxes(1, 2) @ gain @ W)
     along = np.einsum("tba,tcb,tc->ta", directions, W, difference)

@@ -1,7 +1,6 @@
 """`judge`: verdicts on the covariance of a run, with their causes, from all evidence that the run offers.
 
-A full run is judged by its innovations. Other modes and older archives keep none, so that the size of the NIS and the
-truth remain.
+A full run is judged by its innovations. Other modes and older archives keep none: only NIS and truth remain.
 """
 
 from __future__ import annotations
@@ -43,10 +42,10 @@ class Cause:
     """A defect of the model.
 
     Args:
-        kind: A key of ``_SHARED`` for errors common to the landmarks of a frame, ``pixel noise``, ``tracks``,
-            ``agreement``, ``outliers``, ``moving``, ``prior`` or ``smoother``.
+        kind: ``bias``, ``shared drift``, ``shared noise``, ``pixel noise``, ``tracks``, ``agreement``, ``outliers``,
+            ``moving``, ``prior`` or ``smoother``.
         where: Axes, rows, or names of parameters.
-        factor: Ratio of errors to covariance, beyond what single observations explain; 1 for causes without one.
+        factor: Ratio of errors to covariance that single observations do not explain; 1 if it does not apply.
         text: Description.
     """
 
@@ -76,14 +75,11 @@ class Honesty:
     """All verdicts on a run, and their evidence; None for evidence that the run does not offer.
 
     Args:
-        name: Name of the recording.
-        frames: Number of frames.
+        name, frames: Name of the recording, number of frames.
         nis: NIS per degree of freedom.
         shared, tracks, rejections, priors, smoother, truth: The evidence.
-        smoother_skipped: Reason for the missing comparison with the smoother; empty if there is one.
-        innovations_skipped: Reason for missing innovations; empty if there are some.
-        factor: Approximate ratio of errors to covariance, in standard deviations, by innovations: above 1 the
-            covariance is too small.
+        smoother_skipped, innovations_skipped: Reason for a missing smoother or missing innovations; else empty.
+        factor: Approximate ratio of errors to covariance, in standard deviations, by innovations.
         causes: Causes of a covariance that is too small or too large, worst first.
         findings: Other defects.
     """
@@ -112,7 +108,7 @@ class Honesty:
     def judgements(self) -> list[Judgement]:
         """The verdicts, the main one first; empty without any evidence."""
         found = [*self._by_innovations(), *self._by_truth()]
-        # A defect comes first. If there is none, the truth says more than the size of the NIS.
+        # Defects come first. Without any, the truth says more than the size of the NIS.
         if len(found) == 2 and self.shared is None and found[0].factor == 1.0:
             found.reverse()
         return found
@@ -234,7 +230,7 @@ def judge(
         smoothed: Its posterior.
         skipped: Reason for a missing posterior.
         truth: Truth of the recording.
-        interpolated: (T,) interpolated intervals of the recording; the frames after them are not compared with truth.
+        interpolated: (T,) interpolated intervals; the frames after them are not compared with truth.
     """
     shared, tracks, rejections = None, None, evidence.RejectedShares(evidence.reasons_of(result))
     priors = () if result.parameters is None else evidence.prior_agreement(result.parameters)
@@ -243,10 +239,8 @@ def judge(
     factor, causes, findings = 1.0, tuple[Cause, ...](), tuple[Cause, ...]()
     if whitened is not None and not missing:
         examined = evidence.examined_frames(result)
-        gate, tau_s = (
-            float(result.config["filter"]["gate_probability"]),
-            np.diff(result.time_s, prepend=result.time_s[0]),
-        )
+        gate = float(result.config["filter"]["gate_probability"])
+        tau_s = np.diff(result.time_s, prepend=result.time_s[0])
         shared = evidence.shared_innovations(whitened, examined, tau_s)
         tracks = evidence.track_innovations(result, examined, gate)
         rejections = evidence.rejected_shares(result, examined, gate, tracks.scale)
@@ -270,11 +264,7 @@ def judge(
 
 
 def require_innovations(result: Result) -> None:
-    """Raise unless a run has innovations to be judged by.
-
-    Raises:
-        HonestyError: The result has no whitened innovations, or too few frames with them.
-    """
+    """Raise `HonestyError` if a run has no whitened innovations, or too few frames with them."""
     missing = _missing_innovations(result)
     if missing:
         raise HonestyError(f"{result.sequence_name}: {missing}")
@@ -303,21 +293,19 @@ def _causes(
         causes, aside = (large, ()) if factor < 1 / _NOTABLE else ((), large)
     agreement = _agreement(shared, tracks)
     if agreement >= _LEAST_AGREEMENT and not any(cause.kind in _SHARED for cause in causes):
-        text = (
-            f"the landmarks of a frame agree: relative to single errors, shared errors are {agreement:.1f}x too large"
-        )
-        aside = (*aside, Cause("agreement", (), 1.0, text))
+        text = f"relative to single errors, shared errors are {agreement:.1f}x too large"
+        aside = (*aside, Cause("agreement", (), 1.0, f"the landmarks of a frame agree: {text}"))
     return factor, causes, aside
 
 
 def _shared_causes(shared: SharedInnovations, tracks: evidence.TrackInnovations) -> Iterator[Cause]:
-    """Yield causes of shared errors, beyond what they inherit from errors of single observations."""
+    """Yield causes of shared errors that errors of single observations do not explain."""
     explained = max(1.0, float(np.sqrt(tracks.scale)), _grown(tracks))
     order, mean, factor = shared.order, np.abs(shared.mean), shared.factor / explained
     large = (factor > _NOTABLE) & (shared.factor_low > _LEAST_LOW * explained)
     constant = (mean > _LEAST_MEAN) & (mean > _SURE_OF_MEAN * shared.mean_error)
     rest = order[(large & ~constant)[order]]
-    # An error that is independent in each frame shows at once, a slow one only in sums.
+    # An error that is independent in each frame is large at once, a slow one only in sums.
     slow = np.log(shared.persistence[rest])
     fast = 2.0 * np.log(factor[rest]) - slow
     is_slow = len(rest) and slow.mean() > max(np.log(_LEAST_SLOW), fast.mean())

@@ -4,9 +4,8 @@
     def longest_step(result: Result) -> float:
         return float(np.diff(result.time_s).max())
 
-A file with such a function is all that a new one takes: once it is imported, summaries, tables, sweeps and report pages
-have it. Parameters without default are named after what a function takes of `offered`. If that is missing, the value
-is None.
+Summaries, tables, sweeps and report pages have a metric once its file is imported. Parameters without default name
+entries of `offered`; if one is missing, the value is None.
 """
 
 from __future__ import annotations
@@ -39,10 +38,9 @@ class Metric:
     """A registered figure of merit.
 
     Args:
-        heading: Heading in tables, with unit or expected value.
-        fmt: Format of the value in tables.
+        heading, fmt: Heading in tables, with unit or expected value, and format of the value.
         compute: Function that returns the value, or the values of several metrics.
-        place: Place of the value in what ``compute`` returns; None if it returns the value alone.
+        place: Place of the value among several; None if it is alone.
     """
 
     heading: str
@@ -75,11 +73,11 @@ def metrics(*rows: tuple[str, str, str]) -> Callable[[Function], Function]:
 
 
 def offered(result: Result, truth: Truth | None, interpolated: BoolArray) -> dict[str, Any]:
-    """Return what metrics may take by name, None for what is missing.
+    """Return the values that metrics may take by name, None if missing.
 
-    ``result``, its ``landmarks`` and ``innovation`` (None without an update), the ``interpolated`` intervals (T,) of
-    the recording, and the ``truth``; with true poses ``measured`` (the truth of frames that no interpolated interval
-    leads to), and ``T_est`` and ``T_true`` (n, 4, 4) at its frames.
+    ``result``, its ``landmarks`` and ``innovation`` (None without an update), ``truth``, the ``interpolated`` intervals
+    (T,) of the recording; with true poses ``T_est`` and ``T_true`` (n, 4, 4) at their frames, and ``measured``, the
+    truth of frames that no interpolated interval leads to.
     """
     known = truth if truth is not None and len(truth.frame) else None
     return {
@@ -95,7 +93,7 @@ def offered(result: Result, truth: Truth | None, interpolated: BoolArray) -> dic
 
 
 def computed(found: dict[str, Any]) -> dict[str, Value]:
-    """Return every registered metric of a run, None for those without a value, of what is `offered`."""
+    """Return every registered metric from the values `offered`; None if it has no value."""
     values: dict[Function, Any] = {}
     summary: dict[str, Value] = {}
     for key, entry in METRICS.items():
@@ -125,7 +123,7 @@ metrics(("t_rel_percent", "t_rel [%]", ".3f"), ("r_rel_deg_per_100m", "r_rel [de
 
 @metric("pose_nees_mean", "pose NEES (6)", ".2f")
 def nees(result: Result, measured: Truth) -> float | None:
-    """Return the mean pose NEES over the frames whose covariance is not singular; the truth counts as exact."""
+    """Return the mean pose NEES over the frames whose covariance is not singular, against an exact truth."""
     return _mean(pose_nees(result, measured)[1])
 
 
@@ -180,6 +178,5 @@ def times(result: Result) -> tuple[float, float, float]:
 
 
 def _mean(values: Array) -> float | None:
-    """Return the mean of the values that are not NaN, if there are any."""
     values = values[np.isfinite(values)]
     return float(values.mean()) if len(values) else None

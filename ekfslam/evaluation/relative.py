@@ -18,8 +18,8 @@ PATHS_M = (50.0, 100.0)
 def relative_pairs(truth: Truth, reach: int) -> tuple[IntArray, IntArray]:
     """Return pairs of frames (n,), (n,) with known true poses, whose relative pose is to be judged.
 
-    The first frames are every quarter of ``reach``. The second ones come `FRAMES` later, or are the frames, at most
-    ``reach`` later, whose true path from the first is nearest to `PATHS_M`, within `PATH_TOLERANCE`.
+    First frames are every quarter of ``reach``. Second frames come `FRAMES` later, or nearest to `PATHS_M` of true path
+    later, within `PATH_TOLERANCE` and ``reach``.
     """
     frame, found = truth.frame, set[tuple[int, int]]()
     distance = distance_along(truth.T_world_imu)
@@ -37,11 +37,9 @@ def relative_pairs(truth: Truth, reach: int) -> tuple[IntArray, IntArray]:
 
 
 def dead_reckoned_pairs(first: IntArray, second: IntArray, T_world_imu: Array, covariance: Array) -> PosePairs:
-    """Return cross-covariances of poses without updates: ``cov(xi_k, xi_j) = Ad(T_k T_j^-1) P_jj``, by eq. (2).
+    """Return cross-covariances of poses j, k (n,) without updates: ``cov(xi_k, xi_j) = Ad(T_k T_j^-1) P_jj``, eq. (2).
 
-    Args:
-        first, second: (n,) frames j and k.
-        T_world_imu, covariance: (T, 4, 4) and (T, 6, 6) of all frames.
+    Poses (T, 4, 4) and covariances (T, 6, 6) are of all frames.
     """
     A = se3.adjoint(se3.inverse(T_world_imu[second]) @ T_world_imu[first])
     return PosePairs(first, second, covariance[first] @ np.swapaxes(A, -1, -2))
@@ -64,9 +62,8 @@ def relative_covariance(result: Result, pairs: PosePairs) -> tuple[Array, Array]
 def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) -> tuple[PosePairs, Array]:
     """Return pairs with true poses and the NEES (n,) of their relative pose, 6 degrees of freedom; NaN if singular.
 
-    The covariance is that of `relative_covariance` and, if the truth states noise, ``N_k + A N_j A^T`` with N that of
-    single true poses; an error of the first pose cancels. Pairs with an ``interpolated`` interval (T,) between them are
-    left out.
+    Truth noise adds ``N_k + A N_j A^T`` to `relative_covariance`, with N that of single true poses; an error of the
+    first pose cancels. Pairs with an ``interpolated`` interval (T,) between them are left out.
     """
     pairs, place = result.pairs or PosePairs.empty(), np.full(len(result.time_s), -1)
     place[truth.frame] = np.arange(len(truth.frame))
@@ -83,12 +80,12 @@ def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) ->
 
 
 def over_frames(pairs: PosePairs, frames: int) -> BoolArray:
-    """Return a mask (n,) of the pairs that are so many frames apart."""
+    """Return a mask (n,) of the pairs that are ``frames`` apart."""
     return pairs.second - pairs.first == frames
 
 
 def over_path(pairs: PosePairs, truth: Truth, path_m: float) -> BoolArray:
-    """Return a mask (n,) of the pairs nearest to so many metres of true path, at most one for each first frame."""
+    """Return a mask (n,) of the pairs nearest to ``path_m`` of true path, at most one for each first frame."""
     distance = np.full(truth.frame[-1] + 1 if len(truth.frame) else 0, np.nan)
     distance[truth.frame] = distance_along(truth.T_world_imu)
     off = np.abs(distance[pairs.second] - distance[pairs.first] - path_m)

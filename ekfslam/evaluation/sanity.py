@@ -1,15 +1,14 @@
 """Sanity of a recording and of a run: likely mistakes are named, one line each.
 
-The evidence is the flow of the tracks. From one frame to the next a point that stereo has located moves in the image
-as velocities, stamps and ``T_cam_imu`` predict it. If one of these is wrong in a known way, undoing that mistake makes
-the prediction fit. So each known mistake is undone in turn, and named if the prediction error falls much. Noise of
+The evidence is the flow of the tracks. A point that stereo has located moves in the next image as velocities, stamps
+and ``T_cam_imu`` predict. Each known mistake is undone in turn, and named if the prediction error falls much. Noise of
 velocities is no mistake: velocities that a remedy makes small must still explain more than none at all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,91 +20,72 @@ from ekfslam.filters.result import SANITY, SANITY_SEPARATOR, Result
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
 
-_PAIRS = 5000  # observations that are looked at; more say the same
+_PAIRS = 5000  # observations that are examined; more say the same
 _LEAST_PAIRS = 60
-_SHARE_TURNING = 0.2  # of the frames, in which rotations are looked at
-_BETTER = 0.7  # of the error, which a remedy must leave at most; what is right leaves less than any remedy
+_SHARE_TURNING = 0.2  # of the frames, in which rotations are examined
+_BETTER = 0.7  # of the error, which a remedy must leave at most; a right recording leaves less than any remedy
 _EXPLAINS = 0.85  # of the error without the velocities that a remedy makes small, which it must leave at most
 _AS_GOOD = 1.3  # times the least error: of remedies that do as well, the first is the likelier
 _NEAREST_M = 0.1
-_BESIDE_PX = 1e4  # a prediction that is further off is behind the camera, or as good as there
+_OUTSIDE_PX = 1e4  # error of a prediction behind the camera, and the largest one
 _BEHIND = 0.5  # share of points without depth from which the images look swapped
 _WINDOW = 10  # frames over which the truth's motion is compared
 _LEAST_TURN = np.radians(6.0)
 _SURE = 4.0
-_OTHER_WAY = 0.3  # of it, from which the truth is another
+_OTHER_WAY = 0.3  # relative difference of motions from which the truth is another one
 _SAME_LENGTH = 0.1
 _REJECTED = 0.4
-_OFF_TRUTH = 0.1  # ATE as a share of the path, from which the truth is another
+_OFF_TRUTH = 0.1  # ATE as a share of the path from which the truth is another one
 
 
-@dataclass(frozen=True)
-class Sanity:
-    """What `inspect_sequence` found.
-
-    Args:
-        figures: Facts for the user to judge, one line each.
-        warnings: Likely mistakes, one line each.
-    """
+class Sanity(NamedTuple):
+    """Facts for the user to judge, and warnings about likely mistakes, one line each."""
 
     figures: tuple[str, ...]
     warnings: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Remedy:
-    """The inverse of a mistake.
-
-    Args:
-        text: The mistake, in words.
-        undo: Function from wrong to right extrinsics (4, 4), velocities (n, 6) and intervals (n,).
-        shrinks: Indices of the velocities that it makes small, so that their noise may vanish.
-    """
+class _Remedy(NamedTuple):
+    """A mistake in words, and how to undo it: function of the extrinsics, factors of velocities, unit of the stamps."""
 
     text: str
-    undo: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
-    shrinks: tuple[int, ...] = ()
+    camera: Callable[[Array], Array] = lambda C: C
+    velocities: tuple[float, ...] = (1, 1, 1, 1, 1, 1)
+    seconds: float = 1.0
+    axes: Array = np.eye(3)
+
+    def undo(self, C: Array, u: Array, tau: Array) -> tuple[Array, Array, Array]:
+        """Return the right extrinsics (4, 4), velocities (n, 6) and intervals (n,)."""
+        return (
+            self.camera(C),
+            np.hstack([u[:, :3] @ self.axes, u[:, 3:] @ self.axes]) * self.velocities,
+            self.seconds * tau,
+        )
+
+    @property
+    def shrinks(self) -> BoolArray:
+        """Mask (6,) of the velocities that it makes small, so that their noise may vanish."""
+        return self.seconds * np.abs(self.velocities) < 0.5
 
 
-_OPTICAL = se3.transform(cam.R_CAM_BODY, np.zeros(3))
-
-
-def _signs(*signs: float) -> Callable[[Array, Array, Array], tuple[Array, Array, Array]]:
-    return lambda C, u, tau: (C, u * np.array(signs), tau)
-
-
-def _turned(C: Array, u: Array, tau: Array) -> tuple[Array, Array, Array]:
-    """Return velocities along right, down, forward as velocities along forward, left, up."""
-    return C, np.hstack([u[:, :3] @ cam.R_CAM_BODY, u[:, 3:] @ cam.R_CAM_BODY]), tau
-
-
-_DEGREE = np.pi / 180.0
-_TURNING, _ALL = (3, 4, 5), (0, 1, 2, 3, 4, 5)
+_OPTICAL, _DEGREE = se3.transform(cam.R_CAM_BODY, np.zeros(3)), np.pi / 180.0
+_FORGOTTEN = "optical axes (right, down, forward) are forgotten"
 _REMEDIES = (
-    _Remedy("T_cam_imu looks inverted", lambda C, u, tau: (se3.inverse(C), u, tau)),
-    _Remedy(
-        "T_cam_imu looks like that of a camera with axes forward, left, up: optical axes (right, down, forward) are "
-        "forgotten",
-        lambda C, u, tau: (_OPTICAL @ C, u, tau),
-    ),
-    _Remedy(
-        "T_cam_imu looks inverted, and optical axes (right, down, forward) are forgotten",
-        lambda C, u, tau: (_OPTICAL @ se3.inverse(C), u, tau),
-    ),
-    _Remedy(
-        "angular velocities look like deg/s instead of rad/s", _signs(1, 1, 1, _DEGREE, _DEGREE, _DEGREE), _TURNING
-    ),
-    _Remedy("stamps look like milliseconds instead of seconds", lambda C, u, tau: (C, u, 1e-3 * tau), _ALL),
-    _Remedy("stamps look like microseconds instead of seconds", lambda C, u, tau: (C, u, 1e-6 * tau), _ALL),
-    _Remedy("stamps look like nanoseconds instead of seconds", lambda C, u, tau: (C, u, 1e-9 * tau), _ALL),
-    _Remedy("linear velocities look as if they had the wrong sign", _signs(-1, -1, -1, 1, 1, 1)),
-    _Remedy("angular velocities look as if they had the wrong sign", _signs(1, 1, 1, -1, -1, -1)),
-    _Remedy("all velocities look as if they had the wrong sign", _signs(-1, -1, -1, -1, -1, -1)),
+    _Remedy("T_cam_imu looks inverted", se3.inverse),
+    _Remedy(f"T_cam_imu looks like that of a camera with axes forward, left, up: {_FORGOTTEN}", lambda C: _OPTICAL @ C),
+    _Remedy(f"T_cam_imu looks inverted, and {_FORGOTTEN}", lambda C: _OPTICAL @ se3.inverse(C)),
+    _Remedy("angular velocities look like deg/s instead of rad/s", velocities=(1, 1, 1, _DEGREE, _DEGREE, _DEGREE)),
+    _Remedy("stamps look like milliseconds instead of seconds", seconds=1e-3),
+    _Remedy("stamps look like microseconds instead of seconds", seconds=1e-6),
+    _Remedy("stamps look like nanoseconds instead of seconds", seconds=1e-9),
+    _Remedy("linear velocities look as if they had the wrong sign", velocities=(-1, -1, -1, 1, 1, 1)),
+    _Remedy("angular velocities look as if they had the wrong sign", velocities=(1, 1, 1, -1, -1, -1)),
+    _Remedy("all velocities look as if they had the wrong sign", velocities=(-1, -1, -1, -1, -1, -1)),
     _Remedy(
         "velocities look like those along forward, right, down, while T_cam_imu expects forward, left, up",
-        _signs(1, -1, -1, 1, -1, -1),
+        velocities=(1, -1, -1, 1, -1, -1),
     ),
-    _Remedy("velocities look like those along the camera's axes right, down, forward", _turned),
+    _Remedy("velocities look like those along the camera's axes right, down, forward", axes=cam.R_CAM_BODY),
 )
 
 
@@ -117,50 +97,36 @@ def inspect_sequence(sequence: Sequence) -> Sanity:
         figures.insert(0, f"median step {np.median(tau[1:]):.4g} s, longest {tau[1:].max():.4g} s")
     if len(sequence) < 2 or not sequence.has_velocities:
         return Sanity(tuple(figures), tuple(warnings))
-    speed = np.linalg.norm(sequence.twist[:, :3], axis=1)
+    speed, turning = (np.linalg.norm(sequence.twist[:, axes], axis=1) for axes in (slice(3), slice(3, 6)))
     path = f"path {float(speed @ tau):.4g} m by velocities"
     if sequence.truth is not None and len(sequence.truth.frame) > 1:
         path += f", {distance_along(sequence.truth.T_world_imu)[-1]:.4g} m by truth"
-    turning = np.degrees(np.linalg.norm(sequence.twist[:, 3:], axis=1))
-    figures.append(
-        f"speed {np.median(speed):.3g} m/s, at most {speed.max():.3g}; turning at most {turning.max():.3g} deg/s"
-    )
+    turn = np.degrees(turning.max())
+    figures.append(f"speed {np.median(speed):.3g} m/s, at most {speed.max():.3g}; turning at most {turn:.3g} deg/s")
     figures.append(path)
-    swapped = bool(warnings)
     flow, suspicion = _inspect_flow(sequence, tau)
-    figures += flow
-    # Depths are wrong where the images are swapped, and velocities where the flow does not fit.
-    if not swapped:
-        warnings += suspicion or _inspect_truth(sequence)
-    return Sanity(tuple(figures), tuple(warnings))
+    # Swapped images make depths wrong, and a flow that does not fit makes velocities wrong.
+    warnings = warnings or suspicion or _inspect_truth(sequence)
+    return Sanity((*figures, *flow), tuple(warnings))
 
 
 def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]) -> tuple[str, ...]:
-    """Return warnings about a run, one line each.
-
-    Args:
-        sequence: The recording.
-        result: Of any mode.
-        warnings: What `inspect_sequence` said of the recording: the likely cause.
-    """
+    """Return warnings about a run, one line each; ``warnings`` of `inspect_sequence` are the likely cause."""
     if result.mode in ("dead-reckoning", "mapping-only"):
         return ()  # their poses drift, so that rejections and distances from the truth are no evidence
-    lines = []
     accepted, rejected = int(result.innovation.accepted.sum()), int(result.innovation.rejected.sum())
     if rejected > _REJECTED * max(accepted + rejected, 1):
         cause = warnings[0] if warnings else "tracks, velocities, stamps and T_cam_imu do not fit each other"
-        lines.append(f"{rejected / (accepted + rejected):.0%} of the observations were rejected: {cause}")
+        return (f"{rejected / (accepted + rejected):.0%} of the observations were rejected: {cause}",)
     truth = sequence.truth
-    if truth is None or len(truth.frame) < 2 or warnings or lines:
-        return tuple(lines)
+    if truth is None or len(truth.frame) < 2 or warnings:
+        return ()
     path_m = distance_along(truth.T_world_imu)[-1]
     error_m = absolute_trajectory_error(result.T_world_imu[truth.frame], truth.T_world_imu, align=True)
-    if error_m > _OFF_TRUTH * path_m:
-        lines.append(
-            f"the truth looks like that of another recording: the estimate fits the tracks, and is {error_m:.3g} m off "
-            f"a path of {path_m:.3g} m, aligned"
-        )
-    return tuple(lines)
+    if error_m <= _OFF_TRUTH * path_m:
+        return ()
+    off = f"{error_m:.3g} m off a path of {path_m:.3g} m, aligned"
+    return (f"the truth looks like that of another recording: the estimate fits the tracks, and is {off}",)
 
 
 def sanity_attributes(lines: tuple[str, ...]) -> dict[str, str]:
@@ -175,9 +141,8 @@ def _tracks_in_front(sequence: Sequence) -> tuple[list[str], list[str]]:
         return [], []
     behind = float((pixels[:, 0] <= pixels[:, 2]).mean())
     figures = [f"{1.0 - behind:.1%} of the observations are of points in front of the camera"]
-    if behind < _BEHIND:
-        return figures, []
-    return figures, [f"left and right images look swapped: {behind:.0%} of the disparities are not positive"]
+    swapped = f"left and right images look swapped: {behind:.0%} of the disparities are not positive"
+    return figures, [swapped] if behind >= _BEHIND else []
 
 
 def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]:
@@ -185,8 +150,7 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]
     earlier, later = _pairs(sequence)
     if len(earlier) < _LEAST_PAIRS:
         return [], []
-    at = sequence.observations.frame[later]
-    pixels = sequence.observations.pixels_px
+    at, pixels = sequence.observations.frame[later], sequence.observations.pixels_px
     seen = np.linalg.norm(pixels[later, :2] - pixels[earlier, :2], axis=1)
     turning = np.linalg.norm(sequence.twist[at, 3:], axis=1)
     turns = turning >= np.quantile(turning, 1.0 - _SHARE_TURNING)
@@ -198,36 +162,29 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]
         return _off(sequence, moved, pixels[later, :2], turns)
 
     given = sequence.T_cam_imu, sequence.twist[at], tau[at]
-
-    def without(remedy: _Remedy) -> float:
-        """Return the error without the velocities that a remedy makes small."""
-        none = np.where(np.isin(np.arange(6), remedy.shrinks), 0.0, given[1])
-        return sum(error_px(given[0], none, given[2])) if remedy.shrinks else np.inf
-
     straight, turn = error_px(*given)
-    figure = (
-        f"tracks move by {np.median(seen):.3g} px a frame; the velocities predict it to {straight:.3g} px, "
-        f"where the rig turns most to {turn:.3g} px"
-    )
+    predicted = f"the velocities predict it to {straight:.3g} px, where the rig turns most to {turn:.3g} px"
+    figure = f"tracks move by {np.median(seen):.3g} px a frame; {predicted}"
     found = [(sum(error_px(*remedy.undo(*given))), remedy) for remedy in _REMEDIES]
     least = min(error for error, _ in found)
     best, remedy = next(entry for entry in found if entry[0] <= _AS_GOOD * least)
-    if best > _BETTER * (straight + turn) or best > _EXPLAINS * without(remedy):
+    still = np.where(remedy.shrinks, 0.0, given[1])
+    unmoved = sum(error_px(given[0], still, given[2])) if remedy.shrinks.any() else np.inf
+    if best > _BETTER * (straight + turn) or best > _EXPLAINS * unmoved:
         return [figure], []
-    off = f"{0.5 * (straight + turn):.3g} px" if straight + turn < _BESIDE_PX else "out of the image"
+    off = f"{0.5 * (straight + turn):.3g} px" if straight + turn < _OUTSIDE_PX else "out of the image"
     return [figure], [f"{remedy.text}: the flow of the tracks is predicted {off} off, otherwise {0.5 * best:.2g} px"]
 
 
 def _pairs(sequence: Sequence) -> tuple[IntArray, IntArray]:
-    """Return a part of the observations with depth in successive frames, while the rig moves and is measured."""
-    observations = sequence.observations
+    """Return some observations with depth in successive frames, while the rig moves and is measured."""
+    observations, pixels = sequence.observations, sequence.observations.pixels_px
     earlier, later = successive(observations)
-    pixels = observations.pixels_px
-    beside = observations.frame[later] - observations.frame[earlier] == 1
+    adjacent = observations.frame[later] - observations.frame[earlier] == 1
     near = pixels[earlier, 0] - pixels[earlier, 2] > cam.FLOW_FROM_PX
     moves = (pixels[later] != pixels[earlier]).any(axis=1)
     measured = ~sequence.interpolated[observations.frame[later]]
-    chosen = np.flatnonzero(beside & near & moves & measured)
+    chosen = np.flatnonzero(adjacent & near & moves & measured)
     chosen = chosen[:: max(1, len(chosen) // _PAIRS)]
     return earlier[chosen], later[chosen]
 
@@ -236,7 +193,7 @@ def _off(sequence: Sequence, points: Array, seen: Array, turns: BoolArray) -> tu
     """Return the median distance (px) of projected points (n, 3) from images (n, 2): driving straight, in turns."""
     ahead = points[:, 2] > _NEAREST_M
     image = cam.project(sequence.camera, np.where(ahead[:, None], points, 1.0))[:, :2]
-    off = np.where(ahead, np.minimum(np.linalg.norm(image - seen, axis=1), _BESIDE_PX), _BESIDE_PX)
+    off = np.where(ahead, np.minimum(np.linalg.norm(image - seen, axis=1), _OUTSIDE_PX), _OUTSIDE_PX)
     parts = [off[part] for part in (~turns, turns) if part.any()]
     return float(np.median(parts[0])), float(np.median(parts[-1]))
 
@@ -258,15 +215,10 @@ def _inspect_truth(sequence: Sequence) -> list[str]:
         return []
     lengths, true_lengths = (np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True) for poses in (step, true_step))
     if way > _OTHER_WAY and _disagreement(lengths, true_lengths, least_m, drift_m) < _SAME_LENGTH:
-        return [
-            f"the truth looks like poses of another body than the IMU: it moves as far as the velocities say, "
-            f"but another way ({way:.0%} of it apart)"
-        ]
-    how = (
-        f"moves another way than the velocities, {way:.0%} of it"
-        if way > turn
-        else f"turns otherwise, {turn:.0%} of it"
-    )
+        moves = f"it moves as far as the velocities say, but another way ({way:.0%} of it apart)"
+        return [f"the truth looks like poses of another body than the IMU: {moves}"]
+    moves, turns = f"moves another way than the velocities, {way:.0%}", f"turns otherwise, {turn:.0%}"
+    how = f"{moves if way > turn else turns} of it"
     return [f"the truth looks like that of another recording: over {_WINDOW} frames it {how} apart"]
 
 
@@ -278,10 +230,7 @@ def _noise_over_window(sequence: Sequence) -> tuple[float, float]:
 
 
 def _disagreement(found: Array, true: Array, least: Array, noise: float) -> float:
-    """Return the median distance of motions (n, d), as a share of the larger one, of those above ``least`` (n,).
-
-    Half of what noise may add up to does not count.
-    """
+    """Return the median relative distance of motions (n, d) above ``least`` (n,), without half the bound of noise."""
     larger = np.maximum(np.linalg.norm(found, axis=1), np.linalg.norm(true, axis=1))
     moving = larger > least
     if moving.sum() < _WINDOW:

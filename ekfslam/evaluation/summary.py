@@ -15,25 +15,16 @@ KEYS = METRICS.keys()  # of a summary, in the order of the table
 
 
 def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, Value]:
-    """Return the figures of merit of one run as plain Python numbers, ready for JSON.
+    """Return the figures of merit of one run as plain Python numbers, ready for JSON; None if undefined.
 
-    Trajectory errors are over the frames with known true pose, and start at the first true pose, see
-    `ekfslam.evaluation.trajectory`. Only ``ate_aligned_m`` is aligned. Every NEES leaves interpolated stretches out.
-    None stands for a missing truth or an undefined value.
-
-    Args:
-        sequence: The recording, which has the truth.
-        result: Run of any mode.
+    Trajectory errors are over the frames with known true pose. Only ``ate_aligned_m`` is aligned. Every NEES leaves
+    interpolated intervals out.
     """
     return computed(offered(result, sequence.truth, sequence.interpolated))
 
 
 def compare_table(summary: Mapping[str, Any]) -> str:
-    """Return a Markdown table with one column a mode; rows without any value are left out.
-
-    Args:
-        summary: ``{"sequence", "frames", "landmarks", "modes": {mode: summarise(...)}}``.
-    """
+    """Return ``{"sequence", "frames", "landmarks", "modes": {mode: summarise(...)}}`` as a Markdown table."""
     modes = summary["modes"]
     landmarks = "" if summary["landmarks"] is None else f", {summary['landmarks']} landmarks"
     title = f"**{summary['sequence']}**: {summary['frames']} frames{landmarks}"
@@ -41,7 +32,7 @@ def compare_table(summary: Mapping[str, Any]) -> str:
 
 
 def merit_rows(summaries: Iterable[Mapping[str, Any]]) -> list[list[str]]:
-    """Return rows of a table with one column a summary: heading, then values as text. Rows without any are left out."""
+    """Return table rows of a heading and one value for each summary as text; rows without any value are left out."""
     rows, summaries = [], list(summaries)
     for key, metric in METRICS.items():
         values = [summary.get(key) for summary in summaries]  # older summaries lack some

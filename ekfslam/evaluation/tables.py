@@ -1,4 +1,4 @@
-"""The one writer of Markdown: tables, and the numbers in their cells.
+"""Markdown tables, and the numbers in their cells.
 
 print(markdown_table(["set", "ATE [m]"], [["0027", number(3.972, ".2f")], ["0022", number(None)]]))
 
@@ -23,10 +23,10 @@ def markdown_table(
     """Return a Markdown table without a final line end.
 
     Args:
-        headings: Of the columns.
+        headings: Column headings.
         rows: Cells of each row, as many as there are headings.
-        left: How many columns are text, aligned to the left; those after them are numbers, aligned to the right.
-        padded: Pad the cells, so that the table reads as well on a terminal.
+        left: Number of text columns, aligned to the left; the other columns are numbers, aligned to the right.
+        padded: Pad the cells for terminals.
 
     Raises:
         ValueError: A row has more or fewer cells than there are headings.
@@ -35,21 +35,16 @@ def markdown_table(
     if any(len(line) != len(headings) for line in lines):
         raise ValueError(f"every row must have {len(headings)} cells")
     widths = [max(_NARROWEST, *map(len, column)) if padded else 0 for column in zip(*lines, strict=True)]
-    texts = []
+    texts, rule = [], []
     for line in lines:
         cells = (
             f"{cell:<{w}}" if i < left else f"{cell:>{w}}" for i, (cell, w) in enumerate(zip(line, widths, strict=True))
         )
         texts.append(f"|{'|'.join(f' {cell} ' if cell else ' ' for cell in cells)}|")
-    return "\n".join([texts[0], _rule(widths, left, padded), *texts[1:]])
-
-
-def _rule(widths: Sequence[int], left: int, padded: bool) -> str:
-    """Return the rule between headings and rows, which aligns the columns."""
-    dashes = ["-" * (width + 2) if padded else "---" for width in widths]
-    # In a padded table the colon takes the place of a dash.
-    right = [(text[:-1] if padded else text) + ":" for text in dashes]
-    return f"|{'|'.join([*dashes[:left], *right[left:]])}|"
+    for i, width in enumerate(widths):
+        colon = "" if i < left else ":"
+        rule.append("-" * (width + 2 - len(colon) if padded else 3) + colon)
+    return "\n".join([texts[0], f"|{'|'.join(rule)}|", *texts[1:]])
 
 
 def number(value: float | None, spec: str = "") -> str:

@@ -1,7 +1,6 @@
 """Errors of a trajectory and of a map against ground truth.
 
-Trajectories are stacks of poses ``T_world_imu`` (n, 4, 4), estimate and truth at the same n instants. Only
-`absolute_trajectory_error` aligns, and only when asked to; relative errors do not depend on an alignment.
+Trajectories are stacks of poses ``T_world_imu`` (n, 4, 4), estimate and truth at the same n instants.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from ekfslam.geometry import se3
 
 KITTI_SEGMENT_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_START_STEP = 10  # frames between the starts of segments
-PATH_TOLERANCE = 0.1  # of a path, by which that of a pair of poses may differ from it; the default of evo_rpe
+PATH_TOLERANCE = 0.1  # largest relative difference of the path of a pair from the wanted one; the default of evo_rpe
 
 
 def align_se3(points: Array, reference: Array) -> Array:
@@ -51,8 +50,7 @@ def relative_pose_error_over_frames(T_est: Array, T_true: Array, frames: int = 1
     """Return the RPE over a number of frames: root mean squares of translation error, m, and rotation angle, deg.
 
     The error of the motion from pose i to pose j = i + frames is ``E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`` with Q the true
-    and P the estimated poses (Sturm et al. 2012). Every pair of the n poses counts, also one across a gap in the truth.
-    None if there is no pair.
+    and P the estimated poses (Sturm et al. 2012). Every pair counts, also across a gap in the truth. None without any.
     """
     start = np.arange(len(T_true) - frames)
     return _rms_relative_error(T_est, T_true, start, start + frames)
@@ -61,15 +59,14 @@ def relative_pose_error_over_frames(T_est: Array, T_true: Array, frames: int = 1
 def relative_pose_error_over_path(T_est: Array, T_true: Array, path_m: float) -> tuple[float, float] | None:
     """Return the RPE over a length of true path: root mean squares of translation error, m, and rotation angle, deg.
 
-    As `relative_pose_error_over_frames`, but each pose is paired with the later one (the first, if there are several)
-    whose distance from it along the true path comes nearest to ``path_m``, and left out where that differs by more than
-    `PATH_TOLERANCE` of it. These are the pairs of ``evo_rpe -d PATH -u m --all_pairs --pairs_from_reference``.
+    Each pose is paired with the first later one whose distance along the true path is nearest to ``path_m``, within
+    `PATH_TOLERANCE`. These are the pairs of ``evo_rpe -d PATH -u m --all_pairs --pairs_from_reference``.
     """
     distance = distance_along(T_true)
     after = np.minimum(np.searchsorted(distance, distance + path_m), len(distance) - 1)
     before = np.maximum(after - 1, 0)
     off_after, off_before = (np.abs(distance[end] - distance - path_m) for end in (after, before))
-    # Where the vehicle stands still several poses lie at one distance; a search finds the first.
+    # Several poses lie at one distance while the vehicle stands still; a search finds the first.
     end = np.searchsorted(distance, distance[np.where(off_before <= off_after, before, after)])
     fits = np.minimum(off_before, off_after) <= PATH_TOLERANCE * path_m
     return _rms_relative_error(T_est, T_true, np.flatnonzero(fits), end[fits])
@@ -89,7 +86,6 @@ def _relative_errors(T_est: Array, T_true: Array, start: IntArray, end: IntArray
 
 
 def _rms_relative_error(T_est: Array, T_true: Array, start: IntArray, end: IntArray) -> tuple[float, float] | None:
-    """Return root mean squares in metres and degrees; None if there is no pair."""
     if not len(start):
         return None
     length, angle = _relative_errors(T_est, T_true, start, end)
@@ -99,9 +95,8 @@ def _rms_relative_error(T_est: Array, T_true: Array, start: IntArray, end: IntAr
 def kitti_segment_errors(T_est: Array, T_true: Array) -> tuple[float, float] | None:
     """Return the relative errors of the KITTI odometry benchmark: ``(t_rel_percent, r_rel_deg_per_100m)``.
 
-    Mean over all segments of 100, 200, ..., 800 m of true path that start at every tenth pose, of the segment's
-    translation and rotation error divided by its nominal length (Geiger et al., *Are we ready for autonomous driving?*,
-    CVPR 2012, and its devkit). None if no segment fits, i.e. the path is not longer than 100 m.
+    Mean over all segments of 100, 200, ..., 800 m of true path from every tenth pose, of errors divided by the nominal
+    length (Geiger et al., *Are we ready for autonomous driving?*, CVPR 2012, and its devkit). None if no segment fits.
     """
     distance = distance_along(T_true)
     start, length = np.meshgrid(np.arange(0, len(T_true), KITTI_START_STEP), KITTI_SEGMENT_LENGTHS_M, indexing="ij")
@@ -116,10 +111,7 @@ def kitti_segment_errors(T_est: Array, T_true: Array) -> tuple[float, float] | N
 
 
 def match_landmarks(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, IntArray]:
-    """Return the rows of estimated landmarks with known true position, and their rows in the truth: (n,), (n,).
-
-    An id that occurs several times in the estimate is matched every time.
-    """
+    """Return the rows of estimated landmarks with known true position, and their rows in the truth: (n,), (n,)."""
     order = np.argsort(truth.landmark)
     place = np.searchsorted(truth.landmark, landmarks.id, sorter=order)
     known = np.isin(landmarks.id, truth.landmark)
@@ -127,10 +119,7 @@ def match_landmarks(landmarks: Landmarks, truth: Truth) -> tuple[IntArray, IntAr
 
 
 def landmark_rmse(landmarks: Landmarks, truth: Truth) -> float | None:
-    """Return the root mean square distance in metres of landmarks from their true positions, without alignment.
-
-    None if no estimated landmark has a known true position.
-    """
+    """Return the root mean square distance (m) of landmarks from their true positions, unaligned; None without any."""
     rows, truth_rows = match_landmarks(landmarks, truth)
     if not len(rows):
         return None

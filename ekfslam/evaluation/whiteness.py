@@ -1,9 +1,8 @@
 """Statistics of series that should be white: autocorrelation, long-run variance, means that allow for correlation.
 
-The long-run variance of a series is ``gamma_0 + 2 sum gamma_l``, with gamma its autocovariances: that of its sums, as a
-share of what white noise of unit variance gives. Here with Bartlett's weights, and so never negative. Source: Newey
-and West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix",
-Econometrica 55, 1987. Its relative standard error over T samples is about ``sqrt(4 L / 3 T)`` for L lags.
+The long-run variance is that of sums, relative to white noise: ``gamma_0 + 2 sum w_l gamma_l`` with autocovariances
+gamma and Bartlett's weights w (Newey and West, "A simple, positive semi-definite, heteroskedasticity and
+autocorrelation consistent covariance matrix", Econometrica 55, 1987).
 """
 
 from __future__ import annotations
@@ -13,14 +12,13 @@ from scipy.special import gammainc, gammaincinv
 
 from ekfslam.arrays import Array, IntArray
 
-_LARGEST_SCALE = 100.0  # of variances, that a gate still lets be told
+_LARGEST_SCALE = 100.0  # ratio of variances above which nearly all observations are rejected
 
 
 def autocovariance(series: Array, lags: int) -> Array:
     """Return second moments about 0 (lags+1, n) of samples (T, n) that are 0 to ``lags`` apart; NaN does not count.
 
-    Each is divided by the number of all samples that count, so that the sequence is positive semi-definite. It is 0
-    for lags beyond the length of the series.
+    All are divided by the number of samples, so that the sequence is positive semi-definite; 0 beyond its length.
     """
     known = np.isfinite(series)
     filled, count = np.where(known, series, 0.0), np.maximum(known.sum(axis=0), 1)
@@ -29,7 +27,7 @@ def autocovariance(series: Array, lags: int) -> Array:
 
 
 def long_run_variance(covariances: Array) -> Array:
-    """Return ``gamma_0 + 2 sum w_l gamma_l`` (n,) of autocovariances (lags+1, n), with Bartlett's weights."""
+    """Return the long-run variance (n,) of autocovariances (lags+1, n)."""
     weight = 1.0 - np.arange(len(covariances)) / len(covariances)
     return 2.0 * (weight @ covariances) - covariances[0]
 
@@ -40,15 +38,9 @@ def relative_error(samples: int, lags: int) -> float:
 
 
 def along_tracks(frame: IntArray, landmark: IntArray, values: Array, lags: int) -> tuple[Array, IntArray]:
-    """Return the autocovariance along all tracks, and the number of pairs behind it.
+    """Return the autocovariance (lags+1, d) along all tracks, and the number of pairs (lags+1,) behind it.
 
-    Args:
-        frame, landmark: (K,) of each value; a landmark has at most one in a frame.
-        values: (K, d); NaN does not count.
-        lags: Frames.
-
-    Returns:
-        (lags+1, d) mean products of values that many frames apart, about 0; (lags+1,) how many.
+    A landmark (K,) has at most one value (K, d) in a frame (K,). NaN does not count.
     """
     span = (int(frame.max()) if len(frame) else 0) + lags + 1
     key = landmark.astype(np.int64) * span + frame
@@ -81,18 +73,14 @@ def ratio_error(values: Array, dof: IntArray, lags: int) -> float:
 
 
 def gated_scale(mean: float, dimension: int, probability: float) -> float:
-    """Return the ratio of variances to the stated ones, from the squares that passed a gate.
+    """Return the ratio s of variances to the stated ones, at most 100, from the squares that passed a gate.
 
-    If variances are s times the stated ones, squares are s times chi-square. The gate cuts off large ones, so that
-    their mean understates s.
+    Squares are s times chi-square. The gate cuts off large ones, so that their mean understates s.
 
     Args:
-        mean: Of the accepted squares, divided by their dimension.
-        dimension: Of each.
-        probability: With which the gate accepts what the model says; 1: there is none.
-
-    Returns:
-        s, at most 100.
+        mean: Mean of the accepted squares, divided by their dimension.
+        dimension: Degrees of freedom of one square.
+        probability: Probability of the gate; 1 without a gate.
     """
     if probability >= 1.0 or mean <= 0:
         return mean

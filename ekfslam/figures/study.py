@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from ekfslam.evaluation.consistency import anees, chi2_bounds, time_average
+from ekfslam.evaluation.consistency import chi2_bounds, nanmean
 from ekfslam.figures.style import BOUNDS, EXPECTED, WIDE_BOUNDS, line_of, log_axis, style_of, styled
 from ekfslam.studies.study import LABELS, StudyArchive
 from ekfslam.studies.summary import BOUND_PROBABILITY
@@ -35,8 +35,7 @@ def plot_study_nees(archive: StudyArchive, level: str) -> Figure:
             ax.axhspan(low, high, **style, label=f"{100 * probability:g} % bounds", zorder=0.5)
         ax.axhline(dof, **EXPECTED, label="expected")
         for variant, values in variants.items():
-            mean, _, _ = anees(values[field], dof, BOUND_PROBABILITY)
-            ax.plot(time_s, mean, **line_of(variant), label=LABELS[variant])
+            ax.plot(time_s, nanmean(values[field], axis=0), **line_of(variant), label=LABELS[variant])
         log_axis(ax, (1.0, 3.0))
         ax.set_ylabel(f"{name} NEES ({dof} expected) [-]")
         ax.margins(x=0.01)
@@ -95,7 +94,7 @@ def plot_study_boxes(archive: StudyArchive) -> Figure:
     axes = figure.subplots(1, len(levels), sharey=True, squeeze=False)[0]
     for ax, level in zip(axes, levels, strict=True):
         for place, (variant, values) in enumerate(archive.finished(level).items()):
-            averages = time_average(values["pose_nees"])
+            averages = nanmean(values["pose_nees"], axis=1)
             averages = averages[np.isfinite(averages)]
             color = style_of(variant)["color"]
             ax.boxplot(

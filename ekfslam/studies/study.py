@@ -32,7 +32,7 @@ from ekfslam.config import VARIANTS, Config, FilterConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import Loop, simulate
 from ekfslam.errors import ArchiveError, ConfigError, FilterError
-from ekfslam.evaluation.consistency import joint_nees, nees, pose_error, time_average
+from ekfslam.evaluation.consistency import nanmean, nees, pose_error
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.filters.result import ERROR_CONVENTION
@@ -258,12 +258,12 @@ def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str,
                 continue
             m_true = truth.position_m[np.searchsorted(truth.landmark, ekf.ids)]
             error = ekf.variant.landmark_error(ekf.positions_m, m_true, T_est[k], T_true[k])
-            record["landmark_nees"][k] = time_average(nees(error, ekf.gaussian.landmark_blocks())[None])[0]
+            record["landmark_nees"][k] = nanmean(nees(error, ekf.gaussian.landmark_blocks()), axis=0)
             if k in joint_frames:
                 other = slice(6, ekf.gaussian.body)  # blocks besides the pose
                 P = np.delete(np.delete(ekf.P, other, 0), other, 1)
-                value = joint_nees(pose_error(T_est[k], T_true[k]), error, P) / len(P)
-                record["joint_nees_per_dof"][joint_frames.index(k)] = value
+                joint = np.concatenate([pose_error(T_est[k], T_true[k]), error.ravel()])
+                record["joint_nees_per_dof"][joint_frames.index(k)] = nees(joint, P) / len(P)
     except (FilterError, np.linalg.LinAlgError):
         stopped = True
     _put_errors(record, known, T_est[known], T_true[known], P_pose[known])

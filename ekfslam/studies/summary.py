@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
-from ekfslam.evaluation.consistency import average_over_runs, chi2_bounds, time_average
+from ekfslam.evaluation.consistency import average_over_runs, chi2_bounds, nanmean
 from ekfslam.evaluation.tables import document, markdown_table, plus_minus, significant
 from ekfslam.studies.study import LABELS, TEXTBOOK, StudyArchive
 
@@ -29,10 +28,9 @@ _RATIOS = {"joint_nees_per_dof": "joint / dof (1)", "nis_per_dof": "NIS / dof (1
 def summarise_study(archive: StudyArchive) -> dict[str, Any]:
     """Return figures of merit per level and variant as plain Python numbers, ready for JSON.
 
-    Averages are over time first, then over finished runs: ``{"mean", "half_width", "median", "runs"}`` as in
-    `RunAverage`, with the ``expected`` value of a consistent filter and, for NEES, the two-sided 99.9 % ``bounds`` of
-    the mean of as many values at one instant (a time average varies less). A diverged run counts as long as it has
-    values.
+    Averages are over time first, then over finished runs: ``{"mean", "half_width", "median", "runs"}`` of
+    `average_over_runs`, with the ``expected`` value of a consistent filter. NEES has the two-sided 99.9 % ``bounds`` of
+    the mean of as many values at one instant; a time average varies less. A diverged run counts if it has values.
     """
     levels = {
         level: {variant: _summarise(values) for variant, values in archive.finished(level).items()}
@@ -45,13 +43,13 @@ def _summarise(values: Mapping[str, NDArray]) -> dict[str, Any]:
     """Return the figures of merit of one variant from its fields (runs, ...)."""
     out: dict[str, Any] = {}
     for field, (dof, _) in _NEES.items():
-        average = average_over_runs(time_average(values[field]))
-        bounds = [float(b) for b in chi2_bounds(dof, BOUND_PROBABILITY, max(average.runs, 1))]
-        out[field] = {**dataclasses.asdict(average), "expected": dof, "bounds": bounds}
+        average = average_over_runs(nanmean(values[field], axis=1))
+        bounds = [float(b) for b in chi2_bounds(dof, BOUND_PROBABILITY, max(average["runs"], 1))]
+        out[field] = {**average, "expected": dof, "bounds": bounds}
     dof_total = values["nis_dof"].sum(axis=1)
     per_dof = np.where(dof_total > 0, np.nansum(values["nis"], axis=1) / np.maximum(dof_total, 1), np.nan)
-    for name, per_run in zip(_RATIOS, (time_average(values["joint_nees_per_dof"]), per_dof), strict=True):
-        out[name] = {**dataclasses.asdict(average_over_runs(per_run)), "expected": 1}
+    for name, per_run in zip(_RATIOS, (nanmean(values["joint_nees_per_dof"], axis=1), per_dof), strict=True):
+        out[name] = {**average_over_runs(per_run), "expected": 1}
     out["position_rmse_m"] = _rms(values["position_error"])
     rotation = _rms(values["rotation_error"])
     out["rotation_rmse_deg"] = None if rotation is None else float(np.degrees(rotation))
