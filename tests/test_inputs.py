@@ -17,6 +17,7 @@ from ekfslam.errors import (
     ShapeError,
     StampError,
 )
+from ekfslam.resolve import resolve
 
 DENSITIES = InertialNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3)
 
@@ -172,3 +173,15 @@ def test_info_names_the_inputs(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "440 inertial samples, 200 Hz; gyroscope 0.00017 rad/s/sqrt(Hz)" in shown
     assert "inertial samples move the state" in shown
+
+
+def test_samples_may_end_one_step_before_a_frame_but_not_two():
+    samples = inertial(0.0, 0.9975)  # 200 samples, the last at 0.995 s
+    assert samples.interval(0.9, 0.9995).dt_s.sum() == pytest.approx(0.0995)
+    with pytest.raises(LostDataError):
+        samples.interval(0.9, 1.005)
+
+
+def test_measured_velocities_take_precedence_over_samples():
+    sequence = world(inputs=(synthetic_sequence(frames=20).velocities, inertial()))
+    assert resolve(sequence).model.process.takes is Velocities

@@ -147,3 +147,25 @@ def test_a_file_that_is_no_trajectory_is_refused(tmp_path):
     (tmp_path / "wrong.txt").write_text("1 2 3\n")
     with pytest.raises(ConfigError, match="not a trajectory"):
         builtin(f"room?trajectory={tmp_path / 'wrong.txt'}")
+
+
+def test_samples_have_the_true_biases():
+    biased, clean = (simulate(replace(CLEAN, **changes)) for changes in ({}, NO_BIAS))
+    for samples, bias in (("gyro_rad_s", "gyro_bias_rad_s"), ("accel_m_s2", "accel_bias_m_s2")):
+        found = getattr(biased.inertial, samples) - getattr(clean.inertial, samples)
+        np.testing.assert_allclose(found[0], getattr(biased.truth.motion, bias)[0], atol=1e-9)
+        assert np.abs(found[0]).max() > 1e-3
+
+
+def test_an_id_is_one_unbroken_run_of_frames():
+    seen = builtin("room?seed=1").observations
+    order = np.lexsort((seen.frame, seen.landmark))
+    same = np.diff(seen.landmark[order]) == 0
+    assert (np.diff(seen.frame[order])[same] == 1).all()
+
+
+def test_the_first_velocity_is_in_the_frame_of_the_imu(trajectory):
+    sequence = builtin(f"room?frames=40&trajectory={trajectory}&start_s=2")
+    ahead = sequence.truth.T_world_imu[0, :3, :3] @ sequence.initial_velocity_m_s
+    np.testing.assert_allclose(ahead, sequence.truth.motion.velocity_m_s[0], atol=1e-12)
+    assert np.linalg.norm(ahead) > 0.1
