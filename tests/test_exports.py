@@ -192,7 +192,7 @@ def test_every_format_is_written_by_the_command_line_and_replaced_only_by_its_li
     assert out.stat().st_size > 1000 and f"written to {out}" in capsys.readouterr().out
     out.write_text("something else\n")
     assert main(call) == 2
-    assert "no earlier result of the same" in capsys.readouterr().err
+    assert "not an earlier result of this command" in capsys.readouterr().err
 
 
 def test_what_has_no_log_has_no_graph(world, archive, capsys):

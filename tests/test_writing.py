@@ -302,7 +302,7 @@ def test_other_files_of_the_user_are_not_overwritten(tmp_path, capsys, archive, 
         "export": ["export", str(archive), "--format", "tum"],
     }[command]
     assert main([*arguments, "--out", str(notes)]) == 2
-    assert "notes.txt: exists, and is no earlier result" in one_line(capsys)
+    assert "notes.txt: exists, and is not an earlier result" in one_line(capsys)
     assert notes.read_text() == "my notes\n"
     if command != "tune":
         for more in (["--force"], []):

@@ -1,8 +1,8 @@
-"""The command line: every subcommand is a thin call of the function of the same name in Python.
+"""Command line: every subcommand is a thin call of the function of the same name in Python.
 
-A subcommand is a file of `ekfslam.cli.commands`, found by itself. The first line of its docstring is its summary,
-``EXAMPLES`` are calls of it, ``add_arguments(parser)`` declares its arguments, ``command(options)`` runs it.
-Only the file of the subcommand that is called is imported: help and mistyped names answer at once.
+Each file of `ekfslam.cli.commands` is a subcommand. The first line of its docstring is its summary, ``EXAMPLES`` are
+calls of it, ``add_arguments(parser)`` declares its arguments, ``command(options)`` runs it. Only the called one is
+imported, so help and mistyped names answer at once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ekfslam.names import printable
 
 
 def main(arguments: SequenceType[str] | None = None) -> int:
-    """Entry point of ``ekfslam``; returns the exit code: 0, or 2 after one line for a user's error."""
+    """Run ``ekfslam`` and return the exit code: 0, 130 after Ctrl-C, or 2 after one line for a user's error."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     options = _parser(given[:1]).parse_args(given)
     _prepare_output()
@@ -37,8 +37,7 @@ def main(arguments: SequenceType[str] | None = None) -> int:
             options.command(options)
         sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of our output (head, less) has gone; that is not an error.
-        _forget_output()
+        _forget_output()  # the reader of our output (head, less) has gone, which is no error
     except (EkfslamError, OSError, MemoryError) as error:
         _forget_output()
         message = printable(" ".join(str(error).split())) or "there is not enough memory"
@@ -51,7 +50,7 @@ def main(arguments: SequenceType[str] | None = None) -> int:
 
 
 def _parser(called: SequenceType[str]) -> argparse.ArgumentParser:
-    """The parser of all subcommands, of which only the called one knows its arguments."""
+    """Return the parser of all subcommands; only the called one knows its arguments."""
     parser = argparse.ArgumentParser(
         prog="ekfslam",
         description="Visual-inertial EKF-SLAM: dead reckoning, independent landmark mapping, and full joint SLAM.",
@@ -61,7 +60,8 @@ def _parser(called: SequenceType[str]) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"ekfslam {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
     for module in pkgutil.iter_modules(commands.__path__):
-        summary = _summary(Path(commands.__path__[0]) / f"{module.name}.py")
+        doc = ast.get_docstring(ast.parse((Path(commands.__path__[0]) / f"{module.name}.py").read_bytes())) or ""
+        summary = doc.partition("\n")[0]
         sub = subparsers.add_parser(
             module.name,
             help=summary[0].lower() + summary[1:].rstrip("."),
@@ -73,11 +73,6 @@ def _parser(called: SequenceType[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _summary(path: Path) -> str:
-    """The first line of the docstring of a file, which is not run for it."""
-    return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or path.stem).partition("\n")[0]
-
-
 def _declare(parser: argparse.ArgumentParser, name: str) -> None:
     module = importlib.import_module(f"{commands.__name__}.{name}")
     parser.set_defaults(command=module.command)
@@ -87,7 +82,7 @@ def _declare(parser: argparse.ArgumentParser, name: str) -> None:
         type=float,
         default=DEFAULT_GB,
         metavar="GB",
-        help="how many gigabytes of numbers a file may hold; more is refused unread (default: %(default)s)",
+        help="most gigabytes of numbers in a file; more is refused unread (default: %(default)s)",
     )
     module.add_arguments(parser)
 
@@ -108,7 +103,7 @@ def _notes_on_one_line() -> Iterator[None]:
 
 
 def _prepare_output() -> None:
-    """Let printing work where there is no output, and where its encoding lacks a character of a name."""
+    """Let printing work without an output, and if its encoding lacks a character of a name."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the caller
             setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 (open until the exit)

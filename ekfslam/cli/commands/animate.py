@@ -1,11 +1,11 @@
-"""Make a moving map of an archive: gif, or mp4 where ffmpeg is installed."""
+"""Make a moving map of an archive: gif, or mp4 if ffmpeg is installed."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from ekfslam.cli.options import add_force, require_ours
+from ekfslam.cli.options import declare, require_ours
 from ekfslam.errors import ArchiveError
 from ekfslam.figures.animation import FORMATS, write_animation
 from ekfslam.storage.archive import read_archive
@@ -14,12 +14,13 @@ EXAMPLES = ("animate city.h5", "animate city.h5 --modes full --out drive.mp4 --p
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", type=Path, metavar="ARCHIVE", help="as written by run or compare")
-    parser.add_argument("--modes", nargs="+", metavar="MODE", help="to show (default: all)")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="*.gif or *.mp4; default: drive.gif beside it")
-    parser.add_argument("--pictures", type=int, default=200, metavar="N", help="at most (default: %(default)s)")
-    parser.add_argument("--per-second", type=int, default=20, metavar="N", help="default: %(default)s")
-    add_force(parser)
+    declare(parser, "archive", "--force")
+    parser.add_argument("--modes", nargs="+", metavar="MODE", help="modes to show (default: all)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="*.gif or *.mp4; default: drive.gif in its folder")
+    parser.add_argument("--pictures", type=int, default=200, metavar="N", help="most pictures (default: %(default)s)")
+    parser.add_argument(
+        "--per-second", type=int, default=20, metavar="N", help="pictures per second (default: %(default)s)"
+    )
 
 
 def command(options: argparse.Namespace) -> None:
@@ -36,7 +37,7 @@ def command(options: argparse.Namespace) -> None:
 
 
 def _is_animation(path: Path) -> bool:
-    """Whether a file is what its ending says; nothing tells whose it is."""
+    """Return whether a file is an animation; its content does not say which program wrote it."""
     with path.open("rb") as file:
         head = file.read(12)
     return path.suffix in FORMATS and (head.startswith(b"GIF8") or head[4:8] == b"ftyp")

@@ -1,20 +1,21 @@
-"""Say whether the covariance of a run is honest, without truth, from its innovations."""
+"""Judge whether the covariance of a run is honest, without truth, from its innovations."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
+from ekfslam.cli.options import declare
 from ekfslam.reports import check
 
 EXAMPLES = ("check city.h5", "check drive.h5 --out figures")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", type=Path, metavar="ARCHIVE", help="as written by run or compare, mode full")
-    parser.add_argument("--mode", default="full", help="run in the archive (default: %(default)s)")
+    declare(parser, "archive")
+    parser.add_argument("--mode", default="full", help="mode in the archive (default: %(default)s)")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="for check.md, .json, .png; default: that of the archive"
+        "--out", type=Path, metavar="DIR", help="folder for check.md, .json and .png; default: that of the archive"
     )
 
 

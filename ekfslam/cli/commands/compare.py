@@ -7,18 +7,7 @@ import os
 from pathlib import Path
 
 from ekfslam import files
-from ekfslam.cli.options import (
-    DEFAULT_DATA,
-    add_data_options,
-    add_executor,
-    add_filter_options,
-    add_force,
-    add_no_figures,
-    add_resume,
-    configured,
-    open_data,
-    print_warnings,
-)
+from ekfslam.cli.options import DEFAULT_DATA, EXECUTOR, configured, declare, declare_run, open_data, print_warnings
 from ekfslam.config import MODES
 from ekfslam.errors import ConfigError
 from ekfslam.names import components
@@ -35,24 +24,19 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("data", nargs="*", default=[DEFAULT_DATA], metavar="DATA", help=f"default: {DEFAULT_DATA}")
+    declare(parser, "data", nargs="*", default=[DEFAULT_DATA])
     parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), metavar="MODE", help=", ".join(MODES))
     parser.add_argument("--out", type=Path, default=Path("results/local"), metavar="DIR", help="default: %(default)s")
-    add_force(parser)
-    add_resume(parser)
-    add_no_figures(parser)
-    add_executor(parser)
-    add_data_options(parser)
-    add_filter_options(parser)
+    declare(parser, "--no-figures", *EXECUTOR)
+    declare_run(parser)
 
 
 def command(options: argparse.Namespace) -> None:
     config = configured(options)
     if options.truth and len(options.data) > 1:
         raise ConfigError("--truth belongs to one recording, but several are given; compare them one by one")
-    # Everything is read before anything is run: a mistyped last name should not cost the first hour.
+    # Read everything first: a mistyped last name should not cost the first hour.
     sequences = [open_data(options, data) for data in options.data]
-    # Recordings of the same name do not overwrite each other.
     folders = [options.out / name for name in components(sequence.name for sequence in sequences)]
     for sequence, folder in zip(sequences, folders, strict=True):
         files.require_writable(folder / "archive.h5")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ekfslam.cli.options import add_executor
+from ekfslam.cli.options import EXECUTOR, declare
 from ekfslam.reports import check_consistency
 from ekfslam.studies.study import COMPARED, LEVELS, STUDY_VARIANTS, Study, levels_of
 
@@ -34,8 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="VARIANT",
         help=f"{', '.join(STUDY_VARIANTS)} (default: {' '.join(COMPARED)}); textbook: standard with landmarks in xyz",
     )
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
-    add_executor(parser)
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all runs (default: %(default)s)")
+    declare(parser, *EXECUTOR)
     parser.add_argument(
         "--out",
         type=Path,

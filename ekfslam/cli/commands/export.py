@@ -1,4 +1,4 @@
-"""Write what an archive holds in the formats of other programs: trajectory, map, tables, graph, information."""
+"""Export an archive to the formats of other programs: trajectory, map, tables, graph, information."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import argparse
 from pathlib import Path
 
 from ekfslam import files
-from ekfslam.cli.options import add_force, require_ours
+from ekfslam.cli.options import declare, require_ours
 from ekfslam.errors import ArchiveError
 from ekfslam.names import components
 from ekfslam.storage.archive import open_result, read_archive
 from ekfslam.storage.exports import EXPORTS, is_export, truth_text
 
-TRUTH = "truth"  # what `export` takes beside the modes
+TRUTH = "truth"  # in place of a mode
 EXAMPLES = (
     "export city.h5 --format tum",
     "export city.h5 --format tum --mode truth",
@@ -24,7 +24,7 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", type=Path, metavar="ARCHIVE")
+    declare(parser, "archive", "--force")
     formats = "; ".join(f"{name}: {export.words}" for name, export in EXPORTS.items())
     parser.add_argument("--format", choices=tuple(EXPORTS), required=True, help=formats)
     parser.add_argument(
@@ -36,7 +36,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="default: ARCHIVE with .MODE.FORMAT.txt, or with the ending of the format",
     )
-    add_force(parser)
 
 
 def command(options: argparse.Namespace) -> None:

@@ -8,7 +8,7 @@ import dataclasses
 from threadpoolctl import threadpool_info
 
 from ekfslam import hdf5, kernels
-from ekfslam.cli.options import DEFAULT_DATA, add_data_options, open_data, table
+from ekfslam.cli.options import DATA, declare, open_data, table
 from ekfslam.config import Config
 from ekfslam.data.interpolation import stretches
 from ekfslam.data.readers.simulated import BUILTIN
@@ -26,11 +26,10 @@ EXAMPLES = ("info 0027.npz", "info results/local/city/archive.h5")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="FILE", help=f"default: {DEFAULT_DATA}")
+    declare(parser, "data", *DATA)
     parser.add_argument(
         "--build", action="store_true", help="show the kernels, libraries and threads of this installation instead"
     )
-    add_data_options(parser)
 
 
 def command(options: argparse.Namespace) -> None:

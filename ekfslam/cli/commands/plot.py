@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import get_args
 
 from ekfslam import files
-from ekfslam.cli.options import add_force, require_ours
+from ekfslam.cli.options import declare, require_ours
 from ekfslam.errors import ArchiveError
 from ekfslam.figures.run import save_figures
 from ekfslam.figures.style import Format
@@ -24,7 +24,7 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", type=Path, metavar="ARCHIVE")
+    declare(parser, "archive", "--force")
     parser.add_argument("--out", type=Path, metavar="DIR", help="default: the folder of the archive")
     parser.add_argument("--format", choices=get_args(Format), default="png", help="default: %(default)s")
     parser.add_argument(
@@ -35,7 +35,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.rrd",
         help="show it in Rerun instead of drawing figures; with a name, write a file for Rerun",
     )
-    add_force(parser)
 
 
 def command(options: argparse.Namespace) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import get_args
 
 from ekfslam import files
-from ekfslam.cli.options import add_no_figures, table
+from ekfslam.cli.options import declare, table
 from ekfslam.config import Config, Kernel, Linearisation
 from ekfslam.figures.posterior import draw_posterior_figures
 from ekfslam.figures.style import pngs
@@ -18,7 +18,7 @@ EXAMPLES = ("posterior city.h5", "posterior city.h5 --linearisation filtered", "
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", type=Path, metavar="ARCHIVE", help="as written by run or compare, mode full")
+    declare(parser, "archive", "--no-figures")
     parser.add_argument(
         "--linearisation",
         choices=get_args(Linearisation),
@@ -27,8 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--kernel", choices=get_args(Kernel), help="robust kernel of map (default: as configured, huber)"
     )
-    add_no_figures(parser)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="for the figures; default: the folder of the archive")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the figures; default: the folder of the archive"
+    )
 
 
 def command(options: argparse.Namespace) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ekfslam.cli.options import add_force, require_ours
+from ekfslam.cli.options import declare, require_ours
 from ekfslam.page.report import is_report, write_report
 
 EXAMPLES = (
@@ -15,10 +15,10 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", nargs="+", type=Path, metavar="ARCHIVE", help="as written by run or compare")
+    declare(parser, "archive", nargs="+")
+    declare(parser, "--force")
     parser.add_argument("--out", type=Path, metavar="FILE", help="default: report.html in the first archive's folder")
     parser.add_argument("--title", default="", metavar="TEXT", help="heading; default: the names of the recordings")
-    add_force(parser)
 
 
 def command(options: argparse.Namespace) -> None:

@@ -6,17 +6,7 @@ import argparse
 from pathlib import Path
 
 from ekfslam import files
-from ekfslam.cli.options import (
-    DEFAULT_DATA,
-    add_data_options,
-    add_filter_options,
-    add_force,
-    add_resume,
-    configured,
-    open_data,
-    print_warnings,
-    table,
-)
+from ekfslam.cli.options import configured, declare, declare_run, open_data, print_warnings, table
 from ekfslam.config import MODES
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.older import older_figures, remove_figures
@@ -30,13 +20,10 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("data", nargs="?", default=DEFAULT_DATA, metavar="DATA", help=f"default: {DEFAULT_DATA}")
+    declare(parser, "data")
     parser.add_argument("--mode", choices=MODES, default="full", help="default: %(default)s")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="archive to write")
-    add_force(parser)
-    add_resume(parser)
-    add_data_options(parser)
-    add_filter_options(parser)
+    declare_run(parser)
 
 
 def command(options: argparse.Namespace) -> None:
@@ -60,5 +47,5 @@ def command(options: argparse.Namespace) -> None:
 
 
 def _is_shared(archive: Path) -> bool:
-    """Whether the figures beside an archive need not be its own."""
+    """Return whether figures in the folder of an archive may belong to another one."""
     return not archive.exists() or any(path != archive for path in archive.parent.glob("*.h5"))

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from ekfslam import files
-from ekfslam.cli.options import DEFAULT_DATA, add_force, require_ours
+from ekfslam.cli.options import DEFAULT_DATA, declare, require_ours
 from ekfslam.data.readers.hdf5 import is_recording_of, sequence_image
 from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.simulate import builtin
@@ -17,7 +17,7 @@ EXAMPLES = ("simulate city --out city.h5", "simulate 'loop?seed=7' --out loop.h5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("world", nargs="?", default=DEFAULT_DATA, metavar="WORLD", help=f"default: {DEFAULT_DATA}")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="recording to write")
-    add_force(parser)
+    declare(parser, "--force")
 
 
 def command(options: argparse.Namespace) -> None:

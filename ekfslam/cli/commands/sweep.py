@@ -1,4 +1,4 @@
-"""Run recordings x modes x variants x settings x seeds and write a table with one row a run."""
+"""Run recordings x modes x variants x settings x seeds and write a table with one row per run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from ekfslam import files
-from ekfslam.cli.options import add_executor
+from ekfslam.cli.options import EXECUTOR, declare
 from ekfslam.errors import ConfigError
 from ekfslam.figures.style import pngs
 from ekfslam.figures.sweep import plot_sweep
@@ -26,7 +26,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("study", nargs="?", type=Path, metavar="STUDY.toml", help="recordings, modes, variants, ...")
     parser.add_argument("--table", action="store_true", help="run nothing: show the table in --out")
     parser.add_argument(
-        "--figures", nargs="+", default=list(SHOWN), metavar="COLUMN", help=f"to show (default: {' '.join(SHOWN)})"
+        "--figures",
+        nargs="+",
+        default=list(SHOWN),
+        metavar="COLUMN",
+        help=f"columns to show (default: {' '.join(SHOWN)})",
     )
     parser.add_argument(
         "--only",
@@ -45,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("FIGURE", "SETTING"),
         help="draw a column against another, a panel for each recording; may be given several times",
     )
-    add_executor(parser)
+    declare(parser, *EXECUTOR)
     parser.add_argument(
         "--out",
         type=Path,

@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 
 from ekfslam import files
-from ekfslam.cli.options import add_force, add_place_options, require_ours
-from ekfslam.config import Config
+from ekfslam.cli.options import PLACES, config_file, declare, require_ours
 from ekfslam.data.opening import attach_truth, open_images
 from ekfslam.data.readers.hdf5 import is_recording_of, sequence_image
 from ekfslam.data.velocities import attach_velocities
@@ -25,15 +24,13 @@ EXAMPLES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("data", metavar="SOURCE", help="folder with stereo images and their calibration")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="recording to write")
-    add_place_options(parser)
-    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings in a table [front_end]")
-    parser.add_argument("--features", type=int, metavar="N", help="how many are wanted in a frame")
-    add_force(parser)
+    declare(parser, "--force", *PLACES)
+    declare(parser, "--config", help="settings in a table [front_end]")
+    parser.add_argument("--features", type=int, metavar="N", help="features wanted in a frame")
 
 
 def command(options: argparse.Namespace) -> None:
-    config = Config.from_toml(options.config) if options.config else Config()
-    config = config.with_overrides({"front_end": {"features": options.features}})
+    config = config_file(options).with_overrides({"front_end": {"features": options.features}})
     files.require_writable(options.out)
     recording = open_images(options.data, lateral=options.lateral)
     if recording is None:
