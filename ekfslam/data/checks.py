@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from types import MappingProxyType
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ekfslam.arrays import Array
-from ekfslam.errors import DataError, NonFiniteError, ShapeError, StampError
+from ekfslam.errors import DataError, ExtrinsicsError, NonFiniteError, ShapeError, StampError
+from ekfslam.geometry import se3
 from ekfslam.stored import rigid_defect
 
 ROTATION_TOLERANCE = 1e-4  # files print rotations with as few as five digits
 
 # No quantity of a recording is larger, in s, m, m/s, rad/s or px: beyond, a square or a product loses all digits.
 LARGEST = 1e12
-LARGEST_VELOCITY = 1e6
+LARGEST_VELOCITY, LARGEST_DISTANCE_M = 1e6, 1e9
 
 
 def frozen(array: NDArray) -> NDArray:
@@ -40,9 +45,7 @@ def require_finite(value: Array, name: str, largest: float = LARGEST) -> None:
         index = tuple(int(i) for i in bad[0])
         kind = f"larger than {largest:g}" if np.isfinite(np.asarray(value)[index]) else "NaN or infinite"
         raise NonFiniteError(
-            f"{len(bad)} values are {kind}, the first is {value[index]}",
-            field=name,
-            index=index[0] if len(index) == 1 else index or None,
+            f"{len(bad)} values are {kind}, the first is {value[index]}", field=name, index=_position(index)
         )
 
 
@@ -56,8 +59,31 @@ def require_rigid(T: Array, name: str, error: type[DataError]) -> None:
             f"not a rigid transform: orthogonality defect {defect[index]:.2g}, "
             f"determinant {np.linalg.det(T[index][:3, :3]):.6g}",
             field=name,
-            index=index[0] if len(index) == 1 else index or None,
+            index=_position(index),
         )
+
+
+def _position(index: tuple[int, ...]) -> int | tuple[int, ...] | None:
+    return index[0] if len(index) == 1 else index or None
+
+
+def checked_pose(T: ArrayLike, name: str, largest_m: float = LARGEST_DISTANCE_M) -> Array:
+    """Return a transform (4, 4), made rigid to rounding; raise a `DataError` if it is none."""
+    T = np.asarray(T, dtype=float)
+    require_shape(T, (4, 4), name)
+    require_finite(T, name, largest_m)
+    require_rigid(T, name, ExtrinsicsError)
+    return frozen(se3.nearest_rigid(T))
+
+
+@contextmanager
+def spelled_as_in(source: str, spelling: Mapping[str, str] = MappingProxyType({})) -> Iterator[None]:
+    """Add the file to data errors that are raised inside and name none, and its own names of fields (``spelling``)."""
+    try:
+        yield
+    except DataError as error:
+        name = spelling.get(error.field, error.field)
+        raise type(error)(error.message, source=error.source or source, field=name, index=error.index) from None
 
 
 def validate_stamps(time_s: Array) -> None:

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
-from ekfslam.data.checks import frozen, require_finite, require_rigid, require_shape, validate_stamps
+from ekfslam.data.checks import checked_pose, frozen, require_finite, require_shape, spelled_as_in, validate_stamps
+from ekfslam.data.inputs import Velocities, VelocityFrame
 from ekfslam.data.noise import Noise
-from ekfslam.data.sequence import Truth, VelocityFrame, validate_truth
-from ekfslam.errors import CalibrationError, DataError, ExtrinsicsError
+from ekfslam.data.observations import Truth, validate_truth
+from ekfslam.errors import CalibrationError
 from ekfslam.geometry import se3
 from ekfslam.names import printable
 
@@ -39,16 +40,13 @@ class Distortion:
 
     def __post_init__(self) -> None:
         if self.model not in get_args(DistortionModel):
-            raise CalibrationError(
-                f"expected {', '.join(get_args(DistortionModel))}, found {self.model!r}", field="distortion"
-            )
+            message = f"expected {', '.join(get_args(DistortionModel))}, found {self.model!r}"
+            raise CalibrationError(message, field="distortion")
         object.__setattr__(self, "coefficients", tuple(float(value) for value in self.coefficients))
         allowed = _COEFFICIENTS[self.model]
         if len(self.coefficients) not in allowed:
-            wanted = " or ".join(map(str, allowed))
-            raise CalibrationError(
-                f"{self.model} has {wanted} coefficients, found {len(self.coefficients)}", field="distortion"
-            )
+            message = f"{self.model} has {' or '.join(map(str, allowed))} coefficients, found {len(self.coefficients)}"
+            raise CalibrationError(message, field="distortion")
         require_finite(np.array(self.coefficients), "distortion")
 
 
@@ -87,27 +85,26 @@ class PairCalibration:
         if len(size) != 2 or not all(0 < side < _LARGEST_SIDE_PX for side in size):
             raise CalibrationError(f"expected width and height of an image, found {self.size}", field="size")
         object.__setattr__(self, "size", size)
-        T = np.asarray(self.T_right_left, dtype=float)
-        require_shape(T, (4, 4), "T_right_left")
-        require_finite(T, "T_right_left", 1e9)
-        require_rigid(T, "T_right_left", ExtrinsicsError)
-        if not np.linalg.norm(T[:3, 3]) > 0:
+        object.__setattr__(self, "T_right_left", checked_pose(self.T_right_left, "T_right_left"))
+        if not np.linalg.norm(self.T_right_left[:3, 3]) > 0:
             raise CalibrationError("the two cameras are at the same place", field="T_right_left")
-        object.__setattr__(self, "T_right_left", frozen(se3.nearest_rigid(T)))
 
     @property
     def is_rectified(self) -> bool:
         """Whether rows agree already: no distortion, equal intrinsics without skew, and a shift along x alone."""
         T = self.T_right_left
-        shifted = np.eye(4)
-        shifted[0, 3] = T[0, 3]
         return (
             self.distortion_left.model == self.distortion_right.model == "none"
             and bool((self.K_left == self.K_right).all())
             and self.K_left[0, 1] == 0
             and T[0, 3] < 0
-            and bool(np.abs(T - shifted).max() < 1e-9)
+            and bool(np.abs(T - side_by_side(-T[0, 3])).max() < 1e-9)
         )
+
+
+def side_by_side(baseline_m: float) -> Array:
+    """Return ``T_right_left`` (4, 4) of a rectified pair."""
+    return se3.transform(np.eye(3), np.array([-baseline_m, 0.0, 0.0]))
 
 
 @dataclass(frozen=True)
@@ -115,20 +112,12 @@ class ImageRecording:
     """One recording of stereo images, with or without body velocities.
 
     Args:
-        name: Short name for folders and titles.
-        source: File or folder, named in error messages.
-        time_s: (T,) strictly increasing stamps.
+        name, source, time_s, velocity_frame, truth, noise, notes, attributes: See `ekfslam.Sequence`.
         calibration: Calibration of the pair.
         load: Function that returns the left and right image of frame k as (height, width) uint8, in any order. It
             raises `UnknownFormatError` or `DataError`.
         T_cam_imu: (4, 4) IMU to the optical frame of the left camera before rectification.
-        twist: (T, 6) measured velocities ``[v; w]`` in ``velocity_frame``, ``twist[k]`` drives ``(t[k-1], t[k]]``;
-            None if they were not measured.
-        velocity_frame: See `ekfslam.Sequence`.
-        truth: Ground truth, if there is any.
-        noise: Noise that the source states, if it states any.
-        notes: Findings and repairs of the reader, one sentence each.
-        attributes: Further facts that every result keeps.
+        twist: (T, 6) measured velocities ``[v; w]``, ``twist[k]`` drives ``(t[k-1], t[k]]``; None if there are none.
 
     Raises:
         DataError: A field is malformed; the subclass says how.
@@ -148,23 +137,15 @@ class ImageRecording:
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("time_s", "T_cam_imu") if self.twist is None else ("time_s", "T_cam_imu", "twist"):
+        for name in ("time_s",) if self.twist is None else ("time_s", "twist"):
             object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
-        try:
+        with spelled_as_in(self.source):
             validate_stamps(self.time_s)
             if self.twist is not None:
-                require_shape(self.twist, (len(self.time_s), 6), "twist")
-                require_finite(self.twist, "twist", 1e6)
-            require_shape(self.T_cam_imu, (4, 4), "T_cam_imu")
-            require_finite(self.T_cam_imu, "T_cam_imu", 1e9)
-            require_rigid(self.T_cam_imu, "T_cam_imu", ExtrinsicsError)
+                Velocities(self.time_s, self.twist, self.velocity_frame)
+            object.__setattr__(self, "T_cam_imu", checked_pose(self.T_cam_imu, "T_cam_imu"))
             if self.truth is not None:
                 validate_truth(self.truth, len(self.time_s))
-        except DataError as error:
-            if error.source:
-                raise
-            raise type(error)(error.message, source=self.source, field=error.field, index=error.index) from None
-        object.__setattr__(self, "T_cam_imu", frozen(se3.nearest_rigid(self.T_cam_imu)))
         object.__setattr__(self, "name", printable(self.name))
 
     def __len__(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, TypeVar, get_args
@@ -106,6 +107,27 @@ class Velocities:
 
 
 @dataclass(frozen=True)
+class VelocitySamples:
+    """Velocities as a file has them, before they are brought to the stamps of a recording.
+
+    Args:
+        source: File.
+        time_s: (N,) increasing stamps.
+        twist: (N, 6) ``[v; w]`` in ``velocity_frame``.
+        T_cam_imu: (4, 4) extrinsics of the recording that holds them; None for a text file.
+        attributes, notes: Facts about these velocities for the recording that takes them.
+    """
+
+    source: str
+    time_s: Array
+    twist: Array
+    velocity_frame: VelocityFrame = "imu"
+    T_cam_imu: Array | None = None
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class InertialNoise:
     """Continuous-time noise densities of an inertial unit, as in ``sensor.yaml`` of EuRoC and ``imu.yaml`` of Kalibr.
 
@@ -116,9 +138,6 @@ class InertialNoise:
         accel: m/s^2/sqrt(Hz).
         gyro_walk: rad/s^2/sqrt(Hz).
         accel_walk: m/s^3/sqrt(Hz).
-
-    Raises:
-        DataError: A density is negative, infinite or NaN.
     """
 
     gyro: float

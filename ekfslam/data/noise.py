@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.checks import LARGEST_VELOCITY, require_finite, require_shape
+from ekfslam.errors import DataError
 from ekfslam.stored import stored
 
-# How much of the squared motion of a track's other rows counts for a row, see `TrackError.step_variance`.
+# Share of the squared motion of a track's other rows that counts for a row, see `TrackError.step_variance`.
 ACROSS = 0.35
 
 
@@ -30,7 +32,7 @@ class ProcessNoise:
     gap_std: Array
 
     def pose_std_during(self, is_gap: BoolArray | bool) -> Array:
-        """(..., 6) error of the velocities that move the pose, by whether (...) they were interpolated."""
+        """Return the error (..., 6) of velocities that move the pose, given whether (...) they were interpolated."""
         return np.hypot(self.pose_std, np.where(np.asarray(is_gap)[..., None], self.gap_std, 0.0))
 
     @property
@@ -48,9 +50,8 @@ class ProcessNoise:
 class TrackError:
     """Error of a track in the image, eq. (10): it starts with the track and then walks.
 
-    An observation is ``z(k) = h(k) + e(k)`` with ``e ~ N(0, first^2)`` at landmark initialisation and
-    ``e(k) = e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2))`` while the track goes on: the further pixels move from one
-    frame to the next, the worse they are followed, most along their motion.
+    An observation is ``z(k) = h(k) + e(k)`` with ``e ~ N(0, first^2)`` at landmark initialisation. While the track goes
+    on, ``e(k) = e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2))``: features are followed worse the further they move.
 
     Args:
         first_std: (3,) standard deviation at landmark initialisation, in the sensor's rows, px.
@@ -63,19 +64,18 @@ class TrackError:
     flow_px: float
 
     def step_variance(self, motion_px: Array) -> Array:
-        """Variances (n, 3) of differences from the frame before, whose rows have moved by ``motion_px`` (n, 3).
+        """Return the variances (n, 3) of differences from the frame before, if rows moved by ``motion_px`` (n, 3).
 
-        A row suffers from its own motion, and from that of the others by the share `ACROSS`.
+        The error of a row grows with its own motion, and with the share `ACROSS` of the others' motion.
         """
         square = np.asarray(motion_px) ** 2
         flow = (1.0 - ACROSS) * square + ACROSS * square.sum(axis=1, keepdims=True)
         return self.walk_std**2 * (1.0 + flow / self.flow_px**2)
 
     def absolute_variance(self, age: IntArray) -> Array:
-        """Variances (n, 3) of observations without a predecessor in the frame before, ``age`` (n,) frames old.
+        """Return the variances (n, 3) of observations without a predecessor in the frame before, by age (n,) in frames.
 
-        At age 0 that of landmark initialisation. A track that missed a frame is matched anew: its error is drawn again,
-        from what the error of a track of that age spreads over.
+        A track that missed a frame is matched again: its error is drawn from the spread of tracks of that age.
         """
         return self.first_std**2 + age[:, None] * self.walk_std**2
 
@@ -87,14 +87,14 @@ class Noise:
     Args:
         twist_std: (6,) white noise of the velocities per sample, m/s and rad/s.
         pixel_std_px: (4,) white noise of the pixels (uL, vL, uR, vR).
-        twist_walk_std: (6,) how far the true velocities change from one sample to the next; the joint filter then
-            estimates them, too. None: nothing is assumed of how they change.
+        twist_walk_std: (6,) change of the true velocities from one sample to the next, which the joint filter then
+            estimates. None: nothing is assumed of it.
         motion_std: (6,) error of the motion beyond ``twist_std``, which no averaging of velocities removes.
-        tilt_rad: Of velocities in a level frame: standard deviation of the first roll and pitch against gravity; the
-            joint filter then estimates them. 0: the velocities are taken as those of the IMU frame.
+        tilt_rad: First roll and pitch against gravity of velocities in a level frame, which the joint filter then
+            estimates. 0: the velocities are taken as those of the IMU frame.
         track_first_px: (3,) error of a track at landmark initialisation (u, v, disparity), see `TrackError`. None:
             pixel noise is white.
-        track_walk_px: (3,) how far that error walks from frame to frame (u, v, disparity).
+        track_walk_px: (3,) change of that error from frame to frame (u, v, disparity).
         track_flow_px: Motion in the image at which the variance of the walk has doubled.
         gap_std: (6,) further error of velocities that were interpolated across a gap.
     """
@@ -130,3 +130,23 @@ class Noise:
     def isotropic(sigma_v_m_s: float, sigma_w_rad_s: float, sigma_px: float) -> Noise:
         """Return white noise with one standard deviation each for linear velocities, angular velocities and pixels."""
         return Noise(np.repeat([sigma_v_m_s, sigma_w_rad_s], 3), np.full(4, float(sigma_px)))
+
+
+def validate_noise(noise: Noise) -> None:
+    """Raise a `DataError` for standard deviations of other shapes, or that are none."""
+    sizes = {"twist_std": 6, "pixel_std_px": 4, "motion_std": 6, "gap_std": 6}
+    optional = {"twist_walk_std": 6, "track_first_px": 3, "track_walk_px": 3}
+    for name, size in (sizes | optional).items():
+        if name in optional and getattr(noise, name) is None:
+            continue
+        value = np.asarray(getattr(noise, name), dtype=float)
+        require_shape(value, (size,), f"noise.{name}")
+        require_finite(value, f"noise.{name}", LARGEST_VELOCITY)
+        if (value < 0).any():
+            raise DataError("standard deviations must not be negative", field=f"noise.{name}")
+    if not (np.isfinite(noise.tilt_rad) and noise.tilt_rad >= 0):
+        raise DataError(f"must be finite and not negative, found {noise.tilt_rad}", field="noise.tilt_rad")
+    if (noise.track_first_px is None) != (noise.track_walk_px is None):
+        raise DataError("track_first_px and track_walk_px belong together", field="noise.track_walk_px")
+    if not noise.track_flow_px > 0:
+        raise DataError(f"must be positive, found {noise.track_flow_px}", field="noise.track_flow_px")

@@ -9,12 +9,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.data.checks import frozen, require_finite, require_shape
+from ekfslam.data.checks import (
+    LARGEST_DISTANCE_M,
+    LARGEST_VELOCITY,
+    frozen,
+    require_finite,
+    require_rigid,
+    require_shape,
+)
 from ekfslam.data.truth_noise import TruthNoise
-from ekfslam.errors import EmptyTracksError, NonFiniteError, ShapeError
+from ekfslam.errors import DataError, EmptyTracksError, NonFiniteError, ShapeError, TruthError
 from ekfslam.shown import count
 from ekfslam.stored import COUNTS, stored
 
+LARGEST_ID = 1 << 62  # pieces of cut tracks count on from the largest
 UNSEEN = -1.0  # all four pixels of an unseen track in dense formats; or NaN
 
 
@@ -50,7 +58,7 @@ class Observations:
 
     @cached_property
     def ids(self) -> IntArray:
-        """Return the distinct landmark ids, ascending."""
+        """Distinct landmark ids, ascending."""
         return np.unique(self.landmark)
 
     def at(self, frame: int) -> tuple[IntArray, Array]:
@@ -66,13 +74,7 @@ class Observations:
 
 @dataclass(frozen=True)
 class TrueMotion:
-    """True velocities of the IMU and biases of its samples.
-
-    Args:
-        velocity_m_s: (F, 3) in world.
-        gyro_bias_rad_s: (F, 3).
-        accel_bias_m_s2: (F, 3).
-    """
+    """True velocities (F, 3) of the IMU in world, and biases (F, 3) of its samples."""
 
     velocity_m_s: Array = field(metadata=stored("F xyz", "m/s", "world"))
     gyro_bias_rad_s: Array = field(metadata=stored("F xyz", "rad/s", "imu"))
@@ -110,14 +112,13 @@ class Truth:
     motion: TrueMotion | None = None
 
     def __post_init__(self) -> None:
-        for name, dtype in (("frame", np.int64), ("landmark", np.int64)):
+        types = {"frame": np.int64, "landmark": np.int64, "T_world_imu": np.float64, "position_m": np.float64}
+        for name, dtype in types.items():
             object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=dtype)))
-        for name in ("T_world_imu", "position_m"):
-            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=float)))
 
     @property
     def text(self) -> str:
-        """Return the numbers of poses and landmarks in words."""
+        """Numbers of poses and landmarks in words."""
         landmarks = f", {count(len(self.landmark), 'landmark')}" if len(self.landmark) else ""
         return count(len(self.frame), "pose") + landmarks
 
@@ -131,18 +132,10 @@ class Truth:
 
 
 def flat_observations(dense: Array, frame_axis: int, field: str) -> tuple[Observations, tuple[str, ...]]:
-    """Return the observations of a dense 4 x T x M (``frame_axis`` 1) or 4 x M x T (2) array of pixels.
+    """Return the observations, and notes, of a dense 4 x T x M (``frame_axis`` 1) or 4 x M x T (2) array of pixels.
 
     The index of a track is its landmark id. A track is unseen if all four pixels are -1 or NaN. If only the right two
-    are, there is no depth: the observation is left out.
-
-    Returns:
-        The observations, and notes on tracks that no frame sees and on observations without right pixels.
-
-    Raises:
-        ShapeError: Other parts of the four pixels are missing.
-        NonFiniteError: A pixel is infinite, or other parts of the four are NaN.
-        EmptyTracksError: No track is ever seen.
+    are, there is no depth: the observation is left out. Any other missing pixel is an error.
     """
     missing = (dense == UNSEEN) | np.isnan(dense)
     seen = ~missing.any(axis=0)
@@ -164,20 +157,14 @@ def flat_observations(dense: Array, frame_axis: int, field: str) -> tuple[Observ
 
 def _require_whole(dense: Array, missing: BoolArray, is_known: BoolArray, field: str) -> None:
     partly = np.argwhere(~is_known)
-    if not len(partly):
-        return
-    position = tuple(int(i) for i in partly[0])
-    pixels = dense[:, position[0], position[1]]
-    row = int(np.argmax(missing[:, position[0], position[1]]))
-    if np.isnan(pixels[row]):
-        raise NonFiniteError(
-            f"{len(partly)} observations are NaN in some of their pixels", field=field, index=(row, *position)
-        )
-    raise ShapeError(
-        f"{len(partly)} observations have some but not all of their four pixels equal to -1 (unseen)",
-        field=field,
-        index=(row, *position),
-    )
+    if len(partly):
+        i, j = partly[0].tolist()
+        row = int(np.argmax(missing[:, i, j]))
+        error: type[DataError] = ShapeError
+        kind = "have some but not all of their four pixels equal to -1 (unseen)"
+        if np.isnan(dense[row, i, j]):
+            error, kind = NonFiniteError, "are NaN in some of their pixels"
+        raise error(f"{len(partly)} observations {kind}", field=field, index=(row, i, j))
 
 
 def numbers(value: ArrayLike, name: str) -> Array:
@@ -214,3 +201,35 @@ def truth_of(T_world_imu: Array, frames: int) -> Truth | None:
     require_shape(T_world_imu, (frames, 4, 4), "T_world_imu")
     known = np.flatnonzero(~np.isnan(T_world_imu).any(axis=(1, 2)))
     return Truth(known, T_world_imu[known]) if len(known) else None
+
+
+def require_ids(landmark: IntArray, name: str) -> None:
+    """Raise `ShapeError` for ids of landmarks that are negative or too large."""
+    wrong = (landmark < 0) | (landmark > LARGEST_ID)
+    if wrong.any():
+        index = int(np.argmax(wrong))
+        message = f"landmark ids must be from 0 to {LARGEST_ID}, found {landmark[index]}"
+        raise ShapeError(message, field=name, index=index)
+
+
+def validate_truth(truth: Truth, frames: int) -> None:
+    """Raise a `DataError` for true poses or landmarks of other shapes, or of other frames than these."""
+    require_shape(truth.frame, (None,), "truth.frame")
+    if np.shape(truth.T_world_imu) != (len(truth.frame), 4, 4):
+        message = f"{len(truth.frame)} frames but poses of shape {np.shape(truth.T_world_imu)}"
+        raise TruthError(message, field="truth.T_world_imu")
+    if len(truth.frame) and (truth.frame[0] < 0 or truth.frame[-1] >= frames or (np.diff(truth.frame) <= 0).any()):
+        raise TruthError(f"frames must ascend within 0..{frames - 1}", field="truth.frame")
+    require_finite(truth.T_world_imu, "truth.T_world_imu", LARGEST_DISTANCE_M)
+    require_rigid(truth.T_world_imu, "truth.T_world_imu", TruthError)
+    for name, value in vars(truth.motion).items() if truth.motion is not None else ():
+        require_shape(value, (len(truth.frame), 3), f"truth.motion.{name}")
+        require_finite(value, f"truth.motion.{name}", LARGEST_VELOCITY)
+    if np.shape(truth.position_m) != (len(truth.landmark), 3):
+        message = f"{len(truth.landmark)} landmarks but positions of shape {np.shape(truth.position_m)}"
+        raise TruthError(message, field="truth.position_m")
+    require_ids(truth.landmark, "truth.landmark")
+    require_finite(truth.position_m, "truth.position_m", LARGEST_DISTANCE_M)
+    for name, value in vars(truth.noise).items() if truth.noise is not None else ():
+        if not (np.isfinite(value) and value >= 0):
+            raise DataError(f"must be finite and not negative, found {value}", field=f"truth.noise.{name}")

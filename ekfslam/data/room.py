@@ -85,11 +85,7 @@ class Room(Recording):
 
 
 def simulate_room(world: Room, rng: np.random.Generator | None = None) -> Sequence:
-    """Record a world once; see `ekfslam.data.simulate.simulate`.
-
-    Raises:
-        ConfigError: The file of the trajectory is malformed, too short, or has a gap.
-    """
+    """Record a world once; see `ekfslam.data.simulate.simulate`."""
     geometry = np.random.default_rng(world.seed)
     noise = geometry if rng is None else rng
     jitter = np.clip(world.stamp_jitter_s * geometry.standard_normal(world.frames), -0.3, 0.3)

@@ -13,46 +13,43 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.data.checks import (
-    LARGEST_VELOCITY,
-    frozen,
-    require_finite,
-    require_rigid,
-    require_shape,
-    validate_stamps,
-)
+from ekfslam.arrays import Array, BoolArray
+from ekfslam.data.checks import checked_pose, frozen, require_finite, spelled_as_in, validate_stamps
 from ekfslam.data.inputs import InertialSamples, Input, Velocities, VelocityFrame, validate_inputs
 from ekfslam.data.interpolation import INTERPOLATED, attributes_of_part, known_intervals
 from ekfslam.data.interval import Interval
-from ekfslam.data.noise import Noise
-from ekfslam.data.observations import Observations, Truth, numbers, observations_of, truth_of
+from ekfslam.data.noise import Noise, validate_noise
+from ekfslam.data.observations import (
+    Observations,
+    Truth,
+    numbers,
+    observations_of,
+    require_ids,
+    truth_of,
+    validate_truth,
+)
 from ekfslam.errors import (
     CalibrationError,
-    DataError,
     DuplicateObservationError,
     EmptyTracksError,
     ExtrinsicsError,
     LostDataError,
     ShapeError,
-    TruthError,
 )
 from ekfslam.geometry import se3
-from ekfslam.geometry.camera import R_CAM_BODY, StereoCamera
+from ekfslam.geometry.camera import T_CAM_BODY, StereoCamera
 from ekfslam.names import printable
 from ekfslam.shown import Card, Shown, count, figure
 from ekfslam.stored import stored
 
-LARGEST_ID = 1 << 62  # pieces of cut tracks count on from the largest
-_LARGEST_DISTANCE_M, _LARGEST_PX = 1e9, 1e7
+_LARGEST_PX = 1e7
 
-# Among the attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
+# Attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
-# Among those of one whose tracks are compared with their first sight in every frame, so that their errors do not walk.
+# Attributes of a recording whose tracks are compared with their first sight in every frame: their errors do not walk.
 CHECKED_TRACKS = {"tracks": "checked"}
 # Attributes of a recording whose velocities were not measured. Any it has are those of its own odometry.
 WITHOUT_VELOCITIES = {"velocities": "none"}
-
 
 LEVEL_VELOCITIES_NOTE = (
     "The velocities are forward, left and up over level ground, whatever the vehicle's roll and pitch: full SLAM "
@@ -112,25 +109,24 @@ class Sequence(Shown):
         notes: tuple[str, ...] = (),
         attributes: Mapping[str, str | int | float] | None = None,
     ) -> None:
-        given = {"name": printable(name), "source": source, "camera": camera, "observations": observations}
-        given |= {
-            "truth": truth,
-            "noise": noise,
-            "notes": notes,
-            "attributes": {} if attributes is None else attributes,
-        }
-        given |= {"time_s": frozen(np.asarray(time_s, dtype=float)), "T_cam_imu": np.asarray(T_cam_imu, dtype=float)}
+        given: dict[str, object] = {"name": printable(name), "source": source}
+        given |= {"time_s": frozen(np.asarray(time_s, dtype=float))}
+        given |= {"camera": camera, "observations": observations, "truth": truth, "noise": noise, "notes": notes}
+        given |= {"attributes": {} if attributes is None else attributes}
         for field_name, value in given.items():
             object.__setattr__(self, field_name, value)
-        try:
+        with spelled_as_in(source):
             validate_stamps(self.time_s)
             object.__setattr__(self, "inputs", _with_twist(self, tuple(inputs), twist, velocity_frame))
-            _validate(self)
-        except DataError as error:
-            if error.source:
-                raise
-            raise type(error)(error.message, source=source, field=error.field, index=error.index) from None
-        object.__setattr__(self, "T_cam_imu", frozen(se3.nearest_rigid(self.T_cam_imu)))
+            validate_inputs(self.inputs, self.time_s)
+            validate_camera(camera)
+            object.__setattr__(self, "T_cam_imu", checked_pose(T_cam_imu, "T_cam_imu"))
+            if len(observations) or self.attributes.get("tracks") != WITHOUT_TRACKS["tracks"]:
+                _validate_observations(observations, len(self))
+            if truth is not None:
+                validate_truth(truth, len(self))
+            if noise is not None:
+                validate_noise(noise)
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -226,11 +222,7 @@ class Sequence(Shown):
         )
 
     def between(self, begin_s: float, end_s: float) -> Sequence:
-        """Return the frames whose stamps are in ``[begin_s, end_s)``, on the clock of the recording.
-
-        Raises:
-            ShapeError: There are none.
-        """
+        """Return the frames whose stamps are in ``[begin_s, end_s)``, on the clock of the recording."""
         begin, end = np.searchsorted(self.time_s, (begin_s, end_s)).tolist()
         return self[begin:end]
 
@@ -255,11 +247,7 @@ class Sequence(Shown):
         return frozen(np.zeros((len(self), 6)) if velocities is None else velocities.mean(self.time_s))
 
     def interval(self, frame: int, kind: type[Input] = Velocities) -> Interval:
-        """Return the inputs of a kind that lead to a frame from the frame before.
-
-        Raises:
-            LostDataError: There are no inputs of this kind, or none during the interval.
-        """
+        """Return the inputs of a kind that lead to a frame from the frame before; `LostDataError` if there are none."""
         begin_s, end_s = float(self.time_s[frame - 1]), float(self.time_s[frame])
         velocities = self.velocities
         if kind is InertialSamples:
@@ -269,11 +257,7 @@ class Sequence(Shown):
         return velocities.interval(begin_s, end_s)
 
     def inputs_at(self, frame: int, kind: type[Input] = Velocities) -> Array:
-        """Return the inputs (6,) of a kind at a frame.
-
-        Raises:
-            LostDataError: There are no inputs of this kind.
-        """
+        """Return the inputs (6,) of a kind at a frame; `LostDataError` if there are none."""
         return _samples_of(self).at(self.time_s[frame]) if kind is InertialSamples else self.twist[frame]
 
     @property
@@ -323,10 +307,9 @@ def _camera_pose(T_cam_imu: ArrayLike | None, is_optional: bool) -> Array:
     if T_cam_imu is not None:
         return numbers(T_cam_imu, "T_cam_imu")
     if not is_optional:
-        raise ExtrinsicsError(
-            "velocities and inertial samples need the pose of the camera in their frame", field="T_cam_imu"
-        )
-    return se3.transform(R_CAM_BODY, np.zeros(3))
+        message = "velocities and inertial samples need the pose of the camera in their frame"
+        raise ExtrinsicsError(message, field="T_cam_imu")
+    return T_CAM_BODY
 
 
 def validate_camera(camera: StereoCamera) -> None:
@@ -334,9 +317,8 @@ def validate_camera(camera: StereoCamera) -> None:
     values = np.array([camera.fu_px, camera.fv_px, camera.cu_px, camera.cv_px, camera.baseline_m])
     require_finite(values, "camera (fu, fv, cu, cv, baseline)", _LARGEST_PX)
     if camera.fu_px <= 0 or camera.fv_px <= 0:
-        raise CalibrationError(
-            f"intrinsic matrix K is singular or mirrored: fu {camera.fu_px:g}, fv {camera.fv_px:g}", field="K"
-        )
+        message = f"intrinsic matrix K is singular or mirrored: fu {camera.fu_px:g}, fv {camera.fv_px:g}"
+        raise CalibrationError(message, field="K")
     if camera.baseline_m <= 0:
         raise CalibrationError(f"stereo baseline must be positive, found {camera.baseline_m:g} m", field="baseline")
 
@@ -348,35 +330,16 @@ def _with_twist(
 
     Velocities of 0 that the attributes state as never measured are none at all.
     """
-    others = tuple(samples for samples in inputs if not isinstance(samples, Velocities))
     if twist is None:
-        return (
-            inputs
-            if frame is None
-            else tuple(
-                replace(samples, frame=frame) if isinstance(samples, Velocities) else samples for samples in inputs
-            )
-        )
+        if frame is None:
+            return inputs
+        return tuple(replace(each, frame=frame) if isinstance(each, Velocities) else each for each in inputs)
+    others = tuple(samples for samples in inputs if not isinstance(samples, Velocities))
     frames: list[VelocityFrame] = [samples.frame for samples in inputs if isinstance(samples, Velocities)]
     velocities = Velocities(sequence.time_s, np.asarray(twist, dtype=float), frame or (*frames, "imu")[0])
     if WITHOUT_VELOCITIES.items() <= sequence.attributes.items() and not velocities.twist.any():
         return others
     return (velocities, *others)
-
-
-def _validate(sequence: Sequence) -> None:
-    frames = len(sequence.time_s)
-    validate_inputs(sequence.inputs, sequence.time_s)
-    validate_camera(sequence.camera)
-    require_shape(sequence.T_cam_imu, (4, 4), "T_cam_imu")
-    require_finite(sequence.T_cam_imu, "T_cam_imu", _LARGEST_DISTANCE_M)
-    require_rigid(sequence.T_cam_imu, "T_cam_imu", ExtrinsicsError)
-    if len(sequence.observations) or sequence.attributes.get("tracks") != WITHOUT_TRACKS["tracks"]:
-        _validate_observations(sequence.observations, frames)
-    if sequence.truth is not None:
-        validate_truth(sequence.truth, frames)
-    if sequence.noise is not None:
-        validate_noise(sequence.noise)
 
 
 def _validate_observations(observations: Observations, frames: int) -> None:
@@ -386,83 +349,18 @@ def _validate_observations(observations: Observations, frames: int) -> None:
     outside = (observations.frame < 0) | (observations.frame >= frames)
     if outside.any():
         index = int(np.argmax(outside))
-        raise ShapeError(
-            f"frame {observations.frame[index]} does not exist, there are {frames}",
-            field="observations.frame",
-            index=index,
-        )
-    _require_ids(observations.landmark, "observations.landmark")
+        message = f"frame {observations.frame[index]} does not exist, there are {frames}"
+        raise ShapeError(message, field="observations.frame", index=index)
+    require_ids(observations.landmark, "observations.landmark")
     twice = (np.diff(observations.frame) == 0) & (np.diff(observations.landmark) == 0)
     if twice.any():
         index = int(np.argmax(twice)) + 1
-        raise DuplicateObservationError(
-            f"landmark {observations.landmark[index]} is observed twice in frame {observations.frame[index]}",
-            field="observations",
-            index=index,
-        )
-
-
-def _require_ids(landmark: IntArray, name: str) -> None:
-    wrong = (landmark < 0) | (landmark > LARGEST_ID)
-    if wrong.any():
-        index = int(np.argmax(wrong))
-        raise ShapeError(
-            f"landmark ids must be from 0 to {LARGEST_ID}, found {landmark[index]}", field=name, index=index
-        )
-
-
-def validate_truth(truth: Truth, frames: int) -> None:
-    """Raise a `DataError` for true poses or landmarks of other shapes, or of other frames than these."""
-    require_shape(truth.frame, (None,), "truth.frame")
-    if np.shape(truth.T_world_imu) != (len(truth.frame), 4, 4):
-        raise TruthError(
-            f"{len(truth.frame)} frames but poses of shape {np.shape(truth.T_world_imu)}", field="truth.T_world_imu"
-        )
-    if len(truth.frame) and (truth.frame[0] < 0 or truth.frame[-1] >= frames or (np.diff(truth.frame) <= 0).any()):
-        raise TruthError(f"frames must ascend within 0..{frames - 1}", field="truth.frame")
-    require_finite(truth.T_world_imu, "truth.T_world_imu", _LARGEST_DISTANCE_M)
-    require_rigid(truth.T_world_imu, "truth.T_world_imu", TruthError)
-    for name, value in vars(truth.motion).items() if truth.motion is not None else ():
-        require_shape(value, (len(truth.frame), 3), f"truth.motion.{name}")
-        require_finite(value, f"truth.motion.{name}", LARGEST_VELOCITY)
-    if np.shape(truth.position_m) != (len(truth.landmark), 3):
-        raise TruthError(
-            f"{len(truth.landmark)} landmarks but positions of shape {np.shape(truth.position_m)}",
-            field="truth.position_m",
-        )
-    _require_ids(truth.landmark, "truth.landmark")
-    require_finite(truth.position_m, "truth.position_m", _LARGEST_DISTANCE_M)
-    for name, value in vars(truth.noise).items() if truth.noise is not None else ():
-        if not (np.isfinite(value) and value >= 0):
-            raise DataError(f"must be finite and not negative, found {value}", field=f"truth.noise.{name}")
-
-
-def validate_noise(noise: Noise) -> None:
-    """Raise a `DataError` for standard deviations of other shapes, or that are none."""
-    sizes = {"twist_std": 6, "pixel_std_px": 4, "motion_std": 6, "gap_std": 6}
-    optional = {"twist_walk_std": 6, "track_first_px": 3, "track_walk_px": 3}
-    for name, size in (sizes | optional).items():
-        if name in optional and getattr(noise, name) is None:
-            continue
-        value = np.asarray(getattr(noise, name), dtype=float)
-        require_shape(value, (size,), f"noise.{name}")
-        require_finite(value, f"noise.{name}", LARGEST_VELOCITY)
-        if (value < 0).any():
-            raise DataError("standard deviations must not be negative", field=f"noise.{name}")
-    if not (np.isfinite(noise.tilt_rad) and noise.tilt_rad >= 0):
-        raise DataError(f"must be finite and not negative, found {noise.tilt_rad}", field="noise.tilt_rad")
-    if (noise.track_first_px is None) != (noise.track_walk_px is None):
-        raise DataError("track_first_px and track_walk_px belong together", field="noise.track_walk_px")
-    if not noise.track_flow_px > 0:
-        raise DataError(f"must be positive, found {noise.track_flow_px}", field="noise.track_flow_px")
+        message = f"landmark {observations.landmark[index]} is observed twice in frame {observations.frame[index]}"
+        raise DuplicateObservationError(message, field="observations", index=index)
 
 
 def stretch(text: str) -> slice:
-    """Return the slice of frames that ``A:B`` names; either may be left out, as in Python.
-
-    Raises:
-        ValueError: It is something else.
-    """
+    """Return the slice of frames that ``A:B`` names; either may be left out, as in Python."""
     begin, colon, end = text.partition(":")
     if not colon:
         raise ValueError(f"expected A:B, found {text!r}")

@@ -10,9 +10,9 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.images import ImageRecording
+from ekfslam.data.inputs import VelocitySamples
 from ekfslam.data.interpolation import attributes_of_part, interpolation_attributes, known_intervals
 from ekfslam.data.readers.registry import Lateral, Source, expected, read_as
-from ekfslam.data.samples import VelocitySamples
 from ekfslam.data.sequence import WITHOUT_VELOCITIES, Sequence, VelocityFrame
 from ekfslam.errors import ConfigError, LostDataError, UnknownFormatError
 from ekfslam.geometry import se3
@@ -122,11 +122,7 @@ def _on_clock_of(found: VelocitySamples, time_s: Array, source: str) -> Velocity
 
 
 def resample(found: VelocitySamples, time_s: Array) -> tuple[Array, str]:
-    """Return velocities (T, 6) at the stamps of frames (T,), see `attach_velocities`, and their origin in words.
-
-    Raises:
-        LostDataError: A frame lies outside of the samples by more than a step, or in a gap of more than `MAX_GAP_S`.
-    """
+    """Return velocities (T, 6) at the stamps of frames (T,), see `attach_velocities`, and their origin in words."""
     stamps, twist = found.time_s, found.twist
     if len(stamps) < 2 or len(time_s) < 2:
         raise LostDataError(f"{len(stamps)} samples for {len(time_s)} frames; two are needed", source=found.source)

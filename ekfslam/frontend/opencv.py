@@ -10,11 +10,7 @@ from ekfslam.errors import MissingPackageError
 
 
 def opencv() -> Any:
-    """Return the module ``cv2``.
-
-    Raises:
-        MissingPackageError: OpenCV is not installed.
-    """
+    """Return the module ``cv2``."""
     try:
         import cv2
     except ImportError as error:

@@ -16,7 +16,8 @@ import numpy as np
 from ekfslam.arrays import Array
 
 # Body axes forward, left, up to optical axes right, down, forward.
-R_CAM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+T_CAM_BODY = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+R_CAM_BODY = T_CAM_BODY[:3, :3]
 
 # Least disparities, px: of a point with a depth, of one that shows the motion of the rig, and of one whose flow follows
 # from its depth to a fraction of a pixel.

@@ -27,8 +27,9 @@ import numpy as np
 from ekfslam import files, hdf5
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import check_stored
+from ekfslam.data.checks import spelled_as_in
 from ekfslam.data.interpolation import known_intervals
-from ekfslam.data.readers.fields import spelled_as_in
+from ekfslam.data.noise import Noise, validate_noise
 from ekfslam.data.readers.hdf5 import (
     SPELLING,
     noise_attributes,
@@ -37,15 +38,7 @@ from ekfslam.data.readers.hdf5 import (
     write_sequence_group,
     write_truth_group,
 )
-from ekfslam.data.sequence import (
-    WITHOUT_TRACKS,
-    Noise,
-    Observations,
-    Sequence,
-    Truth,
-    VelocityFrame,
-    validate_noise,
-)
+from ekfslam.data.sequence import WITHOUT_TRACKS, Observations, Sequence, Truth, VelocityFrame
 from ekfslam.errors import ArchiveError, ConfigError, DataError, WriteError
 from ekfslam.filters.result import ERROR_CONVENTION, Result
 from ekfslam.geometry.camera import StereoCamera

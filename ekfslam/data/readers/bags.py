@@ -5,7 +5,8 @@ The package rosbags reads them; it is an extra: ``pip install 'ekfslam[bags]'``.
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,33 +15,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, IntArray
-from ekfslam.data.images import Distortion, DistortionModel, Image, ImageRecording, PairCalibration
-from ekfslam.data.readers.fields import spelled_as_in
-from ekfslam.data.readers.messages import (
-    CAMERA_INFO,
-    COMPRESSED,
-    IMAGE,
-    MCAP_MAGIC,
-    ODOMETRY,
-    ROS1_MAGIC,
-    SQLITE_MAGIC,
-    TRANSFORMS,
-    VELOCITIES,
-    Bag,
-    field_of,
-    gray_of,
-    matrix_of,
-    stamp_of,
-    transform_of,
-)
+from ekfslam.data.checks import spelled_as_in
+from ekfslam.data.images import Distortion, DistortionModel, Image, ImageRecording, PairCalibration, side_by_side
+from ekfslam.data.inputs import VelocitySamples
+from ekfslam.data.readers import messages
+from ekfslam.data.readers.fields import BODY_IS_CAMERA
+from ekfslam.data.readers.messages import CAMERA_INFO, COMPRESSED, IMAGE, ODOMETRY, TRANSFORMS, VELOCITIES, Bag
 from ekfslam.data.readers.pictures import pair_stamps
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row
-from ekfslam.data.samples import VelocitySamples
 from ekfslam.data.velocities import is_covered, resample
 from ekfslam.errors import CalibrationError, LostDataError, StampError, UnknownFormatError
 from ekfslam.geometry import se3
-from ekfslam.geometry.camera import R_CAM_BODY
+from ekfslam.geometry.camera import T_CAM_BODY
 from ekfslam.names import printable
 
 _MODELS: dict[str, DistortionModel] = {
@@ -51,21 +38,15 @@ _MODELS: dict[str, DistortionModel] = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Camera:
-    """A camera of a bag.
-
-    Args:
-        stream: Connection of its images.
-        info: First CameraInfo.
-    """
+    """Images of a camera of a bag (their connection), and its first CameraInfo."""
 
     stream: Any
     info: Any
 
     @property
     def topic(self) -> str:
-        """Topic of the images."""
         return str(self.stream.topic)
 
     @property
@@ -81,11 +62,11 @@ class Camera:
     @property
     def projection(self) -> Array:
         """P (3, 4)."""
-        return matrix_of(self.info, "p", 3)
+        return messages.matrix_of(self.info, "p", 3)
 
 
 def _parts(topic: str) -> tuple[str, str]:
-    """Return space and last part: ``/stereo/left`` and ``image_raw`` of ``/stereo/left/image_raw/compressed``."""
+    """Return space and last part: ``/left`` and ``image_raw`` of ``/left/image_raw/compressed``."""
     space, _, last = topic.removesuffix("/compressed").rpartition("/")
     return space, last
 
@@ -95,7 +76,7 @@ def _frame(name: object) -> str:
 
 
 class BagPairs:
-    """The function `ImageRecording.load` of a bag, which it opens at the first call.
+    """Load pairs of images from a bag, which is opened at the first call.
 
     Args:
         path: Path of the bag.
@@ -112,8 +93,7 @@ class BagPairs:
         return Bag(self.path)
 
     def __call__(self, frame: int) -> tuple[Image, Image]:
-        left, right = (self._image(side, frame) for side in (0, 1))
-        return left, right
+        return self._image(0, frame), self._image(1, frame)
 
     def _image(self, side: int, frame: int) -> Image:
         written_ns, stamp_ns = self.places[side][frame].tolist()
@@ -123,7 +103,9 @@ class BagPairs:
                 continue
             for _, content in bag.raw(connection, written_ns, written_ns + 1):
                 if bag.stamp_ns(content) == stamp_ns:
-                    return gray_of(bag.message(connection, content), f"{self.path}: {printable(topic)}", self.size)
+                    return messages.gray_of(
+                        bag.message(connection, content), f"{self.path}: {printable(topic)}", self.size
+                    )
         raise LostDataError(f"the image at {stamp_ns} ns is gone", source=str(self.path), field=printable(topic))
 
 
@@ -132,58 +114,42 @@ def open_bag(path: Path) -> ImageRecording:
 
     The CameraInfo of the right camera has a baseline in P. Topics with ``rect`` in their last part are rectified
     images with the camera P; others are as the lens sees them, with K, D and R. The body is the frame of the
-    velocities. If ``/tf_static`` does not connect it to the camera, the body is the left camera, with axes forward,
-    left and up.
+    velocities. If ``/tf_static`` does not connect it to the camera, the body is the left camera.
 
     Raises:
         MissingPackageError: rosbags is not installed.
-        UnknownFormatError: The bag is damaged.
-        CalibrationError: There is not exactly one pair of cameras, or a CameraInfo is impossible.
-        LostDataError: Images have no partner, or a stream is empty.
-        StampError: Stamps do not increase.
     """
-    bag = Bag(path)
-    try:
-        with spelled_as_in(str(path)):
-            return _opened(bag)
-    finally:
-        bag.close()
-
-
-def _opened(bag: Bag) -> ImageRecording:
-    left, right = _pair(bag)
-    places = tuple(_places(bag, camera) for camera in (left, right))
-    in_left, in_right, notes = pair_stamps(places[0][:, 1], places[1][:, 1], str(bag.path))
-    calibration, R_cam_optical = _calibration(left, right)
-    time_s = places[0][in_left, 1] / 1e9
-    velocities, frame, found = _velocities(bag)
-    T_optical_body, note = _body(bag, left, frame)
-    notes = (*notes, *found, note)
-    used = np.ones(len(time_s), dtype=bool)
-    if velocities is not None:
-        used = is_covered(velocities.time_s, time_s)
-        if not used.all():
-            notes = (*notes, f"{int((~used).sum())} frames before or after all velocities are left out.")
-    chosen = (places[0][in_left[used]], places[1][in_right[used]])
-    twist = None
-    if velocities is not None:
-        twist, how = resample(velocities, time_s[used])
-        notes = (*notes, f"Velocities ({printable(frame)}): {how}.")
-    return ImageRecording(
-        name=bag.path.resolve().stem,
-        source=str(bag.path),
-        time_s=time_s[used],
-        calibration=calibration,
-        load=BagPairs(bag.path, (left.topic, right.topic), chosen, calibration.size),
-        T_cam_imu=se3.transform(R_cam_optical, np.zeros(3)) @ T_optical_body,
-        twist=twist,
-        notes=notes,
-        attributes={"reader": READER.name, "topics": printable(f"{left.topic} {right.topic}")},
-    )
+    with contextlib.closing(Bag(path)) as bag, spelled_as_in(str(path)):
+        left, right = _pair(bag)
+        places = [_places(bag, camera) for camera in (left, right)]
+        in_left, in_right, notes = pair_stamps(places[0][:, 1], places[1][:, 1], str(path))
+        calibration, R_cam_optical = _calibration(left, right)
+        time_s = places[0][in_left, 1] / 1e9
+        velocities, frame, found = _velocities(bag)
+        T_optical_body, note = _body(bag, left, frame)
+        notes = (*notes, *found, note)
+        twist, used = None, np.ones(len(time_s), dtype=bool)
+        if velocities is not None:
+            used = is_covered(velocities.time_s, time_s)
+            if not used.all():
+                notes = (*notes, f"{int((~used).sum())} frames before or after all velocities are left out.")
+            twist, how = resample(velocities, time_s[used])
+            notes = (*notes, f"Velocities ({printable(frame)}): {how}.")
+        chosen = (places[0][in_left[used]], places[1][in_right[used]])
+        return ImageRecording(
+            name=path.resolve().stem,
+            source=str(path),
+            time_s=time_s[used],
+            calibration=calibration,
+            load=BagPairs(path, (left.topic, right.topic), chosen, calibration.size),
+            T_cam_imu=se3.transform(R_cam_optical, np.zeros(3)) @ T_optical_body,
+            twist=twist,
+            notes=notes,
+            attributes={"reader": READER.name, "topics": printable(f"{left.topic} {right.topic}")},
+        )
 
 
 def _pair(bag: Bag) -> tuple[Camera, Camera]:
-    """Return left and right camera."""
     infos = {_parts(connection.topic)[0]: connection for connection in bag.connections(CAMERA_INFO)}
     streams: dict[str, Any] = {}
     for connection in bag.connections(IMAGE, COMPRESSED):
@@ -246,19 +212,19 @@ def _calibration(left: Camera, right: Camera) -> tuple[PairCalibration, Array]:
     P_left, P_right = left.projection, right.projection
     if not P_right[0, 0] > 0:
         raise CalibrationError("P has no positive focal length", field="CameraInfo")
-    shift = se3.transform(np.eye(3), np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0]))
+    shift = side_by_side(-P_right[0, 3] / P_right[0, 0])
     R_left, R_right = (_rotation(camera) for camera in (left, right))
     if left.is_rectified:
         return PairCalibration(P_left[:, :3], P_right[:, :3], size, shift), R_left
     turn_left, turn_right = (se3.transform(R, np.zeros(3)) for R in (R_left, R_right))
     T_right_left = se3.inverse(turn_right) @ shift @ turn_left
-    K_left, K_right = (matrix_of(camera.info, "k", 3) for camera in (left, right))
+    K_left, K_right = (messages.matrix_of(camera.info, "k", 3) for camera in (left, right))
     return PairCalibration(K_left, K_right, size, T_right_left, _lens(left), _lens(right)), np.eye(3)
 
 
 def _rotation(camera: Camera) -> Array:
-    """Return the rotation from the optical frame to rectified images; all zeros stand for none."""
-    R = matrix_of(camera.info, "r", 3)
+    """Return the rotation from the optical frame to rectified images; all zeros stand for the identity."""
+    R = messages.matrix_of(camera.info, "r", 3)
     if not R.any():
         return np.eye(3)
     if not np.abs(R @ R.T - np.eye(3)).max() < 1e-4 or np.linalg.det(R) < 0:
@@ -267,7 +233,7 @@ def _rotation(camera: Camera) -> Array:
 
 
 def _lens(camera: Camera) -> Distortion:
-    coefficients = tuple(float(value) for value in field_of(camera.info, "d"))
+    coefficients = tuple(float(value) for value in messages.field_of(camera.info, "d"))
     name = str(camera.info.distortion_model)
     if not any(coefficients):
         return Distortion()
@@ -287,8 +253,8 @@ def _velocities(bag: Bag) -> tuple[VelocitySamples | None, str, tuple[str, ...]]
     # A single twist is more likely to be measured than that of an estimate.
     chosen = min(streams, key=lambda connection: (VELOCITIES.index(connection.msgtype), connection.topic))
     others = [connection.topic for connection in streams if connection.topic != chosen.topic]
-    notes = [f"Velocities are those of {printable(chosen.topic)}."]
-    notes += [f"Not used: velocities of {printable(topic)}." for topic in others]
+    topic = printable(chosen.topic)
+    notes = (f"Velocities are those of {topic}.", *(f"Not used: velocities of {printable(name)}." for name in others))
     rows, frame = [], ""
     for message in bag.messages(chosen):
         # With covariance a twist is one level further down.
@@ -296,9 +262,8 @@ def _velocities(bag: Bag) -> tuple[VelocitySamples | None, str, tuple[str, ...]]
         name = message.child_frame_id if chosen.msgtype == ODOMETRY else message.header.frame_id
         frame = frame or _frame(name)
         linear, angular = twist.linear, twist.angular
-        rows.append([stamp_of(message), linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
+        rows.append([messages.stamp_of(message), linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
     table = np.array(rows, dtype=float).reshape(-1, 7)
-    topic = printable(chosen.topic)
     if len(table) < 2:
         raise LostDataError(f"{len(table)} messages; two are needed", field=topic)
     if not np.isfinite(table).all():
@@ -306,7 +271,7 @@ def _velocities(bag: Bag) -> tuple[VelocitySamples | None, str, tuple[str, ...]]
     if (np.diff(table[:, 0]) <= 0).any():
         index = int(np.argmax(np.diff(table[:, 0]) <= 0)) + 1
         raise StampError("the stamp does not increase", field=topic, index=index)
-    return VelocitySamples(str(bag.path), table[:, 0], table[:, 1:], "imu", None, {}, ()), frame, tuple(notes)
+    return VelocitySamples(str(bag.path), table[:, 0], table[:, 1:]), frame, notes
 
 
 def _body(bag: Bag, left: Camera, frame: str) -> tuple[Array, str]:
@@ -316,23 +281,19 @@ def _body(bag: Bag, left: Camera, frame: str) -> tuple[Array, str]:
     T = _transform(bag, left.frame, frame) if frame else None
     if T is not None:
         return T, f"T_cam_imu is that of {printable(frame)} to {printable(left.frame)} in /tf_static."
-    missing = f"/tf_static does not connect {printable(frame)} and {printable(left.frame)}: " if frame else ""
-    note = f"{missing}the body is the left camera, its axes forward, left and up."
-    return se3.transform(R_CAM_BODY, np.zeros(3)), note[0].upper() + note[1:]
+    missing = f"/tf_static does not connect {printable(frame)} and {printable(left.frame)}. " if frame else ""
+    return T_CAM_BODY, missing + BODY_IS_CAMERA
 
 
 def _transform(bag: Bag, target: str, source: str) -> Array | None:
     """Return ``T_target_source`` (4, 4) through the tree of static transforms; None if they are not connected."""
     edges: dict[str, list[tuple[str, Array]]] = {}
-    for connection in bag.connections(TRANSFORMS):
-        if connection.topic.lstrip("/") != "tf_static":
-            continue
-        for message in bag.messages(connection):
-            for entry in message.transforms:
-                parent, child = _frame(entry.header.frame_id), _frame(entry.child_frame_id)
-                T_parent_child = transform_of(entry.transform)
-                edges.setdefault(parent, []).append((child, T_parent_child))
-                edges.setdefault(child, []).append((parent, se3.inverse(T_parent_child)))
+    static = [stream for stream in bag.connections(TRANSFORMS) if stream.topic.lstrip("/") == "tf_static"]
+    for entry in (entry for stream in static for message in bag.messages(stream) for entry in message.transforms):
+        parent, child = _frame(entry.header.frame_id), _frame(entry.child_frame_id)
+        T_parent_child = messages.transform_of(entry.transform)
+        edges.setdefault(parent, []).append((child, T_parent_child))
+        edges.setdefault(child, []).append((parent, se3.inverse(T_parent_child)))
     reached = {target: np.eye(4)}
     waiting = [target]
     while waiting:
@@ -345,7 +306,7 @@ def _transform(bag: Bag, target: str, source: str) -> Array | None:
 
 
 def _recognises(source: Source) -> bool:
-    if source.head.startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC)):
+    if source.head.startswith(messages.MAGICS):
         return True
     return source.path.is_dir() and first_row(source.path / "metadata.yaml", comment=None).startswith(
         "rosbag2_bagfile_information"

@@ -11,21 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
-from ekfslam.data.checks import require_rigid
-from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
+from ekfslam.data.checks import require_rigid, spelled_as_in
 from ekfslam.data.observations import flat_observations
-from ekfslam.data.readers.fields import (
-    LATERAL_NOTES,
-    checksum,
-    require,
-    require_numbers,
-    spelled_as_in,
-    with_lateral,
-)
+from ekfslam.data.readers.fields import LATERAL_NOTES, recorded_tracks, require, require_numbers, with_lateral
 from ekfslam.data.readers.pickled import npy_header
 from ekfslam.data.readers.registry import Extrinsics, Lateral, Reader
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence, validate_camera
-from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import CalibrationError, ExtrinsicsError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
@@ -57,17 +48,13 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
     """Read ``features`` (4 x M x T, -1 or NaN where unseen), velocities (3 x T), stamps, ``K``, ``b``, extrinsics.
 
     There are two editions. That of the report has ``rotational_velocity`` and ``cam_T_imu``. The later one, of
-    KITTI-360, has ``angular_velocity`` and ``imu_T_cam``, a true camera-to-IMU pose; it ignores both options below.
+    KITTI-360, has ``angular_velocity`` and ``imu_T_cam``, a true camera-to-IMU pose; it ignores both options.
 
     Args:
         path: Path of the .npz file.
         extrinsics: ``corrected`` takes ``T_cam_imu = [R, -R t]`` from the stored rotation and translation;
             ``as-stored`` takes the stored matrix, which reproduces the report.
         lateral: Sign of the lateral velocity, see `with_lateral`; ``as-stored`` reproduces the report.
-
-    Raises:
-        UnknownFormatError: The file is damaged, or an .npz of other content.
-        DataError: A field is missing or malformed; the subclass says how.
     """
     fields = _load(path)
     is_later = FIELDS[-1] not in fields and any(name in fields for name in LATER_FIELDS[-2:])
@@ -80,35 +67,33 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
         stored = require_numbers(fields, stored_name, (4, 4))
         features = require_numbers(fields, "features", (4, None, frames), finite=False)
         observations, found = flat_observations(features, frame_axis=2, field="features")
+        choices: dict[str, str]
         if is_later:
-            T_cam_imu, choices = _later_extrinsics(stored), {"lateral": "as-stored"}
+            require_rigid(stored, stored_name, ExtrinsicsError)
+            T_cam_imu, choices = se3.inverse(stored) @ _FLIPPED, {"lateral": "as-stored"}
             how, sign = _LATER_NOTE, AS_STORED_NOTE
         else:
             twist, choices = with_lateral(twist, lateral), {"extrinsics": extrinsics, "lateral": lateral}
-            T_cam_imu = stored if extrinsics == "as-stored" else _with_camera_position(stored)
+            T_cam_imu = stored.copy()
+            if extrinsics == "corrected":
+                T_cam_imu[:3, 3] = -stored[:3, :3] @ stored[:3, 3]
             how, sign = _EXTRINSICS_NOTES[extrinsics], LATERAL_NOTES[lateral]
-        notes = (how, LEVEL_VELOCITIES_NOTE, sign, *found, *interpolation_notes(twist))
-        attributes = {"checksum_sha256": checksum(path), "reader": READER.name}
-        return Sequence(
-            name=path.stem,
-            source=str(path),
+        return recorded_tracks(
+            path,
+            READER.name,
             time_s=time_s,
             twist=twist,
             camera=camera,
             T_cam_imu=T_cam_imu,
             observations=observations,
             velocity_frame="level",
-            notes=(*notes, *inspect_tracks(observations, twist).notes),
-            attributes={**attributes, **choices, **interpolation_attributes(twist)},
+            notes=(how, LEVEL_VELOCITIES_NOTE, sign, *found),
+            attributes=choices,
         )
 
 
 def stamps_of(fields: Mapping[str, NDArray], name: str) -> Array:
-    """Return the stamps (T,) of a field that is a row, a column or a vector.
-
-    Raises:
-        DataError: They are missing, no finite numbers, or a table.
-    """
+    """Return the stamps (T,) of a field that is a row, a column or a vector."""
     shape = require(fields, name).shape
     vector = (None,) if len(shape) == 1 else (None, 1) if len(shape) == 2 and shape[1] == 1 else (1, None)
     return require_numbers(fields, name, vector).ravel()
@@ -163,19 +148,6 @@ def camera_of(K: Array, baseline_m: float) -> StereoCamera:
     camera = StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), baseline_m)
     validate_camera(camera)
     return camera
-
-
-def _later_extrinsics(stored: Array) -> Array:
-    """Return ``T_cam_imu`` of the later edition from its pose ``imu_T_cam``."""
-    require_rigid(stored, LATER_FIELDS[-1], ExtrinsicsError)
-    return se3.inverse(stored) @ _FLIPPED
-
-
-def _with_camera_position(stored: Array) -> Array:
-    """Return ``T_cam_imu`` from its rotation and the position of the camera in the IMU frame."""
-    corrected = stored.copy()
-    corrected[:3, 3] = -stored[:3, :3] @ stored[:3, 3]
-    return corrected
 
 
 READER = Reader(

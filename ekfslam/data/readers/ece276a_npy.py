@@ -11,28 +11,30 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.data.checks import require_rigid
+from ekfslam.data.checks import require_rigid, spelled_as_in
 from ekfslam.data.images import Image, ImageRecording, PairCalibration
 from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.observations import flat_observations
 from ekfslam.data.readers.ece276a import AS_STORED_NOTE, camera_of, stamps_of
-from ekfslam.data.readers.fields import checksum, require, require_numbers, spelled_as_in
+from ekfslam.data.readers.fields import checksum, recorded_tracks, require, require_numbers
 from ekfslam.data.readers.pickled import MAGIC, read_pickled
 from ekfslam.data.readers.registry import Reader
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Sequence
-from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import CalibrationError, ExtrinsicsError, LostDataError, ShapeError, UnknownFormatError
 from ekfslam.geometry import se3
-from ekfslam.geometry.camera import R_CAM_BODY, StereoCamera
+from ekfslam.geometry.camera import T_CAM_BODY, StereoCamera
 
 FIELDS = ("v_t", "w_t", "timestamps", "features", "K_l", "K_r", "extL_T_imu", "extR_T_imu")
 IMAGE_FIELDS = ("cam_imgs_L", "cam_imgs_R")
 
 _EXPECTED = f"expected an .npy file with a dictionary of {', '.join(FIELDS)}"
-_EXTRINSICS_NOTE = (
+_NOTES = (
     "The stored extL_T_imu is a pose of the left camera with axes forward, left, up: T_cam_imu = oTr inv(extL_T_imu) "
-    "is used, and the distance of both cameras as the baseline."
+    "is used, and the distance of both cameras as the baseline.",
+    LEVEL_VELOCITIES_NOTE,
+    AS_STORED_NOTE,
 )
+_LATERAL = {"lateral": "as-stored"}
 
 
 def read_ece276a_npy(path: Path) -> Sequence:
@@ -40,10 +42,6 @@ def read_ece276a_npy(path: Path) -> Sequence:
 
     ``T_cam_imu = oTr inv(extL_T_imu)`` with the optical axes oTr, and the baseline is the length of the translation of
     ``inv(extL_T_imu) extR_T_imu``. A pixel row of -1 or NaN means unseen.
-
-    Raises:
-        UnknownFormatError: The file is damaged, names other things than arrays, or holds another dictionary.
-        DataError: A field is missing or malformed; the subclass says how.
     """
     fields = read_pickled(path, _EXPECTED)
     if "v_t" not in fields:
@@ -56,30 +54,24 @@ def read_ece276a_npy(path: Path) -> Sequence:
             raise ShapeError("this field is missing: the recording has images only, see `track`", field="features")
         features = require_numbers(fields, "features", (4, None, len(time_s)), finite=False)
         observations, found = flat_observations(features, frame_axis=2, field="features")
-        return Sequence(
-            name=path.stem,
-            source=str(path),
+        return recorded_tracks(
+            path,
+            READER.name,
             time_s=time_s,
             twist=twist,
             camera=camera,
             T_cam_imu=T_cam_imu,
             observations=observations,
             velocity_frame="level",
-            notes=(*_notes(twist), *found, *inspect_tracks(observations, twist).notes),
-            attributes=_attributes(path, twist, READER.name),
+            notes=(*_NOTES, *found),
+            attributes=_LATERAL,
         )
 
 
 def open_ece276a_images(path: Path) -> ImageRecording | None:
     """Open lists of images ``cam_imgs_L cam_imgs_R``, all in memory, with the velocities and calibration.
 
-    Args:
-        path: Path of the recording or of its images; the result is None unless both exist.
-
-    Raises:
-        UnknownFormatError: A file is damaged, names other things than arrays, or holds another dictionary.
-        LostDataError: There are more or fewer images than stamps.
-        DataError: A field is missing or malformed; the subclass says how.
+    The path is that of the recording or of its images; return None unless both exist.
     """
     name = path.stem.removesuffix("_imgs")
     recording, images = path.with_name(f"{name}.npy"), path.with_name(f"{name}_imgs.npy")
@@ -105,8 +97,13 @@ def open_ece276a_images(path: Path) -> ImageRecording | None:
         T_cam_imu=T_cam_imu,
         twist=twist,
         velocity_frame="level",
-        notes=_notes(twist),
-        attributes=_attributes(recording, twist, "ece276a_npy_images"),
+        notes=(*_NOTES, *interpolation_notes(twist)),
+        attributes={
+            "checksum_sha256": checksum(recording),
+            "reader": "ece276a_npy_images",
+            **_LATERAL,
+            **interpolation_attributes(twist),
+        },
     )
 
 
@@ -122,29 +119,15 @@ def _motion(fields: dict[str, Any]) -> tuple[Array, Array]:
     return time_s, np.concatenate(velocities, axis=1)
 
 
-def _notes(twist: Array) -> tuple[str, ...]:
-    return (_EXTRINSICS_NOTE, LEVEL_VELOCITIES_NOTE, AS_STORED_NOTE, *interpolation_notes(twist))
-
-
-def _attributes(path: Path, twist: Array, reader: str) -> dict[str, str | int | float]:
-    attributes = {"checksum_sha256": checksum(path), "reader": reader, "lateral": "as-stored"}
-    return {**attributes, **interpolation_attributes(twist)}
-
-
 def _extrinsics(fields: dict[str, Any]) -> tuple[Array, Array]:
-    """Return ``T_cam_imu`` (4, 4) of the left optical frame, and ``T_right_left`` (4, 4) of the optical frames.
-
-    Raises:
-        DataError: A pose is missing or not rigid, or both cameras are at one place.
-    """
-    optical = se3.transform(R_CAM_BODY, np.zeros(3))
+    """Return ``T_cam_imu`` (4, 4) of the left optical frame, and ``T_right_left`` (4, 4) of the optical frames."""
     left, right = (require_numbers(fields, name, (4, 4)) for name in ("extL_T_imu", "extR_T_imu"))
     for name, pose in (("extL_T_imu", left), ("extR_T_imu", right)):
         require_rigid(pose, name, ExtrinsicsError)
-    T_right_left = optical @ se3.inverse(right) @ left @ se3.inverse(optical)
+    T_right_left = T_CAM_BODY @ se3.inverse(right) @ left @ se3.inverse(T_CAM_BODY)
     if not np.linalg.norm(T_right_left[:3, 3]) > 1e-6:
         raise CalibrationError("both cameras are at the same place", field="extR_T_imu")
-    return optical @ se3.inverse(left), T_right_left
+    return T_CAM_BODY @ se3.inverse(left), T_right_left
 
 
 def _rectified_camera(fields: dict[str, Any]) -> tuple[StereoCamera, Array]:
@@ -153,17 +136,16 @@ def _rectified_camera(fields: dict[str, Any]) -> tuple[StereoCamera, Array]:
     K_left, K_right = (require_numbers(fields, name, (3, 3)) for name in ("K_l", "K_r"))
     camera = camera_of(K_left, float(np.linalg.norm(T_right_left[:3, 3])))
     if not np.allclose(K_left, K_right, rtol=1e-3):
-        raise CalibrationError(
-            "the cameras have different intrinsics, so their features are not rectified", field="K_r"
-        )
+        message = "the cameras have different intrinsics, so their features are not rectified"
+        raise CalibrationError(message, field="K_r")
     return camera, T_cam_imu
 
 
 def _images(pictures: dict[str, Any], name: str, count: int) -> list[Image]:
     """Return one image for each of ``count`` stamps."""
-    found = pictures.get(name)
-    if found is None:
-        require(pictures, name)
+    if name not in pictures:
+        raise ShapeError("this field is missing", field=name)
+    found = pictures[name]
     images = list(found) if isinstance(found, list) or (isinstance(found, np.ndarray) and found.ndim) else []
     if len(images) != count or not count:
         raise LostDataError(f"{len(images)} images for {count} stamps", field=name)

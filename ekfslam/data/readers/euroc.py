@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
-from ekfslam.data.checks import require_rigid
+from ekfslam.data.checks import require_rigid, spelled_as_in
 from ekfslam.data.images import Distortion, DistortionModel, ImageRecording, PairCalibration
-from ekfslam.data.readers.fields import checksum, spelled_as_in
+from ekfslam.data.readers.fields import checksum
 from ekfslam.data.readers.pictures import PairFiles, pair_stamps
 from ekfslam.data.readers.poses import Poses, stamped_poses, truth_of_frames
 from ekfslam.data.readers.registry import Reader, Source
@@ -50,13 +50,6 @@ def open_euroc(folder: Path) -> ImageRecording:
     """Open the images of a recording, its calibration, and its truth if there is any.
 
     The body is that of ``sensor.yaml``, the IMU. It gives angular rates and accelerations, but no linear velocity.
-
-    Raises:
-        UnknownFormatError: A file is missing or no text.
-        CalibrationError: A key is missing, or a camera is of another model than a pinhole.
-        ExtrinsicsError: A camera's pose is not rigid.
-        LineError, StampError: A line of ``data.csv`` is malformed.
-        LostDataError: An image is missing, or less than 90 % of the images have a partner.
     """
     mav = _mav(folder) or folder
     (left_ns, left), (right_ns, right) = (_images(mav / name) for name in CAMERAS)
@@ -177,12 +170,6 @@ def read_euroc(path: Path) -> Poses:
 
     The csv holds the pose ``T_R_S`` of the body (the IMU) in the reference frame, stamped in ns, quaternions w first.
     Its header must name these eight columns; further ones (velocity and biases) are not read.
-
-    Raises:
-        UnknownFormatError: The file is not text, or there are no poses.
-        TruthError: The header is missing or names other columns; a line is malformed, or has more or fewer columns.
-        NonFiniteError: A pose holds NaN or infinity.
-        StampError: The stamps do not increase.
     """
     path = find_euroc_truth(path) or path
     lines = read_lines(path, f"expected {TRUTH.expected}")

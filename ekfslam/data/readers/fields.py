@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,14 @@ from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
 from ekfslam.data.checks import require_finite, require_shape
+from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
+from ekfslam.data.observations import Observations
 from ekfslam.data.readers.registry import Lateral
-from ekfslam.errors import DataError, ShapeError
+from ekfslam.data.sequence import Sequence
+from ekfslam.data.tracks import inspect_tracks
+from ekfslam.errors import ShapeError
 
+BODY_IS_CAMERA = "The body is the left camera, with axes forward, left and up."
 LATERAL_NOTES: dict[Lateral, str] = {
     "corrected": (
         "The lateral velocity is stored positive to the right, against the description of its format: it is negated."
@@ -34,27 +38,8 @@ def checksum(*paths: Path) -> str:
     return digest.hexdigest()
 
 
-@contextmanager
-def spelled_as_in(source: str, spelling: Mapping[str, str] | None = None) -> Iterator[None]:
-    """Add the file, and its own names of fields, to data errors that are raised inside.
-
-    Args:
-        source: Name of the file.
-        spelling: Field names of the file by those of `Sequence`, if they differ.
-    """
-    try:
-        yield
-    except DataError as error:
-        name = (spelling or {}).get(error.field, error.field)
-        raise type(error)(error.message, source=source, field=name, index=error.index) from None
-
-
 def require(fields: Mapping[str, Any], name: str) -> NDArray:
-    """Return a field of a file as an array of any type.
-
-    Raises:
-        ShapeError: The field is missing.
-    """
+    """Return a field of a file as an array of any type."""
     if name not in fields:
         raise ShapeError("this field is missing", field=name)
     return np.asarray(fields[name])
@@ -67,12 +52,7 @@ def require_numbers(
     dtype: type = np.float64,
     finite: bool = True,
 ) -> NDArray:
-    """Return a field of a file as numbers of a shape (None stands for any length) and type, finite by default.
-
-    Raises:
-        ShapeError: The field is missing, is not numeric (integral if ``dtype`` is) or has another shape.
-        NonFiniteError: The field holds NaN or infinity.
-    """
+    """Return a field of a file as numbers of a shape (None stands for any length) and type, finite by default."""
     value = require(fields, name)
     if value.dtype.kind not in ("iu" if np.issubdtype(dtype, np.integer) else "iuf"):
         raise ShapeError(f"expected {np.dtype(dtype).name} numbers, found {value.dtype}", field=name)
@@ -88,6 +68,31 @@ def with_lateral(level_twist: Array, lateral: Lateral) -> Array:
     The data format calls ``vl`` leftward, but on every drive it opposes the true lateral velocity, and already the
     first packet of 2011_09_26_drive_0001 contradicts its own velocity north and east. All other signs are right.
     """
-    if lateral == "as-stored":
-        return level_twist
-    return level_twist * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    return level_twist if lateral == "as-stored" else level_twist * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+
+
+def recorded_tracks(
+    path: Path,
+    reader: str,
+    *,
+    twist: Array,
+    observations: Observations,
+    notes: tuple[str, ...],
+    attributes: Mapping[str, str],
+    **fields: Any,
+) -> Sequence:
+    """Return a recording of one file, with notes on its velocities and tracks and its checksum among the attributes."""
+    return Sequence(
+        name=path.stem,
+        source=str(path),
+        twist=twist,
+        observations=observations,
+        notes=(*notes, *interpolation_notes(twist), *inspect_tracks(observations, twist).notes),
+        attributes={
+            "checksum_sha256": checksum(path),
+            "reader": reader,
+            **attributes,
+            **interpolation_attributes(twist),
+        },
+        **fields,
+    )

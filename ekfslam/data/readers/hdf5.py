@@ -28,11 +28,12 @@ import numpy as np
 
 from ekfslam import files, hdf5
 from ekfslam.arrays import Array
+from ekfslam.data.checks import spelled_as_in
 from ekfslam.data.inputs import InertialNoise, InertialSamples, Input, Velocities
 from ekfslam.data.interpolation import interpolated_intervals
 from ekfslam.data.noise import Noise
 from ekfslam.data.observations import Observations, TrueMotion, Truth
-from ekfslam.data.readers.fields import require, require_numbers, spelled_as_in
+from ekfslam.data.readers.fields import require, require_numbers
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import ArchiveError, ShapeError, UnknownFormatError
@@ -139,12 +140,7 @@ def write_sequence_group(h5file: h5py.Group, sequence: Any, observations: Observ
 
 
 def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
-    """Read the sequence below an open file or group, with its truth if ``/truth`` exists.
-
-    Raises:
-        ArchiveError: The group was written without observations, see `read_sequence_fields`.
-        DataError: A field is missing or malformed; the subclass says how.
-    """
+    """Read the sequence below an open file or group, with its truth if ``/truth`` exists."""
     found = read_sequence_fields(h5file, source)
     if "observations" not in found:
         raise ArchiveError(f"{source}: holds a sequence without its observations")
@@ -155,11 +151,7 @@ def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
 
 
 def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
-    """Read the arguments of `Sequence` below an open file or group; ``observations`` only if they are stored.
-
-    Raises:
-        DataError: A field is missing or malformed; the subclass says how.
-    """
+    """Read the arguments of `Sequence` below an open file or group; ``observations`` only if they are stored."""
     with spelled_as_in(source, SPELLING):
         attributes, camera = hdf5.facts(_group(h5file, "sequence/attributes")), _attributes(h5file, "sequence/camera")
         for name in _CAMERA:

@@ -27,16 +27,15 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.data.checks import require_rigid
-from ekfslam.data.images import Distortion, ImageRecording, PairCalibration
-from ekfslam.data.readers.fields import checksum, spelled_as_in
+from ekfslam.data.checks import spelled_as_in
+from ekfslam.data.images import Distortion, ImageRecording, PairCalibration, side_by_side
+from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
 from ekfslam.data.readers.pictures import PairFiles, images_in, size_of
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
 from ekfslam.data.velocities import attach_velocities
-from ekfslam.errors import CalibrationError, DataError, ExtrinsicsError, LostDataError, UnknownFormatError
-from ekfslam.geometry import se3
-from ekfslam.geometry.camera import R_CAM_BODY
+from ekfslam.errors import CalibrationError, DataError, LostDataError, UnknownFormatError
+from ekfslam.geometry.camera import T_CAM_BODY
 
 FILE = "calibration.toml"
 _KEYS = {"left", "right", "times", "rate_hz", "T_right_left", "baseline_m", "T_cam_imu", "velocities"}
@@ -47,25 +46,17 @@ _CAMERA_KEYS = {"intrinsics", "distortion_model", "distortion"}
 def open_folder(path: Path) -> ImageRecording:
     """Open the images that a calibration describes, see this module.
 
-    Without ``T_cam_imu`` the body is the left camera, its axes forward, left and up.
-
-    Args:
-        path: Path of ``calibration.toml``, or of its folder.
-
-    Raises:
-        UnknownFormatError: A file or folder is missing, or the calibration is no TOML.
-        CalibrationError: A key is missing, unknown or malformed.
-        LostDataError: An image has no partner, or no stamp.
-        DataError: A calibration is impossible, or velocities are malformed; the subclass says how.
+    Without ``T_cam_imu`` the body is the left camera.
     """
     file = _file_of(path)
-    folder = file.parent
-    values = _parsed(file)
+    folder, values = file.parent, _parsed(file)
     left, right = (images_in(folder / _text(values, key, file)) for key in ("left", "right"))
     alone = sorted({image.stem for image in left} ^ {image.stem for image in right})
     if alone:
         raise LostDataError(f"{len(alone)} images have no partner, the first is {alone[0]}", source=str(folder))
     size = size_of(left[0])
+    notes: tuple[str, ...] = () if "velocities" in values else ("There are no velocities.",)
+    notes += () if "T_cam_imu" in values else (f"There is no T_cam_imu. {BODY_IS_CAMERA}",)
     with spelled_as_in(str(file)):
         recording = ImageRecording(
             name=folder.resolve().name,
@@ -73,8 +64,8 @@ def open_folder(path: Path) -> ImageRecording:
             time_s=_stamps(values, folder, file, len(left)),
             calibration=_pair(values, size),
             load=PairFiles(left, right, size),
-            T_cam_imu=_matrix(values, "T_cam_imu") if "T_cam_imu" in values else se3.transform(R_CAM_BODY, np.zeros(3)),
-            notes=_notes(values),
+            T_cam_imu=_numbers(values["T_cam_imu"], (4, 4), "T_cam_imu") if "T_cam_imu" in values else T_CAM_BODY,
+            notes=notes,
             attributes={"reader": READER.name, "checksum_sha256": checksum(file)},
         )
     if "velocities" not in values:
@@ -84,13 +75,6 @@ def open_folder(path: Path) -> ImageRecording:
 
 def _file_of(path: Path) -> Path:
     return path / FILE if path.is_dir() else path
-
-
-def _notes(values: dict[str, Any]) -> tuple[str, ...]:
-    notes = () if "velocities" in values else ("There are no velocities.",)
-    if "T_cam_imu" in values:
-        return notes
-    return (*notes, "There is no T_cam_imu: the body is the left camera, its axes forward, left and up.")
 
 
 def _parsed(file: Path) -> dict[str, Any]:
@@ -140,10 +124,9 @@ def _pair(values: dict[str, Any], size: tuple[int, int]) -> PairCalibration:
         baseline = values["baseline_m"]
         if not (isinstance(baseline, int | float) and 0 < baseline < 1e6):
             raise CalibrationError(f"expected a positive length, found {baseline!r}", field="baseline_m")
-        T_right_left = se3.transform(np.eye(3), np.array([-baseline, 0.0, 0.0]))
+        T_right_left = side_by_side(baseline)
     else:
-        T_right_left = _matrix(values, "T_right_left")
-        require_rigid(T_right_left, "T_right_left", ExtrinsicsError)
+        T_right_left = _numbers(values["T_right_left"], (4, 4), "T_right_left")
     return PairCalibration(K_left, K_right, size, T_right_left, lens_left, lens_right)
 
 
@@ -159,10 +142,6 @@ def _camera(values: dict[str, Any], name: str) -> tuple[Array, Distortion]:
     except DataError as error:
         raise CalibrationError(error.message, field=f"{name}.{error.field}") from None
     return np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]]), lens
-
-
-def _matrix(values: dict[str, Any], key: str) -> Array:
-    return _numbers(values.get(key), (4, 4), key)
 
 
 def _numbers(value: Any, shape: tuple[int | None, ...], name: str) -> Array:

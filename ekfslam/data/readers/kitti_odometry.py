@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from ekfslam.data.checks import require_rigid
-from ekfslam.data.images import ImageRecording, PairCalibration
+from ekfslam.data.images import ImageRecording, PairCalibration, side_by_side
+from ekfslam.data.readers.fields import BODY_IS_CAMERA
 from ekfslam.data.readers.pictures import PairFiles, in_order, numbered_images, size_of
 from ekfslam.data.readers.poses import Poses
 from ekfslam.data.readers.registry import Reader
@@ -20,7 +21,7 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import CalibrationError, LostDataError, ShapeError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3
-from ekfslam.geometry.camera import R_CAM_BODY
+from ekfslam.geometry.camera import T_CAM_BODY
 
 _PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
 _COLUMNS = 12
@@ -29,13 +30,7 @@ _COLUMNS = 12
 def open_kitti_odometry(folder: Path) -> ImageRecording:
     """Open a sequence of the benchmark: rectified pairs and stamps, without velocities.
 
-    The body is the left camera, with axes forward, left and up. The gray pair is preferred.
-
-    Raises:
-        UnknownFormatError: A file is missing or no text.
-        CalibrationError: ``calib.txt`` lacks a camera, or the two are no rectified pair.
-        LostDataError: An image is missing, or has no stamp.
-        LineError: A line is malformed.
+    The body is the left camera. The gray pair is preferred.
     """
     names = next((pair for pair in _PAIRS if all((folder / name).is_dir() for name in pair)), None)
     if names is None:
@@ -49,7 +44,7 @@ def open_kitti_odometry(folder: Path) -> ImageRecording:
     if frames > stamps:
         raise LostDataError(f"{frames} images, but {stamps} stamps in times.txt", source=str(folder), field="times.txt")
     size = size_of(left[0])
-    notes = ["There are no velocities: the body is the left camera, its axes forward, left and up."]
+    notes = ["There are no velocities.", BODY_IS_CAMERA]
     if frames < stamps:
         notes.append(f"The folder has the first {frames} of {stamps} images.")
     if names[0] == "image_2":
@@ -60,7 +55,7 @@ def open_kitti_odometry(folder: Path) -> ImageRecording:
         time_s=times.values[:frames, 0],
         calibration=_calibration(folder / "calib.txt", [f"P{name[-1]}" for name in names], size),
         load=PairFiles(left, right, size),
-        T_cam_imu=se3.transform(R_CAM_BODY, np.zeros(3)),
+        T_cam_imu=T_CAM_BODY,
         notes=tuple(notes),
         attributes={"reader": IMAGES.name, "images": " ".join(names)},
     )
@@ -78,8 +73,7 @@ def _calibration(path: Path, keys: list[str], size: tuple[int, int]) -> PairCali
     if not -shift[0] > 10.0 * np.abs(shift[1:]).max():
         raise CalibrationError("the right camera is not to the right of the left one", source=str(path), field="P")
     # The other two components of a rectified pair are rounding of the calibration.
-    T_right_left = se3.transform(np.eye(3), np.array([shift[0], 0.0, 0.0]))
-    return PairCalibration(left[:, :3], left[:, :3], size, T_right_left)
+    return PairCalibration(left[:, :3], left[:, :3], size, side_by_side(-shift[0]))
 
 
 def read_kitti_odometry(path: Path, sequence: Sequence) -> Poses:
@@ -87,11 +81,6 @@ def read_kitti_odometry(path: Path, sequence: Sequence) -> Poses:
 
     ``T_world_imu = T_imu_cam T_cam0_cam T_cam_imu`` with the sequence's extrinsics, so the first pose is the identity.
     The poses are from the GPS/INS unit of KITTI, so their noise is `KITTI_TRUTH_NOISE`.
-
-    Raises:
-        UnknownFormatError: The file is not text.
-        TruthError: A line is malformed, or not a rigid transform.
-        NonFiniteError: A line holds NaN or infinity.
     """
     table = parse_table(read_lines(path, f"expected {POSES.expected}"), path, columns=_COLUMNS, error=TruthError)
     matrices = table.values.reshape(-1, 3, 4)

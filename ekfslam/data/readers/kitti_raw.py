@@ -23,9 +23,9 @@ from typing import Literal
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.data.checks import require_rigid
-from ekfslam.data.images import ImageRecording, PairCalibration
-from ekfslam.data.readers.fields import checksum, spelled_as_in
+from ekfslam.data.checks import require_rigid, spelled_as_in
+from ekfslam.data.images import ImageRecording, PairCalibration, side_by_side
+from ekfslam.data.readers.fields import checksum
 from ekfslam.data.readers.oxts import EXPECTED, Oxts, image_stamp_notes, read_oxts
 from ekfslam.data.readers.pictures import PairFiles, in_order, numbered_images, size_of
 from ekfslam.data.readers.poses import Poses
@@ -48,16 +48,7 @@ _NO_TRACKS = "KITTI raw has no tracks; they must come from elsewhere."
 
 @dataclass(frozen=True)
 class KittiRaw:
-    """A drive: all of a `Sequence` except tracks.
-
-    Args:
-        folder: Drive folder.
-        oxts: Stamps, velocities and truth.
-        camera: Intrinsics of the rectified stereo pair.
-        T_cam_imu: (4, 4) IMU to rectified left camera of the pair.
-        notes: Findings and repairs of the reader, one sentence each.
-        attributes: Checksum, reader, stereo pair, and reading of the lateral velocity.
-    """
+    """A drive: all of a `Sequence` except tracks, see there."""
 
     folder: Path
     oxts: Oxts
@@ -69,11 +60,7 @@ class KittiRaw:
     def sequence(self, observations: Observations | None = None) -> Sequence:
         """Return the drive as a `Sequence`, with tracks from elsewhere, or with none for dead reckoning.
 
-        Args:
-            observations: Tracks in the rectified images of the stereo pair; their frame is the number of the packet.
-
-        Raises:
-            DataError: The observations do not fit the drive; the subclass says how.
+        Tracks are in the rectified images of the stereo pair; their frame is the number of the packet.
         """
         none = Observations(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4)))
         sequence = Sequence(
@@ -132,19 +119,9 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray", lateral: Lateral = "
 
 
 def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> ImageRecording | None:
-    """Open the rectified images of a drive with its velocities and truth; return None if it has no images.
+    """Open the rectified images of a sync drive with its velocities and truth; return None if it has no images.
 
-    Frame k is packet k, as far as there are images. The gray pair is preferred. See `open_kitti_raw` for velocities,
-    truth and calibration.
-
-    Args:
-        folder: Drive folder, of the kind sync.
-        lateral: Sign of the lateral velocity, see `with_lateral`.
-
-    Raises:
-        UnknownFormatError: A file is missing or damaged, or the drive is of the kind extract: not rectified.
-        LostDataError: An image is missing in between, or in one of both cameras, or has no packet.
-        DataError: A packet or a calibration is malformed; the subclass says how.
+    Frame k is packet k, as far as there are images. The gray pair is preferred.
     """
     pair = next((pair for pair in CAMERAS if (folder / f"image_{CAMERAS[pair][0]}" / "data").is_dir()), None)
     if pair is None:
@@ -169,9 +146,7 @@ def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> Image
         name=part.name,
         source=part.source,
         time_s=part.time_s,
-        calibration=PairCalibration(
-            K, K, size, se3.transform(np.eye(3), np.array([-part.camera.baseline_m, 0.0, 0.0]))
-        ),
+        calibration=PairCalibration(K, K, size, side_by_side(part.camera.baseline_m)),
         load=PairFiles(left, right, size),
         T_cam_imu=part.T_cam_imu,
         twist=part.twist,
@@ -188,13 +163,6 @@ def read_calibration(folder: Path, pair: Pair = "gray") -> tuple[StereoCamera, A
     ``P_rect = K [I, t]`` of the left camera moves its origin by t from that of the rectified camera 00, so
 
         T_cam_imu = [I, t] R_rect_00 T_cam00_velo T_velo_imu,   baseline = t_x(left) - t_x(right).
-
-    Raises:
-        UnknownFormatError: A calibration file is missing or is not text.
-        LineError: A value has another length, or is no number.
-        NonFiniteError: A value is NaN or infinite.
-        CalibrationError: A key is missing, or the pair is not rectified.
-        ExtrinsicsError: A rotation is not one.
     """
     left, right = (f"P_rect_{number}" for number in CAMERAS[pair])
     files = tuple(

@@ -29,10 +29,6 @@ def parse_mat(content: bytes, budget: Budget) -> dict[str, NDArray]:
     Args:
         content: Content of the file.
         budget: Limit of the decompressed size.
-
-    Raises:
-        EkfslamError: The variables claim more than the limit.
-        ValueError, struct.error, zlib.error: The file is damaged.
     """
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:

@@ -28,22 +28,15 @@ CAMERA_INFO, TRANSFORMS = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 ODOMETRY = "nav_msgs/msg/Odometry"
 VELOCITIES = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped", ODOMETRY)
 
-ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
+ROS1_MAGIC = b"#ROSBAG V2.0"
+MAGICS = (ROS1_MAGIC, b"\x89MCAP0\r\n", b"SQLite format 3\x00")
 # Bytes of a pixel.
 _BYTES = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "mono16": 2, "16UC1": 2}
 _LUMA = np.array([0.299, 0.587, 0.114])
 
 
 class Bag:
-    """An open bag.
-
-    Args:
-        path: Path of a file, or of a folder with ``metadata.yaml``.
-
-    Raises:
-        MissingPackageError: rosbags is not installed.
-        UnknownFormatError: The bag is damaged, or of a kind that rosbags does not read.
-    """
+    """An open bag: a file, or a folder with ``metadata.yaml``; raises `MissingPackageError` without rosbags."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -78,9 +71,7 @@ class Bag:
         found = [connection for connection in self._reader.connections if connection.msgtype in kinds]
         return sorted(found, key=lambda connection: (connection.topic, connection.id))
 
-    def raw(
-        self, connection: Any, begin_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[tuple[int, bytes]]:
+    def raw(self, connection: Any, begin_ns: int | None = None, end_ns: int | None = None) -> Iterator[Any]:
         """Yield the time of writing (ns) and the bytes of each message of a stream."""
         with self.named():
             for _, written_ns, content in self._reader.messages([connection], begin_ns, end_ns):
@@ -140,12 +131,7 @@ def field_of(info: Any, name: str) -> Any:
 
 
 def gray_of(message: Any, source: str, size: tuple[int, int]) -> Image:
-    """Return the gray pixels (height, width) of an Image or CompressedImage.
-
-    Raises:
-        UnknownFormatError: The encoding is not known, or the image is damaged.
-        CalibrationError: The image has another size than the calibration.
-    """
+    """Return the gray pixels (height, width) of an Image or CompressedImage."""
     if hasattr(message, "format"):
         return decode_gray(bytes(message.data), source, size)
     height, width, encoding = int(message.height), int(message.width), printable(str(message.encoding))
@@ -169,11 +155,7 @@ def gray_of(message: Any, source: str, size: tuple[int, int]) -> Image:
 
 
 def transform_of(transform: Any) -> Array:
-    """Return the pose (4, 4) of the child frame of a Transform in its parent.
-
-    Raises:
-        CalibrationError: The quaternion does not have the length 1.
-    """
+    """Return the pose (4, 4) of the child frame of a Transform in its parent."""
     t, q = transform.translation, transform.rotation
     quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
     if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-3:

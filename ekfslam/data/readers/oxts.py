@@ -1,20 +1,16 @@
 """Packets of the GPS/INS unit of KITTI raw: stamps, velocities and true poses of a drive folder.
 
-Velocities: ``vf vl vu`` and ``wf wl wu`` are *level*: along forward, left and up of a vehicle without roll and pitch
-(``vu`` is the rate of ``alt``, and ``wx wy wz`` turned by roll and pitch are ``wf wl wu``). They are turned into the
-IMU frame by ``v_imu = (R_y(pitch) R_x(roll))^T v_level``. Before that ``vl``, which is stored positive to the right, is
-negated (``lateral`` = ``as-stored`` leaves it, see `with_lateral`).
-
-Poses: east and north are the Mercator projection of the sphere, scaled by the cosine of the first latitude; up is
-``alt``; the rotation is ``R_z(yaw) R_y(pitch) R_x(roll)``. World is the first pose. Their noise is `KITTI_TRUTH_NOISE`.
-
-An empty line of ``timestamps.txt`` is a stamp that the recorder lost. It is interpolated between its neighbours. If its
-packet is missing too, so are its velocities, and the frame has no truth. A note says so.
+``vf vl vu`` and ``wf wl wu`` are *level*: along forward, left and up of a vehicle without roll and pitch. After
+`with_lateral`, ``v_imu = (R_y(pitch) R_x(roll))^T v_level``. East and north are the Mercator projection of the sphere,
+scaled by the cosine of the first latitude; up is ``alt``; the rotation is ``R_z(yaw) R_y(pitch) R_x(roll)``. The world
+is the first pose. An empty line of ``timestamps.txt`` is a lost stamp, which is interpolated between its neighbours. If
+its packet is missing too, so are its velocities, and the frame has no truth.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,9 +56,8 @@ class Oxts:
     Args:
         time_s: (T,) stamps of the packets, seconds since 1970 on the recorder's clock.
         twist: (T, 6) velocities ``[v; w]`` in the IMU frame.
-        truth: ``T_world_imu`` of every frame that has a packet; the world is the IMU frame of the first.
-        notes: Repairs, one sentence each.
-        attributes: Interpolated intervals, if there are any.
+        truth: Poses of every frame that has a packet.
+        notes, attributes: Repairs, and interpolated intervals.
         files: Files that were read.
     """
 
@@ -75,17 +70,7 @@ class Oxts:
 
 
 def read_oxts(folder: Path, lateral: Lateral = "corrected") -> Oxts:
-    """Read the packets of a drive folder, see this module.
-
-    Raises:
-        UnknownFormatError: A file or folder is missing or is not text.
-        LineError: A line is malformed, or ``dataformat.txt`` puts the fields in another order.
-        NonFiniteError: A packet holds NaN or infinity.
-        ShapeError: The numbers of stamps and packets differ.
-        LostDataError: A packet is missing, or stamps at either end, or more than `MAX_EMPTY_RUN` in a row, or more than
-            `MAX_EMPTY_SHARE` of all.
-        StampError: The stamps do not increase, or are more than `MAX_GAP_S` apart.
-    """
+    """Read the packets of a drive folder, see this module."""
     stamps_file = folder / "oxts" / "timestamps.txt"
     format_files = _check_format(folder / "oxts" / "dataformat.txt")
     files = _packets_in(folder / "oxts" / "data")
@@ -95,13 +80,12 @@ def read_oxts(folder: Path, lateral: Lateral = "corrected") -> Oxts:
     gaps = _check_steps(time_s, stamp_ns, stamped, stamps_file)
     packets = np.array([_read_packet(path) for path in files.values()])
     level, twist = np.zeros((2, len(stamped), 6))
+    level[present], twist[present] = _columns(packets, _TWIST), _body_twist(packets, lateral)
+    level, twist = _interpolated(level, present), _interpolated(twist, present)
     # Gaps that the unit filled are straight lines of the level velocities only.
-    level[present] = _columns(packets, _TWIST)
-    level = _interpolated(level, present)
-    twist[present] = _body_twist(packets, lateral)
     return Oxts(
         time_s=time_s,
-        twist=_interpolated(twist, present),
+        twist=twist,
         truth=Truth(np.flatnonzero(present), _poses(packets), noise=KITTI_TRUTH_NOISE),
         notes=(
             "The level velocities vf vl vu wf wl wu are turned into the IMU frame by each packet's roll and pitch.",
@@ -127,7 +111,7 @@ def image_stamp_notes(path: Path, time_s: Array) -> tuple[str, ...]:
 
 
 def _check_format(path: Path) -> tuple[Path, ...]:
-    """Return the optional description of the packets, if it exists and agrees on the fields that are used."""
+    """Return the optional description of the packets; raise `LineError` if it orders them in another way."""
     if not path.exists():
         return ()
     names = [line.split(":")[0].strip() for line in read_lines(path, EXPECTED)]
@@ -148,14 +132,10 @@ def _packets_in(data: Path) -> dict[int, Path]:
 
 
 def _stamps_of(path: Path, packets: dict[int, Path]) -> tuple[IntArray, BoolArray]:
-    """Return the stamps (T,) of packets, ns, 0 if the line is empty, and whether (T,) each line has one.
-
-    Raises:
-        ShapeError, LostDataError: Stamps and packets do not fit, or too many stamps are lost.
-    """
+    """Return `_read_stamps` of packets; raise a `DataError` if both do not fit, or too many stamps are lost."""
     stamp_ns, stamped = _read_stamps(path)
     frames = max(packets) + 1
-    if not stamped[frames:].any():  # empty lines behind the last packet are the end of the file
+    if not stamped[frames:].any():  # empty lines after the last packet are the end of the file
         stamp_ns, stamped = stamp_ns[:frames], stamped[:frames]
     if len(stamped) != frames:
         raise ShapeError(
@@ -194,11 +174,10 @@ def _require_repairable(stamped: BoolArray, path: Path) -> None:
     """Raise `LostDataError` unless single stamps within the recording are lost."""
     if stamped.all():
         return
-    for k in (0, len(stamped) - 1):
-        if not stamped[k]:
-            message = "the line is empty, and a stamp at either end cannot be interpolated"
-            raise LostDataError(message, **line_of(path, k + 1))
     known = np.flatnonzero(stamped)
+    if not (stamped[0] and stamped[-1]):
+        message = "the line is empty, and a stamp at either end cannot be interpolated"
+        raise LostDataError(message, **line_of(path, len(stamped) if stamped[0] else 1))
     longest = int(np.argmax(np.diff(known)))
     run, empty = int(known[longest + 1] - known[longest] - 1), int((~stamped).sum())
     if run > MAX_EMPTY_RUN or empty > max(1, MAX_EMPTY_SHARE * len(stamped)):
@@ -238,20 +217,18 @@ def _check_steps(time_s: Array, stamp_ns: IntArray, stamped: BoolArray, path: Pa
     )
 
 
-def _repair_notes(stamped: BoolArray, present: BoolArray) -> tuple[str, ...]:
-    notes = []
+def _repair_notes(stamped: BoolArray, present: BoolArray) -> Iterator[str]:
     empty, lost = np.flatnonzero(~stamped), np.flatnonzero(~present)
     if len(empty):
-        notes.append(
+        yield (
             f"oxts/timestamps.txt: {len(empty)} of {len(stamped)} lines are empty, the first is line {empty[0] + 1}; "
             "their stamps are interpolated."
         )
     if len(lost):
-        notes.append(
+        yield (
             f"oxts/data: {len(lost)} packets are missing, the first is {lost[0]:010d}.txt; their velocities are "
             "interpolated, their frames have no truth."
         )
-    return tuple(notes)
 
 
 def _read_packet(path: Path) -> Array:
@@ -272,18 +249,16 @@ def _columns(packets: Array, names: tuple[str, ...]) -> Array:
 
 def _body_twist(packets: Array, lateral: Lateral) -> Array:
     """Return (n, 6) velocities in the IMU frame."""
-    roll, pitch = _columns(packets, ("roll", "pitch")).T
-    R_level_imu = Rotation.from_euler("YX", np.column_stack([pitch, roll]))
+    R_level_imu = Rotation.from_euler("YX", _columns(packets, ("pitch", "roll")))
     level = with_lateral(_columns(packets, _TWIST), lateral)
     return np.hstack([R_level_imu.apply(level[:, i : i + 3], inverse=True) for i in (0, 3)])
 
 
 def _poses(packets: Array) -> Array:
     """Return (n, 4, 4) ``T_world_imu``."""
-    lat, lon, alt, roll, pitch, yaw = _columns(packets, _POSE).T
-    lat, lon = np.radians(lat), np.radians(lon)
+    lat, lon = np.radians(_columns(packets, ("lat", "lon")).T)
     scale_m = EARTH_RADIUS_M * np.cos(lat[0])
     east, north = scale_m * lon, scale_m * np.log(np.tan(np.pi / 4 + lat / 2))
-    R = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll])).as_matrix()
-    T_enu_imu = se3.transform(R, np.column_stack([east, north, alt]))
+    R = Rotation.from_euler("ZYX", _columns(packets, ("yaw", "pitch", "roll"))).as_matrix()
+    T_enu_imu = se3.transform(R, np.column_stack([east, north, _columns(packets, ("alt",))]))
     return se3.inverse(T_enu_imu[0]) @ T_enu_imu

@@ -40,12 +40,7 @@ _ALLOWED = _NUMBERS | _TEXTS | _BYTES | _LISTS | _DICTIONARIES | _MEMO | _CALLS 
 
 
 def read_pickled(path: Path, expected: str) -> dict[str, Any]:
-    """Return the dictionary in an .npy file: arrays of numbers, lists of them, or None by name.
-
-    Raises:
-        UnknownFormatError: The file is damaged, claims more than it has, names anything but arrays and containers, or
-            holds no dictionary; the message ends with ``expected``.
-    """
+    """Return the dictionary in an .npy file: arrays of numbers, lists of them, or None by name."""
     require_file(path)
     try:
         content = path.read_bytes()
@@ -73,11 +68,7 @@ def _clean(error: Exception) -> str:
 
 
 def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Return shape and type in the header of an .npy file, and advance the stream beyond it.
-
-    Raises:
-        ValueError: There is no such header.
-    """
+    """Return shape and type in the header of an .npy file, and advance the stream beyond it."""
     version = np.lib.format.read_magic(stream)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:

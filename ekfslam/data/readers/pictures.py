@@ -30,10 +30,6 @@ def read_gray(path: Path, size: tuple[int, int] | None = None) -> Image:
     Args:
         path: Image file.
         size: Required width and height; any by default.
-
-    Raises:
-        UnknownFormatError: The file is missing, damaged, too large or no image.
-        CalibrationError: The image has another size.
     """
     require_file(path)
     return decode_gray(path.read_bytes(), str(path), size)
@@ -57,11 +53,7 @@ def decode_gray(content: bytes, source: str, size: tuple[int, int] | None = None
 
 
 def size_of(path: Path) -> tuple[int, int]:
-    """Read width and height of an image file from its header alone.
-
-    Raises:
-        UnknownFormatError: The file is missing, damaged or no image.
-    """
+    """Read width and height of an image file from its header alone."""
     require_file(path)
     try:
         with Pillow.open(path, formats=_FORMATS) as image:
@@ -88,11 +80,7 @@ class PairFiles:
 
 
 def images_in(folder: Path) -> tuple[Path, ...]:
-    """Return the image files of a folder in the order of their names.
-
-    Raises:
-        UnknownFormatError: The folder is missing, or there are none.
-    """
+    """Return the image files of a folder in the order of their names."""
     if not folder.is_dir():
         raise UnknownFormatError(f"{folder}: this folder of images is missing")
     found = tuple(sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES))
@@ -102,11 +90,7 @@ def images_in(folder: Path) -> tuple[Path, ...]:
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:
-    """Return the image files of a folder by the number that is their name.
-
-    Raises:
-        UnknownFormatError: The folder is missing, there are no images, or a name is no number.
-    """
+    """Return the image files of a folder by the number that is their name."""
     found = {}
     for path in images_in(folder):
         if not path.stem.isdigit():
@@ -116,11 +100,7 @@ def numbered_images(folder: Path) -> dict[int, Path]:
 
 
 def in_order(found: dict[int, Path], numbers: range) -> list[Path]:
-    """Return the images of successive numbers.
-
-    Raises:
-        LostDataError: One of them is missing.
-    """
+    """Return the images of successive numbers."""
     missing = next((number for number in numbers if number not in found), None)
     if missing is None:
         return [found[number] for number in numbers]
@@ -131,11 +111,7 @@ def in_order(found: dict[int, Path], numbers: range) -> list[Path]:
 
 
 def pair_stamps(left_ns: IntArray, right_ns: IntArray, source: str) -> tuple[IntArray, IntArray, tuple[str, ...]]:
-    """Return indices (n,) of left and right images with equal ascending stamps (ns), and a note on the others.
-
-    Raises:
-        LostDataError: Less than `LEAST_PAIRED` of the images of a camera have a partner.
-    """
+    """Return indices (n,) of left and right images with equal ascending stamps (ns), and a note on the others."""
     right = nearest(right_ns, left_ns)
     left = np.flatnonzero(np.abs(right_ns[right] - left_ns) <= _TOLERANCE_NS)
     right, kept = np.unique(right[left], return_index=True)

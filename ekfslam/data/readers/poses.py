@@ -36,12 +36,7 @@ class Poses:
 
 
 def stamped_poses(table: Table) -> Poses:
-    """Return the poses in rows of seconds, metres (3), and a quaternion (4) with w last.
-
-    Raises:
-        TruthError: A quaternion does not have the length 1.
-        StampError: The stamps do not increase.
-    """
+    """Return the poses in rows of seconds, metres (3), and a quaternion (4) with w last."""
     table.require_increasing()
     time_s, position_m, quaternion = table.values[:, 0], table.values[:, 1:4], table.values[:, 4:]
     defect = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0)

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ekfslam.data.images import ImageRecording
+from ekfslam.data.inputs import VelocitySamples
 from ekfslam.data.readers.poses import Poses
-from ekfslam.data.samples import VelocitySamples
 from ekfslam.data.sequence import Sequence
 
 Extrinsics = Literal["corrected", "as-stored"]

@@ -59,11 +59,7 @@ class Table:
 
 
 def read_lines(path: Path, expected: str) -> list[str]:
-    """Return the lines of a text file.
-
-    Raises:
-        UnknownFormatError: It cannot be read, or is not text; the message ends with ``expected``.
-    """
+    """Return the lines of a text file."""
     try:
         require_file(path, is_text=True)
         return path.read_text(encoding="utf-8").splitlines()
@@ -105,10 +101,6 @@ def parse_numbers(
         where: Line of the file.
         converters: Function that converts a word, by column; `float` by default.
         error: Exception for a malformed line.
-
-    Raises:
-        DataError: There are more or fewer words, or one is no number; ``error`` is its subclass.
-        NonFiniteError: A number is NaN or infinite.
     """
     if len(words) != columns:
         raise error(f"{len(words)} values, expected {columns}", **where)
@@ -142,9 +134,6 @@ def parse_table(
         separator: Separator of columns; blanks by default.
         comment: Beginning of a comment; None if there are none.
         converters, error: See `parse_numbers`.
-
-    Raises:
-        DataError: A row is malformed, see `parse_numbers`.
     """
     values: list[list[float]] = []
     numbers: list[int] = []
@@ -167,11 +156,6 @@ def read_keys(path: Path, counts: Mapping[str, int], expected: str) -> dict[str,
         path: Text file.
         counts: Required number of numbers by key.
         expected: End of the message if this is no text file.
-
-    Raises:
-        UnknownFormatError: The file cannot be read, or is not text.
-        LineError, NonFiniteError: A line of a wanted key is malformed.
-        CalibrationError: A key is missing.
     """
     values: dict[str, Array] = {}
     for number, line in enumerate(read_lines(path, expected), start=1):

@@ -10,19 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
-from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
+from ekfslam.data.checks import spelled_as_in
 from ekfslam.data.observations import flat_observations
-from ekfslam.data.readers.fields import (
-    LATERAL_NOTES,
-    checksum,
-    require_numbers,
-    spelled_as_in,
-    with_lateral,
-)
+from ekfslam.data.readers.fields import LATERAL_NOTES, recorded_tracks, require_numbers, with_lateral
 from ekfslam.data.readers.matfile import parse_mat
 from ekfslam.data.readers.registry import Lateral, Reader, Source
 from ekfslam.data.sequence import LEVEL_VELOCITIES_NOTE, Noise, Sequence, Truth
-from ekfslam.data.tracks import inspect_tracks
 from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import DataError, ShapeError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3
@@ -33,13 +26,7 @@ COLUMN_FIELDS = ("t", "v_vk_vk_i", "w_vk_vk_i", "r_i_vk_i", "theta_vk_i")
 CAMERA_FIELDS = ("fu", "fv", "cu", "cv", "b")
 FIELDS = ("y_k_j", *COLUMN_FIELDS, *CAMERA_FIELDS, "C_c_v", "rho_v_c_v")
 
-_SPELLING = {
-    "time_s": "t",
-    "T_cam_imu": "C_c_v",
-    "K": "fu, fv",
-    "baseline": "b",
-    "truth.T_world_imu": "theta_vk_i",
-}
+_SPELLING = {"time_s": "t", "T_cam_imu": "C_c_v", "K": "fu, fv", "baseline": "b", "truth.T_world_imu": "theta_vk_i"}
 
 
 def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
@@ -48,21 +35,11 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
     The vehicle frame ``v`` is the IMU frame, the inertial frame ``i`` the world; ``T_world_imu`` has the rotation
     ``exp(theta_vk_i^)`` and ``T_cam_imu = [C_c_v, -C_c_v rho_v_c_v]``. Stamps, velocities and truth may run longer than
     the tracks: they are cut, with a note. Starry Night adds landmark positions ``rho_i_pj_i`` and noise variances. The
-    truth of a KITTI drive has the noise `KITTI_TRUTH_NOISE`; of that of Starry Night none is stated.
-
-    Args:
-        path: Path of the .mat file.
-        lateral: Sign of the lateral velocity of a KITTI drive, see `with_lateral`; Starry Night has no level velocities
-            and is read as it is.
-
-    Raises:
-        UnknownFormatError: The file is damaged, or a .mat file of other content.
-        TruthError: The truth is shorter than the tracks.
-        DataError: A field is missing or malformed; the subclass says how.
+    truth of a KITTI drive has the noise `KITTI_TRUTH_NOISE`; that of Starry Night states none. ``lateral`` is the sign
+    of the lateral velocity of a KITTI drive, see `with_lateral`; Starry Night has no level velocities.
     """
-    source = str(path)
     fields = _load(path)
-    with spelled_as_in(source, _SPELLING):
+    with spelled_as_in(str(path), _SPELLING):
         pixels = require_numbers(fields, "y_k_j", (4, None, None), finite=False)
         frames = pixels.shape[1]
         (t, v, w, r, theta), cut = _columns(fields, frames)
@@ -72,15 +49,15 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
         observations, notes = flat_observations(pixels, frame_axis=1, field="y_k_j")
         if cut:
             notes = (f"Cut to the {frames} frames of y_k_j: {', '.join(cut)}.", *notes)
-        attributes = {"checksum_sha256": checksum(path), "reader": READER.name}
+        attributes: dict[str, str] = {}
         noise = _noise(fields)  # stated by Starry Night alone, whose velocities are those of its IMU
         if noise is None:
             twist = with_lateral(twist, lateral)
             notes = (*notes, LEVEL_VELOCITIES_NOTE, LATERAL_NOTES[lateral])
             attributes["lateral"] = lateral
-        return Sequence(
-            name=path.stem,
-            source=source,
+        return recorded_tracks(
+            path,
+            READER.name,
             time_s=t[:, 0],
             twist=twist,
             camera=StereoCamera(fu, fv, cu, cv, b),
@@ -89,8 +66,8 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
             truth=_truth(fields, se3.transform(se3.so3_exp(theta), r), tracks=pixels.shape[2]),
             noise=noise,
             velocity_frame="level" if noise is None else "imu",
-            notes=(*notes, *interpolation_notes(twist), *inspect_tracks(observations, twist).notes),
-            attributes={**attributes, **interpolation_attributes(twist)},
+            notes=notes,
+            attributes=attributes,
         )
 
 

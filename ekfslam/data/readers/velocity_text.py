@@ -9,11 +9,10 @@ from __future__ import annotations
 import re
 from typing import cast, get_args
 
-from ekfslam.data.inputs import VelocityFrame
+from ekfslam.data.inputs import VelocityFrame, VelocitySamples
 from ekfslam.data.readers.fields import checksum
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
-from ekfslam.data.samples import VelocitySamples
 from ekfslam.errors import ConfigError, UnknownFormatError
 
 COLUMNS = ("time", "vx", "vy", "vz", "wx", "wy", "wz")
@@ -43,7 +42,7 @@ def _inputs(source: Source) -> VelocitySamples:
     table.require_increasing()
     frame = cast(VelocityFrame, stated or "imu")
     notes = () if stated else (f"{path.name} does not say in which frame its velocities are: they are taken as imu.",)
-    attributes: dict[str, str | int | float] = {"velocities_sha256": checksum(path)}
+    attributes = {"velocities_sha256": checksum(path)}
     return VelocitySamples(str(path), table.values[:, 0], table.values[:, 1:], frame, None, attributes, notes)
 
 

@@ -51,11 +51,7 @@ class Calibration:
 
 
 def read_yaml(path: Path) -> Calibration:
-    """Read the keys of a file.
-
-    Raises:
-        UnknownFormatError: The file is missing or no text.
-    """
+    """Read the keys of a file."""
     values: dict[str, str] = {}
     above: list[tuple[int, str]] = []
     for raw in read_lines(path, "expected a calibration in YAML"):
