@@ -32,6 +32,7 @@ BlockSetting = float | int | str | bool
 
 MODES: tuple[Mode, ...] = get_args(Mode)
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
+LEAST_PX = 1e-3  # pixel noise with which covariances of landmarks keep digits, whatever they begin with
 
 _KINDS: dict[type, str] = {float: "number", int: "whole number", str: "string", bool: "truth value"}
 
@@ -50,18 +51,14 @@ class Rule:
     words: str = ""
     holds: Callable[[Any], bool] = lambda _: True
 
-    def is_kind(self, value: object) -> bool:
-        """Return whether a value is of the kind; a whole number is a number, a truth value is not."""
-        kinds = (float, int) if self.kind is float else self.kind
-        return isinstance(value, kinds) and isinstance(value, bool) == (self.kind is bool)
-
     def plain(self, value: Any) -> Any:
         """Return a value in its kind: a file may write the whole number 2 as 2.0."""
         return int(value) if self.kind is int and isinstance(value, float) and value.is_integer() else value
 
     def check(self, name: str, value: object) -> None:
         """Raise a `ConfigError` that names setting, rule and value, unless the value follows the rule."""
-        if not self.is_kind(value):
+        kinds = (float, int) if self.kind is float else self.kind
+        if not isinstance(value, kinds) or isinstance(value, bool) != (self.kind is bool):
             raise ConfigError(f"{name} must be a {_KINDS[self.kind]}, found {value!r}")
         if not self.holds(value):
             raise ConfigError(f"{name} must {self.words}, found {value!r}")
@@ -72,8 +69,12 @@ def _rule(kind: type, words: str = "", holds: Callable[[Any], bool] = lambda _: 
     return {"rule": Rule(kind, words, holds)}
 
 
+def _range(words: str, least: float, most: float, kind: type = float) -> dict[str, Rule]:
+    return _rule(kind, words, lambda value: least <= value <= most)  # no comparison holds for NaN
+
+
 def _whole(least: int, most: int = 1_000_000) -> dict[str, Rule]:
-    return _rule(int, f"be a whole number not below {least}, nor above {most}", lambda value: least <= value <= most)
+    return _range(f"be a whole number not below {least}, nor above {most}", least, most, int)
 
 
 def _one_of(literal: Any) -> dict[str, Rule]:
@@ -81,26 +82,16 @@ def _one_of(literal: Any) -> dict[str, Rule]:
     return _rule(str, f"be one of {', '.join(names)}", lambda value: value in names)
 
 
-LEAST_PX = 1e-3  # pixel noise with which covariances of landmarks keep digits, whatever they begin with
-
-# No comparison holds for NaN, so the rules refuse it.
 _TEXT, _SWITCH = _rule(str), _rule(bool)
 _NUMBER = _rule(float, "be a number, not NaN", lambda value: abs(value) <= 1e300 or abs(value) == math.inf)
+_POSITIVE = _range("be positive, from 1e-06 to 1e+06", 1e-6, 1e6)
+_NOT_NEGATIVE = _range("not be negative", 0.0, math.inf)
 # Standard deviations of any unit: their squares, and quotients by these, stay within the range of numbers.
-_LEAST, _LARGEST = 1e-12, 1e6
-_POSITIVE = _rule(
-    float, f"be positive, from {1 / _LARGEST:g} to {_LARGEST:g}", lambda value: 1 / _LARGEST <= value <= _LARGEST
-)
-_NOT_NEGATIVE = _rule(float, "not be negative", lambda value: value >= 0)
 _FINITE = _rule(
-    float,
-    f"be finite and not negative: 0, or from {_LEAST:g} to {_LARGEST:g}",
-    lambda value: value == 0 or _LEAST <= value <= _LARGEST,
+    float, "be finite and not negative: 0, or from 1e-12 to 1e+06", lambda value: value == 0 or 1e-12 <= value <= 1e6
 )
-_PIXELS = _rule(
-    float,
-    f"be finite and positive, from {LEAST_PX:g} to {_LARGEST:g}, or the innovation covariance is singular",
-    lambda value: LEAST_PX <= value <= _LARGEST,
+_PIXELS = _range(
+    f"be finite and positive, from {LEAST_PX:g} to 1e+06, or the innovation covariance is singular", LEAST_PX, 1e6
 )
 _PROBABILITY = _rule(float, "be in (0, 1]", lambda value: 0 < value <= 1)
 _BETWEEN_0_AND_1 = _rule(float, "be between 0 and 1", lambda value: 0 < value < 1)
@@ -128,17 +119,13 @@ class NoiseConfig:
         sigma_v_m_s: Linear velocity, each axis.
         sigma_w_rad_s: Angular velocity, each axis.
         sigma_px: Pixels.
-        drift: Random walk of the error of a track in the image from frame to frame, px. 0 takes pixel noise as white;
-            None takes the walk of the model.
-        track_scale: Factor on the walk of track errors in the automatic model. None finds it from innovations, see
-            `ekfslam.resolve`.
-        shared: Whether the automatic model has state blocks for errors that all samples or all tracks share, see
-            `ekfslam.models.noise.shared_errors`.
+        drift: Random walk of track errors from frame to frame, px; 0 takes pixel noise as white.
+        track_scale: Factor on that walk in the automatic model; None finds it from innovations (`ekfslam.resolve`).
+        shared: Whether the automatic model has state blocks for errors that all samples or all tracks share.
         tilt_deg: For velocities in a level frame, the prior standard deviation of roll and pitch, which the joint
-            filter estimates. 0 takes them as velocities of the IMU; None takes the tilt of the model.
+            filter estimates. 0 takes them as velocities of the IMU.
         model: ``auto`` finds the noise from the data (`ekfslam.models.noise`) if the recording states none and no sigma
-            is given here; sigmas given here are those of white noise. ``tuned`` is the same, but sigmas given here only
-            replace the automatic ones: `ekfslam.studies.tuning` found them within the automatic model. ``white`` takes
+            is given here. ``tuned`` does so too, and sigmas given here replace the automatic ones. ``white`` takes
             0.05 m/s, 0.001 rad/s and 1 px, unless the recording or this table states other values.
     """
 
@@ -156,26 +143,20 @@ class NoiseConfig:
 class HygieneConfig:
     """Rules for bad tracks, applied before any filter sees them, see `ekfslam.data.hygiene`.
 
-    False or 0 switches a rule off. Sigmas are standard deviations by the pixel noise of the run. An id that is seen
-    twice in one frame raises a `DuplicateObservationError` instead, since nothing tells the right observation.
+    False or 0 switches a rule off. Sigmas are standard deviations by the pixel noise of the run.
 
     Args:
         min_disparity_sigma: Drop observations with less disparity, in sigmas of a disparity: they have no depth. By
-            default 1, but 3 in the automatic model, whose tracks have a constant error of their disparity. (The filters
-            reject observations without disparity.)
+            default 1, but 3 in the automatic model, whose tracks have a constant error of their disparity.
         max_row_mismatch_sigma: Drop observations with larger ``|vL - vR|``, in sigmas of that difference.
         restart_at_repeats: Cut every track at a frame that repeats the pixels of the previous one while the rig moves.
-        restart_above_px: Do not cut tracks there that move by no more than this in the adjacent frames: they show
-            another point, but a close one. With noisy velocities the poses gain and the tracks lose.
-        jump_sigma: Cut a track where its pixels jump this many sigmas off its course and that of the frame's other
-            tracks.
-        reused_id_sigma: Cut a track where it comes back after a gap this many sigmas off the pixels that the velocities
-            predict.
+        restart_above_px: Do not cut tracks there that move by no more than this in the adjacent frames.
+        jump_sigma: Cut a track if its pixels jump so far off its course and that of the frame's other tracks.
+        reused_id_sigma: Cut a track if it comes back after a gap so far off the pixels that the velocities predict.
         max_depth_error: Drop tracks whose depth is never known better than this, as a share of the depth.
         min_observations: Drop tracks, or pieces of cut tracks, with fewer observations.
-        disparity_jump_sigma: Drop whole tracks that are seen across a frame in which the disparities of most tracks
-            jump by more than this many sigmas from the prediction of the velocities: the right images show other points
-            than before.
+        disparity_jump_sigma: Drop tracks across a frame in which most disparities jump so far from the prediction of
+            the velocities.
     """
 
     min_disparity_sigma: float | None = field(default=None, metadata=_FINITE)
@@ -196,31 +177,28 @@ class FilterConfig:
     Args:
         variant: Linearisation rule of the joint filter, see `ekfslam.filters.variants`.
         landmark_coordinates: Coordinates in which a correction acts on landmarks. ``image``: their images in the last
-            updated camera, where their errors are Gaussian, see `ekfslam.filters.coordinates`; sensors that are not
-            cameras use ``xyz``. ``xyz``: positions in world, the textbook's form.
+            updated camera, see `ekfslam.filters.coordinates`; sensors that are not cameras use ``xyz``. ``xyz``:
+            positions in world, the textbook's form.
         covariance_form: Form of the joint covariance; estimates are the same. ``dense``: one matrix. ``conditional``:
             linear in the number of landmarks, see `ekfslam.filters.conditional`. ``auto`` takes the cheaper one.
-        iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. More than one is refused for ``fej``, and
-            for ``xyz``, where distances would become too short.
+        iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. ``fej`` and ``xyz`` allow no more.
         retire: ``unseen`` marginalises a landmark when it is out of view, ``never`` keeps all. ``auto`` is ``never``
             for a recording of at most 1500 landmarks some of which come back, else ``unseen``.
-        retire_after: Frames without a sighting after which ``unseen`` applies. By default 1, or 10 if some landmarks of
+        retire_after: Frames without a sighting after which ``unseen`` applies: by default 1, or 10 if some landmarks of
             the recording come back.
-        dormant: With ``unseen``, number of landmarks out of view that stay in the state, those seen last. By default 0,
+        dormant: With ``unseen``, number of landmarks out of view that stay in the state, those seen last: by default 0,
             or 1500 if ``auto`` has chosen ``unseen`` although landmarks come back.
-        revive: A retired landmark that is seen again comes back with its exact mean, covariance and cross-covariance,
-            together with up to this many retired landmarks seen nearest to it in time. -1 starts it again.
-        gate_probability: Chi-square gate on each observation, once against the prediction and (joint filter) once
-            against the prediction as corrected by the frame's other landmarks; 1 accepts everything.
-        split_after: Number of observations in a row that fail the gate (or are behind the camera) after which a track
-            is split: its landmark is retired and a new one started, since the tracker has jumped to another point. 0
-            never splits. By default 3; 1 if errors of tracks walk, since each observation then continues the last one.
-        moving_sigma: If errors of tracks walk (`Noise.track_error`), a track that moves along with the rig is dropped
-            for good. Over all its observations it must do so by more than this many standard deviations,
-        moving_share: and by more than this share of the way.
+        revive: A retired landmark that is seen again comes back with its exact mean and covariance, together with up to
+            this many retired landmarks seen nearest to it in time. -1 starts it again.
+        gate_probability: Chi-square gate on each observation, against the prediction and (joint filter) against the
+            prediction as corrected by the frame's other landmarks; 1 accepts everything.
+        split_after: Rejected observations in a row after which a new landmark replaces that of the track; 0 never
+            does. By default 3; 1 if errors of tracks walk, since each observation then continues the last one.
+        moving_sigma, moving_share: If errors of tracks walk, a track that moves along with the rig is dropped for good:
+            by more than this many standard deviations over all its observations, and this share of the way.
         min_depth_m: Reject observations of a landmark that is predicted nearer than this, or behind the camera.
         relative_frames: If truth is known, keep cross-covariances of reported poses up to this many frames apart, for
-            the NEES of relative poses. 0 keeps none: the columns slow the filter down. Estimates do not depend on it.
+            the NEES of relative poses. It slows the filter down; estimates do not depend on it.
         initial_position_std_m: Standard deviation of the first pose's translation, each axis.
         initial_rotation_std_rad: Standard deviation of the first pose's rotation, each axis.
     """
@@ -307,12 +285,10 @@ class PosteriorConfig:
     """Linearisation of the posterior over all poses and landmarks.
 
     Args:
-        linearisation: ``map`` linearises all rows again at the maximum a posteriori, found from the filter's estimate;
-            ``filtered`` keeps the linearisation of the filter.
-        kernel: Robust kernel on the whitened residual of each observation (``map`` only), see
-            `ekfslam.smoother.posterior`.
-        kernel_width: End of the kernel's parabola, in standard deviations. 5 % of Gaussian residuals exceed the
-            default.
+        linearisation: ``map`` linearises all rows again at the maximum a posteriori; ``filtered`` keeps the
+            linearisation of the filter.
+        kernel: Robust kernel on the whitened residual of each observation (``map`` only).
+        kernel_width: End of its parabola, in standard deviations; 5 % of Gaussian residuals exceed the default.
         tolerance: Levenberg-Marquardt stops when an iteration lowers the cost by a smaller share than this.
     """
 
@@ -351,10 +327,9 @@ class Config:
 
     Args:
         noise, filter, posterior, calibration, hygiene, front_end, truth: Tables of a file.
-        tuning: Record of `ekfslam tune`: texts and numbers by name. It decides nothing and becomes attributes
-            ``tuned_*`` of results.
-        blocks: Settings of optional state blocks by the name of the block, ``[blocks.<name>]`` in a file. Here they are
-            plain values; `ekfslam.models.build` checks them.
+        tuning: Record of `ekfslam tune`, texts and numbers by name; results have it as attributes ``tuned_*``.
+        blocks: Settings of optional state blocks by name, ``[blocks.<name>]`` in a file; `ekfslam.models.build` checks
+            them.
 
     Raises:
         ConfigError: A value breaks its rule; the message names table and key, the rule, and the value.
@@ -371,11 +346,7 @@ class Config:
     blocks: Mapping[str, Mapping[str, BlockSetting]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        for table, settings in vars(self).items():
-            if table not in ("blocks", "tuning"):
-                _check_table(table, settings)
-        _check_record(self.tuning)
-        _check_blocks(self.blocks)
+        _check({table: getattr(settings, "__dict__", settings) for table, settings in vars(self).items()})
         object.__setattr__(self, "tuning", dict(self.tuning))
         object.__setattr__(self, "blocks", {name: dict(settings) for name, settings in self.blocks.items()})
         if self.filter.variant == "fej" and self.filter.iterations > 1:
@@ -389,8 +360,7 @@ class Config:
     def with_overrides(self, overrides: Mapping[str, Mapping[str, Any]]) -> Config:
         """Return this configuration with ``{table: {key: value}}`` replaced; None values are skipped.
 
-        Settings of a state block replace those of the same block and leave its others and all other blocks. Settings
-        in `RETIRED` are skipped, too, with a `RetiredSettingWarning`.
+        Settings of a state block leave its other settings. `RETIRED` ones are skipped with a `RetiredSettingWarning`.
 
         Raises:
             ConfigError: An unknown table or key, or a value of the wrong kind or range.
@@ -400,13 +370,15 @@ class Config:
             if table not in tables:
                 raise ConfigError(f"unknown table [{table}]; known: {', '.join(tables)}")
             _require_table(table, values)
-            values = _without_retired(table, values)
+            given = _given(_without_retired(table, values))
             if table == "blocks":
-                tables[table] = _replaced_blocks(self.blocks, values)
-            elif table == "tuning":
-                tables[table] = {**self.tuning, **_given(values)}
+                for name, settings in given.items():
+                    _require_table(f"blocks.{name}", settings)
+                    given[name] = {**self.blocks.get(name, {}), **_given(settings)}
+            if isinstance(tables[table], Mapping):
+                tables[table] = {**tables[table], **given}
             else:
-                tables[table] = _replaced(table, tables[table], values)
+                tables[table] = _replaced(table, tables[table], given)
         return Config(**tables)
 
     @staticmethod
@@ -427,11 +399,7 @@ class Config:
 
     @staticmethod
     def from_stored(tables: Mapping[str, Mapping[str, Any]]) -> Config:
-        """Return the configuration of a stored result; retired settings are skipped without a warning.
-
-        Raises:
-            ConfigError: As of `with_overrides`.
-        """
+        """Return the configuration of a stored result; retired settings are skipped without a warning."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RetiredSettingWarning)
             return Config().with_overrides(tables)
@@ -443,42 +411,38 @@ def require_setting(name: str, value: object, is_scale: bool = False) -> None:
 
 
 def check_stored(tables: Mapping[str, Any]) -> None:
-    """Raise a `ConfigError` if a known setting of a stored configuration breaks its rule."""
-    defaults = Config()
-    for setting in dataclasses.fields(Config):
-        settings = tables.get(setting.name, {})
-        _require_table(setting.name, settings)
-        if setting.name == "blocks":
+    """Raise a `ConfigError` if a known setting of a stored configuration breaks its rule; None is no value."""
+    for table in tables:
+        _require_table(table, tables[table])
+    _check({table: _given(settings) for table, settings in tables.items()})
+
+
+def _check(tables: Mapping[str, Any]) -> None:
+    """Raise a `ConfigError` if a setting breaks its rule; None is allowed if it is the default."""
+    for table in dataclasses.fields(Config):
+        settings = tables.get(table.name, {})
+        if table.name == "blocks":
             _check_blocks(settings)
-            continue
-        if setting.name == "tuning":
-            _check_record(_given(settings))
-            continue
-        for known in dataclasses.fields(type(getattr(defaults, setting.name))):
-            value = settings.get(known.name)
-            if value is not None:
-                known.metadata["rule"].check(f"{setting.name}.{known.name}", value)
+        elif table.name == "tuning":
+            _check_record(settings)
+        else:
+            for setting in dataclasses.fields(table.default_factory):  # type: ignore[arg-type]
+                value = settings.get(setting.name, setting.default)
+                if value is not None or setting.default is not None:
+                    setting.metadata["rule"].check(f"{table.name}.{setting.name}", value)
 
 
 def _without_retired(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a table that still exist, with a warning for each that does not."""
-    retired = {key: RETIRED[f"{table}.{key}"] for key in values if f"{table}.{key}" in RETIRED}
-    for key, note in retired.items():
-        warnings.warn(f"{table}.{key} is ignored: {note}", RetiredSettingWarning, stacklevel=3)
-    return {key: value for key, value in values.items() if key not in retired}
+    for key in values:
+        if note := RETIRED.get(f"{table}.{key}"):
+            warnings.warn(f"{table}.{key} is ignored: {note}", RetiredSettingWarning, stacklevel=3)
+    return {key: value for key, value in values.items() if f"{table}.{key}" not in RETIRED}
 
 
 def _require_table(name: str, value: object) -> None:
     if not isinstance(value, Mapping):
         raise ConfigError(f"[{name}] must be a table, found {value!r}")
-
-
-def _check_table(table: str, settings: Any) -> None:
-    """Raise a `ConfigError` if a setting breaks its rule; None is allowed if it is the default."""
-    for setting in dataclasses.fields(settings):
-        value = getattr(settings, setting.name)
-        if value is not None or setting.default is not None:
-            setting.metadata["rule"].check(f"{table}.{setting.name}", value)
 
 
 def _given(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -505,20 +469,10 @@ def _check_blocks(blocks: Mapping[str, Any]) -> None:
                 raise ConfigError(f"blocks.{name}.{key} must be a number, a string or a truth value, found {value!r}")
 
 
-def _replaced(table: str, settings: Any, values: Mapping[str, Any]) -> Any:
-    """Return the settings of a table with the given values replaced; None values are skipped."""
+def _replaced(table: str, settings: Any, given: Mapping[str, Any]) -> Any:
+    """Return the settings of a table with the given values replaced."""
     rules = {setting.name: setting.metadata["rule"] for setting in dataclasses.fields(settings)}
-    for key in values:
+    for key in given:
         if key not in rules:
             raise ConfigError(f"unknown key {table}.{key}; known: {', '.join(rules)}")
-    given = {key: rules[key].plain(value) for key, value in _given(values).items()}
-    return dataclasses.replace(settings, **given)
-
-
-def _replaced_blocks(blocks: Mapping[str, Any], values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the settings of state blocks with the given values replaced; None values are skipped."""
-    merged = dict(blocks)
-    for name, settings in values.items():
-        _require_table(f"blocks.{name}", settings)
-        merged[name] = {**blocks.get(name, {}), **_given(settings)}
-    return merged
+    return dataclasses.replace(settings, **{key: rules[key].plain(value) for key, value in given.items()})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import warnings
 from pathlib import Path
 
 import h5py
@@ -17,10 +18,11 @@ from support.same import assert_same
 from ekfslam import hdf5
 from ekfslam.data.readers import read_sequence, write_sequence
 from ekfslam.data.simulate import builtin
-from ekfslam.errors import ArchiveError
+from ekfslam.errors import ArchiveError, PosteriorError
 from ekfslam.filters.result import ERROR_CONVENTION, Result
 from ekfslam.geometry import se3
 from ekfslam.runner import run
+from ekfslam.smoother.posterior import posterior
 from ekfslam.storage.archive import (
     FORMAT_VERSION,
     add_result,
@@ -342,3 +344,21 @@ def test_noise_that_no_model_uses_any_more_is_noted(sequence, tmp_path):
     again = read_sequence(tmp_path / "old.h5")
     assert_same(again.noise, sequence.noise)
     assert again.notes == (*sequence.notes, "The noise states drift 0.4, which no model uses any more.")
+
+
+@pytest.mark.parametrize(("name", "value"), [("misalignment_rad", 0.01), ("track_memory", 0.9)])
+def test_a_result_with_noise_that_no_longer_exists_is_read_but_not_smoothed(with_log, tmp_path, name, value):
+    path = Path(shutil.copy(with_log, tmp_path / "old.h5"))
+    with h5py.File(path, "a") as h5file:
+        h5file["runs/full"].attrs[f"noise_{name}"] = value
+    with pytest.raises(PosteriorError, match=rf"had the noise {name} {value}, which no longer exists"):
+        posterior(open_result(path, "full"))
+
+
+def test_an_archive_of_this_version_is_read_and_smoothed_without_notes(with_log):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = open_result(with_log, "full")
+        posterior(result)
+    assert "retired_noise" not in result.attributes
+    assert read_archive(with_log).notes == ()

@@ -119,14 +119,12 @@ def test_odometry_says_how_far_velocities_walk():
     twist = np.zeros((8, 6))
     twist[1:, 0] = np.cumsum([0.0, 0.1, 0.1, 0.2, -0.2, 0.1, 0.1])
     twist[1:, 1] = twist[1:, 2] = twist[1:, 0]
-    noise = vision_noise(
-        dataclasses.replace(Noise.isotropic(0.3, 0.03, 0.7), tilt_rad=0.1, misalignment_rad=0.1), twist
-    )
+    noise = vision_noise(dataclasses.replace(Noise.isotropic(0.3, 0.03, 0.7), tilt_rad=0.1), twist)
     walk = np.repeat([3.0 * 1.4826 * 0.1, 0.005], 3)
     np.testing.assert_allclose(noise.twist_walk_std, walk)
     np.testing.assert_allclose(noise.twist_std, 10.0 * walk)
     np.testing.assert_array_equal(noise.pixel_std_px, 0.7)
-    assert noise.tilt_rad == noise.misalignment_rad == 0.0 and not noise.gap_std.any()
+    assert noise.tilt_rad == 0.0 and not noise.gap_std.any()
     assert (noise.motion_std < 1e-5).all()
 
 

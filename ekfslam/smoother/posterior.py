@@ -242,14 +242,17 @@ def model_of_result(result: Result) -> Model:
     """Return the model of a full run.
 
     Raises:
-        PosteriorError: The run had a state block that this version no longer has.
+        PosteriorError: The run had a state block or noise that this version no longer has.
     """
     assert result.log is not None
     stored, log = _config_of(result), result.log
-    if retired := set(result.config.get("blocks", {})) - set(stored.blocks):
+    retired = [f"state block {name}" for name in sorted({*result.config.get("blocks", {})} - {*stored.blocks})]
+    if "retired_noise" in result.attributes:
+        retired.append(f"noise {result.attributes['retired_noise']}")
+    if retired:
         raise PosteriorError(
-            f"{result.sequence_name}: this result had the state block {', '.join(sorted(retired))}, which no longer "
-            "exists: run the recording again to smooth it"
+            f"{result.sequence_name}: this result had the {' and '.join(retired)}, which no longer exists: run the "
+            "recording again to smooth it"
         )
     start = log.T_predicted[0], log.initial_covariance[:6, :6]
     rig = Rig(result.camera, result.T_cam_imu, result.noise)

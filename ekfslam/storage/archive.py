@@ -31,6 +31,7 @@ from ekfslam.data.checks import spelled_as_in
 from ekfslam.data.interpolation import known_intervals
 from ekfslam.data.noise import Noise, validate_noise
 from ekfslam.data.readers.hdf5 import (
+    OLD_NOISE,
     SPELLING,
     noise_attributes,
     noise_of_attributes,
@@ -244,8 +245,15 @@ def _read_result(h5file: h5py.File, mode: str, sequence: Mapping[str, Any]) -> R
         noise=noise,
         camera=sequence["camera"],
         T_cam_imu=sequence["T_cam_imu"],
-        attributes=hdf5.facts(hdf5.subgroup(group, "attributes")),
+        attributes={**hdf5.facts(hdf5.subgroup(group, "attributes")), **_retired_noise(group)},
     )
+
+
+def _retired_noise(group: h5py.Group) -> dict[str, str]:
+    """Return the attribute ``retired_noise`` of a result whose noise this version cannot express."""
+    old = {name: group.attrs.get(f"noise_{name}", OLD_NOISE[name]) for name in ("misalignment_rad", "track_memory")}
+    stated = [f"{name} {value}" for name, value in old.items() if np.any(value != OLD_NOISE[name])]
+    return {"retired_noise": ", ".join(stated)} if stated else {}
 
 
 def _read_noise(group: h5py.Group) -> Noise:

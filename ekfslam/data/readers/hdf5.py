@@ -60,7 +60,7 @@ LAYOUT = (*_SEQUENCE, *_NOTES, *_NOISE, *_TRUTH)  # of an archive, too
 OBSERVATIONS_LAYOUT = _OBSERVATIONS
 _CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
 # Noise that older files may state and no model uses any more, with the values that said nothing.
-_OLD_NOISE = {"drift": 0.0, "bearing_drift_rad": 0.0, "misalignment_rad": 0.0, "track_memory": 1.0, "margin": 1.0}
+OLD_NOISE = {"drift": 0.0, "bearing_drift_rad": 0.0, "misalignment_rad": 0.0, "track_memory": 1.0, "margin": 1.0}
 _TRUTH_NOISE = "noise_"  # before the names of attributes
 _NOISE_FIELDS = tuple(item.field for item in _NOISE)
 
@@ -173,7 +173,7 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
             found["noise"] = Noise(**{**noise_of_attributes(further), **_read(h5file, _NOISE)})
             found["notes"] += tuple(
                 f"The noise states {name} {further[name]}, which no model uses any more."
-                for name, nothing in _OLD_NOISE.items()
+                for name, nothing in OLD_NOISE.items()
                 if further.get(name, nothing) != nothing
             )
         if "sequence/observations" in h5file:
