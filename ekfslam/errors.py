@@ -1,6 +1,6 @@
-"""Named errors. Every message says where: the file, the field, and the index, frame or landmark id.
+"""Named errors. Every message names its place: file, field, and index, frame or landmark id.
 
-`EkfslamError` is what the command line turns into one line and exit code 2; anything else is a bug.
+The command line turns an `EkfslamError` into one line and exit code 2; any other exception is a bug.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 
 def _listed(ids: tuple[int, ...]) -> str:
-    """`` [3, 5, ...]``, or nothing for none."""
+    """Return ids as `` [3, 5, ...]``, and nothing for none."""
     shown = ", ".join(map(str, ids[:8])) + (", ..." if len(ids) > 8 else "")
     return f" [{shown}]" if ids else ""
 
@@ -23,13 +23,7 @@ class ConfigError(EkfslamError):
 
 
 class MissingPackageError(EkfslamError):
-    """An optional package is not installed.
-
-    Args:
-        package: Its name.
-        extra: The extra of this project that installs it.
-        what: What needs it.
-    """
+    """An optional package is not installed; an extra of this project installs it."""
 
     def __init__(self, package: str, extra: str, what: str) -> None:
         super().__init__(f"{what} needs the package {package}, which is not installed: pip install 'ekfslam[{extra}]'")
@@ -40,30 +34,25 @@ class UnknownFormatError(EkfslamError):
 
 
 class ArchiveError(EkfslamError):
-    """A result archive lacks what was asked of it, or has a format version this release cannot read."""
+    """A result archive is damaged, lacks a run or a field, or has a version that this release cannot read."""
 
 
 class WriteError(ArchiveError):
-    """A file cannot be written; an older one of its name is as it was."""
+    """A file cannot be written; an older one of its name is unchanged."""
 
 
 class DataError(EkfslamError):
     """A data set is malformed.
 
     Args:
-        message: What is wrong.
-        source: File (or built-in world) the data came from.
-        field: Name of the offending field, as the file or `Sequence` spells it.
-        index: Position of the first offending entry within the field, if there is one.
+        message: Problem in words.
+        source: File or built-in world of the data.
+        field: Name of the wrong field, as the file or `Sequence` spells it.
+        index: Index of the first wrong entry of the field, if there is one.
     """
 
     def __init__(
-        self,
-        message: str,
-        *,
-        source: str = "",
-        field: str = "",
-        index: int | tuple[int, ...] | None = None,
+        self, message: str, *, source: str = "", field: str = "", index: int | tuple[int, ...] | None = None
     ) -> None:
         self.message, self.source, self.field, self.index = message, source, field, index
         where = field
@@ -105,7 +94,7 @@ class TruthError(DataError):
 
 
 class FilterError(EkfslamError):
-    """A filter cannot go on."""
+    """A filter cannot continue."""
 
 
 class NoVelocitiesError(FilterError):
@@ -116,8 +105,8 @@ class InnovationError(FilterError):
     """The innovation covariance S is not positive definite.
 
     Args:
-        frame: Frame at which the update failed.
-        ids: Landmark ids whose blocks of S are not positive definite (all observed ones if only the whole is not).
+        frame: Frame of the failed update.
+        ids: Landmarks whose blocks of S are not positive definite; all observed ones if only the whole of S is not.
     """
 
     def __init__(self, frame: int, ids: Iterable[int]) -> None:
@@ -132,15 +121,15 @@ class NonFiniteResultError(FilterError):
     """An estimate or a covariance has become NaN or infinite: there is no result.
 
     Args:
-        mode: Of the run.
+        mode: Mode of the run.
         what: Name of the quantity.
-        index: Of its first entry that is no number, such as the frame.
+        index: Index of its first entry that is not finite, such as the frame.
     """
 
     def __init__(self, mode: str, what: str, index: int) -> None:
         self.mode, self.what, self.index = mode, what, index
         super().__init__(
-            f"{mode}: {what}[{index}] is not finite; velocities, pixels or noise are beyond what numbers can hold"
+            f"{mode}: {what}[{index}] is not finite; velocities, pixels or noise are out of the range of floats"
         )
 
 
@@ -149,25 +138,25 @@ class RetiredSettingWarning(UserWarning):
 
 
 class LateError(EkfslamError):
-    """A message, or a question, is about a time that is over.
+    """A message or a query has a stamp that the filter has already passed.
 
     Args:
         what: ``velocity``, ``image`` or ``pose``.
         stamp_s: Its stamp.
-        least_s: It must be later than this; None: nothing has been taken in yet.
+        least_s: Stamp that it must be later than; None before the first image is processed.
     """
 
     def __init__(self, what: str, stamp_s: float, least_s: float | None) -> None:
         self.what, self.stamp_s, self.least_s = what, stamp_s, least_s
-        known = "no image has been taken in yet" if least_s is None else f"the filter is at {least_s:.6f} s"
+        known = "no image has been processed yet" if least_s is None else f"the filter is at {least_s:.6f} s"
         super().__init__(f"{what} at {stamp_s:.6f} s comes too late: {known}")
 
 
 class MissingVelocityError(EkfslamError):
-    """No velocity has come that could lead to a stamp."""
+    """No velocity has arrived that reaches to a stamp."""
 
     def __init__(self, stamp_s: float) -> None:
-        super().__init__(f"no velocity has come yet that could lead to {stamp_s:.6f} s")
+        super().__init__(f"no velocity has arrived yet that reaches to {stamp_s:.6f} s")
 
 
 class HonestyError(EkfslamError):
@@ -175,15 +164,15 @@ class HonestyError(EkfslamError):
 
 
 class PosteriorError(EkfslamError):
-    """A posterior is asked for what it cannot give."""
+    """A posterior cannot be computed, or not for these frames or landmarks."""
 
 
 class IllPosedError(PosteriorError):
     """The rows of a posterior leave something undetermined.
 
     Args:
-        what: What is undetermined.
-        ids: Ids of the landmarks, or numbers of the frames, that are.
+        what: Undetermined quantity in words.
+        ids: Undetermined landmarks or frames.
     """
 
     def __init__(self, what: str, ids: Iterable[int]) -> None:
@@ -192,8 +181,8 @@ class IllPosedError(PosteriorError):
 
 
 class LineError(DataError):
-    """A line of a text file holds more or fewer values than its format, or what is no number or no stamp."""
+    """A line of a text file has a wrong number of values, or a value that is no number or no stamp."""
 
 
 class LostDataError(DataError):
-    """Packets or stamps of a recording are lost in a number or at a place that cannot be repaired."""
+    """A recording has lost more packets or stamps than can be repaired."""

@@ -1,7 +1,7 @@
-"""Atomic writing of all files of the package: a file is written as a whole or not at all.
+"""Atomic writing: a file is written as a whole or not at all.
 
-The content is complete in memory before anything is touched. It goes to a file next to the target, to the disk (fsync),
-and replaces the target by renaming. A full disk, a limit or a kill leaves the older file as it was.
+The complete content goes to a file next to the target, to the disk (fsync), and replaces the target by renaming. A full
+disk, a limit or a kill leaves the older file unchanged.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ def write(path: str | Path, content: str | bytes) -> None:
 def write_all(contents: Mapping[Path, str | bytes], make_folders: bool = True) -> None:
     """Write files that belong together: all are on the disk before the first one replaces an older file.
 
-    Permissions of older files stay. A symbolic link stays, and the file that it names is written.
+    Older files keep their permissions. A symbolic link stays, and its target is written.
 
     Args:
         contents: Contents by path; text is encoded in UTF-8.
-        make_folders: Whether to make missing folders; they are removed again if the writing fails.
+        make_folders: Whether to make missing folders; they are removed again if writing fails.
 
     Raises:
         WriteError: A target is a folder, a device or protected, its folder is missing, or the disk is full.
@@ -65,7 +65,7 @@ def write_all(contents: Mapping[Path, str | bytes], make_folders: bool = True) -
 
 
 def require_writable(path: str | Path) -> None:
-    """Raise a `WriteError` if `write_all` would fail for another reason than a full disk."""
+    """Raise a `WriteError` if `write_all` would fail even on an empty disk."""
     folder = _target(path).parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
@@ -91,7 +91,7 @@ def _make_folder(folder: Path) -> list[Path]:
 
 @contextmanager
 def alone(path: str | Path) -> Iterator[None]:
-    """Hold the lock of the folder of a path, so that callers change files of the same folder one after the other.
+    """Lock the folder of a path, so that callers change files in it one after the other.
 
     Raises:
         WriteError: There is no such folder.
@@ -126,7 +126,7 @@ def _write_to_disk(unfinished: Path, data: bytes, target: Path) -> None:
     """Write a new file with the permissions of the target, and wait until it is on the disk."""
     with unfinished.open("xb") as file:
         with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_EX)  # shows that its writer is alive
+            fcntl.flock(file, fcntl.LOCK_EX)  # tells `_sweep` that the writer is alive
         if target.exists():
             older = target.stat()
             with suppress(OSError):
@@ -138,7 +138,7 @@ def _write_to_disk(unfinished: Path, data: bytes, target: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring the renaming to the disk, if the file system can."""
+    """Flush a renaming to the disk, if the file system can."""
     with suppress(OSError):
         number = os.open(folder, os.O_RDONLY)
         try:

@@ -1,6 +1,6 @@
-"""Limits on the size of files, checked before anything of a file is allocated, decompressed or read.
+"""Limits on the size of files, checked before any content is allocated, decompressed or read.
 
-A file of some kilobytes can claim gigabytes. Readers ask a `Budget` for the sizes that its headers claim, in all.
+A file of some kilobytes can claim gigabytes. Readers take the sizes that its headers claim from a `Budget`.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from pathlib import Path
 from ekfslam.errors import ConfigError, EkfslamError, UnknownFormatError
 
 DEFAULT_GB = 0.5  # more than twice the largest recording known; reading takes about three times as much
-_TEXT_SHARE = 16  # numbers take so many times the memory of their text
+_TEXT_SHARE = 16  # memory of parsed numbers over that of their text
 _limit: ContextVar[int] = ContextVar("limit", default=int(DEFAULT_GB * 1e9))
 
 
 @contextmanager
 def reading_up_to(gb: float) -> Iterator[None]:
-    """Let files hold up to so many gigabytes of numbers within the context.
+    """Set the limit on the size of files within the context, in gigabytes of numbers.
 
     Raises:
-        ConfigError: The limit is no positive number.
+        ConfigError: The limit is not between 0 and 1e6.
     """
     if not 0 < gb <= 1e6:
         raise ConfigError(f"the limit of reading must be a positive number of gigabytes, found {gb}")
@@ -35,7 +35,7 @@ def reading_up_to(gb: float) -> Iterator[None]:
 
 
 def limit_gb() -> float:
-    """Return how many gigabytes of numbers a file may hold, for `reading_up_to` in another process."""
+    """Return the limit in gigabytes, for `reading_up_to` in another process."""
     return _limit.get() / 1e9
 
 
@@ -44,7 +44,7 @@ class Budget:
 
     Args:
         source: Name of the file, for messages.
-        error: Type of the error if it claims more.
+        error: Type of the error if the file claims more.
     """
 
     def __init__(self, source: str, error: type[EkfslamError] = UnknownFormatError) -> None:
@@ -61,7 +61,7 @@ class Budget:
 
 
 def require_file(path: str | Path, is_text: bool = False) -> None:
-    """Raise an `UnknownFormatError` unless this is a regular file that is small enough; a pipe would never end."""
+    """Raise an `UnknownFormatError` unless this is a small enough regular file; a pipe would never end."""
     try:
         status = Path(path).stat()
     except (OSError, ValueError) as error:

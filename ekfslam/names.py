@@ -1,4 +1,4 @@
-"""Names from inside files and from paths, made safe to print and to use in paths."""
+"""Make names from files and paths safe to print and to use in paths."""
 
 from __future__ import annotations
 
@@ -9,19 +9,14 @@ _UNSAFE = frozenset('/\\:*?"<>|')  # some system separates paths by them, or giv
 
 
 def printable(text: str, keep: str = "") -> str:
-    """Return a text with control characters, and bytes that are no UTF-8, written out: ``\\x1b``.
-
-    Args:
-        text: Any text.
-        keep: Control characters to keep.
-    """
+    """Return a text with its control characters, except those to keep, and invalid UTF-8 written out: ``\\x1b``."""
     return "".join(
         c if c.isprintable() or c in keep else c.encode("unicode_escape", "backslashreplace").decode() for c in text
     )
 
 
 def components(names: Iterable[str]) -> list[str]:
-    """Return a path component for each name that stays in its folder; no two are the same."""
+    """Return a distinct path component for each name, without separators and parent folders."""
     taken: set[str] = set()
     found = []
     for name in names:

@@ -1,4 +1,4 @@
-"""Progress bars: shown on a terminal for what lasts longer than a second, silent elsewhere."""
+"""Progress bars of loops longer than a second, on terminals only."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ Item = TypeVar("Item")
 
 
 def progress(items: Iterable[Item], description: str, unit: str = "frame", total: int | None = None) -> Iterable[Item]:
-    """``items``, with a progress bar on standard error; ``total`` says how many where they cannot tell."""
-    hidden = (
-        not sys.stderr.isatty() or multiprocessing.parent_process() is not None
-    )  # workers would overwrite each other
+    """Return ``items`` with a progress bar on standard error; ``total`` is their number if they have no length."""
+    # Bars of workers would overwrite each other.
+    hidden = not sys.stderr.isatty() or multiprocessing.parent_process() is not None
     return tqdm(items, desc=description, unit=unit, total=total, delay=1.0, leave=False, disable=hidden)

@@ -1,4 +1,4 @@
-"""Short views of records at a prompt and in a notebook: a few lines in place of thousands of numbers."""
+"""Show a record at a prompt or in a notebook in a few lines, in place of thousands of numbers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ class Card(NamedTuple):
     """A short view of a record.
 
     Args:
-        title: Kind and size of the record, in a few words.
+        title: Size of the record in a few words.
         facts: Key figures by name.
-        further: Python calls to go on with.
+        further: Useful Python calls on the record.
     """
 
     title: str

@@ -45,7 +45,7 @@ AUTOMATIC: dict[str, dict[str, Any]] = {"filter": {"relative_frames": 0}}
 
 
 def in_turn(tasks: Mapping[str, Callable[[], Any]], repeat: int) -> dict[str, list[Any]]:
-    """What each task returned, each time; they take turns."""
+    """Run the tasks in turn, ``repeat`` times, and return the results of each."""
     found: dict[str, list[Any]] = {name: [] for name in tasks}
     with threadpool_limits(1, user_api="blas"):
         for _ in range(repeat):
@@ -55,23 +55,23 @@ def in_turn(tasks: Mapping[str, Callable[[], Any]], repeat: int) -> dict[str, li
 
 
 def city(observations: int, frames: int) -> Sequence:
-    """A city in which about so many landmarks are seen in each frame."""
+    """Return a city with about that many observations in each frame."""
     tracks, density = int(1.1 * observations), max(4.0, observations / 12.0)
     return builtin(f"city?frames={frames}&max_tracks={tracks}&landmarks_per_m={density}")
 
 
 def of_form(form: str) -> dict[str, Any]:
-    """Settings of one form of the covariance."""
+    """Return the settings of one form of the covariance."""
     return {"filter": {"covariance_form": form, "relative_frames": 0}}
 
 
 def milliseconds(sequence: Sequence, settings: dict[str, Any]) -> np.ndarray:
-    """Of each frame of a run in mode full."""
+    """Return the milliseconds of each frame of a run in mode full."""
     return ekfslam.run(sequence, "full", ekfslam.Config().with_overrides(settings)).ms_per_frame
 
 
 def by_observations(repeat: int, sizes: tuple[int, ...]) -> list[dict[str, Any]]:
-    """Milliseconds a frame against what a frame sees."""
+    """Measure milliseconds per frame against observations per frame."""
     rows = []
     for size in sizes:
         sequence = city(size, 60 if size <= DENSE_LIMIT else 30)
@@ -86,7 +86,7 @@ def by_observations(repeat: int, sizes: tuple[int, ...]) -> list[dict[str, Any]]
 
 
 def by_laps(laps: int = 3) -> list[dict[str, Any]]:
-    """Seconds a lap, and the longest frame of each, on a ring whose landmarks come back."""
+    """Measure the seconds and the longest frame of each lap of a ring, where landmarks come back."""
     frames = int(laps * 2 * np.pi * 40.0 / 8.0 / 0.1)
     sequence = builtin(f"loop?radius_m=40&landmarks=394&landmark_offset_m=16&frames={frames}")
     settings: dict[str, dict[str, Any]] = {
@@ -108,7 +108,7 @@ def by_laps(laps: int = 3) -> list[dict[str, Any]]:
 
 
 def race(data: Path, files: tuple[str, ...], repeat: int) -> list[dict[str, Any]]:
-    """Total seconds of the filter, and of iSAM2 on what it accepted."""
+    """Measure total seconds of the filter, and of iSAM2 on the observations that it accepted."""
     from map_against_gtsam import RELINEARISE, factors_of, incremental, open_set
 
     def seconds_of_isam(result: ekfslam.Result, factors: Any, pose_covariance: bool = False) -> np.ndarray:
@@ -144,7 +144,7 @@ def race(data: Path, files: tuple[str, ...], repeat: int) -> list[dict[str, Any]
 
 
 def dgemm_gflops() -> float:
-    """Rate of one thread at 500 x 500 matrices."""
+    """Return the rate of one thread at 500 x 500 matrices."""
     A = np.random.default_rng(0).normal(size=(500, 500))
     with threadpool_limits(1, user_api="blas"):
         best = np.inf
@@ -157,7 +157,7 @@ def dgemm_gflops() -> float:
 
 @styled
 def figure(rows: list[dict[str, Any]]) -> Figure:
-    """Milliseconds a frame against observations a frame."""
+    """Draw milliseconds per frame against observations per frame."""
     drawn = Figure(figsize=(5.0, 3.6))
     axes = drawn.add_subplot()
     for form, style in (("dense", VARIANTS["standard"]), ("conditional", VARIANTS["invariant"])):
@@ -174,7 +174,7 @@ def figure(rows: list[dict[str, Any]]) -> Figure:
 
 
 def tables(found: dict[str, Any]) -> str:
-    """All three as Markdown."""
+    """Return all three tables as Markdown."""
     sizes = [
         [
             number(row["observations"], ".0f"),
@@ -206,7 +206,7 @@ def tables(found: dict[str, Any]) -> str:
 
 
 def race_tables(rows: list[dict[str, Any]]) -> list[str]:
-    """Total seconds and ratios on the recordings, and the spread of a frame."""
+    """Return total seconds and ratios on the recordings, and the spread over frames."""
     ours, theirs = ("white", "white, xyz", "automatic"), ("iSAM2", "iSAM2 with covariance")
     totals, ratios, spreads = [], [], []
     for row in rows:

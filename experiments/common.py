@@ -1,6 +1,6 @@
-"""What the experiments share: their options, the recordings and their truth, errors and gains, and the files written.
+"""Shared parts of the experiments: options, recordings and their truth, errors, and the files written.
 
-The recordings are looked for in ``../shared/data`` or ``$EKFSLAM_DATA``; they may not be shipped.
+Recordings are read from ``$EKFSLAM_DATA`` or ``../shared/data``; they may not be redistributed.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ ODOMETRY = {"0020": "06", "0027": "07", "0042": "01", "0027_dense_noisy": "07"}
 def argument_parser(
     description: str | None, results: str, *, data: bool = False, workers: bool = False
 ) -> argparse.ArgumentParser:
-    """A parser with ``--out``, by default the folder ``results`` of `results`; on request ``--data``, ``--workers``."""
+    """Return a parser with ``--out``, by default ``results/<results>``, and on request ``--data`` and ``--workers``."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     if data:
         parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="default: %(default)s")
@@ -62,7 +62,7 @@ def argument_parser(
 
 
 def has_recordings(data: Path, *files: str) -> bool:
-    """Whether the recordings are there; if not, says so, and the experiment is left out without an error."""
+    """Return whether the recordings are there, and print the first missing one."""
     missing = [file for file in files if not (data / file).is_file()]
     if missing:
         print(f"no {missing[0]} in {data}; give --data or set EKFSLAM_DATA", file=sys.stderr)
@@ -70,28 +70,28 @@ def has_recordings(data: Path, *files: str) -> bool:
 
 
 def truth_file(data: Path, file: str) -> Path | None:
-    """The true poses of KITTI odometry, where a recording has none of its own but they are known."""
+    """Return the file of true poses for a recording without truth of its own; None if there is none."""
     poses = ODOMETRY.get(Path(file).stem)
     return None if poses is None else data / "kitti_odometry_poses" / f"{poses}.txt"
 
 
 def open_recording(data: Path, file: str, **arguments: Any) -> Sequence:
-    """A recording with its `truth_file`."""
+    """Open a recording with its `truth_file`."""
     return open_sequence(data / file, truth=truth_file(data, file), **arguments)
 
 
 def recording(
     data: Path, file: str, prepare: Callable[[Sequence, int | None], Sequence] | None = None, name: str = ""
 ) -> Recording:
-    """The same as a recording of a sweep."""
+    """Return a recording of a sweep with its `truth_file`."""
     truth = truth_file(data, file)
     return Recording(str(data / file), name or Path(file).stem, None if truth is None else str(truth), prepare=prepare)
 
 
 def swept(name: str, sweep: Sweep, workers: int) -> SweepTable:
-    """The table of a sweep, which goes on where it was interrupted; says which runs have failed.
+    """Run a sweep or resume it, print failed runs, and return the table.
 
-    It is kept below ``results/local``. Once the program has changed, it is made anew.
+    The table is kept in ``results/local``, and computed again when the program has changed.
     """
     decides = hashlib.sha256("".join(task.key for task in sweep.tasks).encode())
     for source in sorted((ROOT / "ekfslam").rglob("*.py")):
@@ -106,13 +106,13 @@ def swept(name: str, sweep: Sweep, workers: int) -> SweepTable:
 
 
 def truth_of(sequence: Sequence) -> Truth:
-    """The truth of a sequence that has one."""
+    """Return the truth of a sequence that has one."""
     assert sequence.truth is not None
     return sequence.truth
 
 
 def trajectory_errors(sequence: Sequence, T_world_imu: Array) -> dict[str, float]:
-    """Absolute trajectory error of poses (T, 4, 4) in metres: as they stand in world, and aligned by SE(3)."""
+    """Return the absolute trajectory error of poses (T, 4, 4) in metres, without alignment and aligned by SE(3)."""
     truth = truth_of(sequence)
     estimate = T_world_imu[truth.frame]
     return {
@@ -122,7 +122,7 @@ def trajectory_errors(sequence: Sequence, T_world_imu: Array) -> dict[str, float
 
 
 def with_aligned(row: Mapping[str, Any], spec: str = ".2f") -> str:
-    """A cell with an ATE, and in brackets what alignment leaves of it; a dash for none."""
+    """Return a cell with an ATE, and in brackets the aligned one; a dash for none."""
     return "-" if row["ate_m"] is None else f"{row['ate_m']:{spec}} ({row['ate_aligned_m']:{spec}})"
 
 

@@ -4,17 +4,16 @@ The report localises with the prediction alone,
 
     T+ = exp(-tau u^) T,                                                                     (1)
 
-and maps every landmark by a Kalman filter of its own that takes those poses as exact. Pose errors therefore go straight
-into the map, and nothing that the camera sees can ever correct the pose. Full SLAM keeps pose and landmarks in one
-state, whose covariance knows how they hang together,
+and maps every landmark by a separate Kalman filter that takes those poses as exact. Pose errors therefore go straight
+into the map, and images never correct the pose. Full SLAM keeps pose and landmarks in one state, whose covariance holds
+their correlations,
 
     S = H P H^T + V,   (xi, d) = P H^T S^-1 r,   P -= P H^T S^-1 H P,                        (6)
 
 so that an observed landmark pulls the pose, and the pose pulls every landmark in view.
 
-`city` is a drive of 100 s through streets, with 3 % gross outliers and velocities whose noise makes dead reckoning
-drift; no landmark comes back. `loop` drives three times round the same circle, so landmarks do come back, and the
-filter keeps them all.
+`city` is a drive of 100 s through streets, with 3 % gross outliers and noisy velocities, so dead reckoning drifts; no
+landmark comes back. `loop` drives three times round a circle, so landmarks come back, and the filter keeps them all.
 
     python experiments/compare_modes.py [--out DIR] [--workers N]
 """

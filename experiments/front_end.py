@@ -87,7 +87,7 @@ def main() -> None:
 
 
 def _tracked(data: Path, velocities: bool) -> tuple[Sequence, TrackReport, float]:
-    """The tracks of the images, and the processor time of a frame in ms, decoding included."""
+    """Return the tracks of the images, and the processor time per frame in ms, with decoding."""
     recording = open_images(data / FOLDER)
     assert recording is not None
     if velocities:
@@ -102,7 +102,7 @@ def _camera_poses(sequence: Sequence, T_world_imu: Array) -> Array:
 
 
 def errors_of(sequence: Sequence, T_world_cam: Array) -> dict[str, Any]:
-    """What is said of the errors of a recording's tracks at poses (T, 4, 4) of its camera."""
+    """Return the figures of the errors of a recording's tracks at poses (T, 4, 4) of its camera."""
     T_cam_world, observations = se3.inverse(T_world_cam), sequence.observations
     constants, residuals = [], []
     order = np.lexsort((observations.frame, observations.landmark))
@@ -135,7 +135,7 @@ def errors_of(sequence: Sequence, T_world_cam: Array) -> dict[str, Any]:
 
 
 def _fitted(sequence: Sequence, T_cam_world: Array, rows: Array) -> tuple[float, float, Array]:
-    """Constant disparity error of one track, its standard deviation, and residuals (n, 3): u, v, disparity."""
+    """Return the constant disparity error of a track, its standard deviation, and residuals (n, 3) in u, v, d."""
     camera = sequence.camera
     m = np.mean(se3.apply(se3.inverse(T_cam_world), triangulate(camera, rows)), axis=0)
     c = 0.0
@@ -158,19 +158,19 @@ def _fitted(sequence: Sequence, T_cam_world: Array, rows: Array) -> tuple[float,
 
 
 def _robust_std(values: Array) -> Array:
-    """Standard deviations along the first axis, from medians of absolute values."""
+    """Return standard deviations along the first axis, from medians of absolute values."""
     return np.asarray(1.4826 * np.median(np.abs(values), axis=0))
 
 
 def _robust_correlation(x: Array, y: Array) -> float:
-    """Correlation of two zero-mean variables, from the robust standard deviations of their sum and difference."""
+    """Return the correlation of two zero-mean variables, from robust deviations of their sum and difference."""
     x, y = x / _robust_std(x), y / _robust_std(y)
     plus, minus = _robust_std(x + y) ** 2, _robust_std(x - y) ** 2
     return float((plus - minus) / (plus + minus))
 
 
 def _shared(frame: Array, step: Array) -> Array:
-    """(3,) standard deviation of the mean step of a frame, less what means of independent steps would have."""
+    """Return the standard deviation (3,) of the mean step of a frame, less that of the mean of independent steps."""
     squares = []
     for k in np.unique(frame):
         some = step[frame == k]
@@ -226,7 +226,7 @@ def _text(rows: dict[str, Any], found: dict[Any, Any], report: TrackReport, ms: 
 
 @styled
 def plot_errors(found: dict[str, Any]) -> Figure:
-    """How far errors of tracks spread with their age, and their constant disparity errors."""
+    """Draw the spread of track errors against their age, and the constant disparity errors."""
     figure = Figure(figsize=(10.0, 3.0))
     panels = figure.subplots(1, 4)
     styles = {"given KLT": line_of("mapping-only"), "front end": line_of("full")}

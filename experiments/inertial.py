@@ -130,7 +130,7 @@ def nees(ekf: JointEKF, truth: list[Array]) -> dict[str, float]:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """A run: mean NEES over its frames, root mean square position error without alignment, way, time a frame."""
+    """Figures of a run: mean NEES, root mean square position error without alignment, distance, ms per frame."""
 
     nees: dict[str, float]
     ate_m: float
@@ -139,7 +139,7 @@ class Outcome:
 
 
 def run_once(sequence: Sequence, model: Model, config: FilterConfig = FILTER) -> Outcome:
-    """Return how honest the filter is on a recording."""
+    """Filter a recording and compare with its truth."""
     ekf, found, errors, begin = JointEKF(model, config), [], [], perf_counter()
     with one_thread():
         for frame in run_filter(ekf, sequence):
@@ -154,7 +154,7 @@ def run_once(sequence: Sequence, model: Model, config: FilterConfig = FILTER) ->
 
 
 def starts(trajectory: Path | None, seconds: float, runs: int) -> Iterable[float]:
-    """Return where recordings begin: evenly over those stretches of a trajectory that have no gap."""
+    """Return the begins of recordings, spread evenly over the stretches of a trajectory without a gap."""
     if trajectory is None:
         return [0.0] * runs
     stamps = np.loadtxt(trajectory)[:, 0]
@@ -168,7 +168,7 @@ def starts(trajectory: Path | None, seconds: float, runs: int) -> Iterable[float
 
 
 def outcomes(world: Room, prior: Prior, config: FilterConfig, runs: int) -> list[Outcome]:
-    """Return one outcome a seed."""
+    """Return one outcome per seed."""
     trajectory = Path(world.trajectory) if world.trajectory else None
     found = []
     for seed, start_s in enumerate(starts(trajectory, world.frames * world.frame_period_s, runs)):

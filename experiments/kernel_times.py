@@ -18,7 +18,7 @@ LANDMARKS, DIMENSION, WIDTH = 100, 3, 120  # of a frame on KITTI
 
 
 def arguments(name: str) -> tuple[Any, ...]:
-    """Of a kernel, as a frame has them."""
+    """Return arguments of a kernel of the size of a frame."""
     rng = np.random.default_rng(0)
     k, d, n = LANDMARKS, DIMENSION, WIDTH
     A = rng.normal(size=(k, d, d + 2))

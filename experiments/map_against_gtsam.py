@@ -96,14 +96,14 @@ MAX_ITERATIONS = 1000
 
 @dataclass(frozen=True)
 class Factors:
-    """The posterior's problem as GTSAM has it: first pose, T-1 motions, K observations in the order of the log."""
+    """Problem of the posterior as factors of GTSAM: first pose, T-1 motions, K observations in the order of the log."""
 
     first: Any
     motion: list[Any]
     observation: list[Any]
 
     def graph(self) -> Any:
-        """All factors."""
+        """Return the graph of all factors."""
         graph = gtsam.NonlinearFactorGraph()
         for factor in (self.first, *self.motion, *self.observation):
             graph.push_back(factor)
@@ -111,7 +111,7 @@ class Factors:
 
 
 def factors_of(result: Result, config: PosteriorConfig) -> Factors:
-    """Make GTSAM's factors from a run of the joint filter that knew its first pose exactly."""
+    """Make GTSAM's factors from a run of the joint filter with an exact first pose."""
     log, rig = log_of(result), result.camera
     assert not log.initial_covariance.any() and (log.variance == log.variance[0]).all()
 
@@ -264,7 +264,7 @@ def start_of(result: Result, rows: BatchProblem) -> tuple[Array, Array]:
 def cost_of(
     rows: BatchProblem, config: PosteriorConfig, T_world_imu: Array, positions_m: Array
 ) -> tuple[float | None, int]:
-    """Return the posterior's cost anywhere, None if infinite, and the number of observations from behind."""
+    """Return the cost of the posterior, None if infinite, and the number of observations from behind a camera."""
     # White noise and a certain first pose: poses and landmarks are all there is.
     start = rows.filtered_state(positions_m)
     state = replace(start, T_imu_world=se3.inverse(T_world_imu), zeta=0 * start.zeta)

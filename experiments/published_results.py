@@ -57,7 +57,7 @@ SIGMAS = 3.0  # of the stated uncertainty of a mean
 
 @dataclass(frozen=True)
 class PositionSensor:
-    """A sensor that measures the position of a landmark in the vehicle's frame, ``h(q) = q``, for one frame.
+    """Sensor of landmark positions in the vehicle frame, ``h(q) = q``, for one frame.
 
     Its noise grows with the true z, which only the experiment knows: every measurement comes with its own standard
     deviations. Were they taken from the noisy z instead, too small a z would weigh more than too large a one. The pull
@@ -109,7 +109,7 @@ class PositionSensor:
 
 @dataclass(frozen=True)
 class World:
-    """The world from which runs are drawn; steps last 1 s.
+    """World of the runs; steps last 1 s.
 
     Args:
         T_world_imu: (T, 4, 4) true poses.
@@ -199,7 +199,7 @@ def _in_ring(q: Array) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Track:
-    """A filter's poses (T, 4, 4) against the true ones: error ``xi`` and its covariance, in their common coordinates.
+    """Errors ``xi`` of the poses of a filter and their covariances, in common coordinates.
 
     Args:
         xi: (T, 6) stored pose errors.
@@ -273,8 +273,11 @@ def one_run(experiment: str, seed: int) -> dict[Variant, dict[str, float]]:
 
 
 def summarise(runs: list[dict[Variant, dict[str, float]]]) -> dict[str, dict[str, list[float]]]:
-    """Return ``{variant: {figure: [mean, 3 standard errors]}}`` over runs; roots of mean squares; and the pose NEES
-    against the invariant variant's of the same runs, in which what makes a run hard or easy cancels."""
+    """Return ``{variant: {figure: [mean, 3 standard errors]}}`` over runs, with roots of mean squares.
+
+    The pose NEES is also given relative to that of the invariant variant on the same runs, since the difficulty of a
+    run cancels in it.
+    """
     summary: dict[str, dict[str, list[float]]] = {}
     for variant in VARIANTS:
         table = {key: np.array([run[variant][key] for run in runs]) for key in runs[0][variant]}

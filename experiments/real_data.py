@@ -87,18 +87,18 @@ def main() -> int:
 
 
 def recordings(data: Path) -> tuple[Recording, ...]:
-    """All of them; the dense tracks once more with the velocities of the clean edition."""
+    """Return all recordings, and the dense tracks also with the velocities of the clean edition."""
     clean = recording(data, DENSE, partial(with_velocities, edition=data / CLEAN_EDITION), CLEAN_DENSE)
     return (*(recording(data, file) for file in (*UTIAS, *REPORT, DENSE)), clean)
 
 
 def with_velocities(sequence: Sequence, seed: int | None, edition: Path) -> Sequence:
-    """The velocities of another edition of the same frames."""
+    """Return a sequence with the velocities of another edition of the same frames."""
     return sequence.with_velocities(open_sequence(edition).twist)
 
 
 def with_noise(sequence: Sequence, seed: int | None, edition: Path | None = None) -> Sequence:
-    """White noise added to the velocities, or to those of another edition."""
+    """Add white noise to the velocities, or to those of another edition."""
     clean = sequence if edition is None else with_velocities(sequence, seed, edition)
     noise = ADDED_STD * np.random.default_rng(seed).standard_normal(clean.twist.shape)
     return clean.with_velocities(clean.twist + noise)
@@ -108,7 +108,7 @@ def with_noise(sequence: Sequence, seed: int | None, edition: Path | None = None
 
 
 def share(sequence: Sequence, result: Result, of: str) -> float | None:
-    """Share of the observations that full SLAM counts as so."""
+    """Return the share of a count in all observations."""
     counts = result.counts
     if "accepted" not in counts:
         return None
@@ -116,18 +116,18 @@ def share(sequence: Sequence, result: Result, of: str) -> float | None:
 
 
 def tracks_cut(sequence: Sequence, result: Result) -> float:
-    """How many tracks hygiene cut."""
+    """Return the number of tracks cut by hygiene."""
     cut = sum(value for key, value in result.counts.items() if key.startswith("hygiene: "))
     return float(cut - result.counts.get("dropped by hygiene", 0))
 
 
 def tracks_moving(sequence: Sequence, result: Result) -> float:
-    """How many tracks were found to move."""
+    """Return the number of tracks found to move."""
     return float(result.counts.get("moving", 0))
 
 
 def track_scale(sequence: Sequence, result: Result) -> float:
-    """The factor on the walk of track errors that was found."""
+    """Return the automatic factor on the walk of track errors."""
     return float(result.config["noise"]["track_scale"] or 1.0)
 
 
@@ -142,7 +142,7 @@ COLUMNS: dict[str, Column] = {
 
 
 def of_seeds(part: SweepTable) -> dict[str, Array]:
-    """ATE in metres of both modes, the gain, and the pose NEES of full, of one recording seed by seed."""
+    """Return ATE in metres of both modes, gain, and pose NEES of full, by seed of one recording."""
     modes = part.groups("mode")
     drive, full = (modes[mode,].column("ate_m") for mode in ("dead-reckoning", "full"))
     nees = modes["full",].column(NEES["with truth noise"])
@@ -150,12 +150,12 @@ def of_seeds(part: SweepTable) -> dict[str, Array]:
 
 
 def gain(runs: Runs, name: str) -> float:
-    """Dead reckoning's error over that of full SLAM on one recording."""
+    """Return the error of dead reckoning over that of full SLAM on one recording."""
     return float(runs[name, "dead reckoning"]["ate_m"] / runs[name, "full"]["ate_m"])
 
 
 def markdown(runs: Runs, noisy: Noisy) -> str:
-    """The report of the experiment."""
+    """Return the report of the experiment."""
     names, headings = (list(dict.fromkeys(column)) for column in zip(*runs, strict=True))
     drives = [gain(runs, Path(file).stem) for file in UTIAS]
     every = np.concatenate([found["gain"] for name, found in noisy.items() if name != Path(DENSE).stem])
@@ -204,13 +204,13 @@ def markdown(runs: Runs, noisy: Noisy) -> str:
 
 
 def honesty_cells(full: dict[str, Any], smoothed: dict[str, Any]) -> list[str]:
-    """NEES of full and smoothed, NIS and the factor found."""
+    """Return the table of the NEES of full and smoothed, NIS and the factor found."""
     nees = [number(row[key], ".1f") for row in (full, smoothed) for key in NEES.values()]
     return [*nees, f"{full['nis_per_dof']:.2f}", f"{full['track scale']:.2f}"]
 
 
 def observation_cells(full: dict[str, Any]) -> list[str]:
-    """What full SLAM did with the observations."""
+    """Return the table of what full SLAM did with the observations."""
     shares = [f"{full[key]:.1%}" for key in SHARES]
     tracks = [f"{full[key]:.0f}" for key in ("tracks cut", "tracks moving")]
     return [*shares, *tracks]
@@ -218,7 +218,7 @@ def observation_cells(full: dict[str, Any]) -> list[str]:
 
 @styled
 def plot(runs: Runs, noisy: Noisy) -> Figure:
-    """Gain over dead reckoning, set by set: as recorded, and with noise added."""
+    """Draw the gain over dead reckoning for each set, as recorded and with noise added."""
     figure = Figure(figsize=(8.0, 4.2))
     ax = figure.subplots()
     names = list(dict.fromkeys(name for name, _ in runs))

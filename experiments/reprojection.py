@@ -66,7 +66,7 @@ def _points_seen(camera: cam.StereoCamera, T_cam_world: Array, pixels: Array, tr
     points = se3.apply(se3.inverse(T_cam_world[first]), cam.triangulate(camera, rows))
 
     def cost(points: Array) -> tuple[Array, Array, Array, Array]:
-        """Points in the camera frame, residuals, their norms, and the cost of each track."""
+        """Return points in the camera frame, residuals, their norms, and the cost of each track."""
         q = se3.apply(T_cam_world, points[track])
         residual = pixels - cam.project(camera, q)
         norm = np.linalg.norm(residual, axis=1)

@@ -145,7 +145,7 @@ def measure_size(landmarks: int) -> Row:
 
 
 def counted_ms(sequence: Sequence, result: Result) -> Array:
-    """Return the milliseconds of the frames that count; see the module."""
+    """Return the milliseconds of the counted frames, see the module."""
     in_view = np.bincount(sequence.observations.frame, minlength=len(sequence))
     second_half = np.arange(len(sequence)) >= len(sequence) // 2
     return result.ms_per_frame[second_half & (in_view >= IN_VIEW[0]) & (in_view <= IN_VIEW[1])]
@@ -291,7 +291,7 @@ WORKERS: dict[str, Callable[[int], Row]] = {
 
 
 def in_own_process(worker: str, landmarks: int) -> Row:
-    """Measure in a process of its own."""
+    """Measure in a new process."""
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, __file__, "--worker", worker, str(landmarks)]
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)

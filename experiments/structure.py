@@ -1,7 +1,7 @@
 """Choose the structure of a recording's errors and find their sizes, without truth.
 
-A *candidate* is a set of settings: which state blocks there are, whether pixels are white or tracks walk, and where the
-sizes start. The joint filter runs over stretches of the recording under each, and its innovations decide:
+A *candidate* is a set of settings: state blocks, white pixels or walking tracks, and first values of the sizes. The
+joint filter runs over stretches of the recording under each, and its innovations decide:
 
 - Sizes of what landmarks or frames share are those of the largest log-likelihood, the prediction error decomposition of
   `ekfslam.studies.tuning`, rejected observations included. They are found one after the other, by a parabola through
@@ -43,13 +43,13 @@ _NIS_RUNS = 4  # to find one size
 
 @dataclass(frozen=True)
 class Candidate:
-    """A structure of errors, and which of its sizes are looked for.
+    """A structure of errors, and the sizes to search.
 
     Args:
         name: In words.
-        overrides: Settings ``{table: {key: value}}`` that make it; sizes that are looked for start there.
+        overrides: Settings ``{table: {key: value}}`` of the structure, with the first values of the sizes.
         by_likelihood: Sizes found by likelihood, such as ``blocks.camera_jitter.rotation_deg``.
-        by_nis: The size found by NIS, such as ``noise.sigma_px``; "" for none.
+        by_nis: Size found by NIS, such as ``noise.sigma_px``; "" for none.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Candidate:
 
     @property
     def sizes(self) -> tuple[str, ...]:
-        """Names of all sizes that are looked for."""
+        """Names of all sizes to search."""
         return (*self.by_likelihood, *([self.by_nis] if self.by_nis else []))
 
 
@@ -74,7 +74,7 @@ class Tried:
         log_likelihood: Of the innovations; minus infinity where the filter broke down.
         nis_per_dof: Mean NIS of the accepted innovations per degree of freedom.
         dof: Degrees of freedom.
-        runs: How many times the stretches were filtered.
+        runs: Number of times that the stretches were filtered.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Tried:
 
     @property
     def line(self) -> str:
-        """What was found, as one line of text."""
+        """The result as one line of text."""
         sizes = "".join(f", {name} {size:.3g}" for name, size in self.sizes.items())
         if not np.isfinite(self.log_likelihood):
             return f"{self.name}: the filter broke down{sizes}"
@@ -107,7 +107,7 @@ class Choice:
     Args:
         chosen: The best candidate.
         tried: All of them, in the order given.
-        frames: How many frames each run has filtered.
+        frames: Number of frames of each run.
     """
 
     chosen: Tried
@@ -121,7 +121,7 @@ class Choice:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """What was tried and what was chosen, one line each."""
+        """The results and the choice, one line each."""
         runs = sum(tried.runs for tried in self.tried)
         lead = sorted(tried.score for tried in self.tried)
         ahead = f", log-likelihood {lead[-1] - lead[-2]:.0f} ahead for its number of sizes" if len(lead) > 1 else ""
@@ -141,15 +141,15 @@ def choose(
 ) -> Choice:
     """Return the candidate under which the innovations of the joint filter are most likely, with its sizes.
 
-    Moving tracks and bad observations are left out as the configuration without the candidates' settings finds them, so
-    that all candidates are judged by the same observations. The truth is not looked at.
+    Moving tracks and bad observations are found without the settings of the candidates, so all candidates are judged by
+    the same observations. The truth is not used.
 
     Args:
         sequence: The recording.
-        config: All other settings; defaults where None.
+        config: All other settings; None for the defaults.
         candidates: At least one.
-        frames: About how many are filtered in a run, in stretches of 50 that are spread over the recording.
-        runs: At most so many of all candidates together, but at least one each.
+        frames: Approximate number of frames of a run, in stretches of 50 that are spread over the recording.
+        runs: Limit on the runs of all candidates together; each has at least one.
 
     Raises:
         ConfigError: No candidate; one of its settings is unknown or wrong, or a size has no value to start from.
@@ -166,7 +166,7 @@ def choose(
     error: InnovationError | None = None
     with one_thread():
         parts, gated, _ = parts_of(sequence, config, noise_of(sequence, config), observations)
-        # What the simple ones leave of the runs goes to those with many sizes.
+        # Candidates with many sizes get the runs that simple ones leave.
         for left, i in enumerate(sorted(range(len(candidates)), key=lambda i: len(candidates[i].sizes))):
             spent = sum(tried.runs for tried in found.values())
             share = max((runs - spent) // (len(candidates) - left), 1)
@@ -254,7 +254,7 @@ class _Search:
         sequence, config: As for `choose`, the configuration resolved.
         gated: Settings of the filter, without the candidate's.
         parts: Stretches.
-        candidate: What is looked for.
+        candidate: Candidate.
         budget: Runs.
     """
 

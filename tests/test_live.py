@@ -213,9 +213,9 @@ def test_what_comes_too_late_is_named_or_counted():
 def test_messages_that_cannot_be_right_are_named_and_leave_everything_as_it_was():
     problem = problem_of()
     live = LiveEKF(filter_of(problem))
-    with pytest.raises(MissingVelocityError, match="no velocity has come yet"):
+    with pytest.raises(MissingVelocityError, match="no velocity has arrived yet"):
         live.update([1], [[10.0, 5.0, 4.0, 5.0]], 0.0) or live.flush()
-    with pytest.raises(LateError, match="no image has been taken in yet"):
+    with pytest.raises(LateError, match="no image has been processed yet"):
         live.pose()
     for wrong in (lambda: live.predict([1.0, 2.0], 1.0), lambda: live.predict(np.full(6, np.nan), 1.0)):
         with pytest.raises(DataError, match="velocities"):

@@ -45,7 +45,6 @@ from ekfslam.studies.study import (
     VARIANT_LAYOUT,
     Study,
     filter_config,
-    levels_of,
     read_study,
     realisation,
     run_one,
@@ -404,9 +403,6 @@ def test_mistakes_in_a_study_are_named(capsys, tmp_path):
     ):
         with pytest.raises(ConfigError, match=word):
             dataclasses.replace(SMALL, **changes)
-    assert set(levels_of(["all"])) == set(LEVELS)
-    with pytest.raises(ConfigError, match="atlantis"):
-        levels_of(["atlantis"])
     for spec, workers, word in (("cloud", None, "cloud"), ("processes", 0, "workers")):
         with pytest.raises(ConfigError, match=word), open_executor(spec, workers):
             pass
@@ -421,9 +417,7 @@ def test_an_executor_that_is_not_installed_says_what_to_install(monkeypatch, spe
 
 @pytest.mark.slow
 def test_the_command_writes_everything_and_goes_on_where_it_was(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(
-        "ekfslam.cli.commands.consistency.levels_of", lambda names: {name: short(name)[name] for name in names}
-    )
+    monkeypatch.setattr("ekfslam.cli.commands.consistency.LEVELS", short("mid"))
     call = ["consistency", "--runs", "2", "--level", "mid", "--executor", "serial", "--out", str(tmp_path)]
     assert main(call) == 0
     printed = capsys.readouterr()
@@ -495,7 +489,7 @@ def test_the_pose_nees_that_the_first_page_quotes_is_that_of_the_program(tmp_pat
     quoted = [re.search(row.format(name), page, re.MULTILINE).groups() for name in ("invariant", "textbook")]
     (ours, ours_width), (textbook, textbook_width) = np.array(quoted, dtype=float)
     runs = 6
-    study = Study(levels_of(["mid"]), ("invariant", "textbook"), runs=runs)
+    study = Study({"mid": LEVELS["mid"]}, ("invariant", "textbook"), runs=runs)
     values = run_study(study, tmp_path / "s.h5", SerialExecutor()).data["mid"]
     means = [nanmean(values[variant]["pose_nees"], axis=1).mean() for variant in study.variants]
     allowed = np.array([ours_width, textbook_width]) * np.sqrt(50 / runs)

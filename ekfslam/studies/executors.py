@@ -1,4 +1,4 @@
-"""Executors of studies and sweeps: processes of this machine, the calling thread, a Dask cluster, or MPI ranks."""
+"""Executors of many runs: processes of this machine, the calling thread, a Dask cluster, or MPI ranks."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def _missing(spec: str, error: Exception) -> ConfigError:
 
 
 def _end_with_parent() -> None:
-    """Leave Ctrl-C to the parent of a worker, and end with it if it is killed."""
+    """Leave Ctrl-C to the parent of a worker, and exit if the parent is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

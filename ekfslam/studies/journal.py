@@ -39,16 +39,15 @@ def run_missing(
 ) -> None:
     """Run the tasks that the journal does not hold, and save the archive at the end or when an exception interrupts.
 
-    After a kill, the next call finds the finished runs in the journal.
+    After a kill, the next call finds the finished runs in the journal. It is removed once they are saved.
 
     Args:
-        journal: File for finished runs; it is removed once they are saved.
+        journal: File of finished runs.
         tasks: Runs that the archive does not hold.
         submit: Function that hands a task to an executor.
-        keep: Function that takes the record of a run.
+        keep: Function that adds the record of a run to the archive.
         save: Function that writes the archive.
-        label: Name in the progress bar.
-        progress: Whether to show a progress bar on a terminal.
+        label, progress: Name in the progress bar, and whether to show one on a terminal.
 
     Raises:
         ArchiveError: The journal belongs to another study or is damaged; nothing is changed then.
@@ -75,8 +74,7 @@ class Journal:
 
     Args:
         archive: Path of the archive.
-        study: Everything that decides the numbers, ready for JSON. It is the first entry; a journal of another study is
-            refused.
+        study: Everything that decides the numbers, ready for JSON. It is the first entry of the file.
         blank: Function from a level to an empty record, which defines fields, shapes and types.
     """
 

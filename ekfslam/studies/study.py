@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,21 +166,6 @@ class Study(Shown):
         return dataclasses.asdict(self)
 
 
-def levels_of(names: Iterable[str]) -> dict[str, Loop]:
-    """Return some of `LEVELS` by name; ``all`` stands for all of them.
-
-    Raises:
-        ConfigError: There is no such level.
-    """
-    wanted = list(names)
-    if "all" in wanted:
-        return dict(LEVELS)
-    for name in wanted:
-        if name not in LEVELS:
-            raise ConfigError(f"unknown level {name!r}; known: {', '.join(LEVELS)}, all")
-    return {name: LEVELS[name] for name in wanted}
-
-
 def realisation(study: Study, level: str, run: int) -> Loop:
     """Return the world of one run: the level with a seed from the study's seed, the level's name and the run.
 
@@ -292,11 +277,13 @@ class StudyArchive(Shown):
         study: The study.
         done: Level to mask (runs,) of finished runs.
         data: Level to variant to field to values (runs, ...), see `VARIANT_LAYOUT`.
+        software: Versions that wrote the archive.
     """
 
     study: Study
     done: Mapping[str, BoolArray]
     data: Mapping[str, Mapping[str, Mapping[str, NDArray]]]
+    software: Mapping[str, str] = dataclasses.field(default_factory=versions)
 
     @staticmethod
     def empty(study: Study) -> StudyArchive:
@@ -389,18 +376,14 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
 
 
 def _take_over(archive: StudyArchive, path: Path) -> None:
-    """Copy the finished runs of an earlier archive of the same study.
-
-    Raises:
-        ArchiveError: It is of another study.
-    """
-    old, old_versions = _read(path)
+    """Copy the finished runs of an earlier archive; raise an `ArchiveError` if it is of another study."""
+    old = read_study(path)
     study = archive.study
     wanted, found = study.parameters, old.study.parameters
     found["runs"] = max(found["runs"], wanted["runs"])
     # Numbers of another version of the software may differ in the last bits, which matters only if they would mix.
     if not (old.complete and old.study.runs == study.runs):
-        wanted, found = {**wanted, **versions()}, {**found, **old_versions}
+        wanted, found = {**wanted, **versions()}, {**found, **old.software}
     wanted, found = dict(flat(wanted)), dict(flat(found))
     differing = [name for name in {**found, **wanted} if found.get(name) != wanted.get(name)]
     if differing:
@@ -415,11 +398,7 @@ def _take_over(archive: StudyArchive, path: Path) -> None:
 
 
 def write_study(path: str | Path, archive: StudyArchive) -> None:
-    """Write the archive of a study.
-
-    Raises:
-        ArchiveError: The file cannot be written.
-    """
+    """Write the archive of a study."""
     study = archive.study
 
     def fill(h5file: h5py.File) -> None:
@@ -444,11 +423,6 @@ def read_study(path: str | Path) -> StudyArchive:
     Raises:
         ArchiveError: The file is missing or damaged, or holds something else.
     """
-    return _read(path)[0]
-
-
-def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
-    """Read an archive and the versions of the software that wrote it."""
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         parameters = hdf5.json_table(h5file, "study")
         try:
@@ -456,7 +430,9 @@ def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
             study = Study(**{**parameters, "levels": levels})
         except ConfigError as error:
             raise ArchiveError(f"{path}: {error}") from None
-        archive = StudyArchive(study, done := {}, data := {})
+        facts = hdf5.attributes(h5file)
+        software = {name: str(value) for name, value in facts.items() if name.startswith("version_")}
+        archive = StudyArchive(study, done := {}, data := {}, software)
         for level, world in study.levels.items():
             group = hdf5.subgroup(h5file, f"levels/{level}")
             sizes = {"runs": study.runs, "T": world.frames, "J": JOINT_INSTANTS}
@@ -467,5 +443,4 @@ def _read(path: str | Path) -> tuple[StudyArchive, dict[str, str]]:
                 variant: hdf5.read_fields(hdf5.subgroup(group, variant), VARIANT_LAYOUT, sizes, along)
                 for variant in study.variants
             }
-        facts = hdf5.attributes(h5file)
-        return archive, {name: str(facts[name]) for name in facts if name.startswith("version_")}
+        return archive

@@ -109,12 +109,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Case:
-    """Settings that belong together.
-
-    Args:
-        overrides: Table to key to value; they take precedence over those of the sweep.
-        mode: Mode of its runs; empty for the modes of the sweep.
-    """
+    """Settings that belong together: table to key to value. Settings and mode replace those of the sweep."""
 
     overrides: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     mode: str = ""
@@ -154,10 +149,9 @@ class Sweep:
         recordings: The recordings.
         modes, variants: Names in `MODES` and `VARIANTS`.
         seeds: Seeds of built-in worlds and of prepared recordings; none for their own.
-        settings: Table to key to the values to try; or dotted name, such as ``noise.sigma_px``, to these values.
+        settings: Values to try, by table and key or by dotted name such as ``noise.sigma_px``.
         cases: Sets of settings by name; the names become the column ``case``.
-        columns: Further figures of merit by name: functions of sequence and result, as restricted as
-            `Recording.prepare`.
+        columns: Further figures of merit by name, with the restrictions of `Recording.prepare`.
 
     Raises:
         ConfigError: There is nothing to run, too much, or something unknown.
@@ -235,15 +229,9 @@ class Sweep:
 
 
 def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool = True) -> SweepTable:
-    """Run every task that the table at ``path`` does not hold; see `run_missing` for interruptions.
+    """Run every task that the table at ``path`` does not hold, and write the table; see `run_missing`.
 
     A run that a filter cannot finish is a row with an error and no figures.
-
-    Args:
-        sweep: The sweep.
-        path: HDF5 file of the table, made if missing.
-        executor: Executor of the runs, see `ekfslam.studies.executors.open_executor`.
-        progress: Whether to show a progress bar on a terminal.
 
     Raises:
         ArchiveError: ``path`` holds runs that are not part of this sweep, or cannot be written.
@@ -276,12 +264,7 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
 
 
 def run_task(task: Task, read_gb: float = DEFAULT_GB) -> Record:
-    """Run one task and return its figures of merit, or the reason for having none.
-
-    Args:
-        task: The run.
-        read_gb: Limit on the size of files, see `ekfslam.limits.reading_up_to`.
-    """
+    """Run one task, with a limit on the size of files, and return its figures of merit or its error."""
     try:
         with ONE_RUN_AT_A_TIME, reading_up_to(read_gb):
             sequence = _opened(task.recording, task.seed, task.config.front_end)
@@ -295,7 +278,7 @@ def run_task(task: Task, read_gb: float = DEFAULT_GB) -> Record:
 
 
 def _record(columns: Mapping[str, Column], figures: Mapping[str, Any], error: str = "") -> Record:
-    """Return the record of a run: figures, NaN if missing, and the reason for having none."""
+    """Return the record of a run: figures, NaN if missing, and the error."""
     values = [figures.get(name) for name in (*KEYS, *columns)]
     numbers = np.array([np.nan if value is None else float(value) for value in values])
     return {"run": {"figures": numbers, "error": np.array(error.encode()[:_ERROR_BYTES], dtype=f"S{_ERROR_BYTES}")}}

@@ -34,7 +34,7 @@ SHOWN = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_d
 
 @dataclass(frozen=True)
 class SweepTable:
-    """The results of a sweep.
+    """The results of a sweep. Methods raise a `ConfigError` for an unknown column.
 
     Args:
         columns: Name to values (n,): numbers as floats, NaN if missing; all else as text, empty if missing.
@@ -62,32 +62,20 @@ class SweepTable:
         return SweepTable(columns, swept, asked)
 
     def column(self, name: str) -> NDArray:
-        """Return a column by name.
-
-        Raises:
-            ConfigError: There is no such column.
-        """
+        """Return a column by name."""
         if name not in self.columns:
             raise ConfigError(f"the sweep has no column {name!r}; it has {', '.join(self.columns)}")
         return self.columns[name]
 
     def groups(self, *names: str) -> dict[tuple[Any, ...], SweepTable]:
-        """Split the table by the values in some columns, in the order of their first rows.
-
-        Raises:
-            ConfigError: There is no column of such a name.
-        """
+        """Split the table by the values in some columns, in the order of their first rows."""
         rows: dict[tuple[Any, ...], list[int]] = {}
         for row, values in enumerate(zip(*(self.column(name).tolist() for name in names), strict=True)):
             rows.setdefault(values, []).append(row)
         return {values: self._only(chosen) for values, chosen in rows.items()}
 
     def where(self, name: str, *values: str) -> SweepTable:
-        """Return the rows with one of the values in a column, formatted as in `markdown`.
-
-        Raises:
-            ConfigError: There is no such column, or no such value in it.
-        """
+        """Return the rows with one of the values in a column, formatted as in `markdown`; each must occur in it."""
         spoken = [_spoken(value) for value in self.column(name).tolist()]
         for value in values:
             if value not in spoken:
@@ -99,11 +87,7 @@ class SweepTable:
         return SweepTable(columns, self.swept, len(rows))
 
     def rows(self, *names: str) -> list[dict[str, Any]]:
-        """Return some columns (default: all) row by row as plain values, ready for JSON; None for NaN.
-
-        Raises:
-            ConfigError: There is no such column.
-        """
+        """Return some columns (default: all) row by row as plain values, ready for JSON; None for NaN."""
         columns = {name: self.column(name).tolist() for name in names or self.columns}
         return [
             {name: None if values[i] != values[i] else values[i] for name, values in columns.items()}
@@ -111,11 +95,7 @@ class SweepTable:
         ]
 
     def markdown(self, figures: Sequence[str] = SHOWN) -> str:
-        """Return a Markdown table of the swept columns and of some figures of merit, with the errors.
-
-        Raises:
-            ConfigError: There is no such column.
-        """
+        """Return a Markdown table of the swept columns and of some figures of merit, with the errors."""
         told = [name for name in self.swept if len(set(self.column(name).tolist())) > 1] or list(self.swept[:1])
         shown = [
             name for name in figures if self.column(name).dtype.kind != "f" or np.isfinite(self.column(name)).any()
@@ -131,11 +111,7 @@ class SweepTable:
 
 
 def table_image(table: SweepTable) -> bytes:
-    """Return a table as an HDF5 file.
-
-    Raises:
-        ArchiveError: The file could not be read again.
-    """
+    """Return a table as an HDF5 file."""
 
     def fill(h5file: h5py.File) -> None:
         hdf5.write_attributes(h5file, {"swept": json.dumps(table.swept), "runs": table.asked, **versions()})

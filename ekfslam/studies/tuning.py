@@ -68,14 +68,9 @@ _BELOW_FLOOR = "below the errors of the motion that are assumed anyway; not refi
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of one parameter.
+    """Estimate of a parameter of `PARAMETERS` by likelihood and differences combined, with its standard error.
 
-    Args:
-        name: Name in `NoiseConfig`.
-        value: Likelihood and differences combined, in the unit of `PARAMETERS`.
-        error: Standard error of the value, or None.
-        likely, likely_error: Estimate of the likelihood alone; None without a search or a maximum.
-        remark: Reason for a missing estimate, or another remark.
+    ``likely`` and ``likely_error`` are those of the likelihood alone, None without a search or a maximum.
     """
 
     name: str
@@ -293,10 +288,6 @@ class Likelihood:
         A round first rejects wrong matches, with loose velocities. Then it makes one Newton step without them and
         without a gate: all its runs accept the same observations, so the likelihood is smooth. A step that lowers
         log L, rejected observations included, is halved.
-
-        Args:
-            start: Parameters at the start, by name.
-            label: Name in the progress bar.
         """
         if not self.free:
             here = sum(float(log_likelihoods(part, self.base, self.gated).sum()) for part in self.parts)
@@ -342,8 +333,7 @@ def estimates_of(start: dict[str, float], free: list[str], peak: Peak, found: Ve
 
     Args:
         start: Parameters at the start, by name.
-        free: Names of the parameters that the likelihood has searched.
-        peak: Its maximum.
+        free: Names of the parameters that the likelihood has searched, with its maximum ``peak``.
         found: Noise of the velocities by their differences.
     """
     pairs = zip(found.sigma.tolist(), found.sigma_error.tolist(), strict=True)
@@ -417,16 +407,7 @@ def with_differences(x: Array, C: Array, names: list[str], found: VelocityNoise)
 
 
 def log_likelihoods(sequence: Sequence, noise: Noise, config: Config) -> Array:
-    """Return the log-likelihood of a noise frame by frame (T,), see `penalised`.
-
-    Args:
-        sequence: Recording, filtered from its first frame to its last.
-        noise: Noise that the filter assumes, in place of that of the recording and the configuration.
-        config: Resolved settings of the filter.
-
-    Raises:
-        InnovationError: The filter breaks down.
-    """
+    """Return the log-likelihood (T,) of a noise, which replaces that of recording and resolved settings."""
     return penalised(filter_reports(sequence, noise, config))
 
 
@@ -457,9 +438,6 @@ def without_rejected(
     """Remove the observations that a filter rejects for some of its reasons, and count them.
 
     A split track continues under a new id and counts as one more.
-
-    Raises:
-        InnovationError: The filter breaks down.
     """
     reports = filter_reports(sequence, noise, config)
     tracks = sequence.observations
@@ -477,12 +455,7 @@ def without_rejected(
 def parts_of(
     sequence: Sequence, config: Config, base: Noise, observations: int
 ) -> tuple[list[Sequence], Config, Config]:
-    """Return stretches without moving tracks, and settings that reject wrong matches and that reject nothing.
-
-    Args:
-        sequence, config, observations: Arguments of `stretches`.
-        base: Noise under which moving tracks are found.
-    """
+    """Return `stretches` without moving tracks, and settings that reject wrong matches and that reject nothing."""
     # A revival would cost a smoothing each time, so landmarks that return start as new ones. The first pose is certain.
     gated = {"revive": -1, "initial_position_std_m": 0.0, "initial_rotation_std_rad": 0.0, "moving_sigma": _NEVER}
     moving = {**gated, "moving_sigma": config.filter.moving_sigma, "split_after": 0}
@@ -495,12 +468,8 @@ def parts_of(
 def stretches(sequence: Sequence, config: Config, observations: int) -> list[Sequence]:
     """Cut a recording into stretches that are spread evenly over it; a small one stays whole.
 
-    Tracks are cleaned as in every run. The first pose of a stretch, by dead reckoning, is its only truth.
-
-    Args:
-        sequence: Recording.
-        config: Resolved settings.
-        observations: Approximate number of observations of all stretches.
+    Tracks are cleaned as in every run. The first pose of a stretch, by dead reckoning, is its only truth. All stretches
+    together have about so many ``observations``.
     """
     noise = noise_of(sequence, config)
     tracks, _ = clean_tracks(sequence, noise, config.hygiene)

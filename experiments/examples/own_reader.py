@@ -21,7 +21,7 @@ readers.__path__.append(str(Path(__file__).parent / "formats"))
 
 
 def as_lines(sequence: ekfslam.Sequence) -> str:
-    """A recording as text, see ``formats/lines.py``."""
+    """Read a recording from text, see ``formats/lines.py``."""
     camera, noise = sequence.camera, sequence.noise
     assert noise is not None
     rows: list[tuple[str, Iterable[float]]] = [

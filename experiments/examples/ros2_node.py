@@ -28,7 +28,7 @@ TRACK = np.dtype([("id", "<u4"), ("uL", "<f4"), ("vL", "<f4"), ("uR", "<f4"), ("
 
 
 def seconds(stamp: Any) -> float:
-    """A builtin_interfaces/Time."""
+    """Return the seconds of a builtin_interfaces/Time."""
     return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
@@ -68,11 +68,11 @@ class Slam:
         node.create_subscription(tracks, "tracks", self.on_tracks, 10)
 
     def on_tracks(self, message: Any) -> None:
-        """An image."""
+        """Process a pair of images."""
         self.live.update(*tracks_of(message), seconds(message.header.stamp))
 
     def on_velocities(self, message: Any) -> None:
-        """A velocity; the pose at its stamp follows."""
+        """Take a velocity, and publish the pose at its stamp."""
         self.live.predict(twist_of(message), seconds(message.header.stamp))
         if self.live.time_s is None:
             return

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ekfslam.cli.options import EXECUTOR, declare
 from ekfslam.reports import check_consistency
-from ekfslam.studies.study import COMPARED, LEVELS, STUDY_VARIANTS, Study, levels_of
+from ekfslam.studies.study import COMPARED, LEVELS, STUDY_VARIANTS, Study
 
 EXAMPLES = (
     "consistency --runs 20",
@@ -46,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def command(options: argparse.Namespace) -> None:
-    study = Study(levels_of(options.level), tuple(options.variants), options.runs, options.seed)
+    levels = LEVELS if "all" in options.level else {name: LEVELS[name] for name in options.level}
+    study = Study(levels, tuple(options.variants), options.runs, options.seed)
     report = check_consistency(study, options.out, options.executor, options.workers)
     print(f"{report.table}\nwritten to {options.out}: {', '.join(path.name for path in report.paths)}")
