@@ -12,16 +12,12 @@
 
 `ekfslam info` prints the outcome. A resolved configuration resolves to itself.
 
-**Track scale.** Two measures of innovations count, and they need different sizes. From one frame to the next the errors
-of tracks are small: there the scale is right if the normalised innovation squared (NIS) per degree of freedom is
-`TARGET`. But the errors persist along tracks and add up to `PERSISTENCE` times as much over many frames. Clean
-velocities bridge the low frequencies, so the scale of a frame is taken. Otherwise vision alone carries the low
-frequencies, and the scale is `PERSISTENCE`. Errors of tracks that are checked against their template do not walk.
-
-NIS falls with the scale by a power of about ``1 / _EXPONENT``, so one round finds what further rounds would find, to a
-few percent. NIS differs more between parts of a drive than between estimates from stretches of 8 frames in every 60,
-which agree with the NIS of the whole drive within 13 % of the scale on ten recordings. They cost an eighth of the
-filter's time.
+**Track scale.** From one frame to the next the scale of track errors is right if the normalised innovation squared
+(NIS) per degree of freedom is `TARGET`. But the errors persist along tracks: over many frames they add up to
+`PERSISTENCE` times as much. Clean velocities bridge the low frequencies, so the scale of a frame is taken; otherwise
+vision carries them, and the scale is `PERSISTENCE`. NIS falls with the scale by a power of about ``1 / _EXPONENT``, so
+one round suffices. Estimates from stretches of 8 frames in every 60 agree with those of the whole drive within 13 % on
+ten recordings, in an eighth of the filter's time.
 """
 
 from __future__ import annotations
@@ -42,8 +38,8 @@ from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import OPTIONAL_BLOCKS, StateBlock
-from ekfslam.models.build import model_of, optional_blocks
+from ekfslam.models.blocks import StateBlock
+from ekfslam.models.build import blocks_and_process, model_of
 from ekfslam.models.form import is_conditional_cheaper
 from ekfslam.models.model import Model
 from ekfslam.models.noise import (
@@ -56,9 +52,6 @@ from ekfslam.models.noise import (
     with_drift,
 )
 from ekfslam.models.odometry import stereo_odometry, vision_noise
-from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess
-from ekfslam.models.process.inertial import inertial
-from ekfslam.models.process.velocities import velocities
 from ekfslam.models.sensors.stereo import Rig
 
 # Number of dormant landmarks kept in the state of a recording whose landmarks come back: their covariance has 160 MB.
@@ -77,8 +70,6 @@ class Problem:
 
     Args:
         sequence: Recording with cleaned tracks.
-        config: Resolved configuration.
-        model: State blocks, sensor, noise.
         hygiene: What was done to the tracks; None: they were not cleaned.
         account: Attributes of a result that say where the noise comes from.
     """
@@ -126,8 +117,6 @@ def resolve(
     """Return the problem of a recording.
 
     Args:
-        sequence: Recording.
-        config: Settings; defaults if None.
         mode: Mode of the run. Dead reckoning needs no clean tracks; only the joint filter needs the track scale.
         blocks: State blocks in addition to those of the configuration and the automatic model.
 
@@ -140,7 +129,9 @@ def resolve(
         sequence = sequence.with_velocities(stereo_odometry(sequence), "imu")
     config = settings_of(sequence, config or Config())
     noise, hygiene = noise_of(sequence, config), None
-    account = {**_found(sequence, config), **{f"tuned_{key}": value for key, value in config.tuning.items()}}
+    account: dict[str, str | int | float] = {f"tuned_{key}": value for key, value in config.tuning.items()}
+    if is_automatic(sequence, config):
+        account |= found_attributes(velocity_noise(sequence.twist))
     if is_inertial(sequence):
         account |= {f"inertial_{name}": value for name, value in vars(_densities(sequence)).items()}
     if mode != "dead-reckoning":
@@ -179,10 +170,7 @@ def settings_of(sequence: Sequence, config: Config) -> Config:
 
 
 def noise_of(sequence: Sequence, config: Config) -> Noise:
-    """Return the noise that a filter assumes: the configuration's, else the recording's, else the data's or a default.
-
-    The scale of the track errors is that of the configuration, 1 if it has none.
-    """
+    """Return the noise of a filter: the configuration's, else the recording's, else the data's or a default."""
     given = config.noise
     if is_automatic(sequence, config):
         stated = automatic_noise(sequence.twist, sequence.velocity_frame, sequence.has_checked_tracks)
@@ -229,11 +217,6 @@ def found_attributes(found: VelocityNoise) -> dict[str, float]:
     return values
 
 
-def _found(sequence: Sequence, config: Config) -> dict[str, float]:
-    """Return what the differences of the velocities show, if the noise is automatic."""
-    return found_attributes(velocity_noise(sequence.twist)) if is_automatic(sequence, config) else {}
-
-
 def _with_retirement(sequence: Sequence, config: Config) -> Config:
     """Return a configuration that says when landmarks leave the state."""
     settings, come_back = config.filter, _landmarks_come_back(sequence)
@@ -264,23 +247,17 @@ def _require_pixel_noise(sequence: Sequence, noise: Noise) -> None:
 
 
 def _model(sequence: Sequence, config: Config, noise: Noise, blocks: SequenceType[StateBlock]) -> Model:
-    known, tables = dict(OPTIONAL_BLOCKS), dict(config.blocks)
-    make_process: MakeProcess = velocities
-    if is_inertial(sequence):
-        known |= INERTIAL_BLOCKS
-        tables = {name: {} for name in INERTIAL_BLOCKS} | tables
-        make_process = inertial(_densities(sequence))
-    chosen = [block.begun_by(sequence) for block in optional_blocks(tables, known)]
+    chosen, process = blocks_and_process(config.blocks, _densities(sequence) if is_inertial(sequence) else None)
     return model_of(
         Rig(sequence.camera, sequence.T_cam_imu, noise),
         noise,
         se3.inverse(sequence.initial_T_world_imu),
         config.filter.initial_covariance,
         config.calibration,
-        (*chosen, *blocks),
+        (*(block.begun_by(sequence) for block in chosen), *blocks),
         config.filter.landmark_coordinates,
         sequence.has_velocities,
-        make_process,
+        process,
     )
 
 

@@ -10,7 +10,7 @@ from support.reference import small_world
 from ekfslam.config import FilterConfig, PosteriorConfig
 from ekfslam.errors import IllPosedError
 from ekfslam.models.sensors.stereo import Rig
-from ekfslam.smoother.optimise import better_start, kernel_cost
+from ekfslam.smoother.optimise import better_start, robust
 from ekfslam.smoother.problem import BatchProblem
 from ekfslam.smoother.revival import continued
 
@@ -41,7 +41,7 @@ def state(filtered):
 
 def cost_of_landmarks(problem, state):
     s = problem.observations.norms(state)
-    cost = kernel_cost(CONFIG.kernel, CONFIG.kernel_width, s)
+    cost = robust(CONFIG, s)[0]
     return np.array([cost[problem.log.landmark == i].sum() for i in range(problem.log.landmarks)])
 
 

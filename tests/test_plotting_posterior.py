@@ -5,10 +5,9 @@ import pytest
 from matplotlib.collections import EllipseCollection
 
 from ekfslam.data.simulate import builtin
-from ekfslam.figures.posterior import plot_map_before_and_after, plot_sparsity
+from ekfslam.figures.posterior import block_patterns, plot_map_before_and_after, plot_sparsity
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
-from ekfslam.smoother.sparse.information import block_patterns
 
 
 @pytest.fixture(scope="module")

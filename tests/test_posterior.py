@@ -23,7 +23,7 @@ from ekfslam.models.blocks import CameraJitter, TwistBias, VisionDrift
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.resolve import noise_of
 from ekfslam.runner import run
-from ekfslam.smoother.optimise import kernel_cost, kernel_weight
+from ekfslam.smoother.optimise import robust
 from ekfslam.smoother.posterior import posterior, posterior_of_log, smooth
 from ekfslam.smoother.problem import BatchProblem
 from ekfslam.smoother.revival import MapRevival
@@ -148,15 +148,15 @@ SHARED = [CameraJitter(time_s=0.3), VisionDrift(length_m=3.0)]
 KINDS = {"white": (False, []), "every block": (True, []), "shared": (False, SHARED), "all": (True, SHARED)}
 TURNS = {"near identity": 0.01, "random": 1.0, "near pi": 3.1}
 # In the reduced form everything at once is turned in every way, and each kind of state in one.
-LONG = [pytest.param(f"all-{turn}", marks=pytest.mark.slow) for turn in ("near identity", "random")]
-SOME = [*LONG, "all-near pi", "white-near pi", "every block-near identity", "shared-random"]
+LONG = [pytest.param(case, marks=pytest.mark.slow) for case in ("all-near identity", "all-random", "all-near pi")]
+SOME = [*LONG, "white-near pi", "every block-near identity", "shared-random"]
 
 
 @pytest.mark.parametrize("case", [f"{kind}-{turn}" for kind in KINDS for turn in TURNS] if WHOLE else SOME)
 def test_relinearised_rows_are_derivatives_of_the_residuals(case):
     kind, turn = case.split("-")
     (everything, shared), turn = KINDS[kind], TURNS[turn]
-    world = small_world(frames=8, landmarks=20) if WHOLE else small_world(frames=5, landmarks=10)
+    world = small_world(frames=8, landmarks=20) if WHOLE else small_world(frames=4, landmarks=6)
     if everything:
         world = with_everything(world)
         options = {"calibration": CALIBRATION, "blocks": [TwistBias(0.1, 0.01, 3.0, 5.0), *shared]}
@@ -195,8 +195,9 @@ def test_relinearised_rows_are_derivatives_of_the_residuals(case):
 def test_kernel_weight_is_the_slope_of_the_cost(kernel):
     s = np.linspace(0.05, 9.0, 60)
     h = 1e-6
-    slope = (kernel_cost(kernel, 2.8, s + h) - kernel_cost(kernel, 2.8, s - h)) / (2 * h)
-    np.testing.assert_allclose(kernel_weight(kernel, 2.8, s) * s, slope, rtol=1e-6)
+    config = PosteriorConfig(kernel=kernel)
+    slope = (robust(config, s + h)[0] - robust(config, s - h)[0]) / (2 * h)
+    np.testing.assert_allclose(robust(config, s)[1] * s, slope, rtol=1e-6)
 
 
 @pytest.mark.parametrize("kernel", ["huber", "none"])

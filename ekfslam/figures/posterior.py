@@ -14,7 +14,7 @@ from ekfslam.figures.maps import SIGMAS, add_ellipses, dot_size, draw_paths, spr
 from ekfslam.figures.style import LANDMARK_COLOR, style_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.geometry.motion import world_axes_covariance
-from ekfslam.smoother.sparse.information import JointInformation, block_patterns
+from ekfslam.smoother.sparse.information import JointInformation
 
 _POSES = 16  # with an ellipse
 _CELLS = 500  # across a picture of a sparsity pattern
@@ -98,3 +98,33 @@ def draw_posterior_figures(
         "map_before_and_after": plot_map_before_and_after(before, after, truth),
         "sparsity": plot_sparsity(information),
     }
+
+
+def block_patterns(information: JointInformation) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray], int]:
+    """Return rows and columns of the blocks of the information matrix, of its Cholesky factor, and their number.
+
+    Of the information matrix those in the lower triangle: frames, aux, drive, landmarks. Those of the factor in the
+    order of elimination.
+    """
+    s, factor = information.structure, information.factor
+    before, eliminated = s.first["landmarks"], np.flatnonzero(~s.is_kept)
+    count = before + len(s.ids)
+    own = np.arange(count)
+    blocks = [product.places for product in s.products if product.places is not None]
+    blocks = [np.stack([own, own], axis=-1), *(places[places[:, 0] < before] for places in blocks)]
+    blocks += [pairs + np.array([before, s.first[group]]) for group, pairs in s.pairs.items()]
+    row, column = np.unique(np.concatenate(blocks), axis=0).T
+
+    rank, place = np.cumsum(~s.is_kept) - 1, np.empty(len(s.block_sizes), dtype=np.int64)
+    place[factor.pattern.order] = len(eliminated) + np.arange(len(place))
+    L = factor.factor()
+    block = np.repeat(np.sort(place), s.block_sizes[factor.pattern.order])
+    of_column = np.repeat(np.arange(L.shape[1]), np.diff(L.indptr))
+    rows, columns = ([part] for part in np.divmod(np.unique(block[L.indices] * count + block[of_column]), count))
+    for group, pairs in s.pairs.items():
+        landmark, index = pairs[~s.is_kept[pairs[:, 0]]].T
+        rows.append(place[s.blocks(group, index)])
+        columns.append(rank[landmark])
+    for side in (rows, columns):
+        side.append(np.arange(len(eliminated)))
+    return (row, column), (np.concatenate(rows), np.concatenate(columns)), count

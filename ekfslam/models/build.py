@@ -11,6 +11,7 @@ import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.config import CalibrationConfig, FilterConfig, LandmarkCoordinates, require_setting
+from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.noise import Noise
 from ekfslam.errors import ConfigError
 from ekfslam.models.blocks import (
@@ -26,7 +27,8 @@ from ekfslam.models.blocks import (
 )
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.model import Model
-from ekfslam.models.process import MakeProcess
+from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess
+from ekfslam.models.process.inertial import inertial
 from ekfslam.models.process.velocities import velocities
 from ekfslam.models.sensors.base import DelayedSensor, Sensor
 from ekfslam.models.sensors.monocular import Monocular
@@ -123,3 +125,13 @@ def optional_blocks(
             require_setting(f"blocks.{name}.{key}", values[key], is_scale=key.startswith(("time", "length")))
         chosen.append(known_blocks[name](**values))
     return tuple(chosen)
+
+
+def blocks_and_process(
+    tables: Mapping[str, Mapping[str, Any]], densities: InertialNoise | None
+) -> tuple[tuple[StateBlock, ...], MakeProcess]:
+    """Return the blocks of the tables ``[blocks.<name>]``, and the process: inertial if densities are given."""
+    if densities is None:
+        return optional_blocks(tables), velocities
+    tables = {name: {} for name in INERTIAL_BLOCKS} | dict(tables)
+    return optional_blocks(tables, OPTIONAL_BLOCKS | INERTIAL_BLOCKS), inertial(densities)

@@ -22,16 +22,7 @@ LANDMARK_PRIOR_M = 1e4
 
 
 class ObservationFactors:
-    """Factors of a log that concern landmarks.
-
-    Args:
-        log: Record of the filter.
-        model: Its blocks and sensor.
-        unknowns: Groups of the blocks.
-
-    Attributes:
-        first_frame: (M,) frame of each landmark's first observation.
-    """
+    """Factors of a log that concern landmarks; ``first_frame`` (M,) is that of each landmark's first observation."""
 
     def __init__(self, log: Log, model: Model, unknowns: Unknowns) -> None:
         self._log, self._model, self._unknowns = log, model, unknowns
@@ -63,7 +54,7 @@ class ObservationFactors:
         return np.linalg.norm(self._residuals(z, z_before) / np.sqrt(log.variance), axis=1)
 
     def _residuals(self, z: Array, z_before: Array) -> Array:
-        """Return what is left of the observations (K, d), given predicted ones, and those they are differences from."""
+        """Return residuals (K, d), given predicted rows, and those of the observations that differences start from."""
         r = self._log.rows - z
         r[self._follows] -= self._log.rows[self._previous] - z_before
         return r
@@ -75,7 +66,6 @@ class ObservationFactors:
         seen = self._model.observer.see(moments.at(log.frame), positions, positions, "pose", self._is_difference)
         H_x, H_m, z_before = seen.H_x, seen.H_m, seen.z[:0]
         if len(follows):
-            # From the frame before, the landmark is where the observation before has seen it.
             at, positions = moments.at(log.frame[self._previous]), positions[follows]
             before = self._model.observer.see(at, positions, positions, self._clone)
             H_x[follows] -= before.H_x
@@ -84,11 +74,11 @@ class ObservationFactors:
         return [*self._whitened(H_x, H_m, self._residuals(seen.z, z_before)), *self._near(state)]
 
     def _moments(self, state: State) -> Moment:
-        """Return what all frames observe from."""
+        """Return the moments of all frames."""
         log, model, T = self._log, self._model, state.T_imu_world
         twist = np.zeros((len(T), 6))
         if model.observer.has_time_offset:
-            # Velocities as the trajectory has them; that they change with it is of second order.
+            # The trajectory's own velocities: how they change with it is of second order.
             values = self._unknowns.all_values(state)
             before, after = ({name: x[at] for name, x in values.items()} for at in (slice(-1), slice(1, None)))
             twist = np.concatenate([log.seen_twist[:1], model.process.imu_twist(before, after, log.intervals)])
@@ -107,23 +97,14 @@ class ObservationFactors:
         return [Factor(weight * (self._log.first_position_m - state.positions_m), (Term("landmarks", landmarks, J),))]
 
     def _whitened(self, H_x: Array, H_m: Array, r: Array) -> list[Factor]:
-        """Return the factors of observations that stand alone, and of differences.
-
-        Args:
-            H_x: (K, d, seen) Jacobian by the filter's leading columns.
-            H_m: (K, d, 3) Jacobian by the landmarks.
-            r: (K, d) residuals.
-        """
+        """Return the factors of single observations and of differences, from Jacobians and residuals (K, d, ...)."""
         log, u, scale = self._log, self._unknowns, 1.0 / np.sqrt(self._log.variance)
-        observed = u.drive_columns < H_x.shape[-1]
-        everything, factors = np.arange(log.observations), []
+        observed, factors = u.drive_columns < H_x.shape[-1], []
         for is_difference in (False, True):
-            which: IntArray | slice = np.flatnonzero(self._is_difference == is_difference)
-            if not len(everything[which]):
+            which = np.flatnonzero(self._is_difference == is_difference)
+            if not len(which):
                 continue
-            if len(everything[which]) == len(everything):
-                which = slice(None)  # does not copy
-            H, wide, n = H_x[which], scale[which][..., None], len(everything[which])
+            H, wide, n = H_x[which], scale[which][..., None], len(which)
             J_drive = np.zeros((*H.shape[:2], len(observed)))
             J_drive[..., observed] = wide * H[..., u.drive_columns[observed]]
             terms = [
@@ -135,7 +116,7 @@ class ObservationFactors:
                 J_before = np.zeros((*H.shape[:2], u.width))
                 J_before[..., u.cloned] = wide * H[..., u.clone_columns]
                 terms.append(Term("frames", log.frame[which] - 1, J_before))
-            factors.append(Factor(scale[which] * r[which], tuple(terms), everything[which]))
+            factors.append(Factor(scale[which] * r[which], tuple(terms), which))
         return factors
 
     # --- as filtered --------------------------------------------------------------------------------------------------
@@ -145,24 +126,19 @@ class ObservationFactors:
         log, first, layout = self._log, self._is_first, self._model.layout
         position, first_position = log.position_m, log.first_position_m[log.landmark]
         linear_position = first_position if log.first_estimates else position
-        # A new landmark is initialised after the update of its frame, all others are linearised before it.
+        # A new landmark is initialised after the update of its frame; all others are linearised before it.
         T = np.where(first[:, None, None], log.T_updated[log.frame], log.T_linear[log.frame])
         x = np.where(first[:, None], log.updated[log.frame], log.linear[log.frame])
         T_linear = T
         if log.first_estimates:
             T_linear = np.where(first[:, None, None], T, log.T_predicted[log.frame])
-        group, seen_twist = 2 * log.frame + first, log.seen_twist[log.frame]
-        of_frame = self._way_m[log.frame]
-        seen = self._see(
-            group, T, T_linear, x, seen_twist, position, linear_position, of_frame, "pose", self._is_difference
-        )
+        group = 2 * log.frame + first
+        seen = self._see(group, log.frame, T, T_linear, x, position, linear_position, "pose", self._is_difference)
         H_x, H_m = seen.H_x, seen.H_m
         if log.first_estimates:
-            # A new landmark follows the pose as it was predicted, whatever it is seen from.
-            T_first, place = log.T_predicted[log.frame[first]], first_position[first]
-            there = self._see(
-                group[first], T[first], T_first, x[first], seen_twist[first], place, place, of_frame[first]
-            )
+            # A new landmark follows the predicted pose.
+            frame, place = log.frame[first], first_position[first]
+            there = self._see(group[first], frame, T[first], log.T_predicted[frame], x[first], place, place)
             H_x[first, :, layout["pose"]] = H_m[first] @ np.linalg.solve(there.H_m, there.H_x[..., layout["pose"]])
         H_x = _carried_back(H_x, layout["pose"], log.T_linear, log.T_predicted, log.frame, ~first)
         r = log.rows - seen.z + (H_x @ (x - log.departed[0])[:, : layout.seen, None])[..., 0]
@@ -178,8 +154,7 @@ class ObservationFactors:
         T = log.T_linear_before[frame]
         T_linear = log.T_predicted[frame - 1] if log.first_estimates else T
         positions = log.position_m[follows], linear_position[follows]
-        seen_twist, way_m = log.seen_twist[frame - 1], self._way_m[frame]
-        before = self._see(frame, T, T_linear, x[follows], seen_twist, *positions, way_m, self._clone)
+        before = self._see(frame, frame, T, T_linear, x[follows], *positions, self._clone)
         B_x = _carried_back(before.H_x, layout[self._clone], log.T_linear_before, log.T_departed, frame)
         shifted = (B_x @ (x[follows] - log.departed[0])[:, : layout.seen, None])[..., 0]
         r[follows] -= log.rows[log.previous[follows]] - before.z + shifted
@@ -189,21 +164,21 @@ class ObservationFactors:
     def _see(
         self,
         group: IntArray,
+        frame: IntArray,
         T: Array,
         T_linear: Array,
         coordinates: Array,
-        twist: Array,
         positions_m: Array,
         linear_positions_m: Array,
-        way_m: Array,
         pose: str = "pose",
         is_difference: BoolArray | None = None,
     ) -> Seen:
-        """Return landmarks (n, 3) as seen from poses (n, 4, 4), with blocks as coordinates (n, body) say.
+        """Return landmarks (n, 3) as observed in frames (n,) from poses (n, 4, 4), given coordinates (n, body).
 
-        Coordinates of the drive's blocks are alike within a group (n,).
+        Coordinates of the drive's blocks are equal within a group (n,).
         """
         model, calibration, layout = self._model, self._model.observer.calibration, self._model.layout
+        twist, way_m = self._log.seen_twist[frame - (pose != "pose")], self._way_m[frame]
         clones = layout.clones if pose == layout.clones.get("pose") else {}
         shared = {
             block.name: coordinates[:, layout[clones.get(block.name, block.name)]] for block in model.observer.shared
@@ -224,7 +199,7 @@ class ObservationFactors:
 def _carried_back(
     H_x: Array, at: slice, T_linear: Array, T_reference: Array, frame: IntArray, which: BoolArray | bool = True
 ) -> Array:
-    """Return rows of iterated updates in the coordinates before the update: the chain rule, as the filter has it."""
+    """Return rows of iterated updates in the coordinates before the update, by the chain rule."""
     shift = se3.log(T_linear @ se3.inverse(T_reference))
     moved = np.any(np.abs(shift) > 1e-12, axis=1)[frame] & which
     if moved.any():

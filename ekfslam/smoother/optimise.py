@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.config import Kernel, PosteriorConfig
+from ekfslam.config import PosteriorConfig
 from ekfslam.errors import IllPosedError
 from ekfslam.smoother.problem import BatchProblem, State
 from ekfslam.smoother.sparse.factors import LinearSystem
@@ -21,22 +21,14 @@ from ekfslam.smoother.sparse.information import JointInformation
 MOST_ITERATIONS = 50
 
 
-def kernel_cost(kernel: Kernel, width: float, s: Array) -> Array:
-    """Return the cost of whitened residuals of norm s; see the module."""
-    if kernel == "huber":
-        return np.where(s <= width, 0.5 * s**2, width * (s - 0.5 * width))
-    if kernel == "cauchy":
-        return 0.5 * width**2 * np.log1p((s / width) ** 2)
-    return 0.5 * s**2
-
-
-def kernel_weight(kernel: Kernel, width: float, s: Array) -> Array:
-    """Return the weight of an observation with a whitened residual of norm s: derivative of the cost divided by s."""
-    if kernel == "huber":
-        return width / np.maximum(s, width)
-    if kernel == "cauchy":
-        return 1.0 / (1.0 + (s / width) ** 2)
-    return np.ones_like(s)
+def robust(config: PosteriorConfig, s: Array) -> tuple[Array, Array]:
+    """Return cost and weight of whitened residuals of norm s; the weight is the slope of the cost divided by s."""
+    width = config.kernel_width
+    if config.kernel == "huber":
+        return np.where(s <= width, 0.5 * s**2, width * (s - 0.5 * width)), width / np.maximum(s, width)
+    if config.kernel == "cauchy":
+        return 0.5 * width**2 * np.log1p((s / width) ** 2), 1.0 / (1.0 + (s / width) ** 2)
+    return 0.5 * s**2, np.ones_like(s)
 
 
 @dataclass(frozen=True)
@@ -44,7 +36,6 @@ class Evaluation:
     """A problem at a state.
 
     Args:
-        state: Trajectory and map.
         cost: Half the sum of squares, under the kernel.
         weight: (K,) robust weight of each observation.
         system: All factors, linearised and weighted there.
@@ -56,35 +47,15 @@ class Evaluation:
     system: LinearSystem
 
 
-@dataclass(frozen=True)
-class Maximum:
-    """Result of `maximise`.
-
-    Args:
-        state: Trajectory and map.
-        weight: (K,) robust weight of each observation.
-        costs: Cost (half the sum of squares, under the kernel) at the start and after each step.
-        information: All factors, relinearised and weighted there.
-    """
-
-    state: State
-    weight: Array
-    costs: tuple[float, ...]
-    information: JointInformation
-
-
 def evaluate(problem: BatchProblem, state: State, config: PosteriorConfig, min_depth_m: float) -> Evaluation | None:
     """Return cost and system at a state; None if a landmark is behind a camera that saw it."""
     if not problem.model.sensor.in_view(problem.observations.points(state), min_depth_m).all():
         return None
     system = problem.relinearised(state)
     s = system.norms(problem.log.observations)
-    of_observations = kernel_cost(config.kernel, config.kernel_width, s).sum()
-    cost = float(of_observations + system.half_square - 0.5 * (s**2).sum())
-    if config.kernel == "none":
-        return Evaluation(state, cost, np.ones_like(s), system)
-    weight = kernel_weight(config.kernel, config.kernel_width, s)
-    return Evaluation(state, cost, weight, system.weighted(weight))
+    costs, weight = robust(config, s)
+    cost = float(costs.sum() + system.half_square - 0.5 * (s**2).sum())
+    return Evaluation(state, cost, weight, system if config.kernel == "none" else system.weighted(weight))
 
 
 def maximise(
@@ -93,17 +64,14 @@ def maximise(
     config: PosteriorConfig,
     min_depth_m: float,
     iterations: Iterable[int],
-) -> Maximum:
+) -> tuple[Evaluation, tuple[float, ...], JointInformation]:
     """Find the maximum a posteriori of all factors, by Levenberg-Marquardt with iteratively reweighted factors.
 
-    Source: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000, section 4.
+    A landmark that fits better at its first triangulation starts from there. Source: Triggs, McLauchlan, Hartley,
+    Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000, section 4.
 
-    Args:
-        problem: Everything known.
-        start: State to start from; a landmark that fits better at its first triangulation starts from there.
-        config: Kernel and tolerance.
-        min_depth_m: Least depth of a landmark in view.
-        iterations: Iterated over at most once (a range, wrapped in a progress bar by the caller).
+    Returns:
+        The maximum; the costs at the start and after each step; the factorised system there.
 
     Raises:
         IllPosedError: Something is undetermined, or a landmark is behind a camera that saw it; names the ids.
@@ -127,7 +95,7 @@ def maximise(
         costs.append(here.cost)
         if gain <= config.tolerance * here.cost:
             break
-    return Maximum(here.state, here.weight, tuple(costs), JointInformation(here.system, like=step))
+    return here, tuple(costs), JointInformation(here.system, like=step)
 
 
 def better_start(problem: BatchProblem, state: State, config: PosteriorConfig, min_depth_m: float) -> State:
@@ -143,7 +111,7 @@ def better_start(problem: BatchProblem, state: State, config: PosteriorConfig, m
         visible = problem.model.sensor.in_view(problem.observations.points(moved), min_depth_m)
         with np.errstate(all="ignore"):
             s = problem.observations.norms(moved)
-        cost = np.where(visible & ~np.isnan(s), kernel_cost(config.kernel, config.kernel_width, s), np.inf)
+        cost = np.where(visible & ~np.isnan(s), robust(config, s)[0], np.inf)
         return np.asarray(np.bincount(log.landmark, weights=cost, minlength=log.landmarks), dtype=float)
 
     here, first = costs(state.positions_m), costs(log.first_position_m)

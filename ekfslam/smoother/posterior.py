@@ -1,12 +1,9 @@
 """Joint posterior over the whole trajectory and the whole map, from the log of the filter.
 
-The filter carries only what is in view; its log is one sparse system over all poses and all landmarks. Two
-linearisations of it are offered. *As filtered* the rows stay where the filter linearised them: for the standard and the
-first-estimates variants the solution is, to rounding, the state of a dense EKF that never retired a landmark, with
-everything smoothed besides. (The invariant variant moves the errors of all landmarks with every correction, which
-frozen rows do not: they are not the filter then, and on long drives much too confident.) The *maximum a posteriori*
-linearises all rows again at their common solution, which makes it consistent by construction: every row sees the same
-unobservable directions.
+*As filtered*, rows stay where the filter linearised them: for the standard and first-estimates variants in xyz the
+solution is, to rounding, the state of a dense EKF that never retired a landmark, with everything smoothed. The
+*maximum a posteriori* linearises all rows again at their common solution. It is consistent by construction: every row
+sees the same unobservable directions. (For the invariant variant, frozen rows are much too confident on long drives.)
 """
 
 from __future__ import annotations
@@ -29,12 +26,8 @@ from ekfslam.filters.log import Log
 from ekfslam.filters.loop import solvable
 from ekfslam.filters.result import Innovation, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import OPTIONAL_BLOCKS
-from ekfslam.models.build import model_of, optional_blocks
+from ekfslam.models.build import blocks_and_process, model_of
 from ekfslam.models.model import Model
-from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess
-from ekfslam.models.process.inertial import inertial
-from ekfslam.models.process.velocities import velocities
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
 from ekfslam.shown import Card, Shown, count, figure
@@ -49,8 +42,8 @@ DENSE_LIMIT = 20_000  # columns of a dense covariance: 3.2 GB
 class Posterior(Shown):
     """A Gaussian over all poses and all landmarks.
 
-    Landmarks go by their row in ``id`` (`rows_of`), which is the order of the filter's `Landmarks`; frames by their
-    number, negative ones from the end. Covariances are of the stored errors (see `ekfslam`).
+    Landmarks go by their row in ``id`` (`rows_of`), frames by their number, negative ones from the end. Covariances are
+    of the stored errors (see `ekfslam`).
 
     Args:
         linearisation: ``map`` or ``filtered``.
@@ -61,8 +54,7 @@ class Posterior(Shown):
         costs: Cost (half the sum of squares, under the kernel) before each iteration and at the end.
         information: The factorised system.
         values: Estimates of the further state blocks by name: of each frame (T, ...), or of the drive.
-        problem: Factors of the log.
-        state: State at which they are linearised.
+        problem, state: Factors of the log, and where they are linearised.
     """
 
     linearisation: str
@@ -160,11 +152,7 @@ class Posterior(Shown):
         return PosePairs(first, second, cross)
 
     def dense_covariance(self, frames: ArrayLike = (-1,)) -> Array:
-        """Return the covariance of some poses and of all landmarks, in their order; by default that of the EKF's state.
-
-        Raises:
-            PosteriorError: There is no such frame, or the matrix would be wider than 20000.
-        """
+        """Return `joint_covariance` of some poses and all landmarks, refused if wider than 20 000 columns."""
         width = 6 * np.size(frames) + 3 * len(self.id)
         if width > DENSE_LIMIT:
             raise PosteriorError(
@@ -176,15 +164,15 @@ class Posterior(Shown):
     def information_matrix(self) -> tuple[sp.csc_array, dict[str, Array]]:
         """Return the sparse joint information matrix (n, n): the inverse of the joint covariance of all unknowns.
 
-        Columns are those of all poses, ``xi`` of the first frame first, then of what else each frame has, of the
-        drive, and of all landmarks. What is known for certain of the first frame has no column.
+        Columns are those of poses, further blocks of the frames, blocks of the drive, and landmarks. Components of the
+        first frame that are known for certain have no column.
 
         Returns:
-            The matrix, and arrays (n,) that say of each column: ``kind`` (``pose``, ``landmark`` or the name of a state
-            block), ``frame`` (-1: of none), ``id`` of the landmark (-1: of none), ``axis`` within its block.
+            The matrix, and for each column (n,): ``kind`` (``pose``, ``landmark`` or the name of a state block),
+            ``frame`` (-1: none), ``id`` of the landmark (-1: none), ``axis`` within its block.
 
         Raises:
-            PosteriorError: What is known for certain of the first pose is no axis of ``xi``.
+            PosteriorError: The first pose is known for certain in a direction that is no axis of ``xi``.
         """
         problem, frames = self.problem, len(self.T_world_imu)
         is_map = self.linearisation == "map"
@@ -219,7 +207,7 @@ def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterio
 
     Args:
         result: A result of mode ``full``.
-        config: Linearisation and kernel; by default those that the result was configured with.
+        config: Linearisation and kernel; by default those of the result.
 
     Raises:
         PosteriorError: The result has no log.
@@ -256,14 +244,13 @@ def model_of_result(result: Result) -> Model:
         )
     start = log.T_predicted[0], log.initial_covariance[:6, :6]
     rig = Rig(result.camera, result.T_cam_imu, result.noise)
-    known, tables = dict(OPTIONAL_BLOCKS), dict(stored.blocks)
-    make_process: MakeProcess = velocities
+    densities = None
     if "inertial_gyro" in result.attributes:
-        known, tables = known | INERTIAL_BLOCKS, {name: {} for name in INERTIAL_BLOCKS} | tables
-        densities = (float(result.attributes[f"inertial_{field.name}"]) for field in dataclasses.fields(InertialNoise))
-        make_process = inertial(InertialNoise(*densities))
-    blocks, coordinates = optional_blocks(tables, known), stored.filter.landmark_coordinates
-    model = model_of(rig, result.noise, *start, stored.calibration, blocks, coordinates, make_process=make_process)
+        names = (f"inertial_{field.name}" for field in dataclasses.fields(InertialNoise))
+        densities = InertialNoise(*(float(result.attributes[name]) for name in names))
+    blocks, process = blocks_and_process(stored.blocks, densities)
+    coordinates = stored.filter.landmark_coordinates
+    model = model_of(rig, result.noise, *start, stored.calibration, blocks, coordinates, make_process=process)
     if model.layout.body == log.departed.shape[1]:
         return model
     # Archives before format version 4 know of poses alone: velocities are white there, and so are pixels.
@@ -289,14 +276,14 @@ def posterior_of_log(
     min_depth_m: float = FilterConfig.min_depth_m,
     name: str = "posterior",
 ) -> Posterior:
-    """`posterior` of the log of any model.
+    """Return the posterior of the log of a filter with any model.
 
     Args:
-        log, model: What was observed, and what was believed.
+        log, model: Record and model of the filter.
         positions_m: (M, 3) the filter's last estimates of the landmarks of the log, to start from.
         config: Linearisation and kernel.
-        min_depth_m: What is nearer is not in view.
-        name: For the progress bar.
+        min_depth_m: Least depth of a landmark in view.
+        name: Name for the progress bar.
 
     Raises:
         IllPosedError: Something is undetermined; lists landmark ids or frames.
@@ -304,16 +291,16 @@ def posterior_of_log(
     """
     config = config or PosteriorConfig()
     problem = BatchProblem(log, model)
-    weight, costs = np.ones(log.observations), tuple[float, ...]()
+    costs: tuple[float, ...]
     if config.linearisation == "filtered":
         information = JointInformation(problem.as_filtered())
         state = problem.solved_as_filtered(information)
-        costs = (information.cost,)
+        weight, costs = np.ones(log.observations), (information.cost,)
     else:
         iterations = progress(range(MOST_ITERATIONS), f"{name}: smoothing")
         start = problem.filtered_state(positions_m)
-        found = maximise(problem, start, config, min_depth_m, iterations)
-        information, state, weight, costs = found.information, found.state, found.weight, found.costs
+        found, costs, information = maximise(problem, start, config, min_depth_m, iterations)
+        state, weight = found.state, found.weight
     return Posterior(
         config.linearisation,
         log.id,
@@ -332,8 +319,8 @@ def posterior_of_log(
 def smooth(result: Result, config: PosteriorConfig | None = None, found: Posterior | None = None) -> Result:
     """Return the posterior of a full run as a `Result`: smoothed trajectory, map, and all their marginals.
 
-    Its mode is ``smoothed`` (``as filtered`` if linearised so). Arguments and errors are those of `posterior`, whose
-    return value may be given as ``found`` if it is known already.
+    Its mode is ``smoothed`` (``as filtered`` if linearised so). Arguments and errors are those of `posterior`; its
+    return value, if known already, is ``found``.
     """
     begin = perf_counter()
     found = found or posterior(result, config)

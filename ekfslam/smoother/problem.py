@@ -27,14 +27,6 @@ __all__ = ["BatchProblem", "State"]
 class BatchProblem:
     """All factors of a log.
 
-    Args:
-        log: Record of the filter.
-        model: Its blocks, sensor and noise.
-
-    Attributes:
-        unknowns: Groups of the blocks.
-        process, observations: The factors without and with landmarks.
-
     Raises:
         IllPosedError: The velocities have no noise, so that steps have no weight; names frames.
     """
@@ -65,12 +57,12 @@ class BatchProblem:
     def moved(self, state: State, step: JointInformation) -> State:
         """Return a state moved by a solution of its system.
 
-        Landmarks move in the frame of the pose that saw them first, by what the corrections are there to first order:
-        where a long stretch of the trajectory moves and turns as a whole, its landmarks go along to all orders.
+        Landmarks move in the frame of the pose that saw them first, by the corrections to first order there. If a long
+        stretch of the trajectory moves and turns as a whole, its landmarks go along to all orders.
         """
         u, before, zeta, d = self.unknowns, state.T_imu_world, state.zeta + step.zeta, step.d
         T = se3.exp(step.eps[:, :6]) @ before
-        # The first frame is where its prior says, of which eps is the first order.
+        # zeta gives the first frame exactly; eps is its first order.
         first = u.B @ zeta
         T[0] = se3.exp(first[:6]) @ self.log.T_predicted[0]
         eps = np.concatenate([se3.log(T[:1] @ se3.inverse(before[:1])), step.eps[1:, :6]])
@@ -84,7 +76,7 @@ class BatchProblem:
         return State(T, positions, zeta, shared, aux, state.drive + step.drive, drive)
 
     def filtered_state(self, positions_m: Array) -> State:
-        """Return the filter's own estimates as a state: its blocks after each update, and the map given."""
+        """Return the filter's estimates as a state: its blocks after each update, and a map (M, 3)."""
         u, log = self.unknowns, self.log
         xi = se3.log(log.T_updated[0] @ se3.inverse(log.T_predicted[0]))
         drive, shared, aux = (log.updated[:, at] for at in (u.drive_columns, u.frame_columns[6:], u.aux_columns))
@@ -92,7 +84,7 @@ class BatchProblem:
         return State(log.T_updated, positions_m, zeta, shared, aux, drive[-1], u.drive_values(drive[-1]))
 
     def solved_as_filtered(self, solution: JointInformation) -> State:
-        """Return the state that the solution of `as_filtered` stands for; its corrections add up as the filter's do."""
+        """Return the state of a solution of `as_filtered`."""
         T = se3.exp(solution.eps[:, :6]) @ self.log.T_predicted
         u = self.unknowns
         positions, drive = self.log.first_position_m + solution.d, u.drive_values(solution.drive)

@@ -18,13 +18,7 @@ from ekfslam.smoother.unknowns import State, Unknowns, split
 
 
 class ProcessFactors:
-    """Factors of a log that do not concern landmarks.
-
-    Args:
-        log: Record of the filter.
-        model: Its blocks, process and noise.
-        unknowns: Groups of the blocks.
-    """
+    """Factors of a log that do not concern landmarks."""
 
     def __init__(self, log: Log, model: Model, unknowns: Unknowns) -> None:
         self._log, self._model, self._unknowns = log, model, unknowns
@@ -71,13 +65,7 @@ class ProcessFactors:
         return self._model.process.step(values, log.intervals, T_from, log.first_estimates)
 
     def _step(self, error: Array, by_before: Array, by_after: Array) -> Factor:
-        """Return the steps of the process.
-
-        Args:
-            error: (T-1, p) errors.
-            by_before: (T-1, p, body) their derivatives by the process's own blocks before the step.
-            by_after: (T-1, p, body) their derivatives by all blocks after it.
-        """
+        """Return the steps of the process from errors (T-1, p) and derivatives (T-1, p, body), see `Residual`."""
         u, W, steps = self._unknowns, self._weight, np.arange(self._log.frames - 1)
         by_before, by_after = W @ by_before, W @ by_after
         terms = [

@@ -1,17 +1,10 @@
-"""Map revival: the batch problem behind the filter, from which landmarks that were retired come back.
+"""Map revival: landmarks that were retired come back from the batch problem behind the filter.
 
-The filter's state is the marginal, over its blocks and the landmarks in view, of one system over all frames and all
-landmarks. When retired landmarks are seen again, the marginal over the blocks, the active *and* the returning landmarks
-takes its place:
-
-- ``standard`` and ``fej`` with landmarks in xyz: the rows are frozen where the filter linearised them, and so the
-  marginal is exactly the state of a filter that never retired anything. FEJ keeps its consistency, since a landmark
-  comes back with its first estimate; standard is as inconsistent as it ever is.
-- ``invariant``, and every variant with landmarks in image coordinates: a never-retired filter would have moved the
-  error of every retired landmark with every correction, which no sparse row remembers. Here all rows are linearised
-  again at their common maximum a posteriori, and mean and covariance are taken from there. All rows then see the same
-  unobservable directions, those at the new mean, and nothing is learned about them: the invariant filter's own
-  property, at a better estimate. FEJ has its first estimates there from then on.
+When retired landmarks are seen again, the filter's state is replaced by the marginal over its blocks, the active *and*
+the returning landmarks. ``standard`` and ``fej`` with landmarks in xyz keep the rows where the filter linearised them:
+the marginal is exactly the state of a filter that never retired anything. In all other variants, each correction moves
+the errors of all landmarks, which no frozen row remembers. There all rows are linearised again at their common maximum
+a posteriori, so that they see the same unobservable directions; FEJ has its first estimates there from then on.
 """
 
 from __future__ import annotations
@@ -33,11 +26,7 @@ _MAXIMUM = PosteriorConfig(kernel="none", tolerance=1e-12)
 
 
 class MapRevival:
-    """Marginals of the batch problem behind a filter, for its `revival`.
-
-    Args:
-        model, config: Those of the filter.
-    """
+    """Marginals of the batch problem behind a filter with this model and these settings."""
 
     def __init__(self, model: Model, config: FilterConfig) -> None:
         self._model, self._config = model, config
@@ -89,14 +78,13 @@ class MapRevival:
         start = problem.filtered_state(positions_m)
         if self._last is not None:
             start = continued(self._last, start, log)
-        iterations = range(MOST_ITERATIONS)
-        found = maximise(problem, start, _MAXIMUM, self._config.min_depth_m, iterations)
+        found, _, information = maximise(problem, start, _MAXIMUM, self._config.min_depth_m, range(MOST_ITERATIONS))
         self._last = state = found.state
         return Marginal(
             problem.unknowns.last_values(state),
             *problem.unknowns.last_coordinates(state),
             state.positions_m[landmarks],
-            self.covariance(problem, found.information, landmarks),
+            self.covariance(problem, information, landmarks),
         )
 
     def covariance(self, problem: BatchProblem, information: JointInformation, landmarks: IntArray) -> Array:
@@ -118,13 +106,7 @@ class MapRevival:
 
 
 def continued(last: State, state: State, log: Log) -> State:
-    """Return the maximum of an earlier revival, continued by the filter's estimates of everything seen since.
-
-    Args:
-        last: That maximum, of the log up to the prediction to its last frame.
-        state: The filter's estimates now.
-        log: Everything so far.
-    """
+    """Return the maximum of an earlier revival, continued by the filter's estimates of everything seen since."""
     known = len(last.T_imu_world)
     unseen = np.ones(len(last.positions_m), dtype=bool)
     # Observations of the last frame of the maximum came after it.

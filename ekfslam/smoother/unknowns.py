@@ -25,7 +25,7 @@ class State:
         zeta: (w+a,) first frame in units of its prior: ``T_0 = exp((B zeta)^) T_prior``, and its blocks by addition to
             their prior means.
         shared: (T, w-6) values of the blocks of a frame that observations depend on, without its pose.
-        aux: (T, a) values of the further blocks of a frame. They are vectors.
+        aux: (T, a) values of the further blocks of a frame.
         drive: (g,) coordinates of the blocks of the drive: sums of corrections.
         drive_values: Values of the blocks of the drive, by name.
     """
@@ -43,7 +43,6 @@ class Unknowns:
     """Blocks of a model in the groups of `ekfslam.smoother.sparse.factors`.
 
     Args:
-        model: The model.
         initial_covariance: Covariance before the first frame: of all blocks (body, body), or of the pose (6, 6).
         mean: (body,) coordinates before the first frame.
 
@@ -54,7 +53,7 @@ class Unknowns:
         shared_mean, aux_mean: (w-6,), (a,) prior means of the first frame's blocks.
         drive_covariance: (g, g) prior covariance of the drive's blocks.
         B: (w+a, w+a) root of the first frame's covariance, see `FirstFrame`.
-        cloned, clone_columns: Columns (c,) of a frame that the filter has clones of, and the layout's columns of these.
+        cloned, clone_columns: Columns (c,) of a frame with clones in the filter, and the layout's columns of these.
     """
 
     def __init__(self, model: Model, initial_covariance: Array, mean: Array) -> None:
@@ -133,11 +132,7 @@ def split(blocks: Sequence[StateBlock], array: Array) -> dict[str, Array]:
 
 
 def root(covariance: Array, width: int) -> Array:
-    """Return B with ``B B^T = covariance`` (n, n), which may be singular.
-
-    The first rows by the columns from ``width`` on are 0, so that observations of the first frame do not depend on the
-    part of zeta that belongs to its aux.
-    """
+    """Return B with ``B B^T = covariance`` (n, n), which may be singular; its block [:width, width:] is 0."""
     std = np.sqrt(np.diag(covariance))
     scale = np.where(std > 0, std, 1.0)
     correlation = covariance / np.outer(scale, scale)

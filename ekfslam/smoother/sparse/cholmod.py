@@ -1,8 +1,7 @@
 """Sparse block Cholesky factorisation by CHOLMOD; the only module that imports scikit-sparse.
 
-The information matrix of SLAM consists of blocks: six rows a pose, three a landmark. The fill-reducing order is sought
-on the graph of blocks, one node each: it has a thirtieth of the edges of the graph of scalars, and its order leaves
-every block contiguous in the factor, so that whole blocks of the inverse can be read off it.
+The fill-reducing order is sought on the graph of blocks: it has a thirtieth of the edges of the graph of scalars, and
+every block stays contiguous in the factor, so that whole blocks of the inverse can be read off it.
 """
 
 from __future__ import annotations
@@ -22,8 +21,7 @@ class NotPositiveDefiniteError(EkfslamError):
 
     Args:
         shape: Shape of the matrix.
-        block: Block, in the order of the matrix, at whose pivot the factorisation broke off.
-        row: Row of the matrix with that pivot.
+        block, row: Block and row, in the order of the matrix, of the pivot that is not positive.
     """
 
     def __init__(self, shape: tuple[int, int], block: int, row: int) -> None:
@@ -43,7 +41,6 @@ class BlockPattern:
             set. A place may occur in several sets, but once in each. Every diagonal block occurs.
 
     Attributes:
-        sizes: As given.
         order: (b,) blocks in that order.
         permutation: (n,) rows of A in that order: those of each block in turn.
     """
@@ -80,10 +77,7 @@ class BlockPattern:
             self._targets.append(target.astype(index_type))
 
     def assemble(self, values: Iterable[Array]) -> sp.csc_matrix:
-        """Return the permuted lower triangle, given the blocks (n, high, wide) of each set; blocks of a place add up.
-
-        Diagonal blocks are whole, and their upper half is not read.
-        """
+        """Return the permuted lower triangle from blocks (n, high, wide) of each set; blocks of a place add up."""
         data = np.zeros(len(self._indices))
         for target, blocks in zip(self._targets, values, strict=True):
             data[target] += blocks
@@ -140,10 +134,7 @@ class SparseCholesky:
         return result
 
     def factor(self) -> sp.csc_array:
-        """Return L (n, n), its row indices sorted; a copy at every call.
-
-        The pattern may exceed that of the exact factor: CHOLMOD stores zeros where this joins small supernodes.
-        """
+        """Return L (n, n), its row indices sorted; CHOLMOD may store zeros where this joins small supernodes."""
         return sp.csc_array(self._factor.L())
 
     @property
@@ -153,10 +144,7 @@ class SparseCholesky:
 
 
 def _fill_reducing_order(row: IntArray, column: IntArray, blocks: int) -> IntArray:
-    """Return a postordered fill-reducing order of the blocks of a lower triangle.
-
-    CHOLMOD's default: approximate minimum degree, and nested dissection where that leaves much fill.
-    """
+    """Return CHOLMOD's default fill-reducing order of the blocks of a lower triangle, postordered."""
     graph = sp.csc_array(sp.coo_array((np.ones(len(row), dtype=bool), (row, column)), shape=(blocks, blocks)))
     symbolic = cholmod.analyze(graph.astype(float), mode="simplicial", ordering_method="default")
     return np.asarray(symbolic.P(), dtype=np.int64)

@@ -1,22 +1,13 @@
 """Factors: whitened rows over a few unknowns each, and the linear system that a list of them makes.
 
-A factor is a batch of n alike constraints. Its residual ``r`` (n, d) is what its unknowns have to explain, and each
-`Term` says which unknowns a constraint touches and with which Jacobian: ``sum_t J_t x_t = r``, with unit noise. Prior,
-process, observations and everything else are factors; elimination and solution know nothing else.
-
-There are four groups of unknowns:
-
-- ``frames`` (T, w): pose of each frame, and the shared blocks that its observations depend on;
-- ``aux`` (T, a): further blocks of each frame, such as velocities and their biases;
-- ``drive`` (1, g): blocks with one value for the drive;
-- ``landmarks`` (M, 3).
+A factor is a batch of n alike constraints ``sum_t J_t x_t = r`` with unit noise. Unknowns have four groups: ``frames``
+(T, w), the pose of each frame and the shared blocks that its observations depend on; ``aux`` (T, a), further blocks of
+each frame; ``drive`` (1, g), blocks with one value for the drive; ``landmarks`` (M, 3).
 
 To add a new kind of factor, build it from the state at which the system is linearised, and append it to the list:
 
     speed = Factor(r, (Term("aux", frame, J),))  # r (n, 1), frame (n,), J (n, 1, a)
     information = JointInformation(dataclasses.replace(system, factors=(*system.factors, speed)))
-
-No other place has to know of it: its terms alone determine the sparsity.
 """
 
 from __future__ import annotations
@@ -58,8 +49,7 @@ class Factor:
     Args:
         r: (n, d) residual that the unknowns explain.
         terms: One for each unknown that a constraint touches. Terms without columns are dropped.
-        observation: (n,) number of the observation that each constraint comes from; a robust kernel weighs it. None:
-            the factor is not weighted.
+        observation: (n,) number of the observation that each constraint comes from, for the robust kernel.
     """
 
     r: Array
@@ -84,11 +74,10 @@ class Factor:
 class FirstFrame:
     """Prior of the first frame: ``(eps_0, aux_0) = B zeta`` with ``zeta ~ N(-zeta_hat, I)``.
 
-    The unknowns of the first frame are counted in units of their prior, so that its covariance ``B B^T`` may be
-    singular.
+    Unknowns of the first frame count in units of their prior, so that its covariance ``B B^T`` may be singular.
 
     Args:
-        B: (w+a, w+a) root of the covariance; its block of ``eps_0`` by the last a columns is 0.
+        B: (w+a, w+a) root of the covariance; its block [:w, w:] is 0.
         zeta: (w+a,) where the system is linearised.
         width: Size w of ``eps_0``.
     """
@@ -221,8 +210,7 @@ class LinearSystem:
     def information_matrix(self) -> tuple[sp.csc_array, IntArray]:
         """Return the information matrix (n, n) of ``eps, aux, drive, d``, and which of these (n,) are its columns.
 
-        Components of the first frame that are known for certain (a zero row of B) have no finite information, and no
-        column.
+        Components of the first frame that are known for certain (a zero row of B) have no column.
 
         Raises:
             PosteriorError: The first frame is known for certain in a direction that is no axis.

@@ -3,9 +3,7 @@
 Landmarks with few observations are eliminated by their Schur complements, and the rest is left to CHOLMOD (see
 `ekfslam.smoother.sparse.structure`). Both are steps of one sparse elimination: nothing is approximated, and no matrix
 as wide as the state is ever formed.
-
-Sources: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000, section 6 (Schur
-complement); Takahashi, Fagan, Chen, "Formation of a sparse bus impedance matrix", 1973 (selected inverse).
+Source: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000, section 6.
 """
 
 from __future__ import annotations
@@ -37,20 +35,17 @@ class JointInformation:
 
     Args:
         system: All factors.
-        damping: Levenberg-Marquardt: added to the diagonal (0: the posterior itself). Not in proportion to it: that
-            crawls along the flat directions of a trajectory.
+        damping: Levenberg-Marquardt: added to the diagonal. Not in proportion to it: that crawls along the flat
+            directions of a trajectory.
         like: A solution of another system with the same structure, whose analysis is used again.
         structure: Structure of the system; by default that of ``like``, or a new one.
 
     Attributes:
-        structure: As used.
         factor: Factorisation of the reduced matrix.
         zeta: (w+a,) mean of the first frame in units of its prior.
-        eps, aux: (T, w) and (T, a) mean of the unknowns of the frames.
-        drive: (g,) mean of the unknowns of the drive.
-        d: (M, 3) mean of the landmarks.
-        gain: Decrease of half the sum of squares from the linearisation point to the mean, damped or not.
-        cost: Half the sum of squares there.
+        eps, aux, drive, d: Means of the unknowns: (T, w), (T, a), (g,), and (M, 3) of the landmarks.
+        gain: Decrease of half the sum of squares from the linearisation point to the mean.
+        cost: Half the sum of squares at the mean.
 
     Raises:
         IllPosedError: Something is undetermined; names landmark ids or frames.
@@ -294,33 +289,3 @@ def _cholesky_of_landmarks(H_mm: Array, ids: IntArray) -> Array:
     if weak.any():
         raise IllPosedError("landmarks with too little information", ids[weak])
     return np.asarray(np.linalg.cholesky(H_mm))
-
-
-def block_patterns(information: JointInformation) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray], int]:
-    """Return rows and columns of the blocks of the information matrix, of its Cholesky factor, and their number.
-
-    Of the information matrix those in the lower triangle: frames, aux, drive, landmarks. Those of the factor in the
-    order of elimination.
-    """
-    s, factor = information.structure, information.factor
-    before, eliminated = s.first["landmarks"], np.flatnonzero(~s.is_kept)
-    count = before + len(s.ids)
-    own = np.arange(count)
-    blocks = [product.places for product in s.products if product.places is not None]
-    blocks = [np.stack([own, own], axis=-1), *(places[places[:, 0] < before] for places in blocks)]
-    blocks += [pairs + np.array([before, s.first[group]]) for group, pairs in s.pairs.items()]
-    row, column = np.unique(np.concatenate(blocks), axis=0).T
-
-    rank, place = np.cumsum(~s.is_kept) - 1, np.empty(len(s.block_sizes), dtype=np.int64)
-    place[factor.pattern.order] = len(eliminated) + np.arange(len(place))
-    L = factor.factor()
-    block = np.repeat(np.sort(place), s.block_sizes[factor.pattern.order])
-    of_column = np.repeat(np.arange(L.shape[1]), np.diff(L.indptr))
-    rows, columns = ([part] for part in np.divmod(np.unique(block[L.indices] * count + block[of_column]), count))
-    for group, pairs in s.pairs.items():
-        landmark, index = pairs[~s.is_kept[pairs[:, 0]]].T
-        rows.append(place[s.blocks(group, index)])
-        columns.append(rank[landmark])
-    for side in (rows, columns):
-        side.append(np.arange(len(eliminated)))
-    return (row, column), (np.concatenate(rows), np.concatenate(columns)), count

@@ -1,14 +1,11 @@
-"""Marginal covariances of a sparse system: those entries of the inverse that lie in the pattern of its Cholesky factor.
+"""Selected inverse: the entries of ``Z = A^-1`` in the pattern of the Cholesky factor L of A.
 
-Takahashi, Fagan and Chen, *Formation of a sparse bus impedance matrix and its application to short circuit study*
-(PICA 1973): with ``A = L L^T`` and ``Z = A^-1``, the entries of Z in the pattern of L follow from one another, from the
-last column to the first, and need no others. Here one supernode at a time, a run J of columns that have their rows R
-below the run in common, so that all the work is dense:
+They follow from one another, from the last column to the first (Takahashi, Fagan and Chen, PICA 1973). Here one
+supernode at a time, a run J of columns that have their rows R below the run in common:
 
     Y = L_RJ L_JJ^-1        Z_RJ = -Z_RR Y        Z_JJ = L_JJ^-T L_JJ^-1 - Y^T Z_RJ
 
-R lies within the columns and rows of the parent, the supernode that owns the first of R; so Z_RR is a submatrix of the
-parent's front, the dense Z over its columns and rows.
+Z_RR is a submatrix of the dense Z over the parent, the supernode that owns the first of R.
 """
 
 from __future__ import annotations
@@ -30,11 +27,7 @@ class PatternError(EkfslamError):
 
 
 class MissingBlockError(EkfslamError):
-    """A block of the inverse was asked for that lies outside the pattern of the Cholesky factor.
-
-    Args:
-        i, j: The pair of blocks, as asked for.
-    """
+    """A block (i, j) of the inverse lies outside the pattern of the Cholesky factor."""
 
     def __init__(self, i: int, j: int) -> None:
         self.i, self.j = i, j
@@ -42,11 +35,7 @@ class MissingBlockError(EkfslamError):
 
 
 class SelectedInverse:
-    """Blocks of ``A^-1``: every diagonal block, every block stored in A, and whichever the factor fills in.
-
-    Args:
-        cholesky: The factorisation of A.
-    """
+    """Blocks of ``A^-1`` in the pattern of a factorisation of A: all diagonal ones, and all stored in A."""
 
     def __init__(self, cholesky: SparseCholesky) -> None:
         inverse = selected_inverse(cholesky.factor())
@@ -67,11 +56,7 @@ class SelectedInverse:
         self._offset = concatenated_ranges(np.zeros(nb, dtype=np.int64), height)[leads]
 
     def blocks(self, i: ArrayLike, j: ArrayLike) -> Array:
-        """Blocks (i, j) of the inverse, (n, s_i, s_j): cross-covariances, or covariances where i = j.
-
-        Args:
-            i: (n,) blocks in the order of A, all of one size s_i.
-            j: (n,) likewise, of one size s_j.
+        """Return blocks (n, s_i, s_j) of the inverse, for blocks i and j (n,) of A, each of one size.
 
         Raises:
             MissingBlockError: A pair lies outside the pattern of the factor.
@@ -103,15 +88,10 @@ class SelectedInverse:
 
 
 def selected_inverse(L: sp.csc_array) -> sp.csc_array:
-    """Entries of ``(L L^T)^-1`` in the pattern of L (n, n): its lower triangle with the diagonal.
-
-    Args:
-        L: Lower-triangular factor, row indices sorted, with the pattern of a Cholesky factor: the rows below the
-            diagonal of a column are among those of its parent, the column of the first of them. `SparseCholesky.factor`
-            is of this kind; a factor from which small entries have been dropped is not.
+    """Return the entries of ``(L L^T)^-1`` in the pattern of L (n, n), a `SparseCholesky.factor`.
 
     Raises:
-        PatternError: The rows of a supernode are not among those of its parent.
+        PatternError: The rows of a supernode are not among those of its parent, as of a factor with dropped entries.
     """
     tree = _supernodes(L)
     in_factor = np.triu(np.ones((max(tree.width), max(tree.height)), dtype=bool))
@@ -150,14 +130,13 @@ def selected_inverse(L: sp.csc_array) -> sp.csc_array:
 
 @dataclass(frozen=True)
 class _Supernodes:
-    """The supernodes of a Cholesky factor, in the order of their columns; lists, as Python reads those faster.
+    """The supernodes of a Cholesky factor, in the order of their columns; lists, which Python reads faster.
 
     Args:
-        first: First column of each.
-        width: Number of columns.
+        first, width: First column of each, and their number.
         height: Number of rows, those of the columns themselves included.
         parent: Supernode that owns the first row below the columns; -1 of a root.
-        children: Number of supernodes that have this one for parent.
+        children: Number of children.
         rows_in_parent: (height - width,) places of the rows below the columns among the rows of the parent.
     """
 

@@ -1,8 +1,8 @@
 """Structure of a linear system: which blocks of its normal equations are not zero, and what adds to each.
 
-It follows from the indices of the factors' terms alone, and serves for every linearisation. Landmarks know of each
-other only through other unknowns, so those with few observations are eliminated first, all at once, by their Schur
-complements. The rest is the *reduced* system: one block for each frame, aux, the drive and each kept landmark.
+It follows from the indices of the factors' terms alone, and serves for every linearisation. Landmarks with few
+observations are eliminated first, all at once, by their Schur complements. The rest is the *reduced* system: one block
+for each frame, aux, the drive and each kept landmark.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Coupling:
     Args:
         row, column: Groups of the unknowns.
         later, earlier: Pairs of either group, those of one couple together.
-        sizes: (c,) number of them for each couple.
+        sizes: (c,) number of pairs of each couple.
         couples: (c, 2) row and column blocks of the reduced matrix.
     """
 
@@ -97,14 +97,13 @@ class Structure:
         eliminate_up_to: Landmarks observed from at most so many frames are eliminated.
 
     Attributes:
-        counts, sizes, ids: As in the system.
-        pairs: For each reduced group, landmark and unknown (p, 2) of the pairs that factors couple, in their order.
-        is_kept, kept: Whether (M,) a landmark is kept for CHOLMOD, and the numbers of those that are.
+        pairs: For each reduced group, landmark and unknown (p, 2) of the pairs that factors couple.
+        is_kept, kept: Whether (M,) a landmark is kept for CHOLMOD, and the numbers of kept ones.
         first: First reduced block of each group.
         block_sizes, start: Columns of each reduced block; the first of them, and the number of all.
-        products, couplings: What adds to the normal equations, and what elimination takes away.
+        products, couplings: Terms of the normal equations, and of the elimination.
         kept_pairs: For each reduced group, numbers of the pairs with kept landmarks.
-        pattern: Of the reduced matrix. Its sets: groups, products, couplings, kept pairs.
+        pattern: Pattern of the reduced matrix. Its sets: groups, products, couplings, kept pairs.
 
     Raises:
         IllPosedError: Landmarks without an observation; names them.
@@ -191,7 +190,7 @@ class Structure:
         return Product(number, row, column, rows, index, np.stack(np.divmod(keys, n), axis=-1))
 
     def _coupling(self, row: str, column: str) -> Coupling:
-        """Return which unknowns of two groups the eliminated landmarks connect, and through which pairs."""
+        """Return the couples of unknowns of two groups that eliminated landmarks connect."""
         by_row, by_column = self._numbers[row], self._numbers[column]  # by landmark, then by unknown
         of_row, of_column = self.pairs[row][by_row, 0], self.pairs[column][by_column, 0]
         eliminated = np.flatnonzero(~self.is_kept[of_row])
