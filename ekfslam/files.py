@@ -46,20 +46,20 @@ def write_all(contents: Mapping[Path, str | bytes], make_folders: bool = True) -
             if make_folders:
                 made += _make_folder(target.parent)
             _sweep(target.parent)
-            beside = target.with_name(f"{_PREFIX}{os.getpid()}.{next(_counter)}{_SUFFIX}")
-            unfinished[target] = beside
+            scratch = target.with_name(f"{_PREFIX}{os.getpid()}.{next(_counter)}{_SUFFIX}")
+            unfinished[target] = scratch
             data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
-            _write_to_disk(beside, data, target)
-        for target, beside in unfinished.items():
-            beside.replace(target)
+            _write_to_disk(scratch, data, target)
+        for target, scratch in unfinished.items():
+            scratch.replace(target)
         for folder in {target.parent for target in unfinished}:
             _sync_folder(folder)
     except OSError as error:
         raise WriteError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
         with suppress(OSError):
-            for beside in unfinished.values():
-                beside.unlink(missing_ok=True)
+            for scratch in unfinished.values():
+                scratch.unlink(missing_ok=True)
             for folder in reversed(made):
                 folder.rmdir()  # only empty ones can be
 

@@ -1,11 +1,11 @@
-"""What each part of the model of real recordings brings, and what recordings say about their calibration.
+"""Measure what each part of the model of real recordings contributes, and what recordings tell of their calibration.
 
 Every recording with truth is filtered with one part of the automatic model left out at a time. Then the calibration is
-made part of the state: once with the velocities as measured, once with the true motion in their place,
+part of the state: once with the measured velocities, once with the true motion in their place,
 
     u(k) = -log(T_world_imu(k)^-1 T_world_imu(k-1)) / tau,                                   the inverse of (1)
 
-which tells what the tracks themselves want.
+which shows the calibration that the tracks alone prefer.
 
     python experiments/ablation.py [--data DIR] [--out DIR] [--workers N]
 """

@@ -1,13 +1,12 @@
-"""How long a frame takes: both forms of the covariance, and the joint filter against GTSAM's iSAM2.
+"""Measure the time of a frame: both forms of the covariance, and the joint filter against GTSAM's iSAM2.
 
-Three tables, each from runs that take turns (A B A B ...) on one BLAS thread, so that what else the machine does hits
-all alike:
+Three tables, on one BLAS thread. Runs take turns (A B A B ...), so other work on the machine affects all alike:
 
-- *Observations a frame*: `builtin:city` with 30 to 1000; dense and conditional form, the same filter to rounding.
-- *Laps*: a ring of 40 m radius, driven three times. Landmarks out of view sleep, and come back exactly.
-- *The race*: total seconds of the joint filter on the UTIAS drives, with white noise as GTSAM's factors have it, and
-  with the automatic model. Beside it iSAM2 (relinearizeSkip 10, Cauchy) on the very observations that the filter
-  accepted, without and with the covariance of its last pose in every frame. Building its factors is not counted.
+- *Observations per frame*: `builtin:city` with 30 to 1000; dense and conditional form, the same filter to rounding.
+- *Laps*: a ring of 40 m radius, driven three times. Landmarks out of view are dormant, and return exactly.
+- *The race*: total seconds of the joint filter on the UTIAS drives, with white noise as in GTSAM's factors, and with
+  the automatic model. iSAM2 (relinearizeSkip 10, Cauchy) runs on the observations that the filter accepted, without
+  and with the covariance of its last pose in every frame. Building its factors is not counted.
 
     python experiments/benchmark.py [--data DIR] [--out DIR] [--repeat N] [--quick]
 """

@@ -1,16 +1,16 @@
-"""Tracks of the front end beside given ones: their errors in the image, and what poses come of them.
+"""Compare tracks of the front end with given ones: errors in the image, and errors of the poses.
 
 The images are the first 51 frames of KITTI odometry 06; the given tracks are KLT tracks of the same drive and frames. A
-track is fitted to poses from elsewhere: a landmark m, and an error c of its disparity that stays, as
+track is fitted to given poses: a landmark m, and a constant error c of its disparity,
 
     z(k) = pi(T_cam_world(k) m) + c e_d + r(k),    e_d = (0, 0, -1),    c ~ N(0, 1 px),
 
-by least squares over its rows (u, v, uR) with standard deviations of 0.3 px. What is said of a track's error then is
+by least squares over its rows (u, v, uR) with standard deviations of 0.3 px. Figures of the errors of tracks:
 
 - constant: standard deviation of c over tracks that determine it to 0.4 px, in disparity,
 - walk: standard deviation of r(k) - r(k-1), for u, v, and disparity (white noise s gives sqrt(2) s),
 - lag 1: correlation of successive differences (-0.5 for white noise, 0 for a walk),
-- shared: standard deviation of the mean difference of a frame beyond what independent tracks have.
+- shared: standard deviation of the mean difference of a frame beyond that of independent tracks.
 
 All are robust (medians of absolute values). Poses are those of vision alone (front end, full, without velocities), and
 the true ones, whose first second is interpolated.

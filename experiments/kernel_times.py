@@ -1,4 +1,4 @@
-"""Times of the kernels, compiled and plain, with pytest-benchmark: where one becomes slow, a comparison shows it.
+"""Time the kernels, compiled and plain, with pytest-benchmark; a comparison shows kernels that became slower.
 
 python -m pytest experiments/kernel_times.py -n 0 --benchmark-autosave
 python -m pytest experiments/kernel_times.py -n 0 --benchmark-compare

@@ -1,19 +1,19 @@
-"""The smoothed trajectory next to GTSAM's: the same problem, solved by the posterior, by GTSAM's batch, and by iSAM2.
+"""Compare the smoothed trajectory with GTSAM: the same problem for the posterior, GTSAM's batch solver, and iSAM2.
 
 The posterior of a run minimises, over all poses x_k = T_world_imu(k) and all landmarks m_j,
 
     sum_k |log(T_imu_world(k) T_imu_world(k-1)^-1 E_k^-1)|^2_Q / 2  +  sum_kj rho(|z_kj - h(x_k, m_j)|_V),
 
-where E_k is the measured motion (1), Q its covariance (2), h the stereo camera (3) and rho the robust kernel. Here the
-very observations that the filter accepted become the same problem in GTSAM: `BetweenFactorPose3` over exp(tau u), with
-GTSAM's order of a pose's error (rotation first), `GenericStereoFactor3D`, and a prior on the first pose. GTSAM's motion
-residual, log(E x_(k-1)^-1 x_k), is minus the one above, so Q goes over as it is. Both batch solvers start from the
-filter's estimate and stop at the same relative decrease of the cost; GTSAM's is then driven on until nothing decreases
-any more, which gives the cost that ours is held against. Every solution is put into both cost functions. They differ
-where a landmark is behind a camera that saw it: ours is infinite there, GTSAM's a constant. iSAM2 gets one frame at a
-time, its first guesses from its own last estimate: the new pose by the measured motion, new landmarks by triangulation.
-It never sees the filter. Where it loses a landmark behind a camera, which leaves its system singular, it runs once more
-with a weak prior on every landmark.
+where E_k is the measured motion (1), Q its covariance (2), h the stereo camera (3) and rho the robust kernel. The
+observations that the filter accepted become the same problem in GTSAM: `BetweenFactorPose3` over exp(tau u), with
+rotation first as in GTSAM, `GenericStereoFactor3D`, and a prior on the first pose. GTSAM's motion residual,
+log(E x_(k-1)^-1 x_k), is minus the one above, so Q is unchanged.
+
+Both batch solvers start from the filter's estimate and stop at the same relative decrease of the cost. GTSAM then
+continues until nothing decreases, which gives the reference cost. Every solution is put into both cost functions. They
+differ if a landmark is behind a camera that saw it: ours is infinite then, GTSAM's a constant. iSAM2 gets one frame at
+a time and never sees the filter: a new pose starts from the measured motion, a new landmark from triangulation. If a
+landmark behind a camera leaves its system singular, it runs again with a weak prior on every landmark.
 
 Seconds are wall-clock within the solvers: building GTSAM's factors from Python is not counted, nor are our marginals.
 

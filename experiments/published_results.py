@@ -1,26 +1,26 @@
 """Two published consistency experiments, repeated with the joint filter.
 
-A filter is consistent if its covariance P tells the truth about its error e. The measure is the normalised estimation
-error squared, NEES, of an error and a covariance in the same coordinates,
+A filter is consistent if its error e is as large as its covariance P says. The measure is the normalised estimation
+error squared, NEES, with both in the same coordinates,
 
     eps = e^T P^-1 e,   e = log(T_imu_world T_hat^-1),   expected: E[eps] = dim e.
 
-What makes EKF-SLAM inconsistent is that it gains information about where the world is and which way it is turned,
-which no measurement holds. The invariant filter (RI) cannot, FEJ does not, the standard one does.
+EKF-SLAM is inconsistent because it gains information about position and heading of the world, which no measurement
+holds. The invariant filter (RI) cannot, FEJ does not, the standard one does.
 
 (a) Zhang, Wu, Song, Huang, Dissanayake: "Convergence and Consistency Analysis for a 3-D Invariant-EKF SLAM", RA-L
-2017, Table II. A vehicle flies in a box of 50 x 40 x 20 m among 300 landmarks and measures those nearer than 20 m and
-within a field of view of 120 degrees by their position in its own frame,
+2017, Table II. A vehicle flies in a box of 50 x 40 x 20 m among 300 landmarks. It measures the position in its own
+frame of landmarks nearer than 20 m within a field of view of 120 degrees,
 
     z = q + n,   n ~ N(0, sigma^2 diag(z^2)),   odometry noise ~ N(0, sigma^2 diag(u^2)),   sigma = 1 % or 5 %.
 
 (b) Brossard, Barrau, Bonnabel: UKF-M, benchmark `slam2d`. A robot drives ten times round a circle with landmarks
 outside of it, measured by position to 0.1 m; heading noise is large. The plane lies in the filter's space: sideways and
-vertical velocity, roll and pitch rates are noiseless, so that with P0 = 0 the pose cannot leave the plane, and what the
-third row of a measurement says about a landmark's height bears on nothing else.
+vertical velocity, roll and pitch rates are noiseless, so with P0 = 0 the pose cannot leave the plane, and the third row
+of a measurement affects only the height of its landmark.
 
-Both start at a pose that is known exactly, P0 = 0, and keep every landmark. Time steps of one run hang together
-closely, so that runs are the samples: tables give mean +- 3 standard errors over runs.
+Both start at an exactly known pose, P0 = 0, and keep every landmark. Time steps of one run are strongly correlated, so
+runs are the samples: tables give mean +- 3 standard errors over runs.
 
     python experiments/published_results.py [--runs N] [--seed S] [--out DIR]
 """
@@ -89,7 +89,7 @@ class PositionSensor:
         return measured
 
     def variance(self, rows: Array) -> Array:
-        # The filter asks for some of the measurements, in an order of its own.
+        # The filter selects and reorders the measurements.
         order = np.argsort(self.measured_m[:, 0])
         place = order[np.searchsorted(self.measured_m[order, 0], rows[:, 0])]
         return self.std_m[place] ** 2

@@ -1,8 +1,8 @@
-"""Every recording, every mode, one configuration: noise from the data, no truth used but for the evaluation.
+"""Run every mode on every recording with one configuration: noise from the data, truth for the evaluation only.
 
-Errors are absolute trajectory errors against the true poses. The gain is dead reckoning's over that of full SLAM:
-above 1 where the camera helps. The last tables add known white noise to the clean velocities of the UTIAS drives and of
-the dense tracks of 0027 (0.5 m/s and 0.05 rad/s a sample, several seeds); the filter is not told.
+Errors are absolute trajectory errors against the true poses. The gain is the error of dead reckoning over that of full
+SLAM. The last tables add white noise to the clean velocities of the UTIAS drives and of the dense tracks of 0027
+(0.5 m/s and 0.05 rad/s per sample, several seeds), which the filter does not know.
 
     python experiments/real_data.py [--data DIR] [--out DIR] [--variants] [--workers N]
 """

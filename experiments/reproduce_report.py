@@ -1,4 +1,4 @@
-"""The report's Figures 1-5 from its own recordings, next to what full SLAM makes of the same data.
+"""Reproduce Figures 1-5 of the report from its own recordings, next to full SLAM on the same data.
 
 The report's system has two halves. Its trajectories (Figures 1 and 4) come from the prediction alone,
 
@@ -8,14 +8,14 @@ its maps (Figures 2, 3 and 5) from one small EKF per landmark at those poses,
 
     K = P H^T (H P H^T + V)^-1,   m+ = m + K (z - M pi(q)),   P+ = (I - K H) P,
 
-started where the first stereo observation puts the landmark. That is the mode `mapping-only`. Full SLAM, the step that
-the report's last paragraph asks for, runs beside it on the same observations.
+started at the first stereo observation. That is the mode `mapping-only`. Full SLAM, the further work that the report
+proposes, runs on the same observations.
 
-The recordings carry about three landmarks a frame and velocities from the very box that the truth comes from. So dead
-reckoning is hard to beat here, and vision has little to add; what changes is the map, and that poses and landmarks now
-come with a joint covariance. `cam_T_imu` of these files holds the camera's position instead of the translation of a
-rigid transform; it is corrected here, and the table shows what it costs to take it as stored. The lateral velocity of
-these files is positive to the right, against the description of its format; it is taken as stored, as in the report.
+The recordings hold about three landmarks per frame, and velocities from the unit that also gives the truth. So dead
+reckoning is hard to beat, and vision adds little; but the map changes, and poses and landmarks have a joint covariance.
+`cam_T_imu` of these files holds the camera's position instead of the translation of a rigid transform. It is corrected
+here, and the table shows the errors without the correction. The lateral velocity of these files is positive to the
+right, against the description of its format. It is used as stored, as in the report.
 
     python experiments/reproduce_report.py [--data DIR] [--out DIR]
 """

@@ -1,4 +1,4 @@
-"""How well the tracks of a recording fit the true poses: the measure of track hygiene, independent of any filter."""
+"""Measure how well tracks fit the true poses: the criterion of track hygiene, independent of any filter."""
 
 from __future__ import annotations
 

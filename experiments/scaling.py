@@ -1,8 +1,8 @@
-"""What the size of the map costs: time and memory of a frame and of the posterior against the number of landmarks M.
+"""Measure time and memory of a frame and of the posterior against the number of landmarks M.
 
 The world is `ekfslam.data.simulate.City` with short tracks: about 70 landmarks in view and 9 new ones a frame, so that
-M = 10^5 is a drive of some 11 000 frames. Every size runs in a process of its own, whose peak memory is its own, on one
-core. Seconds are CPU time of the process, which other work on the machine disturbs least.
+M = 10^5 is a drive of some 11 000 frames. Every size runs in a new process on one core, for its peak memory. Seconds
+are CPU time of the process, since other work on the machine affects it least.
 
 - *Filter*: the frames of the second half in which 66 to 74 landmarks are in view; median. The cost of a frame at the
   largest M is also held against that at M = 10^3 frame by frame in turn, in one process (`in_turn`).
@@ -86,7 +86,7 @@ class PeakMemory:
         status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
         peak = int(status["VmHWM"].split()[0]) * 1024 / 1e6
         self.overall = max(self.overall, peak)
-        Path("/proc/self/clear_refs").write_text("5")  # starts the count anew
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
         return peak
 
 

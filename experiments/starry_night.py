@@ -1,24 +1,23 @@
-"""Starry Night: is the filter consistent on real measurements, and is their noise what the file says it is?
+"""Starry Night: test the consistency of the filter on real measurements, and the stated noise of the file.
 
-The indoor recording of UTIAS (`dataset3.mat`) is rare in that everything is known: the pose at every frame from a
-motion capture system, the positions of all 20 landmarks, and the variances of velocities and pixels. So the covariance
-can be held against the true error of pose and map,
+Everything is known of the indoor recording of UTIAS (`dataset3.mat`): the pose at every frame from a motion capture
+system, the positions of all 20 landmarks, and the variances of velocities and pixels. So the covariance is compared
+with the true error of pose and map,
 
     eps = e^T P^-1 e,   expected: 6 for a pose, 3 for a landmark,
 
-and the noise against its model by what the measurements leave at the truth,
+and the noise with its model, by the residuals at the truth,
 
     r(k) = z(k) - M pi(T_cam_imu T_imu_world(k) m),   w(k) = u(k) + log(T_imu_world(k) T_imu_world(k-1)^-1) / tau.
 
 The recording is cut into windows of 100 frames. Each starts from the true pose, displaced by a draw from the prior that
-the filter is given, with an empty map; windows are the samples. Gates are off: the question is what a model of the
-noise is worth, and nothing shall be hidden. Two models are compared, neither of which has seen the truth: all of the
-stated pixel noise white, and the structure that `structure.choose` finds by innovations: the camera jitters as
-far as the stated pixel noise says, and the white rest is small.
+the filter is given, with an empty map; windows are the samples. Gates are off, since they would hide errors of the
+model. Two models of the noise are compared, both chosen without the truth: all of the stated pixel noise white, and the
+structure that `structure.choose` finds by innovations, a camera jitter of the stated size with little white noise.
 
-Whose the jitter is, three instruments tell. Camera (against the known landmarks), truth and integrated velocities each
-measure the rotation over some frames; their errors are independent, so that the variances of the differences give each
-one's own: ``s_a^2 = (v_ab + v_ac - v_bc) / 2``.
+Three instruments show the source of the jitter. Camera (against the known landmarks), truth and integrated velocities
+each measure the rotation over some frames. Their errors are independent, so the variances of the differences give the
+variance of each: ``s_a^2 = (v_ab + v_ac - v_bc) / 2``.
 
     python experiments/starry_night.py [--data DIR] [--out DIR]
 """

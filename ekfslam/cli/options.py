@@ -81,13 +81,13 @@ _SHARED: dict[str, dict[str, Any]] = {
         "type": _setting,
         "default": [],
         "metavar": "KEY=VALUE",
-        "help": "standard deviations of the truth, in place of those that its format states: roll_deg, pitch_deg, "
+        "help": "standard deviations of the truth, in place of the defaults of its format: roll_deg, pitch_deg, "
         "yaw_deg, first_position_m, stamp_s, position_m, attitude_deg",
     },
     "--config": {
         "type": Path,
         "metavar": "FILE.toml",
-        "help": "tables [noise], [hygiene], [filter], [calibration], [posterior], [truth]; what `tune` writes is one",
+        "help": "tables [noise], [hygiene], [filter], [calibration], [posterior], [truth]; `tune` writes such a file",
     },
     **{flag: {"action": _Retired, "nargs": 0, "help": argparse.SUPPRESS} for flag in RETIRED},
 }
@@ -162,7 +162,7 @@ def open_data(options: argparse.Namespace, data: str) -> Sequence:
 
 
 def print_warnings(sequence: Sequence) -> None:
-    """Print what looks wrong in a recording."""
+    """Print the warnings about a recording."""
     for line in inspect_sequence(sequence).warnings:
         print(f"{sequence.name}: warning: {line}", flush=True)
 

@@ -100,7 +100,7 @@ def _dask_client(spec: str) -> Any:
         raise _missing(spec, error) from None
     security = None
     if spec.startswith("tls://"):
-        security = Security(require_encryption=True)  # its files are those of Dask's configuration
+        security = Security(require_encryption=True)  # with the files of Dask's configuration
         if not all(getattr(security, name) for name in ("tls_ca_file", "tls_client_cert")):
             raise ConfigError(
                 f"executor {spec}: Dask's configuration has no certificates; set distributed.comm.tls.ca-file, and "

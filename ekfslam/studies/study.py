@@ -154,7 +154,6 @@ class Study(Shown):
             )
 
     def card(self) -> Card:
-        """Return the content of ``repr``."""
         filters = self.runs * len(self.levels) * len(self.variants)
         facts = {"levels": ", ".join(self.levels), "variants": ", ".join(self.variants), "seed": str(self.seed)}
         title = f"{count(self.runs, 'run')} of each level, {count(filters, 'filter')} in all"
@@ -245,7 +244,7 @@ def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str,
             error = ekf.variant.landmark_error(ekf.positions_m, m_true, T_est[k], T_true[k])
             record["landmark_nees"][k] = nanmean(nees(error, ekf.gaussian.landmark_blocks()), axis=0)
             if k in joint_frames:
-                other = slice(6, ekf.gaussian.body)  # blocks besides the pose
+                other = slice(6, ekf.gaussian.body)  # all blocks but the pose
                 P = np.delete(np.delete(ekf.P, other, 0), other, 1)
                 joint = np.concatenate([pose_error(T_est[k], T_true[k]), error.ravel()])
                 record["joint_nees_per_dof"][joint_frames.index(k)] = nees(joint, P) / len(P)
@@ -295,7 +294,6 @@ class StudyArchive(Shown):
         return StudyArchive(study, {level: np.zeros(study.runs, dtype=bool) for level in study.levels}, data)
 
     def card(self) -> Card:
-        """Return the content of ``repr``."""
         runs = self.study.runs
         facts = {level: f"{int(done.sum())} of {count(runs, 'run')}" for level, done in self.done.items()}
         facts["variants"] = ", ".join(self.study.variants)

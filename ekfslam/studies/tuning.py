@@ -70,7 +70,7 @@ _BELOW_FLOOR = "below the errors of the motion that are assumed anyway; not refi
 class Estimate:
     """Estimate of a parameter of `PARAMETERS` by likelihood and differences combined, with its standard error.
 
-    ``likely`` and ``likely_error`` are those of the likelihood alone, None without a search or a maximum.
+    ``likely`` and ``likely_error`` come from the likelihood alone, None without a search or a maximum.
     """
 
     name: str
@@ -88,7 +88,7 @@ class TunedNoise:
     Args:
         sequence: Name of the recording.
         model: Model of the noise as in `NoiseConfig`: ``tuned`` or ``white``.
-        estimates: All parameters, also those that the likelihood did not search.
+        estimates: All parameters, searched by likelihood or not.
         found: Noise of the velocities by their differences.
         log_likelihood: Maximum of the likelihood alone.
         frames, runs: Number of frames in a run, and number of runs.

@@ -1,7 +1,7 @@
-"""Live use from a queue: odometry and a tracker send at 10 Hz, each with a delay of its own; the map grows meanwhile.
+"""Live use from a queue: odometry and a tracker send at 10 Hz with different delays, and the map grows meanwhile.
 
-One learns how `LiveEKF` takes messages that overtake each other, where it is at any time, and what it says of what
-came late. Replace `send` by whatever fills your queue.
+It shows how `LiveEKF` takes messages out of order, gives the pose at any time, and reports late messages. Replace
+`send` by the source of your queue.
 """
 
 from __future__ import annotations

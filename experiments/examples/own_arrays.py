@@ -1,7 +1,7 @@
 """A recording from plain arrays, with nothing in files; stretches of it; velocities from a text file.
 
-One learns `Sequence.from_tracks`, ``sequence[100:300]`` and ``sequence.between``, `attach_velocities`, and what a
-recording without velocities is.
+It shows `Sequence.from_tracks`, ``sequence[100:300]`` and ``sequence.between``, `attach_velocities`, and a recording
+without velocities.
 """
 
 from __future__ import annotations

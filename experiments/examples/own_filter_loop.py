@@ -1,6 +1,6 @@
-"""Live data frame by frame, without a `Sequence`: `JointEKF.predict` and `update`, and what can be asked in between.
+"""Live data frame by frame, without a `Sequence`: `JointEKF.predict` and `update`, and queries in between.
 
-One learns how to build a filter with a map revival (landmarks out of view leave the state, and come back exactly when
+It shows how to build a filter with a map revival (landmarks out of view leave the state, and come back exactly when
 they are seen again), and how to read pose, covariance, and the joint covariance of any landmarks in view.
 """
 

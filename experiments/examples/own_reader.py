@@ -1,8 +1,8 @@
-"""A recording in a format of one's own: `open_sequence` and all that follows take it like any other.
+"""A recording in your own format, which `open_sequence` and everything else then take like any other.
 
-One learns what a reader is (a file with a `Reader`, see ``formats/lines.py``) and how it becomes known: every file in
-the folders of the package `ekfslam.data.readers` is looked at, and a folder of one's own may be one of them. The
-command line finds the reader if its file is put into ``ekfslam/data/readers`` itself.
+It shows a reader (a file with a `Reader`, see ``formats/lines.py``) and its registration: readers are all files in the
+folders of the package `ekfslam.data.readers`, to which you can add a folder. The command line finds the reader if its
+file is in ``ekfslam/data/readers`` itself.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""A sensor of one's own: range, bearing and elevation of landmarks, as of a radar or a laser scanner.
+"""Your own sensor: range, bearing and elevation of landmarks, as of a radar or a laser scanner.
 
-One learns what the filter asks of a sensor (`ekfslam.models.sensors.base.Sensor`): rows with their variances, ``h(q)``,
+It shows what the filter needs of a sensor (`ekfslam.models.sensors.base.Sensor`): rows with their variances, ``h(q)``,
 its Jacobian and its inverse; and how to tell from NEES over some drives whether the covariance is true.
 """
 
