@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ekfslam.config import FilterConfig
 from ekfslam.errors import InnovationError
 from ekfslam.filters import dormant
 from ekfslam.filters.conditional import ConditionalGaussian
@@ -291,7 +292,8 @@ def test_a_landmark_moves_from_its_third_observation_on_if_its_evidence_is_large
     table = LandmarkTable(dimension=3, extra=0)
     table.append(id=[1, 2, 3, 4], position_m=np.zeros((4, 3)), observations=[2, 3, 9, 3])
     along, information = np.array([50.0, -50.0, 50.0, 1.0]), np.full(4, 25.0)
-    verdict = moves_along(table, np.arange(4), along, information, np.full(4, 100.0), 25.0, 3.0, 0.05)
+    config = FilterConfig(moving_sigma=3.0, moving_share=0.05)
+    verdict = moves_along(table, np.arange(4), (along, information), np.full(4, 100.0), 25.0, config)
     assert verdict.tolist() == [False, True, True, False]
     # Gross outliers count as at the gate: half of what they show.
     np.testing.assert_allclose(table.evidence, np.column_stack([0.5 * along, information]))

@@ -1,12 +1,10 @@
 """Coordinates in which a correction acts on landmarks: eq. (7'), the image in the last updated camera.
 
-An error of a landmark seen once is Gaussian in the image (u, v, disparity) of the camera that saw it. In world it is
-not: depth is the inverse of a disparity. Image coordinates are linear in (x/z, y/z, 1/z), which serve here instead: so
-intrinsics do not matter, and one camera alone has them, too. The camera must be one whose pose is updated already. That
-of the prediction turns by degrees in the update, and images are not linear in that.
-
-Sources: Castellanos, Martinez-Cantin, Tardos, Neira, "Robocentric map joining", RAS 2007 (a clone of the last pose);
-Civera, Davison, Montiel, "Inverse depth parametrization for monocular SLAM", T-RO 2008.
+The error of a landmark seen once is Gaussian in the image (u, v, disparity), not in world. (x/z, y/z, 1/z), linear in
+that image, needs no intrinsics and no second camera. The camera must belong to an updated pose: a predicted one turns
+by degrees in the update, and images are not linear in that. Sources: Castellanos, Martinez-Cantin, Tardos, Neira,
+"Robocentric map joining", RAS 2007 (a clone of the last pose); Civera, Davison, Montiel, "Inverse depth
+parametrization for monocular SLAM", T-RO 2008.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from ekfslam.models.blocks import Values
 from ekfslam.models.model import Model
 from ekfslam.models.sensors.stereo import Rig
 
-# A landmark is beside the camera where a ray is this much longer across than along the optical axis.
+# Largest ratio of distances across and along the optical axis for image coordinates.
 _MOST_OBLIQUE = 3.0
 # Largest factor by which a correction may change a disparity.
 _LARGEST_FACTOR = 4.0
@@ -31,11 +29,11 @@ _LARGEST_FACTOR = 4.0
 
 @dataclass(frozen=True)
 class Change:
-    """``d_i+ = M_i d_i + B_i x``: landmark errors after a correction by those before, and by some of the body.
+    """Landmark errors after a correction, ``d_i+ = M_i d_i + B_i x``.
 
     Args:
-        slot: (n,) the landmarks, ascending.
-        columns: (c,) of the body.
+        slot: (n,) slots of the landmarks, ascending.
+        columns: (c,) body columns of x.
         B: (n, 3, c).
         M: (n, 3, 3); None is the identity.
     """
@@ -53,11 +51,11 @@ class Change:
 
 @dataclass(frozen=True)
 class View:
-    """Landmarks as the camera has them.
+    """Landmarks in the camera frame.
 
     Args:
-        q: (n, 3) in its frame.
-        q_linear, R_linear: (n, 3), (3, 3) the same points, and the rotation from world, where derivatives are taken.
+        q: (n, 3) points.
+        q_linear, R_linear: (n, 3), (3, 3) points and rotation from world at which derivatives are taken.
         by_columns: (6, c) error of the camera's pose by columns of the body, ``dq = [I, -q^] by_columns x``.
     """
 
@@ -69,15 +67,15 @@ class View:
 
 @dataclass(frozen=True)
 class CameraCoordinates:
-    """Landmarks by their images in the camera of a pose in the state.
+    """Image coordinates of landmarks in the camera of a pose in the state.
 
-    Landmarks behind or beside the camera, those without disparity, and those whose disparity a correction would change
-    by too large a factor count by their positions (x, y, z) in the camera frame instead.
+    A landmark counts by its position (x, y, z) in the camera frame instead if it is behind the camera, far off its axis
+    or without disparity, or if a correction would change its disparity by too large a factor.
 
     Args:
-        model: Of the filter.
-        pose: Name of the pose's block: of the last updated pose.
-        min_depth_m: What is nearer is behind the camera.
+        model: Model of the filter.
+        pose: Name of the pose's block.
+        min_depth_m: Depth below which a landmark is behind the camera.
     """
 
     model: Model
@@ -85,7 +83,7 @@ class CameraCoordinates:
     min_depth_m: float
 
     def view(self, values: Values, positions_m: Array, T_linear: Array, linear_positions_m: Array) -> View:
-        """Landmarks (n, 3) in world from the camera, at blocks; derivatives are of another pose and of others (FEJ)."""
+        """Return the view of landmarks (n, 3) in world; derivatives are at T_linear and other positions (FEJ)."""
         calibration, T_cam_imu = self.model.observer.calibration, self._T_cam_imu(values)
         by_columns = np.asarray(se3.adjoint(T_cam_imu), dtype=float)
         if calibration is not None:
@@ -97,15 +95,12 @@ class CameraCoordinates:
         return View(q, q_linear, T_cam_imu[:3, :3] @ T_linear[:3, :3], by_columns)
 
     def retract(self, before: View, after: Values, x: Array, d: Array) -> tuple[Array, BoolArray]:
-        """Landmarks ``m+`` (n, 3) of eq. (7') after a correction of blocks ``x`` (seen,) and landmarks d (n, 3).
+        """Return ``m+`` (n, 3) of eq. (7'), and whether (n,) each landmark counts by its image.
 
         Args:
-            before: The view before it, linear where it is.
-            after: Blocks after it.
-            x, d: The correction.
-
-        Returns:
-            Also whether (n,) a landmark counts by its image.
+            before: View before the correction, with derivatives at the estimate.
+            after: Blocks after the correction.
+            x, d: (seen,), (n, 3) correction of the blocks and of the landmarks.
         """
         q, xi = before.q, before.by_columns @ x[self.columns]
         step = xi[:3] + q @ se3.skew(xi[3:]).T + d @ before.R_linear.T
@@ -113,14 +108,7 @@ class CameraCoordinates:
         return se3.apply(se3.inverse(self._T_cam_imu(after) @ after[self.pose]), q_after), in_image
 
     def change(self, slot: IntArray, before: View, after: View, in_image: BoolArray, turned: Array) -> Change:
-        """``M`` and ``B`` of eq. (7').
-
-        Args:
-            slot: (n,) the landmarks.
-            before, after: The views before and after a correction.
-            in_image: (n,) which landmarks count by their images.
-            turned: (6, 6) how the error of the pose before becomes that after.
-        """
+        """Return ``M`` and ``B`` of eq. (7') from the views before and after; ``turned`` is its D_p (6, 6)."""
         by_after = after.by_columns.copy()
         by_after[:, :6] = by_after[:, :6] @ turned
         B, M = kernels.change_by_image(
@@ -140,7 +128,7 @@ class CameraCoordinates:
         return np.concatenate([columns, layout[calibration.name].start + calibration.extrinsic])
 
     def _T_cam_imu(self, values: Values) -> Array:
-        """(4, 4) extrinsics as calibrated."""
+        """Return the estimated extrinsics (4, 4)."""
         return self.model.observer.sensor_at(self.model.observer.parameters(values)).T_cam_imu
 
     def _is_in_image(self, q: Array) -> BoolArray:

@@ -1,4 +1,4 @@
-"""The correction of one frame: gates, eq. (6), and the iterated update."""
+"""The correction of one frame by its known landmarks: gates, eq. (6), and the iterated update."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.arrays import Array, IntArray
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate, Mean
 from ekfslam.filters.gaussian import Conditioned, Projection, Rows, Solution
@@ -26,13 +26,13 @@ class Correction:
 
     Args:
         solution: Eq. (6) solved, to be applied to the covariance; None: nothing was accepted.
-        done: Correction of the mean, NIS and ``log det S`` of what was accepted.
-        dof: Its degrees of freedom.
-        verdict: (k,) on each landmark: `ACCEPTED` or a reason code.
-        slot, measured, variance: (j,), (j, d), (j, d) of the accepted ones.
-        linear: Where they were linearised.
+        done: Correction of the mean, NIS and ``log det S`` of the accepted rows.
+        dof: Degrees of freedom of the NIS.
+        verdict: (k,) `ACCEPTED` or a reason code for each landmark.
+        slot, measured, variance: (j,), (j, d), (j, d) of the accepted landmarks.
+        linear: Mean at which the accepted rows were linearised.
         coordinates: (body,) coordinates there.
-        innovations: Those of the accepted ones, of the first iteration.
+        innovations: Innovations of the accepted rows in the first iteration.
     """
 
     solution: Solution | None
@@ -48,13 +48,13 @@ class Correction:
 
 
 def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correction:
-    """Solve eq. (6) with its gates, for landmarks at ``slot`` (k,) with rows (k, d).
+    """Solve eq. (6) behind its gates, for landmarks at ``slot`` (k,) with rows (k, d).
 
     A landmark must agree with the prediction, and with the prediction as corrected by all *other* landmarks of the
     frame: the first gate is weak while the pose itself is uncertain, the second is not. The second gate rejects
     observations that the joint solution already contains, so they are removed from it.
 
-    The estimate stays, but for the evidence of motion in its table. The caller applies solution and correction.
+    Of the estimate, only the evidence of motion in its table changes. The caller applies the correction.
 
     Raises:
         InnovationError: The innovation covariance is not positive definite.
@@ -74,12 +74,11 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     taken = verdict == ACCEPTED
     if not taken.all():
         rows, measured = rows.only(taken), measured[taken]
-    done, coordinates = Conditioned(np.zeros(e.gaussian.body + 3 * e.gaussian.landmarks)), e.coordinates
-    if solution is not None:
-        done = solution.done
-        if e.config.iterations > 1 and taken.any():
-            solution, at, coordinates = _iterated(e, at, frame, solution, rows.slot, measured)
-            done = replace(done, correction=solution.done.correction)
+    coordinates = e.coordinates
+    done = Conditioned(np.zeros(e.gaussian.body + 3 * e.gaussian.landmarks)) if solution is None else solution.done
+    if solution is not None and e.config.iterations > 1 and taken.any():
+        solution, at, coordinates = _iterated(e, at, frame, solution, rows.slot, measured)
+        done = replace(done, correction=solution.done.correction)
     return Correction(
         solution, done, rows.residual.size, verdict, rows.slot, measured, rows.variance, at, coordinates, innovations
     )
@@ -88,7 +87,7 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
 def _gate_jointly(
     e: Estimate, frame: int, tried: Projection, seen: Seen, some: IntArray, verdict: IntArray, gate: float
 ) -> tuple[Solution, FrameInnovations]:
-    """Solve eq. (6) for rows (j), and remove those that others reject; the verdict (k,) on these is written."""
+    """Solve eq. (6) for rows (j), and remove those that others reject; write their verdicts (k,)."""
     S = tried.variances + gates.diagonal(tried.rows.variance)
     solution = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot])
     accepted, left = tried.rows, tried.rows.corrected(*parts(e, solution.done.correction))
@@ -104,15 +103,13 @@ def _gate_jointly(
 def _gate_alone(
     e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArray, gate: float
 ) -> tuple[IntArray, Projection]:
-    """Return which landmarks (j,) of the rows pass the gate by themselves, and their rows seen through the covariance.
-
-    The verdict (k,) on the others is written.
-    """
+    """Return the landmarks (j,) that pass the gate by themselves, with ``H P H^T``; write verdicts on others."""
     some = np.flatnonzero(verdict == ACCEPTED)
     rows = rows if len(some) == len(verdict) else rows.only(some)
     tried = e.gaussian.project(rows, frame, e.ids[rows.slot])
     # So near to the camera plane that its image may be anywhere: linearised, it would spoil the whole frame.
-    blurred = np.any(_own_variance(tried) > _MOST_BLURRED * tried.rows.variance, axis=1)
+    own = np.diagonal(tried.variances, axis1=1, axis2=2) + tried.rows.variance
+    blurred = np.any(own > _MOST_BLURRED * tried.rows.variance, axis=1)
     if blurred.any():
         verdict[some[blurred]] = BEHIND_CAMERA
         some, tried = some[~blurred], tried.only(np.flatnonzero(~blurred))
@@ -122,7 +119,7 @@ def _gate_alone(
     verdict[some[~inside]] = GATE
     if _judges_motion(e) and not e.model.process.estimates_velocity:
         evidence = gates.evidence_alone(tried.rows, S, _motion(e, seen, some))
-        moving = _moving(e, tried.rows.slot, evidence, squares, gate)
+        moving = gates.moves_along(e.table, tried.rows.slot, evidence, squares, gate, e.config)
         verdict[some[moving]] = MOVING
         inside &= ~moving
     if not inside.all():
@@ -130,22 +127,10 @@ def _gate_alone(
     return some, tried
 
 
-def _own_variance(tried: Projection) -> Array:
-    """Return the variances (k, d) of the innovations."""
-    return np.diagonal(tried.variances, axis1=1, axis2=2) + tried.rows.variance
-
-
 def _gate_by_others(
     e: Estimate, solution: Solution, left: Rows, S: Array, seen: Seen, some: IntArray, gate: float
 ) -> IntArray:
-    """Return verdicts (j,) on landmarks by all others of the frame.
-
-    Args:
-        solution: Of eq. (6) for the rows (j).
-        left: The rows with the residuals that the correction leaves.
-        S: (j, d, d) of each by itself, before the conditioning.
-        seen: What all landmarks (k,) look like, of which these are ``some`` (j,).
-    """
+    """Return verdicts (j,) on ``some`` landmarks by all others, given the residuals ``left`` and prior S (j, d, d)."""
     verdict, judges_motion = np.full(len(some), ACCEPTED), _judges_motion(e) and e.model.process.estimates_velocity
     if not (np.isfinite(gate) or judges_motion):
         return verdict
@@ -160,7 +145,7 @@ def _gate_by_others(
         if judges_motion:
             # Noisy velocities would accuse all tracks of a frame alike: only what others leave counts.
             evidence = gates.evidence_given_others(left, C, _motion(e, seen, some))
-            verdict[_moving(e, left.slot, evidence, squares, gate) & judged] = MOVING
+            verdict[gates.moves_along(e.table, left.slot, evidence, squares, gate, e.config) & judged] = MOVING
     return verdict
 
 
@@ -174,15 +159,10 @@ def _motion(e: Estimate, seen: Seen, some: IntArray) -> Array:
     return seen.H_m[some] @ (e.T_imu_world[:3, :3].T @ (e.imu_twist[:3] * e.motion.tau_s))
 
 
-def _moving(e: Estimate, slot: IntArray, evidence: tuple[Array, Array], squares: Array, gate: float) -> BoolArray:
-    return gates.moves_along(e.table, slot, *evidence, squares, gate, e.config.moving_sigma, e.config.moving_share)
-
-
 def _corrected_twist(e: Estimate, frame: int, tried: Projection) -> Array:
-    """Return the velocity (6,) at this frame as corrected by its observations.
+    """Return the velocity (6,) at this frame as corrected by its observations, for eq. (9).
 
-    A time offset counts in proportion to it. With the measured one, whose noise the innovations show, too, it would
-    come out far too small.
+    With the measured velocity a time offset would be estimated far too small: its noise is in the innovations, too.
     """
     correction = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot]).done.correction
     after = e.model.retract(e.values, correction)
@@ -192,14 +172,11 @@ def _corrected_twist(e: Estimate, frame: int, tried: Projection) -> Array:
 def _iterated(
     e: Estimate, at: Mean, frame: int, solution: Solution, slot: IntArray, measured: Array
 ) -> tuple[Solution, Mean, Array]:
-    """Iterate eq. (6) by Gauss-Newton: linearise again at the corrected mean, always from the same prior.
+    """Iterate eq. (6) by Gauss-Newton; return the last solution, with the mean and the coordinates of its rows.
 
-    Rows taken at the corrected mean are carried back into the prior's coordinates by the variant's derivative D,
-    ``H_k D_k``, and the residual becomes ``r_k + H_k D_k (xi, d)_k``. Source: Bell and Cathey, "The iterated Kalman
-    filter update as a Gauss-Newton method", IEEE TAC 1993.
-
-    Returns:
-        The last solution; the mean and the coordinates (body,) at which it was linearised.
+    Rows are linearised again at the corrected mean, and carried back into the prior's coordinates by the variant's
+    derivative D: ``H_k D_k`` with the residual ``r_k + H_k D_k (xi, d)_k``. Source: Bell and Cathey, "The iterated
+    Kalman filter update as a Gauss-Newton method", IEEE TAC 1993.
     """
     linear, coordinates = at, e.coordinates
     for _ in range(e.config.iterations - 1):

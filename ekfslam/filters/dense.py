@@ -1,7 +1,4 @@
-"""The dense form of the joint covariance: one matrix P. Readable, the oracle of the other form, fast for small frames.
-
-Every verb equals its naive form ``F P F^T + Q``, ``P - K S K^T`` and so on to rounding.
-"""
+"""The dense form of the joint covariance: one matrix P. Readable, the oracle of the other form."""
 
 from __future__ import annotations
 
@@ -35,8 +32,7 @@ class DenseProjection(Projection):
         return self.HPH.reshape(k, d, k, d)[own, :, own, :]
 
     def only(self, which: IntArray) -> DenseProjection:
-        d = self.rows.residual.shape[1]
-        row = (d * which[:, None] + np.arange(d)).ravel()
+        row = _columns(which, self.rows.residual.shape[1])
         return DenseProjection(self.rows.only(which), self.HP[row], self.HPH[np.ix_(row, row)])
 
 
@@ -44,19 +40,19 @@ class DenseProjection(Projection):
 class DenseSolution(Solution):
     """Eq. (6) with ``S = L L^T``.
 
-    Rows are taken out by projection: what is left of the whitened rows is orthogonal to ``A = L^-1 E`` of those
-    rows E, because ``S_kk^-1 = L^-T (I - A (A^T A)^-1 A^T) L^-1``.
+    Rows E are removed by projection of the whitened rows to those orthogonal to ``A = L^-1 E``, because
+    ``S_kk^-1 = L^-T (I - A (A^T A)^-1 A^T) L^-1``.
 
     Args:
-        Y: (body+3n, m) ``Y^T = (L^-1 H P)^T``, by whose square P shrinks.
-        L: (m, m), of which only the lower triangle counts.
+        Y: (body+3n, m) ``(L^-1 H P)^T``, with ``P - Y Y^T`` the covariance afterwards.
+        L: (m, m) in the lower triangle; the upper one is not used.
         white: (m,) ``L^-1 r``.
         log_det: ``log det S``.
-        shape: (k, d) of the rows; one row each where they are of the body alone.
+        shape: (k, d) of the rows; d is 1 for rows of the body alone.
         variance: (m,).
-        body, considered: Of the covariance.
+        considered: Columns of the mean that stay.
         left: (k,) which landmarks are left; None: all.
-        Q: (m, r) orthonormal basis of what has been taken out.
+        Q: (m, r) orthonormal basis of the removed rows.
     """
 
     Y: Array
@@ -65,35 +61,32 @@ class DenseSolution(Solution):
     log_det: float
     shape: tuple[int, int]
     variance: Array
-    body: int
-    considered: int
+    considered: slice
     left: BoolArray | None = None
     Q: Array | None = None
 
     @cached_property
     def done(self) -> Conditioned:
         correction = self.Y @ self.white
-        correction[self.body - self.considered : self.body] = 0.0
+        correction[self.considered] = 0.0
         return Conditioned(correction, float(self.white @ self.white), self.log_det)
 
     def given_others(self, which: IntArray) -> Array:
         k, d = self.shape
-        if 3 * len(which) < k:
-            E = np.zeros((k * d, len(which) * d))
-            E[(d * which[:, None] + np.arange(d)).ravel(), np.arange(E.shape[1])] = 1.0
-            columns = blas.dtrsm(1.0, self.L, E, lower=1).T.reshape(len(which), d, k * d)
-        else:
-            inverse, _ = lapack.dtrtri(self.L, lower=1)
-            columns = np.tril(inverse).T.reshape(k, d, k * d)[which]
+        columns = self._whitened(which).T.reshape(len(which), d, k * d)
         std = np.sqrt(self.variance.reshape(k, d)[which])
         return (columns @ columns.swapaxes(1, 2)) * (std[:, :, None] * std[:, None, :])
 
+    def _whitened(self, which: IntArray) -> Array:
+        """Return ``L^-1 E`` (m, j d) for unit vectors E of the rows of landmarks (j,)."""
+        rows = _columns(which, self.shape[1])
+        E = np.zeros((len(self.L), len(rows)))
+        E[rows, np.arange(len(rows))] = 1.0
+        return blas.dtrsm(1.0, self.L, E, lower=1)
+
     def without(self, out: BoolArray) -> DenseSolution:
         assert self.Q is None
-        d, out_rows = self.shape[1], np.repeat(out, self.shape[1])
-        E = np.zeros((len(out_rows), d * int(out.sum())))
-        E[out_rows, np.arange(E.shape[1])] = 1.0
-        Q, R = np.linalg.qr(blas.dtrsm(1.0, self.L, E, lower=1))
+        Q, R = np.linalg.qr(self._whitened(np.flatnonzero(out)))
         white = self.white - Q @ (Q.T @ self.white)
         log_det = self.log_det + 2.0 * float(np.log(np.abs(R.diagonal())).sum())
         if out.all():  # so that rounding is not left over
@@ -111,12 +104,7 @@ class DenseSolution(Solution):
 
 
 class DenseGaussian(Gaussian):
-    """Dense covariance ``P`` (body+3n, body+3n).
-
-    Args:
-        body: (body, body) covariance before there are landmarks.
-        seen: Leading body columns that observations depend on.
-    """
+    """Dense covariance ``P``, before there are landmarks that of the ``body`` (body, body)."""
 
     def __init__(self, body: Array, seen: int) -> None:
         self._P, self.body, self.seen = np.array(body, dtype=float), len(body), seen
@@ -138,6 +126,10 @@ class DenseGaussian(Gaussian):
     def body_covariance(self) -> Array:
         return self._P[: self.body, : self.body].copy()
 
+    @property
+    def _considered(self) -> slice:
+        return slice(self.body - self.considered, self.body)
+
     def landmark_blocks(self, slot: IntArray | None = None) -> Array:
         b, (row, column) = self.body, self._P.strides
         blocks = np.lib.stride_tricks.as_strided(
@@ -150,7 +142,7 @@ class DenseGaussian(Gaussian):
         return self._P[np.ix_(columns, columns)]
 
     def _columns(self, slot: IntArray) -> IntArray:
-        return (self.body + 3 * slot[:, None] + np.arange(3)).ravel()
+        return self.body + _columns(slot, 3)
 
     def consider(self, columns: int) -> int:
         start = self.body
@@ -205,11 +197,11 @@ class DenseGaussian(Gaussian):
         white = blas.dtrsm(1.0, L, residual.reshape(-1, 1), lower=1)[:, 0]
         log_det = 2.0 * float(np.log(L.diagonal()).sum())
         k, d = residual.shape
-        return DenseSolution(Y, L, white, log_det, (k, d), variance.ravel(), self.body, self.considered)
+        return DenseSolution(Y, L, white, log_det, (k, d), variance.ravel(), self._considered)
 
     def apply(self, solution: Solution) -> None:
         assert isinstance(solution, DenseSolution)
-        at = slice(self.body - self.considered, self.body)
+        at = self._considered
         own = self._P[at, at].copy()
         add_square(self._P, solution.Y, -1.0)
         self._P[at, at] = own
@@ -229,10 +221,8 @@ class DenseGaussian(Gaussian):
         self._P = P
 
     def transform_landmarks(self, slot: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
-        if len(slot) == self.landmarks:
-            transform_part(self._P, slice(self.body, None), M, B, columns)
-        else:
-            transform_part(self._P, self._columns(slot), M, B, columns)
+        own = slice(self.body, None) if len(slot) == self.landmarks else self._columns(slot)
+        transform_part(self._P, own, M, B, columns)
 
     def transform_body(self, at: slice, A: Array) -> None:
         transform(self._P, at, A)
@@ -248,8 +238,13 @@ class DenseGaussian(Gaussian):
         self._P = np.ascontiguousarray(P, dtype=float)
 
 
+def _columns(which: IntArray, size: int) -> IntArray:
+    """Return the columns (n size,) of blocks (n,) of one size."""
+    return (size * which[:, None] + np.arange(size)).ravel()
+
+
 def transform(P: Array, at: slice, A: Array) -> None:
-    """``x_at <- A x_at`` in place, for symmetric P."""
+    """Re-express columns of symmetric P in place: ``x_at <- A x_at``."""
     P[at] = A @ P[at]
     P[:, at] = P[at].T
     P_xx = A @ P[at, at]
@@ -257,7 +252,7 @@ def transform(P: Array, at: slice, A: Array) -> None:
 
 
 def transform_part(P: Array, own: IntArray | slice, M: Array | None, B: Array, columns: IntArray) -> None:
-    """``d_i <- M_i d_i + B_i x`` in place, for symmetric P: d_i (n of them) has the columns ``own`` (3n,)."""
+    """Re-express the columns ``own`` (3n,) of symmetric P in place: ``d_i <- M_i d_i + B_i x``."""
     n, B = len(B), B.reshape(-1, len(columns))
     if M is None and isinstance(own, slice):
         # d+ = d + B a, hence P+ = P + B Z^T + Z B^T with Z = P_a + B P_aa / 2.
@@ -276,7 +271,11 @@ def transform_part(P: Array, own: IntArray | slice, M: Array | None, B: Array, c
 
 
 def add_square(P: Array, A: Array, sign: float) -> None:
-    """``P += sign A A^T`` in place, for symmetric C-ordered P (n, n) and A (n, k); symmetric to the last bit."""
+    """Add ``sign A A^T`` to symmetric C-ordered P in place, which stays symmetric to the last bit; A is (n, k).
+
+    Raises:
+        ValueError: P is not C-contiguous: BLAS would update a copy of it.
+    """
     _require_order(P)
     # NumPy's row-major P is LAPACK's column-major P^T: the upper triangle there is the lower one here.
     blas.dsyrk(sign, A, beta=1.0, c=P.T, lower=0, overwrite_c=1)
@@ -284,7 +283,7 @@ def add_square(P: Array, A: Array, sign: float) -> None:
 
 
 def add_product(P: Array, A: Array, B: Array) -> None:
-    """``P += A B^T + B A^T`` in place, for symmetric C-ordered P (n, n), A and B (n, k)."""
+    """Add ``A B^T + B A^T`` to P, see `add_square`; A and B are (n, k)."""
     _require_order(P)
     blas.dsyr2k(1.0, A, B, beta=1.0, c=P.T, lower=0, overwrite_c=1)
     _mirror(P)

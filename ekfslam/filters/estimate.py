@@ -27,9 +27,9 @@ class Mean:
     """Mean at which observations are linearised.
 
     Args:
-        values: Of the blocks.
+        values: Values of the blocks.
         position_m: (n, 3) landmarks.
-        imu_twist: (6,) velocity of the IMU at the image, by which a time offset counts.
+        imu_twist: (6,) velocity of the IMU at the image, for a time offset, eq. (9).
     """
 
     values: dict[str, Array]
@@ -39,13 +39,13 @@ class Mean:
 
 @dataclass(frozen=True)
 class Motion:
-    """The last prediction; before the first one it leads nowhere.
+    """The last prediction, eq. (1); before the first one, an empty one.
 
     Args:
-        T_departed: (4, 4) ``T_imu_world`` from which it led.
-        T_predicted, T_predicted_before: (4, 4) ``T_imu_world`` to which it and the one before led.
-        interval: Its inputs.
-        way_m: How far it led.
+        T_departed: (4, 4) ``T_imu_world`` before it.
+        T_predicted, T_predicted_before: (4, 4) predicted ``T_imu_world`` of this frame and of the one before.
+        interval: Inputs.
+        way_m: Length of the way.
         imu_twist_before: (6,) velocity of the IMU at the image before.
     """
 
@@ -64,7 +64,7 @@ class Motion:
 
     @property
     def tau_s(self) -> float:
-        """Duration."""
+        """Duration of the interval."""
         return self.interval.tau_s
 
 
@@ -73,23 +73,20 @@ class Estimate:
 
     Args:
         model: Blocks, sensor and noise.
-        config: Variant, gate, limits, and the form of the covariance (``auto`` counts as ``dense``).
+        config: Settings of the filter; the form ``auto`` of the covariance means ``dense``.
 
     Raises:
         ConfigError: Landmarks in image coordinates, but no clone of the last pose in the model.
 
     Attributes:
-        model, config, variant: Settings.
         values: Estimate of every state block by name.
-        coordinates: (body,) of the blocks, as in the log.
-        imu_twist: (6,) velocity of the IMU at the last frame, by which a time offset counts.
+        coordinates: (body,) coordinates of the blocks, as in the log.
+        imu_twist: (6,) velocity of the IMU at the last frame, for a time offset, eq. (9).
         table: The active landmarks, in the order of their blocks in P.
-        gaussian: The covariance.
-        motion: The last prediction.
         step: Number of predictions so far.
-        updated_pose: Block of the pose that was updated last: the pose itself between an update and the next
-            prediction, then its clone. None: the observations of the frame before have not updated it.
-        cameras: Coordinates of landmarks in the cameras of the pose and of its clone, eq. (7'); none with ``xyz``.
+        updated_pose: Block of the last updated pose: the pose itself between an update and the next prediction, then
+            its clone. None: the observations of the frame before have not updated it.
+        cameras: Image coordinates in the cameras of the pose and of its clone, eq. (7'); none with ``xyz``.
     """
 
     def __init__(self, model: Model, config: FilterConfig) -> None:
@@ -111,11 +108,11 @@ class Estimate:
 
     @property
     def mean(self) -> Mean:
-        """The mean as it is."""
+        """The present mean."""
         return Mean(self.values, self.table.position_m, self.imu_twist)
 
     def without_landmarks(self) -> Estimate:
-        """Return the blocks as an estimate of their own, to look ahead with `ekfslam.filters.prediction.predict`."""
+        """Return an estimate of the blocks alone, to look ahead with `ekfslam.filters.prediction.predict`."""
         alone, body = Estimate(self.model, self.config), self.model.layout.body
         alone.values, alone.coordinates, alone.imu_twist = self.values, self.coordinates, self.imu_twist
         alone.motion, alone.step, alone.updated_pose = self.motion, self.step, self.updated_pose
@@ -126,8 +123,8 @@ class Estimate:
     def P(self) -> Array:
         """(b+3n, b+3n) covariance of the blocks, in the columns of ``model.layout``, and of ``(d_1, ..., d_n)``.
 
-        ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``. The pose has the first six columns. Columns that are only
-        considered (`ekfslam.filters.references`) stand between blocks and landmarks where a run asks for them.
+        The pose has the first six columns. Considered columns, if any (`ekfslam.filters.references`), stand between
+        blocks and landmarks.
         """
         return self.gaussian.P
 
@@ -137,12 +134,12 @@ class Estimate:
 
     @property
     def sensor(self) -> Sensor:
-        """Sensor of the landmarks, with the calibration as given."""
+        """Sensor of the landmarks, with the given calibration."""
         return self.model.sensor
 
     @property
     def T_imu_world(self) -> Array:
-        """(4, 4) estimate of the report's inverse pose."""
+        """(4, 4) estimated inverse pose of the IMU, as in the report."""
         return self.values["pose"]
 
     @property
@@ -172,11 +169,11 @@ class Estimate:
 
     @property
     def curved(self) -> Array:
-        """(v,) values of blocks whose value is no sum of corrections, as in the log."""
+        """(v,) values of the curved blocks, as in the log."""
         return np.concatenate([np.empty(0), *(self.values[block.name] for block in self.model.layout.curved)])
 
     def covariance_of(self, ids: IntArray) -> Array:
-        """Joint covariance (b+3k, b+3k) of the blocks and of some active landmarks.
+        """Return the joint covariance (b+3k, b+3k) of the blocks and of some active landmarks.
 
         Raises:
             KeyError: An id is not active.

@@ -1,8 +1,8 @@
 """The joint Gaussian of body and landmarks, and the verbs that change it: nothing else writes the covariance.
 
 Two forms have these verbs, and equal each other to rounding: `ekfslam.filters.dense` keeps P as one matrix and is the
-readable one, `ekfslam.filters.conditional` keeps landmarks given what they depend on and is linear in their number.
-Body columns come first (see `ekfslam.models.blocks.Layout`), then three columns a landmark.
+readable one, `ekfslam.filters.conditional` is linear in the number of landmarks. Body columns come first (see
+`ekfslam.models.blocks.Layout`), then three columns a landmark. ``frame`` and ``ids`` serve error messages alone.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ class Rows:
 
     Args:
         slot: (k,) place of each landmark in the state.
-        H_x: (k, d, seen) by the leading body columns.
-        H_m: (k, d, 3) by the landmark.
+        H_x, H_m: (k, d, seen), (k, d, 3) derivatives by the leading body columns and by the landmark, eq. (4).
         residual, variance: (k, d).
     """
 
@@ -42,13 +41,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Conditioned:
-    """Effect of conditioning on rows.
-
-    Args:
-        correction: (body+3n,) of the mean.
-        nis: Normalised innovation squared.
-        log_det: ``log det S``.
-    """
+    """Effect of conditioning on rows: correction (body+3n,) of the mean, NIS and ``log det S``."""
 
     correction: Array
     nis: float = 0.0
@@ -56,11 +49,7 @@ class Conditioned:
 
 
 class Projection(ABC):
-    """Rows seen through the covariance: ``H P H^T`` and what its form needs besides.
-
-    Attributes:
-        rows: The k rows.
-    """
+    """Rows of k landmarks, projected through the covariance: ``H P H^T``, in the form of the Gaussian."""
 
     rows: Rows
 
@@ -79,12 +68,11 @@ class Solution(ABC):
 
     @property
     @abstractmethod
-    def done(self) -> Conditioned:
-        """Effect of conditioning on the rows."""
+    def done(self) -> Conditioned: ...
 
     @abstractmethod
     def given_others(self, which: IntArray) -> Array:
-        """``V^1/2 (S^-1)_ii V^1/2`` (j, d, d) of the rows of some landmarks (j,), in their standard deviations.
+        """Return ``V^1/2 (S^-1)_ii V^1/2`` (j, d, d) for some landmarks (j,).
 
         The innovation of landmark i given those of all *others* has covariance ``((S^-1)_ii)^-1``.
         """
@@ -95,16 +83,16 @@ class Solution(ABC):
 
     @abstractmethod
     def information(self, J: Array) -> Array:
-        """``J^T S^-1 J`` (c, c) for J (j, d, c) of the j landmarks that are left."""
+        """Return ``J^T S^-1 J`` (c, c) for J (j, d, c) of the j landmarks that are left."""
 
 
 class Gaussian(ABC):
     """Covariance of body columns and landmarks.
 
     Attributes:
-        body: Number of columns before those of landmarks.
-        seen: Leading body columns that observations depend on.
-        considered: How many body columns, at their end, are *considered*: see `consider`.
+        body: Number of body columns.
+        seen: Number of leading body columns that observations depend on.
+        considered: Number of *considered* columns at the end of the body, see `consider`.
     """
 
     body: int
@@ -114,7 +102,7 @@ class Gaussian(ABC):
     @property
     @abstractmethod
     def P(self) -> Array:
-        """(body+3n, body+3n). Not to be written to."""
+        """(body+3n, body+3n), read only."""
 
     @property
     @abstractmethod
@@ -137,30 +125,27 @@ class Gaussian(ABC):
 
     @abstractmethod
     def covariance_of(self, slot: IntArray) -> Array:
-        """(body+3k, body+3k) of the body and of the landmarks at the slots (k,)."""
+        """Return the covariance (body+3k, body+3k) of the body and of the landmarks at the slots (k,)."""
 
     @abstractmethod
     def consider(self, columns: int) -> int:
-        """Add columns to the end of the body, certain zeros at first, of what is considered but not estimated.
+        """Add columns to the end of the body that are considered but not estimated, zero at first; return the first.
 
-        Conditioning changes their cross-covariances, and leaves their own covariance and their mean as they are
-        (Schmidt, "Application of state-space methods to navigation problems", 1966).
-
-        Returns:
-            The first of them.
+        Conditioning changes only their cross-covariances, not their own covariance and mean (Schmidt, "Application of
+        state-space methods to navigation problems", 1966).
         """
 
     @abstractmethod
     def clone(self, source: slice, to: slice) -> None:
-        """Considered columns take the place of body columns: from now on they are what these are now."""
+        """Copy body columns into considered ones."""
 
     @abstractmethod
     def propagate(self, Phi: Array, Q: Array) -> None:
-        """``P <- F P F^T + Q`` with F = Phi (b, b) on the body and identity on what is considered and on landmarks."""
+        """Propagate, eq. (2): ``P <- F P F^T + Q``, F = Phi (b, b) on estimated body columns and I on all others."""
 
     @abstractmethod
     def project(self, rows: Rows, frame: int, ids: IntArray) -> Projection:
-        """Return the rows seen through P; frame and ids (k,) are for the error message.
+        """Return the rows projected through P.
 
         Raises:
             InnovationError: The variance of some landmark's rows is not positive definite.
@@ -168,7 +153,7 @@ class Gaussian(ABC):
 
     @abstractmethod
     def solve(self, projection: Projection, frame: int, ids: IntArray) -> Solution:
-        """Eq. (6) for projected rows; frame and ids (k,) are for the error message.
+        """Solve eq. (6) for projected rows.
 
         Raises:
             InnovationError: The innovation covariance is not positive definite.
@@ -176,11 +161,11 @@ class Gaussian(ABC):
 
     @abstractmethod
     def solve_body(self, H: Array, residual: Array, variance: Array, frame: int) -> Solution:
-        """Eq. (6) for rows H (k, b) of the body alone, with residuals and variances (k,)."""
+        """Solve eq. (6) for rows H (k, b) of the body alone, with residuals and variances (k,)."""
 
     @abstractmethod
     def apply(self, solution: Solution) -> None:
-        """Condition on the rows of a solution, which must be of the covariance as it is."""
+        """Condition on the rows of a solution of the present covariance."""
 
     @abstractmethod
     def augment(self, G: Array, covariance: Array) -> None:
@@ -188,22 +173,18 @@ class Gaussian(ABC):
 
     @abstractmethod
     def transform_landmarks(self, slot: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
-        """``d_i <- M_i d_i + B_i x``: errors of some landmarks (n,) in other coordinates.
+        """Re-express errors of landmarks at slots (n,), ascending: ``d_i <- M_i d_i + B_i x``.
 
-        Args:
-            slot: (n,) ascending.
-            M: (n, 3, 3); None is the identity.
-            B: (n, 3, c) by some of the body, x.
-            columns: (c,) of x.
+        M is (n, 3, 3), None is the identity; B is (n, 3, c) for the body columns (c,) of x.
         """
 
     @abstractmethod
     def transform_body(self, at: slice, A: Array) -> None:
-        """``x_at <- A x_at`` for some body columns, with invertible A."""
+        """Re-express some body columns, ``x_at <- A x_at`` with invertible A."""
 
     @abstractmethod
     def rest(self, asleep: BoolArray) -> None:
-        """Set which landmarks (n,) are dormant: they are not observed before they wake. P stays unchanged."""
+        """Set which landmarks (n,) are dormant, that is not observed before they wake; P stays unchanged."""
 
     @abstractmethod
     def marginalise(self, stay: BoolArray) -> None:
@@ -211,10 +192,10 @@ class Gaussian(ABC):
 
     @abstractmethod
     def replace(self, P: Array) -> None:
-        """Another covariance of the same body and of other landmarks: when P is put back."""
+        """Replace P by one of the same body and of other landmarks."""
 
     def start_over(self, P: Array) -> None:
-        """Replace P at a map revival: it has no considered columns, whose covariance is lost."""
+        """Replace P, at a map revival, by one without considered columns: these become zero."""
         columns, self.body = self.considered, self.body - self.considered
         self.considered = 0
         self.replace(P)

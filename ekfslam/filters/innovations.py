@@ -1,4 +1,4 @@
-"""Innovations whitened: of each observation by itself, and what all observations of a frame say of the camera.
+"""Whitened innovations: of each observation by itself, and apart from the motion of the camera they agree on.
 
 With S the joint innovation covariance of a frame's accepted rows r, and J their derivative by the pose's error
 (difference rows of eq. (10) included), the motion xi of the camera on which the frame's innovations agree best has
@@ -24,14 +24,7 @@ from ekfslam.filters.result import WhitenedInnovations
 
 @dataclass(frozen=True)
 class FrameInnovations:
-    """Innovations of one frame's k accepted observations of known landmarks; see `WhitenedInnovations`.
-
-    Args:
-        landmark: (k,) row of each landmark in the log.
-        alone, apart: (k, d).
-        score: (6,).
-        information: (6, 6).
-    """
+    """`WhitenedInnovations` of one frame's k accepted observations, with rows of the log (k,) for their landmarks."""
 
     landmark: IntArray
     alone: Array
@@ -47,13 +40,13 @@ class FrameInnovations:
 
 
 def innovations_of(solution: Solution, landmark: IntArray, rows: Rows, S: Array, left: Array) -> FrameInnovations:
-    """Return the innovations of one frame, see the module.
+    """Return the innovations of one frame.
 
     Args:
-        solution: Of eq. (6) for the rows.
+        solution: Solution of eq. (6) for the rows.
         landmark: (k,) row of each landmark in the log.
-        rows: Of the accepted observations, with their innovations.
-        S: (k, d, d) of each by itself, before the conditioning.
+        rows: Accepted rows.
+        S: (k, d, d) innovation covariance of each landmark by itself.
         left: (k, d) residuals that the correction leaves.
     """
     if not len(landmark):
@@ -69,7 +62,7 @@ def innovations_of(solution: Solution, landmark: IntArray, rows: Rows, S: Array,
 
 
 def _inverse(information: Array) -> Array:
-    """Inverse (6, 6) of an information matrix; NaN where it leaves a direction undetermined."""
+    """Return the inverse of an information matrix (6, 6); NaN if it leaves a direction undetermined."""
     std = np.sqrt(np.maximum(np.diagonal(information), np.finfo(float).tiny))
     values, axes = np.linalg.eigh(information / np.outer(std, std))
     if not values[0] > 1e-12:

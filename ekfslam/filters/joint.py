@@ -153,7 +153,7 @@ class JointEKF(Estimate):
         if not found.dof:  # no update; but if every active landmark is new, its image coordinates refer to this pose
             first_step = self.table.first_step[self.table.asleep == 0]
             self.updated_pose = "pose" if len(first_step) and (first_step == self.step).all() else None
-        self.retired.start_afresh(ids[new][started])
+        self.retired.start_again(ids[new][started])
         reason[np.flatnonzero(new)[~started]] = DISPARITY if self._waiting is None else WAITING
         return self._report(frame, ids, reason, split, found)
 

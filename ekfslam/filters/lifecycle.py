@@ -21,8 +21,8 @@ class Marginal:
     """Mean and covariance of all blocks and of some landmarks, given everything in a log.
 
     Args:
-        values: Estimates of blocks; what is not there stays.
-        columns, coordinates: (c,) columns of the body whose coordinates have changed, and what they are now.
+        values: Estimates of the blocks that change.
+        columns, coordinates: (c,) body columns whose coordinates change, and their new coordinates.
         position_m: (n, 3) landmarks.
         P: (body+3n, body+3n) covariance in the order of a filter's state.
     """
@@ -48,9 +48,9 @@ class Retired:
     """Landmarks that have left the state.
 
     Attributes:
-        row_of: Rows in the log of those that may come back, by id.
+        row_of: Rows in the log of landmarks that may come back, by id.
         revived: Ids of retired landmarks that were seen again and came back.
-        reappeared: Ids of retired landmarks that were seen again and started afresh.
+        reappeared: Ids of retired landmarks that were seen again and initialised as new ones.
         moving: Ids of tracks that were found to move; they are not used again.
     """
 
@@ -63,18 +63,11 @@ class Retired:
         self.reappeared: list[int] = []
         self.moving: set[int] = set()
 
-    def __len__(self) -> int:
-        return sum(len(part) for part in self._parts)
-
     @property
     def counts(self) -> dict[str, int]:
         """Totals by name."""
-        return {
-            "retired": len(self),
-            "revived": len(self.revived),
-            "reappeared": len(self.reappeared),
-            "moving": len(self.moving),
-        }
+        again = {name: len(getattr(self, name)) for name in ("revived", "reappeared", "moving")}
+        return {"retired": sum(len(part) for part in self._parts), **again}
 
     def add(self, table: LandmarkTable, covariance: Array, gone: BoolArray, may_return: bool) -> None:
         """Add landmarks (n,) of a table that are gone, with their covariances (k, 3, 3)."""
@@ -91,7 +84,7 @@ class Retired:
         """Return the ids that were retired and may come back, ascending."""
         return sorted(self.row_of.keys() & set(ids.tolist())) if self.row_of else []
 
-    def start_afresh(self, ids: IntArray) -> None:
+    def start_again(self, ids: IntArray) -> None:
         """Mark ids that are initialised again: landmarks retired under them do not come back."""
         again = self.among(ids)
         self.reappeared.extend(again)
@@ -99,7 +92,7 @@ class Retired:
             del self.row_of[i]
 
     def all_landmarks(self, table: LandmarkTable, covariance: Array) -> Landmarks:
-        """Return every landmark so far, in the order of the log; those in the table have covariances (n, 3, 3)."""
+        """Return every landmark so far, in the order of the log; covariances (n, 3, 3) are for the table."""
         row = np.concatenate([*self._rows, table.log_row])
         everything = Landmarks.concatenate([*self._parts, table.snapshot(np.arange(len(table)), covariance)])
         # A landmark that came back and was retired again is there twice; its last estimate counts.
@@ -112,12 +105,12 @@ class Retired:
         """Put returning landmarks back into the table, and the neighbours that will probably be seen next.
 
         Args:
-            table: Grows.
+            table: Table that grows.
             known: All landmarks, in the order of the log.
-            log: Everything so far.
+            log: Record up to now.
             ids: Landmarks that were seen again.
-            revival: Says which neighbours come along.
-            frame: Of the present.
+            revival: Source of the neighbours.
+            frame: Present frame.
         """
         returning = np.array([self.row_of[i] for i in ids])
         retired = np.fromiter(self.row_of.values(), dtype=np.int64, count=len(self.row_of))
@@ -125,6 +118,7 @@ class Retired:
         back = np.concatenate([returning, neighbours])
         came = known.only(back)
         misses, evidence = zip(*(self._verdicts[row] for row in back.tolist()), strict=True)
+        _, first_observation = np.unique(log.landmark, return_index=True)
         table.append(
             id=came.id,
             first_frame=came.first_frame,
@@ -133,7 +127,7 @@ class Retired:
             misses=np.array(misses),
             evidence=np.array(evidence),
             log_row=back,
-            first_step=_first_steps(log, back),
+            first_step=log.frame[first_observation[back]],
             last_step=np.full(len(back), -2),
             stay_until=frame + np.concatenate([np.zeros_like(returning), 2 * distance + PATIENCE]),
             position_m=came.position_m,
@@ -142,12 +136,6 @@ class Retired:
         for i in came.id.tolist():
             del self.row_of[i]
         self.revived.extend(ids)
-
-
-def _first_steps(log: Log, rows: IntArray) -> IntArray:
-    """Return the frames of the log (n,) with the first observation of landmarks, given by their rows."""
-    _, first = np.unique(log.landmark, return_index=True)
-    return log.frame[first][rows]
 
 
 def at_rest(out: BoolArray, table: LandmarkTable, limit: int | None) -> BoolArray:

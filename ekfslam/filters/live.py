@@ -1,17 +1,10 @@
 """Live use: velocities and images as they come, at any rates, in any order within a stated delay.
 
-    live = LiveEKF.from_rig(camera, T_cam_imu, noise, delay_s=0.2)
-    live.predict(velocities, t)       # from the odometry
-    live.update(ids, pixels, t)       # from the tracker
-    now = live.pose()                 # at the newest stamp: T_world_imu and the covariance of xi
-
-An image is *taken in* when ``delay_s`` has passed on the clock of the stamps: from then on nothing older can come, and
-before the first velocity none is. So
-the filter behind, ``live.ekf``, is that of the recording in order, whatever order the messages came in. Later poses
-follow from it by the velocities that are there.
+See docs/live.md. An image is processed once a message stamped ``delay_s`` later has arrived; older messages are then
+rejected. So the filter, ``live.ekf``, is that of the recording in order. Later poses follow from it by the velocities.
 
 A velocity at stamp s holds since the one before, as in a recording. Those between two images act as one: the constant
-velocity that leads to the same pose. Its noise is that of the model, whatever the rate of the velocities.
+velocity that leads to the same pose. Its noise is that of the model at any rate of velocities.
 """
 
 from __future__ import annotations
@@ -38,13 +31,9 @@ from ekfslam.models.sensors.stereo import Rig
 
 
 class Pose(NamedTuple):
-    """A pose at one time.
+    """A pose (4, 4) at a stamp, with the covariance (6, 6) of its error ``xi``.
 
-    Args:
-        time_s: Its stamp.
-        T_world_imu: (4, 4) estimate.
-        covariance: (6, 6) of its error ``xi``, see `ekfslam`.
-        is_held: Whether no velocity of the last stretch was there yet, so that the one before was taken.
+    ``is_held`` says that the last velocity was extrapolated because none had arrived for the stamp.
     """
 
     time_s: float
@@ -58,12 +47,12 @@ class LiveCounts:
     """Counts of all messages: none is dropped without being counted.
 
     Args:
-        velocities, images: Messages that were not late.
-        taken_in: Images that the filter has had.
-        late_velocities, late_images: Older than what the filter has had, hence of no use any more.
-        out_of_order: Messages that came after a later one of their kind, and were not late.
-        held: Images to which no velocity led in time, so that the one before was held.
-        gaps: Images to which velocities led that are more than ``gap_s`` apart.
+        velocities, images: Messages in time.
+        taken_in: Images that the filter has processed.
+        late_velocities, late_images: Rejected messages, older than the last processed image.
+        out_of_order: Messages in time that came after a later one of their kind.
+        held: Images processed with an extrapolated velocity, since none had arrived in time.
+        gaps: Images after velocities more than ``gap_s`` apart.
     """
 
     velocities: int = 0
@@ -84,7 +73,6 @@ class _Velocities:
         self._twists: list[Array] = []
 
     def add(self, twist: Array, t: float) -> None:
-        """Put one in its place."""
         at = bisect_left(self.stamps, t)
         if at < len(self.stamps) and self.stamps[at] == t:
             raise StampError(f"there are two velocities at {t:.6f} s", field="t")
@@ -92,12 +80,12 @@ class _Velocities:
         self._twists.insert(at, twist)
 
     def at(self, t: float) -> tuple[Array, bool]:
-        """Return the velocity (6,) at a stamp, and whether none came after it, so that the last one is held."""
+        """Return the velocity (6,) at a stamp, and whether it is the last one, extrapolated."""
         at = min(bisect_left(self.stamps, t), len(self.stamps) - 1)
         return self._twists[at], self.stamps[-1] < t
 
     def during(self, begin: float, end: float, gap_s: float) -> tuple[Interval, bool]:
-        """Return the velocities from one stamp to a later one, and whether the last one is held.
+        """Return the velocities between two stamps, and whether the last one is extrapolated.
 
         The interval is a gap if velocities in it are more than ``gap_s`` apart.
         """
@@ -121,17 +109,17 @@ class LiveEKF:
     """The joint filter behind a window of messages, see the module.
 
     Args:
-        ekf: The filter, as it starts; with a `MapRevival` if landmarks shall come back.
-        delay_s: How much later than a later message one may come. An image waits for so long; 0: no message does.
-        gap_s: Velocities further apart are worth as little as the noise says of gaps.
-        history_s: How far back `pose` can be asked for.
-        late: Whether a message that is too late is an error, or is counted alone.
+        ekf: New filter; with a `MapRevival` if landmarks shall come back.
+        delay_s: Time for which an image waits for older messages.
+        gap_s: Spacing of velocities above which the noise of a gap applies.
+        history_s: Time before the last processed image for which `pose` answers.
+        late: ``raise`` an error at a late message, or only ``count`` it.
 
     Raises:
         ConfigError: A time is negative.
 
     Attributes:
-        ekf: The filter after the last image that was taken in: its ``P``, ``ids``, ``positions_m``, ``covariance_of``.
+        ekf: Filter after the last processed image: its ``P``, ``ids``, ``positions_m``, ``covariance_of``.
         counts: `LiveCounts`.
         time_s: Stamp of that image; None before the first.
     """
@@ -167,15 +155,12 @@ class LiveEKF:
         """Return the live filter of a stereo rig with measured velocities.
 
         Args:
-            camera: Of the rectified pair.
+            camera: Rectified pair.
             T_cam_imu: (4, 4) IMU to left optical frame.
-            noise: Of velocities and pixels, white.
-            T_world_imu: (4, 4) pose at the start; by default there is the origin of world.
-            config: Settings of the filter; by default landmarks leave the state when they are out of view.
+            noise: White noise of velocities and pixels.
+            T_world_imu: (4, 4) first pose; by default the origin of world.
+            config: Settings of the filter; by default landmarks out of view are retired.
             window: ``delay_s``, ``gap_s``, ``history_s`` and ``late`` of `LiveEKF`.
-
-        Raises:
-            ConfigError: A time is negative.
         """
         settings = FilterConfig(retire="unseen") if config is None else config
         start = np.eye(4) if T_world_imu is None else T_world_imu
@@ -187,14 +172,11 @@ class LiveEKF:
         return max(self._newest.values())
 
     def predict(self, velocities: ArrayLike, t: float) -> list[FrameReport]:
-        """Take a measured velocity.
+        """Take a measured velocity, and return reports on the images that could be processed then.
 
         Args:
             velocities: (6,) ``[v; w]``, m/s and rad/s, which holds since the stamp of the one before.
-            t: Its stamp in s.
-
-        Returns:
-            Reports on the images that were taken in by it.
+            t: Stamp in s.
 
         Raises:
             DataError: No six finite numbers, or a stamp that another velocity has.
@@ -211,18 +193,15 @@ class LiveEKF:
         return self._arrived("velocity", t)
 
     def update(self, ids: ArrayLike, pixels: ArrayLike, t: float) -> list[FrameReport]:
-        """Take the tracks of an image.
+        """Take the tracks of an image, and return reports on the images that could be processed then.
 
         Args:
             ids: (n,) landmark ids, distinct.
-            pixels: (n, 4) rectified pixels (uL, vL, uR, vR), or what else the sensor measures.
-            t: Its stamp in s.
-
-        Returns:
-            Reports on the images that were taken in by it: without a delay on this one.
+            pixels: (n, 4) rectified pixels (uL, vL, uR, vR), or the measurements of another sensor.
+            t: Stamp in s.
 
         Raises:
-            DataError: Shapes do not agree, a number is none, an id occurs twice, or another image has the stamp.
+            DataError: Shapes disagree, a number is not finite, an id occurs twice, or another image has the stamp.
             LateError: The filter has had a later image already.
             FilterError: The filter cannot go on.
         """
@@ -245,7 +224,7 @@ class LiveEKF:
         return self._arrived("image", t)
 
     def flush(self) -> list[FrameReport]:
-        """Take in all images that wait, since nothing more will come; reports on them.
+        """Process all images that wait, since nothing more will come, and return reports on them.
 
         Raises:
             MissingVelocityError: No velocity has come at all.
@@ -258,11 +237,8 @@ class LiveEKF:
     def pose(self, t: float | None = None) -> Pose:
         """Return the pose at a stamp, by default the newest one, given the images processed until then.
 
-        Args:
-            t: From ``history_s`` before the last image that was taken in.
-
         Raises:
-            LateError: It is further back, or nothing has been taken in.
+            LateError: The stamp is over ``history_s`` before the last processed image, or there is none.
             MissingVelocityError: No velocity has come.
         """
         t = self.newest_s if t is None else t
@@ -274,7 +250,7 @@ class LiveEKF:
         if t > begin:
             interval, is_held = self._velocities.during(begin, t, self.gap_s)
             then = then.without_landmarks()
-            predict(then, _worth(interval, is_held), None)
+            predict(then, _distrusted(interval, is_held), None)
         return Pose(t, then.T_world_imu, then.gaussian.body_covariance[:6, :6].copy(), is_held)
 
     def _in_time(self, kind: Literal["velocity", "image"], t: float) -> bool:
@@ -282,10 +258,8 @@ class LiveEKF:
         require_finite(np.array(t, dtype=float), "t")
         if self.time_s is None or t > self.time_s:
             return True
-        if kind == "velocity":
-            self.counts.late_velocities += 1
-        else:
-            self.counts.late_images += 1
+        self.counts.late_velocities += kind == "velocity"
+        self.counts.late_images += kind == "image"
         if self.late == "raise":
             raise LateError(kind, t, self.time_s)
         return False
@@ -296,7 +270,7 @@ class LiveEKF:
         return self._take_in(self.newest_s - self.delay_s)
 
     def _take_in(self, until: float) -> list[FrameReport]:
-        """Take in the images up to a stamp, in their order."""
+        """Process the images up to a stamp, in their order; none before the first velocity."""
         reports = []
         while self._waiting and self._waiting[0][0] <= until and self._velocities.stamps:
             (t, ids, measured), begin = self._waiting[0], self.time_s
@@ -305,7 +279,7 @@ class LiveEKF:
                 self.ekf.begin(twist)
             else:
                 interval, is_held = self._velocities.during(begin, t, self.gap_s)
-                self.ekf.predict(_worth(interval, is_held))
+                self.ekf.predict(_distrusted(interval, is_held))
                 self.counts.gaps += interval.is_gap
             self.counts.held += is_held
             del self._waiting[0]
@@ -318,6 +292,6 @@ class LiveEKF:
         return reports
 
 
-def _worth(interval: Interval, is_held: bool) -> Interval:
-    """Return an interval whose held velocity is trusted as little as one across a gap."""
+def _distrusted(interval: Interval, is_held: bool) -> Interval:
+    """Return an interval with the noise of a gap if its velocity is extrapolated."""
     return dataclasses.replace(interval, is_gap=True) if is_held else interval

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import fields
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.interval import Interval
@@ -14,95 +16,67 @@ from ekfslam.filters.log import Log
 from ekfslam.filters.prediction import Prediction
 from ekfslam.models.process import Measured
 
-_PER_FRAME = (
-    "tau_s",
-    "is_gap",
-    "way_m",
-    "seen_twist",
-    "T_departed",
-    "T_predicted",
-    "T_linear",
-    "T_linear_before",
-    "T_updated",
-    "departed",
-    "linear",
-    "updated",
-    "curved",
-)
-
 
 class LogBook:
-    """Grows a `Log` frame by frame; arrays are joined when the log is asked for.
+    """Grows a `Log` frame by frame; arrays are joined when the log is read.
 
     Args:
-        start: What the filter knows before the first frame.
+        start: Filter before the first frame.
     """
 
     def __init__(self, start: Estimate) -> None:
         self._first_estimates = start.variant.first_estimates
         self._initial_covariance = start.gaussian.body_covariance
-        self._frames: dict[str, list] = {name: [] for name in _PER_FRAME}
-        no_index, none, rows = np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, start.sensor.dimension))
-        self._lists: dict[str, list] = {
-            "id": [no_index],
-            "first_position_m": [np.empty((0, 3))],
-            "frame": [no_index],
-            "landmark": [no_index],
-            "previous": [no_index],
-            "rows": [rows],
-            "variance": [rows],
-            "position_m": [np.empty((0, 3))],
-            "input_frame": [no_index],
-            "input_dt_s": [none],
-            "inputs": [np.empty((0, 6))],
-            "measured_frame": [no_index],
-            "measured_axis": [no_index],
-            "measured_value": [none],
-            "measured_std": [none],
-            "measured_is_biased": [np.empty(0, dtype=bool)],
-        }
+        self._frames: list[dict] = []
+        self._parts: defaultdict[str, list] = defaultdict(list)
         self._landmarks = self._observations = 0
+        # Empty parts, for a log to which nothing is added.
+        none, no_index, no_rows = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, start.sensor.dimension))
+        self.started(no_index, np.empty((0, 3)), (0, no_rows, no_rows))
+        self._measured(Measured(no_index, none, none, np.empty(0, dtype=bool)))
+        self._add(input_frame=no_index, input_dt_s=none, inputs=np.empty((0, 6)))
         self._add_frame(start, start.coordinates)
+
+    def _add(self, **arrays: NDArray) -> None:
+        for name, value in arrays.items():
+            self._parts[name].append(value)
 
     def predicted(self, now: Estimate, interval: Interval, found: Prediction) -> None:
         """Add a frame, reached by a prediction over an interval."""
         if found.measured is not None:
             self._measured(found.measured)
-        self._lists["input_frame"].append(np.full(len(interval.dt_s), now.step))
-        self._lists["input_dt_s"].append(interval.dt_s)
-        self._lists["inputs"].append(interval.inputs)
+        frame = np.full(len(interval.dt_s), now.step)
+        self._add(input_frame=frame, input_dt_s=interval.dt_s, inputs=interval.inputs)
         self._add_frame(now, found.departed)
 
     def _add_frame(self, now: Estimate, departed: Array) -> None:
-        T, coordinates = now.T_imu_world, now.coordinates.copy()
-        values = {
-            "tau_s": now.motion.tau_s,
-            "is_gap": now.motion.interval.is_gap,
-            "way_m": now.motion.way_m,
-            "seen_twist": now.imu_twist,
-            "T_departed": now.motion.T_departed,
-            "T_predicted": T,
-            "T_linear": T,
-            "T_linear_before": now.motion.T_departed,
-            "T_updated": T,
-            "departed": departed,
-            "linear": coordinates,
-            "updated": coordinates,
-            "curved": now.curved,
-        }
-        for name, value in values.items():
-            self._frames[name].append(value)
+        T, coordinates, motion = now.T_imu_world, now.coordinates.copy(), now.motion
+        self._frames.append(
+            {
+                "tau_s": motion.tau_s,
+                "is_gap": motion.interval.is_gap,
+                "way_m": motion.way_m,
+                "seen_twist": now.imu_twist,
+                "T_departed": motion.T_departed,
+                "T_predicted": T,
+                "T_linear": T,
+                "T_linear_before": motion.T_departed,
+                "T_updated": T,
+                "departed": departed,
+                "linear": coordinates,
+                "updated": coordinates,
+                "curved": now.curved,
+            }
+        )
 
     def amend(self, **values: Array) -> None:
         """Replace fields of the frame that is being written, by their names in `Log`."""
-        for name, value in values.items():
-            self._frames[name][-1] = value
+        self._frames[-1].update(values)
 
     def _measured(self, rows: Measured) -> None:
         """Add measurements of blocks during the interval to the next frame."""
-        self._lists["measured_frame"].append(np.full(len(rows.axis), len(self._frames["tau_s"])))
-        for field in fields(rows):
-            self._lists[f"measured_{field.name}"].append(getattr(rows, field.name))
+        self._add(measured_frame=np.full(len(rows.axis), len(self._frames)))
+        self._add(**{f"measured_{field.name}": getattr(rows, field.name) for field in fields(rows)})
 
     def corrected(self, now: Estimate, found: Correction) -> None:
         """Add the correction of this frame, before the estimate takes it."""
@@ -120,13 +94,11 @@ class LogBook:
         )
 
     def started(self, ids: IntArray, positions_m: Array, *views: tuple[int, Array, Array]) -> IntArray:
-        """Add landmarks (n,) and the views that initialised them: frame, rows (n, d), variances (n, d).
+        """Add landmarks (n,) and the views that initialised them, and return their rows in the log.
 
-        Returns:
-            Their rows in the log.
+        Each view is a frame, rows (n, d) and variances (n, d).
         """
-        self._lists["id"].append(ids)
-        self._lists["first_position_m"].append(positions_m)
+        self._add(id=ids, first_position_m=positions_m)
         at = np.arange(self._landmarks, self._landmarks + len(ids))
         self._landmarks += len(ids)
         for step, rows, variance in views:
@@ -134,22 +106,15 @@ class LogBook:
         return at
 
     def last(self, count: int) -> IntArray:
-        """Places of the last observations."""
+        """Return the places of the last observations."""
         return np.arange(self._observations - count, self._observations)
 
     def _observed(
         self, step: int, landmark: IntArray, rows: Array, variance: Array, position_m: Array, previous: IntArray
     ) -> None:
-        values = {
-            "frame": np.full(len(landmark), step),
-            "landmark": landmark,
-            "previous": previous,
-            "rows": rows,
-            "variance": variance,
-            "position_m": position_m,
-        }
-        for name, value in values.items():
-            self._lists[name].append(value)
+        frame = np.full(len(landmark), step)
+        self._add(frame=frame, landmark=landmark, previous=previous)
+        self._add(rows=rows, variance=variance, position_m=position_m)
         self._observations += len(landmark)
 
     def log(self) -> Log:
@@ -157,6 +122,6 @@ class LogBook:
         return Log(
             first_estimates=self._first_estimates,
             initial_covariance=self._initial_covariance,
-            **{name: np.array(values) for name, values in self._frames.items()},
-            **{name: np.concatenate(values) for name, values in self._lists.items()},
+            **{name: np.array([frame[name] for frame in self._frames]) for name in self._frames[0]},
+            **{name: np.concatenate(parts) for name, parts in self._parts.items()},
         )

@@ -1,7 +1,4 @@
-"""Equations (7) and (7'): what a correction makes of blocks and landmarks, and of their covariance.
-
-`retract` alone writes: the mean, its coordinates, and the covariance in the new errors. All else here only reads.
-"""
+"""Equations (7) and (7'): the effect of a correction on blocks, landmarks and their covariance; `retract` writes."""
 
 from __future__ import annotations
 
@@ -18,13 +15,13 @@ from ekfslam.filters.gaussian import Rows
 
 @dataclass(frozen=True)
 class Moved:
-    """The mean that a correction leads to.
+    """The mean after a correction.
 
     Args:
         mean: The mean after the correction.
-        awake, asleep: Slots of landmarks that were moved in the camera, eq. (7'), and of all others, moved in world.
-        in_image: Which of the former (k,) by their images.
-        before: The camera's view of them before; None: none was moved in it.
+        awake, asleep: Slots of landmarks corrected in the camera, eq. (7'), and in world, eq. (7).
+        in_image: (k,) which of the former count by their images.
+        before: View of the former before the correction; None: no camera.
     """
 
     mean: Mean
@@ -35,7 +32,7 @@ class Moved:
 
 
 def retract(e: Estimate, correction: Array) -> None:
-    """Move the mean by a correction (b+3n,), and re-express the covariance where the variant does."""
+    """Correct the mean by (b+3n,), and re-express the covariance in the errors after it, eq. (7) and (7')."""
     moved = retracted(e, correction)
     e.variant.transport(e.gaussian, e.model, e.values, moved.mean.values, _changes(e, moved, e.variant.turned))
     e.values, e.table.position_m = moved.mean.values, moved.mean.position_m
@@ -43,10 +40,10 @@ def retract(e: Estimate, correction: Array) -> None:
 
 
 def retracted(e: Estimate, correction: Array) -> Moved:
-    """Return the mean after a correction (b+3n,); the estimate stays.
+    """Return the mean after a correction (b+3n,), which leaves the estimate unchanged.
 
-    Active landmarks move in the camera that was updated last, dormant ones in the world frame: far from the camera,
-    image coordinates lose precision.
+    Correct active landmarks in the last updated camera, eq. (7'), and dormant ones in the world frame: far from the
+    camera, image coordinates lose precision.
     """
     x, d = parts(e, correction)
     after, positions = e.model.retract(e.values, correction), e.table.position_m.copy()
@@ -55,27 +52,27 @@ def retracted(e: Estimate, correction: Array) -> Moved:
     if camera is None:
         awake, others = others[:0], np.arange(len(positions))
     before, in_image = None, np.empty(0, dtype=bool)
-    if len(others):
+    if len(others):  # eq. (7)
         positions[others] = e.variant.retract_landmarks(e.T_imu_world, positions[others], correction[:6], d[others])
-    if camera is not None:
+    if camera is not None:  # eq. (7')
         before = camera.view(e.values, positions[awake], e.values[camera.pose], positions[awake])
         positions[awake], in_image = camera.retract(before, after, x, d[awake])
     return Moved(Mean(after, positions, e.imu_twist), awake, others, in_image, before)
 
 
 def carried_back(e: Estimate, rows: Rows, moved: Moved) -> Rows:
-    """Return rows that were taken where a correction leads, in the errors at the estimate."""
+    """Return rows that were taken after a correction, in the errors before it."""
     change = _changes(e, moved, e.variant.derivative)[0].only(rows.slot)
     return e.variant.carry_back(rows, e.model, e.values, moved.mean.values, change)
 
 
 def parts(e: Estimate, correction: Array) -> tuple[Array, Array]:
-    """Split a correction into the part that observations depend on (seen,), and that of the landmarks (n, 3)."""
+    """Return the parts of a correction for the leading blocks (seen,) and for the landmarks (n, 3)."""
     return correction[: e.gaussian.seen], correction[e.gaussian.body :].reshape(-1, 3)
 
 
 def _camera(e: Estimate) -> CameraCoordinates | None:
-    """Coordinates of landmarks in the last updated camera; None: they count by their positions in world."""
+    """Return the image coordinates of the last updated camera; None: landmarks count by their positions in world."""
     return None if e.updated_pose is None else e.cameras.get(e.updated_pose)
 
 

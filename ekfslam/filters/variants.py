@@ -1,11 +1,7 @@
-"""The linearisation variants of the joint filter, one class each: everything that is a variant's own.
+"""The linearisation variants of the joint filter: where Jacobians are taken, and how a correction acts.
 
-All variants share the prediction (1)-(2), the measurement rows (4), new landmarks (5) and the update (6), and keep P in
-the stored coordinates ``T_imu_world = exp(xi^) T_hat``, ``m = m_hat + d``. They differ in where Jacobians are taken and
-in how a correction acts. With landmarks in image coordinates, eq. (7'), all variants move them alike. Then they differ
-in how the errors of poses before a correction become those after it, and (FEJ) in where M and B are taken.
-
-The iterated update (``iterations > 1``) goes with ``standard`` and ``invariant``, in image coordinates.
+Equations (1) to (6) and the errors of P are the same for all. With landmarks in image coordinates, eq. (7'), all
+variants move landmarks alike. Then they differ in the errors of poses after a correction, and (FEJ) in M and B.
 """
 
 from __future__ import annotations
@@ -26,14 +22,12 @@ from ekfslam.models.model import Model
 class Standard:
     """Jacobians at the estimate, plain retraction: every textbook's EKF.
 
-    Known weakness: the directions that no measurement observes (where the world's origin is, which way it is turned)
-    are seen from ever new linearisation points. So the filter gains information about them that does not exist; its
-    heading becomes overconfident first.
+    Known weakness: Jacobians at changing linearisation points give information about directions that no measurement
+    observes (origin and rotation of the world). The heading becomes overconfident first.
 
     Attributes:
         first_estimates: Whether Jacobians are taken at first estimates.
-        is_frozen_exactly: Whether, with landmarks in xyz, rows frozen where the filter linearised them are the filter;
-            see the function of this name.
+        is_frozen_exactly: See the function of this name; for landmarks in xyz.
     """
 
     name = "standard"
@@ -45,14 +39,7 @@ class Standard:
         return first if self.first_estimates else estimate
 
     def retract_landmarks(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> Array:
-        """``m+ = m + d`` (n, 3), where ``T+ = exp(xi^) T``.
-
-        Args:
-            T_imu_world: (4, 4) pose before the correction.
-            positions_m: (n, 3) landmarks before the correction.
-            xi: (6,) correction of the pose.
-            d: (n, 3) corrections of the landmarks.
-        """
+        """Return ``m+ = m + d`` (n, 3) for ``T+ = exp(xi^) T``; pose and landmarks are those before the correction."""
         return positions_m + d
 
     def turned(self, before: Array, after: Array) -> Array:
@@ -64,25 +51,21 @@ class Standard:
         return np.asarray(se3.left_jacobian(se3.log(after @ se3.inverse(before))), dtype=float)
 
     def change(self, model: Model, before: Values, slot: IntArray, moved_m: Array) -> Change:
-        """Errors of landmarks (n,) in xyz after a correction that moved them by ``moved_m`` (n, 3): here they stay."""
+        """Return the change of landmark errors in xyz by a correction that moved them by ``moved_m`` (n, 3): none."""
         return Change(slot, np.empty(0, dtype=np.int64), np.empty((len(moved_m), 3, 0)))
 
     def transport(
         self, gaussian: Gaussian, model: Model, before: Values, after: Values, changes: Iterable[Change]
     ) -> None:
-        """Re-express the covariance after a correction that changed errors of landmarks: ``P <- G P G^T``.
-
-        G has M and B of the changes, and `turned` of each pose: 3x3 blocks, and a rank beyond them which is the number
-        of the changes' columns.
-        """
+        """Re-express the covariance by ``P <- G P G^T``: G has the changes, and `turned` of each pose."""
         for change in changes:
             if len(change.columns) and len(change.slot):
                 gaussian.transform_landmarks(change.slot, change.M, change.B, change.columns)
 
     def carry_back(self, rows: Rows, model: Model, before: Values, after: Values, change: Change) -> Rows:
-        """Rows taken at a corrected state in the errors before the correction, for an iterated update: the chain rule.
+        """Return rows taken at a corrected state in the errors before the correction, by the chain rule.
 
-        The change (k) is of the landmarks of the rows, with `derivative` for its pose.
+        The change is that of the landmarks of the rows, with `derivative` for its pose.
         """
         H_x = rows.H_x.copy()
         for name in model.layout.poses:
@@ -93,22 +76,17 @@ class Standard:
         return Rows(rows.slot, H_x, H_m, rows.residual, rows.variance)
 
     def landmark_error(self, m_hat: Array, m_true: Array, T_world_imu_hat: Array, T_world_imu_true: Array) -> Array:
-        """Errors d (..., 3) of landmarks that the covariance is about; shapes broadcast.
-
-        Args:
-            m_hat, m_true: (..., 3) estimated and true positions in world.
-            T_world_imu_hat, T_world_imu_true: (..., 4, 4) poses at the time at which the covariances hold.
-        """
+        """Return the landmark errors d (..., 3) that P is about, given poses at the time of P; shapes broadcast."""
         return m_true - m_hat
 
 
 class FirstEstimates(Standard):
     """First-estimates Jacobians: poses are linearised where they were predicted, landmarks where they were first seen.
 
-    So the unobservable directions stay the same for good. A of eq. (4) does not matter for that and is taken at the
-    estimate: with A at first estimates too, the filter turns a little less noisy where noise is moderate and diverges
-    where it is large. Known weakness: a poor first estimate is never mended. Source: Huang, Mourikis, Roumeliotis,
-    "Observability-based rules for designing consistent EKF SLAM estimators", IJRR 2010.
+    So the unobservable directions never change. A of eq. (4) does not matter for that and is taken at the estimate: at
+    first estimates the filter diverges when noise is large. Known weakness: a poor first estimate is never mended.
+    Source: Huang, Mourikis, Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators",
+    IJRR 2010.
     """
 
     name = "fej"
@@ -127,28 +105,25 @@ class Invariant(Standard):
     is_frozen_exactly = False
 
     def retract_landmarks(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> Array:
-        """Second line of eq. (7); arguments as in `Standard.retract_landmarks`.
-
-        The correction acts as one rigid motion of the world (e_theta) on all landmarks, plus what remains of each.
-        """
+        """Return ``m+`` (n, 3) of eq. (7): a rigid rotation of all landmarks, plus the remainder of each."""
         e_theta = -T_imu_world[:3, :3].T @ xi[3:]
         e = d - positions_m @ se3.skew(e_theta).T
         R, J = se3.so3_exp_and_left_jacobian(e_theta)
         return positions_m @ R.T + e @ J.T
 
     def turned(self, before: Array, after: Array) -> Array:
-        """Third line of eq. (7), ``Ad(T+ T^-1)``.
+        """Return ``Ad(T+ T^-1)``, J of eq. (7) for a pose.
 
-        It is not the derivative of the retraction: it keeps the *invariant* error, which is the same before and after.
-        So ``G N(X) = N(X+)`` for the unobservable directions N, and rows carried back through G still see nothing along
-        them. The exact derivative turns them by ``J_l(e)``; an iterated update with it gains heading from nothing.
+        It is not the derivative of the retraction: it keeps the *invariant* error. So ``G N(X) = N(X+)`` for the
+        unobservable directions N, and rows carried back through G contain no information along them. The exact
+        derivative turns N by ``J_l(e)``; an iterated update with it gains heading from nothing.
         """
         return np.asarray(se3.adjoint(after @ se3.inverse(before)), dtype=float)
 
     derivative = turned
 
     def change(self, model: Model, before: Values, slot: IntArray, moved_m: Array) -> Change:
-        """Return the change of landmark errors in xyz by rotations: of the pose, and of the camera if estimated."""
+        """Return the change of landmark errors in xyz by the rotation of the pose, and of the camera if estimated."""
         start = model.layout["pose"].start + 3
         columns, by = np.arange(start, start + 3), se3.skew(moved_m) @ before["pose"][:3, :3].T
         calibration = model.observer.calibration
@@ -168,13 +143,9 @@ class Invariant(Standard):
             gaussian.transform_body(model.layout[name], self.turned(before[name], after[name]))
 
     def landmark_error(self, m_hat: Array, m_true: Array, T_world_imu_hat: Array, T_world_imu_true: Array) -> Array:
-        """Errors (..., 3) as eq. (7) has them: what a rigid motion of the world does to pose and landmarks is no error.
+        """Return ``d_i = e_i - m_hat^ e_theta`` (..., 3) of eq. (7); it is ``m_true - m_hat`` to first order.
 
-        The right-invariant error couples a landmark to the rotation error ``e_theta`` of the pose of the same time,
-
-            R_true = exp(e_theta) R_hat,    m_true = exp(e_theta) m_hat + J_l(e_theta) e_i,
-
-        and eq. (7) stores it as ``d_i = e_i - m_hat^ e_theta``, which is ``m_true - m_hat`` to first order.
+        ``R_true = exp(e_theta) R_hat`` and ``m_true = exp(e_theta) m_hat + J_l(e_theta) e_i``, with the pose's e_theta.
         """
         R_error = T_world_imu_true[..., :3, :3] @ np.swapaxes(T_world_imu_hat[..., :3, :3], -1, -2)
         e_theta = se3.so3_log(R_error)
@@ -187,8 +158,5 @@ VARIANTS: dict[str, Standard] = {variant.name: variant for variant in (Invariant
 
 
 def is_frozen_exactly(config: FilterConfig) -> bool:
-    """Return whether rows frozen at the filter's linearisation points have the filter as solution.
-
-    A landmark that comes back then takes its place among them, otherwise all rows are linearised again.
-    """
+    """Return whether rows at the filter's linearisation points reproduce the filter, so that revivals can keep them."""
     return config.landmark_coordinates == "xyz" and VARIANTS[config.variant].is_frozen_exactly
