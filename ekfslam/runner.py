@@ -23,12 +23,13 @@ from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.innovations import collect_innovations
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.log import Log
-from ekfslam.filters.loop import FurtherVelocities, one_thread, run_filter, solvable
+from ekfslam.filters.loop import one_thread, run_filter, solvable
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.references import References
 from ekfslam.filters.reports import FrameReport, collect
 from ekfslam.filters.result import Innovation, Landmarks, Parameters, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
+from ekfslam.models.sensors.velocities import VelocitySource
 from ekfslam.progress import progress
 from ekfslam.resolve import Problem, resolve
 from ekfslam.smoother.posterior import smooth
@@ -40,7 +41,7 @@ def run(
     sequence: Sequence,
     mode: Mode = "full",
     config: Config | None = None,
-    further: FurtherVelocities | None = None,
+    further: VelocitySource | None = None,
 ) -> Result:
     """Estimate trajectory and map of a sequence.
 
@@ -103,7 +104,7 @@ def _judged(problem: Problem) -> tuple[IntArray, IntArray] | None:
     return relative_pairs(truth, reach) if truth is not None and reach else None
 
 
-def _joint(problem: Problem, further: FurtherVelocities | None) -> _Estimate:
+def _joint(problem: Problem, further: VelocitySource | None) -> _Estimate:
     """Run the joint filter."""
     sequence, settings, judged = problem.sequence, problem.config.filter, _judged(problem)
     count = len(sequence)

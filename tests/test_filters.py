@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from support.jacobians import measurement_jacobian
 from support.reference import report_mapping, run_naive, small_world
 
 from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig
@@ -11,7 +12,6 @@ from ekfslam.data.sequence import Observations
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.observing import measurement_jacobian
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import se3
 from ekfslam.models.sensors.stereo import Rig

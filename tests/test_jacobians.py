@@ -5,7 +5,7 @@ States: random, near the identity, and near half turns; extrinsics far from triv
 
 import numpy as np
 import pytest
-from support.jacobians import POSES, RNG, TWISTS, central, visible_points
+from support.jacobians import POSES, RNG, TWISTS, central, measurement_jacobian, transition_jacobian, visible_points
 from support.reference import CAMERA, T_CAM_IMU, jacobian_of_pi, small_world, stereo_matrix, triangulate_least_squares
 
 from ekfslam.config import FilterConfig
@@ -13,8 +13,6 @@ from ekfslam.data.interval import Interval
 from ekfslam.data.sequence import Noise
 from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.observing import measurement_jacobian
-from ekfslam.filters.prediction import transition_jacobian
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3

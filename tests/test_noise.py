@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.gauge import gauge_directions
 from support.helpers import grown, run_joint, tracked
-from support.jacobians import central
+from support.jacobians import central, measurement_jacobian, transition_jacobian
 from support.reference import D, circle_dot, homogeneous, jacobian_of_pi, small_world, stereo_matrix
 from support.running import WHOLE, seeds
 
@@ -19,8 +19,7 @@ from ekfslam.data.sequence import Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
-from ekfslam.filters.observing import measurement_jacobian, moment_before, observe
-from ekfslam.filters.prediction import transition_jacobian
+from ekfslam.filters.observing import moment_before, observe
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import motion, se3
 from ekfslam.models.noise import (

@@ -7,6 +7,7 @@ import tomllib
 import numpy as np
 import pytest
 from support.helpers import run_joint, tracked
+from support.jacobians import measurement_jacobian
 from support.reference import small_world
 from support.running import WHOLE
 
@@ -22,7 +23,6 @@ from ekfslam.filters.dense import DenseSolution
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.filters.mapping import IndependentLandmarks
-from ekfslam.filters.observing import measurement_jacobian
 from ekfslam.geometry import motion
 from ekfslam.models.noise import VelocityNoise, velocity_noise, with_drift
 from ekfslam.models.sensors.base import MOVING

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import scipy.optimize
 from support.gauge import P0, drive, exact_motion, gauge_directions
-from support.jacobians import POSES, central, visible_points
+from support.jacobians import POSES, central, measurement_jacobian, visible_points
 from support.reference import CAMERA, T_CAM_IMU, small_world, stereo_matrix
 
 from ekfslam.config import Config, FilterConfig
 from ekfslam.data.sequence import Noise
 from ekfslam.errors import ConfigError
 from ekfslam.filters.gaussian import Rows
-from ekfslam.filters.observing import measurement_jacobian
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
 from ekfslam.models.build import model_of

@@ -1,12 +1,7 @@
 """The joint EKF over state blocks and all active landmarks, with full cross-covariance.
 
-A frame on one page: `predict` is eq. (1) and (2), `update` is (3) to (7) and (10). They call functions that write:
-
-- `ekfslam.filters.prediction.predict`: blocks, covariance and motion.
-- `ekfslam.filters.observing.observe`: nothing.
-- `ekfslam.filters.correction.correct`: nothing but the evidence of motion of tracks.
-- `ekfslam.filters.retraction.retract`: blocks, landmarks and covariance.
-- `ekfslam.filters.starting.start`: new landmarks, covariance and log.
+A frame on one page: `predict` is eq. (1) and (2), `update` is (3) to (7) and (10). The equations are in the modules
+`prediction` (1, 2), `observing` (3, 4, 10), `correction` (6), `retraction` (7, 7') and `starting` (5) of this package.
 """
 
 from __future__ import annotations
@@ -30,9 +25,8 @@ from ekfslam.filters.prediction import predict
 from ekfslam.filters.reports import FrameReport, log_density, missed
 from ekfslam.filters.result import Landmarks, Parameters
 from ekfslam.filters.retraction import retract
-from ekfslam.filters.starting import start
+from ekfslam.filters.starting import Waiting, start
 from ekfslam.filters.variants import is_frozen_exactly
-from ekfslam.filters.waiting import Waiting
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import StateBlock
 from ekfslam.models.build import model_of
@@ -45,15 +39,14 @@ class JointEKF(Estimate):
     """Joint EKF-SLAM: call `predict`, then `update`, once a frame.
 
     Args:
-        sensor: What observes the landmarks, with its noise; or a whole model, and then nothing of what follows but
-            ``config`` and ``revival``.
-        config: Variant, gate, limits, retirement (``auto`` must have been resolved; it counts as ``unseen``).
+        sensor: Sensor of the landmarks with its noise; or a whole model, with ``config`` and ``revival`` alone.
+        config: Settings of the filter (resolved: retirement ``auto`` means ``unseen``).
         T_world_imu: (4, 4) first pose.
         covariance: (6, 6) of its error ``xi``; by default that of the configuration.
-        calibration: What of the sensor's calibration is estimated (a `Rig` only); by default nothing. With a time
-            offset, call `begin` before the first `update`.
+        calibration: Estimated calibration of a `Rig`; by default none. With a time offset, call `begin` before the
+            first `update`.
         blocks: Further state blocks.
-        revival: What brings retired landmarks back; None: they start afresh.
+        revival: Source of returning landmarks; None: they are initialised again.
 
     Raises:
         ConfigError: A calibration to estimate, but no `Rig`; or neither a model nor a first pose.
@@ -90,7 +83,7 @@ class JointEKF(Estimate):
         self._log_likelihood = 0.0  # of the velocities measured since the last frame
 
     def begin(self, inputs: Array) -> None:
-        """Take the inputs (c,) at the first frame, to which no prediction leads; only a time offset needs them."""
+        """Take the inputs (c,) at the first frame, for a time offset, eq. (9); no prediction leads to this frame."""
         self.imu_twist = self.model.process.begin(self.values, np.asarray(inputs, dtype=float))
         self._log.amend(seen_twist=self.imu_twist)
 
@@ -100,10 +93,10 @@ class JointEKF(Estimate):
         """Predict over one interval, eq. (1) and (2).
 
         Args:
-            inputs: The interval; or one velocity (6,) ``[v; w]``, m/s and rad/s, that holds during it.
-            tau_s: Duration, for one velocity.
+            inputs: The interval; or one velocity (6,) ``[v; w]``, m/s and rad/s, with ``tau_s`` and ``is_gap``.
+            tau_s: Duration.
             also: Measurements by further sensors during the interval, if the velocity is in the state.
-            is_gap: Whether the one velocity was interpolated across a gap.
+            is_gap: Whether the velocity was interpolated across a gap.
 
         Raises:
             ConfigError: Measurements by further sensors of a velocity that is not in the state.
@@ -114,42 +107,43 @@ class JointEKF(Estimate):
         self._log.predicted(self, interval, found)
 
     def update(self, frame: int, ids: IntArray, measured: Array) -> FrameReport:
-        """Retire what is out of view, correct with what is known (6), start what is new (5).
+        """Retire landmarks out of view, correct with known ones (6), start new ones (5).
 
         Args:
             frame: Frame index.
             ids: (n,) landmark ids seen, distinct.
-            measured: (n, 4) their pixels (uL, vL, uR, vR), or what else the sensor measures.
+            measured: (n, 4) their pixels (uL, vL, uR, vR), or the measurements of another sensor.
 
         Returns:
-            What became of each observation, and the innovation statistics.
+            The outcome of each observation, and the innovation statistics.
 
         Raises:
             InnovationError: The innovation covariance is not positive definite.
         """
-        # 1. Landmarks out of view leave, those that come back return.
+        # 1. Retire landmarks out of view, revive those that come back.
         self._rest(frame, ids)
         if self.revival is not None and (returning := self.retired.among(ids)):
             self._revive(frame, returning)
-        # 2. What cannot be used at all.
+        # 2. Screen observations that cannot be used at all.
         rows = self.sensor.rows(measured)
         reason = self.sensor.screen(measured, self.config.min_depth_m)
         if known_to_move := self.retired.moving.intersection(ids.tolist()):
             reason[np.isin(ids, list(known_to_move))] = MOVING
-        # 3. Correct with known landmarks, eq. (6) and (7).
+        # 3. Correct with known landmarks: solve eq. (6) for rows (3), (4), (10), then apply (6), (7) and (7').
         slot, is_known = self.table.lookup(ids)
         known = np.flatnonzero(is_known & (reason == ACCEPTED))
         found = correct(self, frame, slot[known], rows[known])
         self._take(found, frame)
         reason[known] = found.verdict
         self.table.misses[slot[known[missed(found.verdict)]]] += 1
-        # 4. Tracks that move go for good, tracks that jumped start again.
+        # 4. Retire tracks that move for good, and start tracks that jumped again.
         split = self._split(slot[known[found.verdict == MOVING]])
         new = (~is_known & (reason == ACCEPTED)) | np.isin(ids, split)
         reason[new] = ACCEPTED
         self._log.amend(T_updated=self.T_imu_world, updated=self.coordinates)
         # 5. Start new landmarks, eq. (5), or let them wait.
-        started = start(self, self._log, self._waiting, frame, ids[new], rows[new])
+        enter = start if self._waiting is None else self._waiting.start
+        started = enter(self, self._log, frame, ids[new], rows[new])
         if not found.dof:  # no update; but if every active landmark is new, its image coordinates refer to this pose
             first_step = self.table.first_step[self.table.asleep == 0]
             self.updated_pose = "pose" if len(first_step) and (first_step == self.step).all() else None
@@ -158,7 +152,7 @@ class JointEKF(Estimate):
         return self._report(frame, ids, reason, split, found)
 
     def _take(self, found: Correction, frame: int) -> None:
-        """Condition covariance and mean on a correction, and count its observations."""
+        """Condition the covariance, eq. (6), and the mean, eq. (7), on a correction; count its observations."""
         self._log.corrected(self, found)
         self.table.observed(found.slot, self.step, found.measured, self._log.last(len(found.slot)))
         if found.solution is not None:
@@ -169,7 +163,7 @@ class JointEKF(Estimate):
         self.table.accepted(found.slot, frame)
 
     def _report(self, frame: int, ids: IntArray, reason: IntArray, split: IntArray, found: Correction) -> FrameReport:
-        """Report on a frame, and keep what blocks report."""
+        """Return the report on a frame, and keep the estimates of blocks with labels."""
         self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
         done = found.done
         likelihood = self._log_likelihood + log_density(done.nis, done.log_det, found.dof)
@@ -194,11 +188,7 @@ class JointEKF(Estimate):
             self.table.keep(~gone)
 
     def _split(self, moving: IntArray) -> IntArray:
-        """Retire the landmarks at the slots that move, for good, and those that missed too often in a row.
-
-        Returns:
-            Ids of the latter, which are then free to start anew.
-        """
+        """Retire landmarks at slots that move, for good, and those that missed too often; return ids of the latter."""
         moves = np.zeros(len(self.ids), dtype=bool)
         moves[moving] = True
         split_after = self.config.misses_to_split(self.model.track_error is not None)
@@ -209,10 +199,7 @@ class JointEKF(Estimate):
         return ids
 
     def _revive(self, frame: int, ids: list[int]) -> None:
-        """Bring retired landmarks back, and with them the neighbours that will probably be seen next.
-
-        Blocks, active and returning landmarks take the marginal of the batch problem behind.
-        """
+        """Bring retired landmarks and their neighbours back: the state becomes the marginal of the batch problem."""
         assert self.revival is not None
         log, known = self._log.log(), self.landmarks()
         self.retired.fetch(self.table, known, log, ids, self.revival, frame)
@@ -227,11 +214,11 @@ class JointEKF(Estimate):
             self.motion = replace(self.motion, T_predicted=self.T_imu_world, T_predicted_before=clone)
 
     def landmarks(self) -> Landmarks:
-        """Return every landmark so far, in the order of the log, which is that of landmark initialisation."""
+        """Return every landmark so far, in the order of landmark initialisation."""
         return self.retired.all_landmarks(self.table, self.gaussian.landmark_blocks())
 
     def log(self) -> Log:
-        """Return the record of all conditioning so far, for the posterior over all poses and landmarks."""
+        """Return the log so far, for the posterior over all poses and landmarks."""
         return self._log.log()
 
     def parameters(self) -> Parameters | None:
@@ -244,5 +231,5 @@ class JointEKF(Estimate):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Totals: landmarks retired, those seen again that came back or started afresh, and tracks found to move."""
+        """Totals of landmarks: retired, revived, reappeared (initialised again), and moving."""
         return self.retired.counts

@@ -5,39 +5,23 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters.result import Landmarks
 
-_INTS = (
-    "id",
-    "first_frame",
-    "last_frame",
-    "observations",
-    "misses",
-    "log_row",
-    "stay_until",
-    "first_step",
-    "last_step",
-    "last_observation",
-    "asleep",
-)
+_WHOLE = ("id", "first_frame", "last_frame", "observations", "misses")  # with `_STEPS` the columns of whole numbers
+_STEPS = ("log_row", "stay_until", "first_step", "last_step", "last_observation", "asleep")
+_REAL = ("position_m", "initial_m", "evidence", "seen_rows", "extra")
 
 
 def _column(name: str) -> Any:
-    """Return a property for a named column (n,) of whole numbers: a view that can be written to."""
-    at = _INTS.index(name)
-    return property(lambda table: table._ints[at, : table._rows])
+    """Return a property for a named column (n, ...): a view; assigned values are copied."""
 
+    def assign(table: LandmarkTable, value: Array) -> None:
+        table._rows[name] = value
 
-def _columns(start: int, stop: int | None) -> Any:
-    """Named columns (n, k) of real numbers: a view; what is assigned is copied."""
-
-    def replace(table: LandmarkTable, value: Array) -> None:
-        table._floats[: table._rows, start:stop] = value
-
-    return property(lambda table: table._floats[: table._rows, start:stop], replace)
+    return property(lambda table: table._rows[name], assign)
 
 
 class LandmarkTable:
@@ -45,7 +29,7 @@ class LandmarkTable:
 
     Args:
         dimension: Rows d of an observation.
-        extra: Number of further columns.
+        extra: Width of the column ``extra``, for the filter's own use.
 
     Attributes:
         id: (n,) landmark ids.
@@ -55,60 +39,44 @@ class LandmarkTable:
         log_row: (n,) row of the landmark in the log.
         first_step, last_step: (n,) frames of the log with the first and the last accepted observation.
         last_observation: (n,) place of the last accepted observation in the log.
-        asleep: (n,) 1 where it is out of view: it will not be seen before it is woken.
+        asleep: (n,) 1 if the landmark is dormant: not seen before it is woken.
         stay_until: (n,) frame up to which the landmark stays without being seen.
         position_m, initial_m: (n, 3) estimate, and the one at landmark initialisation.
         seen_rows: (n, d) rows of the last accepted observation.
-        extra: (n, extra) whatever a filter keeps besides.
         evidence: (n, 2) of the test for moving tracks, see `ekfslam.filters.gates`.
     """
 
     def __init__(self, dimension: int = 3, extra: int = 0) -> None:
-        # Two matrices and not a dozen arrays, with room to grow: a frame that starts or drops landmarks costs little.
-        self._ints = np.empty((len(_INTS), 0), dtype=np.int64)
-        self._floats = np.empty((0, 8 + dimension + extra))
-        self._rows, self._dimension = 0, dimension
+        widths = zip(_REAL, (3, 3, 2, dimension, extra), strict=True)
+        whole = [(name, np.int64) for name in (*_WHOLE, *_STEPS)]
+        self._rows = np.empty(0, dtype=[*whole, *((name, float, (width,)) for name, width in widths)])
 
     def __len__(self) -> int:
-        return self._rows
+        return len(self._rows)
 
-    id, first_frame, last_frame, observations, misses = (_column(name) for name in _INTS[:5])
-    log_row, stay_until, first_step, last_step, last_observation, asleep = (_column(name) for name in _INTS[5:])
-    position_m, initial_m = _columns(0, 3), _columns(3, 6)
-    evidence = _columns(6, 8)
-
-    @property
-    def seen_rows(self) -> Array:
-        return self._floats[: len(self), 8 : 8 + self._dimension]
-
-    @property
-    def extra(self) -> Array:
-        return self._floats[: len(self), 8 + self._dimension :]
+    id, first_frame, last_frame, observations, misses = map(_column, _WHOLE)
+    log_row, stay_until, first_step, last_step, last_observation, asleep = map(_column, _STEPS)
+    position_m, initial_m, evidence, seen_rows, extra = map(_column, _REAL)
 
     def append(self, **values: ArrayLike) -> None:
         """Append rows; columns not given are 0."""
-        before = len(self)
-        after = before + len(np.asarray(values["id"]))
-        if after > len(self._floats):
-            self._floats = _wider(self._floats[:before], after)
-            self._ints = np.ascontiguousarray(_wider(self._ints[:, :before].T, after).T)
-        self._ints[:, before:after], self._floats[before:after], self._rows = 0, 0.0, after
+        new = np.zeros(len(np.asarray(values["id"])), dtype=self._rows.dtype)
         for name, value in values.items():
-            getattr(self, name)[before:] = value
+            new[name] = value
+        self._rows = np.concatenate([self._rows, new])
 
     def keep(self, stay: BoolArray) -> None:
         """Drop the rows that do not stay (n,)."""
-        self._ints, self._floats = self._ints[:, : len(self)][:, stay], self._floats[: len(self)][stay]
-        self._rows = len(self._floats)
+        self._rows = self._rows[stay]
 
     def lookup(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
-        """Slot (k,) of each id, and whether (k,) it is in the table at all."""
-        order = np.argsort(self.id, kind="stable")  # fast where ids ascend already, as they mostly do
+        """Return the slot (k,) of each id, and whether (k,) it is in the table at all."""
+        order = np.argsort(self.id, kind="stable")  # fast for ids that ascend already, as they mostly do
         index, is_known = lookup(self.id[order], ids)
         return (order[index] if len(order) else index), is_known
 
     def observed(self, slot: IntArray, step: int, rows: Array, places: IntArray) -> None:
-        """Remember what was seen of landmarks (k,) for the next frame: rows (k, d), and places (k,) in the log."""
+        """Keep the last observation of landmarks (k,): rows (k, d), and places (k,) in the log."""
         self.last_step[slot], self.seen_rows[slot], self.last_observation[slot] = step, rows, places
 
     def accepted(self, slot: IntArray, frame: int) -> None:
@@ -119,26 +87,12 @@ class LandmarkTable:
 
     def snapshot(self, slot: IntArray, covariance: Array) -> Landmarks:
         """Return some landmarks as records of a result, with their covariances (k, 3, 3)."""
-        return Landmarks(
-            self.id[slot],
-            self.position_m[slot],
-            covariance,
-            self.initial_m[slot],
-            self.first_frame[slot],
-            self.last_frame[slot],
-            self.observations[slot],
-        )
-
-
-def _wider(rows: NDArray, least: int) -> NDArray:
-    """Return a copy of the rows (n, k) with room for 1.5 times a least number of rows."""
-    room = np.empty((least + least // 2, rows.shape[1]), dtype=rows.dtype)
-    room[: len(rows)] = rows
-    return room
+        names = ("initial_m", "first_frame", "last_frame", "observations")
+        return Landmarks(self.id[slot], self.position_m[slot], covariance, *(self._rows[name][slot] for name in names))
 
 
 def lookup(sorted_ids: IntArray, ids: IntArray) -> tuple[IntArray, BoolArray]:
-    """Index (n,) of each id in ``sorted_ids``, and whether (n,) it is there at all."""
+    """Return the index (n,) of each id in ``sorted_ids``, and whether (n,) it is there at all."""
     if len(sorted_ids) == 0:
         return np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=bool)
     index = np.minimum(np.searchsorted(sorted_ids, ids), len(sorted_ids) - 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from time import perf_counter
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -15,7 +15,7 @@ from ekfslam.errors import FilterError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.reports import FrameReport
-from ekfslam.models.process import Measured
+from ekfslam.models.sensors.velocities import VelocitySource
 
 
 class Frame(NamedTuple):
@@ -24,13 +24,6 @@ class Frame(NamedTuple):
     number: int
     report: FrameReport
     ms: float
-
-
-class FurtherVelocities(Protocol):
-    """Measurements by further sensors: see `ekfslam.models.sensors.velocities.VelocitySource`."""
-
-    def during(self, begin_s: float, end_s: float) -> Measured | None:
-        """Measurements of the velocities of one interval."""
 
 
 def one_thread() -> AbstractContextManager[object]:
@@ -43,7 +36,7 @@ def solvable() -> Iterator[None]:
     """Raise a named error for a matrix that cannot be inverted or decomposed; also a decorator.
 
     Raises:
-        FilterError: There was one inside.
+        FilterError: NumPy raised LinAlgError inside.
     """
     try:
         yield
@@ -56,17 +49,17 @@ def run_filter(
     estimator: JointEKF | IndependentLandmarks,
     sequence: Sequence,
     frames: Iterable[int] | None = None,
-    further: FurtherVelocities | None = None,
+    further: VelocitySource | None = None,
     clock: Callable[[], float] = perf_counter,
 ) -> Iterator[Frame]:
     """Feed a recording to an estimator frame by frame; its state can be read in between.
 
     Args:
-        estimator: A new one: it begins at the first of the frames.
+        estimator: New estimator, which begins at the first of the frames.
         sequence: The recording.
         frames: Successive frames, all by default (or wrapped in a progress bar).
-        further: Velocity measurements of other sensors.
-        clock: In seconds; by default wall-clock time.
+        further: Velocity measurements of another sensor.
+        clock: Function that returns seconds; by default wall-clock time.
     """
     begun = False
     for k in range(len(sequence)) if frames is None else frames:

@@ -1,12 +1,8 @@
-"""Equations (3), (4), (9), (10) and (11): the rows of a frame's observations, linearised at a given mean.
-
-Nothing here writes.
-"""
+"""Equations (3), (4), (9), (10) and (11): the rows of a frame's observations, linearised at a given mean."""
 
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse as sp
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.filters.estimate import Estimate, Mean
@@ -23,7 +19,7 @@ def moment(e: Estimate, at: Mean) -> Moment:
 
 
 def moment_before(e: Estimate, at: Mean) -> Moment:
-    """Return the moment of the frame before, as far as clones know it."""
+    """Return the moment of the frame before, from the clones."""
     clones = e.model.layout.clones
     T = at.values[clones["pose"]]
     T_linear = e.variant.linear(T, e.motion.T_predicted_before)
@@ -32,9 +28,9 @@ def moment_before(e: Estimate, at: Mean) -> Moment:
 
 
 def observe(e: Estimate, at: Mean, slot: IntArray, measured: Array) -> tuple[Seen, Rows]:
-    """Return landmarks at the slots (k,) as the sensor sees them, and the rows of what it ``measured`` (k, d).
+    """Return the predicted view, eq. (3) and (4), of landmarks at slots (k,), and the rows of measurements (k, d).
 
-    If tracks have errors, eq. (10), an observation that follows another one is the difference from it.
+    If tracks have errors, eq. (10), an observation that follows another one becomes its difference from it.
     """
     model, table = e.model, e.table
     positions = at.position_m[slot]
@@ -58,20 +54,3 @@ def observe(e: Estimate, at: Mean, slot: IntArray, measured: Array) -> tuple[See
         H_m[follows] -= before.H_m
         variance[follows] = error.step_variance(measured[follows] - rows_before)
     return seen, Rows(slot, H_x, H_m, residual, variance)
-
-
-def measurement_jacobian(e: Estimate, ids: IntArray) -> sp.csr_array:
-    """Return the full-width H (3k, b+3n) of the sensor's rows of active landmarks ``ids`` (k,), for inspection.
-
-    Raises:
-        KeyError: An id is not active.
-    """
-    slot = e.slots(ids)
-    seen = e.model.observer.see(moment(e, e.mean), e.positions_m[slot], e.linear_positions_m[slot])
-    k, d, width = seen.H_x.shape
-    row = np.broadcast_to(np.arange(k * d).reshape(k, d, 1), (k, d, width + 3))
-    body = np.broadcast_to(np.arange(width), (k, d, width))
-    own = np.broadcast_to((e.gaussian.body + 3 * slot)[:, None, None] + np.arange(3), (k, d, 3))
-    columns = np.concatenate([body, own], axis=-1)
-    values = np.concatenate([seen.H_x, seen.H_m], axis=-1)
-    return sp.csr_array((values.ravel(), (row.ravel(), columns.ravel())), shape=(k * d, len(e.P)))

@@ -1,14 +1,8 @@
-"""Equations (1) and (2): one interval.
-
-`predict` writes blocks, coordinates, covariance, motion and step of an estimate. Landmarks stay as they are, unless
-inputs measure a block.
-"""
+"""Equations (1) and (2): one interval. Landmarks stay unchanged, unless inputs measure a block, eq. (6)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-import scipy.sparse as sp
 
 from ekfslam.arrays import Array
 from ekfslam.data.interval import Interval
@@ -26,8 +20,8 @@ class Prediction:
 
     Args:
         departed: (body,) coordinates before the process moved its blocks.
-        measured: Measurements of blocks during the interval; None: there were none.
-        log_likelihood: Log-density of these; 0 without.
+        measured: Measurements of blocks during the interval, if any.
+        log_likelihood: Log-density of these measurements, or 0.
     """
 
     departed: Array
@@ -39,8 +33,8 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     """Predict over an interval: clones and walking blocks, then measurements of blocks, then the process.
 
     Args:
-        e: Moves.
-        interval: The inputs.
+        e: Estimate that changes.
+        interval: Inputs.
         also: Measurements by further sensors.
 
     Raises:
@@ -50,11 +44,13 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     if also is not None and not process.estimates_velocity:
         raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
     way_m = process.way_m(e.values, interval)
+    # Clones and walking blocks, then the first or measured inputs, eq. (6).
     moved = model.wander(e.values, interval.tau_s, way_m)
     e.coordinates = e.coordinates.copy()  # the log has those after the update
     if moved is not None:
         e.coordinates, e.values = moved.Phi @ e.coordinates, moved.values
     moved, measured, log_likelihood = _measure(e, moved, interval, also)
+    # Eq. (1): the mean, and Phi and Q of eq. (2).
     step = model.step(e.values, interval, e.linear_T_imu_world, e.variant.first_estimates)
     whole = step if moved is None else step.after(moved)
     e.gaussian.propagate(whole.Phi, whole.Q)
@@ -69,10 +65,10 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
 def _measure(
     e: Estimate, moved: Transition | None, interval: Interval, also: Measured | None
 ) -> tuple[Transition | None, Measured | None, float]:
-    """Condition on measurements of blocks by the inputs; the first inputs start blocks instead.
+    """Condition on measurements of blocks by the inputs, eq. (6); the first inputs start blocks instead.
 
     Returns:
-        What the covariance has not followed yet of the transition so far; the measurements and their log-density.
+        The transition that the covariance still has to follow; the measurements, and their log-density.
     """
     process, is_first = e.model.process, e.step == 0
     parts = [some for some in (process.measured(interval, is_first), also) if some is not None]
@@ -95,11 +91,3 @@ def _measure(
     e.gaussian.apply(solution)
     retract(e, solution.done.correction)
     return None, measured, log_density(solution.done.nis, solution.done.log_det, len(residual))
-
-
-def transition_jacobian(e: Estimate, interval: Interval) -> sp.csr_array:
-    """Return the full-width F (b+3n, b+3n) of a step, identity but for the rows of the body, for inspection."""
-    step = e.model.step(e.values, interval, e.linear_T_imu_world, e.variant.first_estimates)
-    full = sp.lil_array(sp.identity(len(e.P)))
-    full[: len(step.Phi), : len(step.Phi)] = step.Phi
-    return sp.csr_array(full)

@@ -1,32 +1,42 @@
-"""How new landmarks enter the state: at once, or after waiting for a second view."""
+"""Equation (5): how new landmarks enter the state, at once or after waiting for a second view.
+
+*Delayed*: one clone of the pose, the anchor, serves all waiting tracks. Once the parallax from there suffices, both
+views of a landmark, ``r = H_x x + H_m d + n`` whitened, are split by the QR factorisation ``H_m = [Q_1 Q_2] [R; 0]``:
+
+    d = R^-1 Q_1^T (r - H_x x - n)      initialises it, as eq. (5) does,
+    Q_2^T r = Q_2^T H_x x + Q_2^T n     is an ordinary measurement of pose and anchor.
+
+Source: Li and Mourikis, "Optimization-based estimator design for vision-aided inertial navigation", RSS 2012.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.logbook import LogBook
 from ekfslam.filters.observing import moment
 from ekfslam.filters.retraction import retract
-from ekfslam.filters.waiting import Waiting
+from ekfslam.geometry import se3
+from ekfslam.models.blocks import Anchor
+from ekfslam.models.observer import Moment
+from ekfslam.models.sensors.base import DelayedSensor
 
 
-def start(e: Estimate, log: LogBook, waiting: Waiting | None, frame: int, ids: IntArray, rows: Array) -> BoolArray:
+def start(e: Estimate, log: LogBook, frame: int, ids: IntArray, rows: Array) -> BoolArray:
     """Append new landmarks with their full cross-covariance, eq. (5).
 
     Args:
-        e: Grows.
-        log: Keeps what initialised them.
-        waiting: Those that wait, for a sensor that needs two views.
+        e: Estimate that grows.
+        log: Record of the observations.
         frame: Frame index.
         ids, rows: (n,), (n, d) new tracks, distinct from all in the state.
 
     Returns:
-        Which (n,) have a landmark now; the others wait, or see nothing that is in front of the sensor.
+        Whether (n,) each track is in front of the sensor and has a landmark now.
     """
-    if waiting is not None:
-        return _start_after_waiting(e, log, waiting, frame, ids, rows)
     error, now = e.model.track_error, moment(e, e.mean)
     q, has_depth = e.model.observer.inverted(now, rows)
     ids, rows, q = ids[has_depth], rows[has_depth], q[has_depth]
@@ -40,21 +50,88 @@ def start(e: Estimate, log: LogBook, waiting: Waiting | None, frame: int, ids: I
     return has_depth
 
 
-def _start_after_waiting(
-    e: Estimate, log: LogBook, waiting: Waiting, frame: int, ids: IntArray, rows: Array
-) -> BoolArray:
-    """Append landmarks that two views initialise; their remaining rows are a measurement of the blocks."""
-    found = waiting.start(e, ids, rows)
-    if found.which.any():
-        now, variance = rows[found.which], e.sensor.variance(rows[found.which])
-        e.gaussian.augment(found.G, found.covariance)
-        views = (found.step, found.rows, variance), (e.step, now, variance)
-        _append(e, log, frame, ids[found.which], found.position_m, now, *views)
-        solution = e.gaussian.solve_body(found.H, found.residual, np.ones(len(found.residual)), e.step)
-        e.gaussian.apply(solution)
-        retract(e, solution.done.correction)
-    waiting.move_on(e, ids[~found.which], rows[~found.which])
-    return found.which
+class Waiting:
+    """Tracks seen from the anchor that have no landmark yet.
+
+    Args:
+        sensor: Sensor that needs two views of a landmark.
+        gate_probability: Chi-square gate on the remaining rows of two views.
+    """
+
+    def __init__(self, sensor: DelayedSensor, gate_probability: float) -> None:
+        self._sensor, self._gate_probability = sensor, gate_probability
+        self._ids, self._rows = np.empty(0, dtype=np.int64), np.empty((0, 0))
+        self._step, self._T_linear = 0, np.eye(4)
+
+    def start(self, e: Estimate, log: LogBook, frame: int, ids: IntArray, rows: Array) -> BoolArray:
+        """Append the landmarks that two views initialise; arguments and result as of the function `start`."""
+        which, then, position = self._triangulated(e, ids, rows)
+        H_x, H_m, r = self._views(e, position, then, rows[which])
+        Q, R = np.linalg.qr(H_m, mode="complete")
+        R_inverse = np.linalg.inv(R[:, :3])
+        by_state, by_rows = Q.swapaxes(1, 2) @ H_x, (Q.swapaxes(1, 2) @ r[..., None])[..., 0]
+        rest_H, rest_r = by_state[:, 3:], by_rows[:, 3:]
+        seen = e.gaussian.seen
+        S = rest_H @ e.gaussian.body_covariance[:seen, :seen] @ rest_H.swapaxes(1, 2) + np.eye(rest_H.shape[1])
+        gate = gates.threshold(self._gate_probability, rest_H.shape[1])
+        inside = gates.normalised_squares(S, rest_r, e.step, ids[which]) <= gate
+
+        started = np.zeros(len(ids), dtype=bool)
+        started[which[inside]] = True
+        if inside.any():
+            now, then, R_inverse = rows[started], then[inside], R_inverse[inside]
+            position = position[inside] + (R_inverse @ by_rows[inside, :3, None])[..., 0]
+            e.gaussian.augment(-R_inverse @ by_state[inside, :3], R_inverse @ R_inverse.swapaxes(1, 2))
+            variance = e.sensor.variance(now)
+            _append(e, log, frame, ids[started], position, now, (self._step, then, variance), (e.step, now, variance))
+            H, residual = np.zeros((rest_r[inside].size, e.gaussian.body)), rest_r[inside].ravel()
+            H[:, :seen] = rest_H[inside].reshape(-1, seen)
+            solution = e.gaussian.solve_body(H, residual, np.ones(len(residual)), e.step)
+            e.gaussian.apply(solution)
+            retract(e, solution.done.correction)
+        self._move_on(e, ids[~started], rows[~started])
+        return started
+
+    def _triangulated(self, e: Estimate, ids: IntArray, rows: Array) -> tuple[IntArray, Array, Array]:
+        """Return the new tracks (k,) with enough parallax, their rows (k, d) at the anchor, and positions (k, 3)."""
+        which = np.flatnonzero(np.isin(ids, self._ids))
+        then = self._rows[np.searchsorted(self._ids, ids[which])] if len(which) else np.empty((0, rows.shape[1]))
+        T_cam_world = e.sensor.T_cam_imu @ e.T_imu_world
+        T_now_anchor = T_cam_world @ se3.inverse(e.sensor.T_cam_imu @ e.values[Anchor.name])
+        q, is_ready = self._sensor.triangulate(then, rows[which], T_now_anchor)
+        return which[is_ready], then[is_ready], se3.apply(se3.inverse(T_cam_world), q)[is_ready]
+
+    def _views(self, e: Estimate, position: Array, then: Array, now: Array) -> tuple[Array, Array, Array]:
+        """Return whitened H_x (k, 2d, seen), H_m (k, 2d, 3) and r (k, 2d) of both views."""
+        T_anchor, present = e.values[Anchor.name], moment(e, e.mean)
+        T_linear = e.variant.linear(present.T_imu_world, e.motion.T_predicted)
+        anchor = Moment(T_anchor, e.variant.linear(T_anchor, self._T_linear), present.calibration, present.twist)
+        present = present.linearised_at(T_linear)
+        views = (
+            (e.model.observer.see(anchor, position, position, Anchor.name), then),
+            (e.model.observer.see(present, position, position), now),
+        )
+        H_x, H_m, r = [], [], []
+        for seen, rows in views:
+            scale = 1.0 / np.sqrt(e.sensor.variance(rows))
+            H_x.append(scale[..., None] * seen.H_x)
+            H_m.append(scale[..., None] * seen.H_m)
+            r.append(scale * (rows - seen.z))
+        return np.concatenate(H_x, axis=1), np.concatenate(H_m, axis=1), np.concatenate(r, axis=1)
+
+    def _move_on(self, e: Estimate, ids: IntArray, rows: Array) -> None:
+        """Keep the tracks (n,) without a landmark that wait already; if none is left or patience ends, start again."""
+        still = np.isin(self._ids, ids)
+        self._ids, self._rows = self._ids[still], self._rows[still]
+        if len(self._ids) and e.step - self._step < self._sensor.patience:
+            return
+        # All tracks start to wait again, from here: the anchor takes the pose's place.
+        layout = e.model.layout
+        Phi = np.eye(layout.body)
+        Phi[layout[Anchor.name], layout[Anchor.name]], Phi[layout[Anchor.name], layout["pose"]] = 0.0, np.eye(6)
+        e.gaussian.propagate(Phi, np.zeros_like(Phi))
+        e.values = {**e.values, Anchor.name: e.T_imu_world}
+        self._ids, self._rows, self._step, self._T_linear = ids, rows, e.step, e.motion.T_predicted
 
 
 def _append(
@@ -66,7 +143,7 @@ def _append(
     rows: Array,
     *views: tuple[int, Array, Array],
 ) -> None:
-    """Write new landmarks, whose covariance is there already, into table and log."""
+    """Write new landmarks into table and log."""
     fresh = np.zeros(len(ids), dtype=np.int64)
     e.table.append(
         id=ids,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 
+from ekfslam.filters.observing import moment
 from ekfslam.geometry import se3
 from support.reference import T_CAM_IMU
 
@@ -29,3 +31,24 @@ def visible_points(T_imu_world, n=5):
     """World points in front of the camera, near and far."""
     q = RNG.uniform([-3, -2, 2], [3, 2, 30], (n, 3))
     return se3.apply(se3.inverse(T_CAM_IMU @ T_imu_world), q)
+
+
+def transition_jacobian(e, interval):
+    """Return the full-width F (b+3n, b+3n) of a step, identity but for the rows of the body."""
+    step = e.model.step(e.values, interval, e.linear_T_imu_world, e.variant.first_estimates)
+    full = sp.lil_array(sp.identity(len(e.P)))
+    full[: len(step.Phi), : len(step.Phi)] = step.Phi
+    return sp.csr_array(full)
+
+
+def measurement_jacobian(e, ids):
+    """Return the full-width H (3k, b+3n) of the sensor's rows of active landmarks ``ids`` (k,)."""
+    slot = e.slots(ids)
+    seen = e.model.observer.see(moment(e, e.mean), e.positions_m[slot], e.linear_positions_m[slot])
+    k, d, width = seen.H_x.shape
+    row = np.broadcast_to(np.arange(k * d).reshape(k, d, 1), (k, d, width + 3))
+    body = np.broadcast_to(np.arange(width), (k, d, width))
+    own = np.broadcast_to((e.gaussian.body + 3 * slot)[:, None, None] + np.arange(3), (k, d, 3))
+    columns = np.concatenate([body, own], axis=-1)
+    values = np.concatenate([seen.H_x, seen.H_m], axis=-1)
+    return sp.csr_array((values.ravel(), (row.ravel(), columns.ravel())), shape=(k * d, len(e.P)))

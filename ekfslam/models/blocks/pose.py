@@ -74,6 +74,6 @@ class PreviousPose(Clone):
 
 @dataclass(frozen=True)
 class Anchor(Clone):
-    """A clone of the pose from which tracks wait for parallax, see `ekfslam.filters.waiting`."""
+    """A clone of the pose from which tracks wait for parallax, see `ekfslam.filters.starting`."""
 
     name = "anchor"

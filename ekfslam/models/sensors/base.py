@@ -57,7 +57,7 @@ class DelayedSensor(Protocol):
     """A `Sensor` one view of which does not say where a landmark is, such as one camera alone.
 
     Its model has the block `ekfslam.models.blocks.pose.Anchor`. New tracks wait from the anchor on, until
-    `triangulate` has an answer; see `ekfslam.filters.waiting`.
+    `triangulate` has an answer; see `ekfslam.filters.starting`.
     """
 
     @property
