@@ -1,4 +1,4 @@
-"""Formulas as MathML, which browsers draw by themselves: no script and no font is fetched."""
+"""Convert formulas to MathML, which browsers draw without scripts or fonts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Replace what `pymdownx.arithmatex` has marked."""
+    """Replace the formulas that `pymdownx.arithmatex` has marked."""
     return _FORMULA.sub(_mathml, content)
 
 

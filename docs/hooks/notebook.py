@@ -1,6 +1,6 @@
-"""A notebook without Jupyter: its cells run in one namespace, and what they show is kept.
+"""Run a notebook without Jupyter: all cells share one namespace, and their output is kept.
 
-For the page of the tutorial and for its test. Shown are what a cell prints, its last expression, and open figures.
+The page of the tutorial and its test use it. Output is printed text, the last expression, and open figures.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ class Cell:
 
     Args:
         kind: ``markdown`` or ``code``.
-        source: Its text.
-        shown: What it shows, as Markdown.
+        source: Text of the cell.
+        shown: Output as Markdown.
     """
 
     kind: str
@@ -32,11 +32,11 @@ class Cell:
 
 
 def execute(path: Path, namespace: dict[str, Any] | None = None) -> list[Cell]:
-    """Run the code cells of a notebook in their order.
+    """Run the code cells of a notebook in order.
 
     Args:
         path: The ``.ipynb`` file.
-        namespace: Where the names of the notebook go; by default nowhere.
+        namespace: Dictionary for the names of the notebook; by default a new one.
     """
     names = {} if namespace is None else namespace
     cells = []
@@ -48,7 +48,7 @@ def execute(path: Path, namespace: dict[str, Any] | None = None) -> list[Cell]:
 
 
 def as_markdown(cells: list[Cell]) -> str:
-    """The page of a notebook that has run."""
+    """Return the page of a notebook that has run."""
     parts = [
         cell.source if cell.kind == "markdown" else f"```python\n{cell.source}\n```\n\n{cell.shown}" for cell in cells
     ]
@@ -56,7 +56,7 @@ def as_markdown(cells: list[Cell]) -> str:
 
 
 def _run(source: str, names: dict[str, Any]) -> str:
-    """What a code cell shows."""
+    """Return the output of a code cell."""
     from matplotlib import pyplot
 
     tree, value = ast.parse(source), None
@@ -73,7 +73,7 @@ def _run(source: str, names: dict[str, Any]) -> str:
 
 
 def _shown(value: Any) -> list[str]:
-    """A value as a notebook shows it: a figure as a picture, by its HTML form where it has one, else by its repr."""
+    """Return a value as a notebook shows it: a figure as a picture, else its HTML form if it has one, else its repr."""
     if value is None:
         return []
     if hasattr(value, "savefig"):

@@ -1,4 +1,4 @@
-"""Pages that are made from something else: the tutorial, the command line, and files of the top folder."""
+"""Generate pages: the tutorial, the command line, and files of the top folder."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def _beside(name: str) -> ModuleType:
-    """A module of this folder, which is no package."""
+    """Return a module of this folder, which is not a package."""
     spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -44,14 +44,14 @@ def _beside(name: str) -> ModuleType:
 
 
 def _command_line() -> str:
-    """The help of every subcommand, as it prints it."""
+    """Return the help of every subcommand."""
     from ekfslam.cli import commands
 
     names = sorted(path.stem for path in Path(commands.__path__[0]).glob("*.py") if path.stem != "__init__")
     parts = [
         "# Command line",
-        "Every subcommand is a thin call of the function of the same name in Python. What follows is what `--help` "
-        "prints. A user's error is one line and exit code 2.",
+        "Every subcommand is a thin call of the Python function of the same name. This page shows the output of "
+        "`--help`. An error of the user is one line and exit code 2.",
         _help(),
         *(f"## {name}\n\n{_help(name)}" for name in names),
     ]
