@@ -109,6 +109,17 @@ def test_an_entry_whose_content_does_not_fit_its_digest_ends_the_journal(tmp_pat
     assert [run for (_, run), _ in journal.entries()] == list(range(kept))
 
 
+def test_a_run_appended_after_an_incomplete_entry_is_read(tmp_path):
+    blank = {"invariant": {"pose_nees": np.zeros(3)}}
+    journal = Journal(tmp_path / "a.h5", {"seed": 1}, lambda level: blank)
+    journal.append(("mid", 0), blank)
+    with journal.path.open("ab") as file:
+        file.write(framed(b"killed")[:-1])
+    assert [run for (_, run), _ in journal.entries()] == [0]
+    journal.append(("mid", 1), blank)
+    assert [run for (_, run), _ in journal.entries()] == [0, 1]
+
+
 def test_a_journal_of_a_longer_study_serves_a_shorter_one(tmp_path):
     longer = Study(short("mid", 6), ("invariant",), runs=3)
     record = run_one(longer, "mid", 2)

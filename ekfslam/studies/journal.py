@@ -156,13 +156,17 @@ def framed(content: bytes) -> bytes:
 
 
 def _read(path: Path) -> Iterator[bytes]:
-    """Yield the entries of a file up to the first incomplete one."""
+    """Yield the entries of a file up to the first incomplete one, and drop the rest of the file."""
     if not path.is_file():
         return
+    end = 0
     with path.open("rb") as file:
         while len(head := file.read(_LENGTH + _DIGEST)) == _LENGTH + _DIGEST:
             length = int.from_bytes(head[:_LENGTH], "big")
             content = file.read(length) if length <= _LONGEST else b""
             if len(content) != length or hashlib.sha256(content).digest() != head[_LENGTH:]:
-                return
+                break
+            end = file.tell()
             yield content
+    if end < path.stat().st_size:
+        os.truncate(path, end)  # or entries that are appended would never be read

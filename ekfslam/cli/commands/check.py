@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from ekfslam.cli.options import declare
 from ekfslam.reports import check
@@ -12,11 +11,8 @@ EXAMPLES = ("check city.h5", "check drive.h5 --out figures")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    declare(parser, "archive")
+    declare(parser, "archive", "--out")
     parser.add_argument("--mode", default="full", help="mode in the archive (default: %(default)s)")
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for check.md, .json and .png; default: that of the archive"
-    )
 
 
 def command(options: argparse.Namespace) -> None:

@@ -26,7 +26,7 @@ EXAMPLES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "data", nargs="*", default=[DEFAULT_DATA])
     parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), metavar="MODE", help=", ".join(MODES))
-    parser.add_argument("--out", type=Path, default=Path("results/local"), metavar="DIR", help="default: %(default)s")
+    declare(parser, "--out", default=Path("results/local"), help="default: %(default)s")
     declare(parser, "--no-figures", *EXECUTOR)
     declare_run(parser)
 

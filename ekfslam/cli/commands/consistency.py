@@ -36,13 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all runs (default: %(default)s)")
     declare(parser, *EXECUTOR)
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("results/local/consistency"),
-        metavar="DIR",
-        help="default: %(default)s; an interrupted study there resumes",
-    )
+    resumes = "default: %(default)s; an interrupted study there resumes"
+    declare(parser, "--out", default=Path("results/local/consistency"), help=resumes)
 
 
 def command(options: argparse.Namespace) -> None:

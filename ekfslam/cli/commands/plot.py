@@ -24,8 +24,7 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    declare(parser, "archive", "--force")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="default: the folder of the archive")
+    declare(parser, "archive", "--out", "--force")
     parser.add_argument("--format", choices=get_args(Format), default="png", help="default: %(default)s")
     parser.add_argument(
         "--viewer",

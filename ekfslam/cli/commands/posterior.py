@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import get_args
 
 from ekfslam import files
@@ -18,7 +17,7 @@ EXAMPLES = ("posterior city.h5", "posterior city.h5 --linearisation filtered", "
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    declare(parser, "archive", "--no-figures")
+    declare(parser, "archive", "--out", "--no-figures")
     parser.add_argument(
         "--linearisation",
         choices=get_args(Linearisation),
@@ -26,9 +25,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--kernel", choices=get_args(Kernel), help="robust kernel of map (default: as configured, huber)"
-    )
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the figures; default: the folder of the archive"
     )
 
 

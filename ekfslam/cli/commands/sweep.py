@@ -50,13 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="draw a column against another, a panel for each recording; may be given several times",
     )
     declare(parser, *EXECUTOR)
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("results/local/sweep"),
-        metavar="DIR",
-        help="default: %(default)s; an interrupted sweep there resumes",
-    )
+    resumes = "default: %(default)s; an interrupted sweep there resumes"
+    declare(parser, "--out", default=Path("results/local/sweep"), help=resumes)
 
 
 def _chosen(text: str) -> tuple[str, str]:
