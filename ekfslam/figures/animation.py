@@ -5,33 +5,43 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from PIL import Image
 
 from ekfslam import files
-from ekfslam.arrays import IntArray
+from ekfslam.arrays import Array, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.errors import ConfigError
-from ekfslam.figures.maps import SIGMAS, dot_size, ellipse_axes, map_axes, map_of, spread
+from ekfslam.figures.maps import (
+    SIGMAS,
+    diagonal,
+    draw_dots,
+    ellipse_axes,
+    ellipses,
+    legend_below,
+    map_axes,
+    map_of,
+    position_covariance,
+    spread,
+)
 from ekfslam.figures.style import LANDMARK_COLOR, TRUTH, line_of, style_of, styled
 from ekfslam.filters.result import Result
-from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.progress import progress
 
 FORMATS = (".gif", ".mp4")
 MOST_PICTURES = 2000
 _DPI = 100
+Update = Callable[[int], Iterable[Artist]]  # moves artists to a frame and returns them
 _CODEC = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23", "-movflags", "+faststart")
 
 
@@ -48,11 +58,11 @@ def write_animation(
     A landmark appears in the frame of its first observation, at its last estimate: archives hold no earlier ones.
 
     Args:
-        path: Ends in ``.gif``, or in ``.mp4``, for which the program ffmpeg is needed.
+        path: Target file: ``.gif``, or ``.mp4``, which needs the program ffmpeg.
         results: Mode to result.
         truth: Known poses.
-        pictures: How many, at most; they are spread over the drive.
-        per_second: How fast they follow each other.
+        pictures: Largest number of pictures, spread over the drive.
+        per_second: Pictures per second.
 
     Raises:
         ConfigError: Another ending, a number out of range, or ffmpeg is missing or fails.
@@ -71,107 +81,82 @@ def write_animation(
 
 
 def animated(results: Mapping[str, Result], truth: Truth | None, pictures: int) -> Iterator[Image.Image]:
-    """Yield at most so many pictures of a drive, the last of its last frame."""
+    """Yield at most ``pictures`` pictures of a drive, the last one of its last frame."""
     frames = len(next(iter(results.values())).time_s)
-    figure, update = _moving_map(results, truth)
+    updates: list[Update] = []
+    figure = _still_map(results, truth, updates)
     canvas = FigureCanvasAgg(figure)
-    canvas.draw()  # places everything that does not move
+    canvas.draw()
     still = canvas.copy_from_bbox(figure.bbox)
     for k in spread(frames, pictures):
         canvas.restore_region(still)
-        for artist in update(int(k)):
-            figure.draw_artist(artist)
+        for update in updates:
+            for artist in update(int(k)):
+                figure.draw_artist(artist)
         yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
 
-def _moving_map(results: Mapping[str, Result], truth: Truth | None) -> tuple[Figure, Callable[[int], Iterable[Artist]]]:
-    """Return a map without its moving parts, and a function that updates these to a frame."""
-    parts: list[Callable[[int], Iterable[Artist]]] = []
-
-    @styled
-    def draw() -> Figure:
-        paths = [result.T_world_imu[:, :2, 3] for result in results.values()]
-        if truth is not None and len(truth.frame):
-            paths.append(truth.T_world_imu[:, :2, 3])
-        mapper = map_of(results)
-        ax, _ = map_axes(np.concatenate(paths), mapper.landmarks.position_m[:, :2])
-        figure = ax.get_figure()
-        assert isinstance(figure, Figure)
-        figure.set_dpi(_DPI)
-        parts.append(_landmarks(ax, mapper))
-        if truth is not None and len(truth.frame):
-            ax.plot(*truth.T_world_imu[:, :2, 3].T, **TRUTH, alpha=0.35, label="truth")
-        parts.extend(_vehicle(ax, mode, result) for mode, result in results.items())
-        parts.append(_clock(ax, mapper))
-        legend = figure.legend(loc="outside lower center", ncols=3)
-        for handle in legend.legend_handles:
-            if isinstance(handle, Line2D) and handle.get_marker() == ".":
-                handle.set_markersize(8.0)
-        ax.set_title(f"{mapper.sequence_name}: {SIGMAS:g}-sigma ellipses")
-        return figure
-
-    figure = draw()
-    return figure, lambda k: [artist for part in parts for artist in part(k)]
+@styled
+def _still_map(results: Mapping[str, Result], truth: Truth | None, updates: list[Update]) -> Figure:
+    """Return a map without its moving parts, and append the functions that move them to a frame."""
+    mapper = map_of(results)
+    figure, ax, _ = map_axes(results, truth, mapper.landmarks.position_m[:, :2])
+    figure.set_dpi(_DPI)
+    updates.append(_landmarks(ax, mapper))
+    if truth is not None and len(truth.frame):
+        ax.plot(*truth.T_world_imu[:, :2, 3].T, **TRUTH, alpha=0.35, label="truth")
+    updates.extend(_vehicle(ax, mode, result) for mode, result in results.items())
+    updates.append(_clock(ax, mapper))
+    legend_below(figure, ax)
+    ax.set_title(f"{mapper.sequence_name}: {SIGMAS:g}-sigma ellipses")
+    return figure
 
 
-def _landmarks(ax: Axes, mapper: Result) -> Callable[[int], Iterable[Artist]]:
-    """Return the updates of landmarks: dots of all seen so far, ellipses of all in view."""
+def _landmarks(ax: Axes, mapper: Result) -> Update:
+    """Return the update of landmarks: dots of all seen so far, ellipses of all in view."""
     landmarks = mapper.landmarks
     points = landmarks.position_m[:, :2]
-    (dots,) = ax.plot([], [], ".", color=LANDMARK_COLOR, markersize=1.5 * dot_size(len(points)), markeredgewidth=0)
-    dots.set(animated=True, label=f"landmarks of {mapper.mode}", alpha=0.6)
-    long, short, angle = ellipse_axes(landmarks.covariance[:, :2, :2], SIGMAS)
-    fits = long < 0.1 * np.hypot(np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()))
+    dots = draw_dots(ax, points, f"landmarks of {mapper.mode}", alpha=0.6, animated=True)
+    dots.set_markersize(1.5 * dots.get_markersize())
+    axes = ellipse_axes(landmarks.covariance[:, :2, :2])
+    fits = axes[0] < 0.1 * diagonal(ax)
 
     def update(k: int) -> Iterable[Artist]:
         seen = landmarks.first_frame <= k
         dots.set_data(*points[seen].T)
         now = np.flatnonzero(seen & (landmarks.last_frame >= k) & fits)
-        return dots, _ellipses(ax, now, points, long, short, angle, LANDMARK_COLOR)
+        return dots, _ellipses(ax, now, points, axes, LANDMARK_COLOR)
 
     return update
 
 
-def _vehicle(ax: Axes, mode: str, result: Result) -> Callable[[int], Iterable[Artist]]:
-    """Return the updates of a run: path so far, position with ellipse, and heading."""
+def _vehicle(ax: Axes, mode: str, result: Result) -> Update:
+    """Return the update of a run: path so far, position with ellipse, and heading."""
     xy, forward, color = result.T_world_imu[:, :2, 3], result.T_world_imu[:, :2, 0], style_of(mode)["color"]
     (line,) = ax.plot([], [], **line_of(mode), label=mode, animated=True)
     arrow = ax.quiver(*xy[0], *forward[0], color=color, angles="xy", scale=18, width=0.006, zorder=5, animated=True)
-    axes = ellipse_axes(world_axes_covariance(result.T_world_imu, result.covariance)[0][:, :2, :2], SIGMAS)
+    axes = ellipse_axes(position_covariance(result.T_world_imu, result.covariance))
 
     def update(k: int) -> Iterable[Artist]:
         line.set_data(*xy[: k + 1].T)
         arrow.set_offsets(xy[k])
         arrow.set_UVC(*forward[k])
-        return line, _ellipses(ax, np.array([k]), xy, *axes, color), arrow
+        return line, _ellipses(ax, np.array([k]), xy, axes, color), arrow
 
     return update
 
 
-def _ellipses(
-    ax: Axes, rows: IntArray, centres: Any, long: Any, short: Any, angle: Any, color: str
-) -> EllipseCollection:
-    """Return ellipses of some rows that are ready to be drawn on axes, but not added to them."""
-    found = EllipseCollection(
-        long[rows],
-        short[rows],
-        angle[rows],
-        units="xy",
-        offsets=centres[rows],
-        offset_transform=ax.transData,
-        facecolors="none",
-        edgecolors=color,
-        linewidths=0.8,
-    )
-    figure = ax.get_figure()
-    assert figure is not None
+def _ellipses(ax: Axes, rows: IntArray, centres: Array, axes: tuple[Array, Array, Array], color: str) -> Artist:
+    """Return ellipses that can be drawn without being added to the axes, where they would pile up."""
+    long, short, angle = (values[rows] for values in axes)
+    found = ellipses(ax, centres[rows], (long, short, angle), color, linewidths=0.8)
     found.axes = ax
-    found.set_figure(figure)
+    found.set_figure(ax.get_figure())  # type: ignore[arg-type]
     found.set_clip_box(ax.bbox)
     return found
 
 
-def _clock(ax: Axes, result: Result) -> Callable[[int], Iterable[Artist]]:
+def _clock(ax: Axes, result: Result) -> Update:
     text = ax.text(0.015, 0.985, "", transform=ax.transAxes, va="top", animated=True)
 
     def update(k: int) -> Iterable[Artist]:
@@ -193,25 +178,19 @@ def _gif(pictures: Iterable[Image.Image], per_second: int) -> bytes:
 
 def _mp4(pictures: Iterable[Image.Image], per_second: int) -> bytes:
     """Return an mp4 made by ffmpeg; pictures are piped to it as they are drawn."""
-    with TemporaryDirectory() as folder:
+    pictures = iter(pictures)
+    first = next(pictures)
+    width, height = (size - size % 2 for size in first.size)  # H.264 wants even sizes
+    with TemporaryDirectory() as folder, (Path(folder) / "errors").open("w+b") as errors:
         target = Path(folder) / "drive.mp4"
-        iterator = iter(pictures)
-        first = next(iterator)
-        width, height = (size - size % 2 for size in first.size)  # H.264 wants even sizes
         source = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(per_second), "-i", "-")
         call = ["ffmpeg", "-y", "-loglevel", "error", *source, *_CODEC, str(target)]
-        with (Path(folder) / "errors").open("w+b") as errors:
-            process = subprocess.Popen(call, stdin=subprocess.PIPE, stderr=errors)
+        with suppress(BrokenPipeError), subprocess.Popen(call, stdin=subprocess.PIPE, stderr=errors) as process:
             assert process.stdin is not None
-            try:
-                process.stdin.write(first.crop((0, 0, width, height)).tobytes())
-                for picture in iterator:
-                    process.stdin.write(picture.crop((0, 0, width, height)).tobytes())
-                process.stdin.close()
-            except BrokenPipeError:
-                pass  # what ffmpeg says is told below
-            if process.wait() != 0 or not target.exists():
-                errors.seek(0)
-                said = " ".join(errors.read(2000).decode(errors="replace").split())
-                raise ConfigError(f"ffmpeg makes no mp4: {said or 'no reason given'}")
+            for picture in chain([first], pictures):
+                process.stdin.write(picture.crop((0, 0, width, height)).tobytes())
+        if process.returncode != 0 or not target.exists():
+            errors.seek(0)
+            said = " ".join(errors.read(2000).decode(errors="replace").split())
+            raise ConfigError(f"ffmpeg makes no mp4: {said or 'no reason given'}")
         return target.read_bytes()

@@ -24,9 +24,7 @@ _BINS = 60  # of the time axis, in which rejections are counted
 def plot_check(result: Result, found: Honesty) -> Figure:
     """Draw six panels: NIS, rejections, autocorrelation along tracks and of shared innovations, and these over time.
 
-    Args:
-        result: With whitened innovations.
-        found: What `ekfslam.evaluation.honesty.judge` said of it.
+    The result needs whitened innovations, and the judgement of `ekfslam.evaluation.honesty.judge`.
     """
     assert found.shared is not None and found.tracks is not None
     figure = Figure(figsize=(11.0, 9.6))
@@ -83,11 +81,10 @@ def _correlation(ax: Axes, found: Whiteness, samples: IntArray, names: tuple[str
 def _shared(result: Result) -> tuple[Array, Array]:
     """Return sums over `LAGS` frames (n, 6) divided by their expected deviation, and the times (n,) of their middle."""
     assert result.whitened is not None
-    series, time_s = result.whitened.shared, result.time_s - result.time_s[0]
-    known = np.isfinite(series).all(axis=1)
-    series, time_s = series[known], time_s[known]
-    total = np.cumsum(np.vstack([np.zeros(6), series]), axis=0)
-    return (total[LAGS:] - total[:-LAGS]) / np.sqrt(LAGS), time_s[LAGS // 2 :][: len(series) - LAGS + 1]
+    known = np.isfinite(result.whitened.shared).all(axis=1)
+    total = np.cumsum(np.vstack([np.zeros(6), result.whitened.shared[known]]), axis=0)
+    sums = (total[LAGS:] - total[:-LAGS]) / np.sqrt(LAGS)
+    return sums, (result.time_s - result.time_s[0])[known][LAGS // 2 :][: len(sums)]
 
 
 def _over_time(ax: Axes, time_s: Array, shared: Array, axes: range) -> None:

@@ -24,6 +24,5 @@ def older_figures(directory: Path) -> list[Path]:
 def remove_figures(older: Iterable[Path], new: Iterable[Path]) -> None:
     """Remove older figures that no new ones replace, and with ``check.png`` its verdict."""
     for path in set(older) - set(new):
-        verdict = [path.with_suffix(".md"), path.with_suffix(".json")] if path.name == "check.png" else []
-        for old in (path, *verdict):
-            old.unlink(missing_ok=True)
+        for suffix in (".png", ".md", ".json") if path.name == "check.png" else (".png",):
+            path.with_suffix(suffix).unlink(missing_ok=True)

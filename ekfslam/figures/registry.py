@@ -4,16 +4,14 @@
     def speed(result: Result, truth: Truth) -> Figure:
         ...
 
-A file with such a function is all that a new figure takes. `ekfslam.figures.run.draw_figures` draws it once the file is
-imported.
+`ekfslam.figures.run.draw_figures` draws a figure once its file is imported.
 """
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
-from typing import Any, ParamSpec
+from typing import Any, NamedTuple, ParamSpec
 
 from matplotlib.figure import Figure
 
@@ -25,9 +23,8 @@ from ekfslam.filters.result import Result
 P = ParamSpec("P")
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A registered figure: what it needs, what it takes, and the function that draws it."""
+class Entry(NamedTuple):
+    """A registered figure: names that it needs, names that it takes, and the function that draws it."""
 
     needs: frozenset[str]
     takes: tuple[str, ...]
@@ -40,11 +37,9 @@ FIGURES: dict[str, Entry] = {}
 def figure(name: str, needs: Collection[str] = ()) -> Callable[[Callable[P, Figure]], Callable[P, Figure]]:
     """Register a function that draws a figure of runs, and draw it in the style of all figures.
 
-    Its parameters are named after what it takes of `offered`.
-
     Args:
-        name: Name of the file. With ``{mode}`` in it, the figure is drawn of each mode alone.
-        needs: Names of `offered` without which the figure is left out.
+        name: Name of the file. If it contains ``{mode}``, each mode has a figure of its own.
+        needs: Names of `offered` without which the figure is left out. Its parameters are such names, too.
     """
 
     def register(draw: Callable[P, Figure]) -> Callable[P, Figure]:
@@ -56,10 +51,10 @@ def figure(name: str, needs: Collection[str] = ()) -> Callable[[Callable[P, Figu
 
 
 def offered(results: Mapping[str, Result], truth: Truth | None, interpolated: BoolArray | None) -> dict[str, Any]:
-    """Return what a figure may take or need, None for what is missing.
+    """Return the values that a figure may take or need, None if missing.
 
-    ``results`` by mode, ``result`` (the first), each mode by its name, ``truth``, ``interpolated`` (T,) intervals of
-    the recording; and as needs alone ``updates``, ``landmarks``, and ``parameters`` of the full run.
+    ``results`` by mode, ``result`` (the first), each mode by its name, ``truth``, ``interpolated`` (T,) intervals;
+    and as needs alone ``updates``, ``landmarks``, and ``parameters`` of the full run.
     """
     runs = list(results.values())
     return {

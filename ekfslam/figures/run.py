@@ -1,7 +1,4 @@
-"""Figures of runs over time: errors, NIS, estimated parameters; and all figures of a run.
-
-Functions return a `matplotlib.figure.Figure` and touch no global state.
-"""
+"""Figures of runs over time: errors, NIS, estimated parameters; and all figures of a run."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from ekfslam.figures import maps as maps  # registers figures, as the next one d
 from ekfslam.figures import posterior as posterior
 from ekfslam.figures import registry, series
 from ekfslam.figures.series import BAND_SIGMAS, draw_series
-from ekfslam.figures.style import PRIOR, ZERO, Format, save_all, style_of
+from ekfslam.figures.style import PRIOR, ZERO, Format, legend_of, save_all, style_of
 from ekfslam.filters.result import Result
 
 
@@ -25,9 +22,8 @@ from ekfslam.filters.result import Result
 def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolArray | None = None) -> Figure:
     """Draw estimate minus truth over time, world axes: position (m) and rotation (degrees) with 3-sigma bands.
 
-    Each mode has a column with scales of its own, so that a small error stays legible. Modes with equal trajectories
-    (mapping-only and dead reckoning) share a column. NEES is of the frames that no ``interpolated`` interval (T,)
-    leads to.
+    Each mode has a column with its own scales. Modes with equal trajectories (mapping-only and dead reckoning) share a
+    column. NEES is of the frames that no ``interpolated`` interval (T,) leads to.
     """
     columns: dict[str, Result] = {}
     for mode, result in results.items():
@@ -39,9 +35,8 @@ def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolA
     figure = Figure(figsize=(4.4 * len(columns) + 0.4, 8.8))
     axes = figure.subplots(6, len(columns), sharex=True, squeeze=False)
     for column, (title, result) in zip(axes.T, columns.items(), strict=True):
-        errors = series.errors(result, truth)
+        errors, color = series.errors(result, truth), style_of(result.mode)["color"]
         for ax, error in zip(column, errors, strict=True):
-            color = style_of(result.mode)["color"]
             draw_series(ax, error, color, {"color": "black", "linewidth": 1.0}, levels=ZERO)
         inside = f"{100 * series.share_inside(errors):.1f} % inside {BAND_SIGMAS:g} sigma"
         column[0].set_title(f"{title}\n{inside}{_nees_words(result, truth, interpolated)}")
@@ -61,11 +56,7 @@ def _nees_words(result: Result, truth: Truth, interpolated: BoolArray | None) ->
 
 @registry.figure("nis", needs={"updates"})
 def plot_nis(results: Mapping[str, Result]) -> Figure:
-    """Draw NIS per degree of freedom over time for each mode with updates, with each frame's 95 % chi-square bounds.
-
-    Raises:
-        ValueError: No mode has an update.
-    """
+    """Draw NIS per degree of freedom over time for each mode with updates, with each frame's 95 % chi-square bounds."""
     updated = {mode: result for mode, result in results.items() if result.innovation.dof.any()}
     if not updated:
         raise ValueError("no mode has an innovation to show")
@@ -77,7 +68,7 @@ def plot_nis(results: Mapping[str, Result]) -> Figure:
         draw_series(ax, nis, style["color"], {**dots, "linestyle": ""})
         inside = f"{100 * nis.share_inside:.1f} % of {len(nis.y)} frames inside"
         ax.set_title(f"{mode}: {inside}, mean {nis.mean:.3g} (1 expected)")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    legend_of(figure, axes[:1], 2)
     figure.suptitle(f"{next(iter(results.values())).sequence_name}: normalised innovation squared")
     return figure
 
@@ -86,32 +77,26 @@ def plot_nis(results: Mapping[str, Result]) -> Figure:
 def plot_parameters(full: Result) -> Figure:
     """Draw the estimated parameters (calibration, roll and pitch) over time with 3-sigma bands.
 
-    Dashed lines are the 3-sigma bounds of the prior. A band that still fills them at the end has not been observed.
-
-    Raises:
-        ValueError: The run has no such parameters.
+    Dashed lines are the 3-sigma bounds of the prior. A parameter whose band still fills them was not observed.
     """
-    drawn = series.parameters(full)
+    drawn, color = series.parameters(full), style_of(full.mode)["color"]
     if full.parameters is None or not drawn:
         raise ValueError("there are no parameters to show")
     columns = min(len(drawn), 3)
     rows = -(-len(drawn) // columns)
     figure = Figure(figsize=(3.6 * columns, 0.6 + 2.2 * rows))
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    color = style_of(full.mode)["color"]
-    for ax, one, is_observed in zip(axes, drawn, full.parameters.is_observed, strict=False):
+    for i, (one, is_observed) in enumerate(zip(drawn, full.parameters.is_observed, strict=True)):
+        ax = figure.add_subplot(rows, columns, i + 1)
         draw_series(ax, one, color, {"color": color}, levels=PRIOR)
-        ax.set(title=one.name + ("" if is_observed else " (not observable)"), ylabel=f"[{one.unit or '-'}]")
-        ax.set_xlabel(one.labels[0])
-    for ax in axes[len(drawn) :]:
-        ax.set_visible(False)
+        title = one.name + ("" if is_observed else " (not observable)")
+        ax.set(title=title, xlabel=one.labels[0], ylabel=f"[{one.unit or '-'}]")
     return figure
 
 
 def draw_figures(
     results: Mapping[str, Result], truth: Truth | None = None, interpolated: BoolArray | None = None
 ) -> dict[str, Figure]:
-    """Draw the registered figures that the results allow, by name, see `ekfslam.figures.registry`.
+    """Draw the registered figures that the results allow, by name.
 
     ``map`` and ``side`` always, ``errors`` with true poses, ``nis`` with updates, ``parameters`` if ``full`` estimated
     any, ``landmarks_<mode>`` for every mode with a map, ``map_before_and_after`` with ``full`` and ``smoothed``.

@@ -1,7 +1,6 @@
 """The table of series: each curve over a run with its unit, its bounds and its expected value.
 
-Figures and report pages draw the same series. Matplotlib draws them by `draw_series`; `ekfslam.page` packs them for its
-script.
+Figures draw them by `draw_series`; `ekfslam.page` packs them for its script.
 """
 
 from __future__ import annotations
@@ -16,23 +15,18 @@ from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
-from ekfslam.evaluation.consistency import (
-    chi2_bounds,
-    measured_truth,
-    pose_nees,
-    world_axes_errors,
-    world_axes_std,
-)
+from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_nees, world_axes_errors, world_axes_std
 from ekfslam.evaluation.trajectory import distance_along
 from ekfslam.figures.style import BAND_ALPHA, BOUNDS, EXPECTED, Style, log_axis
 from ekfslam.filters.result import Result
 
 BAND_SIGMAS = 3.0
 PROBABILITY = 0.95  # of the bounds of NIS and NEES
-_LOG_RATIO = 20.0  # largest over smallest value from which a logarithmic axis shows more
+LOG_RATIO = 20.0  # largest over smallest value from which a logarithmic axis shows more
 _AXES = tuple(f"{kind} {axis}" for kind in ("position", "rotation") for axis in "xyz")
 _SCALES = np.repeat([1.0, np.degrees(1.0)], 3)  # m and rad to the units below
 _UNITS = ("m", "m", "m", "deg", "deg", "deg")
+_ABSCISSAE = {"s": "time [s]", "m": "distance driven [m]"}
 
 
 @dataclass(frozen=True)
@@ -46,9 +40,8 @@ class Series:
         bounds_expectation: Whether the bounds hold values of an honest run; otherwise they are those of the estimate.
         levels: Values to compare with: expected ones, or bounds of the prior.
         is_positive: Whether large ratios matter, so that the axis may be logarithmic.
-        is_dotted: Whether single points are drawn instead of a line.
         mean: Mean by degrees of freedom, for titles.
-        x_name, x_unit: Label of the x axis.
+        x_unit: ``s`` over time, ``m`` over distance driven.
     """
 
     name: str
@@ -60,20 +53,18 @@ class Series:
     bounds_expectation: bool = False
     levels: tuple[float, ...] = ()
     is_positive: bool = False
-    is_dotted: bool = False
     mean: float | None = None
-    x_name: str = "time"
     x_unit: str = "s"
 
     @property
     def labels(self) -> tuple[str, str]:
         """Labels of the x axis and of the y axis."""
-        return f"{self.x_name} [{self.x_unit}]", f"{self.name} [{self.unit or '-'}]"
+        return _ABSCISSAE[self.x_unit], f"{self.name} [{self.unit or '-'}]"
 
     @property
     def is_log(self) -> bool:
         """Whether a logarithmic axis shows more."""
-        return self.is_positive and len(self.y) > 0 and bool(np.max(self.y) > _LOG_RATIO * np.min(self.y))
+        return self.is_positive and len(self.y) > 0 and bool(np.max(self.y) > LOG_RATIO * np.min(self.y))
 
     @property
     def share_inside(self) -> float:
@@ -82,24 +73,19 @@ class Series:
         return float(np.mean((self.y >= self.low) & (self.y <= self.high)))
 
     def only(self, rows: IntArray) -> Series:
-        """Return some points of the curve."""
+        """Return the points of some rows (n,)."""
         low, high = (None if bound is None else bound[rows] for bound in (self.low, self.high))
         return dataclasses.replace(self, x=self.x[rows], y=self.y[rows], low=low, high=high)
-
-    def without_bounds(self) -> Series:
-        """Return the curve alone."""
-        return dataclasses.replace(self, low=None, high=None)
 
 
 def draw_series(ax: Axes, series: Series, band: str, line: Style, levels: Style = EXPECTED, label: str = "_") -> None:
     """Draw a curve, its bounds and levels with labelled axes.
 
     Args:
-        ax: Where to.
-        series: What to draw.
+        ax: Target axes.
+        series: The curve.
         band: Colour of the bounds of an estimate; bounds of expected values are grey.
-        line: Style of the curve.
-        levels: Style of the levels.
+        line, levels: Styles of curve and levels.
         label: Label of the curve in legends, which leave out names that begin with ``_``.
     """
     if series.low is not None and series.high is not None:
@@ -114,11 +100,9 @@ def draw_series(ax: Axes, series: Series, band: str, line: Style, levels: Style 
     ax.plot(series.x, series.y, **line, label=label)
     if series.is_log:
         log_axis(ax, (1.0, 2.0, 5.0))
-    x_label, y_label = series.labels
-    ax.set_ylabel(y_label)
     place = ax.get_subplotspec()
-    if place is None or place.is_last_row():
-        ax.set_xlabel(x_label)
+    is_last = place is None or place.is_last_row()
+    ax.set(ylabel=series.labels[1], xlabel=series.labels[0] if is_last else "")
     ax.margins(x=0.01)
 
 
@@ -157,9 +141,7 @@ def nis(result: Result) -> Series:
     low, high = (bound / dof for bound in chi2_bounds(dof, PROBABILITY))
     mean = float(innovation.nis.sum() / dof.sum()) if len(dof) else None
     y = innovation.nis[seen] / dof
-    return Series(
-        "NIS per dof", "", _time(result)[seen], y, low, high, True, (1.0,), is_positive=True, is_dotted=True, mean=mean
-    )
+    return Series("NIS per dof", "", _time(result)[seen], y, low, high, True, (1.0,), is_positive=True, mean=mean)
 
 
 def distance_from_truth(result: Result, truth: Truth) -> Series:
@@ -172,11 +154,10 @@ def distance_from_truth(result: Result, truth: Truth) -> Series:
 def height(T_world_imu: Array, covariance: Array | None = None) -> Series:
     """Return z of world over the distance driven, with 3-sigma bounds if there is a covariance (T, 6, 6)."""
     x, z = distance_along(T_world_imu), T_world_imu[:, 2, 3]
-    series = Series("z", "m", x, z, x_name="distance driven", x_unit="m")
     if covariance is None:
-        return series
+        return Series("z", "m", x, z, x_unit="m")
     bound = BAND_SIGMAS * world_axes_std(T_world_imu, covariance)[:, 2]
-    return dataclasses.replace(series, low=z - bound, high=z + bound)
+    return Series("z", "m", x, z, z - bound, z + bound, x_unit="m")
 
 
 def trajectory(result: Result, truth: Truth | None = None) -> list[tuple[Series, Series | None]]:
@@ -184,11 +165,10 @@ def trajectory(result: Result, truth: Truth | None = None) -> list[tuple[Series,
     time_s, values = _time(result), _unwrapped(result.T_world_imu)
     attitude = np.degrees(_attitude_std(result.T_world_imu, result.covariance))
     bound = BAND_SIGMAS * np.hstack([result.position_std_world_m, attitude])
-    known = truth is not None and len(truth.frame) > 0
     found = []
     for i, (name, unit) in enumerate(zip(("x", "y", "z", "roll", "pitch", "yaw"), _UNITS, strict=True)):
         y, true = values[:, i], None
-        if truth is not None and known:
+        if truth is not None and len(truth.frame):
             of_truth = _unwrapped(truth.T_world_imu)[:, i]
             turns = 360.0 * np.round((of_truth[0] - y[truth.frame[0]]) / 360.0) if unit == "deg" else 0.0
             true = Series(name, unit, time_s[truth.frame], of_truth - turns)
@@ -221,16 +201,10 @@ def _unwrapped(T_world_imu: Array) -> Array:
 
 
 def _attitude_std(T_world_imu: Array, covariance: Array) -> Array:
-    """Return standard deviations (T, 3) of roll, pitch and yaw, rad, to first order.
-
-    The rotation error ``theta`` is about the axes of the IMU, ``R_true = R exp(-theta^)``. The rows of E are the
-    derivatives of the angles with respect to it.
-    """
+    """Return standard deviations (T, 3) of roll, pitch and yaw, rad, to first order: E has their derivatives."""
     _, pitch, roll = Rotation.from_matrix(T_world_imu[:, :3, :3]).as_euler("ZYX").T
     sin, cos, zero = np.sin(roll), np.cos(roll), np.zeros_like(roll)
     level = np.maximum(np.cos(pitch), 1e-9)
-    E = np.stack(
-        [zero + 1.0, sin * np.tan(pitch), cos * np.tan(pitch), zero, cos, -sin, zero, sin / level, cos / level]
-    )
-    E = E.T.reshape(-1, 3, 3)
+    rows = [zero + 1.0, sin * np.tan(pitch), cos * np.tan(pitch), zero, cos, -sin, zero, sin / level, cos / level]
+    E = np.stack(rows, axis=1).reshape(-1, 3, 3)
     return np.sqrt(np.maximum(np.einsum("tij,tjk,tik->ti", E, covariance[:, 3:, 3:], E), 0.0))

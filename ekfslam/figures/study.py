@@ -1,15 +1,14 @@
-"""Figures of a Monte Carlo study: NEES against time, errors of runs against their bounds, NEES run by run.
-
-As in `ekfslam.figures.maps`, every function returns a `matplotlib.figure.Figure` and touches no global state.
-"""
+"""Figures of a Monte Carlo study: NEES over time, errors of runs with their bounds, NEES run by run."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from ekfslam.evaluation.consistency import chi2_bounds, nanmean
-from ekfslam.figures.style import BOUNDS, EXPECTED, WIDE_BOUNDS, line_of, log_axis, style_of, styled
+from ekfslam.figures.style import BOUNDS, EXPECTED, WIDE_BOUNDS, legend_of, line_of, log_axis, style_of, styled
 from ekfslam.studies.study import LABELS, StudyArchive
 from ekfslam.studies.summary import BOUND_PROBABILITY
 
@@ -20,10 +19,10 @@ _SHOWN_PERCENT = 98.0  # of the errors are within the view; a run that diverges 
 
 @styled
 def plot_study_nees(archive: StudyArchive, level: str) -> Figure:
-    """Draw pose and landmark NEES against time: mean over runs of every variant, with its 95 % and 99.9 % bounds.
+    """Draw pose and landmark NEES over time: mean over runs of every variant, with its 95 % and 99.9 % bounds.
 
-    The landmark NEES of a frame is itself a mean over landmarks, which share the pose's error: its bounds are those of
-    a single landmark, and so err on the wide side.
+    The landmark NEES of a frame is a mean over landmarks that share the pose's error. Its bounds are those of a single
+    landmark, and so err on the wide side.
     """
     figure = Figure(figsize=(9.0, 6.4))
     axes = figure.subplots(2, 1, sharex=True)
@@ -40,30 +39,32 @@ def plot_study_nees(archive: StudyArchive, level: str) -> Figure:
         ax.set_ylabel(f"{name} NEES ({dof} expected) [-]")
         ax.margins(x=0.01)
     axes[-1].set_xlabel("time [s]")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    legend_of(figure, axes[:1], 4)
     figure.suptitle(f"{level}: NEES, mean of {runs} runs")
     return figure
 
 
 @styled
 def plot_study_errors(archive: StudyArchive, level: str) -> Figure:
-    """Draw position errors (x, y) and yaw error of the first runs against time, one column a variant, same scales.
+    """Draw position errors (x, y) and yaw error of the first runs over time, one column a variant, same scales.
 
-    Bounds are three sigma as the filter states them, median over runs; titles say how many errors of all runs are
-    within their own run's bounds (99.7 % expected).
+    Bounds are the filter's three sigma, median over runs. Titles say how many errors of all runs are within their own
+    run's bounds (99.7 % expected).
     """
-    variants = archive.finished(level)
-    time_s = archive.time_s(level)
-    rows = (("x [m]", "position_error", 0, 1.0), ("y [m]", "position_error", 1, 1.0), ("yaw [deg]", "", 2, 180 / np.pi))
+    variants, time_s = archive.finished(level), archive.time_s(level)
+    # Label, field, its column, column of the bounds, and scale.
+    rows: tuple[tuple[str, str, int, int, float], ...] = (
+        ("x [m]", "position_error", 0, 0, 1.0),
+        ("y [m]", "position_error", 1, 1, 1.0),
+        ("yaw [deg]", "rotation_error", 2, 5, 180 / np.pi),
+    )
     figure = Figure(figsize=(2.9 * len(variants) + 0.5, 6.6))
     axes = figure.subplots(3, len(variants), sharex=True, sharey="row", squeeze=False)
     for column, (variant, values) in zip(axes.T, variants.items(), strict=True):
         color = style_of(variant)["color"]
         inside = []
-        for ax, (label, field, axis, scale) in zip(column, rows, strict=True):
-            errors = scale * values[field or "rotation_error"][..., axis]
-            bounds = scale * values["three_sigma"][..., axis + (0 if field else 3)]
+        for ax, (label, field, axis, bound, scale) in zip(column, rows, strict=True):
+            errors, bounds = scale * values[field][..., axis], scale * values["three_sigma"][..., bound]
             known = np.isfinite(errors)
             inside.append(np.abs(errors[known]) <= bounds[known])
             ax.plot(time_s, errors[:_SHOWN_RUNS].T, color="0.25", linewidth=0.5)
@@ -76,8 +77,11 @@ def plot_study_errors(archive: StudyArchive, level: str) -> Figure:
                 ax.set_ylabel(label)
         column[0].set_title(f"{LABELS[variant]}\n{100 * np.concatenate(inside).mean():.1f} % inside own 3 sigma")
         column[-1].set_xlabel("time [s]")
-    for row, (_, field, axis, scale) in zip(axes, rows, strict=True):
-        row[0].set_ylim(*_view(archive, level, field or "rotation_error", axis, scale))
+    for row, (_, field, axis, _, scale) in zip(axes, rows, strict=True):
+        errors = np.concatenate([scale * values[field][..., axis].ravel() for values in variants.values()])
+        errors = np.abs(errors[np.isfinite(errors)])
+        limit = 1.4 * float(np.percentile(errors, _SHOWN_PERCENT)) if len(errors) else 1.0
+        row[0].set_ylim(-limit, limit)
     figure.align_ylabels()
     runs = int(archive.done[level].sum())
     shown = f"{_SHOWN_RUNS} of {runs} runs" if runs > _SHOWN_RUNS else f"{runs} runs"
@@ -97,20 +101,14 @@ def plot_study_boxes(archive: StudyArchive) -> Figure:
             averages = nanmean(values["pose_nees"], axis=1)
             averages = averages[np.isfinite(averages)]
             color = style_of(variant)["color"]
-            ax.boxplot(
-                averages,
-                positions=[place],
-                widths=0.6,
-                showfliers=False,
-                medianprops={"color": color, "linewidth": 1.8},
-                **{part: {"color": color} for part in ("boxprops", "whiskerprops", "capprops")},
-            )
+            look: dict[str, Any] = {part: {"color": color} for part in ("boxprops", "whiskerprops", "capprops")}
+            look["medianprops"] = {"color": color, "linewidth": 1.8}
+            ax.boxplot(averages, positions=[place], widths=0.6, showfliers=False, **look)
             spread = np.linspace(-0.22, 0.22, len(averages))
             ax.plot(place + spread, averages, ".", color=color, markersize=3.0, alpha=0.6, markeredgewidth=0)
         ax.axhline(6.0, **EXPECTED, zorder=0.9)
-        ax.set_xticks(
-            range(len(variants)), [LABELS[v] for v in variants], rotation=40, ha="right", rotation_mode="anchor"
-        )
+        names = [LABELS[variant] for variant in variants]
+        ax.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
         ax.grid(False, axis="x")
         ax.set_title(f"{level}, {int(archive.done[level].sum())} runs")
     log_axis(axes[0], (1.0, 3.0))
@@ -126,11 +124,3 @@ def draw_study_figures(archive: StudyArchive) -> dict[str, Figure]:
         figures[f"nees_{level}"] = plot_study_nees(archive, level)
         figures[f"errors_{level}"] = plot_study_errors(archive, level)
     return figures
-
-
-def _view(archive: StudyArchive, level: str, field: str, axis: int, scale: float) -> tuple[float, float]:
-    """Return symmetric limits around the bulk of the errors of all variants."""
-    errors = np.concatenate([values[field][..., axis].ravel() for values in archive.finished(level).values()])
-    errors = np.abs(scale * errors[np.isfinite(errors)])
-    limit = 1.4 * float(np.percentile(errors, _SHOWN_PERCENT)) if len(errors) else 1.0
-    return -limit, limit

@@ -1,18 +1,16 @@
 """The one palette and style of all figures: a mode or variant has the same colour, line and marker everywhere.
 
 Colours are those of Okabe and Ito, which readers with colour-blindness tell apart, and greys. Line styles and markers
-differ as well, so that every figure is legible in grey. What belongs together looks alike: ``full`` is the filter whose
-default variant is ``invariant``; an iterated variant has the lighter shade of its colour; the modes in which the camera
-never corrects a pose are grey.
+differ as well, so that figures are legible in grey. ``full`` looks like its default variant ``invariant``. An iterated
+variant has the lighter shade of its colour. Modes in which the camera never corrects a pose are grey.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from io import BytesIO
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal, ParamSpec
 
 import matplotlib as mpl
@@ -37,76 +35,66 @@ VERMILLION, ORANGE = "#D55E00", "#E69F00"
 GREEN, PURPLE = "#009E73", "#CC79A7"
 BROWN = "#8A5A00"
 
-RC: Mapping[Any, Any] = MappingProxyType(
-    {
-        "font.size": 9.0,
-        "axes.titlesize": 10.0,
-        "axes.labelsize": 9.0,
-        "legend.fontsize": 8.0,
-        "axes.grid": True,
-        "grid.color": "0.88",
-        "grid.linewidth": 0.6,
-        "axes.axisbelow": True,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "legend.framealpha": 0.9,
-        "lines.linewidth": 1.4,
-        "lines.markersize": 4.5,
-        "figure.constrained_layout.use": True,
-    }
-)
+RC: Mapping[Any, Any] = {
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.labelsize": 9.0,
+    "legend.fontsize": 8.0,
+    "axes.grid": True,
+    "grid.color": "0.88",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.framealpha": 0.9,
+    "lines.linewidth": 1.4,
+    "lines.markersize": 4.5,
+    "figure.constrained_layout.use": True,
+}
 
 Style = Mapping[str, Any]  # keyword arguments of `Axes.plot`
 
 
 def _style(color: str, linestyle: Any, marker: str) -> Style:
-    return MappingProxyType({"color": color, "linestyle": linestyle, "marker": marker})
+    return {"color": color, "linestyle": linestyle, "marker": marker}
 
 
-MODES: Mapping[str, Style] = MappingProxyType(
-    {
-        "full": _style(BLUE, "-", "o"),
-        "dead-reckoning": _style(DARK_GREY, "--", "^"),
-        "mapping-only": _style(GREY, ":", "s"),
-        "smoothed": _style(PURPLE, "-.", "D"),
-    }
-)
-VARIANTS: Mapping[str, Style] = MappingProxyType(
-    {
-        "invariant": _style(BLUE, "-", "o"),
-        "fej": _style(GREEN, "-.", "s"),
-        "standard": _style(VERMILLION, "--", "D"),
-        "textbook": _style(BROWN, (0, (6, 2)), "X"),
-        "invariant-iterated": _style(SKY_BLUE, (0, (4, 1, 1, 1)), "v"),
-        "standard-iterated": _style(ORANGE, ":", "P"),
-    }
-)
-# Estimates of other kinds: other programs, dense references, archives with names of their own.
-OTHER: Style = _style(SKY_BLUE, "-.", "v")
+MODES: Mapping[str, Style] = {
+    "full": _style(BLUE, "-", "o"),
+    "dead-reckoning": _style(DARK_GREY, "--", "^"),
+    "mapping-only": _style(GREY, ":", "s"),
+    "smoothed": _style(PURPLE, "-.", "D"),
+}
+VARIANTS: Mapping[str, Style] = {
+    "invariant": _style(BLUE, "-", "o"),
+    "fej": _style(GREEN, "-.", "s"),
+    "standard": _style(VERMILLION, "--", "D"),
+    "textbook": _style(BROWN, (0, (6, 2)), "X"),
+    "invariant-iterated": _style(SKY_BLUE, (0, (4, 1, 1, 1)), "v"),
+    "standard-iterated": _style(ORANGE, ":", "P"),
+}
+OTHER: Style = _style(SKY_BLUE, "-.", "v")  # other programs, dense references, archives with names of their own
 
-TRUTH: Style = MappingProxyType({"color": BLACK, "linestyle": "-", "linewidth": 2.2})
+TRUTH: Style = {"color": BLACK, "linestyle": "-", "linewidth": 2.2}
 LANDMARK_COLOR, FIRST_LANDMARK_COLOR = BROWN, SKY_BLUE  # as estimated last, and as initialised
 
-# What a value is held against: its expected value, zero, and the region that it keeps with some probability.
-EXPECTED: Style = MappingProxyType({"color": BLACK, "linewidth": 0.8})
-ZERO: Style = MappingProxyType({"color": "0.5", "linewidth": 0.6})
-PRIOR: Style = MappingProxyType({"color": "0.3", "linestyle": "--", "linewidth": 0.8})
-REFERENCE: Style = MappingProxyType({"color": "0.3", "linestyle": "-", "linewidth": 0.8})  # such as a ratio of 1
-BOUNDS: Style = MappingProxyType({"color": "0.85", "linewidth": 0})
-WIDE_BOUNDS: Style = MappingProxyType({"color": "0.92", "linewidth": 0})  # around `BOUNDS`
+# References for a value: its expected value, zero, and the region that it keeps with some probability.
+EXPECTED: Style = {"color": BLACK, "linewidth": 0.8}
+ZERO: Style = {"color": "0.5", "linewidth": 0.6}
+PRIOR: Style = {"color": "0.3", "linestyle": "--", "linewidth": 0.8}
+REFERENCE: Style = {"color": "0.3", "linestyle": "-", "linewidth": 0.8}  # such as a ratio of 1
+BOUNDS: Style = {"color": "0.85", "linewidth": 0}
+WIDE_BOUNDS: Style = {"color": "0.92", "linewidth": 0}  # around `BOUNDS`
 BAND_ALPHA = 0.2  # of the bands of an estimate, in its own colour
 
-# Like quantities beside each other, such as six axes, in this order.
-SERIES: tuple[Style, ...] = tuple(
-    MappingProxyType({"color": color, "linestyle": linestyle})
-    for color, linestyle in (
-        (BLUE, "-"),
-        (VERMILLION, "--"),
-        (BLACK, ":"),
-        (GREEN, "-."),
-        (GREY, (0, (5, 1))),
-        (PURPLE, (0, (1, 1))),
-    )
+# Series of one kind, such as six axes, in this order.
+SERIES: tuple[Style, ...] = (
+    {"color": BLUE, "linestyle": "-"},
+    {"color": VERMILLION, "linestyle": "--"},
+    {"color": BLACK, "linestyle": ":"},
+    {"color": GREEN, "linestyle": "-."},
+    {"color": GREY, "linestyle": (0, (5, 1))},
+    {"color": PURPLE, "linestyle": (0, (1, 1))},
 )
 
 P = ParamSpec("P")
@@ -129,7 +117,7 @@ def marker_of(name: str) -> Style:
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorate a function to draw with the settings `RC`, whatever those of the caller are, and names as plain text."""
+    """Decorate a function to draw with the settings `RC` in place of the caller's, and names as plain text."""
 
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -150,6 +138,13 @@ def _written(figure: Figure) -> list[Text]:
     return [*figure.texts, *in_legends, *(text for ax in figure.axes for text in (ax.title, *ax.texts))]
 
 
+def legend_of(figure: Figure, axes: Iterable[Axes], columns: int, title: str | None = None) -> None:
+    """Add a legend of several axes below them, with one entry for equal labels."""
+    found = [ax.get_legend_handles_labels() for ax in axes]
+    handles = {label: handle for pair in found for handle, label in zip(*pair, strict=True)}
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns, title=title)
+
+
 def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
     """Make the y axis logarithmic, with plain numbers at ``ticks`` times the powers of ten."""
     ax.set_yscale("log")
@@ -159,12 +154,9 @@ def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
 
 
 def png(figure: Figure, packed: bool = False) -> bytes:
-    """Return a figure as a PNG file.
+    """Return a figure as a PNG file at `DPI`.
 
-    Args:
-        figure: Drawn at `DPI`.
-        packed: With a palette of 256 colours: a third of the size or less, without a visible difference, but finding it
-            takes as long as drawing. For what is kept for good.
+    ``packed`` takes a palette of 256 colours: a third of the size without a visible difference, but twice the time.
     """
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
@@ -181,7 +173,7 @@ def png(figure: Figure, packed: bool = False) -> bytes:
 
 
 def vector(figure: Figure, format: Literal["svg", "pdf"]) -> bytes:
-    """Return a figure as lines and text, the same bytes each time; text stays text."""
+    """Return a figure as lines and text, the same bytes each time."""
     content = BytesIO()
     named = {"Creator": MADE_BY, "Date" if format == "svg" else "CreationDate": None}
     with mpl.rc_context({**RC, "svg.fonttype": "none", "svg.hashsalt": MADE_BY, "pdf.fonttype": 42}):
@@ -201,7 +193,7 @@ def pngs(
 def save_all(
     directory: str | Path, figures: Mapping[str, Figure], packed: bool = False, format: Format = "png"
 ) -> list[Path]:
-    """Write figures as ``<name>.<format>`` into a folder, made if missing; the paths written. See `pngs`."""
+    """Write the files of `pngs` into a folder, made if missing; return their paths."""
     contents = pngs(directory, figures, packed, format)
     files.write_all(contents)
     return list(contents)

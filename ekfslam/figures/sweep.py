@@ -1,7 +1,4 @@
-"""Figures of a sweep: any figure of merit against any setting.
-
-As in `ekfslam.figures.maps`, every function returns a `matplotlib.figure.Figure` and touches no global state.
-"""
+"""Figures of a sweep: any figure of merit against any setting."""
 
 from __future__ import annotations
 
@@ -12,12 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ekfslam.arrays import Array, IntArray
-from ekfslam.figures.style import BAND_ALPHA, SERIES, log_axis, styled
+from ekfslam.arrays import Array
+from ekfslam.figures.series import LOG_RATIO
+from ekfslam.figures.style import BAND_ALPHA, SERIES, legend_of, log_axis, styled
 from ekfslam.studies.sweep_table import SweepTable
 
 _MARKERS = "os^Dv<>P"
-_LOG_RATIO = 20.0  # largest over smallest value from which a logarithmic axis shows more
 _MOST_LINES, _MOST_PANELS = 24, 24
 _PANELS_A_ROW = 3
 
@@ -26,8 +23,7 @@ _PANELS_A_ROW = 3
 def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
     """Draw a column of figures of merit against a setting: one line for each choice of the others, means over seeds.
 
-    Every recording has a panel. Bands show the range over seeds. Runs without the figure are left out and counted in
-    the title.
+    Every recording has a panel. Bands are the range over seeds. The title counts runs without the figure.
 
     Raises:
         ConfigError: There is no such column.
@@ -41,19 +37,15 @@ def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
     others = [name for name in told if name not in (setting, "seed", "recording")]
     choices = list(table.groups(*others)) if others else [()]
     if len(choices) > _MOST_LINES or len(panels) > _MOST_PANELS:
-        raise ValueError(
-            f"{len(panels)} panels with {len(choices)} lines of {', '.join(others)} are more than a figure can show: "
-            f"{_MOST_PANELS} with {_MOST_LINES}"
-        )
+        found = f"{len(panels)} panels with {len(choices)} lines of {', '.join(others)}"
+        raise ValueError(f"{found} are more than a figure can show: {_MOST_PANELS} with {_MOST_LINES}")
     columns = min(len(panels), _PANELS_A_ROW)
     rows = -(-len(panels) // columns)
-    size = (
-        8.0 if columns == 1 else 1.0 + 4.0 * columns,
-        0.6 + (4.2 if rows == 1 else 3.2 * rows) + 0.09 * len(choices),
-    )
-    drawn = Figure(figsize=size)
+    width = 8.0 if columns == 1 else 1.0 + 4.0 * columns
+    drawn = Figure(figsize=(width, 0.6 + (4.2 if rows == 1 else 3.2 * rows) + 0.09 * len(choices)))
     axes = drawn.subplots(rows, columns, squeeze=False, sharex=True).ravel()
-    names = _names(x)
+    # Values of a setting that is text, in the order of their places on the axis.
+    names = [] if x.dtype.kind == "f" else list(dict.fromkeys(x.tolist()))
     for ax, (name, panel) in zip(axes, panels.items(), strict=False):
         _draw_panel(ax, panel, figure, setting, others, choices, names)
         ax.set(title=", ".join(name), xlabel=setting, ylabel=figure)
@@ -62,8 +54,7 @@ def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
     missing = int((~np.isfinite(y)).sum())
     drawn.suptitle(f"{figure}, {len(y) - missing} runs" + (f", {missing} without it" if missing else ""))
     if others:
-        handles, labels = axes[0].get_legend_handles_labels()
-        drawn.legend(handles, labels, title=", ".join(others), loc="outside lower center", ncols=min(columns + 1, 3))
+        legend_of(drawn, axes[:1], min(columns + 1, 3), ", ".join(others))
     return drawn
 
 
@@ -92,19 +83,13 @@ def _draw_panel(
     if names:
         ax.set_xticks(range(len(names)), [name or "default" for name in names])
     shown = table.column(figure)[np.isfinite(table.column(figure))]
-    if len(shown) and shown.min() > 0 and shown.max() > _LOG_RATIO * shown.min():
+    if len(shown) and shown.min() > 0 and shown.max() > LOG_RATIO * shown.min():
         log_axis(ax, (1.0, 2.0, 5.0))
-
-
-def _names(x: Array) -> list[str]:
-    """Return the values of a setting that is text, in the order of their places on the axis."""
-    return [] if x.dtype.kind == "f" else list(dict.fromkeys(x.tolist()))
 
 
 def _over_seeds(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     """Return distinct x, and mean, least and largest y of each."""
-    at: Array
-    which: IntArray
-    at, which = np.unique(x, return_inverse=True)
-    groups = [y[which == i] for i in range(len(at))]
-    return at, *(np.array([pick(group) for group in groups]) for pick in (np.mean, np.min, np.max))  # type: ignore[return-value]
+    at = np.unique(x)
+    groups = [y[x == value] for value in at]
+    mean, low, high = (np.array([pick(group) for group in groups]) for pick in (np.mean, np.min, np.max))
+    return at, mean, low, high

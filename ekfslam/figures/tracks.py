@@ -24,10 +24,7 @@ _DEPTHS_M = (3.0, 60.0)
 def plot_tracks(recording: ImageRecording, sequence: Sequence, report: TrackReport) -> Figure:
     """Draw left images with tracks, track lengths, losses by reason, and the rotation of the right camera.
 
-    Args:
-        recording: Recording of the tracks; its images are read again.
-        sequence: Its tracks.
-        report: Report on the tracks.
+    The images of the recording are read again.
     """
     rectified = rectification(recording.calibration)
     frames = np.unique(np.linspace(min(_TRAIL, len(sequence) - 1), len(sequence) - 1, _SHOWN).round().astype(int))
@@ -60,8 +57,7 @@ def _draw_frame(ax: Axes, image: Image, sequence: Sequence, frame: int) -> None:
     before &= np.isin(observations.landmark, ids)
     trails = [observations.pixels_px[before & (observations.landmark == track), :2] for track in ids]
     norm = LogNorm(*_DEPTHS_M)
-    lines = LineCollection(trails, array=depth, cmap=_COLOURS, norm=norm, linewidths=1.3)
-    ax.add_collection(lines)
+    ax.add_collection(LineCollection(trails, array=depth, cmap=_COLOURS, norm=norm, linewidths=1.3))
     ax.scatter(pixels[:, 0], pixels[:, 1], c=depth, cmap=_COLOURS, norm=norm, s=9, linewidths=0)
     ax.set(xlim=(0, image.shape[1] - 1), ylim=(image.shape[0] - 1, 0), xticks=[], yticks=[])
     seconds = sequence.time_s[frame] - sequence.time_s[0]
@@ -89,7 +85,6 @@ def _rotation(ax: Axes, sequence: Sequence, report: TrackReport) -> None:
         ax.fill_between(time_s, value - std, value + std, color=SERIES[i]["color"], alpha=BAND_ALPHA, linewidth=0)
     ax.axhline(0.0, **ZERO)
     largest = float(np.abs(report.rotation_px).max()) + 2.0 * float(report.rotation_std_px[-1].max())
-    ax.set(
-        xlabel="time [s]", ylabel="rotation x focal length [px]", title="right camera", ylim=(-1.4 * largest, largest)
-    )
+    ax.set(xlabel="time [s]", ylabel="rotation x focal length [px]", title="right camera")
+    ax.set_ylim(-1.4 * largest, largest)
     ax.legend(ncols=3, loc="lower center")

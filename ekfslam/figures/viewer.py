@@ -29,7 +29,7 @@ _ELLIPSOIDS = 2000  # of landmarks: more are slow to draw
 
 
 def write_viewer_file(archive: Archive, path: str | Path) -> None:
-    """Write an archive as a file that Rerun opens (``.rrd``), as a whole or not at all.
+    """Write an archive as a file of Rerun (``.rrd``), as a whole or not at all.
 
     Raises:
         MissingPackageError: Rerun is not installed.
@@ -50,7 +50,7 @@ def is_viewer_file(path: Path) -> bool:
 
 
 def show_archive(archive: Archive) -> None:
-    """Open the viewer, which has to be on this machine, and show an archive in it.
+    """Open the viewer on this machine, and show an archive in it.
 
     Raises:
         MissingPackageError: Rerun is not installed.
@@ -66,12 +66,7 @@ def show_archive(archive: Archive) -> None:
 
 
 def log_archive(archive: Archive, recording: Any) -> None:
-    """Send an archive to a recording stream of Rerun.
-
-    Args:
-        archive: What to show.
-        recording: ``rerun.RecordingStream``.
-    """
+    """Send an archive to a ``rerun.RecordingStream``."""
     rr = _rerun()
     time_s = archive.time_s - archive.time_s[0]
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -81,9 +76,8 @@ def log_archive(archive: Archive, recording: Any) -> None:
     for mode, result in archive.results.items():
         part = rr.escape_entity_path_part(mode)
         color = _bytes(style_of(mode)["color"])
-        recording.log(
-            f"world/{part}/path", rr.LineStrips3D([result.T_world_imu[:, :3, 3]], colors=[color]), static=True
-        )
+        path = rr.LineStrips3D([result.T_world_imu[:, :3, 3]], colors=[color])
+        recording.log(f"world/{part}/path", path, static=True)
         _log_pose(recording, f"world/{part}/imu", result, time_s, color)
         if len(result.landmarks):
             _log_landmarks(recording, f"world/{part}/landmarks", result)
@@ -97,12 +91,11 @@ def _log_pose(recording: Any, place: str, result: Result, time_s: Array, color: 
     moves = rr.Transform3D.columns(
         translation=T[:, :3, 3], quaternion=Rotation.from_matrix(T[:, :3, :3]).as_quat().astype(np.float32)
     )
-    when = [rr.TimeColumn("time", duration=time_s)]
-    recording.send_columns(place, indexes=when, columns=moves)
+    _send(recording, place, time_s, moves)
     axes, turns = ellipsoids(result.covariance[:, :3, :3])  # rho is along the axes of the IMU
     columns = rr.Ellipsoids3D.columns(centers=np.zeros((len(T), 3)), half_sizes=axes, quaternions=turns)
     recording.log(f"{place}/ellipsoid", rr.Ellipsoids3D.from_fields(colors=[color]), static=True)
-    recording.send_columns(f"{place}/ellipsoid", indexes=when, columns=columns)
+    _send(recording, f"{place}/ellipsoid", time_s, columns)
     T_imu_cam, camera = se3.inverse(result.T_cam_imu), result.camera
     placed = rr.Transform3D(translation=T_imu_cam[:3, 3], mat3x3=T_imu_cam[:3, :3])
     focal, centre = [camera.fu_px, camera.fv_px], [camera.cu_px, camera.cv_px]
@@ -127,14 +120,17 @@ def _log_scalars(recording: Any, part: str, archive: Archive, result: Result, ti
     truth, innovation = archive.truth, result.innovation
     if truth is not None and len(truth.frame):
         error = world_axes_errors(result.T_world_imu[truth.frame], truth.T_world_imu)[:, :3]
-        when = [rr.TimeColumn("time", duration=time_s[truth.frame])]
         columns = rr.Scalars.columns(scalars=np.linalg.norm(error, axis=1))
-        recording.send_columns(f"errors/{part}", indexes=when, columns=columns)
+        _send(recording, f"errors/{part}", time_s[truth.frame], columns)
     seen = innovation.dof > 0
     if seen.any():
-        when = [rr.TimeColumn("time", duration=time_s[seen])]
         columns = rr.Scalars.columns(scalars=innovation.nis[seen] / innovation.dof[seen])
-        recording.send_columns(f"nis/{part}", indexes=when, columns=columns)
+        _send(recording, f"nis/{part}", time_s[seen], columns)
+
+
+def _send(recording: Any, place: str, time_s: Array, columns: Any) -> None:
+    """Send values over time."""
+    recording.send_columns(place, indexes=[_rerun().TimeColumn("time", duration=time_s)], columns=columns)
 
 
 def ellipsoids(covariance: Array) -> tuple[Array, Array]:

@@ -11,26 +11,17 @@ from ekfslam.errors import TruthError
 from ekfslam.figures.maps import plot_map
 from ekfslam.figures.run import plot_errors
 from ekfslam.figures.series import BAND_SIGMAS, draw_series, trajectory
-from ekfslam.figures.style import TRUTH, line_of, styled
+from ekfslam.figures.style import TRUTH, legend_of, line_of, styled
 from ekfslam.filters.result import Result
 
 
 def map_of(result: Result, truth: Any = None) -> Figure:
-    """Draw the map from above with trajectory and ellipses, see `ekfslam.figures.maps.plot_map`.
-
-    Args:
-        result: Any run.
-        truth: `Truth`, or a record that has one (`Sequence`, `Archive`), drawn for comparison.
-    """
+    """Draw the map from above by `plot_map`; ``truth`` is a `Truth`, or a `Sequence` or an `Archive` that has one."""
     return plot_map({result.mode: result}, _truth(truth))
 
 
 def errors_of(result: Result, truth: Any) -> Figure:
-    """Draw estimate minus truth against time with bands of 3 sigma, see `ekfslam.figures.run.plot_errors`.
-
-    Args:
-        result: Any run.
-        truth: As for `map_of`.
+    """Draw estimate minus truth over time by `plot_errors`, with ``truth`` as for `map_of`.
 
     Raises:
         TruthError: The truth is missing or has no pose, or has frames that the result has not.
@@ -45,12 +36,7 @@ def errors_of(result: Result, truth: Any) -> Figure:
 
 
 def trajectory_of(result: Result, truth: Any = None) -> Figure:
-    """Draw position and attitude against time with bands of 3 sigma, see `plot_trajectory`.
-
-    Args:
-        result: Any run.
-        truth: As for `map_of`.
-    """
+    """Draw position and attitude over time by `plot_trajectory`, with ``truth`` as for `map_of`."""
     return plot_trajectory(result, _truth(truth))
 
 
@@ -69,12 +55,11 @@ def plot_trajectory(result: Result, truth: Truth | None = None) -> Figure:
         draw_series(ax, one, color, line_of(result.mode), label=f"{result.mode}, {BAND_SIGMAS:g} sigma")
     figure.align_ylabels()
     figure.suptitle(f"{result.sequence_name}, {result.mode}: pose of the IMU in world")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    legend_of(figure, axes[0, :1], 2)
     return figure
 
 
 def _truth(of: Any) -> Truth | None:
-    """Return a truth as it is, or that of a record that has one."""
     found = getattr(of, "truth", of)
     if found is not None and not isinstance(found, Truth):
         raise TypeError(f"expected a Truth, a Sequence or an Archive, found {type(of).__name__}")
