@@ -1,4 +1,4 @@
-"""Reports: calls that run, write archives, tables and figures, and return what they found.
+"""Calls that run, and write archives, tables and figures.
 
 `compare` runs several modes on one sequence. `check_consistency` judges covariances on simulations, whose truth is
 known. `check` judges one run without truth, by its innovations.
@@ -46,8 +46,7 @@ class Comparison(Shown):
         sequence: The recording.
         results: Mode to result, in the order of the call.
         summary: The figures of merit as written to ``summary.json``.
-        skipped: Mode to the reason why it has no result: an ill-posed posterior, or a filter that cannot go on. The
-            other modes are run nevertheless.
+        skipped: Mode to the reason why it has no result: an ill-posed posterior, or a filter that cannot continue.
     """
 
     sequence: Sequence
@@ -76,17 +75,12 @@ class Comparison(Shown):
         return compare_table(self.summary) + "".join(f"\n{line}\n" for line in lines)
 
     def save(self, directory: str | Path, force: bool = False, figures: bool = True) -> list[Path]:
-        """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures; returns their paths.
+        """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures into a folder; return their paths.
 
-        All are written or none. Figures of an earlier run in the folder go.
-
-        Args:
-            directory: Target folder, made if missing.
-            force: Replace an archive of another recording, too.
-            figures: Draw figures, too.
+        All are written or none. Figures of an earlier run are removed.
 
         Raises:
-            WriteError: The directory cannot be written, or holds results of another recording.
+            WriteError: The folder cannot be written, or holds another recording and ``force`` is false.
         """
         directory = Path(directory)
         archive, summary, table = (directory / name for name in ("archive.h5", "summary.json", "summary.md"))
@@ -106,21 +100,12 @@ class Comparison(Shown):
         return list(contents)
 
 
-def compare(
-    sequence: Sequence,
-    modes: Iterable[Mode] = MODES,
-    config: Config | None = None,
-) -> Comparison:
+def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | None = None) -> Comparison:
     """Run several modes with one configuration.
-
-    Args:
-        sequence: The recording.
-        modes: Modes to run.
-        config: Settings; defaults where None.
 
     Raises:
         ConfigError: Unknown mode.
-        FilterError: No mode has a result; otherwise `Comparison.skipped` says which has none, and why.
+        FilterError: No mode has a result; if some have, `Comparison.skipped` tells why others have none.
     """
     if config is not None:
         sequence = with_truth_noise(sequence, config.truth)
@@ -162,10 +147,7 @@ def compare_into(
     force: bool = False,
     figures: bool = True,
 ) -> str:
-    """Compare modes on a recording and save all into a folder.
-
-    Returns:
-        What a terminal shows: notes of the reader, the table, and the files written.
+    """Save `compare` into a folder, and return the text for a terminal: notes of the reader, table and files written.
 
     Raises:
         ArchiveError: The folder holds results of another recording, or cannot be written.
@@ -184,12 +166,7 @@ def compare_all(
     config: Config | None = None,
     **options: bool,
 ) -> Iterator[str]:
-    """Run `compare_into` for many recordings in parallel, and yield what a terminal shows of each as it finishes.
-
-    Args:
-        recordings: Folder to recording.
-        executor: Executor of the runs, see `open_executor`.
-        modes, config, options: Arguments of `compare_into`.
+    """Run `compare_into` for many recordings, by folder, in parallel, and yield the text of each as it finishes.
 
     Raises:
         FilterError: Some recordings cannot be compared; raised after all others are saved.
@@ -211,7 +188,7 @@ def compare_all(
 def _compared(
     sequence: Sequence, folder: Path, modes: Iterable[Mode], config: Config | None, options: Mapping[str, bool]
 ) -> tuple[str, str]:
-    """Return the text of `compare_into` and an empty string, or the other way round the reason for failure."""
+    """Return the text of `compare_into` and the reason for failure; one of them is empty."""
     with ONE_RUN_AT_A_TIME:
         try:
             return compare_into(sequence, folder, modes, config, **options), ""
@@ -226,7 +203,7 @@ class ConsistencyReport(Shown):
     Args:
         archive: All values of all runs.
         summary: Averages and their bounds, as written to ``summary.json``.
-        paths: The files written.
+        paths: Files written.
     """
 
     archive: StudyArchive
@@ -247,41 +224,27 @@ class ConsistencyReport(Shown):
 def check_consistency(
     study: Study, directory: str | Path, executor: str = "processes", workers: int | None = None
 ) -> ConsistencyReport:
-    """Run the missing part of a study, and write ``study.h5``, ``summary.json``, ``table.md`` and figures.
+    """Run a study into a folder, or its missing part; write ``study.h5``, ``summary.json``, ``table.md`` and figures.
 
-    Args:
-        study: The study.
-        directory: Target folder, made if missing. An interrupted study in it is resumed.
-        executor, workers: See `open_executor`.
+    ``executor`` and ``workers`` are those of `open_executor`.
 
     Raises:
         ArchiveError: The directory holds another study, or cannot be written.
         ConfigError: The executor is unknown, not installed or not reachable.
     """
-    directory = Path(directory)
-    archive_path, summary_path, table_path = (directory / name for name in ("study.h5", "summary.json", "table.md"))
-    for path in (archive_path, summary_path, table_path):
-        files.require_writable(path)
+    archive_path, summary_path, table_path = _targets(Path(directory), "study.h5", "summary.json", "table.md")
     with open_executor(executor, workers) as opened:
         archive = run_study(study, archive_path, opened)
     summary = summarise_study(archive)
-    contents = {
-        summary_path: _json(summary),
-        table_path: study_table(summary),
-        **pngs(directory, draw_study_figures(archive)),
-    }
+    figures = pngs(directory, draw_study_figures(archive))
+    contents = {summary_path: _json(summary), table_path: study_table(summary), **figures}
     files.write_all(contents)
     return ConsistencyReport(archive, summary, [archive_path, *contents])
 
 
 @dataclass(frozen=True)
 class Check:
-    """Results of `check`.
-
-    Args:
-        honesty: Verdict and evidence.
-        paths: The files written.
-    """
+    """Results of `check`: verdict with evidence, and the files written."""
 
     honesty: Honesty
     paths: list[Path]
@@ -290,19 +253,14 @@ class Check:
 def check(archive: str | Path, mode: str = "full", directory: str | Path | None = None) -> Check:
     """Judge the covariance of a run without truth, and write ``check.json``, ``check.md`` and ``check.png``.
 
-    Args:
-        archive: Archive written by run or compare.
-        mode: Mode of the run in it.
-        directory: Target folder, made if missing; by default the folder of the archive.
+    The files go into ``directory``, by default the folder of the archive.
 
     Raises:
         ArchiveError: The archive cannot be read or has no such mode.
-        HonestyError: The run has no innovations to judge by: of another mode than full, or of an older release.
+        HonestyError: The run has no innovations: another mode than full, or an older release.
     """
-    directory = Path(archive).parent if directory is None else Path(directory)
-    values, table, figure = (directory / name for name in ("check.json", "check.md", "check.png"))
-    for path in (values, table, figure):
-        files.require_writable(path)
+    folder = Path(archive).parent if directory is None else Path(directory)
+    values, table, figure = _targets(folder, "check.json", "check.md", "check.png")
     result = open_result(archive, mode)
     require_innovations(result)
     smoothed, skipped = None, ""
@@ -313,6 +271,14 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
     found = judge(result, smoothed, skipped)
     files.write_all({values: _json(found.values), table: found.table, figure: png(plot_check(result, found))})
     return Check(found, [values, table, figure])
+
+
+def _targets(directory: Path, *names: str) -> list[Path]:
+    """Return the paths of files that can be written."""
+    paths = [directory / name for name in names]
+    for path in paths:
+        files.require_writable(path)
+    return paths
 
 
 def _json(summary: dict[str, Any]) -> str:

@@ -18,10 +18,11 @@ from ekfslam.errors import ConfigError
 from ekfslam.evaluation.consistency import world_axes_std
 from ekfslam.evaluation.trajectory import distance_along
 from ekfslam.figures import viewer
-from ekfslam.figures.animation import write_animation
+from ekfslam.figures.animation import animated, write_animation
 from ekfslam.figures.maps import plot_map, plot_side
 from ekfslam.figures.style import save_all
 from ekfslam.filters.result import Landmarks
+from ekfslam.geometry import se3
 from ekfslam.storage.archive import read_archive, write_archive
 
 
@@ -93,6 +94,18 @@ def test_a_gif_shows_the_drive_to_its_end(path, tmp_path, capsys):
     assert drawn[-1] > drawn[0], "the line of the full mode grows"
     assert main(["animate", str(path), "--modes", "smoothed", "--out", str(target)]) == 2
     assert "smoothed" in capsys.readouterr().err
+
+
+def test_arrows_of_an_animation_have_the_heading_also_without_truth(sequence):
+    result = synthetic_result(sequence, "dead-reckoning")
+    result = dataclasses.replace(result, covariance=np.zeros_like(result.covariance))
+    turned = result.T_world_imu @ se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
+    pictures = []
+    for T_world_imu in (result.T_world_imu, turned):
+        changed = dataclasses.replace(result, T_world_imu=T_world_imu)
+        *_, last = animated({"dead-reckoning": changed}, None, 2)
+        pictures.append(np.asarray(last))
+    assert (pictures[0] != pictures[1]).any()
 
 
 @pytest.mark.slow

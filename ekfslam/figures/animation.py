@@ -133,7 +133,7 @@ def _landmarks(ax: Axes, mapper: Result) -> Update:
 def _vehicle(ax: Axes, mode: str, result: Result) -> Update:
     """Return the update of a run: path so far, position with ellipse, and heading."""
     xy, forward, color = result.T_world_imu[:, :2, 3], result.T_world_imu[:, :2, 0], style_of(mode)["color"]
-    (line,) = ax.plot([], [], **line_of(mode), label=mode, animated=True)
+    (line,) = ax.plot(*xy.T, **line_of(mode), label=mode, animated=True)  # without data, arrows have no direction
     arrow = ax.quiver(*xy[0], *forward[0], color=color, angles="xy", scale=18, width=0.006, zorder=5, animated=True)
     axes = ellipse_axes(position_covariance(result.T_world_imu, result.covariance))
 

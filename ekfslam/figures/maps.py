@@ -16,7 +16,7 @@ from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.trajectory import distance_along
 from ekfslam.figures import registry
 from ekfslam.figures.series import BAND_SIGMAS, draw_series, height
-from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, line_of, style_of
+from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, legend_of, line_of, style_of
 from ekfslam.filters.result import Result
 from ekfslam.geometry.motion import world_axes_covariance
 
@@ -222,15 +222,9 @@ def _outside_text(outside: BoolArray) -> str:
 
 
 def legend_below(figure: Figure, ax: Axes) -> None:
-    """Add a legend below the axes, where it hides no data, with marks of start and end if they are drawn."""
-    handles, _ = ax.get_legend_handles_labels()
+    """Add a legend below a map, with marks of start and end if they are drawn."""
+    marks = []
     if any(line.get_marker() == "X" for line in ax.lines):
         look: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": ""}
-        handles += [
-            Line2D([], [], marker=marker, label=label, **look) for marker, label in (("o", "start"), ("X", "end"))
-        ]
-    columns = 3 if figure.get_figwidth() > 7.0 else 2
-    legend = figure.legend(handles=handles, loc="outside lower center", ncols=columns)
-    for handle in legend.legend_handles:
-        if isinstance(handle, Line2D) and handle.get_marker() == ".":
-            handle.set_markersize(8.0)  # dots small enough for a map of thousands are invisible in a legend
+        marks = [Line2D([], [], marker=marker, label=label, **look) for marker, label in (("o", "start"), ("X", "end"))]
+    legend_of(figure, [ax], 3 if figure.get_figwidth() > 7.0 else 2, extra=marks)

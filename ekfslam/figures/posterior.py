@@ -47,7 +47,7 @@ def plot_map_before_and_after(full: Result, smoothed: Result, truth: Truth | Non
         inside = ((landmarks.position_m[:, :2] > low) & (landmarks.position_m[:, :2] < high)).all(axis=1)
         xy, covariance = landmarks.position_m[inside, :2], landmarks.covariance[inside, :2, :2]
         add_ellipses(ax, xy, covariance, LANDMARK_COLOR, 0.3, alpha=0.7, linewidths=0.6)
-        draw_dots(ax, xy, f"landmark, {SIGMAS:g} sigma")
+        draw_dots(ax, xy, f"landmark, {SIGMAS:g} sigma", markeredgewidth=1.0)
         draw_paths(ax, {result.mode: result}, truth)
         add_pose_ellipses(ax, result, _POSES)
         of_poses = _median_std(position_covariance(result.T_world_imu, result.covariance))

@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
@@ -97,6 +98,8 @@ SERIES: tuple[Style, ...] = (
     {"color": PURPLE, "linestyle": (0, (1, 1))},
 )
 
+RUN_COLORS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)  # of runs whose modes do not tell them apart
+
 P = ParamSpec("P")
 Format = Literal["png", "svg", "pdf"]  # of files
 
@@ -138,11 +141,17 @@ def _written(figure: Figure) -> list[Text]:
     return [*figure.texts, *in_legends, *(text for ax in figure.axes for text in (ax.title, *ax.texts))]
 
 
-def legend_of(figure: Figure, axes: Iterable[Axes], columns: int, title: str | None = None) -> None:
-    """Add a legend of several axes below them, with one entry for equal labels."""
+def legend_of(
+    figure: Figure, axes: Iterable[Axes], columns: int, title: str | None = None, extra: Iterable[Line2D] = ()
+) -> None:
+    """Add a legend of several axes below them, where it hides no data, with one entry for equal labels."""
     found = [ax.get_legend_handles_labels() for ax in axes]
     handles = {label: handle for pair in found for handle, label in zip(*pair, strict=True)}
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns, title=title)
+    shown = [*handles.values(), *extra]
+    legend = figure.legend(handles=shown, loc="outside lower center", ncols=columns, title=title)
+    for handle in legend.legend_handles:
+        if isinstance(handle, Line2D) and handle.get_marker() == ".":
+            handle.set_markersize(8.0)  # dots small enough for a map of thousands are invisible in a legend
 
 
 def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:

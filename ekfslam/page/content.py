@@ -1,7 +1,4 @@
-"""Content of a page of archives: the series of every run for its plots, and its judgement.
-
-Archives of the same recording, by name and stamps, stand together: their runs share maps and plots.
-"""
+"""Content of a page of archives: the series of every run for its plots, and its judgement."""
 
 from __future__ import annotations
 
@@ -24,17 +21,7 @@ from ekfslam.evaluation.trajectory import distance_along
 from ekfslam.figures import series
 from ekfslam.figures.maps import SIGMAS, spread
 from ekfslam.figures.series import Series
-from ekfslam.figures.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    LANDMARK_COLOR,
-    ORANGE,
-    PURPLE,
-    SKY_BLUE,
-    VERMILLION,
-    style_of,
-)
+from ekfslam.figures.style import GREY, LANDMARK_COLOR, RUN_COLORS, style_of
 from ekfslam.filters.result import Landmarks, Result
 from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.storage.archive import Archive
@@ -43,23 +30,15 @@ POINTS = 1500  # of a series; longer ones are thinned evenly
 POSES = 24  # with an ellipse or an arrow
 PART = " \u00b7 "  # between the parts of a label
 _DASHES = {"-": "", "--": "7 4", ":": "2 3", "-.": "8 3 2 3"}
-_COLORS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)
+_PALETTE = tuple((color, dash) for dash in ("", "7 4", "2 3") for color in RUN_COLORS)
 # A series, its name in tooltips, its style in ``report.css`` (``truth``, ``thin``, ``dots`` or none), and the numbers
 # of the runs in whose colours the curve and its bounds are drawn (None: black and grey).
 Curve = tuple[Series, str, str, int | None, int | None]
-_PALETTE = tuple((color, dash) for dash in ("", "7 4", "2 3") for color in _COLORS)
 
 
 @dataclass(frozen=True)
 class Run:
-    """One mode of one archive.
-
-    Args:
-        label: Name on the page.
-        archive, result: The archive and its run.
-        color, dash: Colour of its lines as ``#rrggbb``, and lengths of dashes and gaps as in SVG.
-        shown: Whether maps show it at first.
-    """
+    """One mode of one archive: colour ``#rrggbb`` and SVG dashes of its lines, and whether maps show it at first."""
 
     label: str
     archive: Archive
@@ -85,7 +64,7 @@ class Run:
 
     @property
     def said(self) -> list[str]:
-        """Verdicts in words: the main one, its reasons, and one line for each other verdict."""
+        """Verdicts in words: the main one, its reasons, and a line for each other verdict."""
         if not self.honesty.judgements:
             return [self.honesty.innovations_skipped]
         main, *others = self.honesty.judgements
@@ -94,7 +73,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Section:
-    """Runs on one recording: a section of the page."""
+    """Runs on one recording, which share maps and plots: a section of the page."""
 
     name: str
     runs: tuple[Run, ...]
@@ -111,13 +90,13 @@ class Section:
 
     @property
     def length_m(self) -> float:
-        """Distance driven by the truth; by the last run without truth."""
+        """Distance driven, by the truth or else the last run."""
         T = self.runs[-1].result.T_world_imu if self.truth is None else self.truth.T_world_imu
         return float(distance_along(T)[-1])
 
 
 def sections_of(archives: Mapping[str, Archive]) -> list[Section]:
-    """Return archives, given by label, in sections: those with the same name and stamps stand together."""
+    """Return archives, given by label, in sections of recordings with the same name and stamps."""
     groups: dict[tuple[str, bytes], dict[str, Archive]] = {}
     for label, archive in archives.items():
         groups.setdefault((archive.name, archive.time_s.tobytes()), {})[label] = archive
@@ -125,7 +104,7 @@ def sections_of(archives: Mapping[str, Archive]) -> list[Section]:
 
 
 def _runs(archives: Mapping[str, Archive]) -> Iterator[Run]:
-    """Yield the runs of a recording: those of one archive in the colours of their modes, of several each in its own."""
+    """Yield the runs of a recording: of one archive in the colours of their modes, of several each in its own."""
     if len(archives) == 1:
         archive = next(iter(archives.values()))
         for mode, result in archive.results.items():
@@ -141,7 +120,7 @@ def _runs(archives: Mapping[str, Archive]) -> Iterator[Run]:
 
 
 def told_apart(labels: Sequence[str]) -> list[str]:
-    """Return labels without the parts at both ends that all have in common, cut to the shortest ends that differ."""
+    """Return labels without common parts at both ends, cut to the shortest ends that differ."""
     parts = [label.split(PART) for label in labels]
     for end in (0, -1):
         while min(map(len, parts)) > 1 and len({part[end] for part in parts}) == 1:
@@ -152,7 +131,7 @@ def told_apart(labels: Sequence[str]) -> list[str]:
 
 
 def plotted(section: Section) -> dict[str, Any]:
-    """Return everything that the script of a page draws of a recording, ready for JSON; arrays as `packed`."""
+    """Return the values that the script of a page draws of a recording, ready for JSON."""
     archive = section.archive
     time_s = archive.time_s - archive.time_s[0]
     kept, truth = spread(len(time_s), POINTS), section.truth
@@ -160,14 +139,15 @@ def plotted(section: Section) -> dict[str, Any]:
         "sigmas": SIGMAS,
         "landmarkColor": to_hex(LANDMARK_COLOR),
         "time": packed(time_s[kept]),
-        "truth": truth
-        and {
-            "xyz": packed(truth.T_world_imu[spread(len(truth.frame), POINTS), :3, 3]),
-            "landmarks": packed(truth.position_m),
-        },
+        "truth": truth and _truth(truth),
         "plots": _compared(section),
         "runs": [_plotted_run(section, j, kept) for j in range(len(section.runs))],
     }
+
+
+def _truth(truth: Truth) -> dict[str, Any]:
+    some = spread(len(truth.frame), POINTS)
+    return {"xyz": packed(truth.T_world_imu[some, :3, 3]), "landmarks": packed(truth.position_m)}
 
 
 def _compared(section: Section) -> list[dict[str, Any]]:
@@ -180,11 +160,10 @@ def _compared(section: Section) -> list[dict[str, Any]]:
         heights.append((one, run.label, "", j, j))
     words = f"z in m over metres driven; band: {series.BAND_SIGMAS:g} sigma of {section.runs[best].label}"
     plots = [_plot("Height profile", words, heights)]
-    off: list[Curve] = [
-        (series.distance_from_truth(run.result, run.truth), run.label, "", j, None)
-        for j, run in shown
-        if run.truth is not None
-    ]
+    off: list[Curve] = []
+    for j, run in shown:
+        if run.truth is not None:
+            off.append((series.distance_from_truth(run.result, run.truth), run.label, "", j, None))
     if off:
         plots.append(_plot("Distance from the truth", "m, first pose aligned, nothing else", off))
     return plots
@@ -228,8 +207,9 @@ def _consistency(run: Run, j: int) -> Iterator[dict[str, Any]]:
             yield _plot("Pose NEES", words, [(nees, "NEES", "thin", j, None)])
     nis = series.nis(run.result)
     if nis.mean is not None:
-        share = f"{100 * nis.share_inside:.1f} % of frames within their {percent}, grey"
-        words = f"1 expected, mean {nis.mean:.3g}; {share}"
+        words = (
+            f"1 expected, mean {nis.mean:.3g}; {100 * nis.share_inside:.1f} % of frames within their {percent}, grey"
+        )
         yield _plot("NIS per degree of freedom", words, [(nis, "NIS / dof", "dots", j, None)])
 
 
@@ -265,7 +245,7 @@ def _landmarks(landmarks: Landmarks) -> dict[str, Any] | None:
 
 
 def packed(values: Array) -> dict[str, str]:
-    """Return an array as base64 of its 32-bit floats, row by row: half the size of digits."""
+    """Return an array as base64 of its 32-bit floats, row by row."""
     return {"f32": base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()}
 
 

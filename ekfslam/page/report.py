@@ -1,7 +1,7 @@
-"""`write_report`: archives as one web page that needs nothing else, on a desk or a telephone, in daylight or dark.
+"""`write_report`: archives as one self-contained web page for all screens, light or dark.
 
-Tables and words are HTML; plots are drawn by ``report.js`` from numbers in the page. Names from files are text, never
-markup. A content security policy lets the page run its own script alone, and load nothing.
+Tables and words are HTML; ``report.js`` draws plots from numbers in the page. Names from files are text, never markup.
+A content security policy lets the page run only its own script, and load nothing.
 """
 
 from __future__ import annotations
@@ -35,20 +35,14 @@ _JUDGED = (
     "Where there is truth, it has a verdict of its own; one drive is one sample."
 )
 _KEY_FIGURES = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_dof", "landmark_rmse_m")
-_ERRORS = ("ate_m", "t_rel_percent", "landmark_rmse_m")  # those of a card, whose verdict has the others
-_MOST_CARDS = 4  # of all runs; of more, only those that innovations judge have one
+_ERRORS = ("ate_m", "t_rel_percent", "landmark_rmse_m")  # on cards, whose verdict has the others
+_MOST_CARDS = 4  # of more runs, only those judged by innovations have a card
 
 
 def write_report(archives: Sequence[str | Path], path: str | Path, title: str = "") -> Path:
-    """Write one HTML page of archives.
+    """Write one HTML page of archives, and return its path; archives of one recording share a section.
 
-    Args:
-        archives: As written by run or compare. Those of the same recording are shown together.
-        path: Of the page; its folder is made if missing.
-        title: Heading; by default the names of the recordings.
-
-    Returns:
-        The path.
+    The title is by default the names of the recordings.
 
     Raises:
         ArchiveError: There is none, there are too many, or one cannot be read or holds no run.
@@ -60,11 +54,7 @@ def write_report(archives: Sequence[str | Path], path: str | Path, title: str = 
 
 
 def read_archives(paths: Sequence[str | Path]) -> dict[str, Archive]:
-    """Read archives by labels that tell them apart, from names of folders and files.
-
-    Raises:
-        ArchiveError: There is none, there are too many, or one cannot be read or holds no run.
-    """
+    """Read archives by distinct labels from the names of folders and files; errors as of `write_report`."""
     if not 1 <= len(paths) <= MOST_ARCHIVES:
         raise ArchiveError(f"a report is of 1 to {MOST_ARCHIVES} archives, found {len(paths)}")
     # Not `Path.resolve`, which raises ValueError for invalid names of files.
@@ -124,8 +114,7 @@ def report_page(archives: Mapping[str, Archive], title: str = "") -> str:
 
 def _title(names: Sequence[str]) -> str:
     different = list(dict.fromkeys(names))
-    more = f" and {len(different) - 3} more" if len(different) > 3 else ""
-    return ", ".join(different[:3]) + more
+    return ", ".join(different[:3]) + (f" and {len(different) - 3} more" if len(different) > 3 else "")
 
 
 def _section(number: int, section: Section, is_alone: bool) -> str:
@@ -163,28 +152,24 @@ def _facts(facts: Iterable[str]) -> str:
 def _carded(section: Section) -> list[Run]:
     """Return the runs with a card: all; of many, those judged by innovations, or the last."""
     runs = list(section.runs)
-    if len(runs) <= _MOST_CARDS:
-        return runs
-    return [run for run in runs if run.honesty.shared is not None] or runs[-1:]
+    judged = [run for run in runs if run.honesty.shared is not None] or runs[-1:]
+    return runs if len(runs) <= _MOST_CARDS else judged
 
 
 def _card(run: Run) -> str:
     """Return the verdicts of a run, their evidence, and its errors."""
     head, *items = run.said
-    figures = "".join(
-        f"<div><dt>{escape(heading)}</dt><dd>{escape(value)}</dd></div>"
-        for heading, value in merit_rows([{key: run.summary[key] for key in _ERRORS}])
-    )
+    figures = dict(merit_rows([{key: run.summary[key] for key in _ERRORS}]))
     return f"""<article class="card {run.honesty.grade}">
 <h3>{escape(run.label)}</h3>
 <p class="verdict">{escape(head[:1].upper() + head[1:])}</p>
 {_list([*items, *run.result.remarks], "causes")}
-<dl>{figures}</dl>
+{_pairs(figures, "")}
 </article>"""
 
 
 def _evidence(section: Section) -> str:
-    """Return a table of the evidence; expected values stand beside the name if all runs have the same one."""
+    """Return a table of the evidence; an expected value that all runs share is next to the name."""
     found = [{name: cells for name, *cells in run.honesty.evidence} for run in section.runs]
     rows = []
     for name in dict.fromkeys(name for evidence in sorted(found, key=len, reverse=True) for name in evidence):
@@ -262,12 +247,12 @@ def _list(items: Iterable[str], kind: str = "") -> str:
     return f'<ul class="{kind}">{shown}</ul>' if shown else ""
 
 
-def _pairs(values: Mapping[str, Any]) -> str:
+def _pairs(values: Mapping[str, Any], kind: str = "pairs") -> str:
     shown = "".join(
         f"<div><dt>{escape(printable(str(key)))}</dt><dd>{escape(_spoken(value))}</dd></div>"
         for key, value in values.items()
     )
-    return f'<dl class="pairs">{shown}</dl>' if shown else ""
+    return f'<dl class="{kind}">{shown}</dl>' if shown else ""
 
 
 def _spoken(value: Any) -> str:
@@ -284,10 +269,8 @@ def _spoken(value: Any) -> str:
 
 def _colors(sections: Sequence[Section]) -> str:
     """Return colours of runs as variables of the style: ``--run-<recording>-<run>``."""
-    named = "".join(
-        f"--run-{i}-{j}:{run.color};" for i, section in enumerate(sections) for j, run in enumerate(section.runs)
-    )
-    return f"\n:root{{{named}}}\n"
+    runs = [(i, j, run) for i, section in enumerate(sections) for j, run in enumerate(section.runs)]
+    return f"\n:root{{{''.join(f'--run-{i}-{j}:{run.color};' for i, j, run in runs)}}}\n"
 
 
 def _file(name: str) -> str:
