@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial import cKDTree
+from support.jacobians import hat
 
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import BUILTIN, GROUND_M, IMAGE_SIZE_PX, builtin, simulate
@@ -116,7 +117,7 @@ def test_truth_is_the_exact_integral_of_the_noise_free_velocities(world):
     exact = simulate(replace(world, sigma_v_m_s=0.0, sigma_w_rad_s=0.0))
     T = se3.inverse(exact.truth.T_world_imu)
     tau = np.diff(exact.time_s)
-    E = expm(-tau[:, None, None] * se3.hat(exact.twist[1:]))
+    E = expm(-tau[:, None, None] * hat(exact.twist[1:]))
     np.testing.assert_allclose(T[1:], E @ T[:-1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(dead_reckoned_positions_m(exact), exact.truth.T_world_imu[:, :3, 3], rtol=0, atol=1e-12)
 

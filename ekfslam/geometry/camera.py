@@ -2,9 +2,8 @@
 
 Points ``q`` are in the left optical frame (x right, y down, z forward, metres). Pixels are ``z = (uL, vL, uR, vR)``.
 
-The two v rows of a rectified pair have the same Jacobian, so the filters work on the three *rectified rows*
-``(uL, v, uR)``, where v is the mean of vL and vR weighted by their inverse variances: the same information in a smaller
-innovation covariance. ``vL - vR`` carries none, and serves as an outlier check.
+The two v rows have the same Jacobian, so filters work on the three *rectified rows* ``(uL, v, uR)``, where v is the
+mean of vL and vR weighted by inverse variances: the same information in a smaller innovation covariance.
 """
 
 from __future__ import annotations
@@ -47,9 +46,9 @@ class StereoCamera:
 
 
 def project(camera: StereoCamera, q: Array) -> Array:
-    """Eq. (3), ``z = M pi(q)`` with the canonical projection ``pi(q) = q / q_z``: (..., 3) m to (..., 4) px.
+    """Return ``z = M pi(q)`` with ``pi(q) = q / q_z``, eq. (3): (..., 3) m to (..., 4) px.
 
-    Points with ``q_z <= 0`` are behind the camera; their pixels are meaningless and the caller must mask them.
+    The caller masks points with ``q_z <= 0``, which are behind the camera.
     """
     q_homogeneous = np.concatenate([q, np.ones((*q.shape[:-1], 1))], axis=-1)
     return (q_homogeneous / q[..., 2:3]) @ camera.matrix.T
@@ -69,16 +68,10 @@ def projection_jacobian(camera: StereoCamera, q: Array) -> Array:
 def rectified_rows(pixels_px: Array, pixel_std_px: Array) -> tuple[Array, Array]:
     """Rows ``(uL, v, uR)`` of pixels (..., 4) and their variances (3,) px^2, for pixel noise (4,) px."""
     variance = np.asarray(pixel_std_px, dtype=float) ** 2
-    weight_left = weight_of_left_row(pixel_std_px)
+    weight_left = variance[3] / (variance[1] + variance[3])
     v = weight_left * pixels_px[..., 1] + (1.0 - weight_left) * pixels_px[..., 3]
     rows = np.stack([pixels_px[..., 0], v, pixels_px[..., 2]], axis=-1)
     return rows, np.array([variance[0], weight_left * variance[1], variance[2]])
-
-
-def weight_of_left_row(pixel_std_px: Array) -> float:
-    """Share of vL in the mean v of the rectified rows, for pixel noise (4,) px."""
-    variance = np.asarray(pixel_std_px, dtype=float) ** 2
-    return float(variance[3] / (variance[1] + variance[3]))
 
 
 def rectified_jacobian(camera: StereoCamera, q: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Lenses that are no pinholes: where they image a direction."""
+"""Distortion of lenses that are no pinholes."""
 
 from __future__ import annotations
 

@@ -42,8 +42,7 @@ def twist_jacobian(twist: Array, tau_s: Array | float) -> Array:
 def process_noise(twist: Array, tau_s: Array | float, twist_std: Array) -> Array:
     """Return ``Q = G W G^T`` with G of `twist_jacobian`, eq. (2): (..., 6) to (..., 6, 6).
 
-    ``twist_std`` (..., 6) holds the standard deviations per sample, m/s and rad/s; ``W`` is the diagonal of their
-    squares.
+    ``W`` is the diagonal of the squares of ``twist_std`` (..., 6), m/s and rad/s per sample.
     """
     return process_noise_by(twist_jacobian(np.asarray(twist, dtype=float), tau_s), twist_std)
 
@@ -54,17 +53,15 @@ def process_noise_by(G: Array, twist_std: Array) -> Array:
 
 
 def level_frame(up: Array) -> tuple[Array, Array]:
-    """The level frame of an IMU that knows which way is up: z up, x the horizontal part of its own x axis.
+    """Return the level frame of an IMU: z up, x the horizontal part of its own x axis.
 
-    Automotive units (OXTS) give velocities in it: forward, leftward and upward over level ground, whatever the body's
-    roll and pitch are.
+    Automotive units (OXTS) give velocities in it: forward, leftward and upward over level ground.
 
     Args:
         up: (..., 3) unit vectors against gravity, in the IMU frame; not along its x axis.
 
     Returns:
-        ``R_imu_level`` (..., 3, 3), and Z (..., 3, 3): where up turns by ``exp(phi^)``, the frame turns by
-        ``exp((Z phi)^)``.
+        ``R_imu_level`` (..., 3, 3), and Z (..., 3, 3): up turns by ``exp(phi^)``, the frame by ``exp((Z phi)^)``.
     """
     sine = up[..., :1]
     cosine = np.sqrt(1.0 - sine**2)
@@ -78,11 +75,10 @@ def level_frame(up: Array) -> tuple[Array, Array]:
 
 
 def imu_twist(level_twist: Array, up: Array) -> tuple[Array, Array, Array]:
-    """Eq. (8): velocities of the level frame, (..., 6) m/s and rad/s, in the IMU frame; ``up`` (..., 3) is of that.
+    """Turn velocities (..., 6) of the level frame into the IMU frame, eq. (8); ``up`` (..., 3) is in the IMU frame.
 
     Returns:
-        The velocities (..., 6), their derivative (..., 6, 6) by ``level_twist``, and (..., 6, 3) by phi where up is
-        ``exp(phi^) up``.
+        The velocities, their derivative (..., 6, 6) by ``level_twist``, and (..., 6, 3) by phi of ``exp(phi^) up``.
     """
     R, Z = level_frame(up)
     by_level = np.zeros((*R.shape[:-2], 6, 6))
@@ -97,11 +93,10 @@ def turned_by(twist: Array) -> Array:
 
 
 def world_axes_covariance(T_world_imu: Array, covariance: Array) -> tuple[Array, Array]:
-    """Covariances (T, 3, 3) of position (m^2) and rotation error (rad^2), both along world axes.
+    """Return covariances (T, 3, 3) of position (m^2) and rotation error (rad^2) along world axes, from that of ``xi``.
 
-    As ``T_world_imu = T_hat exp(-xi)``, an error ``xi = [rho; theta]`` moves the IMU by ``-R rho`` to first order and
-    turns it by ``-R theta`` in world, with R the rotation of ``T_world_imu`` (T, 4, 4). ``covariance`` (T, 6, 6) is of
-    ``xi``.
+    As ``T_world_imu = T_hat exp(-xi)``, an error ``xi = [rho; theta]`` moves the IMU by ``-R rho`` and turns it by
+    ``-R theta`` in world, to first order.
     """
     R = T_world_imu[:, :3, :3]
     R_transposed = np.swapaxes(R, 1, 2)

@@ -1,15 +1,10 @@
 """Rotations and rigid transforms on arrays: exponential, logarithm, adjoint and left Jacobian.
 
-Every function works on stacks: the leading dimensions are free. One pose by itself goes through C where that is built
-(`ekfslam.kernels.pose`), to the same numbers. Tangent vectors of SE(3) are translation first,
-``xi = [rho; theta]`` (metres, radians). Everything is accurate to rounding through angle 0 and up to angle pi; the
-logarithm of a half turn returns one of its two equally valid axes.
-
-The formulas are those of Barfoot, *State Estimation for Robotics*, chapter 7, rewritten in the functions
-
-    phi_k(theta) = sum_n (-1)^n theta^(2n) / (2n + k)!
-
-so that each coefficient is smooth at zero: phi_1 = sin(theta)/theta, phi_2 = (1 - cos(theta))/theta^2, and so on.
+Leading dimensions are free; single poses go through C if that is built (`ekfslam.kernels.pose`). Tangent vectors of
+SE(3) are ``xi = [rho; theta]`` (metres, radians). All is accurate to rounding from angle 0 to pi; the logarithm of a
+half turn returns one of its two axes. Formulas: Barfoot, *State Estimation for Robotics*, chapter 7, in the functions
+``phi_k = sum_n (-1)^n theta^(2n) / (2n + k)!``, which are smooth at zero: phi_1 = sin(theta)/theta, phi_2 =
+(1 - cos(theta))/theta^2, and so on.
 """
 
 from __future__ import annotations
@@ -30,10 +25,10 @@ _EYE = np.eye(3)
 
 
 def phis(theta_squared: Array) -> tuple[Array, ...]:
-    """``(phi_0, ..., phi_5)`` at ``theta^2`` (any shape).
+    """Return ``(phi_0, ..., phi_5)`` at ``theta^2`` (any shape).
 
-    Where theta is small, from the power series of the last two by ``phi_k = 1/k! - theta^2 phi_{k+2}``; elsewhere from
-    cosine and sine by the same recurrence the other way round.
+    For small theta they come from the series of the last two by ``phi_k = 1/k! - theta^2 phi_{k+2}``, for others from
+    cosine and sine by the same recurrence reversed.
     """
     x = np.asarray(theta_squared, dtype=float)
     if x.shape == (1, 1):
@@ -56,7 +51,7 @@ def phis(theta_squared: Array) -> tuple[Array, ...]:
 
 
 def _phis_of_one(x: float) -> tuple[Any, ...]:
-    """The same of a single vector, in plain numbers: a filter asks for it dozens of times a frame."""
+    """Return `phis` of a single vector in plain numbers, which is faster: a filter needs dozens a frame."""
     if x <= _SERIES_LIMIT:
         phi_4 = phi_5 = 0.0
         for c_4, c_5 in _SERIES_OF_ONE:
@@ -80,7 +75,7 @@ def skew(v: Array) -> Array:
 
 
 def _angle_squared(theta: Array) -> Array:
-    """``|theta|^2`` of (..., 3) as (..., 1, 1), to multiply matrices with."""
+    """Return ``|theta|^2`` of (..., 3) as (..., 1, 1)."""
     return np.sum(theta * theta, axis=-1)[..., None, None]
 
 
@@ -95,10 +90,7 @@ def so3_left_jacobian(theta: Array) -> Array:
 
 
 def so3_exp_and_left_jacobian(theta: Array) -> tuple[Array, Array]:
-    """`so3_exp` and `so3_left_jacobian` at the price of one: (..., 3) to (..., 3, 3) twice.
-
-    ``I + phi_1 theta^ + phi_2 theta^ theta^`` and ``I + phi_2 theta^ + phi_3 theta^ theta^``.
-    """
+    """Return `so3_exp` and `so3_left_jacobian` at the price of one: (..., 3) to (..., 3, 3) twice."""
     theta = np.asarray(theta, dtype=float)
     if pose.is_one(theta, 3):
         return pose.so3_exp_and_left_jacobian(theta)
@@ -117,9 +109,9 @@ def so3_left_jacobian_inverse(theta: Array) -> Array:
 
 
 def so3_log(R: Array) -> Array:
-    """Rotation vector (rad, angle in [0, pi]) of a rotation matrix: (..., 3, 3) to (..., 3).
+    """Return the rotation vector (rad, angle in [0, pi]) of a rotation matrix: (..., 3, 3) to (..., 3).
 
-    Goes through the unit quaternion built on its largest component, which stays accurate for every angle.
+    It goes through the unit quaternion built on its largest component, which stays accurate for every angle.
     """
     R = np.asarray(R, dtype=float)
     # Row c of `candidates` is 4 q_c q (components w, x, y, z); the row of the largest |q_c| is well conditioned.
@@ -129,15 +121,9 @@ def so3_log(R: Array) -> Array:
     candidates[..., 1, 1] = 1 + d0 - d1 - d2
     candidates[..., 2, 2] = 1 - d0 + d1 - d2
     candidates[..., 3, 3] = 1 - d0 - d1 + d2
-    for i, j, value in (
-        (0, 1, R[..., 2, 1] - R[..., 1, 2]),
-        (0, 2, R[..., 0, 2] - R[..., 2, 0]),
-        (0, 3, R[..., 1, 0] - R[..., 0, 1]),
-        (1, 2, R[..., 1, 0] + R[..., 0, 1]),
-        (1, 3, R[..., 0, 2] + R[..., 2, 0]),
-        (2, 3, R[..., 2, 1] + R[..., 1, 2]),
-    ):
-        candidates[..., i, j] = candidates[..., j, i] = value
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        candidates[..., 0, k + 1] = candidates[..., k + 1, 0] = R[..., j, i] - R[..., i, j]
+        candidates[..., i + 1, j + 1] = candidates[..., j + 1, i + 1] = R[..., j, i] + R[..., i, j]
     best = np.argmax(np.diagonal(candidates, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -157,10 +143,7 @@ def transform(R: Array, t: Array) -> Array:
 
 
 def nearest_rigid(T: Array) -> Array:
-    """The transform (4, 4) with its rotation part replaced by the nearest rotation; as it is if that is one already.
-
-    `inverse` takes the transpose for the inverse: with a rotation printed to five digits the two differ by 1e-5.
-    """
+    """Return the transform (4, 4) with its rotation part replaced by the nearest rotation, unless it is one."""
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() < 1e-14:
         return T
@@ -181,14 +164,6 @@ def apply(T: Array, points: Array) -> Array:
     return (T[..., :3, :3] @ points[..., None])[..., 0] + T[..., :3, 3]
 
 
-def hat(xi: Array) -> Array:
-    """``xi^``, the 4x4 Lie-algebra matrix of a tangent vector: (..., 6) to (..., 4, 4)."""
-    xi = np.asarray(xi, dtype=float)
-    out = np.zeros((*xi.shape[:-1], 4, 4))
-    out[..., :3, :3], out[..., :3, 3] = skew(xi[..., 3:]), xi[..., :3]
-    return out
-
-
 def exp(xi: Array) -> Array:
     """Exponential of a tangent vector ``[rho; theta]``: (..., 6) to (..., 4, 4)."""
     xi = np.asarray(xi, dtype=float)
@@ -206,7 +181,7 @@ def log(T: Array) -> Array:
 
 
 def _blocks(top_left: Array, top_right: Array) -> Array:
-    """``[A B; 0 A]``, the form of every 6x6 matrix of this module."""
+    """Return ``[A B; 0 A]``, the form of every 6x6 matrix of this module."""
     out = np.zeros((*top_left.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = top_left
     out[..., :3, 3:] = top_right

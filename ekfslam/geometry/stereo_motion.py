@@ -1,16 +1,13 @@
-"""How a stereo rig moved between two frames, from the rows of points that both of them see.
+"""Motion of a stereo rig between two frames, from the rows of common points.
 
-Rows are ``(uL, v, uR)`` of a rectified pair, see `ekfslam.geometry.camera`. A point is triangulated in the frame before
-and projected into the frame now, ``h(z) = pi(T_now_before pi^-1(z))``. Rows have white noise w of standard deviation s
-at both ends, and a track keeps an error c of its disparity in both. The true rows before are estimated with the motion
+Rows are ``(uL, v, uR)``, see `ekfslam.geometry.camera`. With ``h(z) = pi(T_now_before pi^-1(z))``, white noise w of
+standard deviation s at both ends, and an error c of the disparity that a track keeps, the true rows are estimated, too
 (orthogonal distance regression: Boggs, Byrd and Schnabel, SIAM J. Sci. Stat. Comput. 1987):
 
     r = z_now - h(z_true) - B (z_before - z_true) = w_now - B w_before + k c,    B = dh/dz at z_true
     k = (I - B) e,    e = (0, 0, 1): the row uR
     S = s^2 (I + B B^T) + s_c^2 k k^T
     z_true = z_before + (s^2 B^T - s_c^2 e k^T) S^-1 r
-
-Derivatives are those at ``z_true``: at ``z_before`` they would go along with the noise that they are multiplied with.
 """
 
 from __future__ import annotations
@@ -70,15 +67,13 @@ def linearise(
     std_px: float,
     scale: float,
 ) -> Alignment:
-    """Residuals, derivatives and weights at a motion.
+    """Return residuals, derivatives and weights at a motion (4, 4).
 
     Args:
-        camera: Of the rectified pair.
         before_px, now_px: (n, 3) rows with positive disparity.
-        T_now_before: (4, 4) motion.
-        true_px: (n, 3) what the rows before are taken for.
+        true_px: (n, 3) estimates of the true rows before.
         std_px: Standard deviation s of one row.
-        scale: Of the Geman-McClure kernel, in standard deviations; its weight is ``(1 + e^2 / scale^2)^-2``.
+        scale: Scale of the Geman-McClure kernel, in standard deviations; its weight is ``(1 + e^2 / scale^2)^-2``.
     """
     q_before = triangulate(camera, true_px)
     q = se3.apply(T_now_before, q_before)
@@ -96,7 +91,7 @@ def linearise(
     weight = np.where(is_ahead, (1.0 + squared / scale**2) ** -2, 0.0)
     moved = before_px + std_px**2 * (np.swapaxes(B, -1, -2) @ Wr[..., None])[..., 0]
     moved[:, 2] -= TRACK_STD_PX**2 * (k * Wr).sum(axis=1)
-    # Of what does not fit at all, the rows say nothing about each other.
+    # Rows of an outlier say nothing about each other.
     fits = (squared < _FITS) & (moved[:, 0] - moved[:, 2] > 0.5 * (before_px[:, 0] - before_px[:, 2]))
     true_px = np.where(fits[:, None], moved, before_px)
     return Alignment(T_now_before, true_px, np.where(is_ahead[:, None], r, np.inf), H, B, W * weight[:, None, None])
@@ -105,10 +100,10 @@ def linearise(
 def align(
     camera: StereoCamera, before_px: Array, now_px: Array, T_now_before: Array, std_px: float = 0.2, scale: float = 2.0
 ) -> Alignment:
-    """Robust Gauss-Newton from a first guess of the motion; arguments as in `linearise`."""
+    """Align two frames by robust Gauss-Newton from a first guess of the motion; arguments as in `linearise`."""
     found = linearise(camera, before_px, now_px, T_now_before, before_px, std_px, scale)
     for _ in range(_ITERATIONS):
-        # A whisper of a prior keeps the step finite where too few points are left.
+        # A weak prior keeps the step finite if too few points are left.
         xi: Array = np.linalg.solve(found.information + 1e-6 * np.eye(6), found.gradient(found.H)).astype(float)
         T = se3.exp(xi) @ found.T_now_before
         found = linearise(camera, before_px, now_px, T, found.true_px, std_px, scale)
@@ -120,15 +115,9 @@ def align(
 def sampled_motion(
     camera: StereoCamera, before_px: Array, now_px: Array, generator: np.random.Generator, samples: int, limit_px: float
 ) -> Array:
-    """The motion (4, 4) on which most points agree, of those that three random points each give (RANSAC).
+    """Return the motion (4, 4) of three random points with which most points agree, up to ``limit_px`` (RANSAC).
 
-    Source: Fischler and Bolles, CACM 1981; the motion of three points in closed form is Umeyama's, PAMI 1991.
-
-    Args:
-        camera, before_px, now_px: As in `linearise`; fewer than three points give the identity.
-        generator: Of random numbers.
-        samples: How many to try.
-        limit_px: Largest residual of a point that agrees.
+    Fewer than three points give the identity. Source: Fischler and Bolles, CACM 1981; Umeyama, PAMI 1991.
     """
     count = len(before_px)
     if count < 3:
@@ -145,7 +134,7 @@ def sampled_motion(
 
 
 def _rigid(q: Array, p: Array) -> Array:
-    """Transforms (s, 4, 4) that bring points q (s, n, 3) onto p in the least squares sense."""
+    """Return transforms (s, 4, 4) that bring points q (s, n, 3) onto p in the least squares sense."""
     q_mean, p_mean = q.mean(axis=1), p.mean(axis=1)
     U, _, Vt = np.linalg.svd(np.swapaxes(p - p_mean[:, None], 1, 2) @ (q - q_mean[:, None]))
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
@@ -154,5 +143,5 @@ def _rigid(q: Array, p: Array) -> Array:
 
 
 def agrees(alignment: Alignment, limit_px: float) -> BoolArray:
-    """Which points (n,) move as the rig says: no residual above a limit."""
+    """Return whether points (n,) move with the rig: no residual is above a limit."""
     return np.abs(alignment.residual_px).max(axis=-1, initial=0.0) <= limit_px

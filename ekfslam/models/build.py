@@ -49,14 +49,12 @@ def model_of(
     """Return the model of a sensor, its noise and the calibration to estimate.
 
     Args:
-        sensor: Sensor of landmarks.
-        noise: Noise of velocities and tracks.
-        T_imu_world: (4, 4) first pose.
-        covariance: (6, 6) covariance of its error.
+        sensor, noise: Sensor of landmarks; noise of velocities and tracks.
+        T_imu_world, covariance: (4, 4) first pose, and (6, 6) covariance of its error.
         calibration: Prior standard deviations of the calibration to estimate; None: it is not estimated.
         blocks: Further state blocks.
-        coordinates: Coordinates of landmarks; those in the last updated camera need its pose in the state.
-        measures_twist: Whether velocities are measured at all, see `Twist`.
+        coordinates: Coordinates of landmarks; ``image`` needs the pose of the last updated camera in the state.
+        measures_twist: Whether velocities are measured, see `Twist`.
         make_process: The process that moves the blocks; its own blocks besides the pose are among ``blocks``.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Which form of the joint covariance is cheaper for a recording: counted in floating-point operations.
+"""The cheaper form of the joint covariance for a recording, counted in floating-point operations.
 
 With k landmarks seen in a frame, the dense form costs some ``2.3 (3k)^3 + 3k N^2`` operations a frame for a state of N
 columns; the conditional form (`ekfslam.filters.conditional`) ``12 k n^2 + 2.7 n^3`` for X of n columns.
@@ -11,23 +11,21 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.sequence import Observations
 
-# Operations of the conditional form are smaller, and take twice as long: measured where both forms cost the same, on
-# `builtin:city` at 80 to 100 observations a frame.
+# Operations of the conditional form take twice as long: measured on `builtin:city` at 80 to 100 observations a frame.
 _COST = 2.0
 
 
 def is_conditional_cheaper(
     observations: Observations, frames: int, body: int, group: int, stay: int, kept: int
 ) -> bool:
-    """Whether the conditional form takes fewer operations, over all frames.
+    """Return whether the conditional form takes fewer operations, over all frames.
 
     Args:
-        observations: Of landmarks.
-        frames: Number of frames.
+        observations, frames: Observations of landmarks, and the number of frames.
         body: Number of body columns.
-        group: How many of them observations depend on and each frame changes.
-        stay: Frames that a landmark is awake after it was seen last.
-        kept: How many stay in the state beyond that.
+        group: Number of body columns that observations depend on and each frame changes.
+        stay: Frames that a landmark is active after it was seen last.
+        kept: Number of dormant landmarks.
     """
     _, place = np.unique(observations.landmark, return_inverse=True)
     first, last = np.full(place.max(initial=-1) + 1, frames), np.full(place.max(initial=-1) + 1, -1)
@@ -46,6 +44,6 @@ def is_conditional_cheaper(
 
 
 def _smallest_window(age: IntArray | Array, group: int) -> float:
-    """Fewest columns: those of w past frames, and of the landmarks that are older, ages (n,) ascending."""
+    """Return the fewest columns of w past frames and of older landmarks, whose ages (n,) ascend."""
     past = np.arange(int(age[-1]) + 1) if len(age) else np.zeros(1, dtype=np.int64)
     return float((group * past + 3 * (len(age) - np.searchsorted(age, past, side="right"))).min())

@@ -1,8 +1,4 @@
-"""The model: state blocks, sensor and noise together, as the filter and the smoother both use it.
-
-Filter and smoother call the same functions. Arrays may have leading dimensions (frames or observations), so that the
-filter asks for one frame and the smoother for a whole drive.
-"""
+"""The model: state blocks, process, sensor and noise, shared by filter and smoother."""
 
 from __future__ import annotations
 
@@ -49,10 +45,8 @@ class Model:
     """The blocks of the state, their process, the sensor of landmarks, and all noise.
 
     Args:
-        sensor: Of landmarks.
-        noise: Of velocities and tracks.
-        blocks: Of the state; the pose is always the first.
-        make_process: The process that moves them, by default that of velocities.
+        blocks: Blocks of the state, the pose first.
+        make_process: Maker of the process that moves them.
         joint_prior: (body, body) covariance before the first frame, in the columns of ``layout``; None: blocks are
             independent of each other, with the covariances that they state.
     """
@@ -80,7 +74,7 @@ class Model:
 
     @cached_property
     def track_error(self) -> TrackError | None:
-        """The error of tracks; None where the sensor's noise is white."""
+        """Error of tracks; None if the sensor's noise is white."""
         return self.noise.track_error
 
     @cached_property
@@ -130,7 +124,7 @@ class Model:
 
     @cached_property
     def labels(self) -> tuple[tuple[str, ...], tuple[str, ...], Array]:
-        """Names, units and prior standard deviations (p,) of what the blocks report."""
+        """Names, units and prior standard deviations (p,) of reported estimates."""
         blocks = [block for block in self.layout.blocks if block.labels]
         return (
             tuple(label for block in blocks for label in block.labels),
@@ -150,10 +144,7 @@ class Model:
     # --- from one frame to the next -----------------------------------------------------------------------------------
 
     def wander(self, values: Values, tau_s: float, way_m: Array) -> Transition | None:
-        """Return how clones and walking blocks change by themselves; None: there are none.
-
-        A clone takes the value that its block has now. Clones of the process's own blocks are not among them.
-        """
+        """Return the transition of walking blocks, and of clones of blocks that the process does not own, if any."""
         own = self.process.own
         clones = [(self.layout.clones[name], name) for name in self.layout.clones if name not in own]
         if not clones and not self.wandering:
@@ -175,11 +166,7 @@ class Model:
     def step(self, values: Values, interval: Interval, T_linear: Array, first_estimates: bool) -> Transition:
         """Return the step of the process, in which clones of its own blocks take their values.
 
-        Args:
-            values: Estimates before, walking blocks as they are during the interval.
-            interval: The inputs.
-            T_linear: (4, 4) pose at which the pose's error before the step is linearised.
-            first_estimates: Whether Phi leads from there (FEJ) and not from the estimate.
+        Arguments are those of `Process.step`.
         """
         moved = self.widened(values, self.process.step(values, interval, T_linear, first_estimates))
         for name in self.process.own:
@@ -192,8 +179,7 @@ class Model:
     def coordinates_after(self, step: Transition, departed: Array) -> Array:
         """Return the coordinates (body,) after a step, given those before it.
 
-        Those of a pose count from where it is predicted: they start at 0. Those of the process's other blocks are their
-        values.
+        Those of a pose count from its prediction: they start at 0. Those of other moved blocks are their values.
         """
         coordinates, layout = departed.copy(), self.layout
         for name in self.process.own:

@@ -1,18 +1,10 @@
-"""Noise from the data: what a recording's velocities are worth, found without truth.
+"""Noise from the data: the noise of a recording's velocities, found without truth.
 
-Measured velocities are a slowly changing signal plus white noise. The first differences of white noise of variance s^2
-have autocovariance 2 s^2 at lag 0 and -s^2 at lag 1; those of a signal that walks or swings slowly have none below 0.
-So ``s^2 = -cov(d_k, d_k+1)`` sees the noise alone. (Second and third differences see the vehicle itself shake: on clean
-KITTI velocities they find ten times the noise there is.)
-
-A sample of velocities that are clean is not the mean over its interval either. Where the velocity walks between
-samples, second differences d of it have variance ``q tau / 2``, q tau being that of a step, and the integral by samples
-misses that of the path between them (a Brownian bridge) by ``q tau / 12`` a sample: half of what d, scaled to the
-variance of white noise by ``d / sqrt(1.5)``, would say. This *sampling noise* is found axis by axis; of roll and pitch
-rates of a car it is 0.1 to 0.3 deg/s, more than any sensor noise of the unit.
-
-What no difference can see are slow errors that all samples or all tracks of a recording share. They are state blocks
-(`SHARED_ERRORS`), whose sizes are priors of classes of sensors, stated below with their sources.
+Measured velocities are a slowly changing signal plus white noise. First differences of white noise of variance s^2 have
+autocovariance -s^2 at lag 1, those of a slow signal none below 0: ``s^2 = -cov(d_k, d_k+1)``. (Higher differences see
+the vehicle shake.) If the velocity walks between samples, second differences d have variance ``q tau / 2``, and the
+integral by samples misses the path between them (a Brownian bridge) by ``q tau / 12`` a sample: the *sampling noise*,
+half of ``d / sqrt(1.5)``. No difference sees slow errors that all samples or tracks share: see `shared_errors`.
 """
 
 from __future__ import annotations
@@ -28,23 +20,22 @@ from ekfslam.data.sequence import VelocityFrame
 from ekfslam.models.blocks import OPTIONAL_BLOCKS
 
 # Velocities of an automotive GNSS/INS unit: the data sheets of OXTS's RT3000 family state 0.05 to 0.1 km/h (0.014 to
-# 0.028 m/s) and 0.01 deg/s. White errors of a sample are at least of that order, too.
+# 0.028 m/s) and 0.01 deg/s. White errors of a sample are at least of that order.
 VELOCITY_STD = np.repeat([0.02, np.deg2rad(0.02)], 3)
-# What an interpolated sample is worth: a car changes its speed by 1 m/s and turns by 2 deg/s in a second or so.
+# Noise of an interpolated sample: a car changes its speed by 1 m/s and turns by 2 deg/s in a second or so.
 GAP_STD = np.array([1.0, 0.1, 0.1, *np.deg2rad([2.0, 2.0, 2.0])])
 
 # Roll and pitch of a road vehicle, and how well the rotation of a camera against a unit elsewhere in a car is known.
 TILT_RAD = np.deg2rad(3.0)
 CAMERA_ROTATION_DEG = 0.3
 
-# Of tracks of a KLT tracker (u, v, disparity): their error at landmark initialisation and how it walks from frame to
-# frame, see `ekfslam.data.noise.TrackError`. Their proportions are the tracker's; `track_scale` multiplies the walk.
-# White pixel noise only sets the limits of hygiene.
+# Errors of KLT tracks (u, v, disparity) at landmark initialisation and their walk from frame to frame, which
+# `track_scale` multiplies (`ekfslam.data.noise.TrackError`). White pixel noise only sets the limits of hygiene.
 PIXEL_STD_PX = 0.7
 TRACK_FIRST_PX = np.array([0.1, 0.1, 1.0])
 TRACK_WALK_PX = np.array([0.08, 0.08, 0.06])
 TRACK_FLOW_PX = 3.0
-# Of tracks that are compared with their first sight in every frame: what is left is white, and this small.
+# Tracks that are compared with their first sight in every frame have small white errors.
 CHECKED_PIXEL_STD_PX = 0.3
 # Disparity below which the constant error of a track leaves no depth, in standard deviations of a measured disparity.
 MIN_DISPARITY_SIGMA = 3.0
@@ -63,10 +54,9 @@ class VelocityNoise:
 
     Args:
         sigma: (2,) white noise per sample of the linear (m/s) and the angular velocities (rad/s), each axis.
-        sigma_error: (2,) their standard errors (jackknife over 20 stretches); 0 where no noise is seen.
-        limit: (2,) what they are below with a confidence of 95 %, also where none is seen:
-            ``s^2 + 1.645 e``, with e the standard error of ``s^2``.
-        walk: (2,) how far the true velocities change per sample, root mean square.
+        sigma_error: (2,) standard errors (jackknife over 20 stretches); 0 if no noise is seen.
+        limit: (2,) upper limits of sigma with a confidence of 95 %.
+        walk: (2,) change of the true velocities per sample, root mean square.
         sampling: (6,) noise of taking a sample for the mean over its interval, each axis.
     """
 
@@ -78,12 +68,12 @@ class VelocityNoise:
 
     @property
     def is_clean(self) -> bool:
-        """Whether the differences show no more white noise than a good unit has anyway."""
+        """Whether the differences show no more white noise than a good unit has."""
         return bool((np.repeat(self.sigma, 3) <= NOISY_FROM).all())
 
     @property
     def texts(self) -> tuple[str, str]:
-        """The noise of the linear and of the angular velocities in words: with its error, or what it is below."""
+        """Noise of the linear and of the angular velocities in words: with its error, or its limit."""
         v, w = (
             with_error(sigma, error) if sigma > 0 else f"below {limit:.2g} (95 %)"
             for sigma, error, limit in zip(self.sigma, self.sigma_error, self.limit, strict=True)
@@ -92,7 +82,7 @@ class VelocityNoise:
 
 
 def velocity_noise(twist: Array) -> VelocityNoise:
-    """White noise and walk of velocities (T, 6), m/s and rad/s."""
+    """Return white noise and walk of velocities (T, 6), m/s and rad/s."""
     d = np.diff(np.asarray(twist, dtype=float), axis=0)
     if len(d) < 2:
         return VelocityNoise(np.zeros(2), np.full(2, np.inf), np.full(2, np.inf), np.zeros(2))
@@ -104,7 +94,7 @@ def velocity_noise(twist: Array) -> VelocityNoise:
     error = _jackknife(np.array([_white(lag_1) for lag_1 in left_out]))
     limit = _white(np.minimum(product.mean(axis=0), 0.0) - _ONE_SIDED_95 * _jackknife(left_out))
 
-    # The walk is what is left of the differences, or what slow means show, whichever is more.
+    # The walk is the rest of the differences, or that of slow means if larger.
     lag_1 = np.minimum(product.mean(axis=0), 0.0)
     fast = np.maximum(square.mean(axis=0) + 2.0 * lag_1, 0.0)
     whole = len(twist) // _SPAN * _SPAN
@@ -115,7 +105,7 @@ def velocity_noise(twist: Array) -> VelocityNoise:
         steps = _SPAN - (_SPAN**2 - 1) / (3 * _SPAN)
         slow = np.maximum((np.diff(means, axis=0) ** 2).mean(axis=0) + 2.0 / _SPAN * lag_1, 0.0) / steps
     walk = np.maximum(*(np.sqrt(variance.reshape(2, 3).mean(axis=1)) for variance in (fast, slow)))
-    # Of second differences white noise has 3/2 of its variance; what is more is the motion between samples.
+    # Second differences of white noise have 6 times its variance; the rest is the motion between samples.
     bent = np.maximum(((d[1:] - d[:-1]) ** 2).mean(axis=0) / 6.0 - np.repeat(sigma, 3) ** 2, 0.0)
     return VelocityNoise(sigma, error, limit, walk, 0.5 * np.sqrt(bent))
 
@@ -126,19 +116,16 @@ def _jackknife(left_out: Array) -> Array:
 
 
 def _white(lag_1: Array) -> Array:
-    """(2,) noise of linear and angular velocities from the lag-1 covariances (6,): the median of three axes."""
+    """Return the noise (2,) of linear and angular velocities from lag-1 covariances (6,): the median of three axes."""
     return np.median(np.sqrt(np.maximum(-lag_1, 0.0)).reshape(2, 3), axis=1)
 
 
 def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu", checked: bool = False) -> Noise:
     """Return the noise for a recording that states none, from its velocities (T, 6).
 
-    Args:
-        twist, velocity_frame: As in the recording.
-        checked: Whether tracks are compared with their first sight, so that their errors are white.
+    ``checked`` tracks are compared with their first sight, so that their errors are white.
     """
     found = velocity_noise(twist)
-    # Where the white part is below what is there anyway, smoothing the velocities brings nothing.
     walk = None if found.is_clean else np.repeat(found.walk, 3)
     own = np.hypot(found.sampling, VELOCITY_STD)
     return Noise(
@@ -157,11 +144,7 @@ def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu", checked
 def shared_errors(twist: Array | None, checked: bool = False) -> dict[str, dict[str, float]]:
     """Return tables ``[blocks.<name>]`` of the errors that all samples or all tracks of a recording share.
 
-    Each block says its own, see `StateBlock.automatic`.
-
-    Args:
-        twist: (T, 6) measured velocities; None: there are none.
-        checked: As in `automatic_noise`.
+    They come from `StateBlock.automatic`, given measured velocities (T, 6), or None, and whether tracks are checked.
     """
     found = None if twist is None else velocity_noise(twist)
     white_std, is_clean = (None, False) if found is None else (found.sigma, found.is_clean)

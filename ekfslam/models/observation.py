@@ -12,14 +12,13 @@ from ekfslam.models.sensors.base import Sensor
 def linearise(
     sensor: Sensor, T_imu_world: Array, positions_m: Array, T_linear: Array, linear_positions_m: Array
 ) -> tuple[Array, Array, Array]:
-    """Eq. (4): landmarks (n, 3) in world as the sensor sees them, with their Jacobians.
+    """Linearise observations of landmarks (n, 3) in world, eq. (4).
 
     Args:
-        sensor: What sees them.
-        T_imu_world: (4, 4) pose, or one a landmark (n, 4, 4); with ``positions_m`` the place where A is taken.
-        positions_m: (n, 3) estimates.
-        T_linear, linear_positions_m: Pose and positions for the rest of H: the estimates themselves, or (FEJ) the first
-            ones.
+        sensor: Sensor that sees them.
+        T_imu_world, positions_m: Pose (4, 4) or poses (n, 4, 4), and positions (n, 3): the estimates, at which A is
+            taken.
+        T_linear, linear_positions_m: Pose and positions for the rest of H: the estimates, or (FEJ) the first ones.
 
     Returns:
         The points in the camera frame (n, 3) m; ``H_x`` (n, d, 6), derivative by the pose error ``xi`` of
@@ -34,13 +33,12 @@ def linearise(
 def initialise(
     sensor: Sensor, T_imu_world: Array, rows: Array, variance: Array, T_linear: Array
 ) -> tuple[Array, Array, Array]:
-    """Eq. (5): landmark initialisation from one observation each, rows (n, 3).
+    """Initialise landmarks from one observation each, eq. (5).
 
     Args:
-        sensor: What saw them.
+        sensor: Sensor that saw them.
         T_imu_world: (4, 4) pose.
-        rows: (n, 3) what was seen.
-        variance: (n, 3) its variances.
+        rows, variance: (n, 3) observed rows and their variances.
         T_linear: (4, 4) pose at which G is taken: the same, or (FEJ) the predicted one.
 
     Returns:
@@ -56,10 +54,7 @@ def initialise(
 
 
 def landmark_by_pose(T_imu_world: Array, positions_m: Array) -> Array:
-    """``G = -C^T [I, -s^]`` (n, 3, 6) of eq. (5): how new landmarks (n, 3) follow the error of the pose that saw them.
-
-    The pose is (4, 4) for all, or (n, 4, 4).
-    """
+    """Return ``G = -C^T [I, -s^]`` (n, 3, 6) of eq. (5) for landmarks (n, 3) seen from (4, 4) or (n, 4, 4) poses."""
     s = se3.apply(T_imu_world, positions_m)
     minus_C_transposed = np.broadcast_to(-T_imu_world[..., :3, :3].swapaxes(-1, -2), (len(s), 3, 3))
     return np.concatenate([minus_C_transposed, -minus_C_transposed @ se3.skew(s)], axis=-1)

@@ -12,6 +12,7 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import Calibration, Layout, StateBlock, Values
+from ekfslam.models.blocks.calibration import TIME, calibrated, to_exposure
 from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
@@ -27,8 +28,8 @@ class Moment:
     Args:
         T_imu_world: (..., 4, 4) pose.
         T_linear: (..., 4, 4) pose at which its error is linearised: the same, or (FEJ) the predicted one.
-        calibration: (9,) parameters, where they are a block.
-        twist: (..., 6) velocities of the IMU, by which a time offset counts.
+        calibration: (9,) parameters.
+        twist: (..., 6) velocities of the IMU, for the time offset.
         shared: Values (..., size) of the blocks in `Model.shared`, by name.
         way_m: (...) way driven since the frame before.
     """
@@ -66,12 +67,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Observer:
-    """A sensor of landmarks, and the blocks that its observations depend on.
-
-    Args:
-        sensor: Sensor as given.
-        layout: Columns of all blocks.
-    """
+    """A sensor of landmarks, and the blocks that its observations depend on."""
 
     sensor: Sensor
     layout: Layout
@@ -88,7 +84,7 @@ class Observer:
     @property
     def has_time_offset(self) -> bool:
         """Whether observations depend on velocities."""
-        return self.calibration is not None and self.calibration.has_time_offset
+        return self.calibration is not None and bool(self.calibration.std[TIME])
 
     @cached_property
     def shared(self) -> tuple[StateBlock, ...]:
@@ -117,11 +113,10 @@ class Observer:
         """Return landmarks (n, 3) as the sensor sees them, eq. (3), (4), (9) and (11).
 
         Args:
-            moment: From where.
             positions_m, linear_positions_m: As in `ekfslam.models.observation.linearise`.
-            pose: Whose columns the pose of the moment has: those of the pose, or of a clone. Where it is the pose of
-                the frame before, shared blocks have the columns of their clones, too.
-            is_difference: (n,) which observations are differences from the frame before; None: none is.
+            pose: Block whose columns the pose of the moment has: the pose, or a clone. With the clone of the previous
+                pose, shared blocks have the columns of their clones, too.
+            is_difference: (n,) whether observations are differences from the frame before; None: none is.
         """
         layout, sensor = self.layout, self.sensor_at(moment.calibration)
         T, T_linear, offset = moment.T_imu_world, moment.T_linear, None
@@ -174,12 +169,15 @@ class Observer:
 
     def points(self, moment: Moment, positions_m: Array, is_difference: BoolArray | None = None) -> Array:
         """Return landmarks (n, 3) in the frame of the sensor; arguments as of `see`."""
+        return se3.apply(self._T_cam_world(moment, is_difference), positions_m)
+
+    def _T_cam_world(self, moment: Moment, is_difference: BoolArray | None) -> Array:
         T = moment.T_imu_world
         if self._moves_camera:
             T = se3.exp(self._camera_offset(moment, is_difference)[0]) @ T
         if self.calibration is not None:
-            T = self.calibration.delay(moment.calibration, moment.twist) @ T
-        return se3.apply(self.sensor_at(moment.calibration).T_cam_imu @ T, positions_m)
+            T = to_exposure(moment.calibration, moment.twist) @ T
+        return self.sensor_at(moment.calibration).T_cam_imu @ T
 
     def predicted(self, moment: Moment, q: Array) -> Array:
         """Return the rows (n, d) of points (n, 3) in the frame of the sensor."""
@@ -188,8 +186,7 @@ class Observer:
     def inverted(self, moment: Moment, rows: Array) -> tuple[Array, BoolArray]:
         """Return the points (n, 3) in the sensor's frame that rows (n, 3) see, and whether (n,) they have a depth.
 
-        The sensor's `screen` has judged that of the sensor as given. Where blocks change it, disparities may be less
-        than that of a point at infinity.
+        A calibrated sensor may see disparities below that of infinity, which `screen` of the given one accepts.
         """
         sensor = self.sensor_at(moment.calibration)
         q = sensor.invert(rows)
@@ -201,20 +198,10 @@ class Observer:
     def initialise(self, moment: Moment, q: Array, variance: Array) -> tuple[Array, Array, Array]:
         """Return positions (n, 3) of new landmarks, G (n, 3, seen), and the measurement's part (n, 3, 3), eq. (5).
 
-        What was seen stays as it is: ``H_x x + H_m d = 0``, hence ``G = -H_m^-1 H_x``.
-
-        Args:
-            moment: Of the first observations.
-            q: (n, 3) points in the frame of the sensor, see `inverted`.
-            variance: (n, 3) of the rows.
+        Rows stay the same, ``H_x x + H_m d = 0``, hence ``G = -H_m^-1 H_x``. The moment is that of the first
+        observations, q (n, 3) are points of `inverted`, and variance (n, 3) is that of the rows.
         """
-        T = moment.T_imu_world
-        if self._moves_camera:
-            T = se3.exp(self._camera_offset(moment, None)[0]) @ T
-        if self.calibration is not None:
-            T = self.calibration.delay(moment.calibration, moment.twist) @ T
-        sensor = self.sensor_at(moment.calibration)
-        positions = se3.apply(se3.inverse(sensor.T_cam_imu @ T), q)
+        positions = se3.apply(se3.inverse(self._T_cam_world(moment, None)), q)
         here = self.see(moment.linearised_at(moment.T_imu_world), positions, positions)
         by_rows = np.linalg.inv(here.H_m)
         covariance = (by_rows * variance[:, None, :]) @ by_rows.swapaxes(-1, -2)
@@ -226,7 +213,7 @@ class Observer:
 
     def sensor_at(self, parameters: Array) -> Sensor:
         """Return the sensor with a calibration (9,) applied."""
-        return self.sensor if self.calibration is None else self.calibration.applied(self.rig, parameters)
+        return self.sensor if self.calibration is None else calibrated(self.rig, parameters)
 
     @property
     def rig(self) -> Rig:

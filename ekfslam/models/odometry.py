@@ -1,8 +1,7 @@
-"""Velocities of a recording without any, from its tracks: stereo odometry.
+"""Stereo odometry: velocities of a recording without any, from its tracks.
 
-They say how the rig moves from frame to frame, but are no measurements: they come from the observations that the filter
-conditions on anyway. So they start the block `twist`, which then walks unmeasured; they say how far it walks; and they
-stand in where poses are needed before there is a filter (hygiene, mapping-only).
+They are no measurements: the filter conditions on the same observations. They start the block `twist`, set its walk,
+and stand in where poses are needed before there is a filter (hygiene, mapping-only).
 """
 
 from __future__ import annotations
@@ -22,18 +21,17 @@ from ekfslam.geometry.stereo_motion import agrees, align, sampled_motion
 _LEAST_POINTS, _AGREE_SHARE, _AGREE_PX = 6, 0.5, 2.0
 _SAMPLES = 200
 _NEIGHBOURS = 5
-# Of the typical step: velocities change most where they are needed.
 _WALK_FACTOR = 3.0
 _LEAST_WALK = np.repeat([0.05, 0.005], 3)
-# What is known of the first velocities beside what the observations say, in steps of the walk: nearly nothing.
+# Prior of the first velocities, in steps of the walk: nearly nothing is known.
 _START_FACTOR = 10.0
 
 
 def stereo_odometry(sequence: Sequence) -> Array:
-    """Velocities (T, 6) between successive frames from the tracks that both see; the last known ones where too few do.
+    """Return velocities (T, 6) between successive frames from common tracks; the last ones if there are too few.
 
-    Robust Gauss-Newton over the three rows of every point, started at the motion before, or at the best of random
-    three-point motions where most points disagree.
+    Robust Gauss-Newton over the three rows of every point starts at the previous motion, or at the best of random
+    three-point motions if most points disagree.
     """
     camera, observations, C = sequence.camera, sequence.observations, sequence.T_cam_imu
     generator = np.random.default_rng(0)
@@ -61,7 +59,7 @@ def stereo_odometry(sequence: Sequence) -> Array:
 
 
 def _without_jumps(twist: Array) -> Array:
-    """Velocities (T, 6) with those that no vehicle has, so far are they from their neighbours, replaced by a median."""
+    """Return velocities (T, 6) with those that are too far from their neighbours replaced by a median."""
     middle = median_filter(twist[1:], (_NEIGHBOURS, 1), mode="mirror")
     jumps = (np.abs(twist[1:] - middle) > _START_FACTOR * _walk(twist)).any(axis=1)
     found = np.where(jumps[:, None], middle, twist[1:])
@@ -69,14 +67,14 @@ def _without_jumps(twist: Array) -> Array:
 
 
 def _walk(twist: Array) -> Array:
-    """(6,) how far velocities (T, 6) go from one interval to the next, with room for when they change most."""
+    """Return the typical change (6,) of velocities (T, 6) between intervals, times `_WALK_FACTOR`."""
     steps = np.abs(np.diff(twist[1:], axis=0)).reshape(-1, 2, 3)
     typical = 1.4826 * np.median(steps, axis=(0, 2)) if len(steps) else np.zeros(2)
     return np.maximum(_WALK_FACTOR * np.repeat(typical, 3), _LEAST_WALK)
 
 
 def vision_noise(noise: Noise, twist: Array) -> Noise:
-    """Noise, with what it says of velocities replaced by a walk of the twist as the odometry (T, 6) has it."""
+    """Return the noise with its velocities replaced by a walk as the odometry (T, 6) has it."""
     walk = _walk(twist)
     return dataclasses.replace(
         noise,

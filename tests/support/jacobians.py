@@ -52,3 +52,10 @@ def measurement_jacobian(e, ids):
     columns = np.concatenate([body, own], axis=-1)
     values = np.concatenate([seen.H_x, seen.H_m], axis=-1)
     return sp.csr_array((values.ravel(), (row.ravel(), columns.ravel())), shape=(k * d, len(e.P)))
+
+
+def hat(xi):
+    """Return ``xi^``, the 4x4 Lie-algebra matrix of a tangent vector: (..., 6) to (..., 4, 4)."""
+    out = np.zeros((*np.shape(xi)[:-1], 4, 4))
+    out[..., :3, :3], out[..., :3, 3] = se3.skew(xi[..., 3:]), xi[..., :3]
+    return out

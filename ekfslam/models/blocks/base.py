@@ -10,12 +10,10 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Sequence
 
-# Estimates by name of their block; arrays may have leading dimensions (frames), so that a whole drive is one call.
+# Estimates by name of their block; arrays may have leading dimensions (frames).
 Values = Mapping[str, Array]
 
-
-# What depends on a block: the measured velocities (it is added to them), the frame that they are in (it turns them),
-# the camera's pose in the IMU frame, the sensor itself, or nothing of these.
+# A block is added to the measured velocities, turns them, moves the camera, changes the sensor, or none of these.
 Coupling = Literal["none", "velocity", "level", "camera", "sensor"]
 _COUPLED_BY: dict[str, Coupling] = {
     "velocity_offset": "velocity",
@@ -25,21 +23,20 @@ _COUPLED_BY: dict[str, Coupling] = {
 
 
 class StateBlock:
-    """A part of the state: by default a constant vector with an additive error, of which nothing else depends.
+    """A part of the state: by default a constant vector with an additive error, on which nothing else depends.
 
-    Subclasses are frozen dataclasses that override what is different.
+    Subclasses are frozen dataclasses that override the differences.
 
     Attributes:
-        coupling: What depends on it; set by the method that a subclass overrides.
+        coupling: Role in the model; set by the method that a subclass overrides.
         name: Key of its value, and of its columns in the `Layout`.
         size: Number of columns of its error.
-        per_frame: Whether it has a value for each frame (in the batch problem: one unknown a frame), or one for the
-            whole drive.
+        per_frame: Whether it has a value for each frame, or one for the whole drive.
         is_seen: Whether observations of landmarks depend on it.
         is_curved: Whether its value is a vector but no sum of corrections, so that the log keeps it.
-        is_pose: Whether it is a pose ``T_imu_world`` with the error of one: the pose itself, or a clone of it.
-        clones: Name of the block whose value of the frame before it is; "" where it is no clone.
-        labels, units: Names and units of what `reported` returns; none is not reported.
+        is_pose: Whether it is a pose ``T_imu_world``: the pose itself, or a clone of it.
+        clones: Name of the block whose previous value it is; "" if it is no clone.
+        labels, units: Names and units of the estimates that `reported` returns.
     """
 
     coupling: ClassVar[Coupling] = "none"
@@ -91,11 +88,9 @@ class StateBlock:
         return value + correction
 
     def transition(self, tau_s: Array | float, way_m: Array | float) -> tuple[Array, Array] | None:
-        """Return the walk from frame to frame, ``x+ = phi x + w`` element by element; None: it is constant.
+        """Return ``phi`` and the standard deviation of w (..., size) of the walk ``x+ = phi x + w``; None: constant.
 
-        Returns:
-            ``phi`` (..., size) and the standard deviation (..., size) of w over intervals of ``tau_s`` (...), in which
-            the rig drives ``way_m`` (...).
+        Intervals have durations ``tau_s`` (...) and ways driven ``way_m`` (...).
         """
         return None
 
@@ -106,11 +101,11 @@ class StateBlock:
     def turn_velocities(
         self, twist: Array, by: Array, values: Values, R_linear: Array, layout: Layout
     ) -> tuple[Array, Array]:
-        """Return velocities (..., 6) and their derivative (..., 6, body), after this block has acted on them.
+        """Return velocities (..., 6) and their derivative (..., 6, body), after this block has turned them.
 
         Args:
-            twist, by: Before.
-            values: Estimates of all blocks, the pose being the one that the interval starts from.
+            twist, by: Velocities and derivative before.
+            values: Estimates of all blocks; the pose is the one before the interval.
             R_linear: (..., 3, 3) rotation of that pose at which its error is linearised.
             layout: Columns of the blocks.
         """
@@ -122,9 +117,6 @@ class StateBlock:
         Args:
             way_m: (...) way driven since the frame before, for each observation.
             is_difference: (...) whether it is a difference from the frame before, eq. (10).
-
-        Returns:
-            Shares (...); None: the block does not move the camera.
         """
         return None
 
@@ -133,7 +125,7 @@ class StateBlock:
         """Return its settings in the automatic model of a recording; None: it is not part of that model.
 
         Args:
-            white_std: (2,) white noise of linear (m/s) and angular velocities (rad/s); None: there are none.
+            white_std: (2,) white noise of linear (m/s) and angular velocities (rad/s); None: no velocities.
             is_clean: Whether these show no more noise than a good unit has.
             has_checked_tracks: Whether tracks are compared with their first sight, so that they do not drift.
         """
@@ -157,7 +149,6 @@ class Layout(dict[str, slice]):
         blocks: In any order, the pose first; those that are seen move to the front.
 
     Attributes:
-        blocks: In the order of their columns.
         body: Number of columns of all blocks.
         seen: Number of leading columns that observations of landmarks depend on.
         poses: Names of the pose and of its clones.
@@ -182,11 +173,7 @@ class Layout(dict[str, slice]):
         return tuple(block for block in self.blocks if block.coupling == coupling)
 
     def block(self, name: str) -> StateBlock:
-        """Return a block by name.
-
-        Raises:
-            KeyError: It is not in the state.
-        """
+        """Return a block by name; raise a `KeyError` if it is not in the state."""
         return {block.name: block for block in self.blocks}[name]
 
     def columns(self, names: Iterable[str]) -> IntArray:

@@ -1,4 +1,4 @@
-"""The stereo rig's calibration as a state block: which parameters there are, and their Jacobians.
+"""The stereo rig's calibration as a state block: its parameters and their Jacobians.
 
 With nine parameters c the rig sees ``q = exp(c_0..5^) T_cam_imu exp(-c_time u^) T_imu_world m``, eq. (9), its
 baseline is ``b exp(c_baseline)``, and its disparities come out larger by ``c_disparity``. All are 0 for the calibration
@@ -21,15 +21,8 @@ from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.stereo import Rig
 
 NAMES = (
-    "camera x",
-    "camera y",
-    "camera z",
-    "camera rotation x",
-    "camera rotation y",
-    "camera rotation z",
-    "ln baseline",
-    "disparity offset",
-    "time offset",
+    *("camera x", "camera y", "camera z", "camera rotation x", "camera rotation y", "camera rotation z"),
+    *("ln baseline", "disparity offset", "time offset"),
 )
 UNITS = ("m", "m", "m", "rad", "rad", "rad", "1", "px", "s")
 _EXTRINSIC, _BASELINE, _DISPARITY, TIME = slice(0, 6), 6, 7, 8
@@ -37,16 +30,9 @@ _ROTATION = slice(3, 6)
 
 
 def prior_std(config: CalibrationConfig) -> Array:
-    """(9,) prior standard deviations of the parameters, in their `UNITS`; 0 where one is taken as given."""
-    return np.array(
-        [
-            *[config.lever_arm_m] * 3,
-            *[np.deg2rad(config.rotation_deg or 0.0)] * 3,
-            config.baseline,
-            config.disparity_px,
-            config.time_s,
-        ]
-    )
+    """Return prior standard deviations (9,) of the parameters, in their `UNITS`; 0 takes one as given."""
+    camera = np.repeat([config.lever_arm_m, np.deg2rad(config.rotation_deg or 0.0)], 3)
+    return np.array([*camera, config.baseline, config.disparity_px, config.time_s])
 
 
 @dataclass(frozen=True)
@@ -80,11 +66,6 @@ class Calibration(StateBlock):
     def units(self) -> tuple[str, ...]:
         return tuple(UNITS[i] for i in self.free)
 
-    @property
-    def has_time_offset(self) -> bool:
-        """Whether the images' time offset is free, so that velocities enter the observations."""
-        return bool(self.std[TIME])
-
     def initial(self) -> Array:
         return np.zeros(9)
 
@@ -99,21 +80,13 @@ class Calibration(StateBlock):
     def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
         return values[self.name][self.free], np.sqrt(np.diag(covariance)[layout[self.name]])
 
-    def applied(self, rig: Rig, parameters: Array) -> Rig:
-        """Return the rig with parameters (9,), all but the time offset."""
-        return calibrated(rig, parameters)
-
-    def delay(self, parameters: Array, twist: Array) -> Array:
-        """(..., 4, 4) motion from the stamps to the exposures, with velocities (..., 6)."""
-        return to_exposure(parameters, twist)
-
     @cached_property
     def extrinsic(self) -> IntArray:
         """Columns of the block that move or turn the camera."""
         return np.flatnonzero(self.free < _EXTRINSIC.stop)
 
     def camera_by_extrinsic(self, parameters: Array) -> Array:
-        """Error (6, e) of the camera's pose ``exp(c_0..5^) T_cam_imu T_imu_world`` by the columns `extrinsic`."""
+        """Return the derivative (6, e) of the camera's pose error by the columns `extrinsic`."""
         return np.asarray(se3.left_jacobian(parameters[_EXTRINSIC])[:, self.free[self.extrinsic]], dtype=float)
 
     @cached_property
@@ -131,19 +104,17 @@ class Calibration(StateBlock):
         T_linear: Array,
         linear_positions_m: Array,
     ) -> tuple[Array, Array, Array, Array]:
-        """Eq. (4) with parameters (9,) at which to linearise, and velocities ``twist`` (6,) or (n, 6) of the IMU.
-
-        The rig is the calibrated one, see `applied`.
+        """Linearise eq. (4) at parameters (9,), with the `calibrated` rig and velocities (6,) or (n, 6) of the IMU.
 
         Returns:
-            As `ekfslam.models.observation.linearise`, with H (n, 3, size) by the free parameters before H_m.
+            Values of `ekfslam.models.observation.linearise`, with H (n, 3, size) by the free parameters before H_m.
         """
         delay = to_exposure(parameters, twist)
         q, H_x, H_m = linearise(rig, delay @ T_imu_world, positions_m, delay @ T_linear, linear_positions_m)
         T_cam_linear = rig.T_cam_imu @ delay @ T_linear
         H = np.zeros((len(q), 3, 9))
         if len(self.extrinsic):
-            # First estimates here, too: a camera and its landmarks turned about it as one must look the same for good.
+            # First estimates here, too: turning the camera and all landmarks about it must stay unobservable.
             q_linear = se3.apply(T_cam_linear, linear_positions_m)
             A = H_m @ T_cam_linear[..., :3, :3].swapaxes(-1, -2)
             moved = np.concatenate([A, -A @ se3.skew(q_linear)], axis=-1)
@@ -158,10 +129,9 @@ class Calibration(StateBlock):
     def landmarks_by_rotation(self, rig: Rig, parameters: Array, T_imu_world: Array, moved_m: Array) -> Array:
         """Return the landmark errors (n, 3, 3) by the camera's rotation after a correction by ``moved_m`` (n, 3).
 
-        A rig that turns its camera and all landmarks about it sees the same: their errors count in the camera's frame,
-        as those of the invariant variant do in that of the IMU. In world they would be seen from ever new linearisation
-        points, above all while depths are poor, and the filter would learn the rotation from noise. Pose (4, 4) and
-        parameters (9,) are those before the correction.
+        If camera and landmarks turn about it as one, images stay the same. So errors count in the camera's frame; in
+        world the filter would learn the rotation from noise. Pose (4, 4) and parameters (9,) are those before the
+        correction.
         """
         R_world_cam = (se3.exp(parameters[_EXTRINSIC]) @ rig.T_cam_imu @ T_imu_world)[:3, :3].T
         by_rotation = se3.skew(moved_m) @ R_world_cam @ se3.so3_left_jacobian(parameters[_ROTATION])
@@ -180,5 +150,5 @@ def calibrated(rig: Rig, parameters: Array) -> Rig:
 
 
 def to_exposure(parameters: Array, twist: Array) -> Array:
-    """(..., 4, 4) motion from the stamp to the exposure; ``T_imu_world`` there is it times that at the stamp."""
+    """Return the motion (..., 4, 4) from stamps to exposures, by which ``T_imu_world`` is premultiplied."""
     return motion.increment(twist, parameters[TIME])

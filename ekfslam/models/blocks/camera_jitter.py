@@ -16,8 +16,8 @@ from ekfslam.models.blocks.gauss_markov import GaussMarkov
 class CameraJitter(GaussMarkov):
     """Error n of the camera's pose that all landmarks of a frame share: ``q = T_cam_imu exp(n^) T_imu_world m``.
 
-    Mounts that swing, stamps that jitter, motion blur and rolling shutters look like it. It is a Gauss-Markov process
-    of time, [m; rad] along the axes of the IMU.
+    Swinging mounts, jitter of stamps, motion blur and rolling shutters look like it. It is a Gauss-Markov process of
+    time, [m; rad] along the axes of the IMU.
 
     Args:
         translation_m, rotation_deg: Stationary standard deviations, each axis.

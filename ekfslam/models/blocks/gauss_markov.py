@@ -1,4 +1,4 @@
-"""Vectors that wander about zero: what the blocks of slowly changing errors have in common."""
+"""Vectors that wander about zero: the base of blocks of slowly changing errors."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ekfslam.models.blocks.base import StateBlock
 class GaussMarkov(StateBlock):
     """``x+ = exp(-l / L) x + w``, ``w ~ N(0, sigma^2 (1 - exp(-2 l / L)))``: stationary with standard deviation sigma.
 
-    ``l`` is the time or the way between two frames, L the time or way after which a share 1/e is left. Source: Maybeck,
-    "Stochastic Models, Estimation, and Control" 1, 1979, section 4.11. Every setting of a subclass is positive.
+    ``l`` is the time or way between two frames, L the time or way after which a share 1/e is left (Maybeck, "Stochastic
+    Models, Estimation, and Control" 1, 1979, section 4.11). Every setting of a subclass is positive.
     """
 
     per_frame = True

@@ -11,13 +11,22 @@ from ekfslam.geometry import se3
 from ekfslam.models.blocks.base import StateBlock
 
 
+class _PoseBlock(StateBlock):
+    size = 6
+    is_seen = True
+    is_pose = True
+
+    def retract(self, value: Array, correction: Array) -> Array:
+        return se3.exp(correction) @ value
+
+
 @dataclass(frozen=True)
-class Pose(StateBlock):
-    """``T_imu_world = exp(xi^) T_hat``, moved by the velocities: eq. (1) and (2).
+class Pose(_PoseBlock):
+    """``T_imu_world = exp(xi^) T_hat``, moved by the process.
 
     Args:
         T_imu_world: (4, 4) first pose.
-        covariance: (6, 6) of its error.
+        covariance: (6, 6) covariance of its error.
     """
 
     T_imu_world: Array
@@ -25,12 +34,6 @@ class Pose(StateBlock):
 
     name = "pose"
     per_frame = True
-    is_seen = True
-    is_pose = True
-
-    @property
-    def size(self) -> int:
-        return 6
 
     def initial(self) -> Array:
         return self.T_imu_world
@@ -38,34 +41,20 @@ class Pose(StateBlock):
     def prior_covariance(self) -> Array:
         return self.covariance
 
-    def retract(self, value: Array, correction: Array) -> Array:
-        return se3.exp(correction) @ value
-
 
 @dataclass(frozen=True)
-class Clone(StateBlock):
+class Clone(_PoseBlock):
     """Clone of a pose: it begins as a certain identity, until it takes the pose's place."""
-
-    is_seen = True
-    is_pose = True
-
-    @property
-    def size(self) -> int:
-        return 6
 
     def initial(self) -> Array:
         return np.eye(4)
-
-    def retract(self, value: Array, correction: Array) -> Array:
-        return se3.exp(correction) @ value
 
 
 @dataclass(frozen=True)
 class PreviousPose(Clone):
     """A clone of the pose of the frame before: errors of tracks are differences over two frames, eq. (10).
 
-    Source: Roumeliotis and Burdick, "Stochastic cloning", ICRA 2002. It takes the pose's place at every prediction; in
-    the batch problem it is the pose of the frame before itself.
+    It takes the pose's place at every prediction. Source: Roumeliotis and Burdick, "Stochastic cloning", ICRA 2002.
     """
 
     name = "previous_pose"

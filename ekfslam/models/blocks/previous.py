@@ -10,11 +10,7 @@ from ekfslam.models.blocks.base import StateBlock
 
 @dataclass(frozen=True)
 class Previous(StateBlock):
-    """Value of another block in the frame before, as `PreviousPose` is that of the pose: eq. (10) needs both.
-
-    Args:
-        block: The other one, a vector.
-    """
+    """Value of another block, a vector, in the frame before: eq. (10) needs both."""
 
     block: StateBlock
 

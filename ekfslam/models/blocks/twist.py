@@ -23,11 +23,8 @@ class Twist(StateBlock):
     is_measured: bool = True
 
     name = "twist"
+    size = 6
     per_frame = True
-
-    @property
-    def size(self) -> int:
-        return 6
 
     def transition(self, tau_s: Array | float, way_m: Array | float) -> tuple[Array, Array] | None:
         std = np.broadcast_to(self.walk_std, (*np.shape(tau_s), 6))

@@ -22,7 +22,7 @@ class TwistBias(GaussMarkov):
     """Gauss-Markov bias b of the six measured velocities: measured = true + b + white noise.
 
     Args:
-        sigma_v_m_s, sigma_w_rad_s: Stationary standard deviations of the linear and the angular velocities, each axis.
+        sigma_v_m_s, sigma_w_rad_s: Stationary standard deviations for linear and angular velocities, each axis.
         time_v_s, time_w_s: Their time constants.
     """
 

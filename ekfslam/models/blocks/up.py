@@ -1,4 +1,4 @@
-"""Which way is up: what level velocities need to become those of the IMU."""
+"""The direction up, by which velocities of a level frame are turned into the IMU frame."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Up(StateBlock):
     ``exp(phi^)``, ``phi = theta + R psi``: nothing when the world turns as a whole.
 
     Args:
-        direction: (3,) up as it is taken first: the first pose's z axis.
+        direction: (3,) first estimate: the first pose's z axis.
         tilt_rad: Standard deviation of its angles.
     """
 
@@ -27,13 +27,10 @@ class Up(StateBlock):
     tilt_rad: float
 
     name = "up"
+    size = 3
     is_curved = True
     labels = ("roll", "pitch")
     units = ("rad", "rad")
-
-    @property
-    def size(self) -> int:
-        return 3
 
     def initial(self) -> Array:
         return self.direction
@@ -45,13 +42,12 @@ class Up(StateBlock):
         return (se3.so3_exp(correction) @ value[..., None])[..., 0]
 
     def in_imu(self, values: Values) -> Array:
-        """(..., 3) up in the IMU frame."""
+        """Return up (..., 3) in the IMU frame."""
         return (values["pose"][..., :3, :3] @ values[self.name][..., None])[..., 0]
 
     def turn_velocities(
         self, twist: Array, by: Array, values: Values, R_linear: Array, layout: Layout
     ) -> tuple[Array, Array]:
-        """Eq. (8)."""
         twist, by_level, by_phi = motion.imu_twist(twist, self.in_imu(values))
         by = by_level @ by
         by[..., layout[self.name]] += by_phi @ R_linear
@@ -59,7 +55,7 @@ class Up(StateBlock):
         return twist, by
 
     def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
-        """Roll and pitch of the IMU and their standard deviations, rad."""
+        """Return roll and pitch of the IMU and their standard deviations, rad."""
         up = self.in_imu(values)
         by = np.zeros((3, layout.body))
         by[:, layout["pose"].start + 3 : layout["pose"].stop] = np.eye(3)

@@ -20,13 +20,12 @@ class VisionDrift(GaussMarkov):
     """Rates b of a motion that the flow of a frame shows besides the true one, [m/m; rad/m] along the axes of the IMU.
 
     From one frame to the next the errors of all tracks grow alike, by what a motion ``b way`` of the camera would do:
-    ``z(k) - z(k-1) = h(exp(way b(k)^) T_k m) - h(T_k-1 m) + w``, eq. (10). Trackers that creep along edges, and what is
-    left of the rig's calibration look like it. It is a Gauss-Markov process of the way driven, and says nothing of
-    observations that are no differences.
+    ``z(k) - z(k-1) = h(exp(way b(k)^) T_k m) - h(T_k-1 m) + w``, eq. (10). Trackers that creep along edges and errors
+    of the calibration look like it. It is a Gauss-Markov process of the way driven.
 
     Args:
         translation_percent: Stationary standard deviation of the translation, each axis, in percent of the way.
-        rotation_deg_m: Of the rotation, each axis, in degrees a metre of way.
+        rotation_deg_m: Stationary standard deviation of the rotation, each axis, in degrees a metre of way.
         length_m: Way after which a share 1/e is left.
     """
 
@@ -46,10 +45,9 @@ class VisionDrift(GaussMarkov):
 
     @classmethod
     def automatic(cls, white_std: Array | None, is_clean: bool, has_checked_tracks: bool) -> dict[str, float] | None:
-        """Return a tracker's own drift: about 1 % of the way and a few mdeg/m. Tracks that are checked do not drift.
+        """Return a tracker's own drift: about 1 % of the way and a few mdeg/m; checked tracks do not drift.
 
-        If velocities are clean, a larger value leaves the low frequencies to them, as the accuracy of a good unit
-        deserves.
+        For clean velocities a larger value leaves the low frequencies to them.
         """
         if has_checked_tracks:
             return None

@@ -1,19 +1,13 @@
-"""The interface of a process model: how the state gets from one frame to the next, and what drives it.
+"""The interface of a process model: how the state gets from one frame to the next.
 
-A process moves some blocks, its *own*: the pose always, and a velocity or biases if it has them. Constant blocks,
-blocks that walk by themselves (`StateBlock.transition`) and clones are not among them; its step may depend on all.
-
-To add a process, write one file with a subclass and its settings, one file for each new block, and hand
-``make_process`` to `ekfslam.models.build.model_of`.
-
-Contract:
+A process moves its *own* blocks: the pose, and a velocity or biases if it has them. Its step may depend on all others,
+which are constant, clones, or walk by themselves (`StateBlock.transition`). To add a process, write one file with a
+subclass, one file for its new blocks, and hand ``make_process`` to `ekfslam.models.build.model_of`.
 
 - A process is built for one layout: ``make_process(layout, noise)``. It keeps no state.
-- ``values`` map block names to estimates. Methods accept leading dimensions (m, ...) with `Intervals` in place of an
-  `Interval`: the filter takes one interval, the smoother all at once. A process that cannot do all at once loops over
-  ``intervals[k]`` there.
-- Blocks that walk by themselves have walked already: a step starts from *their* values of the frame that it leads to,
-  and from the values of its own blocks in the frame before.
+- ``values`` map block names to estimates. The filter takes one `Interval`; the smoother takes all `Intervals` at once,
+  with leading dimensions (m, ...).
+- A step starts from its own blocks in the frame before, and from walking blocks in the frame that it leads to.
 - Errors are those of the blocks (`StateBlock.retract`). The rows of ``Phi`` and ``Q`` are the columns of the blocks
   that a step moves.
 """
@@ -67,13 +61,11 @@ class Residual:
 
 @dataclass(frozen=True)
 class Measured:
-    """Scalar measurements of blocks by inputs, each of one component that the process has (an axis of its velocity).
+    """Scalar measurements of blocks by inputs, each of one component of the process (an axis of its velocity).
 
     Args:
-        axis: (n,) which component.
-        value: (n,) measured value.
-        std: (n,) standard deviation.
-        is_biased: (n,) whether it comes from the recording's own inputs, whose biases are in the state.
+        axis, value, std: (n,) components, measured values, and standard deviations.
+        is_biased: (n,) whether they come from the recording's own inputs, whose biases are in the state.
     """
 
     axis: IntArray
@@ -118,12 +110,7 @@ class Process(ABC):
 
     @abstractmethod
     def residual(self, before: Values, after: Values, intervals: Intervals) -> Residual:
-        """Return the error of steps between given states, with its derivatives.
-
-        Args:
-            before, after: Estimates (m, ...) of the blocks in the frames before and after each interval.
-            intervals: m of them.
-        """
+        """Return the error of steps between estimates (m, ...) before and after each of m intervals."""
 
     @abstractmethod
     def begin(self, values: Values, inputs: Array) -> Array:
@@ -141,7 +128,7 @@ class Process(ABC):
         """Return the way (...) driven during an interval, given the values before it."""
 
     def start(self, values: Values, interval: Interval) -> Step | None:
-        """Return the step with which the first inputs start blocks that nothing is known of; None: there are none."""
+        """Return the step with which the first inputs start unknown blocks; None: there are none."""
         return None
 
     def measured(self, interval: Interval, is_first: bool) -> Measured | None:

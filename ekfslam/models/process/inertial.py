@@ -41,13 +41,7 @@ def inertial(noise: InertialNoise, gravity_m_s2: float = GRAVITY_M_S2) -> MakePr
 
 @dataclass(frozen=True)
 class Inertial(Process):
-    """Inertial samples move pose and body velocity.
-
-    Args:
-        layout: Columns of all blocks.
-        noise: Densities of the samples.
-        gravity_m_s2: Magnitude of gravity; its direction is -z of world.
-    """
+    """Inertial samples move pose and body velocity; gravity is along -z of world."""
 
     layout: Layout
     noise: InertialNoise

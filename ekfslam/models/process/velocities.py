@@ -30,18 +30,13 @@ def velocities(layout: Layout, noise: Noise) -> Process:
 
 @dataclass(frozen=True)
 class VelocityInputs(Process):
-    """Measured velocities move the pose.
-
-    Args:
-        layout: Columns of all blocks.
-        noise: Errors of the velocities.
-    """
+    """Measured velocities move the pose."""
 
     layout: Layout
     noise: ProcessNoise
 
     def step(self, values: Values, interval: Interval | Intervals, T_linear: Array, first_estimates: bool) -> Step:
-        """Eq. (1) and (2)."""
+        """Return eq. (1) and (2)."""
         twist, by, tau_s, T = mean_velocity(interval), None, interval.tau_s, values["pose"]
         if self._depends_on_blocks:
             twist, by = self.imu_velocities(values, twist, T_linear[..., :3, :3])
@@ -116,15 +111,9 @@ class VelocityInputs(Process):
         return self.unbiased(inputs, values), by
 
     def imu_velocities(self, values: Values, inputs: Array, R_linear: Array) -> tuple[Array, Array]:
-        """Return the velocities of the IMU that drive an interval, and their derivative by the errors of all blocks.
+        """Return the velocities (..., 6) of the IMU in an interval, and their derivative (..., 6, body).
 
-        Args:
-            values: Estimates: of the pose before the interval, of walking blocks during it.
-            inputs: (..., 6) measured velocities.
-            R_linear: (..., 3, 3) rotation at which the error of the pose is linearised.
-
-        Returns:
-            (..., 6) m/s and rad/s; (..., 6, body).
+        Values of the pose are those before the interval; its error is linearised at a rotation (..., 3, 3).
         """
         twist, by = self._driving(values, inputs)
         for block in self._turning:

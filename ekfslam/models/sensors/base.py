@@ -31,7 +31,7 @@ class Sensor(Protocol):
         """Noise of velocities and measurements."""
 
     def screen(self, measured: Array, min_depth_m: float) -> IntArray:
-        """Reason codes (n,) of what can be judged from the measurements alone."""
+        """Return reason codes (n,), judged from the measurements alone."""
 
     def in_view(self, q: Array, min_depth_m: float) -> BoolArray:
         """Return whether (n,) points (n, 3) can be seen at all."""
@@ -40,7 +40,7 @@ class Sensor(Protocol):
         """Return the rows (n, d) of each measurement."""
 
     def variance(self, rows: Array) -> Array:
-        """Variances (n, d) of the rows where noise is white."""
+        """Return variances (n, d) of the rows if noise is white."""
 
     def predict(self, q: Array) -> Array:
         """``h(q)``: points (n, 3) m to rows (n, d)."""

@@ -20,13 +20,11 @@ _DISPARITY_ROWS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, -1.0]])
 class Rig:
     """A `Sensor`: measurements are pixels (n, 4), rows those of the rectified pair whose errors are independent.
 
-    Where pixel noise is white these are (uL, v, uR), where tracks err they are (u, v, disparity) with u = uL.
+    If pixel noise is white these are (uL, v, uR); if tracks err they are (u, v, disparity) with u = uL.
 
     Args:
-        camera: Intrinsics.
-        T_cam_imu: (4, 4) extrinsics.
-        noise: Of pixels, tracks and velocities.
-        disparity_offset_px: Disparities come out larger by this than the camera's matrix says.
+        camera, T_cam_imu, noise: Intrinsics, extrinsics (4, 4), and noise of pixels, tracks and velocities.
+        disparity_offset_px: Offset of all disparities from those of the camera's matrix.
     """
 
     camera: StereoCamera
