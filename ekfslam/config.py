@@ -32,7 +32,7 @@ BlockSetting = float | int | str | bool
 
 MODES: tuple[Mode, ...] = get_args(Mode)
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
-LEAST_PX = 1e-3  # pixel noise with which covariances of landmarks keep digits, whatever they begin with
+LEAST_PX = 1e-3  # least pixel noise with which covariances of landmarks keep digits
 
 _KINDS: dict[type, str] = {float: "number", int: "whole number", str: "string", bool: "truth value"}
 
@@ -102,7 +102,7 @@ _CONSTANTS_OF_THE_FRONT_END = (
     *("template", "template_score_left", "template_score_right", "template_shift", "kernel", "residual_limit"),
     *("strikes", "residual_drop", "samples", "rotation_gap", "settling"),
 )
-# Settings of earlier versions: a file that names them is read, and a note says what became of them.
+# Settings of earlier versions: files that name them are read, with a note.
 RETIRED = {
     "blocks.stereo_rotation": "the block is gone: it improved nothing. Pitch and roll of the right camera are the mean "
     "of vL - vR over the tracks of a recording",
@@ -116,9 +116,7 @@ class NoiseConfig:
     """Standard deviations per sample; None takes the noise that the recording states.
 
     Args:
-        sigma_v_m_s: Linear velocity, each axis.
-        sigma_w_rad_s: Angular velocity, each axis.
-        sigma_px: Pixels.
+        sigma_v_m_s, sigma_w_rad_s, sigma_px: Linear and angular velocities, and pixels, each axis.
         drift: Random walk of track errors from frame to frame, px; 0 takes pixel noise as white.
         track_scale: Factor on that walk in the automatic model; None finds it from innovations (`ekfslam.resolve`).
         shared: Whether the automatic model has state blocks for errors that all samples or all tracks share.
@@ -199,8 +197,7 @@ class FilterConfig:
         min_depth_m: Reject observations of a landmark that is predicted nearer than this, or behind the camera.
         relative_frames: If truth is known, keep cross-covariances of reported poses up to this many frames apart, for
             the NEES of relative poses. It slows the filter down; estimates do not depend on it.
-        initial_position_std_m: Standard deviation of the first pose's translation, each axis.
-        initial_rotation_std_rad: Standard deviation of the first pose's rotation, each axis.
+        initial_position_std_m, initial_rotation_std_rad: Standard deviations of the first pose, each axis.
     """
 
     variant: Variant = field(default="invariant", metadata=_one_of(Variant))
@@ -227,9 +224,7 @@ class FilterConfig:
 
     def misses_to_split(self, tracks_walk: bool) -> int:
         """Return `split_after`, or its default if errors of tracks walk or do not; 0 means never."""
-        if self.split_after is not None:
-            return self.split_after
-        return 1 if tracks_walk else 3
+        return (1 if tracks_walk else 3) if self.split_after is None else self.split_after
 
     @property
     def initial_covariance(self) -> np.ndarray:
@@ -300,16 +295,14 @@ class PosteriorConfig:
 
 @dataclass(frozen=True)
 class TruthConfig:
-    """Standard deviations of the true poses; None takes those that their format states, if any.
+    """Standard deviations of the true poses; None takes those of their format, if any.
 
     Only the evaluation uses it, see `ekfslam.data.truth_noise.TruthNoise`.
 
     Args:
-        roll_deg, pitch_deg, yaw_deg: Attitude of the first pose, about the axes of the IMU.
-        first_position_m: Position of the first pose, each axis.
+        roll_deg, pitch_deg, yaw_deg, first_position_m: First pose, about and along the axes of the IMU.
         stamp_s: Jitter of the stamps.
-        position_m: Position of each pose, each axis.
-        attitude_deg: Attitude of each pose, each axis.
+        position_m, attitude_deg: Each pose, each axis.
     """
 
     roll_deg: float | None = field(default=None, metadata=_FINITE)

@@ -70,7 +70,7 @@ class Problem:
 
     Args:
         sequence: Recording with cleaned tracks.
-        hygiene: What was done to the tracks; None: they were not cleaned.
+        hygiene: Report of cleaning; None: tracks were not cleaned.
         account: Attributes of a result that say where the noise comes from.
     """
 
@@ -135,7 +135,11 @@ def resolve(
     if is_inertial(sequence):
         account |= {f"inertial_{name}": value for name, value in vars(_densities(sequence)).items()}
     if mode != "dead-reckoning":
-        _require_pixel_noise(sequence, noise)
+        if (least := float(np.min(noise.pixel_std_px))) < LEAST_PX:
+            raise ConfigError(
+                f"{sequence.name}: the recording states a pixel noise of {least:g} px, with which innovation "
+                f"covariances are singular; give noise.sigma_px, at least {LEAST_PX:g}"
+            )
         observations, hygiene = clean_tracks(sequence, noise, config.hygiene)
         attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
         sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
@@ -210,11 +214,9 @@ def is_automatic(sequence: Sequence, config: Config) -> bool:
 
 def found_attributes(found: VelocityNoise) -> dict[str, float]:
     """Return white noise of velocities, standard errors and 95 % limits by name, with the units in the names."""
-    values: dict[str, float] = {}
-    for i, name in enumerate(("sigma_v_m_s", "sigma_w_rad_s")):
-        values[f"found_{name}"], values[f"found_{name}_error"] = float(found.sigma[i]), float(found.sigma_error[i])
-        values[f"found_{name}_limit"] = float(found.limit[i])
-    return values
+    kinds = {"": found.sigma, "_error": found.sigma_error, "_limit": found.limit}
+    names = ("sigma_v_m_s", "sigma_w_rad_s")
+    return {f"found_{name}{kind}": float(pair[i]) for i, name in enumerate(names) for kind, pair in kinds.items()}
 
 
 def _with_retirement(sequence: Sequence, config: Config) -> Config:
@@ -235,15 +237,6 @@ def _landmarks_come_back(sequence: Sequence) -> bool:
     order = np.lexsort((observations.frame, observations.landmark))
     same = np.diff(observations.landmark[order]) == 0
     return bool((same & (np.diff(observations.frame[order]) > 1)).any())
-
-
-def _require_pixel_noise(sequence: Sequence, noise: Noise) -> None:
-    least = float(np.min(noise.pixel_std_px))
-    if least < LEAST_PX:
-        raise ConfigError(
-            f"{sequence.name}: the recording states a pixel noise of {least:g} px, with which innovation "
-            f"covariances are singular; give noise.sigma_px, at least {LEAST_PX:g}"
-        )
 
 
 def _model(sequence: Sequence, config: Config, noise: Noise, blocks: SequenceType[StateBlock]) -> Model:
@@ -268,11 +261,10 @@ def _densities(sequence: Sequence) -> InertialNoise:
 
 
 def _has_open_scale(sequence: Sequence, config: Config) -> bool:
-    """Return whether the track scale is automatic and not known yet."""
+    """Return whether the track scale is automatic and not known yet; a tuned file was found with scale 1."""
     noise = config.noise
-    # A tuned file was found with the walk as it is.
-    is_given = noise.track_scale is not None or noise.drift is not None or noise.model != "auto"
-    return is_automatic(sequence, config) and not is_given and not sequence.has_checked_tracks
+    is_open = noise.track_scale is None and noise.drift is None and noise.model == "auto"
+    return is_open and is_automatic(sequence, config) and not sequence.has_checked_tracks
 
 
 def _track_scale(sequence: Sequence, config: Config, model: Model) -> float:
@@ -296,9 +288,10 @@ def _track_scale(sequence: Sequence, config: Config, model: Model) -> float:
 
 def _settings(table: Mapping[str, BlockSetting | None]) -> str:
     """Return the settings of a table that have a value as text."""
-    given = {key: value for key, value in table.items() if value is not None}
     return ", ".join(
-        f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in given.items()
+        f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}"
+        for key, value in table.items()
+        if value is not None
     )
 
 

@@ -46,10 +46,8 @@ def run(
     """Estimate trajectory and map of a sequence.
 
     Args:
-        sequence: Recording.
         mode: ``dead-reckoning`` (prediction only), ``mapping-only`` (the report: independent landmark EKFs on dead
             reckoning's poses), ``full`` (joint EKF SLAM) or ``smoothed`` (the posterior of a full run).
-        config: Settings; defaults where None.
         further: Velocity measurements of other sensors, for the joint filter (`ekfslam.models.sensors.velocities`).
 
     Raises:
@@ -78,14 +76,7 @@ def run(
 
 @dataclasses.dataclass(frozen=True)
 class _Estimate:
-    """Estimate of a mode; fields are those of `Result`, except for the direction of the poses.
-
-    Args:
-        T_imu_world: (T, 4, 4) poses.
-        covariance: (T, 6, 6) covariances of their errors.
-        ms: (T,) time spent on each frame.
-        reports: Report of each frame; empty without observations.
-    """
+    """Estimate of a mode; fields are those of `Result`, except for the direction of the poses (T, 4, 4)."""
 
     T_imu_world: Array
     covariance: Array

@@ -61,7 +61,7 @@ def test_the_standard_variant_gains_information_about_the_heading():
 def test_dense_and_conditional_form_agree():
     forms = [dataclasses.replace(FILTER, covariance_form=form) for form in ("dense", "conditional")]
     ekfs = [JointEKF(model_from_prior(room(), Prior(), np.random.default_rng(0)), config) for config in forms]
-    for _ in zip(*(run_filter(ekf, room()) for ekf in ekfs), strict=True):
+    for _ in zip(*(run_filter(ekf, room(), range(30)) for ekf in ekfs), strict=True):
         pass
     for name, value in ekfs[0].values.items():
         np.testing.assert_allclose(ekfs[1].values[name], value, atol=1e-8, err_msg=name)
@@ -78,14 +78,14 @@ def test_a_recording_with_samples_alone_runs_by_them():
 
 def test_priors_of_the_inertial_blocks_are_settings():
     config = ekfslam.Config(blocks={"gyro_bias": {"std_rad_s": 0.02}})
-    model = resolve(room(), config).model
+    model = resolve(room(8), config).model
     assert model.prior_covariance[model.layout["gyro_bias"], model.layout["gyro_bias"]][0, 0] == pytest.approx(4e-4)
 
 
 def test_samples_without_densities_are_refused():
-    samples = dataclasses.replace(room().inertial, noise=None)
+    samples = dataclasses.replace(room(8).inertial, noise=None)
     with pytest.raises(ConfigError, match="no densities"):
-        ekfslam.run(dataclasses.replace(room(), inputs=(samples,)), "full")
+        ekfslam.run(dataclasses.replace(room(8), inputs=(samples,)), "full")
 
 
 @pytest.mark.parametrize("variant", ["standard", "fej"])

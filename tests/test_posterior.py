@@ -112,7 +112,7 @@ def test_where_landmarks_are_eliminated_makes_no_difference():
     for one in found[1:]:
         np.testing.assert_allclose(one.eps, found[0].eps, atol=1e-10)
         np.testing.assert_allclose(one.d, found[0].d, atol=1e-9)
-        np.testing.assert_allclose(one.pose_covariances(), found[0].pose_covariances(), atol=1e-10)
+        np.testing.assert_allclose(one.frame_covariances(), found[0].frame_covariances(), atol=1e-10)
         np.testing.assert_allclose(one.landmark_covariances(), found[0].landmark_covariances(), atol=1e-9)
         np.testing.assert_allclose(one.log_determinant, found[0].log_determinant, rtol=1e-12)
 

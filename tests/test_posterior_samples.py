@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.running import WHOLE
 
 from ekfslam import Config, FilterConfig, PosteriorConfig, open_sequence, posterior, run
 from ekfslam.geometry import se3
 
-SIZE = 4000
+SIZE = 4000 if WHOLE else 1000
 
 
 @pytest.fixture(

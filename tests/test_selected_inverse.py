@@ -134,12 +134,6 @@ def test_block_outside_the_pattern_is_a_named_error():
     assert (caught.value.i, caught.value.j) == (199, 3)
 
 
-def test_blocks_of_one_request_have_one_size():
-    inverse = SelectedInverse(block_cholesky(np.eye(9), [6, 3]))
-    with pytest.raises(ValueError, match=r"\[3, 6\]"):
-        inverse.blocks([0, 1], [0, 1])
-
-
 def test_no_blocks():
     none = np.empty(0, dtype=np.int64)
     assert SelectedInverse(block_cholesky(np.eye(9), [6, 3])).blocks(none, none).shape == (0, 0, 0)

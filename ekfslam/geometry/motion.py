@@ -29,7 +29,7 @@ def integrate(T_imu_world: Array, twist: Array, tau_s: Array) -> Array:
 
 
 def error_jacobian(E: Array) -> Array:
-    """``F = Ad_E`` of eq. (2): how the pose error goes through the prediction, (..., 4, 4) to (..., 6, 6)."""
+    """Return ``F = Ad_E`` of eq. (2), the transition of the pose error: (..., 4, 4) to (..., 6, 6)."""
     return se3.adjoint(E)
 
 

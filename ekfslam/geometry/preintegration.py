@@ -1,9 +1,8 @@
 """Preintegration of a gyroscope and an accelerometer: motion, error transition and noise of short pieces, composed.
 
 Errors are left-invariant, ``T_world_imu = T_hat exp(z^)`` with ``z = (phi, nu, r, bg, ba)``: rotation, velocity,
-position, biases. Their generator depends on angular rate and specific force alone. So all results are exact for samples
-that are constant during a piece. Source: Barrau and Bonnabel, "The invariant extended Kalman filter as a stable
-observer", IEEE TAC 2017.
+position, biases. All results are exact for samples that are constant during a piece. Source: Barrau and Bonnabel, "The
+invariant extended Kalman filter as a stable observer", IEEE TAC 2017.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ class Increment:
 
     Args:
         R, v, p: (..., 3, 3), (..., 3) m/s, (..., 3) m at the end, in the IMU frame at the start.
-        tau_s: (...) duration.
         Phi, Q: (..., 15, 15) transition and noise of ``z``.
     """
 

@@ -29,11 +29,11 @@ _FITS = 9.0  # mean square of a point's rows, in variances
 
 @dataclass(frozen=True)
 class Alignment:
-    """Two frames brought together.
+    """Motion between two frames, with residuals.
 
     Args:
         T_now_before: (4, 4) coordinates of the camera before to those of the camera now.
-        true_px: (n, 3) rows before, as both frames have them.
+        true_px: (n, 3) estimates of the true rows before.
         residual_px: (n, 3) r; infinite for points behind the camera.
         H: (n, 3, 6) derivative of the prediction by xi, ``T_now_before = exp(xi^) T_hat``.
         B: (n, 3, 3) derivative of the prediction by the rows before.

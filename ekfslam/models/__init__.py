@@ -1,1 +1,1 @@
-"""What is believed: state blocks, sensors, noise."""
+"""State blocks, processes, sensors and noise."""

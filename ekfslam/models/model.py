@@ -134,12 +134,9 @@ class Model:
 
     def reported(self, values: Values, covariance: Array) -> Array:
         """Return estimates and standard deviations (2, p) by labels; the covariance begins with the body."""
-        if not self.labels[0]:
-            return np.empty((2, 0))
-        blocks = [block for block in self.layout.blocks if block.labels]
         covariance = covariance[: self.layout.body, : self.layout.body]
-        found = [np.array(block.reported(values, covariance, self.layout)) for block in blocks]
-        return np.hstack(found)
+        found = (block.reported(values, covariance, self.layout) for block in self.layout.blocks if block.labels)
+        return np.hstack([np.empty((2, 0)), *(np.array(pair) for pair in found)])
 
     # --- from one frame to the next -----------------------------------------------------------------------------------
 

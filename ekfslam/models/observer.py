@@ -217,6 +217,6 @@ class Observer:
 
     @property
     def rig(self) -> Rig:
-        """The sensor, where it is a stereo rig."""
+        """The sensor, which must be a stereo rig."""
         assert isinstance(self.sensor, Rig)
         return self.sensor

@@ -1,4 +1,4 @@
-"""Factors of the observations of landmarks, where the filter linearised them or at any state.
+"""Factors of the observations of landmarks, at any state or as the filter linearised them.
 
 An observation whose track walks is a *difference* from the observation before, eq. (10): it touches two frames.
 """
@@ -17,7 +17,7 @@ from ekfslam.models.observer import GIVEN, Moment, Seen
 from ekfslam.smoother.sparse.factors import Factor, Term
 from ekfslam.smoother.unknowns import State, Unknowns, split
 
-# How far a landmark may lie from where it was initialised: so weak that no landmark with a depth feels it.
+# Prior of a landmark about its initialisation: too weak to matter to a landmark with a depth.
 LANDMARK_PRIOR_M = 1e4
 
 
@@ -86,7 +86,7 @@ class ObservationFactors:
         return Moment(T, T, model.observer.parameters(state.drive_values), twist, shared, self._way_m)
 
     def _near(self, state: State) -> list[Factor]:
-        """Return weak priors of landmarks, where errors of tracks walk.
+        """Return weak priors of landmarks if errors of tracks walk.
 
         Differences of successive observations leave the disparity itself open: some tracks fit best at infinity.
         """

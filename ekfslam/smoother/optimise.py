@@ -99,7 +99,7 @@ def maximise(
 
 
 def better_start(problem: BatchProblem, state: State, config: PosteriorConfig, min_depth_m: float) -> State:
-    """Return the state with every landmark where it fits its observations better: as it is, or at its initialisation.
+    """Return the state with every landmark at its position or its initialisation, whichever fits better.
 
     Raises:
         IllPosedError: A landmark is behind a camera that saw it in both places; names the ids.

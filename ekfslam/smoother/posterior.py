@@ -88,7 +88,7 @@ class Posterior(Shown):
     @cached_property
     def pose_covariance(self) -> Array:
         """(T, 6, 6) marginals of all poses."""
-        return self.information.pose_covariances()
+        return self.information.frame_covariances()[:, :6, :6]
 
     @cached_property
     def landmark_covariance(self) -> Array:
@@ -101,18 +101,16 @@ class Posterior(Shown):
         Raises:
             PosteriorError: There is no such block.
         """
-        unknowns = self.problem.unknowns
-        for blocks, covariance in (
-            (unknowns.aux, self.information.aux_covariances),
-            (unknowns.shared, lambda: self.information.frame_covariances()[:, 6:, 6:]),
-            (unknowns.of_drive, self.information.drive_covariance),
+        u, of = self.problem.unknowns, self.information
+        for blocks, find, first in (
+            (u.aux, of.aux_covariances, 0),
+            (u.shared, of.frame_covariances, 6),
+            (u.of_drive, of.drive_covariance, 0),
         ):
-            start = 0
-            for block in blocks:
-                if block.name == name:
-                    at = slice(start, start + block.size)
-                    return covariance()[..., at, at]
-                start += block.size
+            owners = [block.name for block in blocks for _ in range(block.size)]
+            if name in owners:
+                at = first + np.flatnonzero(np.array(owners) == name)
+                return find()[..., at[:, None], at]
         raise PosteriorError(f"there is no state block {name!r}; there are {', '.join(self.values) or 'none'}")
 
     def rows_of(self, ids: ArrayLike) -> IntArray:

@@ -1,6 +1,6 @@
 """The batch problem: all factors of a filter's log, as filtered or linearised at any state.
 
-*As filtered*, unknowns are the coordinates of the log: a pose counts from where it was predicted, a landmark from its
+*As filtered*, unknowns are the coordinates of the log: a pose counts from its prediction, a landmark from its
 initialisation. A standard or first-estimates EKF that never retires a landmark has exactly the solution of these
 factors as its estimate. *Relinearised*, all unknowns are errors of one state.
 """

@@ -21,7 +21,7 @@ from ekfslam.smoother.optimise import MOST_ITERATIONS, maximise
 from ekfslam.smoother.problem import BatchProblem, State
 from ekfslam.smoother.sparse.information import JointInformation
 
-# What came in has passed the gate: no kernel. The mean must be the linearisation point, so the tolerance is tight.
+# Observations have passed the gate: no kernel. The mean must be the linearisation point, so the tolerance is tight.
 _MAXIMUM = PosteriorConfig(kernel="none", tolerance=1e-12)
 
 

@@ -146,7 +146,7 @@ class Layout(dict[str, slice]):
     """Columns of the blocks in a covariance: blocks that observations depend on come first.
 
     Args:
-        blocks: In any order, the pose first; those that are seen move to the front.
+        blocks: Blocks in any order, the pose first; seen ones move to the front.
 
     Attributes:
         body: Number of columns of all blocks.

@@ -17,7 +17,7 @@ _LEAST_WAY_M = 0.1
 @optional_block
 @dataclass(frozen=True)
 class VisionDrift(GaussMarkov):
-    """Rates b of a motion that the flow of a frame shows besides the true one, [m/m; rad/m] along the axes of the IMU.
+    """Rates b of a motion that the flow of a frame shows in addition, [m/m; rad/m] along the axes of the IMU.
 
     From one frame to the next the errors of all tracks grow alike, by what a motion ``b way`` of the camera would do:
     ``z(k) - z(k-1) = h(exp(way b(k)^) T_k m) - h(T_k-1 m) + w``, eq. (10). Trackers that creep along edges and errors

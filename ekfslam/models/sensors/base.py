@@ -15,7 +15,7 @@ GATE, DISPARITY, _, BEHIND_CAMERA, MOVING, WAITING = range(6)
 class Sensor(Protocol):
     """Anything that sees point landmarks in d rows each: ``z = h(q)``, ``q = T_cam_imu s``, with independent errors.
 
-    `ekfslam.models.sensors.stereo.Rig` is the one the library is about; experiments bring their own.
+    `ekfslam.models.sensors.stereo.Rig` is the main one; experiments bring their own.
     """
 
     @property
@@ -54,7 +54,7 @@ class Sensor(Protocol):
 
 @runtime_checkable
 class DelayedSensor(Protocol):
-    """A `Sensor` one view of which does not say where a landmark is, such as one camera alone.
+    """A `Sensor` that needs two views to locate a landmark, such as one camera alone.
 
     Its model has the block `ekfslam.models.blocks.pose.Anchor`. New tracks wait from the anchor on, until
     `triangulate` has an answer; see `ekfslam.filters.starting`.
@@ -62,10 +62,10 @@ class DelayedSensor(Protocol):
 
     @property
     def patience(self) -> int:
-        """Frames after which the anchor moves on, whoever still waits."""
+        """Frames after which the anchor moves on."""
 
     def triangulate(self, rows_anchor: Array, rows: Array, T_now_anchor: Array) -> tuple[Array, BoolArray]:
-        """Points (n, 3) in the sensor's frame from two views (n, d), and whether (n,) these say where they are.
+        """Return points (n, 3) in the sensor's frame from two views (n, d), and whether (n,) parallax suffices.
 
-        ``T_now_anchor`` (4, 4) maps the sensor's frame at the anchor into that of now.
+        ``T_now_anchor`` (4, 4) maps the sensor's frame at the anchor into the present one.
         """

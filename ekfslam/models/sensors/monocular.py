@@ -22,7 +22,7 @@ class Monocular:
     Args:
         camera: Intrinsics; the baseline is not used.
         T_cam_imu: (4, 4) extrinsics.
-        noise: Of pixels (white) and velocities.
+        noise: White noise of pixels, and noise of velocities.
         parallax_rad: Angle between two rays beyond which their landmark is initialised.
         patience: Frames after which the anchor moves on.
     """

@@ -104,7 +104,7 @@ class SparseCholesky:
 
     def __init__(self, pattern: BlockPattern, matrix: sp.csc_matrix, like: SparseCholesky | None = None) -> None:
         self.pattern = pattern
-        # Supernodal: a true L L^T, where the simplicial L D L^T would let indefinite matrices pass.
+        # Supernodal: a true L L^T; the simplicial L D L^T would accept indefinite matrices.
         self._symbolic: cholmod.Factor = (
             like._symbolic if like else cholmod.analyze(matrix, mode="supernodal", ordering_method="natural")
         )

@@ -161,24 +161,14 @@ class JointInformation:
         covariance[0] = self._first.frames @ covariance[0] @ self._first.frames.T
         return covariance
 
-    def pose_covariances(self) -> Array:
-        """Return the marginal covariances (T, 6, 6) of all poses, by selected inversion."""
-        return self.frame_covariances()[:, :6, :6]
-
     def aux_covariances(self) -> Array:
         """Return the marginal covariances (T, a, a) of the further blocks of the frames, by selected inversion."""
-        s, w = self.structure, self._first.width
+        s = self.structure
         if not s.counts["aux"]:
             return np.empty((s.counts["frames"], 0, 0))
         own = s.blocks("aux", np.arange(s.counts["aux"]))
         covariance = self._selected.blocks(own, own)
-        first = np.zeros(2, dtype=np.int64)
-        joint = np.zeros((len(self._first.B),) * 2)
-        joint[:w, :w] = self._selected.blocks(first[:1], first[:1])[0]
-        joint[w:, :w] = self._selected.blocks(own[:1], first[:1])[0]
-        joint[:w, w:], joint[w:, w:] = joint[w:, :w].T, covariance[0]
-        by = self._first.B[w:]
-        covariance[0] = by @ joint @ by.T
+        covariance[0] = self.covariance(aux=[0])
         return covariance
 
     def drive_covariance(self) -> Array:
@@ -189,8 +179,7 @@ class JointInformation:
     def landmark_covariances(self) -> Array:
         """Return the marginal covariances (M, 3, 3) of all landmarks, by selected inversion.
 
-        That of an eliminated landmark is ``L^-T (I + sum_kl Y_k Z_kl Y_l^T) L^-1`` over its pairs k and l, Z being the
-        selected inverse of the reduced matrix.
+        That of an eliminated landmark is ``L^-T (I + sum_kl Y_k Z_kl Y_l^T) L^-1`` over its pairs k and l.
         """
         s = self.structure
         half = np.zeros_like(self._L_inverse)
@@ -212,12 +201,7 @@ class JointInformation:
         return 0.5 * (covariance + covariance.swapaxes(1, 2))
 
     def covariance(self, **wanted: IntArray | Sequence[int]) -> Array:
-        """Return the joint covariance of some unknowns, by solves.
-
-        Args:
-            wanted: Numbers (n,) of unknowns by group, such as ``frames=[3, 4], landmarks=[0]``. Columns are in the
-                order given.
-        """
+        """Return the joint covariance of unknowns, given in the order of columns: ``frames=[3, 4], landmarks=[0]``."""
         index = {group: np.asarray(chosen, dtype=np.int64) for group, chosen in wanted.items()}
         half = self.factor.half_solve(self._selection(index).T.toarray())
         covariance = half.T @ half

@@ -18,7 +18,7 @@ class NormalEquations:
     """Blocks of ``J^T J`` and ``J^T r``.
 
     Args:
-        own: For each group, diagonal blocks (count, size, size), those of all landmarks included.
+        own: For each group, diagonal blocks (count, size, size).
         pairs: For each reduced group, blocks (p, 3, size) of its pairs with landmarks.
         products: For each product of the structure with places in the reduced matrix, blocks (p, high, wide).
         gradient: For each group, ``J^T r`` (count, size).
@@ -65,7 +65,7 @@ def _add_products(into: Array, product: Product, A: Array, B: Array) -> None:
         if product.is_sum:
             into += sum_by(product.index[part], len(into), blocks)
         else:
-            into[part if product.is_in_order else product.index[part]] += blocks
+            into[product.index[part]] += blocks
 
 
 def sum_by(index: IntArray, groups: int, values: Array) -> Array:

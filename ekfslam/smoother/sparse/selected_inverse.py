@@ -60,10 +60,9 @@ class SelectedInverse:
 
         Raises:
             MissingBlockError: A pair lies outside the pattern of the factor.
-            ValueError: The blocks of `i`, or those of `j`, differ in size.
         """
         i, j = np.asarray(i, dtype=np.int64), np.asarray(j, dtype=np.int64)
-        s_i, s_j = self._common_size(i), self._common_size(j)
+        s_i, s_j = (int(self._sizes[some[:1]].sum()) for some in (i, j))
         low, high = np.minimum(self._rank[i], self._rank[j]), np.maximum(self._rank[i], self._rank[j])
         wanted = low * len(self._sizes) + high
         place = np.searchsorted(self._pairs, wanted)
@@ -79,12 +78,6 @@ class SelectedInverse:
         column, row = np.where(transposed, a, b), np.where(transposed, b, a)
         start = self._indptr[self._start[low][:, None, None] + column]
         return self._data[start + self._offset[place][:, None, None] + row - column]
-
-    def _common_size(self, blocks: IntArray) -> int:
-        sizes = self._sizes[blocks]
-        if len(sizes) and np.any(sizes != sizes[0]):
-            raise ValueError(f"blocks of sizes {np.unique(sizes).tolist()} in one request")
-        return int(sizes[0]) if len(sizes) else 0
 
 
 def selected_inverse(L: sp.csc_array) -> sp.csc_array:

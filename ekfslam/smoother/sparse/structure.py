@@ -28,7 +28,7 @@ REDUCED = GROUPS[:3]
 
 @dataclass(frozen=True)
 class Product:
-    """Blocks ``J_row^T J_column`` of two terms of a factor, and where they are added.
+    """Blocks ``J_row^T J_column`` of two terms of a factor, and the places to which they are added.
 
     Args:
         factor, row, column: Numbers of the factor and of the terms.
@@ -51,15 +51,10 @@ class Product:
         """Whether several constraints go to one place."""
         return len(np.unique(self.index)) < len(self.index)
 
-    @cached_property
-    def is_in_order(self) -> bool:
-        """Whether the constraints go to the first places, one after the other."""
-        return np.array_equal(self.index, np.arange(len(self.index)))
-
 
 @dataclass(frozen=True)
 class Coupling:
-    """Couples of unknowns that eliminated landmarks connect, and the pairs (landmark, unknown) through which they do.
+    """Couples of unknowns that eliminated landmarks connect, and the pairs (landmark, unknown) that do it.
 
     Couples are sorted by their numbers of pairs, so that many can be summed in one matrix product.
 
