@@ -184,6 +184,23 @@ def test_deviations_of_the_calibration_are_what_they_say():
     assert (np.mean(squares, axis=0) < 3).all()
 
 
+def test_a_time_offset_counts_by_the_corrected_velocity():
+    """The measured one is wrong by 1 m/s; the images correct most of that before they tell of the offset."""
+    world = small_world(frames=2)
+    ekf = JointEKF(
+        Rig(world.camera, world.T_cam_imu, Noise(np.ones(6), np.full(4, 0.3))),
+        OPEN,
+        world.initial_T_world_imu,
+        calibration=CalibrationConfig(time_s=0.02),
+    )
+    ekf.begin(world.twist[0])
+    ekf.update(0, *world.observations.at(0))
+    ekf.predict(world.twist[1] + [1, 0, 0, 0, 0, 0], float(np.diff(world.time_s)[0]))
+    assert np.abs(ekf.imu_twist - world.twist[1]).max() > 0.9
+    ekf.update(1, *world.observations.at(1))
+    assert np.abs(ekf.log().seen_twist[1] - world.twist[1]).max() < 0.5
+
+
 @pytest.mark.slow
 def test_noise_of_the_velocities_does_not_hide_a_time_offset():
     """With measured velocities in its Jacobian the offset comes out 14 deviations too small here."""

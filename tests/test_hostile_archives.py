@@ -153,10 +153,14 @@ def test_fields_of_a_log_that_contradict_each_other_are_named(whole, tmp_path):
     previous[later] = before[0]  # in the frame before, but another landmark
     with pytest.raises(ArchiveError, match=rf"previous\[{later}\] is no observation of the same landmark"):
         read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
-    with pytest.raises(ArchiveError, match="up has 2 columns"):
-        path = altered(whole, tmp_path, "runs/full/log/up", np.zeros((12, 2)))
-        with h5py.File(path, "a") as h5file:
-            del h5file["runs/full/log/up_axis"]
+
+
+@pytest.mark.parametrize("columns", [1, 2, 4])
+def test_a_curved_block_in_a_log_has_its_three_columns_or_none(whole, tmp_path, columns):
+    path = altered(whole, tmp_path, "runs/full/log/curved", np.zeros((12, columns)))
+    with h5py.File(path, "a") as h5file:
+        del h5file["runs/full/log/curved_axis"]
+    with pytest.raises(ArchiveError, match=f"log/curved has {columns} columns"):
         read_archive(path)
 
 

@@ -36,15 +36,7 @@ from ekfslam.filters.window import Push, Window
 
 @dataclass(frozen=True)
 class ConditionalProjection(Projection):
-    """Rows (k) over X, whitened by what landmarks are unsure of given X.
-
-    Args:
-        rows: As given.
-        L: (k, d, d) ``R_i = L_i L_i^T``.
-        B: (k, d, n_X).
-        T: (k, d, f) ``B F``.
-        G: (k, 3, d).
-    """
+    """Whitened rows (k) over X: L (k, d, d), B (k, d, n_X), T (k, d, f) and G (k, 3, d) of the module."""
 
     rows: Rows
     L: Array
@@ -62,15 +54,7 @@ class ConditionalProjection(Projection):
 
 @dataclass(frozen=True)
 class ConditionalSolution(Solution):
-    """Eq. (6) solved over X, for some landmarks.
-
-    Args:
-        gaussian: The covariance that it is about.
-        at: What was projected.
-        w: (k, d) ``L^-1 r``.
-        U: (f, f) upper triangle.
-        left: (k,) which landmarks are left.
-    """
+    """Eq. (6) solved over X for landmarks ``left`` (k,): w (k, d) and U (f, f) of the module."""
 
     gaussian: ConditionalGaussian
     at: ConditionalProjection
@@ -129,12 +113,7 @@ class ConditionalSolution(Solution):
 
 
 class ConditionalGaussian(Gaussian):
-    """Covariance in the conditional form.
-
-    Args:
-        body: (body, body) covariance before there are landmarks.
-        seen: Leading body columns that observations depend on.
-    """
+    """Covariance in the conditional form, before there are landmarks that of the ``body`` (body, body)."""
 
     def __init__(self, body: Array, seen: int) -> None:
         self.body, self.seen, self.considered = len(body), seen, 0
@@ -145,8 +124,6 @@ class ConditionalGaussian(Gaussian):
         self._P_c, self._P_cc = np.empty((0, len(body))), np.empty((0, 0))
         self._window, self._dormant = Window(len(body)), Dormant(len(body))
         self._root: Array | None = None
-
-    # --- what it is ---------------------------------------------------------------------------------------------------
 
     @property
     def landmarks(self) -> int:
@@ -162,10 +139,6 @@ class ConditionalGaussian(Gaussian):
         return self.covariance_of(np.arange(self.landmarks))
 
     @property
-    def is_finite(self) -> bool:
-        return all(bool(np.isfinite(part).all()) for part in (self._P, self._K, self._S))
-
-    @property
     def body_covariance(self) -> Array:
         b = self.body - self.considered
         P = np.empty((self.body, self.body))
@@ -174,7 +147,7 @@ class ConditionalGaussian(Gaussian):
         return P
 
     def _conditional(self, slot: IntArray) -> tuple[Array, IntArray, IntArray]:
-        """K (k, 3, n_X) of landmarks at the slots (k,), and which are asleep: at which places, as which there."""
+        """Return K (k, 3, n_X) of landmarks at slots (k,); the dormant ones as indices of ``slot`` and in `Dormant`."""
         K, row = np.empty((len(slot), 3, self.width)), self._row[slot]
         awake, asleep = np.flatnonzero(row >= 0), np.flatnonzero(row < 0)
         K[awake] = self._K[row[awake]]
@@ -221,8 +194,6 @@ class ConditionalGaussian(Gaussian):
             self._root = _pivoted_root(self._P) if failed else F
         return self._root
 
-    # --- what changes X -----------------------------------------------------------------------------------------------
-
     def consider(self, columns: int) -> int:
         start = self.body
         self._P_c = np.concatenate([self._P_c, np.zeros((columns, self.width))])
@@ -255,7 +226,7 @@ class ConditionalGaussian(Gaussian):
         self._K, self._dormant.K = (_pushed(K, push, kept, b) for K in (self._K, self._dormant.K))
 
     def _promote(self, rows: IntArray) -> None:
-        """Some awake landmarks become columns of X."""
+        """Make some awake landmarks columns of X."""
         self._window.promote(rows)
         self._join(self._K[rows].reshape(-1, self.width), np.zeros((3 * len(rows),) * 2))
         _add_blocks(self._P, self.width - 3 * len(rows), self._S[rows])
@@ -264,13 +235,7 @@ class ConditionalGaussian(Gaussian):
         self._dormant.K = np.pad(self._dormant.K, ((0, 0), (0, 3 * len(rows))))
 
     def _join(self, K: Array, S: Array, cross: Array | float = 0.0) -> None:
-        """``K x + eps`` (m,) become the last columns of X; no landmark depends on them yet.
-
-        Args:
-            K: (m, n_X).
-            S: (m, m) covariance of eps.
-            cross: (considered, m) of what is considered with eps.
-        """
+        """Append ``K x + eps`` (m,) to X, given S (m, m) of eps, and its covariance (c, m) with considered columns."""
         KP = K @ self._P
         self._P = np.block([[self._P, KP.T], [KP, _symmetric(KP @ K.T + S)]])
         self._P_c = np.concatenate([self._P_c, self._P_c @ K.T + cross], axis=1)
@@ -278,7 +243,7 @@ class ConditionalGaussian(Gaussian):
         self._root = None
 
     def _drop(self, leaving: IntArray) -> None:
-        """Columns of X, on which no landmark that is awake depends, leave it."""
+        """Drop columns of X on which no awake landmark depends."""
         if self._dormant.columns_leave(self._P, self._P_c, leaving):
             self._window.refer(slice(0, self.body - self.considered))
         kept = np.delete(np.arange(self.width), leaving)
@@ -293,8 +258,6 @@ class ConditionalGaussian(Gaussian):
         self._K[..., at] = self._K[..., at] @ inverse
         self._dormant.K[:, at] = self._dormant.K[:, at] @ inverse
         self._root = None
-
-    # --- conditioning -------------------------------------------------------------------------------------------------
 
     def project(self, rows: Rows, frame: int, ids: IntArray) -> ConditionalProjection:
         k, d = rows.residual.shape
@@ -327,11 +290,7 @@ class ConditionalGaussian(Gaussian):
         return self.solve(projection, frame, np.empty(0, dtype=np.int64))
 
     def solve_left(self, solution: ConditionalSolution) -> ConditionalSolution:
-        """The solution for the rows that are left: ``M = I + T^T T`` factorised.
-
-        Raises:
-            numpy.linalg.LinAlgError: M is not finite.
-        """
+        """Factorise ``M = I + T^T T`` for the rows that are left; raise LinAlgError if it is not finite."""
         M = np.eye(solution.T.shape[1], order="F")
         if len(solution.T):
             # A row-major T is LAPACK's T^T.
@@ -342,7 +301,7 @@ class ConditionalGaussian(Gaussian):
         return ConditionalSolution(self, solution.at, solution.w, U, solution.left)
 
     def correction(self, solution: ConditionalSolution) -> Array:
-        """(body+3n,) of the mean."""
+        """Return the correction (body+3n,) of the mean."""
         x, at = solution.x, solution.at
         b = self.body - self.considered
         d = np.empty((self.landmarks, 3))
@@ -364,8 +323,6 @@ class ConditionalGaussian(Gaussian):
             kernels.correct(self._K, self._S, self._row[at.rows.slot], at.B, at.G, np.flatnonzero(left))
             self._window.refer(np.flatnonzero(at.rows.H_x[left].any(axis=(0, 1))))
 
-    # --- landmarks ----------------------------------------------------------------------------------------------------
-
     def augment(self, G: Array, covariance: Array) -> None:
         K = np.zeros((len(G), 3, self.width))
         K[..., : self.seen] = G
@@ -374,7 +331,7 @@ class ConditionalGaussian(Gaussian):
         self._window.refer(np.flatnonzero(G.any(axis=(0, 1))))
 
     def _append(self, slot: IntArray, K: Array, S: Array) -> None:
-        """Landmarks (n,) at the slots, new ones or others, are awake."""
+        """Add awake landmarks (n,) at the slots."""
         before = len(self._slot)
         self._K, self._S = np.concatenate([self._K, K]), np.concatenate([self._S, S])
         self._slot = np.concatenate([self._slot, slot])
@@ -399,7 +356,7 @@ class ConditionalGaussian(Gaussian):
         _promote(self._K, rows, self._window.promoted[rows])
 
     def _forget(self, rows: IntArray) -> None:
-        """Landmarks are awake no more."""
+        """Remove awake landmarks."""
         gone = np.zeros(len(self._slot), dtype=bool)
         gone[rows] = True
         leaving = self._window.forget(gone)
@@ -429,7 +386,7 @@ class ConditionalGaussian(Gaussian):
         self._window.refer(columns)
 
     def _transform_awake(self, row: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
-        """The same for landmarks that are awake."""
+        """Transform awake landmarks."""
         first = self._window.promoted[row]
         is_promoted = first >= 0
         if is_promoted.any():
@@ -458,7 +415,7 @@ class ConditionalGaussian(Gaussian):
 
 
 def _pushed(K: Array, push: Push, kept: IntArray, body: int) -> Array:
-    """K (..., n_X) after a propagation."""
+    """Return K (..., n_X) after a propagation."""
     new = np.zeros((*K.shape[:-1], body + len(kept)))
     new[..., push.carried_to] = K[..., push.carried_from]
     new[..., body:] = K[..., kept]
@@ -470,12 +427,12 @@ def _symmetric(blocks: Array) -> Array:
 
 
 def _columns(first: IntArray) -> IntArray:
-    """Columns (3n,) of landmarks by their first ones."""
+    """Return the columns (3n,) of landmarks from their first ones."""
     return (first[:, None] + np.arange(3)).ravel()
 
 
 def _promote(K: Array, slot: IntArray, first: IntArray) -> None:
-    """``K_i`` of landmarks that are columns of X."""
+    """Set ``K_i`` of landmarks that are columns of X."""
     K[slot] = 0.0
     axis = np.arange(3)
     K[slot[:, None], axis, first[:, None] + axis] = 1.0
@@ -488,10 +445,7 @@ def _add_blocks(P: Array, start: int, blocks: Array) -> None:
 
 
 def _pivoted_root(P: Array) -> Array:
-    """F (n, f) of ``P = F F^T`` where P is singular: what is known for certain has no column.
-
-    Of nothing but zeros there is one column all the same, because BLAS knows no empty matrices.
-    """
+    """Return F (n, f) of ``P = F F^T`` for singular P; at least one column, because BLAS knows no empty matrices."""
     std = np.sqrt(np.maximum(P.diagonal(), 0.0))
     scale = np.divide(1.0, std, out=np.zeros_like(std), where=std > 0)
     L, pivots, rank, _ = lapack.dpstrf(P * np.outer(scale, scale), lower=1)

@@ -14,9 +14,9 @@ def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> 
     """Return poses and covariances from the velocities alone, eq. (1) and (2).
 
     Args:
-        sequence: The recording; starts at its `initial_T_world_imu`. Velocities of its own odometry, where nobody
-            measured any, are as good as the walk of the twist says.
-        noise: Its velocity noise.
+        sequence: Recording, which starts at its `initial_T_world_imu`. Velocities of visual odometry have the standard
+            deviation of the twist's walk.
+        noise: Velocity noise.
         initial_covariance: (6, 6) of the first pose's error ``xi``.
 
     Returns:

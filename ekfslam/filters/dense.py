@@ -119,10 +119,6 @@ class DenseGaussian(Gaussian):
         return (len(self._P) - self.body) // 3
 
     @property
-    def is_finite(self) -> bool:
-        return bool(np.isfinite(self._P).all())
-
-    @property
     def body_covariance(self) -> Array:
         return self._P[: self.body, : self.body].copy()
 

@@ -23,17 +23,7 @@ WAITING = 192
 
 
 class Dormant:
-    """Landmarks that sleep.
-
-    Args:
-        width: Number n_X of columns of X.
-        considered: Number c of columns that are considered.
-
-    Attributes:
-        slot: (n,) their slots, in the order in which they are kept.
-        K: (3n, n_X).
-        cross: (c, 3n) covariance of what is considered with eps_B.
-    """
+    """Dormant landmarks at slots (n,): K (3n, n_X), and cross (c, 3n) of the considered columns with eps_B."""
 
     def __init__(self, width: int, considered: int = 0) -> None:
         self.slot = np.empty(0, dtype=np.int64)
@@ -46,7 +36,7 @@ class Dormant:
         return len(self.slot)
 
     def append(self, slot: IntArray, K: Array, S: Array) -> None:
-        """Landmarks (n,) with K (n, 3, n_X) and S (n, 3, 3), independent given X, fall asleep."""
+        """Add landmarks (n,) with K (n, 3, n_X) and S (n, 3, 3), independent given X."""
         before, n = 3 * len(self), 3 * len(slot)
         self.slot = np.concatenate([self.slot, slot])
         self.K = np.concatenate([self.K, K.reshape(n, -1)])
@@ -59,15 +49,9 @@ class Dormant:
         self._squares = np.concatenate([self._squares, np.zeros((n, self._squares.shape[1]))])
 
     def columns_leave(self, P: Array, P_c: Array, leaving: IntArray) -> bool:
-        """Columns leave X.
+        """Drop columns (o,) of X with covariance P (n_X, n_X); P_c (c, n_X) is that of considered columns with X.
 
-        Args:
-            P: (n_X, n_X) of X with them.
-            P_c: (c, n_X) of what is considered with X.
-            leaving: (o,).
-
-        Returns:
-            Whether some landmark depended on them: now it depends on all columns that stay.
+        Return whether some landmark depended on them, and so depends on all columns that stay.
         """
         kept = np.delete(np.arange(len(P)), leaving)
         K_kept, K_leaving = self.K[:, kept], self.K[:, leaving]
@@ -81,11 +65,7 @@ class Dormant:
         return depends
 
     def wake(self, which: BoolArray) -> tuple[Array, Array, Array]:
-        """Some of the landmarks (n,) wake up and become the last columns of X, in their order here.
-
-        Returns:
-            Their K (3r, n_X), the joint covariance S (3r, 3r), and what is considered with it (c, 3r).
-        """
+        """Wake landmarks as the last columns of X; return their K (3r, n_X), S (3r, 3r) and cross (c, 3r)."""
         own, rest = (np.flatnonzero(np.repeat(part, 3)) for part in (which, ~which))
         S_own = self.covariance(own)
         K_own, S_rr, S_rb = self.K[own], S_own[:, own], S_own[:, rest]
@@ -103,13 +83,13 @@ class Dormant:
         return K_own, S_rr, cross
 
     def leave(self, stay: BoolArray) -> None:
-        """Landmarks that do not stay (n,) are marginalised."""
+        """Marginalise the landmarks that do not stay (n,)."""
         rows = np.flatnonzero(np.repeat(stay, 3))
         self.slot, self.K, self.cross = self.slot[stay], self.K[rows], self.cross[:, rows]
         self._S, self._squares = self._S[np.ix_(rows, rows)], self._squares[rows]
 
     def transform(self, own: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
-        """``d_i <- M_i d_i + B_i x`` for landmarks (n,) with the rows ``own`` (3n,)."""
+        """Re-express landmarks with the rows ``own`` (3n,): ``d_i <- M_i d_i + B_i x``."""
         if M is not None:
             wide = np.eye(3 * len(self))
             at = own.reshape(-1, 3)
@@ -120,7 +100,7 @@ class Dormant:
         self.K[own[:, None], columns] += B.reshape(len(own), -1)
 
     def transform_promoted(self, own: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
-        """The columns ``own`` (3n,) of X become ``x_own <- M x_own + B x_columns``, B (3n, c): m_B stays what it is."""
+        """Keep m_B while columns ``own`` (3n,) of X become ``x_own <- M x_own + B x_columns``, B (3n, c)."""
         K = self.K[:, own]
         if M is not None:
             K = (K.reshape(len(K), len(M), 1, 3) @ np.linalg.inv(M)).reshape(K.shape)
@@ -128,17 +108,17 @@ class Dormant:
         self.K[:, columns] -= K @ B
 
     def covariance(self, own: IntArray) -> Array:
-        """Rows (r, 3n) of S."""
+        """Return rows (r, 3n) of S."""
         return self._S[own] + (self._squares[own] * self._sign) @ self._squares.T
 
     def blocks(self, which: IntArray) -> Array:
-        """Blocks (k, 3, 3) of S on its diagonal, of landmarks (k,)."""
+        """Return the diagonal blocks (k, 3, 3) of S of landmarks (k,)."""
         at = 3 * which[:, None] + np.arange(3)
         squares = self._squares[at]
         return self._S[at[:, :, None], at[:, None, :]] + (squares * self._sign) @ squares.swapaxes(1, 2)
 
     def _add(self, A: Array, sign: float) -> None:
-        """``S += sign A A^T``."""
+        """Add ``sign A A^T`` to S."""
         self._squares = np.hstack([self._squares, A])
         self._sign = np.concatenate([self._sign, np.full(A.shape[1], sign)])
         if len(self._sign) > WAITING:
@@ -152,7 +132,7 @@ class Dormant:
 
 
 def _given(P: Array, kept: IntArray, leaving: IntArray) -> tuple[Array, Array]:
-    """C (o, k) of ``x_o = C x_k + eps``, and a root of the covariance of eps."""
+    """Return C (o, k) of ``x_o = C x_k + eps``, and a root of the covariance of eps."""
     order = np.concatenate([kept, leaving])
     std = np.sqrt(np.maximum(P.diagonal()[order], 0.0))
     std[std == 0.0] = 1.0
@@ -169,6 +149,6 @@ def _given(P: Array, kept: IntArray, leaving: IntArray) -> tuple[Array, Array]:
 
 
 def _root(S: Array) -> Array:
-    """A root of a symmetric matrix that is positive semi-definite but for rounding."""
+    """Return a root of a symmetric matrix that is positive semi-definite but for rounding."""
     values, axes = np.linalg.eigh(0.5 * (S + S.T))
     return axes * np.sqrt(np.maximum(values, 0.0))

@@ -10,6 +10,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
+
 from ekfslam.arrays import Array, BoolArray, IntArray
 
 
@@ -110,9 +112,9 @@ class Gaussian(ABC):
         """Number n of landmarks."""
 
     @property
-    @abstractmethod
     def is_finite(self) -> bool:
-        """Whether no number is NaN or infinite."""
+        """Whether no number on the diagonal blocks is NaN or infinite."""
+        return bool(np.isfinite(self.body_covariance).all() and np.isfinite(self.landmark_blocks()).all())
 
     @property
     @abstractmethod

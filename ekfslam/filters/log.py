@@ -1,10 +1,8 @@
 """The log: everything the joint filter conditioned on, and where it linearised it.
 
-With the log the posterior over *all* poses and landmarks can be rebuilt at any time (`ekfslam.smoother.posterior`),
-though the filter itself carries only what is in view. It is flat arrays, a few numbers an observation.
-
-*Coordinates* (body,) of the state blocks are sums of corrections, in the columns of the layout. Those of a pose count
-from where it was predicted; those of blocks that are vectors are their values.
+From it `ekfslam.smoother.posterior` rebuilds the posterior over *all* poses and landmarks. *Coordinates* (body,) of the
+state blocks are sums of corrections, in the columns of the layout: of a pose since its prediction; of a vector, its
+value.
 """
 
 from __future__ import annotations
@@ -44,36 +42,29 @@ class Log:
     """Motion and accepted observations of the joint filter over T frames, M landmarks and K observations.
 
     Args:
-        first_estimates: Whether the filter took the landmark's place in H at its first estimate (FEJ).
-        initial_covariance: (body, body) of all blocks before the first frame. Archives of versions before 6 have that
-            of the first pose alone, (6, 6).
+        first_estimates: Whether the filter took H at first estimates (FEJ).
+        initial_covariance: (body, body) of all blocks before the first frame; (6, 6) of the pose in older archives.
         tau_s: (T,) length of the interval that led to each frame; 0 for the first one.
-        is_gap: (T,) whether its inputs were interpolated across a gap.
+        is_gap: (T,) whether the inputs were interpolated across a gap.
         input_frame: (N,) frame to which each piece of the inputs led, ascending; none led to the first one.
         input_dt_s, inputs: (N,), (N, c) durations and inputs of the pieces, see `ekfslam.data.interval.Interval`.
         way_m: (T,) way driven during the interval.
-        seen_twist: (T, 6) velocity of the IMU by which a time offset counted in the update.
-        T_departed: (T, 4, 4) ``T_imu_world`` of the frame before from which the prediction to this frame led.
-        T_predicted: (T, 4, 4) ``T_imu_world`` before the update of each frame.
-        T_linear: (T, 4, 4) ``T_imu_world`` at which the update was linearised: the predicted one, unless it was
-            iterated or a landmark came back.
-        T_linear_before: (T, 4, 4) the same of the clone of the frame before.
-        T_updated: (T, 4, 4) ``T_imu_world`` after the update.
-        departed: (T, body) coordinates of the blocks before the process moved its own ones: these are of the frame
-            before, all others of this frame.
-        linear: (T, body) coordinates at which the update was linearised.
-        updated: (T, body) coordinates after the update.
-        curved: (T, v) values at the prediction of blocks whose value is no sum of corrections, in the order of their
-            columns.
+        seen_twist: (T, 6) velocity of the IMU for a time offset in the update, eq. (9).
+        T_departed, T_predicted, T_updated: (T, 4, 4) ``T_imu_world`` before and after the prediction, and after the
+            update.
+        T_linear, T_linear_before: (T, 4, 4) ``T_imu_world`` and its clone at which the update was linearised. They
+            differ from the prediction if the update was iterated or a landmark came back.
+        departed: (T, body) coordinates before the process moved its own blocks; all others are of this frame.
+        linear, updated: (T, body) coordinates at which the update was linearised, and after it.
+        curved: (T, v) values at the prediction of blocks whose value is no sum of corrections.
         id: (M,) landmark ids in the order of landmark initialisation; an id occurs again where a track was split.
         first_position_m: (M, 3) position at landmark initialisation, in world.
         frame: (K,) frame of each accepted observation; ascending but for views that waited for a second one.
         landmark: (K,) row of the landmark in ``id``. Its first observation is the one that initialised it.
-        previous: (K,) observation of the same landmark in the frame before, from which this one is a difference; -1
-            where it stands alone.
-        rows: (K, d) what was measured: the sensor's rows.
+        previous: (K,) observation in the frame before from which this one is a difference, eq. (10); -1: none.
+        rows: (K, d) the sensor's rows.
         variance: (K, d) variances of the rows, or of their differences.
-        position_m: (K, 3) where the landmark was linearised, in world.
+        position_m: (K, 3) landmark position of the linearisation, in world.
         measured_frame: (S,) frame of each scalar measurement of blocks by inputs.
         measured_axis, measured_value, measured_std, measured_is_biased: (S,) see `ekfslam.models.process.Measured`.
     """

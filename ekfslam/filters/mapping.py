@@ -21,9 +21,9 @@ class IndependentLandmarks:
     """Independent EKF updates of all landmarks of a frame in one batch.
 
     Args:
-        sensor: What observes, and its noise.
+        sensor: Sensor with its noise.
         config: Gate and limits.
-        T_imu_world: (T, 4, 4) poses of all frames, taken as exact.
+        T_imu_world: (T, 4, 4) exact poses of all frames.
     """
 
     def __init__(self, sensor: Sensor, config: FilterConfig, T_imu_world: Array) -> None:
@@ -33,16 +33,7 @@ class IndependentLandmarks:
         self._split: list[Landmarks] = []
 
     def update(self, frame: int, ids: IntArray, measured: Array) -> FrameReport:
-        """Correct what is known, split what jumped, start what is new, eq. (4) to (6) with an exact pose.
-
-        Args:
-            frame: Frame index.
-            ids: (n,) landmark ids seen, distinct.
-            measured: (n, 4) pixels, or what else the sensor measures.
-
-        Raises:
-            InnovationError: An innovation covariance is not positive definite.
-        """
+        """Correct known landmarks, split tracks that jumped, start new ones; see `JointEKF.update`."""
         table, T = self.table, self._poses[frame]
         rows = self.sensor.rows(measured)
         reason = self.sensor.screen(measured, self.config.min_depth_m)
@@ -102,17 +93,16 @@ class IndependentLandmarks:
         )
 
     def _retire(self, gone: BoolArray) -> IntArray:
-        """Keep what was split off; returns the ids, which are then free to start anew."""
+        """Move landmarks (n,) that are gone out of the table, and return their ids, ascending."""
         slot = np.flatnonzero(gone)
-        if not len(slot):
-            return slot
         slot = slot[np.argsort(self.table.id[slot])]
         ids = self.table.id[slot]
-        self._split.append(self.table.snapshot(slot, self.covariance[slot]))
-        self.table.keep(~gone)
+        if len(slot):
+            self._split.append(self.table.snapshot(slot, self.covariance[slot]))
+            self.table.keep(~gone)
         return ids
 
     def landmarks(self) -> Landmarks:
-        """Pieces that were split off, then the rest in the order of their ids."""
+        """Return the landmarks that were split off, then the others in the order of their ids."""
         slot = np.argsort(self.table.id)
         return Landmarks.concatenate([*self._split, self.table.snapshot(slot, self.covariance[slot])])

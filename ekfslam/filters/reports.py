@@ -22,11 +22,10 @@ class FrameReport:
         ids: (n,) landmark ids seen.
         reason: (n,) `ACCEPTED` or an index into `REASONS`.
         nis: Normalised innovation squared of the accepted updates.
-        dof: Its degrees of freedom.
-        split: Ids of tracks that were split, their observation starting a new landmark.
-        log_likelihood: Log-density of the frame's innovations, of accepted updates and, where velocities are in the
-            state, of their measurement; see `log_density`. Landmarks that start are without prior and contribute 0.
-        innovations: Of the accepted updates, whitened (joint filter only).
+        dof: Degrees of freedom of the NIS.
+        split: Ids of tracks that were split: their observation starts a new landmark.
+        log_likelihood: Log-density of the accepted innovations, and of measured velocities if these are in the state.
+        innovations: Whitened innovations of the accepted updates (joint filter only).
     """
 
     frame: int
@@ -40,7 +39,7 @@ class FrameReport:
 
 
 def log_density(nis: float, log_det: float, dof: int) -> float:
-    """``log N(r; 0, S) = -(r^T S^-1 r + log det S + n log 2 pi) / 2`` from the NIS, ``log det S`` and n.
+    """Return ``log N(r; 0, S) = -(r^T S^-1 r + log det S + n log 2 pi) / 2`` from the NIS, ``log det S`` and n.
 
     Summed over a run it is the log-likelihood of the filter's parameters: the prediction error decomposition, Schweppe,
     "Evaluation of likelihood functions for Gaussian signals", IEEE Trans. Information Theory 11, 1965.

@@ -13,12 +13,7 @@ _BODY, _LANDMARK = 0, -1
 
 @dataclass(frozen=True)
 class Push:
-    """What becomes of the columns of X in a propagation; those behind the body stay.
-
-    Args:
-        carried_from, carried_to: (c,) body columns on which landmarks depend, whose values are in the body afterwards.
-        pushed: (p,) those whose values are not: copies of them stay, right behind the body.
-    """
+    """Body columns on which landmarks depend: carried within the body (c,), or copied right behind it (p,)."""
 
     carried_from: IntArray
     carried_to: IntArray
@@ -26,15 +21,7 @@ class Push:
 
 
 class Window:
-    """The columns of X, and what awake landmarks depend on.
-
-    Args:
-        body: Number of body columns.
-        promoted: Number of landmarks, all promoted, in the order of their columns.
-
-    Attributes:
-        promoted: (n,) first column of each promoted landmark; -1 of the others.
-    """
+    """The columns of X; ``promoted`` (n,) has the first column of each promoted landmark, -1 of the others."""
 
     def __init__(self, body: int, promoted: int = 0) -> None:
         self._body, self._groups = body, 0
@@ -45,11 +32,11 @@ class Window:
         self._is_referenced = np.zeros(body, dtype=bool)
 
     def refer(self, columns: BoolArray | IntArray | slice) -> None:
-        """Some landmark depends on these body columns from now on."""
+        """Mark body columns that some landmark depends on."""
         self._is_referenced[columns] = True
 
     def augment(self, landmarks: int, promoted: bool = False) -> None:
-        """New landmarks, which depend on the body alone, or are the last columns of X."""
+        """Add landmarks that depend on the body alone, or are the last columns of X."""
         first = len(self._group) + 3 * np.arange(landmarks) if promoted else np.full(landmarks, -1)
         self.promoted = np.concatenate([self.promoted, first])
         self._since = np.concatenate([self._since, np.full(landmarks, self._groups + 1)])
@@ -57,12 +44,12 @@ class Window:
             self._group = np.concatenate([self._group, np.full(3 * landmarks, _LANDMARK)])
 
     def promote(self, which: IntArray) -> None:
-        """Some landmarks become the last columns of X."""
+        """Make some landmarks the last columns of X."""
         self.promoted[which] = len(self._group) + 3 * np.arange(len(which))
         self._group = np.concatenate([self._group, np.full(3 * len(which), _LANDMARK)])
 
     def keep(self, columns: IntArray) -> None:
-        """Only some columns of X are left."""
+        """Keep only some columns of X."""
         new = np.full(len(self._group), -1)
         new[columns] = np.arange(len(columns))
         is_promoted = self.promoted >= 0
@@ -70,13 +57,13 @@ class Window:
         self._group = self._group[columns]
 
     def forget(self, gone: BoolArray) -> IntArray:
-        """Landmarks that are gone (n,) leave; returns their columns, which are still there."""
+        """Drop landmarks that are gone (n,), and return their columns, which stay."""
         own = self.promoted[gone & (self.promoted >= 0)]
         self.promoted, self._since = self.promoted[~gone], self._since[~gone]
         return (own[:, None] + np.arange(3)).ravel()
 
     def push(self, Phi: Array, Q: Array) -> Push:
-        """``x+ = Phi x + w`` on the body, w with covariance Q."""
+        """Propagate the body by ``x+ = Phi x + w``, w with covariance Q."""
         carried_from, carried_to, pushed = self._split(Phi, Q)
         if len(pushed):
             self._groups += 1
@@ -88,7 +75,7 @@ class Window:
         return Push(carried_from, carried_to, pushed)
 
     def _split(self, Phi: Array, Q: Array) -> tuple[IntArray, IntArray, IntArray]:
-        """Body columns on which landmarks depend: those whose values stay in the body, where, and those that leave."""
+        """Return body columns on which landmarks depend: those that stay in the body, where, and those that leave."""
         is_copy = ((Phi != 0).sum(axis=1) == 1) & (Phi.max(axis=1) == 1.0) & ~Q.any(axis=1)
         source = Phi.argmax(axis=1)
         to = np.full(len(Phi), -1)
@@ -100,7 +87,7 @@ class Window:
         return carried, to[carried], np.flatnonzero(self._is_referenced & (to < 0))
 
     def cut(self) -> tuple[IntArray, IntArray]:
-        """Landmarks to promote, and columns that may leave then, so that X becomes smallest."""
+        """Return landmarks to promote, and columns that may leave then, so that X becomes smallest."""
         group = self._group[self._body :]
         numbers, widths = np.unique(group[group != _LANDMARK], return_counts=True)
         free = np.flatnonzero(self.promoted < 0)

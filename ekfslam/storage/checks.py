@@ -28,6 +28,8 @@ def require_agreement(result: Mapping[str, Any], place: str) -> None:
 def _require_log(log: Log, landmarks: int, place: str) -> None:
     if log.landmarks != landmarks:
         raise ArchiveError(f"{place}/landmark_id has {log.landmarks} entries, but the map has {landmarks} landmarks")
+    if (columns := log.curved.shape[1]) not in (0, 3):  # those of the block `up`, if it was in the state
+        raise ArchiveError(f"{place}/curved has {columns} columns, expected 0 or 3")
     if len(np.unique(log.landmark)) < log.landmarks:
         unseen = np.setdiff1d(np.arange(log.landmarks), log.landmark)[0]
         raise ArchiveError(f"{place}/landmark_id[{unseen}] has no observation")
