@@ -13,9 +13,8 @@ from support.running import WHOLE
 
 from ekfslam import open_sequence
 from ekfslam.config import CalibrationConfig, Config, FilterConfig, NoiseConfig, PosteriorConfig
-from ekfslam.data.sequence import Noise, Observations
+from ekfslam.data.sequence import Noise, Observations, cut
 from ekfslam.data.simulate import builtin
-from ekfslam.data.stretches import cut
 from ekfslam.errors import IllPosedError, PosteriorError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.geometry import se3

@@ -1,11 +1,8 @@
 """Track hygiene: the stage between a recording and the filters that cuts tracks and drops observations.
 
-The rules use tracks, their pixel noise, and measured velocities; none needs an estimate. A `HygieneReport` lists every
-observation that a rule changed.
-
-A rule either *drops* an observation, or *cuts* a track: from that observation on the track has an id of its own. Ids of
-new pieces count on from the largest. If the tracks of a recording have no gaps, a track is also cut at every gap that a
-rule makes.
+The rules use tracks, their pixel noise, and measured velocities; none needs an estimate. A rule either *drops* an
+observation, or *cuts* a track: from that observation on the track has an id of its own. Ids of new pieces count on from
+the largest. If the tracks of a recording have no gaps, a track is also cut at every gap that a rule makes.
 """
 
 from __future__ import annotations
@@ -19,7 +16,7 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import HygieneConfig
 from ekfslam.data.sequence import Noise, Observations, Sequence
-from ekfslam.data.tracks import cut_tracks, repeated_frames, successive
+from ekfslam.data.tracks import adjacent, cut_tracks, repeated_frames, successive
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
 from ekfslam.stored import COUNTS, FRAMES, attribute, stored, whole, zeros
@@ -39,8 +36,7 @@ _SWITCHES: dict[str, str] = {
 RULES: tuple[str, ...] = tuple(_SWITCHES)
 REPEATED_FRAME, JUMP, REUSED_ID, DISPARITY, ROW_MISMATCH, DEPTH, TOO_SHORT, DISPARITY_JUMP = range(len(RULES))
 
-# Standard deviation that white noise of 1 px gives to what `jumps` compares.
-_JUMP_STD = 2.0
+_JUMP_STD = 2.0  # of the jump that `jumps` tests, due to white noise of 1 px
 _COMPANY = 5  # tracks of a frame that can tell how the frame as a whole moved
 
 
@@ -64,12 +60,12 @@ class HygieneReport:
 
     @property
     def dropped(self) -> int:
-        """Return the number of dropped observations."""
+        """Number of dropped observations."""
         return int((self.continuation < 0).sum())
 
     @property
     def counts(self) -> dict[str, int]:
-        """Return the number of findings by rule, and of all dropped observations."""
+        """Number of findings by rule, and of all dropped observations."""
         found = np.bincount(self.rule, minlength=len(RULES)).tolist()
         return {
             "dropped by hygiene": self.dropped,
@@ -93,22 +89,15 @@ class HygieneReport:
 
 
 class _Cleaning:
-    """Tracks from which rules drop observations, or which they cut.
-
-    Attributes:
-        kept: Observations that are left.
-        own: (K,) ids of their tracks in the recording.
-    """
+    """Observations that rules leave (``kept``), and ids (K,) of their tracks in the recording (``own``)."""
 
     def __init__(self, observations: Observations) -> None:
         self.kept, self.own = observations, observations.landmark
         self._looked_at = len(observations)
-        # If no track of the recording has a gap, dropping shall leave none.
         self._has_gaps = bool(_after_gaps(observations).any())
         self._findings: list[tuple[IntArray, ...]] = []
 
     def drop(self, rule: int, bad: BoolArray) -> None:
-        """Drop the observations that ``bad`` (K,) marks."""
         self._record(rule, bad, np.full(len(bad), -1))
         kept = self.kept
         self.kept, self.own = Observations(kept.frame[~bad], kept.landmark[~bad], kept.pixels_px[~bad]), self.own[~bad]
@@ -116,7 +105,6 @@ class _Cleaning:
             self.cut(rule, gaps)
 
     def cut(self, rule: int, starts: BoolArray) -> None:
-        """Cut tracks before the observations that ``starts`` (K,) marks."""
         kept = self.kept
         landmark = cut_tracks(kept, starts, int(kept.landmark.max(initial=-1)) + 1)
         self._record(rule, starts, landmark)
@@ -128,7 +116,6 @@ class _Cleaning:
         return np.searchsorted(self.kept.ids, self.kept.landmark)
 
     def report(self) -> HygieneReport:
-        """Return what was dropped and cut."""
         if not self._findings:
             return HygieneReport(self._looked_at, **zeros(HygieneReport, finding=0))
         return HygieneReport(self._looked_at, *map(np.concatenate, zip(*self._findings, strict=True)))
@@ -139,16 +126,7 @@ class _Cleaning:
 
 
 def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tuple[Observations, HygieneReport]:
-    """Apply the rules of ``config`` to the tracks of a sequence.
-
-    Args:
-        sequence: Recording.
-        noise: Noise of its pixels and velocities; all limits are multiples of it.
-        config: Rules that are on, and their limits.
-
-    Returns:
-        The tracks that are left, and the report.
-    """
+    """Return the tracks that the rules of ``config`` leave, and the report; limits are multiples of the noise."""
     tracks, std = _Cleaning(sequence.observations), noise.pixel_std_px
     disparity_std, row_std = np.hypot(std[0], std[2]), np.hypot(std[1], std[3])
     if config.restart_at_repeats:
@@ -262,9 +240,7 @@ def disparity_jumps(sequence: Sequence, noise: Noise, sigma: float) -> IntArray:
     of disparity do not count, nor do those of two frames; at least `_COMPANY` must be left.
     """
     o, camera = sequence.observations, sequence.camera
-    earlier, later = successive(o)
-    beside = o.frame[later] - o.frame[earlier] == 1
-    earlier, later = earlier[beside], later[beside]
+    earlier, later = adjacent(o)
     disparity, std = _disparity(o), float(np.hypot(noise.pixel_std_px[0], noise.pixel_std_px[2]))
     tells = (disparity[earlier] > sigma * std) & (disparity[later] > 0)
     a, b = earlier[tells], later[tells]
@@ -292,18 +268,13 @@ def disparity_jumps(sequence: Sequence, noise: Noise, sigma: float) -> IntArray:
 
 
 def _is_slow(observations: Observations, limit_px: float) -> BoolArray:
-    """Return whether (K,) a track moves by at most ``limit_px`` about the frame that leads to an observation.
-
-    These are the motions to the frame before and from this one to the next; a track that has neither is not slow.
-    """
-    earlier, later = successive(observations)
-    beside = observations.frame[later] - observations.frame[earlier] == 1
-    earlier, later = earlier[beside], later[beside]
+    """Return whether (K,) a track moves by at most ``limit_px`` to the frame before, and from this one to the next."""
+    earlier, later = adjacent(observations)
     moved = np.abs(observations.pixels_px[later] - observations.pixels_px[earlier]).max(axis=1)
     onward, hither, before = np.full((3, len(observations)), -1.0)
     onward[earlier] = hither[later] = moved
     before[later] = hither[earlier]
-    fastest = np.maximum(before, onward)
+    fastest = np.maximum(before, onward)  # -1: neither motion is known
     return (fastest >= 0) & (fastest <= limit_px)
 
 

@@ -48,9 +48,8 @@ class Velocities:
         require_shape(self.twist, (len(self.time_s), 6), "twist")
         require_finite(self.twist, "twist", LARGEST_VELOCITY)
         if self.frame not in get_args(VelocityFrame):
-            raise DataError(
-                f"expected {' or '.join(get_args(VelocityFrame))}, found {self.frame!r}", field="velocity_frame"
-            )
+            message = f"expected {' or '.join(get_args(VelocityFrame))}, found {self.frame!r}"
+            raise DataError(message, field="velocity_frame")
         found = interpolated_intervals(self.twist) if self.interpolated is None else self.interpolated
         require_shape(found, self.time_s.shape, "interpolated")
         object.__setattr__(self, "interpolated", frozen(np.asarray(found, dtype=bool)))
@@ -82,6 +81,10 @@ class Velocities:
         """Return whether there is one sample for each of the stamps (T,)."""
         return np.array_equal(self.time_s, time_s)
 
+    def is_twist_of(self, time_s: Array) -> bool:
+        """Return whether stamps (T,), ``twist`` and ``frame`` alone restore the samples."""
+        return self.has_stamps(time_s) and np.array_equal(self.interpolated, interpolated_intervals(self.twist))
+
     def mean(self, time_s: Array) -> Array:
         """Return the mean velocities (T, 6) over the intervals that end at the stamps (T,).
 
@@ -92,8 +95,8 @@ class Velocities:
         at = self._driving(time_s)
         grid = np.union1d(self.time_s, time_s)
         held = self.twist[self._driving(grid)]
-        way = np.cumsum(held * np.diff(grid, prepend=grid[0])[:, None], axis=0)[np.searchsorted(grid, time_s)]
-        return np.vstack([self.twist[at[:1]], np.diff(way, axis=0) / np.diff(time_s)[:, None]])
+        means = means_between(time_s, grid, held * np.diff(grid, prepend=grid[0])[:, None])
+        return np.vstack([self.twist[at[:1]], means])
 
     def interpolated_at(self, time_s: Array) -> BoolArray:
         """Return whether a sample of each interval that ends at the stamps (T,) was interpolated."""
@@ -134,10 +137,8 @@ class InertialNoise:
     The standard deviation of a sample is ``gyro * sqrt(rate)``; a bias changes by ``gyro_walk * sqrt(dt)`` in ``dt``.
 
     Args:
-        gyro: rad/s/sqrt(Hz).
-        accel: m/s^2/sqrt(Hz).
-        gyro_walk: rad/s^2/sqrt(Hz).
-        accel_walk: m/s^3/sqrt(Hz).
+        gyro, accel: rad/s/sqrt(Hz), m/s^2/sqrt(Hz).
+        gyro_walk, accel_walk: rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz).
     """
 
     gyro: float
@@ -180,9 +181,8 @@ class InertialSamples:
     @property
     def text(self) -> str:
         """The samples in words."""
-        stated = "densities of noise not stated"
-        if self.noise is not None:
-            n = self.noise
+        n, stated = self.noise, "densities of noise not stated"
+        if n is not None:
             stated = f"gyroscope {n.gyro:.3g} rad/s/sqrt(Hz), accelerometer {n.accel:.3g} m/s^2/sqrt(Hz)"
         return f"{len(self.time_s)} inertial samples, {_rate(self.time_s)}; {stated}"
 
@@ -199,8 +199,7 @@ class InertialSamples:
 
     def at(self, time_s: Array | float) -> Array:
         """Return the samples ``[w; f]`` (..., 6) at some time, linear between stamps."""
-        columns = np.hstack([self.gyro_rad_s, self.accel_m_s2]).T
-        return np.stack([np.interp(time_s, self.time_s, column) for column in columns], axis=-1)
+        return linear(self.time_s, np.hstack([self.gyro_rad_s, self.accel_m_s2]), time_s)
 
     def interval(self, begin_s: float, end_s: float) -> Interval:
         """Return the mean samples ``[w; f]`` between successive stamps, linear to both ends of the interval.
@@ -221,6 +220,17 @@ class InertialSamples:
 
 Input = Velocities | InertialSamples
 AnyInput = TypeVar("AnyInput", Velocities, InertialSamples)
+
+
+def linear(time_s: Array | IntArray, values: Array, wanted_s: Array | IntArray | float) -> Array:
+    """Return the values (..., c) at some times, linear between those (N, c) at stamps (N,), constant outside."""
+    return np.stack([np.interp(wanted_s, time_s, column) for column in values.T], axis=-1)
+
+
+def means_between(time_s: Array, grid_s: Array, moved: Array) -> Array:
+    """Return means (T-1, c) between stamps (T,), from integrals ``moved`` (N, c) over the steps that end at a grid."""
+    way = np.cumsum(moved, axis=0)[np.searchsorted(grid_s, time_s)]
+    return np.diff(way, axis=0) / np.diff(time_s)[:, None]
 
 
 def validate_inputs(inputs: tuple[Input, ...], time_s: Array) -> None:

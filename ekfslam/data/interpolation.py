@@ -1,8 +1,7 @@
 """Stretches of a recording that were never measured: where a unit had a gap, and a line was drawn across it.
 
-OXTS units (KITTI) fill gaps so, velocities and poses alike: over the first second of 2011_09_30_drive_0020, for
-instance. There the true poses move by 10.5 m/s, where velocities say 11.5 m/s and vision 11.6 m/s, and the yaw rates
-are wrong by up to 2.7 deg/s.
+OXTS units (KITTI) fill gaps of velocities and poses so. In the first second of 2011_09_30_drive_0020 the true poses
+move by 10.5 m/s and the velocities are 11.5 m/s; yaw rates are wrong by up to 2.7 deg/s.
 """
 
 from __future__ import annotations
@@ -46,10 +45,7 @@ def stretches(which: BoolArray) -> list[tuple[int, int]]:
 
 
 def interpolation_attributes(twist: Array) -> dict[str, str]:
-    """Return interpolated intervals as the attribute ``interpolated``, such as ``1-12 178-182``; empty if none.
-
-    It stays with a recording whose velocities are changed, for instance turned or given noise.
-    """
+    """Return interpolated intervals as the attribute ``interpolated``, such as ``1-12 178-182``; empty if none."""
     return _attributes(interpolated_intervals(twist))
 
 

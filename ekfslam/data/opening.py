@@ -23,15 +23,7 @@ def open_recording(
 ) -> Sequence | ImageRecording:
     """Open a recording as it is stored: as images if it has any, otherwise as tracks.
 
-    Args:
-        source: Path of a recording, or ``builtin:NAME``.
-        extrinsics, lateral: See `ekfslam.open_sequence`.
-
-    Raises:
-        UnknownFormatError: The file is missing, empty, damaged or of unknown content, or there is no such world.
-        ConfigError: The recording's format does not know ``extrinsics`` or ``lateral``.
-        ArchiveError: A newer release wrote the file.
-        DataError: A field is missing or malformed; the subclass says how.
+    For arguments and errors see `ekfslam.open_sequence`.
     """
     choices = {"extrinsics": (extrinsics, Extrinsics), "lateral": (lateral, Lateral)}
     for name, (choice, known) in choices.items():
@@ -44,8 +36,7 @@ def open_recording(
     sequence: Sequence | None = read_as(place, "tracks")
     if sequence is None:
         problem = f"cannot be read ({place.problem})" if place.problem else "unknown content"
-        if not place.head and not place.problem:
-            problem = "empty file"
+        problem = problem if place.head or place.problem else "empty file"
         raise UnknownFormatError(f"{place.place}: {problem}; {expected('tracks', 'images')}")
     for name, (choice, _) in choices.items():
         # A file of our own has been read before: it keeps the choice made then.
@@ -57,9 +48,7 @@ def open_recording(
 def open_images(source: str | Path, *, lateral: Lateral = "corrected") -> ImageRecording | None:
     """Open a recording of stereo images; return None if no reader finds images there.
 
-    Args:
-        source: Path of a file or folder.
-        lateral: Reading of the lateral velocity of KITTI, see `ekfslam.open_sequence`.
+    ``lateral`` is the reading of the lateral velocity of KITTI, see `ekfslam.open_sequence`.
 
     Raises:
         UnknownFormatError: A file of the recording is missing or damaged.
@@ -90,7 +79,10 @@ def attach_truth(sequence: Sequence, path: Path) -> Sequence:
     """
     poses: Poses | None = read_as(Source.at(path), "truth", sequence)
     if poses is None:
-        raise _unknown_poses(path)
+        formats = expected("truth")
+        number, content = next(iter(rows_of(read_lines(path, formats))), (0, ""))
+        found = f"line {number} has {len(content.split())} columns" if content else "holds no poses"
+        raise UnknownFormatError(f"{path}: {found}; {formats}")
     truth = truth_of_frames(sequence.time_s, poses)
     frames, known, count = len(sequence), len(truth.frame), len(poses.T_world_imu)
     if known < MIN_COVERAGE * frames:
@@ -110,14 +102,6 @@ def attach_truth(sequence: Sequence, path: Path) -> Sequence:
         notes=(*sequence.notes, note),
         attributes={**sequence.attributes, "truth_checksum_sha256": checksum(*poses.files)},
     )
-
-
-def _unknown_poses(path: Path) -> UnknownFormatError:
-    formats = expected("truth")
-    number, content = next(iter(rows_of(read_lines(path, formats))), (0, ""))
-    if not content:
-        return UnknownFormatError(f"{path}: holds no poses; {formats}")
-    return UnknownFormatError(f"{path}: line {number} has {len(content.split())} columns; {formats}")
 
 
 def _span(time_s: Array) -> str:

@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from ekfslam.arrays import Array
 from ekfslam.data.inputs import InertialNoise, InertialSamples
 from ekfslam.data.noise import Noise
-from ekfslam.data.observations import Observations, TrueMotion, Truth
+from ekfslam.data.observations import TrueMotion, Truth
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.spline import PoseSpline, resampled
-from ekfslam.data.worlds import Recording, View, numbers_of, outlier_shifts, track_ids, tracked, visible
+from ekfslam.data.worlds import Recording, View, numbers_of, observed, stamps
 from ekfslam.errors import ConfigError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
@@ -39,13 +39,13 @@ class Room(Recording):
     """A box around the trajectory, with landmarks on its six sides. Tracks that are lost come back under other ids.
 
     Args:
-        landmarks: How many there are.
-        wall_m, ceiling_m: Distance of walls, of floor and ceiling, from where the trajectory comes nearest to them.
-        imu_rate_hz: Of gyroscope and accelerometer.
+        landmarks: Number of landmarks.
+        wall_m, ceiling_m: Least distances of walls, and of floor and ceiling, from the trajectory.
+        imu_rate_hz: Rate of gyroscope and accelerometer.
         gyro, accel, gyro_walk, accel_walk: Densities, see `InertialNoise`; by default those of EuRoC.
-        gyro_bias_std_rad_s, accel_bias_std_m_s2: The first biases are drawn from these.
+        gyro_bias_std_rad_s, accel_bias_std_m_s2: Standard deviations of the first biases.
         trajectory: TUM file of poses with gravity along -z; "" for a trajectory made from the seed.
-        start_s: Where in the trajectory the recording begins.
+        start_s: Time in the trajectory at which the recording begins.
     """
 
     name: str = "room"
@@ -88,9 +88,7 @@ def simulate_room(world: Room, rng: np.random.Generator | None = None) -> Sequen
     """Record a world once; see `ekfslam.data.simulate.simulate`."""
     geometry = np.random.default_rng(world.seed)
     noise = geometry if rng is None else rng
-    jitter = np.clip(world.stamp_jitter_s * geometry.standard_normal(world.frames), -0.3, 0.3)
-    time_s = world.frame_period_s * np.arange(world.frames) + np.minimum(jitter, world.frame_period_s / 3)
-    time_s = time_s - time_s[0]
+    time_s = stamps(world, geometry)
     spline = _trajectory(world, float(time_s[-1]), geometry)
     motion = spline.at(time_s)
     view = View(CAMERA, IMAGE_SIZE_PX, _extrinsics(motion.T_world_imu[:, :3, :3]))
@@ -98,25 +96,20 @@ def simulate_room(world: Room, rng: np.random.Generator | None = None) -> Sequen
     samples, gyro_bias, accel_bias = _samples(world, spline, time_s, noise)
 
     T_imu_world = se3.inverse(motion.T_world_imu)
-    frame, point, pixels = visible(world, view, T_imu_world, points_m)
-    kept = tracked(world, frame, point, len(points_m), noise)
-    frame, point, pixels = frame[kept], point[kept], pixels[kept]
-    pixels = pixels + outlier_shifts(world, view, pixels, noise) + world.sigma_px * noise.standard_normal(pixels.shape)
-    landmark = track_ids(frame, point)
-    ids, an_observation = np.unique(landmark, return_index=True)
+    observations, ids, position_m = observed(world, view, T_imu_world, points_m, noise, ids_last=False)
     return Sequence(
         name=world.name,
         source=f"builtin:{world.name}",
         time_s=time_s,
         camera=CAMERA,
         T_cam_imu=view.T_cam_imu,
-        observations=Observations(frame, landmark, pixels),
+        observations=observations,
         inputs=(samples,),
         truth=Truth(
             frame=np.arange(world.frames),
             T_world_imu=motion.T_world_imu,
             landmark=ids,
-            position_m=points_m[point[an_observation]],
+            position_m=position_m,
             motion=TrueMotion(motion.velocity_m_s, gyro_bias, accel_bias),
         ),
         noise=Noise.isotropic(0.0, 0.0, world.sigma_px),
@@ -131,14 +124,14 @@ def _trajectory(world: Room, duration_s: float, rng: np.random.Generator) -> Pos
     if not world.trajectory:
         return PoseSpline(begin, KNOT_S, _hand_held(np.maximum(knots + world.start_s, 0.0), rng))
     path = Path(world.trajectory)
-    stamps, T = _poses(path)
+    given, T = _poses(path)
     wanted = knots - knots[0] + world.start_s
-    if wanted[-1] > stamps[-1]:
-        raise ConfigError(f"{path}: the trajectory ends after {stamps[-1]:.1f} s, {wanted[-1]:.1f} s are needed")
-    k = np.flatnonzero((np.diff(stamps) > MAX_GAP_S) & (stamps[1:] > wanted[0]) & (stamps[:-1] < wanted[-1]))
+    if wanted[-1] > given[-1]:
+        raise ConfigError(f"{path}: the trajectory ends after {given[-1]:.1f} s, {wanted[-1]:.1f} s are needed")
+    k = np.flatnonzero((np.diff(given) > MAX_GAP_S) & (given[1:] > wanted[0]) & (given[:-1] < wanted[-1]))
     if len(k):
-        raise ConfigError(f"{path}: the trajectory has a gap from {stamps[k[0]]:.1f} to {stamps[k[0] + 1]:.1f} s")
-    return PoseSpline(begin, KNOT_S, resampled(stamps, T, wanted))
+        raise ConfigError(f"{path}: the trajectory has a gap from {given[k[0]]:.1f} to {given[k[0] + 1]:.1f} s")
+    return PoseSpline(begin, KNOT_S, resampled(given, T, wanted))
 
 
 def _poses(path: Path) -> tuple[Array, Array]:

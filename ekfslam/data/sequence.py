@@ -365,3 +365,11 @@ def stretch(text: str) -> slice:
     if not colon:
         raise ValueError(f"expected A:B, found {text!r}")
     return slice(*(int(bound) if bound.strip() else None for bound in (begin, end)))
+
+
+def cut(sequence: Sequence, begin: int, end: int, T_world_imu: Array) -> Sequence | None:
+    """Return frames ``begin`` to ``end - 1`` with the first pose (4, 4) as truth; None if nothing is observed."""
+    seen = sequence.observations.frame
+    if not ((seen >= begin) & (seen < end)).any():
+        return None
+    return replace(sequence[begin:end], truth=Truth(np.zeros(1, dtype=np.int64), T_world_imu[None]))

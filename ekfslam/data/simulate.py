@@ -1,9 +1,8 @@
 """Simulated drives with exact truth: the embedded default data, and the raw material of Monte Carlo studies.
 
-Three worlds are built in. ``city`` is a drive through streets, seen the way a feature tracker sees it: short tracks
-whose ids never come back, and some gross outliers. ``loop`` is a ring driven several times past the same few landmarks,
-which keep their ids. ``room`` is hand-held, with inertial samples in place of velocities, see `ekfslam.data.room`.
-``dataclasses.replace(BUILTIN["loop"], radius_m=10.0)`` makes another world of the same kind.
+Three worlds are built in. ``city`` is a drive through streets with short tracks, whose ids never come back, and some
+gross outliers. ``loop`` is a ring driven several times past the same few landmarks, which keep their ids. ``room`` is
+hand-held, with inertial samples, see `ekfslam.data.room`.
 
 The truth of a drive obeys the model of the filters exactly: the velocity is constant over every interval and
 integrates by eq. (1). The world frame is the IMU frame of the first stamp, x forward, y left, z up.
@@ -22,17 +21,8 @@ import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.data.room import Room, simulate_room
-from ekfslam.data.sequence import Noise, Observations, Sequence, Truth
-from ekfslam.data.worlds import (
-    Recording,
-    View,
-    numbers_of,
-    outlier_shifts,
-    parameters_of,
-    track_ids,
-    tracked,
-    visible,
-)
+from ekfslam.data.sequence import Noise, Sequence, Truth
+from ekfslam.data.worlds import Recording, View, numbers_of, observed, parameters_of, stamps
 from ekfslam.errors import ConfigError, UnknownFormatError
 from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import StereoCamera
@@ -46,7 +36,7 @@ T_CAM_IMU = se3.transform(_R_CAM_IMU, -_R_CAM_IMU @ _CAMERA_IN_IMU_M)
 GROUND_M = -0.95  # height of the road in the IMU frame
 ROAD_HALF_WIDTH_M = 4.0
 TURN_SPEED_M_S = 5.0
-# Typical size of what keeps a drive from being flat: pitch, roll (rad), sideways and vertical speed per forward speed.
+# Typical unevenness of a road: pitch, roll (rad), sideways and vertical speed per forward speed.
 _UNEVENNESS = np.array([0.025, 0.010, 0.004, 0.008])
 _MOST_STREETS_M = 1e6
 _FASTEST_M_S = 15.0  # in the city
@@ -59,9 +49,8 @@ class Drive(Recording):
 
     Args:
         sigma_v_m_s, sigma_w_rad_s: White noise of the velocities, per sample and axis.
-        initial_position_std_m, initial_rotation_std_rad: Prior of the first pose, each axis, which the truth is drawn
-            from. Unless both are 0 the first pose is unknown: estimates start at identity, and the truth starts at
-            frame 1.
+        initial_position_std_m, initial_rotation_std_rad: Prior of the first pose, each axis, from which the truth is
+            drawn. Unless both are 0, estimates start at identity, and the truth starts at frame 1.
     """
 
     sigma_v_m_s: float = 0.5
@@ -105,10 +94,10 @@ class Loop(Drive):
     """A ring driven at constant speed; landmarks keep their ids, loop after loop (157 frames each by default).
 
     Args:
-        radius_m, speed_m_s: Of the ring, and along it.
-        landmarks: How many there are, inside and outside of the ring.
-        landmark_offset_m: How far outside of the ring's centre line they may stand (inside: a fifth of the radius).
-        landmark_height_m: They stand between the ground and this height.
+        radius_m, speed_m_s: Radius of the ring, and speed along it.
+        landmarks: Number of landmarks inside and outside of the ring.
+        landmark_offset_m: Largest distance of landmarks outside of the ring; inside it is a fifth of the radius.
+        landmark_height_m: Largest height of landmarks above the ground.
     """
 
     name: str = "loop"
@@ -163,46 +152,43 @@ def builtin(name: str) -> Sequence:
 def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
     """Record a world once; every call gives the same bits.
 
-    Args:
-        world: What to simulate. Its seed decides the stamps, the drive and the landmarks.
-        rng: Draws the first pose, the noise, the losses and the outliers. By default the world's own generator goes on,
-            so that the seed decides everything; give one to record the same drive again with other noise.
+    The recording has the true noise, all true poses (but see `Drive` on the prior), and the true position of every
+    observed landmark.
 
-    Returns:
-        The recording, with the true noise, all true poses (but see `Recording` on the prior), and the true position of
-        every landmark that was observed.
+    Args:
+        world: World, whose seed decides stamps, drive and landmarks.
+        rng: Generator of first pose, noise, losses and outliers, to record the same drive again with other noise. By
+            default the world's own generator goes on, so that the seed decides everything.
     """
     if isinstance(world, Room):
         return simulate_room(world, rng)
     geometry = np.random.default_rng(world.seed)
     noise = geometry if rng is None else rng
 
-    time_s = _stamps(world, geometry)
-    distance_m, yaw_rad = _drive(world, time_s, geometry)
-    wavelength_m = 2 * np.pi * world.radius_m if isinstance(world, Loop) else 150.0
+    time_s = stamps(world, geometry)
+    if isinstance(world, Loop):
+        distance_m, wavelength_m = world.speed_m_s * time_s, 2 * np.pi * world.radius_m
+        yaw_rad = distance_m / world.radius_m
+    else:
+        (distance_m, yaw_rad), wavelength_m = _drive_streets(time_s, geometry), 150.0
     twist = _twists(time_s, distance_m, yaw_rad, wavelength_m, geometry)
     T_imu_world = _integrate(twist, np.diff(time_s))
-    points_m = _landmarks(world, distance_m, yaw_rad, se3.inverse(T_imu_world)[:, :3, 3], geometry)
+    if isinstance(world, Loop):
+        points_m = _around_ring(world, geometry)
+    else:
+        points_m = _line_streets(world, distance_m, yaw_rad, se3.inverse(T_imu_world)[:, :3, 3], geometry)
 
-    # The first pose is exp(xi^) instead of the identity: everything true moves along, so that no measurement changes.
+    # The first pose is exp(xi^), not the identity. The truth moves with it, so that no measurement changes.
     prior_std = np.repeat([world.initial_position_std_m, world.initial_rotation_std_rad], 3)
     T_first = se3.exp(prior_std * noise.standard_normal(6))
     T_imu_world = T_imu_world @ T_first
     points_m = se3.apply(se3.inverse(T_first), points_m)
-    first_known = 1 if prior_std.any() else 0  # a first pose that is drawn is one that nobody may start from
+    first_known = 1 if prior_std.any() else 0  # estimates must not start from a first pose that is drawn
 
     stated = Noise.isotropic(world.sigma_v_m_s, world.sigma_w_rad_s, world.sigma_px)
     measured_twist = twist + stated.twist_std * noise.standard_normal(twist.shape)
 
-    frame, point, pixels = visible(world, _VIEW, T_imu_world, points_m)
-    kept = tracked(world, frame, point, len(points_m), noise)
-    frame, point, pixels = frame[kept], point[kept], pixels[kept]
-    pixels = (
-        pixels + outlier_shifts(world, _VIEW, pixels, noise) + stated.pixel_std_px * noise.standard_normal(pixels.shape)
-    )
-    landmark = track_ids(frame, point) if isinstance(world, City) else point
-    ids, an_observation = np.unique(landmark, return_index=True)
-
+    observations, ids, position_m = observed(world, _VIEW, T_imu_world, points_m, noise, isinstance(world, Loop))
     return Sequence(
         name=world.name,
         source=f"builtin:{world.name}",
@@ -210,36 +196,23 @@ def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
         twist=measured_twist,
         camera=CAMERA,
         T_cam_imu=T_CAM_IMU,
-        observations=Observations(frame, landmark, pixels),
+        observations=observations,
         truth=Truth(
             frame=np.arange(first_known, world.frames),
             T_world_imu=se3.inverse(T_imu_world)[first_known:],
             landmark=ids,
-            position_m=points_m[point[an_observation]],
+            position_m=position_m,
         ),
         noise=stated,
         attributes={"world": world.name, **numbers_of(world)},
     )
 
 
-def _stamps(world: City | Loop, rng: np.random.Generator) -> Array:
-    """Return stamps (T,) from 0, with a jitter too small to swap two of them."""
-    limit = world.frame_period_s / 3
-    jitter = np.clip(world.stamp_jitter_s * rng.standard_normal(world.frames), -limit, limit)
-    time_s = world.frame_period_s * np.arange(world.frames) + jitter
-    return time_s - time_s[0]
-
-
-def _drive(world: City | Loop, time_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return distance driven (T,) m and heading (T,) rad at the stamps, both 0 at the first."""
-    if isinstance(world, Loop):
-        distance = world.speed_m_s * time_s
-        return distance, distance / world.radius_m
-    return _drive_streets(time_s, rng)
-
-
 def _drive_streets(time_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return `_drive` of a city: manoeuvres, each with a duration, a speed at its end and an angle to turn by."""
+    """Return distance (T,) m and heading (T,) rad in a city, both 0 at the first stamp.
+
+    Every manoeuvre has a duration, a speed at its end and an angle to turn by.
+    """
     accelerate_s, brake_s, stand_s, start_s, turn_s = 3.5, 3.5, 3.0, 3.0, 5.0
     streets = int(time_s[-1] / (accelerate_s + brake_s + turn_s)) + 1
     cruise_m_s = rng.uniform(9.0, 12.0, (streets, 2))
@@ -298,24 +271,20 @@ def _integrate(twist: Array, tau_s: Array) -> Array:
     return T
 
 
-def _landmarks(
-    world: City | Loop, distance_m: Array, yaw_rad: Array, position_m: Array, rng: np.random.Generator
-) -> Array:
-    """Return landmark positions (N, 3) in world, given the drive (T,), (T,), (T, 3)."""
-    if isinstance(world, Loop):
-        # The camera's field of view never reaches points nearer to the centre than 0.77 radii.
-        verge, inner, outer = ROAD_HALF_WIDTH_M / 2, 0.2 * world.radius_m, world.landmark_offset_m
-        offset = rng.uniform(verge - inner, outer - verge, world.landmarks)
-        radius = world.radius_m + offset + np.where(offset > 0, verge, -verge)
-        angle = rng.uniform(0.0, 2 * np.pi, world.landmarks)
-        height = GROUND_M + rng.uniform(0.0, world.landmark_height_m, world.landmarks)
-        return np.stack([radius * np.cos(angle), world.radius_m + radius * np.sin(angle), height], axis=-1)
-    return _line_streets(world, distance_m, yaw_rad, position_m, rng)
+def _around_ring(world: Loop, rng: np.random.Generator) -> Array:
+    """Return landmark positions (N, 3) in world."""
+    # The camera's field of view never reaches points nearer to the centre than 0.77 radii.
+    verge, inner, outer = ROAD_HALF_WIDTH_M / 2, 0.2 * world.radius_m, world.landmark_offset_m
+    offset = rng.uniform(verge - inner, outer - verge, world.landmarks)
+    radius = world.radius_m + offset + np.where(offset > 0, verge, -verge)
+    angle = rng.uniform(0.0, 2 * np.pi, world.landmarks)
+    height = GROUND_M + rng.uniform(0.0, world.landmark_height_m, world.landmarks)
+    return np.stack([radius * np.cos(angle), world.radius_m + radius * np.sin(angle), height], axis=-1)
 
 
 def _line_streets(world: City, distance_m: Array, yaw_rad: Array, position_m: Array, rng: np.random.Generator) -> Array:
-    """Return `_landmarks` of a city: facades on both sides, street furniture in front of them, and kerbs."""
-    # The street goes on past the last frame, or the vehicle would end up looking into the void.
+    """Return points (N, 3) in world: facades on both sides, street furniture in front of them, and kerbs."""
+    # The street goes on past the last frame, where the vehicle still looks ahead.
     ahead = np.array([np.cos(yaw_rad[-1]), np.sin(yaw_rad[-1]), 0.0])
     path_s = np.append(distance_m, distance_m[-1] + world.max_range_m)
     path = np.concatenate([position_m, [position_m[-1] + world.max_range_m * ahead]])

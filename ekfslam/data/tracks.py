@@ -22,10 +22,10 @@ class TrackReport:
     Args:
         tracks: Number of distinct landmark ids.
         observations_per_frame: (T,) number of observations.
-        repeated_frames: Ascending frames whose pixels all repeat the previous frame's (see `repeated_frames`).
-        returning_tracks: Number of tracks that come back after frames that did not see them.
+        repeated_frames: See the function `repeated_frames`.
+        returning_tracks: Number of tracks that come back after a gap.
         nonpositive_disparities: Number of observations with ``uL - uR <= 0``, which have no depth.
-        max_row_mismatch_px: Largest ``|vL - vR|``; 0 for an ideally rectified pair.
+        max_row_mismatch_px: Largest ``|vL - vR|``.
     """
 
     tracks: int
@@ -37,7 +37,7 @@ class TrackReport:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return the findings, one sentence each."""
+        """Findings, one sentence each."""
         frames, observations = len(self.observations_per_frame), int(self.observations_per_frame.sum())
         blind = int((self.observations_per_frame == 0).sum())
         return (
@@ -85,21 +85,23 @@ def cut_tracks(observations: Observations, starts: NDArray[np.bool_], first_id: 
 def repeated_frames(observations: Observations, twist: Array) -> IntArray:
     """Return ascending frames of a moving rig that repeat the previous frame's pixels in every common track.
 
-    One common track is enough: a subpixel tracker does not return the same four numbers from another image, and in the
-    recordings no frame repeats only some tracks. ``twist[k]`` (T, 6) m/s and rad/s drives the interval before frame k
-    and says whether the rig moves; at rest, pixels may repeat.
-
-    In such a frame the tracker was restarted at the old pixels in the new image. The pixels are right for this frame
-    and predict the next one, but show other points than before: no track leads across.
+    One common track is enough: a subpixel tracker does not return the same four numbers from another image. Velocities
+    ``twist`` (T, 6) say whether the rig moves; at rest, pixels may repeat. In such a frame the tracker was restarted at
+    the old pixels in the new image: they are right, but show other points than before, so no track leads across.
     """
-    earlier, later = successive(observations)
-    adjacent = observations.frame[later] - observations.frame[earlier] == 1
-    earlier, later = earlier[adjacent], later[adjacent]
+    earlier, later = adjacent(observations)
     same = (observations.pixels_px[earlier] == observations.pixels_px[later]).all(axis=1)
     common = np.bincount(observations.frame[later], minlength=len(twist))
     repeated = np.bincount(observations.frame[later[same]], minlength=len(twist))
     moving = (np.linalg.norm(twist[:, :3], axis=1) > MOVING_M_S) | (np.linalg.norm(twist[:, 3:], axis=1) > MOVING_RAD_S)
     return np.flatnonzero((common > 0) & (repeated == common) & moving)
+
+
+def adjacent(observations: Observations) -> tuple[IntArray, IntArray]:
+    """Return the pairs of `successive` whose frames follow on each other."""
+    earlier, later = successive(observations)
+    follows = observations.frame[later] - observations.frame[earlier] == 1
+    return earlier[follows], later[follows]
 
 
 def successive(observations: Observations) -> tuple[IntArray, IntArray]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.images import ImageRecording
-from ekfslam.data.inputs import VelocitySamples
+from ekfslam.data.inputs import VelocitySamples, linear, means_between
 from ekfslam.data.interpolation import attributes_of_part, interpolation_attributes, known_intervals
 from ekfslam.data.readers.registry import Lateral, Source, expected, read_as
 from ekfslam.data.sequence import WITHOUT_VELOCITIES, Sequence, VelocityFrame
@@ -20,7 +20,7 @@ from ekfslam.geometry import se3
 Recording = TypeVar("Recording", Sequence, ImageRecording)
 
 MAX_GAP_S = 1.0  # over longer, a velocity is not linear in time
-NO_VELOCITIES = "There are no velocities"  # how a note begins that is true no more when there are some
+_NO_VELOCITIES = "There are no velocities"  # beginning of a note of a recording without any
 _SAME = 1e-3  # of a step, by which stamps of the same instants may differ
 _DENSE = 2.0  # samples an interval from which their mean over it is taken
 
@@ -63,16 +63,17 @@ def attach_velocities(
     twist, how = resample(found, recording.time_s)
     own = {name: value for name, value in recording.attributes.items() if name not in (*WITHOUT_VELOCITIES, "lateral")}
     gaps = _interpolated_attributes(found, recording.time_s, twist)
-    note = f"Velocities ({found.velocity_frame} frame) from {path}: {how}."
-    changes: dict[str, Any] = {
-        "twist": twist,
-        "velocity_frame": found.velocity_frame,
-        "notes": (*_still_true(recording.notes), *found.notes, note),
-        "attributes": {**own, **found.attributes, **gaps},
-    }
+    notes = [note for note in recording.notes if not note.startswith(_NO_VELOCITIES)]
+    notes += [*found.notes, f"Velocities ({found.velocity_frame} frame) from {path}: {how}."]
+    changes: dict[str, Any] = {"twist": twist, "velocity_frame": found.velocity_frame}
     if found.T_cam_imu is not None:
-        changes |= _with_extrinsics(recording, found.T_cam_imu, changes["notes"])
-    return replace(recording, **changes)
+        changes["T_cam_imu"] = found.T_cam_imu
+        notes.append("The body is the IMU of the recording that the velocities are from, and T_cam_imu is its own.")
+        if recording.truth is not None:
+            T_old_new = se3.inverse(recording.T_cam_imu) @ found.T_cam_imu
+            T_world_imu = recording.truth.T_world_imu @ T_old_new
+            changes["truth"] = replace(recording.truth, T_world_imu=T_world_imu, motion=None)
+    return replace(recording, notes=tuple(notes), attributes={**own, **found.attributes, **gaps}, **changes)
 
 
 def read_velocities(path: Path, lateral: Lateral = "corrected") -> VelocitySamples:
@@ -133,7 +134,7 @@ def resample(found: VelocitySamples, time_s: Array) -> tuple[Array, str]:
     nearest = np.clip(np.searchsorted(stamps, time_s - 0.5 * sample_s), 0, len(stamps) - 1)
     if (np.abs(stamps[nearest] - time_s) <= _SAME * sample_s).all():
         return twist[nearest], "frames and samples have the same stamps"
-    return _linear(stamps, twist, time_s), "linear between samples"
+    return linear(stamps, twist, time_s), "linear between samples"
 
 
 def is_covered(stamps: Array, time_s: Array) -> BoolArray:
@@ -169,17 +170,12 @@ def _require_cover(found: VelocitySamples, time_s: Array) -> None:
             )
 
 
-def _linear(stamps: Array, twist: Array, time_s: Array) -> Array:
-    return np.column_stack([np.interp(time_s, stamps, column) for column in twist.T])
-
-
 def _means(stamps: Array, twist: Array, time_s: Array) -> Array:
     """Return the mean over each interval of the line through the samples; for the first frame, its value there."""
     grid = np.union1d(stamps, time_s)
-    values = _linear(stamps, twist, grid)
+    values = linear(stamps, twist, grid)
     area = 0.5 * (values[1:] + values[:-1]) * np.diff(grid)[:, None]
-    total = np.vstack([np.zeros(6), np.cumsum(area, axis=0)])[np.searchsorted(grid, time_s)]
-    means = np.diff(total, axis=0) / np.diff(time_s)[:, None]
+    means = means_between(time_s, grid, np.vstack([np.zeros(6), area]))
     return np.vstack([values[np.searchsorted(grid, time_s[0])], means])
 
 
@@ -190,18 +186,3 @@ def _interpolated_attributes(found: VelocitySamples, time_s: Array, twist: Array
     gaps = known_intervals(found.attributes, found.twist)
     sample = np.clip(np.searchsorted(found.time_s, time_s - _SAME), 0, len(found.time_s) - 1)
     return attributes_of_part({"interpolated": "0-0"}, gaps[sample])
-
-
-def _still_true(notes: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the notes that remain true once a recording has velocities."""
-    return tuple(note for note in notes if not note.startswith(NO_VELOCITIES))
-
-
-def _with_extrinsics(recording: Sequence | ImageRecording, T_cam_imu: Array, notes: tuple[str, ...]) -> dict[str, Any]:
-    """Return the changes to a recording whose body becomes the IMU of another."""
-    note = "The body is the IMU of the recording that the velocities are from, and T_cam_imu is its own."
-    changes: dict[str, Any] = {"T_cam_imu": T_cam_imu, "notes": (*notes, note)}
-    if recording.truth is not None:
-        T_old_new = se3.inverse(recording.T_cam_imu) @ T_cam_imu
-        changes["truth"] = replace(recording.truth, T_world_imu=recording.truth.T_world_imu @ T_old_new, motion=None)
-    return changes

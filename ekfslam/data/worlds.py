@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.observations import Observations
 from ekfslam.errors import ConfigError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera, project
@@ -71,9 +72,8 @@ class Recording:
         for key, value in numbers_of(self).items():
             most = _MOST.get(key, _LARGEST)
             if not (value == 0 or _LEAST <= value <= most):
-                raise ConfigError(
-                    f"{self.name}: {key} must be finite and not negative: 0, or {_LEAST:g} to {most:g}, found {value}"
-                )
+                allowed = f"finite and not negative: 0, or {_LEAST:g} to {most:g}"
+                raise ConfigError(f"{self.name}: {key} must be {allowed}, found {value}")
             if value == 0 and key in ("frame_period_s", "radius_m"):
                 raise ConfigError(f"{self.name}: {key} must be positive")
         if self.frames < 2:
@@ -132,7 +132,7 @@ def visible(world: Recording, view: View, T_imu_world: Array, points_m: Array) -
 
 
 def tracked(world: Recording, frame: IntArray, point: IntArray, points: int, rng: np.random.Generator) -> BoolArray:
-    """Return which visible observations (K,) the tracker makes: those of preferred points, some of which it loses."""
+    """Return whether (K,) the tracker makes a visible observation: it prefers some points, and loses some."""
     preference = rng.random(points)
     order = np.lexsort((preference[point], frame))
     place = np.arange(len(order)) - np.searchsorted(frame[order], frame[order])
@@ -142,7 +142,7 @@ def tracked(world: Recording, frame: IntArray, point: IntArray, points: int, rng
 
 
 def _inside(view: View, pixels: Array) -> BoolArray:
-    """Return which pixels (K, 4) are within both images, off the border."""
+    """Return whether (K,) pixels (K, 4) are within both images, off the border."""
     limit = np.tile(view.size_px, 2) - 1 - BORDER_PX
     return np.asarray(((pixels >= BORDER_PX) & (pixels <= limit)).all(axis=-1))
 
@@ -180,3 +180,27 @@ def track_ids(frame: IntArray, point: IntArray) -> IntArray:
     ids = np.empty(len(order), dtype=np.int64)
     ids[order] = rank[np.cumsum(starts) - 1]
     return ids
+
+
+def observed(
+    world: Recording, view: View, T_imu_world: Array, points_m: Array, rng: np.random.Generator, ids_last: bool
+) -> tuple[Observations, IntArray, Array]:
+    """Return what the tracker sees of points (N, 3), ids (M,) of all landmarks seen, and their positions (M, 3).
+
+    Ids that do not last are those of unbroken tracks.
+    """
+    frame, point, pixels = visible(world, view, T_imu_world, points_m)
+    kept = tracked(world, frame, point, len(points_m), rng)
+    frame, point, pixels = frame[kept], point[kept], pixels[kept]
+    pixels = pixels + outlier_shifts(world, view, pixels, rng) + world.sigma_px * rng.standard_normal(pixels.shape)
+    landmark = point if ids_last else track_ids(frame, point)
+    ids, an_observation = np.unique(landmark, return_index=True)
+    return Observations(frame, landmark, pixels), ids, points_m[point[an_observation]]
+
+
+def stamps(world: Recording, rng: np.random.Generator) -> Array:
+    """Return stamps (T,) from 0, with a jitter too small to swap two of them."""
+    limit = world.frame_period_s / 3
+    jitter = np.clip(world.stamp_jitter_s * rng.standard_normal(world.frames), -limit, limit)
+    time_s = world.frame_period_s * np.arange(world.frames) + jitter
+    return time_s - time_s[0]

@@ -14,15 +14,9 @@ _BUCKETS = 12, 4  # columns and rows of the grid over which new features are spr
 
 
 def corners(image: Image, free: BoolArray, spacing: int) -> Array:
-    """Return corners by the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994).
+    """Return corners (n, 2), strongest first, ``spacing`` px apart at pixels that are ``free`` (height, width).
 
-    Args:
-        image: Image to search.
-        free: (height, width) whether a feature may be at a pixel.
-        spacing: Least distance between features, px.
-
-    Returns:
-        Pixels (n, 2), strongest first.
+    Their strength is the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994).
     """
     cv2 = opencv()
     response = cv2.cornerMinEigenVal(image, _BLOCK)
@@ -42,18 +36,10 @@ def without(free: BoolArray, pixels: Array, radius: int) -> BoolArray:
 
 
 def spread(found: Array, taken: Array, size: tuple[int, int], wanted: int) -> IntArray:
-    """Choose features so that they cover the image evenly.
+    """Return indices of at most ``wanted`` features so that they cover an image of this width and height evenly.
 
-    Every cell of a grid gives its best, then its second best, and so on. Features that it has already count first.
-
-    Args:
-        found: (n, 2) pixels, best first.
-        taken: (m, 2) pixels of the present features.
-        size: Width and height of the image.
-        wanted: Number of features to choose.
-
-    Returns:
-        Indices of at most ``wanted`` features, in the order of choice.
+    Every cell of a grid gives its best of ``found`` (n, 2), then its second best, and so on. Features that are already
+    there, ``taken`` (m, 2), count first.
     """
     cell, count = _cells(found, size), np.bincount(_cells(taken, size), minlength=np.prod(_BUCKETS))
     order = np.argsort(cell, kind="stable")
@@ -64,10 +50,8 @@ def spread(found: Array, taken: Array, size: tuple[int, int], wanted: int) -> In
 
 
 def _cells(pixels: Array, size: tuple[int, int]) -> IntArray:
-    """Return the number of the cell of the grid that each pixel (n, 2) is in."""
-    column, row = (
-        np.clip((pixels[:, i] * _BUCKETS[i] / size[i]).astype(np.int64), 0, _BUCKETS[i] - 1) for i in range(2)
-    )
+    """Return the cell of the grid (n,) of each pixel (n, 2)."""
+    column, row = np.clip((pixels * _BUCKETS / size).astype(np.int64), 0, np.array(_BUCKETS) - 1).T
     return column * _BUCKETS[1] + row
 
 

@@ -62,16 +62,10 @@ def follow(
     guess: tuple[Array, Array],
     levels: int,
 ) -> Followed:
-    """Find features in the next pair of images.
+    """Find features in the next pair of images, given guesses of their pixels (n, 2) in both.
 
-    Optical flow finds them in the left image, and the way back. The right feature is sought at its prediction, shifted
-    by the error of the left one, on the finest level. Both are then aligned to the patches of first sight.
-
-    Args:
-        features: Features in the images before.
-        before, now: Left and right images.
-        guess: (n, 2) predicted pixels in both images now.
-        levels: Levels of the pyramid in the left image.
+    Optical flow finds them in the left image, on some levels of the pyramid, and the way back. The right feature is
+    sought at its guess, shifted by the error of the left one. Both are then aligned to the patches of first sight.
     """
     found, is_found = flow(before[0], now[0], features.left, guess[0], levels)
     back = returns(before[0], now[0], features.left, found)

@@ -14,18 +14,10 @@ _RETURN_PX = 0.7  # largest error of a feature that is tracked there and back
 
 
 def flow(source: Image, target: Image, pixels: Array, guess: Array, levels: int) -> tuple[Array, BoolArray]:
-    """Track features by pyramidal Lucas-Kanade.
+    """Return features (n, 2) of the source in the target, by pyramidal Lucas-Kanade, and whether (n,) they were found.
 
-    J.-Y. Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001.
-
-    Args:
-        source, target: First and second image.
-        pixels: (n, 2) features of the source.
-        guess: (n, 2) predicted pixels in the target.
-        levels: Levels of the pyramid; 1 is the image alone.
-
-    Returns:
-        Pixels (n, 2) in the target, and whether they were found (n,).
+    J.-Y. Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001. ``guess`` (n, 2) are predicted
+    pixels; one level of the pyramid is the image alone.
     """
     if not len(pixels):
         return np.empty((0, 2)), np.empty(0, dtype=bool)

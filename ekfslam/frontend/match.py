@@ -20,16 +20,9 @@ _LEAST_MARGIN = 0.03  # to the second best
 def match_along_row(
     left: Image, right: Image, pixels: Array, row_offset: Array, config: FrontEndConfig
 ) -> tuple[Array, BoolArray]:
-    """Find features of the left image in the right one, to a pixel.
+    """Return features (n, 2) of the left image in the right one, to a pixel, and whether (n,) they are good and unique.
 
-    Args:
-        left, right: Rectified images.
-        pixels: (n, 2) features of the left one.
-        row_offset: (n,) ``vL - vR`` due to the rotation of the right camera.
-        config: Settings.
-
-    Returns:
-        Pixels (n, 2), and whether (n,) the match is good and unique.
+    ``row_offset`` (n,) is ``vL - vR`` due to the rotation of the right camera.
     """
     cv2, half = opencv(), _PATCH // 2
     found, good = pixels.copy(), np.zeros(len(pixels), dtype=bool)
@@ -45,30 +38,22 @@ def match_along_row(
         best = int(np.argmax(score))
         found[i, 0] += begin + best + half - u
         found[i, 1] -= row_offset[i]
-        good[i] = score[best] >= _LEAST_SCORE and score[best] > _second(score, best, half) + _LEAST_MARGIN
+        # The second best overlaps less than half of the best one.
+        second = max(score[: max(best - half, 0)].max(initial=-1.0), score[best + half + 1 :].max(initial=-1.0))
+        good[i] = score[best] >= _LEAST_SCORE and score[best] > second + _LEAST_MARGIN
     return found, good
-
-
-def _second(score: Array, best: int, half: int) -> float:
-    """Return the largest score of patches that overlap less than half of the best one; -1 if there is none."""
-    return float(max(score[: max(best - half, 0)].max(initial=-1.0), score[best + half + 1 :].max(initial=-1.0)))
 
 
 def first_pairs(
     left: Image, right: Image, pixels: Array, row_offset: Array, config: FrontEndConfig
 ) -> tuple[Array, BoolArray]:
-    """Find features of the left image in the right one, to a fraction of a pixel; see `match_along_row`.
-
-    Returns:
-        Pixels (n, 2), and whether (n,) they can be trusted.
-    """
+    """Return `match_along_row` to a fraction of a pixel, and whether (n,) the pixels can be trusted."""
     found, good = match_along_row(left, right, pixels, row_offset, config)
     refined = found.copy()
     refined[good], status = flow(left, right, pixels[good], found[good], 1)
     good[good] = status
     good[good] = returns(left, right, pixels[good], refined[good])
-    size = (right.shape[1], right.shape[0])
-    good &= inside(refined, size, SIDE // 2)
+    good &= inside(refined, (right.shape[1], right.shape[0]), SIDE // 2)
     good &= np.abs(pixels[:, 1] - refined[:, 1] - row_offset) < ROW_LIMIT_PX
     good &= pixels[:, 0] - refined[:, 0] >= config.min_disparity
     return refined, good

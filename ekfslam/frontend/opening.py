@@ -31,8 +31,7 @@ def open_sequence(
         extrinsics: Reading of ``cam_T_imu`` of an .npz recording, see `read_ece276a`. All other formats store
             ``T_cam_imu`` unambiguously and accept only ``corrected``.
         lateral: Reading of the lateral velocity of KITTI (.npz, .mat, drive folder), which is stored with the wrong
-            sign, see `with_lateral`. All other formats accept only ``corrected``. The attribute ``lateral`` says what
-            was done.
+            sign, see `with_lateral`. All other formats accept only ``corrected``.
         truth: File or folder of true poses to use in place of the recording's own, see `attach_truth`.
         velocities: File or recording with velocities to use in place of the recording's own, see `attach_velocities`.
         velocity_frame: Frame of these velocities.
@@ -52,8 +51,7 @@ def open_sequence(
     if isinstance(recording, ImageRecording):
         if velocities is not None:
             recording = attach_velocities(recording, velocities, velocity_frame=velocity_frame, lateral=lateral)
-        sequence, _ = track(recording, front_end)
-        return sequence if truth is None else attach_truth(sequence, Path(truth))
+        recording, velocities = track(recording, front_end)[0], None
     if truth is not None:
         recording = attach_truth(recording, Path(truth))
     if velocities is None:

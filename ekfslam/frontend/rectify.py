@@ -38,10 +38,8 @@ class Rectification:
         if self.maps is None:
             return left, right
         cv2 = opencv()
-        left, right = (
-            cv2.remap(image, m[..., 0], m[..., 1], cv2.INTER_LINEAR)
-            for image, m in zip((left, right), self.maps, strict=True)
-        )
+        pairs = zip((left, right), self.maps, strict=True)
+        left, right = (cv2.remap(image, m[..., 0], m[..., 1], cv2.INTER_LINEAR) for image, m in pairs)
         return left, right
 
 
@@ -62,9 +60,8 @@ def rectification(calibration: PairCalibration) -> Rectification:
     R_rectified_left = _rectifying_rotation(T)
     rotations = R_rectified_left, R_rectified_left @ T[:3, :3].T
     f = float(np.mean([K[i, i] for K in (K_left, K_right) for i in (0, 1)]))
-    sides = list(
-        zip((K_left, K_right), (calibration.distortion_left, calibration.distortion_right), rotations, strict=True)
-    )
+    lenses = calibration.distortion_left, calibration.distortion_right
+    sides = list(zip((K_left, K_right), lenses, rotations, strict=True))
     width, height = calibration.size
     middle = np.mean([_direction_of_middle(K, lens, R, calibration.size) for K, lens, R in sides], axis=0)
     cu, cv = 0.5 * (np.array([width, height]) - 1.0) - f * middle
@@ -73,12 +70,8 @@ def rectification(calibration: PairCalibration) -> Rectification:
     rays = np.stack([(u - cu) / f, (v - cv) / f, np.ones(u.shape)], axis=-1)
     left, right = (_image(rays @ R, K, lens) for K, lens, R in sides)
     maps = left.astype(np.float32), right.astype(np.float32)
-    return Rectification(
-        camera,
-        se3.transform(R_rectified_left, np.zeros(3)),
-        maps,
-        (_shows(maps[0], calibration.size), _shows(maps[1], calibration.size)),
-    )
+    valid = _shows(maps[0], calibration.size), _shows(maps[1], calibration.size)
+    return Rectification(camera, se3.transform(R_rectified_left, np.zeros(3)), maps, valid)
 
 
 def _rectifying_rotation(T_right_left: Array) -> Array:

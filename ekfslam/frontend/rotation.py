@@ -26,17 +26,7 @@ _LEAST_POINTS = 10
 
 
 class RightRotation:
-    """Estimate of the rotation and its covariance.
-
-    Args:
-        camera: Rectified pair.
-        std_rad: Prior standard deviation of each axis.
-        pixel_std: Standard deviation of one pixel.
-
-    Attributes:
-        rows: (3,) a, b, c, px.
-        yaw: Estimate of yaw, px.
-    """
+    """Estimate of the rotation, from a prior ``std_rad`` of each axis and the standard deviation of one pixel."""
 
     def __init__(self, camera: StereoCamera, std_rad: float, pixel_std: float) -> None:
         self._camera, self._std = camera, pixel_std
@@ -46,6 +36,7 @@ class RightRotation:
 
     @property
     def rows(self) -> Array:
+        """(3,) a, b, c, px."""
         return np.asarray(np.linalg.solve(self._rows_information, self._rows_vector), dtype=float)
 
     @property
@@ -77,12 +68,7 @@ class RightRotation:
         self._rows_vector = self._rows_vector + (J * weight[:, None]).T @ (r + J @ self.rows)
 
     def observe_motion(self, alignment: Alignment, before_px: Array, now_px: Array) -> None:
-        """Update yaw from two frames, with their motion eliminated.
-
-        Args:
-            alignment: Alignment of the rows of the two frames, corrected by the present estimate.
-            before_px, now_px: (n, 3) rows of the two frames.
-        """
+        """Update yaw from the rows (n, 3) of two frames and their alignment, with the motion eliminated."""
         if len(before_px) < _LEAST_POINTS:
             return
         by_yaw = np.zeros((len(before_px), 3, 1))

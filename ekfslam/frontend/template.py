@@ -63,12 +63,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Templates(Rows):
-    """Patches of one image.
-
-    Args:
-        patch: (n, side^2) pixels of first sight.
-        solver: (n, 4, side^2) least squares solution for ``(g d_u, g d_v, g, b)``.
-    """
+    """Patches (n, side^2) of one image, and their solutions (n, 4, side^2) for ``(g d_u, g d_v, g, b)``."""
 
     patch: Float32Array
     solver: Float32Array
@@ -88,23 +83,16 @@ class Templates(Rows):
         return Templates(T, solver.astype(np.float32))
 
     def align(self, image: Float32Array, pixels: Array, scale: Array) -> tuple[Array, Array]:
-        """Align features to their patches.
+        """Align features from predicted pixels (n, 2) to their patches, scaled (n,) relative to first sight.
 
-        Args:
-            image: Image to search.
-            pixels: (n, 2) predicted pixels.
-            scale: (n,) size relative to first sight.
-
-        Returns:
-            Pixels (n, 2), and the weighted correlation (n,) with the patch there; -1 where alignment fails.
+        Return their pixels (n, 2), and the weighted correlation (n,) with the patch there; -1 if alignment fails.
         """
-        side = SIDE
         pixels, active = pixels.copy(), np.arange(len(pixels))
         fails = np.zeros(len(pixels), dtype=bool)
         for _ in range(_ITERATIONS):
             if not len(active):
                 break
-            seen = sample(image, pixels[active], scale[active], side)
+            seen = sample(image, pixels[active], scale[active], SIDE)
             solution = (self.solver[active] @ seen[..., None])[..., 0]
             gain = solution[:, 2]
             is_odd = gain < 0.1
@@ -112,7 +100,7 @@ class Templates(Rows):
             pixels[active] -= scale[active, None] * np.where(is_odd[:, None], 0.0, step)
             fails[active[is_odd]] = True
             active = active[~is_odd & (np.abs(step).max(axis=1) > _CONVERGED_PX)]
-        score = correlation(self.patch, sample(image, pixels, scale, side), weights(side))
+        score = correlation(self.patch, sample(image, pixels, scale, SIDE), weights(SIDE))
         return pixels, np.where(fails, -1.0, score)
 
 

@@ -20,6 +20,7 @@ from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.progress import progress
 
+_ANGLES = ("pitch", "yaw", "roll")
 _SETTLING = 30  # first frames, whose pixels are corrected by the rotation known after them
 
 
@@ -30,12 +31,12 @@ class TrackReport:
     Args:
         frames, tracks, observations: Their numbers.
         lengths: (tracks,) number of observations of each track.
-        losses: Number of tracks that ended, by reason; the others reached the last frame.
+        losses: Number of tracks that ended before the last frame, by reason.
         withheld: Number of observations that did not move as the rig, and were not reported.
         refused: Number of corners without a match in the right image.
         single: Number of tracks that only one frame saw, which are left out.
-        rotation_px: (T, 3) estimated pitch, yaw and roll of the right camera after each frame, times the focal length.
-        rotation_std_px: (T, 3) standard deviations of ``rotation_px``.
+        rotation_px, rotation_std_px: (T, 3) estimated pitch, yaw and roll of the right camera after each frame, times
+            the focal length, and their standard deviations.
     """
 
     frames: int
@@ -51,16 +52,12 @@ class TrackReport:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The statistics, one sentence each."""
+        """Statistics, one sentence each."""
         shortest, middle, longest = np.percentile(self.lengths, (10, 50, 90))
         ended = sum(self.losses.values())
         reasons = ", ".join(f"{reason} {count}" for reason, count in sorted(self.losses.items(), key=lambda p: -p[1]))
-        found = " ".join(
-            f"{name} {value:+.2f} +- {std:.2f} px,"
-            for name, value, std in zip(
-                ("pitch", "yaw", "roll"), self.rotation_px[-1], self.rotation_std_px[-1], strict=True
-            )
-        )
+        last = zip(_ANGLES, self.rotation_px[-1], self.rotation_std_px[-1], strict=True)
+        found = " ".join(f"{name} {value:+.2f} +- {std:.2f} px," for name, value, std in last)
         return (
             f"{self.tracks} tracks with {self.observations} observations, "
             f"{self.observations / self.frames:.0f} a frame; "
@@ -73,15 +70,9 @@ class TrackReport:
 
 
 def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tuple[Sequence, TrackReport]:
-    """Track features through the images of a recording.
+    """Return a recording with tracks of its images, and statistics of the features; the camera is the rectified pair.
 
-    Args:
-        recording: Images, calibration, and velocities if there are any.
-        config: Settings; None for the defaults.
-
-    Returns:
-        The recording with tracks, whose camera is the rectified pair, and statistics of the features. If velocities
-        were not measured, the attributes contain `WITHOUT_VELOCITIES`.
+    If velocities were not measured, the attributes contain `WITHOUT_VELOCITIES`.
 
     Raises:
         MissingPackageError: OpenCV is not installed.
@@ -119,44 +110,12 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
         rotation,
         std,
     )
-    return _sequence(recording, rectified.camera, T_cam_imu, observations, report, config), report
-
-
-def _observations(seen: list[Seen], rotation: Array, camera: StereoCamera) -> tuple[Observations, int]:
-    """Return corrected observations, and the number of tracks that only one frame saw.
-
-    The correction is causal except at the start: the first frames use the rotation known after them.
-
-    Args:
-        seen: Features of each frame.
-        rotation: (T, 3) rotation of the right camera, estimated after each frame, px.
-        camera: Rectified pair.
-    """
-    frame = np.repeat(np.arange(len(seen)), [len(found.id) for found in seen])
-    ids = np.concatenate([found.id for found in seen])
-    left, right = (np.vstack([getattr(found, side) for found in seen]) for side in ("left", "right"))
-    used = np.maximum(frame, min(_SETTLING, len(seen) - 1))
-    pixels = np.hstack([left, right + correction(camera, rotation[used], right)])
-    _, inverse, counts = np.unique(ids, return_inverse=True, return_counts=True)
-    twice = counts[inverse] > 1
-    return Observations(frame[twice], ids[twice], pixels[twice]), int((~twice).sum())
-
-
-def _sequence(
-    recording: ImageRecording,
-    camera: StereoCamera,
-    T_cam_imu: Array,
-    observations: Observations,
-    report: TrackReport,
-    config: FrontEndConfig,
-) -> Sequence:
-    """Return the recording with tracks instead of images."""
-    return Sequence(
+    sequence = Sequence(
         name=recording.name,
         source=recording.source,
         time_s=recording.time_s,
         twist=recording.twist,
-        camera=camera,
+        camera=rectified.camera,
         T_cam_imu=T_cam_imu,
         observations=observations,
         truth=recording.truth,
@@ -169,6 +128,22 @@ def _sequence(
             **_account(config, report),
         },
     )
+    return sequence, report
+
+
+def _observations(seen: list[Seen], rotation: Array, camera: StereoCamera) -> tuple[Observations, int]:
+    """Return observations, corrected by rotations (T, 3) px, and the number of tracks that only one frame saw.
+
+    The correction is causal except at the start: the first frames use the rotation known after them.
+    """
+    frame = np.repeat(np.arange(len(seen)), [len(found.id) for found in seen])
+    ids = np.concatenate([found.id for found in seen])
+    left, right = (np.vstack([getattr(found, side) for found in seen]) for side in ("left", "right"))
+    used = np.maximum(frame, min(_SETTLING, len(seen) - 1))
+    pixels = np.hstack([left, right + correction(camera, rotation[used], right)])
+    _, inverse, counts = np.unique(ids, return_inverse=True, return_counts=True)
+    twice = counts[inverse] > 1
+    return Observations(frame[twice], ids[twice], pixels[twice]), int((~twice).sum())
 
 
 def _prediction(recording: ImageRecording, T_cam_imu: Array, k: int) -> Array | None:
@@ -186,8 +161,6 @@ def _account(config: FrontEndConfig, report: TrackReport) -> dict[str, str | int
         for setting in dataclasses.fields(config)
         if getattr(config, setting.name) != setting.default
     }
-    yaw, std = report.rotation_px[-1], report.rotation_std_px[-1]
-    names = ("pitch", "yaw", "roll")
-    found = {f"right_camera_{name}_px": float(value) for name, value in zip(names, yaw, strict=True)}
-    found |= {f"right_camera_{name}_std_px": float(value) for name, value in zip(names, std, strict=True)}
+    kinds = {"px": report.rotation_px[-1], "std_px": report.rotation_std_px[-1]}
+    found = {f"right_camera_{n}_{kind}": float(v[i]) for kind, v in kinds.items() for i, n in enumerate(_ANGLES)}
     return {**CHECKED_TRACKS, **settings, **found}

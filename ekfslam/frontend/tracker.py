@@ -40,12 +40,9 @@ _L, _R = slice(0, 2), slice(2, 4)  # pixels of the left and the right image
 
 @dataclass(frozen=True)
 class Seen:
-    """Reported features of a frame.
+    """Reported features of a frame: ids (n,) of tracks, and pixels (n, 2) without the correction of the right camera.
 
-    Args:
-        id: (n,) ids of the tracks.
-        left, right: (n, 2) pixels, without the correction of the right camera.
-        T_now_before: (4, 4) motion of the camera since the frame before; None in the first frame.
+    ``T_now_before`` (4, 4) is the motion of the camera since the frame before; None in the first frame.
     """
 
     id: IntArray
@@ -57,16 +54,9 @@ class Seen:
 class Tracker:
     """Tracker of features in rectified stereo images, frame after frame.
 
-    Args:
-        camera: Rectified pair.
-        config: Settings.
-        valid: Masks (height, width) of the pixels of the left and the right image that show something; None for all.
-
-    Attributes:
-        rotation: Present estimate of the right camera's rotation.
-        losses: Number of ended tracks, by reason.
-        withheld: Number of observations that did not move as the rig, and were not reported.
-        refused: Number of corners that did not become features.
+    ``valid`` are masks (height, width) of the pixels of both images that show something; None for all. Attributes are
+    the present estimate ``rotation`` of the right camera, and the counts ``losses``, ``withheld`` and ``refused`` of
+    `TrackReport`.
     """
 
     def __init__(
@@ -86,11 +76,9 @@ class Tracker:
         self._generator = np.random.default_rng(config.seed)
 
     def track(self, left: Image, right: Image, prediction: Array | None = None) -> Seen:
-        """Track the next frame.
+        """Track the next frame of rectified images; a prediction is the motion ``T_now_before`` of the camera.
 
-        Args:
-            left, right: Rectified images (height, width).
-            prediction: (4, 4) motion ``T_now_before`` of the camera; None takes that of the last interval.
+        Without prediction the motion of the last interval serves.
         """
         motion, reported = None, np.empty(0, dtype=bool)
         guess = self._motion if prediction is None else prediction
@@ -137,14 +125,13 @@ class Tracker:
 
     def _tested(self, now: Followed, size: tuple[int, int]) -> tuple[BoolArray, dict[str, int]]:
         """Return whether (n,) features pass all tests, and the number that fails each test first."""
-        is_alike = (now.score_left >= _LEAST_SCORES[0]) & (now.score_right >= _LEAST_SCORES[1])
         row_error = now.left[:, 1] - now.right[:, 1] - self.rotation.row_offset(now.left)
         tests = {
             "out of the left image": self._inside(0, now.left, size, SIDE // 2),
             "out of the right image": self._inside(1, now.right, size, SIDE // 2),
             "not found": now.is_found,
             "not found back": now.is_found_back,
-            "unlike first sight": is_alike,
+            "unlike first sight": (now.score_left >= _LEAST_SCORES[0]) & (now.score_right >= _LEAST_SCORES[1]),
             "aligned too far": now.shift <= _LARGEST_SHIFT_PX,
             "rows differ": np.abs(row_error) < ROW_LIMIT_PX,
             "no depth": now.left[:, 0] - now.right[:, 0] >= DEPTH_FROM_PX,
@@ -239,21 +226,13 @@ class Tracker:
         """Return the mask (height, width) of pixels at which features may be."""
         if self._valid is not None:
             return self._valid[0]
-        margin = _BORDER
         free = np.zeros(image.shape, dtype=bool)
-        free[margin:-margin, margin:-margin] = True
+        free[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
         return free
 
     def _started(self, left_px: Array, right_px: Array, left: Image, right: Image) -> Features:
-        count = len(left_px)
+        count, disparity = len(left_px), left_px[:, 0] - right_px[:, 0]
         ids = self._next_id + np.arange(count)
         self._next_id += count
-        return Features(
-            ids,
-            left_px,
-            right_px,
-            left_px[:, 0] - right_px[:, 0],
-            np.zeros(count, dtype=np.int64),
-            Templates.of(left.astype(np.float32), left_px),
-            Templates.of(right.astype(np.float32), right_px),
-        )
+        patches = (Templates.of(i.astype(np.float32), px) for i, px in ((left, left_px), (right, right_px)))
+        return Features(ids, left_px, right_px, disparity, np.zeros(count, dtype=np.int64), *patches)

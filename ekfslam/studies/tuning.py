@@ -19,8 +19,7 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import Config, NoiseConfig, NoiseModel
 from ekfslam.data.hygiene import clean_tracks
-from ekfslam.data.sequence import Noise, Observations, Sequence
-from ekfslam.data.stretches import cut
+from ekfslam.data.sequence import Noise, Observations, Sequence, cut
 from ekfslam.errors import EmptyTracksError
 from ekfslam.evaluation.tables import MISSING, document, markdown_table
 from ekfslam.filters.dead_reckoning import dead_reckon

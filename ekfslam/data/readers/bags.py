@@ -161,20 +161,16 @@ def _pair(bag: Bag) -> tuple[Camera, Camera]:
         sides = {space: connection for space, connection in streams.items() if "left" in space or "right" in space}
         streams = sides if len(sides) == 2 else streams
     if len(streams) != 2:
-        raise CalibrationError(
-            f"expected two cameras with images and CameraInfo, found {len(streams)}: "
-            f"{printable(', '.join(connection.topic for connection in streams.values())) or 'none'}",
-            field="topics",
-        )
+        found = printable(", ".join(connection.topic for connection in streams.values())) or "none"
+        message = f"expected two cameras with images and CameraInfo, found {len(streams)}: {found}"
+        raise CalibrationError(message, field="topics")
     cameras = [Camera(streams[space], _first(bag, infos[space])) for space in sorted(streams)]
     shifts = [camera.projection[0, 3] for camera in cameras]
     rights = [i for i, shift in enumerate(shifts) if shift < 0]
     if len(rights) != 1 or shifts[1 - rights[0]] != 0:
-        raise CalibrationError(
-            f"expected P[0, 3] to be 0 for the left camera and negative for the right one, found {shifts[0]:g} and "
-            f"{shifts[1]:g}",
-            field="CameraInfo",
-        )
+        found = f"{shifts[0]:g} and {shifts[1]:g}"
+        message = f"expected P[0, 3] to be 0 for the left camera and negative for the right one, found {found}"
+        raise CalibrationError(message, field="CameraInfo")
     return cameras[1 - rights[0]], cameras[rights[0]]
 
 
@@ -238,10 +234,8 @@ def _lens(camera: Camera) -> Distortion:
     if not any(coefficients):
         return Distortion()
     if name not in _MODELS:
-        raise CalibrationError(
-            f"expected the distortion {', '.join(_MODELS)}, found {printable(name)!r}",
-            field=f"CameraInfo of {printable(camera.topic)}",
-        )
+        message = f"expected the distortion {', '.join(_MODELS)}, found {printable(name)!r}"
+        raise CalibrationError(message, field=f"CameraInfo of {printable(camera.topic)}")
     return Distortion(_MODELS[name], coefficients)
 
 

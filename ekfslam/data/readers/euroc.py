@@ -47,10 +47,7 @@ _MODELS: dict[str, DistortionModel] = {
 
 
 def open_euroc(folder: Path) -> ImageRecording:
-    """Open the images of a recording, its calibration, and its truth if there is any.
-
-    The body is that of ``sensor.yaml``, the IMU. It gives angular rates and accelerations, but no linear velocity.
-    """
+    """Open the images of a recording, its calibration, and its truth if there is any; the body is the IMU."""
     mav = _mav(folder) or folder
     (left_ns, left), (right_ns, right) = (_images(mav / name) for name in CAMERAS)
     in_left, in_right, notes = pair_stamps(left_ns, right_ns, str(mav))
@@ -69,7 +66,7 @@ def open_euroc(folder: Path) -> ImageRecording:
         load=PairFiles([left[i] for i in in_left], [right[i] for i in in_right], calibration.size),
         T_cam_imu=T_cam_imu,
         truth=truth if truth is not None and len(truth.frame) else None,
-        notes=("There are no velocities, only those of turning and accelerations of the IMU.", *notes),
+        notes=("There are no velocities: the IMU gives angular rates and accelerations only.", *notes),
         attributes={
             "reader": IMAGES.name,
             "checksum_sha256": checksum(*(mav / name / "data.csv" for name in CAMERAS), *read),
@@ -135,9 +132,8 @@ def _camera(read: Calibration, prefix: str, coefficients: str) -> tuple[Array, t
         fu, fv, cu, cv = read.numbers(f"{prefix}intrinsics", 4)
         width, height = read.numbers(f"{prefix}resolution", 2)
         if not (float(width).is_integer() and float(height).is_integer()):
-            raise CalibrationError(
-                f"expected whole numbers of pixels, found {width:g} and {height:g}", field=f"{prefix}resolution"
-            )
+            message = f"expected whole numbers of pixels, found {width:g} and {height:g}"
+            raise CalibrationError(message, field=f"{prefix}resolution")
         if (name := read.word(f"{prefix}distortion_model")) not in _MODELS:
             raise CalibrationError(f"expected {', '.join(_MODELS)}, found {name!r}", field=f"{prefix}distortion_model")
         values = () if _MODELS[name] == "none" else tuple(read.numbers(f"{prefix}{coefficients}").tolist())
@@ -166,10 +162,9 @@ def find_euroc_truth(folder: Path) -> Path | None:
 
 
 def read_euroc(path: Path) -> Poses:
-    """Read the poses of a csv, or of the csv that belongs to a folder.
+    """Read the poses ``T_R_S`` of the body (the IMU) in the reference frame, from a csv or the csv of a folder.
 
-    The csv holds the pose ``T_R_S`` of the body (the IMU) in the reference frame, stamped in ns, quaternions w first.
-    Its header must name these eight columns; further ones (velocity and biases) are not read.
+    They are stamped in ns, with quaternions w first. The header must name these eight columns; others are not read.
     """
     path = find_euroc_truth(path) or path
     lines = read_lines(path, f"expected {TRUTH.expected}")

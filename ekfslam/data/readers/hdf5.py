@@ -1,19 +1,9 @@
 """ekfslam's own HDF5 form of a `Sequence`, and its groups for others (the result archive) to embed.
 
-    /                   attributes format, format_version
-    /sequence           attributes name, velocity_frame; time (T,), twist (T, 6), T_cam_imu (4, 4), notes (n,) of text
-        inputs/<i>      every input but velocities at the stamps of the frames, which are ``twist``:
-                        Velocities: attribute frame; time (N,), twist (N, 6), interpolated (N,)
-                        InertialSamples: `InertialNoise` as attributes, if stated; time (N,), gyro (N, 3), accel (N, 3)
-        camera          attributes fu_px, fv_px, cu_px, cv_px, baseline_m
-        attributes      the further facts, as attributes
-        observations    frame (K,), landmark (K,), pixels (K, 4)
-        noise           twist_std (6,), pixel_std (4,), the rest of `Noise` as attributes; only if noise is stated
-    /truth              frame (F,), T_world_imu (F, 4, 4), `TruthNoise` as attributes if any; only if there is truth;
-        motion          the fields of `TrueMotion`; only if they are known
-        landmarks       id (M,), position (M, 3)
-
-See `ekfslam.hdf5` for what all files have in common.
+Data sets are those that the metadata of `Sequence`, `Observations`, `Noise`, `Truth`, `TrueMotion` and of inputs state:
+in ``/sequence`` with its groups ``observations``, ``noise`` and ``inputs/<i>``, and in ``/truth`` with ``motion``.
+Velocities at the stamps of the frames are ``sequence/twist``. The other fields of noise, the camera and the attributes
+of the sequence are attributes of groups. See `ekfslam.hdf5` for the common part of all files.
 """
 
 from __future__ import annotations
@@ -27,10 +17,8 @@ import h5py
 import numpy as np
 
 from ekfslam import files, hdf5
-from ekfslam.arrays import Array
 from ekfslam.data.checks import spelled_as_in
 from ekfslam.data.inputs import InertialNoise, InertialSamples, Input, Velocities
-from ekfslam.data.interpolation import interpolated_intervals
 from ekfslam.data.noise import Noise
 from ekfslam.data.observations import Observations, TrueMotion, Truth
 from ekfslam.data.readers.fields import require, require_numbers
@@ -50,21 +38,19 @@ def _below(place: str, layout: Layout) -> Layout:
 
 _TWIST = Item("twist", "twist", ("T", "u"), "m/s (columns 0-2), rad/s (columns 3-5)", "imu")
 _SEQUENCE = _below("sequence", (*layout_of(Sequence), _TWIST))
-_OBSERVATIONS = _below("sequence/observations", layout_of(Observations))
+OBSERVATIONS_LAYOUT = _below("sequence/observations", layout_of(Observations))
 _NOISE = _below("sequence/noise", layout_of(Noise))
 _TRUTH = _below("truth", layout_of(Truth))
 _MOTION = _below("truth/motion", layout_of(TrueMotion))
 _INPUTS: dict[str, type[Input]] = {kind.__name__: kind for kind in (Velocities, InertialSamples)}
 _NOTES = (Item("sequence/notes", "notes", ("n",), "text", "none", TEXTS),)
 LAYOUT = (*_SEQUENCE, *_NOTES, *_NOISE, *_TRUTH)  # of an archive, too
-OBSERVATIONS_LAYOUT = _OBSERVATIONS
 _CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
-# Noise that older files may state and no model uses any more, with the values that said nothing.
+# Noise that older files may state and no model uses any more, with the values that mean none.
 OLD_NOISE = {"drift": 0.0, "bearing_drift_rad": 0.0, "misalignment_rad": 0.0, "track_memory": 1.0, "margin": 1.0}
 _TRUTH_NOISE = "noise_"  # before the names of attributes
-_NOISE_FIELDS = tuple(item.field for item in _NOISE)
 
-_PARTS = {"": _SEQUENCE, "observations.": _OBSERVATIONS, "noise.": _NOISE, "truth.": _TRUTH}
+_PARTS = {"": _SEQUENCE, "observations.": OBSERVATIONS_LAYOUT, "noise.": _NOISE, "truth.": _TRUTH}
 SPELLING = {part + item.field: item.name for part, layout in _PARTS.items() for item in layout} | {
     "K": "sequence/camera@fu_px, fv_px",
     "baseline": "sequence/camera@baseline_m",
@@ -116,26 +102,24 @@ def read_sequence(path: str | Path) -> Sequence:
 
 
 def write_sequence_group(h5file: h5py.Group, sequence: Any, observations: Observations | None = None) -> None:
-    """Write ``/sequence`` below an open file or group; the truth is left to `write_truth_group`.
+    """Write ``/sequence`` without truth: a `Sequence`, or a record with its fields except the observations.
 
-    Args:
-        h5file: File or group to write below.
-        sequence: A `Sequence`, or a record with the same fields except the observations.
-        observations: Observations to write; None writes neither observations nor inputs.
+    Inputs are written with observations only.
     """
     hdf5.write_fields(h5file, _SEQUENCE, sequence)
     hdf5.write_fields(h5file, _NOTES, {"notes": hdf5.fixed_texts(sequence.notes)})
     group = h5file["sequence"]
-    names = {"name": sequence.name, "velocity_frame": sequence.velocity_frame}
-    hdf5.write_attributes(group, names)
+    hdf5.write_attributes(group, {"name": sequence.name, "velocity_frame": sequence.velocity_frame})
     hdf5.write_attributes(group.create_group("camera"), {name: getattr(sequence.camera, name) for name in _CAMERA})
     hdf5.write_attributes(group.create_group("attributes"), sequence.attributes)
     if sequence.noise is not None:
         hdf5.write_fields(h5file, _NOISE, sequence.noise)
         further = noise_attributes(sequence.noise)
-        hdf5.write_attributes(group["noise"], {key: further[key] for key in further if key not in _NOISE_FIELDS})
+        for item in _NOISE:
+            further.pop(item.field)
+        hdf5.write_attributes(group["noise"], further)
     if observations is not None:
-        hdf5.write_fields(h5file, _OBSERVATIONS, observations)
+        hdf5.write_fields(h5file, OBSERVATIONS_LAYOUT, observations)
         _write_inputs(group.create_group("inputs"), sequence)
 
 
@@ -177,13 +161,13 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
                 if further.get(name, nothing) != nothing
             )
         if "sequence/observations" in h5file:
-            found["observations"] = Observations(**_read(h5file, _OBSERVATIONS))
+            found["observations"] = Observations(**_read(h5file, OBSERVATIONS_LAYOUT))
         return found
 
 
 def _write_inputs(group: h5py.Group, sequence: Sequence) -> None:
     for i, samples in enumerate(sequence.inputs):
-        if samples is sequence.velocities and _is_twist(samples, sequence.time_s):
+        if samples is sequence.velocities and samples.is_twist_of(sequence.time_s):
             hdf5.write_attributes(group, {"twist": i})
             continue
         part = group.create_group(str(i))
@@ -191,12 +175,6 @@ def _write_inputs(group: h5py.Group, sequence: Sequence) -> None:
         hdf5.write_attributes(part, {"kind": type(samples).__name__})
         if isinstance(samples, InertialSamples) and samples.noise is not None:
             hdf5.write_attributes(part, vars(samples.noise))
-
-
-def _is_twist(samples: Velocities, time_s: Array) -> bool:
-    """Return whether ``twist`` and ``velocity_frame`` alone restore the samples."""
-    found = samples.interpolated == interpolated_intervals(samples.twist)
-    return samples.has_stamps(time_s) and bool(found.all())
 
 
 def _read_inputs(group: h5py.Group, found: Mapping[str, Any]) -> dict[str, Any]:
@@ -225,9 +203,8 @@ def write_truth_group(h5file: h5py.Group, truth: Truth) -> None:
     if truth.motion is not None:
         hdf5.write_fields(h5file, _MOTION, truth.motion)
     if truth.noise is not None:
-        hdf5.write_attributes(
-            h5file["truth"], {_TRUTH_NOISE + name: value for name, value in vars(truth.noise).items()}
-        )
+        noise = {_TRUTH_NOISE + name: value for name, value in vars(truth.noise).items()}
+        hdf5.write_attributes(h5file["truth"], noise)
 
 
 def read_truth_group(h5file: h5py.Group, source: str) -> Truth:

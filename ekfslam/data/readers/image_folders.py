@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.data.checks import spelled_as_in
+from ekfslam.data.checks import require_finite, require_shape, spelled_as_in
 from ekfslam.data.images import Distortion, ImageRecording, PairCalibration, side_by_side
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
 from ekfslam.data.readers.pictures import PairFiles, images_in, size_of
@@ -86,10 +86,9 @@ def _parsed(file: Path) -> dict[str, Any]:
     tables = [("", values, _KEYS | _TABLES)]
     tables += [(f"{name}.", values[name], _CAMERA_KEYS) for name in _TABLES if isinstance(values.get(name), dict)]
     for prefix, table, known in tables:
-        for key in table:
-            if key not in known:
-                message = f"unknown key; known: {', '.join(sorted(known))}"
-                raise CalibrationError(message, source=str(file), field=prefix + key)
+        for key in table.keys() - known:
+            message = f"unknown key; known: {', '.join(sorted(known))}"
+            raise CalibrationError(message, source=str(file), field=prefix + key)
     return values
 
 
@@ -137,10 +136,8 @@ def _camera(values: dict[str, Any], name: str) -> tuple[Array, Distortion]:
     fu, fv, cu, cv = _numbers(table.get("intrinsics"), (4,), f"{name}.intrinsics")
     model = table.get("distortion_model", "none")
     coefficients = _numbers(table.get("distortion", []), (None,), f"{name}.distortion")
-    try:
+    with spelled_as_in("", {"distortion": f"{name}.distortion"}):
         lens = Distortion(model, tuple(coefficients.tolist()))
-    except DataError as error:
-        raise CalibrationError(error.message, field=f"{name}.{error.field}") from None
     return np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]]), lens
 
 
@@ -148,12 +145,11 @@ def _numbers(value: Any, shape: tuple[int | None, ...], name: str) -> Array:
     """Return an array of finite numbers of a shape; None stands for any length."""
     try:
         found = np.asarray(value, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        found = np.full(1, np.nan)
-    fits = len(found.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, found.shape, strict=True))
-    if not fits or not np.isfinite(found).all():
+        require_shape(found, shape, name)
+        require_finite(found, name)
+    except (TypeError, ValueError, OverflowError, DataError):
         wanted = " x ".join("n" if n is None else str(n) for n in shape)
-        raise CalibrationError(f"expected {wanted} numbers", field=name)
+        raise CalibrationError(f"expected {wanted} numbers", field=name) from None
     return found
 
 

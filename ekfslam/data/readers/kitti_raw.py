@@ -1,15 +1,9 @@
 """Drive folders of KITTI raw: velocities, calibration, 6-DoF truth, and rectified stereo images if there are any.
 
 Geiger, Lenz, Stiller, Urtasun, *Vision meets Robotics: The KITTI Dataset* (IJRR 2013), and the readme of its
-development kit. A drive is laid out as::
-
-    2011_09_30/
-      calib_imu_to_velo.txt  calib_velo_to_cam.txt  calib_cam_to_cam.txt     (may also be in the drive folder)
-      2011_09_30_drive_0027_sync/
-        oxts/timestamps.txt                      a line for each packet; empty if the recorder lost the stamp
-        oxts/data/0000000000.txt ...             packets of 30 numbers from the GPS/INS unit, see `oxts`
-        image_00/timestamps.txt                  of the left gray camera
-        image_00/data/0000000000.png ...         and image_01 (gray), or image_02 and image_03 (colour)
+development kit. A drive has ``oxts/timestamps.txt`` and packets ``oxts/data/0000000000.txt ...`` (see `oxts`), and
+``image_00/timestamps.txt``, ``image_00/data/0000000000.png ...`` and ``image_01`` (gray), or ``image_02`` and
+``image_03`` (colour). The three files ``calib_*.txt`` are in it or in the folder above.
 """
 
 from __future__ import annotations
@@ -132,9 +126,8 @@ def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> Image
     drive = open_kitti_raw(folder, pair, lateral).sequence()
     first, last = min(found[0]), max(found[0])
     if last >= len(drive):
-        raise LostDataError(
-            f"image {last:010d} has no packet, there are {len(drive)}", source=str(folder), field="oxts"
-        )
+        message = f"image {last:010d} has no packet, there are {len(drive)}"
+        raise LostDataError(message, source=str(folder), field="oxts")
     left, right = (in_order(images, range(first, last + 1)) for images in found)
     part, size = drive[first : last + 1], size_of(left[0])
     K = np.vstack([part.camera.matrix[:2, :3], [0.0, 0.0, 1.0]])
@@ -158,7 +151,7 @@ def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> Image
 
 
 def read_calibration(folder: Path, pair: Pair = "gray") -> tuple[StereoCamera, Array, tuple[Path, ...]]:
-    """Return intrinsics of a rectified stereo pair, ``T_cam_imu`` (4, 4) of its left camera, and the files read.
+    """Return a rectified stereo pair, ``T_cam_imu`` (4, 4) of its left camera, and the files read.
 
     ``P_rect = K [I, t]`` of the left camera moves its origin by t from that of the rectified camera 00, so
 

@@ -136,17 +136,15 @@ def gray_of(message: Any, source: str, size: tuple[int, int]) -> Image:
         return decode_gray(bytes(message.data), source, size)
     height, width, encoding = int(message.height), int(message.width), printable(str(message.encoding))
     if (width, height) != size:
-        raise CalibrationError(
-            f"the image has {width} x {height} pixels, its CameraInfo {size[0]} x {size[1]}", source=source
-        )
+        message = f"the image has {width} x {height} pixels, its CameraInfo {size[0]} x {size[1]}"
+        raise CalibrationError(message, source=source)
     if encoding not in _BYTES:
         raise UnknownFormatError(f"{source}: images encoded as {encoding!r} are not read; known: {', '.join(_BYTES)}")
     size_of_pixel = _BYTES[encoding]
     step, data = int(message.step), np.asarray(message.data, dtype=np.uint8)
     if step < width * size_of_pixel or len(data) != height * step:
-        raise UnknownFormatError(
-            f"{source}: {len(data)} bytes and steps of {step} are no {width} x {height} {encoding}"
-        )
+        found = f"{len(data)} bytes and steps of {step}"
+        raise UnknownFormatError(f"{source}: {found} are no {width} x {height} {encoding}")
     rows = data.reshape(height, step)[:, : width * size_of_pixel].reshape(height, width, size_of_pixel)
     if size_of_pixel <= 2:  # 16 bits: their upper eight
         return np.ascontiguousarray(rows[..., 0 if size_of_pixel == 1 or message.is_bigendian else 1])

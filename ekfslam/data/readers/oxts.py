@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.inputs import linear
 from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.readers.fields import LATERAL_NOTES, with_lateral
 from ekfslam.data.readers.registry import Lateral
@@ -192,8 +193,7 @@ def _interpolated(values: Array, known: BoolArray) -> Array:
     """Return the columns of (T, n) values, linear over the rows that are not known."""
     if known.all():
         return values
-    row = np.arange(len(values))
-    return np.column_stack([np.interp(row, row[known], column[known]) for column in values.T])
+    return linear(np.flatnonzero(known), values[known], np.arange(len(values)))
 
 
 def _check_steps(time_s: Array, stamp_ns: IntArray, stamped: BoolArray, path: Path) -> tuple[str, ...]:

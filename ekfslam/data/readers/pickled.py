@@ -27,16 +27,15 @@ MAGIC = b"\x93NUMPY"
 _MOST_OPERATIONS = 2_000_000  # a recording has some hundred, and ten for every image
 _KINDS = "biuf"
 
-# Operations of pickled arrays and containers.
-_NUMBERS = {"NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG1", "FLOAT", "BINFLOAT"}
-_TEXTS = {"STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"}
-_BYTES = {"BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"}
-_LISTS = {"EMPTY_LIST", "APPEND", "APPENDS", "LIST", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"}
-_DICTIONARIES = {"EMPTY_DICT", "DICT", "SETITEM", "SETITEMS"}
-_MEMO = {"GET", "BINGET", "LONG_BINGET", "PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"}
-_CALLS = {"GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD"}
-_FRAMES = {"PROTO", "FRAME", "STOP", "MARK", "POP", "POP_MARK"}
-_ALLOWED = _NUMBERS | _TEXTS | _BYTES | _LISTS | _DICTIONARIES | _MEMO | _CALLS | _FRAMES
+# Operations of pickled arrays and containers: numbers, texts, bytes, lists, dictionaries, memo, calls, frames.
+_OPERATIONS = """
+NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG1 FLOAT BINFLOAT
+STRING BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8
+BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 EMPTY_LIST APPEND APPENDS LIST EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3
+EMPTY_DICT DICT SETITEM SETITEMS GET BINGET LONG_BINGET PUT BINPUT LONG_BINPUT MEMOIZE
+GLOBAL STACK_GLOBAL REDUCE BUILD PROTO FRAME STOP MARK POP POP_MARK
+"""
+_ALLOWED = frozenset(_OPERATIONS.split())
 
 
 def read_pickled(path: Path, expected: str) -> dict[str, Any]:
@@ -46,16 +45,18 @@ def read_pickled(path: Path, expected: str) -> dict[str, Any]:
         content = path.read_bytes()
         Budget(str(path)).take(len(content), "the pickled dictionary")
         stream = io.BytesIO(content)
-        begin = _header_end(stream)
+        shape, dtype = npy_header(stream)
+        if dtype != np.dtype(object) or shape != ():
+            raise pickle.UnpicklingError(f"an array of {dtype} with the shape {shape} instead of a dictionary")
+        begin = stream.tell()
         _inspect(stream)
         stream.seek(begin)
-        found = _plain(_Restricted(stream).load())
+        found = _unboxed(_Restricted(stream).load())
     except (ValueError, EOFError, OverflowError) as error:
         raise UnknownFormatError(f"{path}: damaged .npy file ({_clean(error)}); {expected}") from None
     except (TypeError, AttributeError, KeyError, IndexError):  # their words are about Python's objects, not the file
-        raise UnknownFormatError(
-            f"{path}: damaged .npy file (its operations do not fit together); {expected}"
-        ) from None
+        message = f"{path}: damaged .npy file (its operations do not fit together); {expected}"
+        raise UnknownFormatError(message) from None
     except pickle.UnpicklingError as error:
         raise UnknownFormatError(f"{path}: {_clean(error)}; {expected}") from None
     if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
@@ -76,14 +77,6 @@ def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     except (KeyError, SyntaxError, TokenError) as error:  # of older headers NumPy parses the words themselves
         raise ValueError(f"no header of an .npy file ({error})") from None
     return shape, dtype
-
-
-def _header_end(stream: io.BytesIO) -> int:
-    """Return the end of the header of an .npy file, which must announce one object."""
-    shape, dtype = npy_header(stream)
-    if dtype != np.dtype(object) or shape != ():
-        raise pickle.UnpicklingError(f"an array of {dtype} with the shape {shape} instead of a dictionary")
-    return stream.tell()
 
 
 def _inspect(stream: io.BytesIO) -> None:
@@ -208,16 +201,11 @@ class _Restricted(pickle.Unpickler):
         raise pickle.UnpicklingError("the file refers to objects outside of it")
 
 
-def _plain(found: Any) -> Any:
-    """Return a dictionary with its arrays, one level of lists deep."""
-    found = found.value if isinstance(found, _Array) else found
-    if not isinstance(found, dict):
-        return found
-    return {name: _unboxed(value) for name, value in found.items()}
-
-
-def _unboxed(value: Any) -> Any:
+def _unboxed(value: Any, depth: int = 2) -> Any:
+    """Return a value with its arrays: a dictionary, of lists."""
     value = value.value if isinstance(value, _Array) else value
-    if isinstance(value, list | tuple):
-        return [entry.value if isinstance(entry, _Array) else entry for entry in value]
+    if depth and isinstance(value, dict):
+        return {name: _unboxed(entry, depth - 1) for name, entry in value.items()}
+    if depth and isinstance(value, list | tuple):
+        return [_unboxed(entry, depth - 1) for entry in value]
     return value

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,9 +28,7 @@ _DAMAGES = (OSError, ValueError, SyntaxError, UnidentifiedImageError, Pillow.Dec
 def read_gray(path: Path, size: tuple[int, int] | None = None) -> Image:
     """Read an image file as (height, width) uint8. Colours become luma, 16 bits their upper eight.
 
-    Args:
-        path: Image file.
-        size: Required width and height; any by default.
+    ``size`` is the required width and height; any by default.
     """
     require_file(path)
     return decode_gray(path.read_bytes(), str(path), size)
@@ -37,39 +36,36 @@ def read_gray(path: Path, size: tuple[int, int] | None = None) -> Image:
 
 def decode_gray(content: bytes, source: str, size: tuple[int, int] | None = None) -> Image:
     """Return `read_gray` of the bytes of an image file; ``source`` names it in messages."""
-    try:
-        with Pillow.open(io.BytesIO(content), formats=_FORMATS) as image:
-            width, height = image.size
-            Budget(source).take(4 * width * height, "the image")
-            if size is not None and image.size != size:
-                raise CalibrationError(
-                    f"the image has {width} x {height} pixels, the calibration {size[0]} x {size[1]}", source=source
-                )
-            if image.mode.startswith("I"):
-                return np.ascontiguousarray(np.asarray(image, dtype=np.uint32) >> 8, dtype=np.uint8)
-            return np.asarray(image if image.mode == "L" else image.convert("L"))
-    except _DAMAGES as error:
-        raise UnknownFormatError(f"{source}: not a readable image ({error})") from None
+    with _opened(io.BytesIO(content), source) as image:
+        width, height = image.size
+        Budget(source).take(4 * width * height, "the image")
+        if size is not None and image.size != size:
+            message = f"the image has {width} x {height} pixels, the calibration {size[0]} x {size[1]}"
+            raise CalibrationError(message, source=source)
+        if image.mode.startswith("I"):
+            return np.ascontiguousarray(np.asarray(image, dtype=np.uint32) >> 8, dtype=np.uint8)
+        return np.asarray(image if image.mode == "L" else image.convert("L"))
 
 
 def size_of(path: Path) -> tuple[int, int]:
     """Read width and height of an image file from its header alone."""
     require_file(path)
+    with _opened(path, str(path)) as image:
+        return image.size
+
+
+@contextmanager
+def _opened(file: Path | io.BytesIO, source: str) -> Iterator[Pillow.Image]:
     try:
-        with Pillow.open(path, formats=_FORMATS) as image:
-            return image.size
+        with Pillow.open(file, formats=_FORMATS) as image:
+            yield image
     except _DAMAGES as error:
-        raise UnknownFormatError(f"{path}: not a readable image ({error})") from None
+        raise UnknownFormatError(f"{source}: not a readable image ({error})") from None
 
 
 @dataclass(frozen=True)
 class PairFiles:
-    """The function `ImageRecording.load` of image files.
-
-    Args:
-        left, right: Path of each frame's image.
-        size: Required width and height of all images.
-    """
+    """Load pairs of images of one width and height from the files of each frame."""
 
     left: Sequence[Path]
     right: Sequence[Path]
@@ -105,9 +101,8 @@ def in_order(found: dict[int, Path], numbers: range) -> list[Path]:
     if missing is None:
         return [found[number] for number in numbers]
     some = next(iter(found.values()))
-    raise LostDataError(
-        f"image {missing:0{len(some.stem)}d} is missing", source=str(some.parent), field="images", index=missing
-    )
+    message = f"image {missing:0{len(some.stem)}d} is missing"
+    raise LostDataError(message, source=str(some.parent), field="images", index=missing)
 
 
 def pair_stamps(left_ns: IntArray, right_ns: IntArray, source: str) -> tuple[IntArray, IntArray, tuple[str, ...]]:
@@ -117,9 +112,7 @@ def pair_stamps(left_ns: IntArray, right_ns: IntArray, source: str) -> tuple[Int
     right, kept = np.unique(right[left], return_index=True)
     left = left[kept]
     if len(left) < LEAST_PAIRED * max(len(left_ns), len(right_ns)):
-        raise LostDataError(
-            f"only {len(left)} of {len(left_ns)} left and {len(right_ns)} right images have the same stamp",
-            source=source,
-        )
+        message = f"only {len(left)} of {len(left_ns)} left and {len(right_ns)} right images have the same stamp"
+        raise LostDataError(message, source=source)
     alone = len(left_ns) + len(right_ns) - 2 * len(left)
     return left, right, (f"{alone} images without a partner are left out.",) if alone else ()

@@ -101,12 +101,9 @@ def readers(*kinds: Kind) -> tuple[Reader, ...]:
 
 
 def read_as(source: Source, kind: Kind, *arguments: Any) -> Any:
-    """Return what the first suitable reader finds in a source, or None if no reader finds this kind of data there.
+    """Return what the first suitable reader finds in a source; None if no reader finds this kind of data there.
 
-    Args:
-        source: Source to read.
-        kind: Kind of data.
-        arguments: Further arguments of the reader's function.
+    Further arguments are those of the reader's function.
     """
     for reader in readers(kind):
         if reader.recognises(source):

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -18,14 +18,7 @@ from ekfslam.errors import CalibrationError, DataError, LineError, NonFiniteErro
 from ekfslam.limits import require_file
 
 Converters = Mapping[int, Callable[[str], float]]
-
-
-class Where(TypedDict):
-    """Place that a `DataError` names."""
-
-    source: str
-    field: str
-    index: int
+Where = dict[str, Any]  # keyword arguments of a `DataError`
 
 
 def line_of(path: Path, number: int) -> Where:
@@ -35,13 +28,7 @@ def line_of(path: Path, number: int) -> Where:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of numbers in a text file.
-
-    Args:
-        path: Text file.
-        values: (n, columns) numbers, all finite.
-        line: (n,) line of each row.
-    """
+    """Rows of finite numbers (n, columns) in a text file, and their lines (n,)."""
 
     path: Path
     values: Array
@@ -93,15 +80,7 @@ def parse_numbers(
     converters: Converters = MappingProxyType({}),
     error: type[DataError] = LineError,
 ) -> list[float]:
-    """Return the finite numbers of a line, one for each column.
-
-    Args:
-        words: Texts of the numbers.
-        columns: Required number of them.
-        where: Line of the file.
-        converters: Function that converts a word, by column; `float` by default.
-        error: Exception for a malformed line.
-    """
+    """Return the finite numbers of a line, one for each column; ``converters`` replace `float` in some columns."""
     if len(words) != columns:
         raise error(f"{len(words)} values, expected {columns}", **where)
     try:
@@ -127,10 +106,9 @@ def parse_table(
     """Return all rows of numbers; there may be none.
 
     Args:
-        lines: Lines of the file.
-        path: Name of the file in messages.
+        lines, path: Lines of a file, and its name in messages.
         columns: Number of columns; that of the first row by default.
-        used: Number of columns that are read; the others may hold anything. All by default.
+        used: Number of columns that are read; the others may hold anything.
         separator: Separator of columns; blanks by default.
         comment: Beginning of a comment; None if there are none.
         converters, error: See `parse_numbers`.
@@ -150,13 +128,7 @@ def parse_table(
 
 
 def read_keys(path: Path, counts: Mapping[str, int], expected: str) -> dict[str, Array]:
-    """Read the numbers of some keys from lines ``KEY: numbers``; other lines may hold anything.
-
-    Args:
-        path: Text file.
-        counts: Required number of numbers by key.
-        expected: End of the message if this is no text file.
-    """
+    """Read as many numbers of each key as ``counts`` says from lines ``KEY: numbers``; others may hold anything."""
     values: dict[str, Array] = {}
     for number, line in enumerate(read_lines(path, expected), start=1):
         key, _, rest = line.partition(":")
