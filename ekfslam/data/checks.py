@@ -18,7 +18,7 @@ ROTATION_TOLERANCE = 1e-4  # files print rotations with as few as five digits
 
 # No quantity of a recording is larger, in s, m, m/s, rad/s or px: beyond, a square or a product loses all digits.
 LARGEST = 1e12
-LARGEST_VELOCITY, LARGEST_DISTANCE_M = 1e6, 1e9
+LARGEST_VELOCITY, LARGEST_DISTANCE_M, LARGEST_PX = 1e6, 1e9, 1e7
 
 
 def frozen(array: NDArray) -> NDArray:
@@ -55,12 +55,8 @@ def require_rigid(T: Array, name: str, error: type[DataError]) -> None:
     bad = np.argwhere(defect > ROTATION_TOLERANCE)
     if len(bad):
         index = tuple(int(i) for i in bad[0])
-        raise error(
-            f"not a rigid transform: orthogonality defect {defect[index]:.2g}, "
-            f"determinant {np.linalg.det(T[index][:3, :3]):.6g}",
-            field=name,
-            index=_position(index),
-        )
+        found = f"orthogonality defect {defect[index]:.2g}, determinant {np.linalg.det(T[index][:3, :3]):.6g}"
+        raise error(f"not a rigid transform: {found}", field=name, index=_position(index))
 
 
 def _position(index: tuple[int, ...]) -> int | tuple[int, ...] | None:
@@ -102,8 +98,5 @@ def validate_stamps(time_s: Array) -> None:
     if (steps <= 0).any():
         index = int(np.argmax(steps <= 0)) + 1
         kind = "duplicates" if steps[index - 1] == 0 else "is before"
-        raise StampError(
-            f"stamp {time_s[index]:.6f} s {kind} its predecessor {time_s[index - 1]:.6f} s",
-            field="time_s",
-            index=index,
-        )
+        message = f"stamp {time_s[index]:.6f} s {kind} its predecessor {time_s[index - 1]:.6f} s"
+        raise StampError(message, field="time_s", index=index)

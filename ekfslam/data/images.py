@@ -52,18 +52,13 @@ class Distortion:
 
 @dataclass(frozen=True)
 class PairCalibration:
-    """Calibration of two cameras, rectified or not.
+    """Calibration of two cameras, rectified or not; raise a `DataError` if it is impossible.
 
     Args:
         K_left, K_right: (3, 3) intrinsic matrices, px.
-        size: Width and height of the images, px; the same for both.
-        T_right_left: (4, 4) left optical frame to right optical frame; the right camera of a rectified pair is at
-            ``-baseline`` along x.
+        size: Width and height of the images of both, px.
+        T_right_left: (4, 4) left to right optical frame; that of a rectified pair is `side_by_side`.
         distortion_left, distortion_right: Distortion of the lenses.
-
-    Raises:
-        CalibrationError: Intrinsics are singular or mirrored, the size is no size, or the cameras coincide.
-        ExtrinsicsError: ``T_right_left`` is not rigid.
     """
 
     K_left: Array
@@ -118,9 +113,6 @@ class ImageRecording:
             raises `UnknownFormatError` or `DataError`.
         T_cam_imu: (4, 4) IMU to the optical frame of the left camera before rectification.
         twist: (T, 6) measured velocities ``[v; w]``, ``twist[k]`` drives ``(t[k-1], t[k]]``; None if there are none.
-
-    Raises:
-        DataError: A field is malformed; the subclass says how.
     """
 
     name: str

@@ -29,9 +29,6 @@ class Velocities:
         twist: (N, 6) velocities ``[v; w]``, m/s and rad/s.
         frame: ``imu``, or ``level``: x forward, y left, z up over level ground, see `motion.level_frame`.
         interpolated: (N,) whether a sample was interpolated rather than measured. By default found from the samples.
-
-    Raises:
-        DataError: An array is malformed; the subclass says how.
     """
 
     time_s: Array = field(metadata=stored("sample", "s", "clock of the recording", name="time"))
@@ -65,11 +62,7 @@ class Velocities:
         return _part(self, min(begin, len(self.time_s) - 1), last + 1)
 
     def interval(self, begin_s: float, end_s: float) -> Interval:
-        """Return the samples that drive a time, each with the duration for which it does.
-
-        Raises:
-            LostDataError: The samples begin after this time or end before it, by more than a step.
-        """
+        """Return the samples that drive a time, with durations; `LostDataError` if it is a step or more outside."""
         part = self.between(begin_s, end_s)
         _require_cover(self, begin_s, end_s)
         ends = np.append(part.time_s[:-1], end_s)
@@ -161,9 +154,6 @@ class InertialSamples:
         gyro_rad_s: (N, 3) angular rates.
         accel_m_s2: (N, 3) specific forces: +9.81 along up at rest.
         noise: Densities; None if the source states none.
-
-    Raises:
-        DataError: An array is malformed; the subclass says how.
     """
 
     time_s: Array = field(metadata=stored("sample", "s", "clock of the recording", name="time"))
@@ -204,10 +194,7 @@ class InertialSamples:
     def interval(self, begin_s: float, end_s: float) -> Interval:
         """Return the mean samples ``[w; f]`` between successive stamps, linear to both ends of the interval.
 
-        It is a gap if samples are missing: a step between two of them is more than three times the median.
-
-        Raises:
-            LostDataError: The samples begin after this time or end before it, by more than a step.
+        It is a gap if a step is more than three times the median. Raise `LostDataError` as `Velocities.interval`.
         """
         part = self.between(begin_s, end_s)
         _require_cover(self, begin_s, end_s)
@@ -239,12 +226,9 @@ def validate_inputs(inputs: tuple[Input, ...], time_s: Array) -> None:
         if not isinstance(samples, Velocities | InertialSamples):
             raise DataError(f"expected Velocities or InertialSamples, found {type(samples).__name__}", field="inputs")
         if samples.time_s[-1] < time_s[0] or samples.time_s[0] > time_s[-1]:
-            raise ShapeError(
-                f"samples from {samples.time_s[0]:.3f} to {samples.time_s[-1]:.3f} s have no time in common with "
-                f"frames from {time_s[0]:.3f} to {time_s[-1]:.3f} s",
-                field="inputs",
-                index=i,
-            )
+            spans = [f"from {each[0]:.3f} to {each[-1]:.3f} s" for each in (samples.time_s, time_s)]
+            message = f"samples {spans[0]} have no time in common with frames {spans[1]}"
+            raise ShapeError(message, field="inputs", index=i)
 
 
 def _median_step(time_s: Array) -> float:

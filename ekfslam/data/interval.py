@@ -11,11 +11,9 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 
 @dataclass(frozen=True)
 class Interval:
-    """The inputs that lead from one frame to the next.
+    """The inputs that lead from one frame to the next, in pieces with one row of inputs each.
 
-    The interval is cut into pieces, and each piece has one row of inputs. Their meaning is that of the process
-    (`ekfslam.models.process`): velocities ``[v; w]``, constant during the piece, or the mean inertial sample ``[w; f]``
-    of the piece.
+    A row is a velocity ``[v; w]``, constant during the piece, or the mean inertial sample ``[w; f]`` of the piece.
 
     Args:
         tau_s: Duration.

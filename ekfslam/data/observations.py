@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.checks import (
     LARGEST_DISTANCE_M,
+    LARGEST_PX,
     LARGEST_VELOCITY,
     frozen,
     require_finite,
@@ -18,7 +19,14 @@ from ekfslam.data.checks import (
     require_shape,
 )
 from ekfslam.data.truth_noise import TruthNoise
-from ekfslam.errors import DataError, EmptyTracksError, NonFiniteError, ShapeError, TruthError
+from ekfslam.errors import (
+    DataError,
+    DuplicateObservationError,
+    EmptyTracksError,
+    NonFiniteError,
+    ShapeError,
+    TruthError,
+)
 from ekfslam.shown import count
 from ekfslam.stored import COUNTS, stored
 
@@ -203,13 +211,30 @@ def truth_of(T_world_imu: Array, frames: int) -> Truth | None:
     return Truth(known, T_world_imu[known]) if len(known) else None
 
 
-def require_ids(landmark: IntArray, name: str) -> None:
-    """Raise `ShapeError` for ids of landmarks that are negative or too large."""
+def _require_ids(landmark: IntArray, name: str) -> None:
     wrong = (landmark < 0) | (landmark > LARGEST_ID)
     if wrong.any():
         index = int(np.argmax(wrong))
         message = f"landmark ids must be from 0 to {LARGEST_ID}, found {landmark[index]}"
         raise ShapeError(message, field=name, index=index)
+
+
+def validate_observations(observations: Observations, frames: int) -> None:
+    """Raise a `DataError` for observations of unknown frames or ids, twice in a frame, or none at all."""
+    if len(observations) == 0:
+        raise EmptyTracksError("there is not one observation", field="observations")
+    require_finite(observations.pixels_px, "observations.pixels_px", LARGEST_PX)
+    outside = (observations.frame < 0) | (observations.frame >= frames)
+    if outside.any():
+        index = int(np.argmax(outside))
+        message = f"frame {observations.frame[index]} does not exist, there are {frames}"
+        raise ShapeError(message, field="observations.frame", index=index)
+    _require_ids(observations.landmark, "observations.landmark")
+    twice = (np.diff(observations.frame) == 0) & (np.diff(observations.landmark) == 0)
+    if twice.any():
+        index = int(np.argmax(twice)) + 1
+        message = f"landmark {observations.landmark[index]} is observed twice in frame {observations.frame[index]}"
+        raise DuplicateObservationError(message, field="observations", index=index)
 
 
 def validate_truth(truth: Truth, frames: int) -> None:
@@ -228,7 +253,7 @@ def validate_truth(truth: Truth, frames: int) -> None:
     if np.shape(truth.position_m) != (len(truth.landmark), 3):
         message = f"{len(truth.landmark)} landmarks but positions of shape {np.shape(truth.position_m)}"
         raise TruthError(message, field="truth.position_m")
-    require_ids(truth.landmark, "truth.landmark")
+    _require_ids(truth.landmark, "truth.landmark")
     require_finite(truth.position_m, "truth.position_m", LARGEST_DISTANCE_M)
     for name, value in vars(truth.noise).items() if truth.noise is not None else ():
         if not (np.isfinite(value) and value >= 0):

@@ -1,7 +1,6 @@
-"""What every reader produces and every filter consumes: one validated recording.
+"""The validated recording that every reader returns and every filter takes.
 
-A `Sequence` cannot exist in a malformed state: its constructor checks every field and raises a `DataError` subclass
-that names source, field and index.
+The constructor of `Sequence` checks every field and raises a `DataError` that names source, field and index.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, BoolArray
-from ekfslam.data.checks import checked_pose, frozen, require_finite, spelled_as_in, validate_stamps
+from ekfslam.data.checks import LARGEST_PX, checked_pose, frozen, require_finite, spelled_as_in, validate_stamps
 from ekfslam.data.inputs import InertialSamples, Input, Velocities, VelocityFrame, validate_inputs
 from ekfslam.data.interpolation import INTERPOLATED, attributes_of_part, known_intervals
 from ekfslam.data.interval import Interval
@@ -24,14 +23,12 @@ from ekfslam.data.observations import (
     Truth,
     numbers,
     observations_of,
-    require_ids,
     truth_of,
+    validate_observations,
     validate_truth,
 )
 from ekfslam.errors import (
     CalibrationError,
-    DuplicateObservationError,
-    EmptyTracksError,
     ExtrinsicsError,
     LostDataError,
     ShapeError,
@@ -41,8 +38,6 @@ from ekfslam.geometry.camera import T_CAM_BODY, StereoCamera
 from ekfslam.names import printable
 from ekfslam.shown import Card, Shown, count, figure
 from ekfslam.stored import stored
-
-_LARGEST_PX = 1e7
 
 # Attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
@@ -61,23 +56,21 @@ LEVEL_VELOCITIES_NOTE = (
 class Sequence(Shown):
     """One recording of a stereo rig, with velocities or inertial samples of its body.
 
-    ``twist`` and ``velocity_frame`` are short for an input `Velocities` at the stamps of the frames. They also serve
-    ``dataclasses.replace(sequence, twist=...)``, which replaces the velocities among the inputs.
-
     Args:
-        name: Short name, used for folders and titles; what cannot be printed is written out (``\\x1b``).
-        source: File or built-in world it came from, used in error messages.
+        name: Short name for folders and titles; characters that cannot be printed are escaped (``\\x1b``).
+        source: File or built-in world, named in error messages.
         time_s: (T,) strictly increasing stamps.
         camera: Stereo intrinsics.
         T_cam_imu: (4, 4) extrinsics, IMU to left optical frame; made rigid to rounding, as files print few digits.
-        observations: Flat stereo observations; none only where the attributes have `WITHOUT_TRACKS`.
+        observations: Stereo observations; none only if the attributes contain `WITHOUT_TRACKS`.
         truth: Ground truth, if there is any.
-        noise: Noise as stated by the source, if it states any.
+        noise: Noise that the source states, if it states any.
         inputs: Velocities and inertial samples, at any rate and from any number of sources.
-        twist: (T, 6) velocities ``[v; w]``; ``twist[k]`` drives ``(t[k-1], t[k]]``. None keeps those of ``inputs``.
+        twist: (T, 6) velocities ``[v; w]``, short for an input `Velocities` at the stamps of the frames;
+            ``twist[k]`` drives ``(t[k-1], t[k]]``. It replaces the velocities among the inputs; None keeps them.
         velocity_frame: Frame of the velocities, see `Velocities`. None keeps it, and is ``imu`` for a new ``twist``.
-        notes: What the reader found and did about it, one sentence each.
-        attributes: Further facts to keep with every result (seed, checksum, simulation parameters).
+        notes: Findings and repairs of the reader, one sentence each.
+        attributes: Further facts that every result keeps (seed, checksum, simulation parameters).
     """
 
     name: str
@@ -122,7 +115,7 @@ class Sequence(Shown):
             validate_camera(camera)
             object.__setattr__(self, "T_cam_imu", checked_pose(T_cam_imu, "T_cam_imu"))
             if len(observations) or self.attributes.get("tracks") != WITHOUT_TRACKS["tracks"]:
-                _validate_observations(observations, len(self))
+                validate_observations(observations, len(self))
             if truth is not None:
                 validate_truth(truth, len(self))
             if noise is not None:
@@ -148,9 +141,7 @@ class Sequence(Shown):
     def __getitem__(self, frames: slice) -> Sequence:
         """Return a stretch of successive frames, ``sequence[100:300]``, as a recording whose frames count from 0.
 
-        Raises:
-            ShapeError: Not a slice, or one that skips frames or has none.
-            EmptyTracksError: No landmark is seen in these frames.
+        Raise `ShapeError` for anything but a slice of some frames, `EmptyTracksError` if they see no landmark.
         """
         if not isinstance(frames, slice) or frames.step not in (None, 1):
             raise ShapeError("only a stretch of successive frames can be taken, such as sequence[100:300]")
@@ -242,7 +233,7 @@ class Sequence(Shown):
 
     @cached_property
     def twist(self) -> Array:
-        """(T, 6) velocities ``[v; w]``; ``twist[k]`` drives ``(t[k-1], t[k]]``. Zero if there are none."""
+        """Velocities (T, 6) ``[v; w]``; ``twist[k]`` drives ``(t[k-1], t[k]]``. Zero if there are none."""
         velocities = self.velocities
         return frozen(np.zeros((len(self), 6)) if velocities is None else velocities.mean(self.time_s))
 
@@ -315,7 +306,7 @@ def _camera_pose(T_cam_imu: ArrayLike | None, is_optional: bool) -> Array:
 def validate_camera(camera: StereoCamera) -> None:
     """Raise `NonFiniteError` or `CalibrationError` for unusable intrinsics or baseline."""
     values = np.array([camera.fu_px, camera.fv_px, camera.cu_px, camera.cv_px, camera.baseline_m])
-    require_finite(values, "camera (fu, fv, cu, cv, baseline)", _LARGEST_PX)
+    require_finite(values, "camera (fu, fv, cu, cv, baseline)", LARGEST_PX)
     if camera.fu_px <= 0 or camera.fv_px <= 0:
         message = f"intrinsic matrix K is singular or mirrored: fu {camera.fu_px:g}, fv {camera.fv_px:g}"
         raise CalibrationError(message, field="K")
@@ -326,10 +317,7 @@ def validate_camera(camera: StereoCamera) -> None:
 def _with_twist(
     sequence: Sequence, inputs: tuple[Input, ...], twist: ArrayLike | None, frame: VelocityFrame | None
 ) -> tuple[Input, ...]:
-    """Return the inputs with the velocities ``twist`` (T, 6) in place of theirs, or with theirs in another frame.
-
-    Velocities of 0 that the attributes state as never measured are none at all.
-    """
+    """Return the inputs with the velocities ``twist`` (T, 6) in place of theirs, or with theirs in another frame."""
     if twist is None:
         if frame is None:
             return inputs
@@ -337,26 +325,10 @@ def _with_twist(
     others = tuple(samples for samples in inputs if not isinstance(samples, Velocities))
     frames: list[VelocityFrame] = [samples.frame for samples in inputs if isinstance(samples, Velocities)]
     velocities = Velocities(sequence.time_s, np.asarray(twist, dtype=float), frame or (*frames, "imu")[0])
+    # Velocities of 0 that were never measured are none at all.
     if WITHOUT_VELOCITIES.items() <= sequence.attributes.items() and not velocities.twist.any():
         return others
     return (velocities, *others)
-
-
-def _validate_observations(observations: Observations, frames: int) -> None:
-    if len(observations) == 0:
-        raise EmptyTracksError("there is not one observation", field="observations")
-    require_finite(observations.pixels_px, "observations.pixels_px", _LARGEST_PX)
-    outside = (observations.frame < 0) | (observations.frame >= frames)
-    if outside.any():
-        index = int(np.argmax(outside))
-        message = f"frame {observations.frame[index]} does not exist, there are {frames}"
-        raise ShapeError(message, field="observations.frame", index=index)
-    require_ids(observations.landmark, "observations.landmark")
-    twice = (np.diff(observations.frame) == 0) & (np.diff(observations.landmark) == 0)
-    if twice.any():
-        index = int(np.argmax(twice)) + 1
-        message = f"landmark {observations.landmark[index]} is observed twice in frame {observations.frame[index]}"
-        raise DuplicateObservationError(message, field="observations", index=index)
 
 
 def stretch(text: str) -> slice:

@@ -43,9 +43,9 @@ def attach_velocities(
 
     Args:
         recording: Recording without velocities, or with others.
-        path: Text (see this module) or another recording.
+        path: Text file (see `readers.velocity_text`) or another recording.
         velocity_frame: Frame of the velocities; by default that of the file, or ``imu`` if it states none.
-        lateral: How to take the lateral velocity of KITTI, see `ekfslam.open_sequence`.
+        lateral: Reading of the lateral velocity of KITTI, see `ekfslam.open_sequence`.
 
     Raises:
         ConfigError: There is no such frame.
@@ -152,22 +152,15 @@ def _require_cover(found: VelocitySamples, time_s: Array) -> None:
     stamps = found.time_s
     outside = ~is_covered(stamps, time_s)
     if outside.any():
-        first = int(np.argmax(outside))
-        raise LostDataError(
-            f"{int(outside.sum())} of {len(time_s)} frames lie outside of the samples from {stamps[0]:.3f} to "
-            f"{stamps[-1]:.3f} s; the first is frame {first} at {time_s[first]:.3f} s",
-            source=found.source,
-        )
+        first, span = int(np.argmax(outside)), f"{stamps[0]:.3f} to {stamps[-1]:.3f} s"
+        message = f"{int(outside.sum())} of {len(time_s)} frames lie outside of the samples from {span}; the first is"
+        raise LostDataError(f"{message} frame {first} at {time_s[first]:.3f} s", source=found.source)
     reach_s = _step(stamps, time_s)
     for k in np.flatnonzero(np.diff(stamps) > max(MAX_GAP_S, 2.0 * reach_s)):
         within = (time_s > stamps[k]) & (time_s < stamps[k + 1])
         if within.any():
-            raise LostDataError(
-                f"samples have a gap of {stamps[k + 1] - stamps[k]:.3f} s, with {int(within.sum())} frames in it",
-                source=found.source,
-                field="time",
-                index=int(k) + 1,
-            )
+            gap = f"samples have a gap of {stamps[k + 1] - stamps[k]:.3f} s, with {int(within.sum())} frames in it"
+            raise LostDataError(gap, source=found.source, field="time", index=int(k) + 1)
 
 
 def _means(stamps: Array, twist: Array, time_s: Array) -> Array:

@@ -140,11 +140,8 @@ def camera_of(K: Array, baseline_m: float) -> StereoCamera:
     wrong = np.argwhere(pinhole != K)
     if len(wrong):
         index = tuple(int(i) for i in wrong[0])
-        raise CalibrationError(
-            f"found {K[index]:g}, but only [[fu, 0, cu], [0, fv, cv], [0, 0, 1]] without skew is supported",
-            field="K",
-            index=index,
-        )
+        message = f"found {K[index]:g}, but only [[fu, 0, cu], [0, fv, cv], [0, 0, 1]] without skew is supported"
+        raise CalibrationError(message, field="K", index=index)
     camera = StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), baseline_m)
     validate_camera(camera)
     return camera

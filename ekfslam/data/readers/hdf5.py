@@ -9,7 +9,7 @@ of the sequence are attributes of groups. See `ekfslam.hdf5` for the common part
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ from ekfslam.data.checks import spelled_as_in
 from ekfslam.data.inputs import InertialNoise, InertialSamples, Input, Velocities
 from ekfslam.data.noise import Noise
 from ekfslam.data.observations import Observations, TrueMotion, Truth
-from ekfslam.data.readers.fields import require, require_numbers
+from ekfslam.data.readers.fields import checksum, require, require_numbers
+from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import ArchiveError, ShapeError, UnknownFormatError
@@ -48,6 +49,10 @@ LAYOUT = (*_SEQUENCE, *_NOTES, *_NOISE, *_TRUTH)  # of an archive, too
 _CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
 # Noise that older files may state and no model uses any more, with the values that mean none.
 OLD_NOISE = {"drift": 0.0, "bearing_drift_rad": 0.0, "misalignment_rad": 0.0, "track_memory": 1.0, "margin": 1.0}
+_UNKNOWN_LATERAL = (
+    "The file does not say how the sign of the lateral velocity was taken, so it is used as stored; older releases "
+    "wrote that of KITTI positive to the right."
+)
 _TRUTH_NOISE = "noise_"  # before the names of attributes
 
 _PARTS = {"": _SEQUENCE, "observations.": OBSERVATIONS_LAYOUT, "noise.": _NOISE, "truth.": _TRUTH}
@@ -255,3 +260,14 @@ def _group(h5file: h5py.Group, name: str) -> h5py.Group:
     if not isinstance(h5file.get(name), h5py.Group):
         raise ShapeError("this group is missing", field=name)
     return h5file[name]
+
+
+def _tracks(source: Source) -> Sequence:
+    sequence = read_sequence(source.path)
+    own = {"checksum_sha256": checksum(source.path), "reader": READER.name}
+    is_unknown = sequence.velocity_frame == "level" and "lateral" not in sequence.attributes
+    notes = (*sequence.notes, _UNKNOWN_LATERAL) if is_unknown else sequence.notes
+    return replace(sequence, attributes={**sequence.attributes, **own}, notes=notes)
+
+
+READER = Reader("hdf5", "an ekfslam HDF5 file", lambda source: source.head.startswith(b"\x89HDF\r\n\x1a\n"), _tracks)

@@ -139,10 +139,8 @@ def _stamps_of(path: Path, packets: dict[int, Path]) -> tuple[IntArray, BoolArra
     if not stamped[frames:].any():  # empty lines after the last packet are the end of the file
         stamp_ns, stamped = stamp_ns[:frames], stamped[:frames]
     if len(stamped) != frames:
-        raise ShapeError(
-            f"{len(stamped)} lines, but the packets run to {packets[frames - 1].name}, which needs {frames}",
-            source=str(path),
-        )
+        message = f"{len(stamped)} lines, but the packets run to {packets[frames - 1].name}, which needs {frames}"
+        raise ShapeError(message, source=str(path))
     lost = np.setdiff1d(np.flatnonzero(stamped), list(packets))
     if len(lost):
         raise LostDataError(
@@ -203,18 +201,13 @@ def _check_steps(time_s: Array, stamp_ns: IntArray, stamped: BoolArray, path: Pa
     for bad, what in ((step_s <= 0, "does not increase"), (step_s / np.diff(known) > MAX_GAP_S, "leaves a gap")):
         if bad.any():
             first = int(np.argmax(bad))
-            raise StampError(
-                f"the stamp {what}: {step_s[first]:.6f} s after the one before",
-                **line_of(path, int(known[first + 1]) + 1),
-            )
+            message = f"the stamp {what}: {step_s[first]:.6f} s after the one before"
+            raise StampError(message, **line_of(path, int(known[first + 1]) + 1))
     step_s = np.diff(time_s)
-    gaps = np.flatnonzero(step_s > _NOTED_GAP * np.median(step_s)) if len(step_s) else np.empty(0, np.int64)
-    if not len(gaps):
-        return ()
-    return (
-        f"{path.name}: {len(gaps)} steps are longer than {_NOTED_GAP} times the median, the longest is "
-        f"{step_s.max():.3f} s before line {int(np.argmax(step_s)) + 2}.",
-    )
+    gaps = int((step_s > _NOTED_GAP * np.median(step_s)).sum()) if len(step_s) else 0
+    longest = f"{step_s.max():.3f} s before line {int(np.argmax(step_s)) + 2}" if gaps else ""
+    note = f"{path.name}: {gaps} steps are longer than {_NOTED_GAP} times the median, the longest is {longest}."
+    return (note,) if gaps else ()
 
 
 def _repair_notes(stamped: BoolArray, present: BoolArray) -> Iterator[str]:
