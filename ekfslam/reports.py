@@ -34,7 +34,7 @@ from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed, open_executo
 from ekfslam.studies.study import Study, StudyArchive, run_study
 from ekfslam.studies.summary import study_table, summarise_study
 
-# Of a summary, as `Comparison` shows them.
+# Key figures of a summary on the card of a `Comparison`.
 _KEY_FIGURES = {"ate_m": "ATE [m]", "pose_nees_mean": "pose NEES (6)", "nis_per_dof": "NIS / dof (1)", "total_s": "s"}
 
 

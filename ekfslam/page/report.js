@@ -79,7 +79,7 @@ function path(xs, ys, to) {
   return text;
 }
 
-/** A figure below `parent`: its caption, and room that is drawn anew whenever its width changes. */
+/** Add a figure with a caption to `parent`; `draw` fills its room, again if the width changes. */
 function figure(parent, title, words, draw) {
   const made = element("figure", { class: "plot" }, parent);
   const caption = element("figcaption", {}, made);
@@ -173,7 +173,7 @@ function chip(parent, text, checked, change, color, dash) {
   element("span", {}, label, text);
 }
 
-/** Buttons of which one is pressed. */
+/** Add buttons, exactly one of them pressed. */
 function choose(parent, heading, names, chosen, change) {
   const row = element("div", { class: "choices" }, parent);
   element("span", {}, row, heading);
