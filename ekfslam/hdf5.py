@@ -427,9 +427,10 @@ def subgroup(group: h5py.Group, name: str) -> h5py.Group:
     return group[name]
 
 
-def write_attributes(item: h5py.Group | h5py.Dataset, values: Mapping[str, Any]) -> None:
-    """Write attributes except those that are None, text with fixed length."""
-    for name, value in values.items():
+def write_attributes(item: h5py.Group | h5py.Dataset, values: Mapping[str, Any], prefix: str = "") -> None:
+    """Write values as attributes ``<prefix><name>`` except None, text with fixed length."""
+    for key, value in values.items():
+        name = prefix + key
         if isinstance(value, str):
             item.attrs[name] = fixed_text(value)
         elif isinstance(value, tuple) and value and isinstance(value[0], str):

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import io
+import shutil
 import sys
 
+import h5py
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from scipy.spatial.transform import Rotation
+from support.same import assert_same
 
 from ekfslam.cli import main
 from ekfslam.config import Config
+from ekfslam.data.readers import read_sequence, write_sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError, MissingPackageError, PosteriorError
 from ekfslam.geometry import se3
 from ekfslam.runner import run
-from ekfslam.smoother.posterior import posterior
+from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage import tables
-from ekfslam.storage.archive import write_archive
+from ekfslam.storage.archive import open_result, read_archive, write_archive
 from ekfslam.storage.exports import EXPORTS, csv_text, g2o_text, information_bytes, ply_bytes
 
 
@@ -203,3 +207,61 @@ def test_what_has_no_log_has_no_graph(world, archive, capsys):
         information_bytes(dead)
     assert main(["export", str(archive), "--format", "ply", "--mode", "truth"]) == 2
     assert "the truth is written as tum or kitti" in capsys.readouterr().err
+
+
+# Runs on inertial samples
+
+
+@pytest.fixture(scope="module")
+def inertial(tmp_path_factory):
+    """An archive of a run on inertial samples."""
+    path = tmp_path_factory.mktemp("inertial") / "room.h5"
+    assert main(["run", "builtin:room?frames=25", "--out", str(path)]) == 0
+    return path
+
+
+def test_an_archive_of_inertial_samples_claims_no_velocities(inertial, tmp_path):
+    archive = read_archive(inertial)
+    assert archive.twist is None and archive.velocity_frame is None
+    assert archive.interpolated.shape == (25,) and not archive.interpolated.any()
+    write_archive(tmp_path / "again.h5", archive, archive.results)
+    assert_same(read_archive(tmp_path / "again.h5").results["full"], archive.results["full"])
+    with h5py.File(inertial) as h5file:
+        assert "twist" not in h5file["sequence"] and h5file["runs/full/log/inputs"].shape[1] == 6
+
+
+def test_a_recording_of_inertial_samples_is_written_without_velocities(tmp_path):
+    room = builtin("room?frames=25")
+    write_sequence(room, tmp_path / "room.h5")
+    with h5py.File(tmp_path / "room.h5") as h5file:
+        assert "twist" not in h5file["sequence"]
+    again = read_sequence(tmp_path / "room.h5")
+    assert again.velocities is None
+    assert_same(again.inertial, room.inertial)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["posterior", "plot", "check", "report", "info"])
+def test_commands_take_archives_of_inertial_samples(inertial, tmp_path, command):
+    path = shutil.copy(inertial, tmp_path / "room.h5")
+    assert main([command, str(path)]) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(set(EXPORTS) - {"g2o"}))
+def test_runs_on_inertial_samples_are_exported(inertial, tmp_path, name):
+    assert main(["export", str(inertial), "--format", name, "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out").stat().st_size > 0
+
+
+def test_g2o_refuses_a_run_on_inertial_samples_in_one_line(inertial, tmp_path, capsys):
+    assert main(["export", str(inertial), "--format", "g2o", "--out", str(tmp_path / "out")]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1 and "no vertices for velocity and biases; take information" in line
+
+
+def test_the_posterior_of_an_archive_is_that_of_the_inertial_run(inertial):
+    read = smooth(open_result(inertial, "full"))
+    made = smooth(run(builtin("room?frames=25"), "full"))
+    np.testing.assert_allclose(read.T_world_imu, made.T_world_imu, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(read.covariance, made.covariance, rtol=1e-9, atol=1e-15)

@@ -164,6 +164,18 @@ def test_a_curved_block_in_a_log_has_its_three_columns_or_none(whole, tmp_path, 
         read_archive(path)
 
 
+def test_a_log_with_the_coordinates_of_other_blocks_is_named(whole, tmp_path, capsys):
+    path = Path(shutil.copy(whole, tmp_path / "copy.h5"))
+    with h5py.File(path, "a") as h5file:
+        log = h5file["runs/full/log"]
+        for name in ("departed", "linear", "updated", "coordinate"):
+            value = log[name][..., :-1]
+            del log[name]
+            log[name] = value
+    assert main(["posterior", str(path), "--no-figures"]) == 2
+    assert "coordinates of state blocks, expected" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("kind", ["text", "empty", "compound", "reference", "variable length"])
 def test_data_of_another_type_are_named(whole, tmp_path, kind):
     name = "runs/full/log/frame"

@@ -224,6 +224,11 @@ def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterio
     )
 
 
+def is_inertial(result: Result) -> bool:
+    """Return whether inertial samples moved the poses of a run."""
+    return "inertial_gyro" in result.attributes
+
+
 def model_of_result(result: Result) -> Model:
     """Return the model of a full run.
 
@@ -243,14 +248,19 @@ def model_of_result(result: Result) -> Model:
     start = log.T_predicted[0], log.initial_covariance[:6, :6]
     rig = Rig(result.camera, result.T_cam_imu, result.noise)
     densities = None
-    if "inertial_gyro" in result.attributes:
+    if is_inertial(result):
         names = (f"inertial_{field.name}" for field in dataclasses.fields(InertialNoise))
         densities = InertialNoise(*(float(result.attributes[name]) for name in names))
     blocks, process = blocks_and_process(stored.blocks, densities)
     coordinates = stored.filter.landmark_coordinates
     model = model_of(rig, result.noise, *start, stored.calibration, blocks, coordinates, make_process=process)
-    if model.layout.body == log.departed.shape[1]:
+    if model.layout.body == log.departed.shape[1] and len(log.initial_covariance) in (6, model.layout.body):
         return model
+    if not log.departed.shape[1] == len(log.initial_covariance) == 6:
+        raise PosteriorError(
+            f"{result.sequence_name}: the log has {log.departed.shape[1]} coordinates of state blocks, expected "
+            f"{model.layout.body} by its configuration"
+        )
     # Archives before format version 4 know of poses alone: velocities are white there, and so are pixels.
     noise = dataclasses.replace(
         result.noise, twist_walk_std=None, tilt_rad=0.0, track_first_px=None, track_walk_px=None

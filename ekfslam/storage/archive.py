@@ -33,11 +33,9 @@ from ekfslam.data.noise import Noise, validate_noise
 from ekfslam.data.readers.hdf5 import (
     OLD_NOISE,
     SPELLING,
-    noise_attributes,
     noise_of_attributes,
     read_sequence_fields,
     write_sequence_group,
-    write_truth_group,
 )
 from ekfslam.data.sequence import WITHOUT_TRACKS, Observations, Sequence, Truth, VelocityFrame
 from ekfslam.errors import ArchiveError, ConfigError, DataError, WriteError
@@ -46,12 +44,12 @@ from ekfslam.geometry.camera import StereoCamera
 from ekfslam.names import printable
 from ekfslam.shown import Card, Shown, count
 from ekfslam.storage import older
-from ekfslam.storage.checks import require_agreement
 
 FORMAT = "ekfslam-archive"
 # 2 added log, 3 hygiene and parameters, 4 state blocks and track errors in the log, 5 coordinates of all dimensions,
 # 6 inputs of any process in the log
 FORMAT_VERSION = 6
+_NOISE = "noise_"  # before the names of attributes
 
 
 @dataclass(frozen=True, repr=False)
@@ -59,20 +57,20 @@ class Archive(Shown):
     """The content of an archive: the sequence without its observations, and the results of its modes.
 
     Args:
-        name, source, time_s, twist, camera, T_cam_imu, truth, noise, velocity_frame, notes, attributes: As in
-            `Sequence`.
+        name, source, time_s, camera, T_cam_imu, truth, noise, notes, attributes: As in `Sequence`.
+        twist, velocity_frame: As in `Sequence`; None if the recording has no velocities.
         results: Mode to result, in the order of writing.
     """
 
     name: str
     source: str
     time_s: Array
-    twist: Array
+    twist: Array | None
     camera: StereoCamera
     T_cam_imu: Array
     truth: Truth | None
     noise: Noise | None
-    velocity_frame: VelocityFrame
+    velocity_frame: VelocityFrame | None
     notes: tuple[str, ...]
     attributes: Mapping[str, str | int | float]
     results: Mapping[str, Result]
@@ -86,7 +84,7 @@ class Archive(Shown):
     @cached_property
     def interpolated(self) -> BoolArray:
         """(T,) whether the velocities of an interval were interpolated."""
-        return known_intervals(self.attributes, self.twist)
+        return known_intervals(self.attributes, np.zeros((len(self.time_s), 6)) if self.twist is None else self.twist)
 
 
 def write_archive(path: str | Path, sequence: Sequence | Archive, results: Mapping[str, Result]) -> None:
@@ -106,8 +104,6 @@ def archive_image(sequence: Sequence | Archive, results: Mapping[str, Result]) -
     def fill(h5file: h5py.File) -> None:
         hdf5.write_attributes(h5file, {"source": sequence.source, "error_convention": ERROR_CONVENTION})
         write_sequence_group(h5file, sequence)
-        if sequence.truth is not None:
-            write_truth_group(h5file, sequence.truth)
         runs = h5file.create_group("runs", track_order=True)
         for mode, result in results.items():
             _write_result(runs.create_group(mode), result, len(sequence.time_s))
@@ -200,24 +196,17 @@ def open_result(path: str | Path, mode: str) -> Result:
 
 
 def _write_result(group: h5py.Group, result: Result, frames: int) -> None:
-    sizes = {"T": frames, "M": len(result.landmarks)}
-    hdf5.write_attributes(
-        group,
-        {
-            "config": json.dumps(result.config),
-            "counts": json.dumps(dict(result.counts)),
-            **noise_attributes(result.noise, "noise_"),
-        },
-    )
+    tables = {"config": json.dumps(result.config), "counts": json.dumps(dict(result.counts))}
+    hdf5.write_attributes(group, tables)
+    hdf5.write_attributes(group, vars(result.noise), _NOISE)
     hdf5.write_attributes(group.create_group("attributes"), result.attributes)
-    hdf5.write_record(group, result, sizes, {"time": result.time_s})
+    hdf5.write_record(group, result, {"T": frames, "M": len(result.landmarks)}, {"time": result.time_s})
 
 
 def _sequence_fields(h5file: h5py.File) -> dict[str, Any]:
     """Return the arguments of `Archive` except the results, validated as a `Sequence`."""
     try:
         found = read_sequence_fields(h5file, h5file.filename)
-        found.pop("observations", None)
         found["name"] = printable(found["name"])
         no_index = np.empty(0, dtype=np.int64)
         none = Observations(no_index, no_index, np.empty((0, 4)))
@@ -235,7 +224,7 @@ def _read_result(h5file: h5py.File, mode: str, sequence: Mapping[str, Any]) -> R
     found = hdf5.read_record(
         group, Result, {"T": len(sequence["time_s"])}, _stamps(group), complete=complete, former=former
     )
-    require_agreement(found, f"{h5file.filename}: {group.name.strip('/')}")
+    _require_agreement(found, f"{h5file.filename}: {group.name.strip('/')}")
     noise = _read_noise(group)
     return Result(
         mode=mode,
@@ -256,11 +245,36 @@ def _retired_noise(group: h5py.Group) -> dict[str, str]:
     return {"retired_noise": ", ".join(stated)} if stated else {}
 
 
+def _require_agreement(result: Mapping[str, Any], place: str) -> None:
+    """Raise an `ArchiveError` if fields of a result that are each valid alone contradict each other."""
+    pairs, log, landmarks = result["pairs"], result["log"], len(result["landmarks"])
+    if pairs is not None and not (pairs.first < pairs.second).all():
+        raise ArchiveError(f"{place}/pairs holds frames that are no pair")
+    if log is None:
+        return
+    if log.landmarks != landmarks:
+        raise ArchiveError(
+            f"{place}/log/landmark_id has {log.landmarks} entries, but the map has {landmarks} landmarks"
+        )
+    if (columns := log.curved.shape[1]) not in (0, 3):  # those of the block `up`, if it was in the state
+        raise ArchiveError(f"{place}/log/curved has {columns} columns, expected 0 or 3")
+    unseen = np.setdiff1d(np.arange(landmarks), log.landmark)
+    if len(unseen):
+        raise ArchiveError(f"{place}/log/landmark_id[{unseen[0]}] has no observation")
+    follows = np.flatnonzero(log.previous >= 0)
+    before = log.previous[follows]
+    wrong = (log.landmark[before] != log.landmark[follows]) | (log.frame[before] != log.frame[follows] - 1)
+    if wrong.any():
+        raise ArchiveError(
+            f"{place}/log/previous[{follows[np.argmax(wrong)]}] is no observation of the same landmark in the frame "
+            "before"
+        )
+
+
 def _read_noise(group: h5py.Group) -> Noise:
-    # These two have no default, and every result has them.
-    for name in ("noise_twist_std", "noise_pixel_std_px"):
-        hdf5.attribute(group, name)
-    noise = Noise(**noise_of_attributes(group.attrs, "noise_"))
+    for name in ("twist_std", "pixel_std_px"):  # without a default
+        hdf5.attribute(group, _NOISE + name)
+    noise = Noise(**noise_of_attributes(group.attrs, _NOISE))
     try:
         validate_noise(noise)
     except DataError as error:

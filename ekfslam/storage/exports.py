@@ -27,7 +27,7 @@ from ekfslam.filters.log import Log
 from ekfslam.filters.result import Result
 from ekfslam.geometry import motion, se3
 from ekfslam.models.sensors.stereo import Rig
-from ekfslam.smoother.posterior import Posterior, posterior
+from ekfslam.smoother.posterior import Posterior, is_inertial, posterior
 from ekfslam.storage.archive import Archive, read_archive
 from ekfslam.storage.tables import columns, covariance_columns
 
@@ -163,14 +163,19 @@ def g2o_text(result: Result) -> str:
       information ``A^T V^-1 A`` of its rows there, eq. (4). The camera is in no edge: some programs read no offset.
     - ``FIX``: the first pose.
 
-    It is the textbook model. Where the run estimates velocities or has errors of tracks, which have memory, a graph of
-    poses and points cannot say so: steps have the noise of measured velocities then, and views that of a first view.
+    Velocities as states and errors of tracks have memory, which a graph of poses and points cannot express: steps have
+    the noise of measured velocities then, and views that of a first view.
 
     Raises:
-        ArchiveError: The result has no log: only the mode ``full`` has one.
+        ArchiveError: The result has no log (only the mode ``full`` has one), or inertial samples moved the poses.
     """
     if result.log is None:
         raise ArchiveError(f"{result.sequence_name}: mode {result.mode!r} has no log, hence no edges; take mode full")
+    if is_inertial(result):
+        raise ArchiveError(
+            f"{result.sequence_name}: inertial samples moved the poses; g2o has no vertices for velocity and biases; "
+            "take information"
+        )
     return "".join(f"{line}\n" for line in _graph(result, result.log))
 
 

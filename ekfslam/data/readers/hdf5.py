@@ -2,8 +2,9 @@
 
 Data sets are those that the metadata of `Sequence`, `Observations`, `Noise`, `Truth`, `TrueMotion` and of inputs state:
 in ``/sequence`` with its groups ``observations``, ``noise`` and ``inputs/<i>``, and in ``/truth`` with ``motion``.
-Velocities at the stamps of the frames are ``sequence/twist``. The other fields of noise, the camera and the attributes
-of the sequence are attributes of groups. See `ekfslam.hdf5` for the common part of all files.
+Velocities at the stamps of the frames are ``sequence/twist``; ``velocity_frame`` is ``none`` without velocities. The
+other fields of noise, the camera and the attributes of the sequence are attributes of groups. See `ekfslam.hdf5` for
+the common part of all files.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ def _below(place: str, layout: Layout) -> Layout:
 
 
 _TWIST = Item("twist", "twist", ("T", "u"), "m/s (columns 0-2), rad/s (columns 3-5)", "imu")
-_SEQUENCE = _below("sequence", (*layout_of(Sequence), _TWIST))
+NO_VELOCITIES = "none"  # attribute ``velocity_frame`` of a recording without velocities
+_UNDRIVEN = _below("sequence", layout_of(Sequence))
+_SEQUENCE = (*_UNDRIVEN, *_below("sequence", (_TWIST,)))
 OBSERVATIONS_LAYOUT = _below("sequence/observations", layout_of(Observations))
 _NOISE = _below("sequence/noise", layout_of(Noise))
 _TRUTH = _below("truth", layout_of(Truth))
@@ -46,7 +49,6 @@ _MOTION = _below("truth/motion", layout_of(TrueMotion))
 _INPUTS: dict[str, type[Input]] = {kind.__name__: kind for kind in (Velocities, InertialSamples)}
 _NOTES = (Item("sequence/notes", "notes", ("n",), "text", "none", TEXTS),)
 LAYOUT = (*_SEQUENCE, *_NOTES, *_NOISE, *_TRUTH)  # of an archive, too
-_CAMERA = ("fu_px", "fv_px", "cu_px", "cv_px", "baseline_m")
 # Noise that older files may state and no model uses any more, with the values that mean none.
 OLD_NOISE = {"drift": 0.0, "bearing_drift_rad": 0.0, "misalignment_rad": 0.0, "track_memory": 1.0, "margin": 1.0}
 _UNKNOWN_LATERAL = (
@@ -74,13 +76,7 @@ def write_sequence(sequence: Sequence, path: str | Path) -> None:
 
 def sequence_image(sequence: Sequence) -> bytes:
     """Return the bytes that `write_sequence` writes."""
-
-    def fill(h5file: h5py.File) -> None:
-        write_sequence_group(h5file, sequence, sequence.observations)
-        if sequence.truth is not None:
-            write_truth_group(h5file, sequence.truth)
-
-    return hdf5.image(FORMAT, FORMAT_VERSION, fill)
+    return hdf5.image(FORMAT, FORMAT_VERSION, lambda h5file: write_sequence_group(h5file, sequence, whole=True))
 
 
 def is_recording_of(path: str | Path, sequence: Sequence) -> bool:
@@ -102,58 +98,68 @@ def read_sequence(path: str | Path) -> Sequence:
         ArchiveError: A newer release wrote the file.
         DataError: A field is missing or malformed; the subclass says how.
     """
-    with hdf5.opened(path, FORMAT, FORMAT_VERSION, error=UnknownFormatError) as h5file:
-        return read_sequence_group(h5file, str(path))
-
-
-def write_sequence_group(h5file: h5py.Group, sequence: Any, observations: Observations | None = None) -> None:
-    """Write ``/sequence`` without truth: a `Sequence`, or a record with its fields except the observations.
-
-    Inputs are written with observations only.
-    """
-    hdf5.write_fields(h5file, _SEQUENCE, sequence)
-    hdf5.write_fields(h5file, _NOTES, {"notes": hdf5.fixed_texts(sequence.notes)})
-    group = h5file["sequence"]
-    hdf5.write_attributes(group, {"name": sequence.name, "velocity_frame": sequence.velocity_frame})
-    hdf5.write_attributes(group.create_group("camera"), {name: getattr(sequence.camera, name) for name in _CAMERA})
-    hdf5.write_attributes(group.create_group("attributes"), sequence.attributes)
-    if sequence.noise is not None:
-        hdf5.write_fields(h5file, _NOISE, sequence.noise)
-        further = noise_attributes(sequence.noise)
-        for item in _NOISE:
-            further.pop(item.field)
-        hdf5.write_attributes(group["noise"], further)
-    if observations is not None:
-        hdf5.write_fields(h5file, OBSERVATIONS_LAYOUT, observations)
-        _write_inputs(group.create_group("inputs"), sequence)
-
-
-def read_sequence_group(h5file: h5py.Group, source: str) -> Sequence:
-    """Read the sequence below an open file or group, with its truth if ``/truth`` exists."""
-    found = read_sequence_fields(h5file, source)
-    if "observations" not in found:
-        raise ArchiveError(f"{source}: holds a sequence without its observations")
-    with spelled_as_in(source, SPELLING):
+    with (
+        hdf5.opened(path, FORMAT, FORMAT_VERSION, error=UnknownFormatError) as h5file,
+        spelled_as_in(str(path), SPELLING),
+    ):
+        found = read_sequence_fields(h5file, str(path))
+        found["observations"] = Observations(**_read(h5file, OBSERVATIONS_LAYOUT))
         if "sequence/inputs" in h5file:
             found |= _read_inputs(h5file["sequence/inputs"], found)
         return Sequence(**found)
 
 
+def write_sequence_group(h5file: h5py.Group, sequence: Any, whole: bool = False) -> None:
+    """Write ``/sequence`` and ``/truth`` below an open file or group.
+
+    Args:
+        h5file: File or group to write below.
+        sequence: A `Sequence`, or a record with the same fields except observations and inputs.
+        whole: Whether to write observations and inputs, too.
+    """
+    has_twist = sequence.velocities is not None if isinstance(sequence, Sequence) else sequence.twist is not None
+    hdf5.write_fields(h5file, _SEQUENCE if has_twist else _UNDRIVEN, sequence)
+    hdf5.write_fields(h5file, _NOTES, {"notes": hdf5.fixed_texts(sequence.notes)})
+    group = h5file["sequence"]
+    names = {"name": sequence.name, "velocity_frame": sequence.velocity_frame if has_twist else NO_VELOCITIES}
+    hdf5.write_attributes(group, names)
+    hdf5.write_attributes(group.create_group("camera"), vars(sequence.camera))
+    hdf5.write_attributes(group.create_group("attributes"), sequence.attributes)
+    if sequence.noise is not None:
+        hdf5.write_fields(h5file, _NOISE, sequence.noise)
+        in_data_sets = {item.field for item in _NOISE}
+        further = {name: value for name, value in vars(sequence.noise).items() if name not in in_data_sets}
+        hdf5.write_attributes(group["noise"], further)
+    if whole:
+        hdf5.write_fields(h5file, OBSERVATIONS_LAYOUT, sequence.observations)
+        _write_inputs(group.create_group("inputs"), sequence)
+    truth = sequence.truth
+    if truth is not None:
+        hdf5.write_fields(h5file, _TRUTH, truth)
+        if truth.motion is not None:
+            hdf5.write_fields(h5file, _MOTION, truth.motion)
+        if truth.noise is not None:
+            hdf5.write_attributes(h5file["truth"], vars(truth.noise), _TRUTH_NOISE)
+
+
 def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
-    """Read the arguments of `Sequence` below an open file or group; ``observations`` only if they are stored."""
+    """Return the arguments of `Sequence` below an open file or group, except observations and inputs.
+
+    Raises:
+        DataError: A field is missing or malformed; the subclass says how.
+    """
     with spelled_as_in(source, SPELLING):
-        attributes, camera = hdf5.facts(_group(h5file, "sequence/attributes")), _attributes(h5file, "sequence/camera")
-        for name in _CAMERA:
-            if not isinstance(camera.get(name), int | float):
-                raise ShapeError("this attribute is missing or no number", field=f"sequence/camera@{name}")
-        names = _attributes(h5file, "sequence")
+        attributes, names = hdf5.facts(_group(h5file, "sequence/attributes")), _attributes(h5file, "sequence")
+        camera = StereoCamera(**_numbers(h5file, "sequence/camera", StereoCamera))
+        frame = str(names.get("velocity_frame", "imu"))
         found: dict[str, Any] = {
             "name": str(names.get("name", "")),
             "source": source,
-            **_read(h5file, _SEQUENCE),
-            "camera": StereoCamera(**{name: camera[name] for name in _CAMERA}),
-            "velocity_frame": str(names.get("velocity_frame", "imu")),
-            "truth": read_truth_group(h5file, source) if "truth" in h5file else None,
+            "twist": None,
+            **_read(h5file, _UNDRIVEN if frame == NO_VELOCITIES else _SEQUENCE),
+            "camera": camera,
+            "velocity_frame": None if frame == NO_VELOCITIES else frame,
+            "truth": _read_truth(h5file) if "truth" in h5file else None,
             "notes": hdf5.texts(require(h5file, "sequence/notes")),
             "attributes": attributes,
         }
@@ -165,8 +171,6 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
                 for name, nothing in OLD_NOISE.items()
                 if further.get(name, nothing) != nothing
             )
-        if "sequence/observations" in h5file:
-            found["observations"] = Observations(**_read(h5file, OBSERVATIONS_LAYOUT))
         return found
 
 
@@ -190,44 +194,24 @@ def _read_inputs(group: h5py.Group, found: Mapping[str, Any]) -> dict[str, Any]:
         if i == twist_at:
             inputs.append(Velocities(found["time_s"], found["twist"], found["velocity_frame"]))
             continue
-        part, stated = _group(group, str(i)), hdf5.attributes(_group(group, str(i)))
-        if stated.get("kind") not in _INPUTS:
+        stated = _attributes(group, str(i))
+        kind = _INPUTS.get(str(stated.get("kind")))
+        if kind is None:
             raise ShapeError(f"inputs of kind {stated.get('kind')!r} are unknown", field=f"sequence/inputs/{i}@kind")
-        kind = _INPUTS[stated["kind"]]
-        arguments = hdf5.read_record(part, kind, {})
-        names = {field.name for field in fields(InertialNoise)}
-        if kind is InertialSamples and names <= stated.keys():
-            arguments["noise"] = InertialNoise(**{name: stated[name] for name in names})
+        arguments = hdf5.read_record(group[str(i)], kind, {})
+        if kind is InertialSamples and "gyro" in stated:
+            arguments["noise"] = InertialNoise(**_numbers(group, str(i), InertialNoise))
         inputs.append(kind(**arguments))
     return {"inputs": tuple(inputs), "twist": None, "velocity_frame": None}
 
 
-def write_truth_group(h5file: h5py.Group, truth: Truth) -> None:
-    """Write ``/truth`` below an open file or group."""
-    hdf5.write_fields(h5file, _TRUTH, truth)
-    if truth.motion is not None:
-        hdf5.write_fields(h5file, _MOTION, truth.motion)
-    if truth.noise is not None:
-        noise = {_TRUTH_NOISE + name: value for name, value in vars(truth.noise).items()}
-        hdf5.write_attributes(h5file["truth"], noise)
-
-
-def read_truth_group(h5file: h5py.Group, source: str) -> Truth:
-    """Read the truth below an open file or group; raise a `DataError` if a field is missing or malformed."""
-    with spelled_as_in(source):
-        found, stored = _read(h5file, _TRUTH), _attributes(h5file, "truth")
-        if "truth/motion" in h5file:
-            found["motion"] = TrueMotion(**_read(h5file, _MOTION))
-        noise = {f.name: stored[_TRUTH_NOISE + f.name] for f in fields(TruthNoise) if _TRUTH_NOISE + f.name in stored}
-        for name, value in noise.items():
-            if not isinstance(value, int | float):
-                raise ShapeError("this attribute is no number", field=f"truth@{_TRUTH_NOISE}{name}")
-        return Truth(**found, noise=TruthNoise(**noise) if noise else None)
-
-
-def noise_attributes(noise: Noise, prefix: str = "") -> dict[str, Any]:
-    """Return noise as attributes, ``<prefix><field>``."""
-    return {prefix + name: value for name, value in vars(noise).items() if value is not None}
+def _read_truth(h5file: h5py.Group) -> Truth:
+    found = _read(h5file, _TRUTH)
+    if "truth/motion" in h5file:
+        found["motion"] = TrueMotion(**_read(h5file, _MOTION))
+    if any(name.startswith(_TRUTH_NOISE) for name in _attributes(h5file, "truth")):
+        found["noise"] = TruthNoise(**_numbers(h5file, "truth", TruthNoise, _TRUTH_NOISE))
+    return Truth(**found)
 
 
 def noise_of_attributes(attributes: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -248,6 +232,16 @@ def _read(h5file: h5py.Group, layout: Layout) -> dict[str, Any]:
         for item in layout
     }
     hdf5.require_coordinates(h5file, layout)
+    return found
+
+
+def _numbers(h5file: h5py.Group, name: str, record: type, prefix: str = "") -> dict[str, float]:
+    """Return the fields of a record of numbers among the attributes of a group, ``<prefix><field>``."""
+    stated = _attributes(h5file, name)
+    found = {field.name: stated.get(prefix + field.name, field.default) for field in fields(record)}
+    for key, value in found.items():
+        if not isinstance(value, int | float):
+            raise ShapeError("this attribute is missing or no number", field=f"{name}@{prefix}{key}")
     return found
 
 
