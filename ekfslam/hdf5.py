@@ -45,16 +45,9 @@ NONE: Coordinates = MappingProxyType({})
 
 
 def image(format: str, version: int, fill: Callable[[h5py.File], None]) -> bytes:
-    """Return the bytes of a new file of a format and version, for `ekfslam.files.write`.
+    """Return the bytes of a new file of a format and version, for `ekfslam.files.write`; ``fill`` writes the rest.
 
     The file is made in memory, since libhdf5 crashes the interpreter if a disk is full.
-
-    Args:
-        format, version: Attributes of the file.
-        fill: Function that writes the rest into the open file.
-
-    Raises:
-        ArchiveError: The content could not be read again.
     """
     content = io.BytesIO()
     # HDF5's own image of an open file will not do: until 2.0 the checksum of its first block is wrong.
@@ -106,13 +99,11 @@ def _reading(path: str | Path) -> h5py.File:
 
 
 def format_of(path: str | Path) -> str:
-    """Return the attribute ``format`` of an HDF5 file; empty for other files."""
-    if not (Path(path).is_file() and h5py.is_hdf5(str(path))):
-        return ""
+    """Return the attribute ``format`` of an HDF5 file; empty for other files and damaged ones."""
     try:
         with _reading(path) as h5file:
             return str(plain(h5file.attrs.get("format", "")))
-    except _DAMAGE:  # `opened` will name it
+    except _DAMAGE:
         return ""
 
 
@@ -196,17 +187,7 @@ def _is_known(dtype: np.dtype) -> bool:
 
 
 def write_record(group: h5py.Group, record: Any, sizes: dict[str, int], coordinates: Coordinates = NONE) -> None:
-    """Write a record as its class says: attributes, data sets, and a group for each record in it.
-
-    Args:
-        group: Group of the record.
-        record: Record to write, see `ekfslam.stored`.
-        sizes: Known shared lengths; those found here are added.
-        coordinates: Values along dimensions by name, where no data set has them.
-
-    Raises:
-        ArchiveError: A value breaks its check: such a file could not be read again.
-    """
+    """Write attributes and data sets of a record, and a group for each record in it, as `write_fields` does."""
     stated = {name: getattr(record, name) for name in stored.attributes_of(type(record))}
     write_attributes(group, stated)
     coordinates = {**coordinates, **_named_entries(type(record), stated)}
@@ -224,21 +205,19 @@ def read_record(
     complete: Callable[[type, dict[str, Any]], dict[str, Any]] = lambda record, found: found,
     former: Mapping[type, stored.Layout] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """Read the stored fields of a class of records, checked; see `write_record`.
+    """Read the stored fields of a class of records, checked as `read_fields` does.
 
     Args:
-        group: Group of the record.
+        group, sizes, coordinates: As for `read_fields`.
         record: Class of the record.
-        sizes: Known shared lengths; those found here are added.
-        coordinates: Values along dimensions; coordinates in the file must equal them.
         complete: Function of class and fields that adds fields which older releases did not write.
         former: Data sets that older releases wrote for a class, for ``complete``.
-
-    Raises:
-        ArchiveError: A field is missing, has another shape or type, or breaks its check.
     """
     layout = stored.layout_of(record)
-    found = {name: _read_attribute(group, name, kind) for name, (kind, _) in stored.attributes_of(record).items()}
+    found: dict[str, Any] = {}
+    for name, (kind, _) in stored.attributes_of(record).items():
+        value = attribute(group, name)
+        found[name] = texts(value) if kind is tuple else printable(str(value)) if kind is str else kind(value)
     coordinates = {**coordinates, **_named_entries(record, found)}
     present = tuple(item for item in layout if item.name in group)
     earlier = tuple(item for item in former.get(record, ()) if item.name in group)
@@ -269,13 +248,6 @@ def _named_entries(record: type, attributes: Mapping[str, Any]) -> dict[str, NDA
     return named
 
 
-def _read_attribute(group: h5py.Group, name: str, kind: type) -> Any:
-    value = attribute(group, name)
-    if kind is tuple:
-        return texts(value)
-    return printable(str(value)) if kind is str else kind(value)
-
-
 def write_fields(
     group: h5py.Group,
     layout: Iterable[Item],
@@ -283,14 +255,12 @@ def write_fields(
     sizes: dict[str, int] | None = None,
     coordinates: Coordinates = NONE,
 ) -> None:
-    """Write the data sets of a layout from the fields of a record, or the values of a mapping, and their dimensions.
+    """Write the data sets of a layout, from a record or mapping with their fields, and their dimensions.
 
     Args:
-        group: Group to write below.
-        layout: Data sets to write.
-        record: Record or mapping with the fields.
+        group, layout, record: Place, data sets, and their values.
         sizes: Known shared lengths; those found here are added.
-        coordinates: Values along dimensions by name, where no data set of the layout has them.
+        coordinates: Values along dimensions by name, if no data set of the layout holds them.
 
     Raises:
         ArchiveError: A value breaks its check: such a file could not be read again.
@@ -369,11 +339,7 @@ def read_fields(
 ) -> dict[str, Any]:
     """Read the data sets of a layout by field, checked; the first one along a shared length decides it.
 
-    Args:
-        group: Group to read from.
-        layout: Data sets to read.
-        sizes: Known shared lengths; those found here are added.
-        coordinates: As for `write_fields`; coordinates in the file must equal them.
+    Arguments are those of `write_fields`. Coordinates in the file must equal the given ones.
 
     Raises:
         ArchiveError: A data set is missing, has another shape or type, or breaks its check.
@@ -432,7 +398,7 @@ def write_attributes(item: h5py.Group | h5py.Dataset, values: Mapping[str, Any],
     for key, value in values.items():
         name = prefix + key
         if isinstance(value, str):
-            item.attrs[name] = fixed_text(value)
+            item.attrs[name] = np.bytes_(value.encode(errors="backslashreplace"))
         elif isinstance(value, tuple) and value and isinstance(value[0], str):
             item.attrs[name] = fixed_texts(value)
         elif value is not None:
@@ -480,14 +446,9 @@ def json_table(item: h5py.Group | h5py.Dataset, name: str) -> dict[str, Any]:
     return table
 
 
-def fixed_text(text: str) -> np.bytes_:
-    """Return a text in HDF5's form of fixed length."""
-    return np.bytes_(text.encode(errors="backslashreplace"))
-
-
 def fixed_texts(texts: Iterable[str]) -> NDArray:
     """Return texts in HDF5's form of fixed length, as an array."""
-    return np.array([fixed_text(text) for text in texts], dtype=np.bytes_)
+    return np.array([text.encode(errors="backslashreplace") for text in texts], dtype=np.bytes_)
 
 
 def plain(value: Any) -> Any:
@@ -506,5 +467,5 @@ def _spoken(item: h5py.Group | h5py.Dataset, name: str) -> str:
     return f"attribute {name} of {item.name.strip('/') or 'the file'}"
 
 
-def _place(group: h5py.Group, name: str = "") -> str:
-    return f"{group.file.filename}: {'/'.join(part for part in (group.name.strip('/'), name) if part)}"
+def _place(group: h5py.Group, name: str) -> str:
+    return f"{group.file.filename}: {f'{group.name}/{name}'.strip('/')}"

@@ -34,6 +34,7 @@ from ekfslam.progress import progress
 from ekfslam.resolve import Problem, resolve
 from ekfslam.smoother.posterior import smooth
 from ekfslam.smoother.revival import MapRevival
+from ekfslam.stored import empty
 
 
 @solvable()
@@ -83,7 +84,7 @@ class _Estimate:
     ms: Array
     pairs: PosePairs | None
     reports: list[FrameReport] = dataclasses.field(default_factory=list)
-    landmarks: Landmarks = dataclasses.field(default_factory=Landmarks.empty)
+    landmarks: Landmarks = dataclasses.field(default_factory=lambda: empty(Landmarks))
     counts: Mapping[str, int] = dataclasses.field(default_factory=dict)
     log: Log | None = None
     parameters: Parameters | None = None
@@ -137,7 +138,7 @@ def _dead_reckoned(problem: Problem, mode: Mode) -> _Estimate:
 def _result(problem: Problem, mode: Mode, estimate: _Estimate) -> Result:
     sequence, reports = problem.sequence, estimate.reports
     account: dict[str, Any] = {**problem.account, "model": "; ".join(problem.lines)}
-    innovation, rejections = Innovation.empty(len(sequence)), Rejections.empty()
+    innovation, rejections = empty(Innovation, T=len(sequence)), empty(Rejections)
     counts, whitened = dict(estimate.counts), None
     if reports:
         innovation, rejections, tallies = collect(reports)

@@ -21,13 +21,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array, BoolArray
 
+Record = TypeVar("Record")
 Sizes = Mapping[str, int]
 Shape = tuple[str, ...]
 
@@ -44,11 +45,9 @@ class Check(NamedTuple):
     """Allowed values of a field.
 
     Args:
-        kinds: NumPy kind that the values are read as: ``f`` numbers, ``i`` whole numbers, ``b`` truth values, ``S``
-            text.
+        kinds: NumPy kind: ``f`` numbers, ``i`` whole numbers, ``b`` truth values, ``S`` text.
         words: Requirement of each value, as it follows "must".
-        holds: Function of the values and the shared lengths. It returns which values pass, in the shape of the values
-            or of its first axes.
+        holds: Function of values and shared lengths that returns which values pass, in the shape of the first axes.
     """
 
     kinds: str
@@ -120,13 +119,7 @@ FRAMES = index_of("T")
 
 
 class Axis(NamedTuple):
-    """A dimension.
-
-    Args:
-        name: Name of the dimension and of its coordinate.
-        meaning: Things counted along it.
-        labels: Names of its entries, if their number is fixed.
-    """
+    """A dimension: its name, the things counted along it, and names of its entries if their number is fixed."""
 
     name: str
     meaning: str
@@ -249,13 +242,7 @@ def stored(
     name: str = "",
     codes: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """Return the metadata of a field that is a data set.
-
-    Args:
-        shape: Names of its axes, separated by blanks, see `AXES`.
-        units, frame, check, codes: As in `Item`.
-        name: Name of the data set; empty: the name of the field.
-    """
+    """Return the metadata of a field that is a data set, see `Item`; ``shape`` separates its axes by blanks."""
     check = whole(0, len(codes) - 1) if codes else check
     return {"stored": Item(name, "", tuple(shape.split()), units, frame, check, codes)}
 
@@ -266,10 +253,7 @@ def attribute(kind: type, along: str = "") -> dict[str, Any]:
 
 
 def group(record: type) -> dict[str, Any]:
-    """Return the metadata of a field that is a record of a class, in a group of the field's name.
-
-    A field with the default None may be missing in a file.
-    """
+    """Return the metadata of a field that is a record, in a group; one with the default None may be missing."""
     return {"stored": record}
 
 
@@ -309,13 +293,18 @@ def values_of(record: Any, name: str = "") -> Iterator[tuple[str, Item, NDArray]
             yield from values_of(getattr(record, field), f"{name}{field}.")
 
 
-def zeros(record: type, **sizes: int) -> dict[str, NDArray]:
-    """Return the fields of a class of records with the entry 0 for these shared lengths."""
+def zeros(layout: Layout, **sizes: int) -> dict[str, NDArray]:
+    """Return the fields of a layout with the entry 0 for shared lengths, 0 by default."""
     types: dict[str, type] = {"f": np.float64, "i": np.int64, "b": np.bool_}
     return {
-        item.field: np.zeros([fixed_length(axis) or sizes[axis] for axis in item.shape], types[item.check.kinds])
-        for item in layout_of(record)
+        item.field: np.zeros([fixed_length(axis) or sizes.get(axis, 0) for axis in item.shape], types[item.check.kinds])
+        for item in layout
     }
+
+
+def empty(record: type[Record], **sizes: int) -> Record:
+    """Return a record with the entry 0 in each of its data sets for shared lengths, 0 by default."""
+    return record(**zeros(layout_of(record), **sizes))
 
 
 def along(record: Any, length: str, which: Any) -> dict[str, Any]:

@@ -33,6 +33,7 @@ from ekfslam.evaluation.tables import document, markdown_table
 from ekfslam.figures.maps import plot_landmark_arrows, plot_map
 from ekfslam.figures.style import save_all
 from ekfslam.filters.result import Landmarks
+from ekfslam.stored import empty
 
 # Recording, and the report's figures of its trajectory and of its landmarks.
 FIGURES = (
@@ -64,7 +65,7 @@ def main() -> int:
 
         results, truth = comparison.results, comparison.sequence.truth
         as_reported = ekfslam.run(comparison.sequence, "mapping-only", AS_REPORTED)
-        paths = {mode: replace(results[mode], landmarks=Landmarks.empty()) for mode in ("dead-reckoning", "full")}
+        paths = {mode: replace(results[mode], landmarks=empty(Landmarks)) for mode in ("dead-reckoning", "full")}
         figures = {
             trajectory_figure: plot_map(paths, truth),
             landmark_figure: plot_landmark_arrows(as_reported, truth),

@@ -30,7 +30,7 @@ from ekfslam.storage.archive import (
     read_archive,
     write_archive,
 )
-from ekfslam.storage.exports import export_trajectory
+from ekfslam.storage.exports import export
 from ekfslam.stored import layouts_of
 
 MODES = ("full", "dead-reckoning", "mapping-only")
@@ -273,12 +273,12 @@ def test_writing_into_a_missing_folder_is_a_named_error(sequence, results, tmp_p
     with pytest.raises(ArchiveError, match=r"absent.result\.h5: cannot be written"):
         write_archive(tmp_path / "absent" / "result.h5", sequence, results)
     with pytest.raises(ArchiveError, match=r"absent.poses\.txt: cannot be written"):
-        export_trajectory(results["full"], tmp_path / "absent" / "poses.txt", "kitti")
+        export(results["full"], tmp_path / "absent" / "poses.txt", "kitti")
 
 
 def test_tum_export_holds_stamps_positions_and_quaternions(results, tmp_path):
     result = results["full"]
-    export_trajectory(result, tmp_path / "poses.txt", "tum")
+    export(result, tmp_path / "poses.txt", "tum")
     rows = np.loadtxt(tmp_path / "poses.txt")
     np.testing.assert_array_equal(rows[:, 0], result.time_s)
     np.testing.assert_array_equal(rows[:, 1:4], result.T_world_imu[:, :3, 3])
@@ -291,7 +291,7 @@ def test_tum_export_holds_stamps_positions_and_quaternions(results, tmp_path):
 
 def test_kitti_export_holds_the_upper_rows_exactly(results, tmp_path):
     result = results["full"]
-    export_trajectory(result, tmp_path / "poses.txt", "kitti")
+    export(result, tmp_path / "poses.txt", "kitti")
     rows = np.loadtxt(tmp_path / "poses.txt")
     np.testing.assert_array_equal(rows.reshape(-1, 3, 4), result.T_world_imu[:, :3])
 

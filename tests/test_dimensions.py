@@ -137,8 +137,8 @@ def test_names_of_dimensions_are_distinct():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("version", [1, 2, 3, 4, 5])
-def test_archives_of_every_earlier_version_are_read_and_written_again(version, tmp_path):
+@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6])
+def test_archives_of_every_version_are_read_and_written_again(version, tmp_path):
     """Files that those releases wrote; what is read of them is what is read after it was written in today's form."""
     old = read_archive(unpacked(f"archive_{version}", tmp_path))
     assert len(old.time_s) == 8 and {"dead-reckoning", "full"} <= set(old.results)
@@ -147,6 +147,14 @@ def test_archives_of_every_earlier_version_are_read_and_written_again(version, t
     write_archive(tmp_path / "new.h5", old, old.results)
     for mode, result in old.results.items():
         assert_same(open_result(tmp_path / "new.h5", mode), result, mode)
+
+
+def test_a_frozen_archive_of_inertial_samples_is_smoothed_as_it_was(tmp_path):
+    archive = read_archive(unpacked("inertial_6", tmp_path))
+    found, frozen = smooth(archive.results["full"]), archive.results["smoothed"]
+    assert archive.twist is None
+    np.testing.assert_allclose(found.T_world_imu, frozen.T_world_imu, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, frozen.covariance, rtol=1e-6, atol=1e-12)
 
 
 def test_an_earlier_sequence_and_study_are_read(tmp_path):

@@ -6,6 +6,7 @@ evo (GPL) is called as a program only; it is never imported.
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 import subprocess
@@ -23,7 +24,7 @@ from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.summary import summarise
 from ekfslam.runner import run
 from ekfslam.storage.archive import read_archive, write_archive
-from ekfslam.storage.exports import export_truth
+from ekfslam.storage.exports import truth_text
 
 ATE = ("evo_ape", "--pose_relation", "trans_part")
 RPE = ("evo_rpe", "--all_pairs", "--pairs_from_reference")
@@ -111,8 +112,9 @@ def test_evo_finds_the_errors_where_truth_has_gaps(evo, result, with_gaps):
 
 
 def test_exported_truth_is_that_of_the_recording(world, archive, tmp_path):
-    assert export_truth(archive, tmp_path / "truth.txt", "kitti") == 80
-    rows = np.loadtxt(tmp_path / "truth.txt")
+    count, text = truth_text(read_archive(archive), "", "kitti")
+    rows = np.loadtxt(io.StringIO(text))
+    assert count == 80
     np.testing.assert_array_equal(rows.reshape(-1, 3, 4), world.truth.T_world_imu[:, :3])
 
 
@@ -130,13 +132,13 @@ def test_exported_truth_with_gaps_has_its_own_stamps(world, with_gaps, tmp_path,
 def test_truth_that_cannot_be_exported_is_a_named_error(world, result, with_gaps, tmp_path, capsys):
     path, out = tmp_path / "blind.h5", tmp_path / "truth.txt"
     with pytest.raises(ArchiveError, match=r"gaps\.h5: holds the true pose of 53 of 80 frames.*take tum"):
-        export_truth(with_gaps, out, "kitti")
+        truth_text(read_archive(with_gaps), str(with_gaps), "kitti")
     none = np.empty(0, dtype=np.int64)
     map_only = Truth(none, np.empty((0, 4, 4)), world.truth.landmark, world.truth.position_m)
     for truth in (None, map_only):
         write_archive(path, dataclasses.replace(world, truth=truth), {"full": result})
         with pytest.raises(ArchiveError, match=r"blind\.h5: holds no true pose"):
-            export_truth(path, out, "tum")
+            truth_text(read_archive(path), str(path), "tum")
     assert main(["export", str(path), "--format", "tum", "--mode", "truth", "--out", str(out)]) == 2
     assert capsys.readouterr().err == f"ekfslam: error: {path}: holds no true pose\n"
     assert not out.exists()

@@ -102,6 +102,8 @@ def test_every_number_of_an_archive_is_looked_at(whole, tmp_path):
         ("runs/full/trajectory/time", 0.0),
         ("runs/full/trajectory/T_world_imu", 2.0),
         ("runs/full/trajectory/covariance", -1.0),
+        ("runs/full/timing/ms_per_frame", 1e200),
+        ("runs/full/innovation/dof", (1 << 62) + 1),
         ("runs/full/landmarks/covariance", -1.0),
         ("truth/frame", 12),
         ("truth/frame", -1),
@@ -116,6 +118,15 @@ def test_values_out_of_their_range_are_named(whole, tmp_path, name, entry):
         pytest.skip(f"{name} has no entry in this run")
     path = altered(whole, tmp_path, name, spoilt(value, entry))
     with pytest.raises(ArchiveError, match=name.split("/")[-1]):
+        read_archive(path)
+
+
+def test_a_stamp_that_comes_twice_is_named(whole, tmp_path):
+    with h5py.File(whole) as h5file:
+        time_s = h5file["runs/full/trajectory/time"][()]
+    time_s[7] = time_s[6]
+    path = altered(whole, tmp_path, "runs/full/trajectory/time", time_s)
+    with pytest.raises(ArchiveError, match=r"time\[7\].*must be finite and ascend"):
         read_archive(path)
 
 

@@ -31,6 +31,7 @@ from ekfslam.evaluation.trajectory import (
 from ekfslam.filters.result import Landmarks
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
+from ekfslam.stored import empty
 
 
 def random_poses(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -203,7 +204,7 @@ def test_landmark_rmse_matches_by_id_counts_repeats_and_ignores_the_unknown():
     estimate = landmarks_at([5, 7, 2, 5], np.array([[5.0, 1, 0], [0, 0, 0], [2, 0, 2], [5, 0, -3]]))
     assert landmark_rmse(estimate, truth) == pytest.approx(np.sqrt((1 + 4 + 9) / 3))
     assert landmark_rmse(landmarks_at([7], np.zeros((1, 3))), truth) is None
-    assert landmark_rmse(Landmarks.empty(), truth) is None
+    assert landmark_rmse(empty(Landmarks), truth) is None
 
 
 def test_pose_error_is_the_stored_one_and_a_linear_map_of_the_right_invariant_one():

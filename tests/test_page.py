@@ -28,6 +28,7 @@ from ekfslam.page.content import PART, packed, sections_of, told_apart
 from ekfslam.page.report import read_archives, report_page, write_report
 from ekfslam.runner import run
 from ekfslam.storage.archive import read_archive, write_archive
+from ekfslam.stored import empty
 
 HONEST = "honest as far as the truth of one drive can tell"
 HOSTILE = "</script><script>alert('x')</script><img src=http://evil.example onerror=alert(1)>\x1b[31m"
@@ -109,7 +110,7 @@ def test_every_run_has_a_verdict_from_what_there_is(archive):
     doubled = dataclasses.replace(
         honest, innovation=dataclasses.replace(honest.innovation, nis=4.0 * honest.innovation.dof)
     )
-    bare = dataclasses.replace(honest, innovation=Innovation.empty(len(honest.time_s)))
+    bare = dataclasses.replace(honest, innovation=empty(Innovation, T=len(honest.time_s)))
     said = carded(known, first=honest, small=small, doubled=doubled, bare=bare)
     assert said["bare"] == ("good", [HONEST, "pose NEES 6, where one honest drive has 1.2 to 14.4"])
     assert said["small"][0] == "bad"

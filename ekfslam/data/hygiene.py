@@ -19,7 +19,7 @@ from ekfslam.data.sequence import Noise, Observations, Sequence
 from ekfslam.data.tracks import adjacent, cut_tracks, repeated_frames, successive
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
-from ekfslam.stored import COUNTS, FRAMES, attribute, stored, whole, zeros
+from ekfslam.stored import COUNTS, FRAMES, attribute, layout_of, stored, whole, zeros
 
 # The rules in the order in which they are applied, with the key of ``[hygiene]`` that switches each. The index of a
 # rule is its code in `HygieneReport.rule`, also in archives: new rules are added at the end.
@@ -117,7 +117,7 @@ class _Cleaning:
 
     def report(self) -> HygieneReport:
         if not self._findings:
-            return HygieneReport(self._looked_at, **zeros(HygieneReport, finding=0))
+            return HygieneReport(self._looked_at, **zeros(layout_of(HygieneReport)))
         return HygieneReport(self._looked_at, *map(np.concatenate, zip(*self._findings, strict=True)))
 
     def _record(self, rule: int, found: BoolArray, continuation: IntArray) -> None:

@@ -10,6 +10,7 @@ from ekfslam.evaluation.consistency import nees, pose_noise_covariance
 from ekfslam.evaluation.trajectory import PATH_TOLERANCE, distance_along
 from ekfslam.filters.result import PosePairs, Result
 from ekfslam.geometry import se3
+from ekfslam.stored import empty
 
 FRAMES = (10, 50, 100)
 PATHS_M = (50.0, 100.0)
@@ -65,7 +66,7 @@ def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) ->
     Truth noise adds ``N_k + A N_j A^T`` to `relative_covariance`, with N that of single true poses; an error of the
     first pose cancels. Pairs with an ``interpolated`` interval (T,) between them are left out.
     """
-    pairs, place = result.pairs or PosePairs.empty(), np.full(len(result.time_s), -1)
+    pairs, place = result.pairs or empty(PosePairs), np.full(len(result.time_s), -1)
     place[truth.frame] = np.arange(len(truth.frame))
     invented = np.cumsum(interpolated)
     is_measured = invented[pairs.first] == invented[pairs.second]

@@ -34,7 +34,6 @@ from ekfslam.stored import (
     index_of,
     stored,
     values_of,
-    zeros,
 )
 
 ERROR_CONVENTION = (
@@ -89,11 +88,6 @@ class Landmarks:
         """Return all landmarks of the parts, in their order."""
         return Landmarks(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Landmarks)))
 
-    @staticmethod
-    def empty() -> Landmarks:
-        """Return a map without landmarks."""
-        return Landmarks(**zeros(Landmarks, M=0))
-
 
 @dataclass(frozen=True)
 class Innovation:
@@ -111,18 +105,12 @@ class Innovation:
     accepted: IntArray = field(metadata=stored("T", "count", check=COUNTS))
     rejected: IntArray = field(metadata=stored("T", "count", check=COUNTS))
 
-    @staticmethod
-    def empty(frames: int) -> Innovation:
-        """Return the statistics of a run without observations."""
-        return Innovation(**zeros(Innovation, T=frames))
-
 
 @dataclass(frozen=True)
 class WhitenedInnovations:
-    """Innovations in units of their predicted deviations, from which `ekfslam.evaluation.honesty` judges a filter.
+    """Innovations of the K' accepted observations of known landmarks in units of their predicted deviations.
 
-    They belong to the K' accepted observations of known landmarks, in the order of frames. The equations are in
-    `ekfslam.filters.innovations`.
+    They are in the order of frames; the equations are in `ekfslam.filters.innovations`.
 
     Args:
         frame: (K',) frame of the observation.
@@ -169,11 +157,6 @@ class Rejections:
     frame: IntArray = field(metadata=stored("R", "frame index", check=FRAMES))
     landmark: IntArray = field(metadata=stored("R", "landmark id", check=COUNTS))
     reason: IntArray = field(metadata=stored("R", "code, see names", codes=REASONS))
-
-    @staticmethod
-    def empty() -> Rejections:
-        """Return the rejections of a run that rejected nothing."""
-        return Rejections(**zeros(Rejections, R=0))
 
 
 @dataclass(frozen=True)
@@ -228,20 +211,11 @@ class PosePairs:
         """Return some of the pairs."""
         return replace(self, **along(self, "pair", which))
 
-    @staticmethod
-    def empty() -> PosePairs:
-        """Return no pairs."""
-        return PosePairs(**zeros(PosePairs, pair=0))
-
 
 class View:
-    """A method of `Result` that a higher module provides: a function whose first argument is the result.
+    """A method of `Result` that a higher module provides, ``module:name`` of a function of the result.
 
-    The function is named here and found at its first use, like an entry point. So results import neither figures nor
-    files, and ``help(Result.map)`` shows the function.
-
-    Args:
-        function: ``module:name`` of the function.
+    It is found at its first use, like an entry point, so that results import neither figures nor files.
     """
 
     def __init__(self, function: str) -> None:
@@ -266,8 +240,7 @@ class Result(Shown):
         innovation: Per-frame statistics.
         rejections: Every rejected observation.
         ms_per_frame: (T,) wall-clock time spent on each frame.
-        counts: Totals: accepted, rejected per reason, retired, reappeared, findings of hygiene. The observations that
-            were accepted, rejected, and dropped by hygiene add up to all.
+        counts: Totals. Observations accepted, rejected and dropped by hygiene add up to all.
         config: The resolved configuration as nested dictionaries.
         noise: The measurement noise that was assumed.
         camera, T_cam_imu: The calibration that was assumed.
@@ -276,8 +249,7 @@ class Result(Shown):
         parameters: Estimates of calibration, roll and pitch (None: none were estimated).
         pairs: Cross-covariances of some of the poses (None: there is no truth to compare with).
         whitened: Whitened innovations (mode full only; older archives have none).
-        attributes: Sequence attributes, versions, seed, input checksum; ``log_likelihood`` of the accepted
-            innovations, by which runs that reject the same observations can be compared.
+        attributes: Sequence attributes, versions, seed, input checksum, ``log_likelihood`` of the accepted innovations.
     """
 
     mode: str
@@ -343,20 +315,15 @@ class Result(Shown):
 
     @property
     def position_covariance_world(self) -> Array:
-        """(T, 3, 3) covariance of the position error of the IMU along the axes of world, m^2.
+        """(T, 3, 3) covariance ``R P_rho R^T`` of the position error along the axes of world, m^2.
 
-        ``covariance`` is of ``xi``, whose axes are those of the IMU: an error ``xi`` moves the IMU by ``-R rho`` to
-        first order, with the rotation R of ``T_world_imu``. So this is ``R P_rho R^T``, for every variant, since stored
-        covariances are always of ``xi``. ``landmarks.covariance`` is along the axes of world already.
+        ``covariance`` is of ``xi`` along the axes of the IMU. ``xi`` moves the IMU by ``-R rho`` to first order.
         """
         return world_axes_covariance(self.T_world_imu, self.covariance)[0]
 
     @property
     def rotation_covariance_world(self) -> Array:
-        """(T, 3, 3) covariance ``R P_theta R^T`` of the rotation error about the axes of world, rad^2.
-
-        The true rotation is ``exp(e^) R`` for an error e, see `position_covariance_world`.
-        """
+        """(T, 3, 3) covariance ``R P_theta R^T`` of the rotation error about the axes of world, rad^2."""
         return world_axes_covariance(self.T_world_imu, self.covariance)[1]
 
     @property
@@ -378,8 +345,8 @@ class Result(Shown):
     def between(self, begin_s: float, end_s: float) -> Result:
         """Return the frames with stamps in ``[begin_s, end_s)``, on the clock of the recording, as a result.
 
-        Estimates, ``counts``, ``config`` and ``attributes`` stay those of the whole run. The map has the landmarks that
-        were seen in these frames. Log, whitened innovations and hygiene belong to the whole run and are left out.
+        The map has the landmarks seen in these frames. Estimates, ``counts``, ``config`` and ``attributes`` stay those
+        of the whole run; log, whitened innovations and hygiene are left out.
 
         Raises:
             ShapeError: There are no such frames.

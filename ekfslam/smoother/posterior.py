@@ -34,6 +34,7 @@ from ekfslam.shown import Card, Shown, count, figure
 from ekfslam.smoother.optimise import MOST_ITERATIONS, maximise
 from ekfslam.smoother.problem import BatchProblem, State
 from ekfslam.smoother.sparse.information import JointInformation
+from ekfslam.stored import empty
 
 DENSE_LIMIT = 20_000  # columns of a dense covariance: 3.2 GB
 
@@ -345,8 +346,8 @@ def smooth(result: Result, config: PosteriorConfig | None = None, found: Posteri
         T_world_imu=found.T_world_imu,
         covariance=covariance,
         landmarks=dataclasses.replace(landmarks, position_m=found.position_m, covariance=landmark_covariance),
-        innovation=Innovation.empty(T),
-        rejections=Rejections.empty(),
+        innovation=empty(Innovation, T=T),
+        rejections=empty(Rejections),
         ms_per_frame=np.full(T, 1e3 * seconds / T),
         counts={
             "observations": len(found.weight),

@@ -88,9 +88,7 @@ class Archive(Shown):
 
 
 def write_archive(path: str | Path, sequence: Sequence | Archive, results: Mapping[str, Result]) -> None:
-    """Write the results (mode to `Result`) of one sequence to an HDF5 file, replacing an old one.
-
-    The file appears under its name only when it is complete: a run that is killed leaves the old archive or none.
+    """Write the results (mode to `Result`) of one sequence to an HDF5 file, as a whole, replacing an old one.
 
     Raises:
         ArchiveError: The file cannot be written, or its content could not be read again (NaN, say).
@@ -124,13 +122,9 @@ def require_same_origin(path: str | Path, sequence: Sequence) -> None:
             source = str(hdf5.attribute(h5file, "source"))
     except ArchiveError as error:
         raise WriteError(f"{path}: exists, and is no archive to be replaced ({error}); --force replaces it") from None
-    key = "checksum_sha256"
-    same_content = (
-        found[key] == sequence.attributes[key] if {key} <= found.keys() & sequence.attributes.keys() else None
-    )
-    if same_content is None:
-        same_content = source == sequence.source and found == dict(sequence.attributes)
-    if not same_content:
+    wanted, key = dict(sequence.attributes), "checksum_sha256"
+    has_checksums = key in found and key in wanted
+    if (found[key] != wanted[key]) if has_checksums else (source, found) != (sequence.source, wanted):
         raise WriteError(f"{path}: exists, and is a result of another recording ({source}); --force replaces it")
 
 
@@ -142,12 +136,10 @@ def add_result(
 ) -> None:
     """Add the result of one more mode to an archive, replacing an older one of that mode.
 
-    The archive is read again and rewritten as a whole. It is never seen half written, and two processes that add to it
-    at the same time both succeed.
+    The archive is rewritten as a whole. Two processes that add to it at the same time both succeed.
 
     Args:
-        path: Path of the archive.
-        result: Result to add.
+        path, result: The archive, and the result to add.
         of: Run of the archive that the result was made from, which must still be there.
         beside: Further files to write with it, see `ekfslam.files.write_all`.
 
@@ -156,17 +148,13 @@ def add_result(
     """
     with files.alone(path):
         archive = read_archive(path)
-        if of is not None and not _is_same_run(archive.results.get(of.mode), of):
-            raise ArchiveError(f"{path}: its run {of.mode!r} was replaced meanwhile; start again")
+        if of is not None:
+            found = archive.results.get(of.mode)
+            names = ("time_s", "T_world_imu", "covariance", "ms_per_frame")
+            if found is None or not all(np.array_equal(getattr(found, name), getattr(of, name)) for name in names):
+                raise ArchiveError(f"{path}: its run {of.mode!r} was replaced meanwhile; start again")
         others = {mode: other for mode, other in archive.results.items() if mode != result.mode}
         files.write_all({**beside, Path(path): archive_image(archive, {**others, result.mode: result})})
-
-
-def _is_same_run(found: Result | None, run: Result) -> bool:
-    return found is not None and all(
-        np.array_equal(getattr(found, name), getattr(run, name))
-        for name in ("time_s", "T_world_imu", "covariance", "ms_per_frame")
-    )
 
 
 def read_archive(path: str | Path) -> Archive:
@@ -221,15 +209,18 @@ def _read_result(h5file: h5py.File, mode: str, sequence: Mapping[str, Any]) -> R
     group = hdf5.subgroup(h5file, f"runs/{mode}")
     version = hdf5.version_of(group if "format_version" in group.attrs else h5file)
     complete, former = partial(older.completed, version=version), older.former(version)
-    found = hdf5.read_record(
-        group, Result, {"T": len(sequence["time_s"])}, _stamps(group), complete=complete, former=former
-    )
+    time = group.get("trajectory/time")
+    coordinates = {"time": time[()]} if isinstance(time, h5py.Dataset) else {}
+    sizes = {"T": len(sequence["time_s"])}
+    found = hdf5.read_record(group, Result, sizes, coordinates, complete=complete, former=former)
     _require_agreement(found, f"{h5file.filename}: {group.name.strip('/')}")
-    noise = _read_noise(group)
+    noise, counts = _read_noise(group), hdf5.json_table(group, "counts")
+    if not all(type(count) is int and 0 <= count < 1 << 62 for count in counts.values()):
+        raise ArchiveError(f"{h5file.filename}: attribute counts of runs/{mode} holds what is no count")
     return Result(
         mode=mode,
         **found,
-        counts=_read_counts(group),
+        counts=counts,
         config=_read_config(group, noise, version),
         noise=noise,
         camera=sequence["camera"],
@@ -282,13 +273,6 @@ def _read_noise(group: h5py.Group) -> Noise:
     return noise
 
 
-def _read_counts(group: h5py.Group) -> dict[str, int]:
-    counts = hdf5.json_table(group, "counts")
-    if not all(type(count) is int and 0 <= count < 1 << 62 for count in counts.values()):
-        raise ArchiveError(f"{group.file.filename}: attribute counts of {group.name.strip('/')} holds what is no count")
-    return counts
-
-
 def _read_config(group: h5py.Group, noise: Noise, version: int) -> dict[str, Any]:
     config = hdf5.json_table(group, "config")
     try:
@@ -298,9 +282,3 @@ def _read_config(group: h5py.Group, noise: Noise, version: int) -> dict[str, Any
     except ConfigError as error:
         raise ArchiveError(f"{group.file.filename}: attribute config of {group.name.strip('/')}: {error}") from None
     return config
-
-
-def _stamps(group: h5py.Group) -> dict[str, Array]:
-    """Return the coordinate of the dimension ``time`` of a run."""
-    time = group.get("trajectory/time")
-    return {"time": time[()]} if isinstance(time, h5py.Dataset) else {}

@@ -28,7 +28,7 @@ from ekfslam.filters.result import Result
 from ekfslam.geometry import motion, se3
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.smoother.posterior import Posterior, is_inertial, posterior
-from ekfslam.storage.archive import Archive, read_archive
+from ekfslam.storage.archive import Archive
 from ekfslam.storage.tables import columns, covariance_columns
 
 MADE_BY = "ekfslam"  # in files that have room for a remark
@@ -37,12 +37,7 @@ _G2O = f"# {MADE_BY}: "
 
 
 def export(result: Result, path: str | Path, format: str) -> None:
-    """Write a result for other programs.
-
-    Args:
-        result: Any run.
-        path: File to write.
-        format: A name of `EXPORTS`: ``tum`` and ``kitti`` are poses, ``ply`` is the map, ``csv-landmarks`` a table.
+    """Write a result for other programs in a format of `EXPORTS`, such as ``tum``, ``ply`` or ``csv-landmarks``.
 
     Raises:
         ArchiveError: There is no such format, it cannot hold this result, or the file cannot be written.
@@ -53,68 +48,39 @@ def export(result: Result, path: str | Path, format: str) -> None:
     files.write(path, EXPORTS[format].write(result))
 
 
-def export_trajectory(result: Result, path: str | Path, format: Literal["tum", "kitti"]) -> None:
-    """Write the estimated poses ``T_world_imu`` as text, one line a frame, in 17 digits: every number exactly.
-
-    Both formats hold the pose of the *IMU* in *world*; KITTI's own files hold the left camera in its first frame.
-
-    Args:
-        result: Run to export.
-        path: File to write.
-        format: ``tum``: ``time tx ty tz qx qy qz qw`` (s, m, unit quaternion); ``kitti``: the twelve entries of the
-            upper 3x4 part row by row.
-
-    Raises:
-        ArchiveError: The file cannot be written.
-    """
-    export(result, path, format)
-
-
-def export_truth(archive: str | Path, path: str | Path, format: Literal["tum", "kitti"]) -> int:
-    """Write the true poses that an archive holds, as `export_trajectory` does; one line a frame of known pose.
-
-    Returns:
-        The number of lines.
-
-    Raises:
-        ArchiveError: As `read_archive`; or there is no true pose, or not of every frame and the format is ``kitti``,
-            which has no stamps to say of which; or the file cannot be written.
-    """
-    poses, text = truth_text(read_archive(archive), str(archive), format)
-    files.write(path, text)
-    return poses
-
-
 def truth_text(archive: Archive, place: str, format: Literal["tum", "kitti"]) -> tuple[int, str]:
-    """Return the number of lines and the text that `export_truth` writes for an archive; it raises the same errors.
+    """Return number and text of the true poses of an archive, one line a frame of known pose.
 
     Args:
         archive: The archive.
         place: Its path, for messages.
-        format: As for `export_truth`.
+        format: Format of the text.
+
+    Raises:
+        ArchiveError: There is no true pose; or frames lack one and the format is ``kitti``, which has no stamps.
     """
     truth, frames = archive.truth, len(archive.time_s)
     if truth is None or not len(truth.frame):
         raise ArchiveError(f"{place}: holds no true pose")
     if format == "kitti" and len(truth.frame) < frames:
         raise ArchiveError(
-            f"{place}: holds the true pose of {len(truth.frame)} of {frames} frames; kitti has no stamps to say of "
-            "which, take tum"
+            f"{place}: holds the true pose of {len(truth.frame)} of {frames} frames; kitti has no stamps, take tum"
         )
     return len(truth.frame), _pose_text(archive.time_s[truth.frame], truth.T_world_imu, format)
 
 
 def _pose_text(time_s: Array, T: Array, format: Literal["tum", "kitti"]) -> str:
+    """Return poses of the IMU in world, one line each, in 17 digits, which is every number exactly.
+
+    A line of ``tum`` is ``time tx ty tz qx qy qz qw``, one of ``kitti`` the upper 3x4 part of the pose by rows. Files
+    of KITTI itself hold the left camera in its first frame.
+    """
     rows = np.column_stack([time_s, _position_and_quaternion(T)]) if format == "tum" else T[:, :3].reshape(-1, 12)
     return "".join(f"{_numbers(row)}\n" for row in rows)
 
 
 def csv_text(result: Result, table: str = "trajectory") -> str:
-    """Return a table of `ekfslam.storage.tables` as comma-separated values with a heading, every number exactly.
-
-    Raises:
-        ArchiveError: There is no such table.
-    """
+    """Return a table of `ekfslam.storage.tables` as comma-separated values with a heading, every number exactly."""
     found, out = columns(result, table), io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(found)
@@ -123,11 +89,9 @@ def csv_text(result: Result, table: str = "trajectory") -> str:
 
 
 def ply_bytes(result: Result) -> bytes:
-    """Return the landmarks as a point cloud (PLY, binary, little endian), a vertex each.
+    """Return the landmarks with their covariances as a point cloud (PLY, binary, little endian).
 
-    Its properties are ``x y z`` (double, m), ``red green blue``, ``id``, ``observations``, and the covariance
-    ``cov_xx`` to ``cov_zz`` (double, m^2). Colours run from blue (1 cm and less) to red (10 m and more) with the
-    logarithm of the largest standard deviation.
+    Colours run from blue (1 cm and less) to red (10 m and more) with the logarithm of the largest standard deviation.
 
     Raises:
         ArchiveError: An id has no place in a double.
@@ -135,8 +99,11 @@ def ply_bytes(result: Result) -> bytes:
     landmarks = result.landmarks
     if len(landmarks) and landmarks.id.max() > 1 << 53:
         raise ArchiveError(f"{result.sequence_name}: landmark id {landmarks.id.max()} is too large for PLY")
+    std = np.sqrt(np.maximum(np.linalg.eigvalsh(landmarks.covariance)[:, -1], 1e-12))
+    share = np.clip((np.log10(std) + 2.0) / 3.0, 0.0, 1.0)[:, None]
+    colours = np.round((1.0 - share) * np.array([0, 114, 178]) + share * np.array([213, 94, 0])).astype(np.uint8)
     properties: dict[str, NDArray] = dict(zip("xyz", landmarks.position_m.T, strict=True))
-    properties |= dict(zip(("red", "green", "blue"), _colours(landmarks.covariance).T, strict=True))
+    properties |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
     properties |= {"id": landmarks.id.astype(float), "observations": landmarks.observations.astype(np.int32)}
     properties |= covariance_columns(landmarks.covariance, "cov_{}")
     types = {"f": ("double", "<f8"), "i": ("int", "<i4"), "u": ("uchar", "u1")}
@@ -145,13 +112,6 @@ def ply_bytes(result: Result) -> bytes:
         vertex[name] = value
     declared = "".join(f"property {types[value.dtype.kind][0]} {name}\n" for name, value in properties.items())
     return (_PLY + f"element vertex {len(landmarks)}\n{declared}end_header\n").encode("ascii") + vertex.tobytes()
-
-
-def _colours(covariance: Array) -> NDArray:
-    """Return colours (n, 3) of covariances (n, 3, 3): blue at 1 cm, red at 10 m."""
-    std = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 1e-12))
-    share = np.clip((np.log10(std) + 2.0) / 3.0, 0.0, 1.0)[:, None]
-    return np.round((1.0 - share) * np.array([0, 114, 178]) + share * np.array([213, 94, 0])).astype(np.uint8)
 
 
 def g2o_text(result: Result) -> str:
@@ -223,10 +183,9 @@ def _numbers(values: Array) -> str:
 
 
 def information_bytes(result: Result, found: Posterior | None = None) -> bytes:
-    """Return the joint information matrix of a full run as a file for `scipy.sparse.load_npz`.
+    """Return the joint information matrix of a full run as a file for `scipy.sparse.load_npz`, without pickle.
 
-    The file also has the arrays ``kind``, ``frame``, ``id`` and ``axis``, which say what each column is, see
-    `Posterior.information_matrix`, and ``made_by``. It contains no pickle.
+    Further arrays ``kind``, ``frame``, ``id`` and ``axis`` name each column, see `Posterior.information_matrix`.
 
     Args:
         result: A result of mode ``full``.

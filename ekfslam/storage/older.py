@@ -8,44 +8,38 @@ inputs of any process in the log.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.arrays import Array
 from ekfslam.config import HygieneConfig
 from ekfslam.data.noise import Noise
 from ekfslam.filters.log import Log
 from ekfslam.geometry import se3
-from ekfslam.stored import FLAGS, FRAMES, NOT_NEGATIVE, Layout, layout_of, stored, whole, zeros
+from ekfslam.stored import FLAGS, FRAMES, NOT_NEGATIVE, NUMBERS, Item, Layout, whole, zeros
 
-_VELOCITIES = "m/s (0-2), rad/s (3-5)"
-
-
-@dataclass(frozen=True)
-class VelocityLog:
-    """Fields of a log of versions before 6, in which velocities were the only inputs.
-
-    Args:
-        twist: (T, 6) velocity that led to each frame; that of the first frame drives nothing.
-        up: (T, 3) direction against gravity in world at the prediction, or (T, 0). From version 4 on.
-        velocity_frame, velocity_axis, velocity_value, velocity_std, velocity_is_biased: (S,) measurements of
-            velocities in the state. From version 4 on.
-    """
-
-    twist: Array = field(metadata=stored("T u", _VELOCITIES))
-    up: Array = field(metadata=stored("T U"))
-    velocity_frame: IntArray = field(metadata=stored("measured", check=FRAMES))
-    velocity_axis: IntArray = field(metadata=stored("measured", check=whole(0, 5)))
-    velocity_value: Array = field(metadata=stored("measured"))
-    velocity_std: Array = field(metadata=stored("measured", check=NOT_NEGATIVE))
-    velocity_is_biased: BoolArray = field(metadata=stored("measured", check=FLAGS))
+# Data sets of a log of versions before 6, in which velocities were the only inputs.
+_TWIST = Item("twist", "twist", ("T", "u"), "m/s (0-2), rad/s (3-5)", "none")  # that of the first frame drives nothing
+_FROM_4 = (
+    Item("up", "up", ("T", "U"), "1", "world"),  # against gravity at the prediction, or (T, 0)
+    *(
+        Item(f"velocity_{name}", f"velocity_{name}", ("measured",), "1", "none", check)
+        for name, check in (
+            ("frame", FRAMES),
+            ("axis", whole(0, 5)),
+            ("value", NUMBERS),
+            ("std", NOT_NEGATIVE),
+            ("is_biased", FLAGS),
+        )
+    ),
+)
 
 
 def former(version: int) -> Mapping[type, Layout]:
     """Return the data sets of records that a release of this format version wrote, and this one does not."""
-    return {Log: layout_of(VelocityLog)} if version < 6 else {}
+    return {Log: (_TWIST, *_FROM_4)} if version < 6 else {}
 
 
 def completed(record: type, found: dict[str, Any], version: int) -> dict[str, Any]:
@@ -83,10 +77,8 @@ def _blocks_of_a_pose(log: dict[str, Any]) -> dict[str, Any]:
 
     departed = np.concatenate([predicted[:1], log["T_updated"][:-1]])
     updated = coordinates(log["T_updated"])
-    sizes = {"T": len(predicted), "B": 6, "U": 0, "L": 0, "K": len(log["frame"]), "d": 0, "measured": 0}
-    velocities = zeros(VelocityLog, **sizes)
     return {
-        **{name: velocities[name] for name in velocities if name != "twist"},
+        **zeros(_FROM_4, T=len(predicted)),
         "seen_twist": log["twist"],
         "T_departed": departed,
         "T_linear_before": departed,

@@ -19,6 +19,7 @@ from ekfslam.filters.result import REASONS, Innovation, Landmarks, Rejections, R
 from ekfslam.geometry import camera, motion, se3
 from ekfslam.geometry.camera import StereoCamera, project
 from ekfslam.smoother.revival import MapRevival
+from ekfslam.stored import empty
 
 CAMERA = StereoCamera(fu_px=700.0, fv_px=700.0, cu_px=600.0, cv_px=180.0, baseline_m=0.54)
 # IMU axes forward, left, up; camera axes right, down, forward.
@@ -76,7 +77,7 @@ def synthetic_result(sequence: Sequence, mode: str = "full", seed: int = 1) -> R
         time_s=sequence.time_s,
         T_world_imu=truth.T_world_imu @ se3.exp(xi),
         covariance=scale**2 * covariance,
-        landmarks=Landmarks.empty(),
+        landmarks=empty(Landmarks),
         innovation=blank,
         rejections=Rejections(none, none, none),
         ms_per_frame=rng.gamma(4.0, 0.5, frames),
