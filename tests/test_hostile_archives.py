@@ -121,6 +121,35 @@ def test_values_out_of_their_range_are_named(whole, tmp_path, name, entry):
         read_archive(path)
 
 
+def test_a_mirrored_pose_is_named(whole, tmp_path):
+    with h5py.File(whole) as h5file:
+        T = h5file["runs/full/trajectory/T_world_imu"][()]
+    T[7, :3, 2] *= -1.0
+    with pytest.raises(ArchiveError, match=r"T_world_imu\[7\]: must be a rigid transform"):
+        read_archive(altered(whole, tmp_path, "runs/full/trajectory/T_world_imu", T))
+
+
+def test_a_pair_of_one_frame_with_itself_is_named(whole, tmp_path):
+    path = Path(shutil.copy(whole, tmp_path / "copy.h5"))
+    with h5py.File(path, "a") as h5file:
+        group = h5file["runs/full/pairs"]
+        for name in list(group):
+            del group[name]
+        group["first"], group["second"], group["cross"] = [3], [3], np.zeros((1, 6, 6))
+    with pytest.raises(ArchiveError, match="pairs holds frames that are no pair"):
+        read_archive(path)
+
+
+def test_a_difference_from_an_earlier_frame_than_the_one_before_is_named(whole, tmp_path):
+    with h5py.File(whole) as h5file:
+        frame, landmark, previous = (h5file[f"runs/full/log/{name}"][()] for name in ("frame", "landmark", "previous"))
+    views = np.flatnonzero(landmark == landmark[frame == 5][0])
+    later = views[frame[views] == 5][0]
+    previous[later] = views[frame[views] < 4][0]
+    with pytest.raises(ArchiveError, match=rf"previous\[{later}\] is no observation of the same landmark"):
+        read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
+
+
 def test_a_stamp_that_comes_twice_is_named(whole, tmp_path):
     with h5py.File(whole) as h5file:
         time_s = h5file["runs/full/trajectory/time"][()]
