@@ -47,6 +47,7 @@ FRAMES = 51
 ROW_STD_PX, CONSTANT_STD_PX, KNOWN_PX, OUTLIER_PX = 0.3, 1.0, 0.4, 3.0
 ITERATIONS, LEAST, LAGS = 8, 4, 8
 ROWS = ("u", "v", "disparity")
+CONFIG = ekfslam.Config().with_overrides({"filter": {"relative_frames": 100}})
 
 
 def main() -> None:
@@ -54,14 +55,13 @@ def main() -> None:
     options = parser.parse_args()
     if not has_recordings(options.data, f"{FOLDER}/calib.txt", TRUTH, GIVEN):
         return
-    tracked, report, ms = _tracked(options.data, velocities=False)
-    driven, _, _ = _tracked(options.data, velocities=True)
+    tracked, report, ms = track_images(options.data, velocities=False)
+    driven, _, _ = track_images(options.data, velocities=True)
     given = attach_truth(ekfslam.open_sequence(options.data / GIVEN)[:FRAMES], options.data / TRUTH)
-    config = ekfslam.Config().with_overrides({"filter": {"relative_frames": 100}})
     runs = {
-        "front end, vision alone": (tracked, ekfslam.run(tracked, "full", config)),
-        "front end, with velocities": (driven, ekfslam.run(driven, "full", config)),
-        "given KLT, with velocities": (given, ekfslam.run(given, "full", config)),
+        "front end, vision alone": (tracked, ekfslam.run(tracked, "full", CONFIG)),
+        "front end, with velocities": (driven, ekfslam.run(driven, "full", CONFIG)),
+        "given KLT, with velocities": (given, ekfslam.run(given, "full", CONFIG)),
     }
     poses = {
         "vision's": _camera_poses(tracked, runs["front end, vision alone"][1].T_world_imu),
@@ -72,7 +72,7 @@ def main() -> None:
         for name, sequence in (("given KLT", given), ("front end", tracked))
         for where, T_world_cam in poses.items()
     }
-    rows = {name: _figures_of(*run) for name, run in runs.items()}
+    rows = {name: figures_of(*run) for name, run in runs.items()}
     values = {
         "ms_per_frame": ms,
         "poses": rows,
@@ -86,7 +86,7 @@ def main() -> None:
     print(_text(rows, found, report, ms))
 
 
-def _tracked(data: Path, velocities: bool) -> tuple[Sequence, TrackReport, float]:
+def track_images(data: Path, velocities: bool) -> tuple[Sequence, TrackReport, float]:
     """Return the tracks of the images, and the processor time per frame in ms, with decoding."""
     recording = open_images(data / FOLDER)
     assert recording is not None
@@ -181,7 +181,7 @@ def _shared(frame: Array, step: Array) -> Array:
     return np.sqrt(np.maximum(np.mean(squares, axis=0), 0.0))
 
 
-def _figures_of(sequence: Sequence, result: ekfslam.Result) -> dict[str, Any]:
+def figures_of(sequence: Sequence, result: ekfslam.Result) -> dict[str, Any]:
     summary = summarise(sequence, result)
     kept = ("nis_per_dof", "pose_nees_with_truth_noise_mean", "pose_nees_relative_10_mean")
     return {**trajectory_errors(sequence, result.T_world_imu), **{name: summary[name] for name in kept}}
