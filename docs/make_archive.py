@@ -67,7 +67,7 @@ earlier format versions are read.
 
 
 def page() -> str:
-    """The text of the page."""
+    """Return the text of the page."""
     parts = ["# The archive format", OPENING, f"This is format version {archive.FORMAT_VERSION} of `{archive.FORMAT}`."]
     parts += [f"Errors: {ERROR_CONVENTION}.", "## Groups and attributes", _tree(archive.__doc__)]
     parts += ["## Dimensions", _dimensions()]
@@ -90,7 +90,7 @@ def page() -> str:
 
 
 def _tree(doc: str | None) -> str:
-    """The indented tree in the docstring of a module."""
+    """Return the indented tree in the docstring of a module."""
     lines = inspect.cleandoc(doc or "").splitlines()
     begin = next(i for i, line in enumerate(lines) if line.startswith("    /"))
     length = next((i for i, line in enumerate(lines[begin:]) if line and not line.startswith("    ")), None)

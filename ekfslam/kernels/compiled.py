@@ -11,7 +11,7 @@ MOST_ROWS = 8  # of one landmark; as in the C file
 
 
 def _of(array: Array | BoolArray, *shape: int) -> Array:
-    """The numbers of an array that must have a shape, as C wants them."""
+    """Return the numbers of an array with a required shape, in C order."""
     if array.shape != shape:
         raise ValueError(f"an array of shape {array.shape}, expected {shape}")
     return np.ascontiguousarray(array, dtype=np.float64)
@@ -24,7 +24,7 @@ def _in_place(array: Array, *shape: int) -> Array:
 
 
 def _places(row: IntArray, below: int) -> IntArray:
-    """Indices, all of which must be in range: C does not look."""
+    """Return indices after a check of their range, which C does not make."""
     row = np.ascontiguousarray(row, dtype=np.int64)
     if len(row) and not (row.min() >= 0 and row.max() < below):
         raise IndexError(f"a place of {row.min()} to {row.max()} among {below}")

@@ -173,7 +173,7 @@ def image(q: Array) -> Array:
 
 
 def image_jacobian(q: Array) -> Array:
-    """Derivative (..., 3, 3) of `image` by the points."""
+    """Return the derivative (..., 3, 3) of `image` by the points."""
     y = image(q)
     J = np.zeros((*q.shape, 3))
     J[..., 0, 0] = J[..., 1, 1] = y[..., 2]
