@@ -87,4 +87,4 @@ def test_the_help_says_the_risk(capsys):
         main(["consistency", "--help"])
     helped = " ".join(capsys.readouterr().out.split())
     assert "tls://HOST:PORT" in helped
-    assert "whoever reaches that port runs programs as you" in helped
+    assert "anyone who reaches that port runs programs as you" in helped
