@@ -110,12 +110,24 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
         rotation,
         std,
     )
-    sequence = Sequence(
+    return _tracked(recording, rectified.camera, T_cam_imu, observations, _account(config, report), report), report
+
+
+def _tracked(
+    recording: ImageRecording,
+    camera: StereoCamera,
+    T_cam_imu: Array,
+    observations: Observations,
+    account: dict[str, str | int | float],
+    report: TrackReport,
+) -> Sequence:
+    """Return the recording with its tracks."""
+    return Sequence(
         name=recording.name,
         source=recording.source,
         time_s=recording.time_s,
         twist=recording.twist,
-        camera=rectified.camera,
+        camera=camera,
         T_cam_imu=T_cam_imu,
         observations=observations,
         truth=recording.truth,
@@ -125,10 +137,9 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
         attributes={
             **recording.attributes,
             **(WITHOUT_VELOCITIES if recording.twist is None else {}),
-            **_account(config, report),
+            **account,
         },
     )
-    return sequence, report
 
 
 def _observations(seen: list[Seen], rotation: Array, camera: StereoCamera) -> tuple[Observations, int]:
