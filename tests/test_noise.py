@@ -443,7 +443,7 @@ def moving_world(share=0.3, speed=0.3, **changes):
 
 @pytest.mark.slow
 def test_tracks_that_travel_with_the_rig_are_found_and_listed():
-    world, movers = moving_world()
+    world, movers = moving_world(speed=0.25)
     rejections = (result := run(world, "full", Config(filter=FilterConfig(moving_share=0.1, split_after=3)))).rejections
     accused = np.unique(rejections.landmark[rejections.reason == REASONS.index("moving")])
     assert result.counts["moving"] == len(accused) > 10
