@@ -165,19 +165,7 @@ def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
     geometry = np.random.default_rng(world.seed)
     noise = geometry if rng is None else rng
 
-    time_s = stamps(world, geometry)
-    if isinstance(world, Loop):
-        distance_m, wavelength_m = world.speed_m_s * time_s, 2 * np.pi * world.radius_m
-        yaw_rad = distance_m / world.radius_m
-    else:
-        (distance_m, yaw_rad), wavelength_m = _drive_streets(time_s, geometry), 150.0
-    twist = _twists(time_s, distance_m, yaw_rad, wavelength_m, geometry)
-    T_imu_world = _integrate(twist, np.diff(time_s))
-    if isinstance(world, Loop):
-        points_m = _around_ring(world, geometry)
-    else:
-        points_m = _line_streets(world, distance_m, yaw_rad, se3.inverse(T_imu_world)[:, :3, 3], geometry)
-
+    time_s, twist, T_imu_world, points_m = _drive(world, geometry)
     # The first pose is exp(xi^), not the identity. The truth moves with it, so that no measurement changes.
     prior_std = np.repeat([world.initial_position_std_m, world.initial_rotation_std_rad], 3)
     T_first = se3.exp(prior_std * noise.standard_normal(6))
@@ -206,6 +194,23 @@ def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
         noise=stated,
         attributes={"world": world.name, **numbers_of(world)},
     )
+
+
+def _drive(world: Loop | City, rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
+    """Return stamps (T,), true velocities (T, 6), poses ``T_imu_world`` (T, 4, 4) and landmarks (M, 3) of a world."""
+    time_s = stamps(world, rng)
+    if isinstance(world, Loop):
+        distance_m, wavelength_m = world.speed_m_s * time_s, 2 * np.pi * world.radius_m
+        yaw_rad = distance_m / world.radius_m
+    else:
+        (distance_m, yaw_rad), wavelength_m = _drive_streets(time_s, rng), 150.0
+    twist = _twists(time_s, distance_m, yaw_rad, wavelength_m, rng)
+    T_imu_world = _integrate(twist, np.diff(time_s))
+    if isinstance(world, Loop):
+        points_m = _around_ring(world, rng)
+    else:
+        points_m = _line_streets(world, distance_m, yaw_rad, se3.inverse(T_imu_world)[:, :3, 3], rng)
+    return time_s, twist, T_imu_world, points_m
 
 
 def _drive_streets(time_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
