@@ -32,7 +32,7 @@ from ekfslam import open_sequence
 from ekfslam.arrays import Array
 from ekfslam.data.sequence import Sequence
 from ekfslam.evaluation.tables import document, markdown_table, number
-from ekfslam.figures.style import ORANGE, REFERENCE, marker_of, styled
+from ekfslam.figures.style import ORANGE, REFERENCE, legend_of, marker_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.studies.sweep import Case, Column, Recording, Sweep
 from ekfslam.studies.sweep_table import SweepTable
@@ -219,7 +219,7 @@ def observation_cells(full: dict[str, Any]) -> list[str]:
 @styled
 def plot(runs: Runs, noisy: Noisy) -> Figure:
     """Draw the gain over dead reckoning for each set, as recorded and with noise added."""
-    figure = Figure(figsize=(8.0, 4.2))
+    figure = Figure(figsize=(8.0, 4.4), layout="constrained")
     ax = figure.subplots()
     names = list(dict.fromkeys(name for name, _ in runs))
     ax.plot([gain(runs, name) for name in names], range(len(names)), **marker_of("full"), label="as recorded")
@@ -234,7 +234,7 @@ def plot(runs: Runs, noisy: Noisy) -> Figure:
     ax.set_yticks(range(len(names)), names)
     ax.invert_yaxis()
     ax.set_xlabel("ATE of dead reckoning over that of full SLAM [-]; more is better")
-    ax.legend(loc="center left")
+    legend_of(figure, [ax], columns=2)
     return figure
 
 
