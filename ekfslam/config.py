@@ -303,6 +303,8 @@ class TruthConfig:
         roll_deg, pitch_deg, yaw_deg, first_position_m: First pose, about and along the axes of the IMU.
         stamp_s: Jitter of the stamps.
         position_m, attitude_deg: Each pose, each axis.
+        world_tilt_deg, turn_deg: Vertical of the world, and axes of the body, about each axis.
+        drift_m_sqrt_s: Random walk of the position, each axis.
     """
 
     roll_deg: float | None = field(default=None, metadata=_FINITE)
@@ -312,6 +314,9 @@ class TruthConfig:
     stamp_s: float | None = field(default=None, metadata=_FINITE)
     position_m: float | None = field(default=None, metadata=_FINITE)
     attitude_deg: float | None = field(default=None, metadata=_FINITE)
+    world_tilt_deg: float | None = field(default=None, metadata=_FINITE)
+    turn_deg: float | None = field(default=None, metadata=_FINITE)
+    drift_m_sqrt_s: float | None = field(default=None, metadata=_FINITE)
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,20 @@ from support.recordings import ece276a_fields, write_npz
 
 from ekfslam import open_sequence
 from ekfslam.cli import main
-from ekfslam.data.interpolation import SHORTEST, interpolated_intervals, known_intervals, stretches
+from ekfslam.data.interpolation import (
+    SHORTEST,
+    interpolated_intervals,
+    interpolated_poses,
+    known_intervals,
+    stretches,
+)
 from ekfslam.data.readers import read_sequence, write_sequence
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.evaluation.consistency import measured_truth, pose_nees
 from ekfslam.evaluation.relative import relative_pose_nees
 from ekfslam.evaluation.summary import summarise
+from ekfslam.geometry import se3
+from ekfslam.geometry.motion import integrate
 from ekfslam.models.noise import GAP_STD
 from ekfslam.storage.archive import read_archive, write_archive
 
@@ -173,3 +181,22 @@ def test_a_first_pose_within_a_stretch_is_trusted_less():
         assert measured_truth(truth, other.interpolated, other.time_s).noise == noise
     exact = dataclasses.replace(truth, noise=None)
     assert measured_truth(exact, sequence.interpolated, sequence.time_s).noise is None
+
+
+def test_poses_on_a_line_are_found_although_their_stamps_jitter():
+    rng = np.random.default_rng(0)
+    twist = np.array([1.0, 0, 0, 0, 0, 0.02]) + np.cumsum(rng.normal(0.0, 0.02, (60, 6)), axis=0)
+    T = integrate(np.eye(4), twist, np.full(59, 0.1))
+    assert not interpolated_poses(T).any()
+    share = np.sort(rng.uniform(0.0, 1.0, 7))
+    way = share[:, None] * np.append(T[28, :3, 3] - T[20, :3, 3], se3.so3_log(T[20, :3, :3].T @ T[28, :3, :3]))
+    T[21:28, :3, 3] = np.round(T[20, :3, 3] + way[:, :3], 8)
+    T[21:28, :3, :3] = T[20, :3, :3] @ se3.so3_exp(way[:, 3:])
+    assert stretches(interpolated_poses(T)) == [(21, 28)]
+
+
+def test_poses_at_rest_and_straight_lines_are_not_interpolated():
+    assert not interpolated_poses(np.tile(np.eye(4), (20, 1, 1))).any()
+    assert not interpolated_poses(
+        integrate(np.eye(4), np.tile([1.0, 0, 0, 0, 0, 0.1], (20, 1)), np.full(19, 0.1))
+    ).any()

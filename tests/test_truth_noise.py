@@ -22,7 +22,9 @@ from ekfslam.evaluation.consistency import (
     pose_nees,
     pose_nees_by_axis,
     pose_noise_covariance,
+    turned_body_covariance,
 )
+from ekfslam.evaluation.relative import relative_pose_nees
 from ekfslam.evaluation.summary import summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.run import plot_errors
@@ -32,6 +34,11 @@ from ekfslam.runner import run
 from ekfslam.storage.archive import read_archive, write_archive
 
 NOISE = TruthNoise(0.01, 0.02, 0.03, 0.1, 0.01, 0.05, 0.004)
+SLOW = {
+    "drift": TruthNoise(drift_m_sqrt_s=0.3),
+    "world": TruthNoise(world_tilt_rad=0.03),
+    "body": TruthNoise(turn_rad=0.02),
+}
 
 
 def with_noise(sequence, noise):
@@ -67,6 +74,33 @@ def test_jitter_of_stamps_is_an_error_along_the_motion():
     white = pose_noise_covariance(TruthNoise(position_m=0.05, attitude_rad=0.004), T, time_s)
     np.testing.assert_allclose(white, np.broadcast_to(np.diag([0.05**2] * 3 + [0.004**2] * 3), (4, 6, 6)))
     np.testing.assert_allclose(pose_noise_covariance(NOISE, T[:1], time_s[:1])[0, 0, 0], 0.05**2)
+
+
+def test_a_turned_body_is_an_error_of_the_motion_since_the_first_pose():
+    T_true, e = synthetic_sequence(frames=30).truth.T_world_imu, np.array([0, 0, 0, 1e-5, -2e-5, 3e-5])
+    turned = T_true @ se3.exp(e)
+    T_est = turned[0] @ se3.inverse(T_true[0]) @ T_true  # the motion of the true body, from the first turned pose
+    xi = pose_error(T_est, turned)
+    A = se3.adjoint(se3.inverse(T_true) @ T_true[0])
+    np.testing.assert_allclose(xi, (A - np.eye(6)) @ e, atol=1e-7)
+    found = sum(turned_body_covariance(TruthNoise(turn_rad=1.0), A)[-1] @ np.eye(6)[i] for i in range(6))
+    np.testing.assert_allclose(found, ((A - np.eye(6))[-1, :, 3:] @ (A - np.eye(6))[-1, :, 3:].T).sum(axis=1))
+
+
+@pytest.mark.parametrize("kind", SLOW)
+def test_nees_against_a_truth_that_drifts_or_is_turned_is_six_with_its_noise(kind):
+    absolute, relative, without, noise = [], [], [], SLOW[kind]
+    for seed in range(40):
+        sequence = synthetic_sequence(frames=40, landmarks=20, seed=seed)
+        result = synthetic_result(sequence, "dead-reckoning")
+        truth = erring_truth(sequence.truth, sequence.time_s, noise, np.random.default_rng(1000 + seed))
+        absolute.append(pose_nees(result, truth, with_truth_noise=True)[1][-1])
+        without.append(pose_nees(result, truth)[1][-1])
+        relative.append(np.nanmean(relative_pose_nees(result, truth, np.zeros(40, dtype=bool))[1]))
+    low, high = chi2_bounds(6, 0.999, runs=40)
+    assert low < np.mean(absolute) < high
+    assert np.mean(without) > 2 * high
+    assert low < np.mean(relative) < high
 
 
 @pytest.mark.slow

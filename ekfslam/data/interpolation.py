@@ -12,9 +12,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
+from ekfslam.geometry.se3 import so3_log
 
 SHORTEST = 3  # samples in a row that lie on the line between their neighbours; a single lost packet does no harm
 INTERPOLATED = "interpolated"
+_BEND = 2e-3  # of the median bend between true motions; measured ones bend by more than 0.01 of it
 _ROUNDING = 1e-9  # of the largest value; measured velocities bend by more than 1e-4 of it
 
 
@@ -35,6 +37,31 @@ def interpolated_intervals(twist: Array) -> BoolArray:
     for begin, end in stretches(on_line):
         if end - begin + 1 >= SHORTEST:
             found[begin : end + 2] = True  # up to the measured sample behind
+    return found
+
+
+def interpolated_poses(T_world_imu: Array) -> BoolArray:
+    """Return which intervals (n,) between poses (n, 4, 4) are interpolated; ``[k]`` leads from pose k-1 to pose k.
+
+    A line between two poses is driven at any speed, so jitter of stamps hides it. But successive motions along it have
+    one direction, to rounding, in position and rotation. A rig at rest, and straight lines of a simulation, whose
+    motions hardly ever bend, have nothing interpolated.
+    """
+    found = np.zeros(len(T_world_imu), dtype=bool)
+    if len(found) < SHORTEST + 2:
+        return found
+    R = T_world_imu[:, :3, :3]
+    moves = np.diff(T_world_imu[:, :3, 3], axis=0), so3_log(np.swapaxes(R[:-1], 1, 2) @ R[1:])
+    on_line = np.ones(len(found) - 2, dtype=bool)
+    for move in moves:
+        before, after = move[:-1], move[1:]
+        square = (before**2).sum(axis=1, keepdims=True)
+        along = (before * after).sum(axis=1, keepdims=True) / np.where(square > 0, square, 1.0)
+        bend = np.linalg.norm(after - along * before, axis=1)
+        on_line &= (square[:, 0] > 0) & (bend < _BEND * np.median(bend))
+    for begin, end in stretches(on_line):
+        if end - begin + 1 >= SHORTEST:
+            found[begin + 1 : end + 3] = True
     return found
 
 

@@ -10,11 +10,15 @@ from dataclasses import dataclass
 class TruthNoise:
     """Standard deviations of a ground truth, all independent of each other.
 
-    An error of the first pose moves the whole estimate, which starts there. The other errors belong to single poses.
+    Errors of the first pose and of the world move the whole estimate, which starts at the first true pose. Drift and
+    turned body grow with time and motion. The other errors belong to single poses.
 
     Args:
         first_roll_rad, first_pitch_rad, first_yaw_rad: Attitude of the first pose, about the axes of the IMU.
         first_position_m: Position of the first pose, each axis.
+        world_tilt_rad: Error of the vertical of the world, about each level axis of it.
+        turn_rad: Constant error of the axes of the true body, about each axis: of extrinsics, say.
+        drift_m_sqrt_s: Random walk of the position, each axis: standard deviation after one second.
         stamp_s: Jitter of the stamps: an error along the motion, in proportion to the velocities.
         position_m: Position of each pose, each axis.
         attitude_rad: Attitude of each pose, each axis.
@@ -27,6 +31,9 @@ class TruthNoise:
     stamp_s: float = 0.0
     position_m: float = 0.0
     attitude_rad: float = 0.0
+    world_tilt_rad: float = 0.0
+    turn_rad: float = 0.0
+    drift_m_sqrt_s: float = 0.0
 
     @property
     def text(self) -> str:
@@ -35,10 +42,14 @@ class TruthNoise:
             f"{math.degrees(value):.3g}"
             for value in (self.first_roll_rad, self.first_pitch_rad, self.first_yaw_rad, self.attitude_rad)
         )
-        return (
+        text = (
             f"first pose {roll}, {pitch}, {yaw} deg (roll, pitch, yaw), {self.first_position_m:.3g} m; each pose "
             f"{self.position_m:.3g} m, {attitude} deg, stamps {1e3 * self.stamp_s:.3g} ms"
         )
+        tilt, turn = (f"{math.degrees(value):.3g} deg" for value in (self.world_tilt_rad, self.turn_rad))
+        drift = f"{self.drift_m_sqrt_s:.3g} m/sqrt(s)"
+        slow = ((self.world_tilt_rad, f"world tilt {tilt}"), (self.turn_rad, f"body turned {turn}"))
+        return "; ".join([text, *(words for value, words in (*slow, (self.drift_m_sqrt_s, f"drift {drift}")) if value)])
 
 
 KITTI_TRUTH_NOISE = TruthNoise(

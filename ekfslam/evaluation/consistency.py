@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri, gammaincinv
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.data.interpolation import stretches
+from ekfslam.data.interpolation import interpolated_poses, stretches
 from ekfslam.data.sequence import Truth
 from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.filters.result import Result
@@ -65,9 +65,10 @@ def nees(error: Array, covariance: Array) -> Array:
 def measured_truth(truth: Truth, interpolated: BoolArray, time_s: Array) -> Truth:
     """Return the truth of the frames (T,) that no interpolated interval leads to; only these can be judged.
 
-    If the recording begins with interpolated intervals, its first position is uncertain by the speed over that gap, and
-    all other positions are relative to it.
+    Intervals are ``interpolated`` (T,) by the velocities, or by the truth itself. If the first ones are, the first
+    position is uncertain by the speed over that gap, and all other positions are relative to it.
     """
+    interpolated = interpolated | interpolated_frames(truth, len(time_s))
     kept, noise = ~interpolated[truth.frame], truth.noise
     if noise is not None and interpolated[1:2].any():
         invented_s = float(time_s[stretches(interpolated)[0][1]] - time_s[0])
@@ -78,16 +79,40 @@ def measured_truth(truth: Truth, interpolated: BoolArray, time_s: Array) -> Trut
     )
 
 
-def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Array:
-    """Return the covariance (n, 6, 6) that the error ``e0 ~ N(0, P_0)`` of the first true pose adds to later errors.
+def interpolated_frames(truth: Truth, frames: int) -> BoolArray:
+    """Return the intervals (T,) in which the true poses are interpolated; an exact truth, without noise, has none."""
+    found = np.zeros(frames, dtype=bool)
+    if truth.noise is not None:
+        found[truth.frame] = interpolated_poses(truth.T_world_imu)
+    return found
 
-    An estimate starts at the first true pose, so with ``T_hat`` the estimated ``T_imu_world``,
-    ``xi_k += Ad(T_hat_k T_hat_0^-1) e0``.
+
+def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Array:
+    """Return the covariance (n, 6, 6) of errors that the first true pose, the world and the body add to later errors.
+
+    An estimate starts at the first true pose, so with ``T_hat`` the estimated ``T_imu_world`` and
+    ``A = Ad(T_hat_k T_hat_0^-1)``, an error ``e0 ~ N(0, P_0)`` of the first pose gives ``xi_k += A e0``. So does a
+    world tilted by w about the first position, if the estimate knows the vertical: ``e0 = (0, R_hat_0 w)``. A body
+    turned by a constant e gives ``xi_k += (A - I) e``.
     """
     first = np.array([noise.first_roll_rad, noise.first_pitch_rad, noise.first_yaw_rad])
     variance = np.concatenate([np.full(3, noise.first_position_m), first]) ** 2
     A = se3.adjoint(se3.inverse(T_world_imu_est) @ T_world_imu_est[0])
-    return (A * variance) @ np.swapaxes(A, -1, -2)
+    tilt = np.zeros((6, 6))
+    level = T_world_imu_est[0, :2, :3]  # level axes of the world along those of the first IMU
+    tilt[3:, 3:] = noise.world_tilt_rad**2 * level.T @ level
+    return A @ (np.diag(variance) + tilt) @ np.swapaxes(A, -1, -2) + turned_body_covariance(noise, A)
+
+
+def turned_body_covariance(noise: TruthNoise, A: Array) -> Array:
+    """Return the covariance ``(A - I) E (A - I)^T`` (n, 6, 6) of motions with adjoints A, for a body that is turned."""
+    turned = (A - np.eye(6))[..., 3:]
+    return noise.turn_rad**2 * turned @ np.swapaxes(turned, -1, -2)
+
+
+def drift_covariance(noise: TruthNoise, lapse_s: Array) -> Array:
+    """Return the covariance (n, 6, 6) of positions that have walked for some time (n,): equal along all axes."""
+    return noise.drift_m_sqrt_s**2 * lapse_s[:, None, None] * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def pose_noise_covariance(noise: TruthNoise, T_world_imu_true: Array, time_s: Array) -> Array:
@@ -118,6 +143,7 @@ def pose_errors(result: Result, truth: Truth, with_truth_noise: bool) -> tuple[A
         T_est = np.concatenate([result.T_world_imu[:1], result.T_world_imu[frame]])
         covariance = covariance + first_pose_error_covariance(truth.noise, T_est)[1:]
         covariance = covariance + pose_noise_covariance(truth.noise, truth.T_world_imu, result.time_s[frame])
+        covariance = covariance + drift_covariance(truth.noise, result.time_s[frame] - result.time_s[0])
     return error, covariance
 
 

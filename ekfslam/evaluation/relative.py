@@ -6,7 +6,13 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
-from ekfslam.evaluation.consistency import nees, pose_noise_covariance
+from ekfslam.evaluation.consistency import (
+    drift_covariance,
+    interpolated_frames,
+    nees,
+    pose_noise_covariance,
+    turned_body_covariance,
+)
 from ekfslam.evaluation.trajectory import PATH_TOLERANCE, distance_along
 from ekfslam.filters.result import PosePairs, Result
 from ekfslam.geometry import se3
@@ -63,12 +69,13 @@ def relative_covariance(result: Result, pairs: PosePairs) -> tuple[Array, Array]
 def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) -> tuple[PosePairs, Array]:
     """Return pairs with true poses and the NEES (n,) of their relative pose, 6 degrees of freedom; NaN if singular.
 
-    Truth noise adds ``N_k + A N_j A^T`` to `relative_covariance`, with N that of single true poses; an error of the
-    first pose cancels. Pairs with an ``interpolated`` interval (T,) between them are left out.
+    Truth noise adds ``N_k + A N_j A^T`` to `relative_covariance`, with N that of single true poses, and the covariances
+    of drift and turned body; errors of the first pose and of the world cancel. Pairs with an ``interpolated`` interval
+    (T,) between them are left out.
     """
     pairs, place = result.pairs or empty(PosePairs), np.full(len(result.time_s), -1)
     place[truth.frame] = np.arange(len(truth.frame))
-    invented = np.cumsum(interpolated)
+    invented = np.cumsum(interpolated | interpolated_frames(truth, len(place)))
     is_measured = invented[pairs.first] == invented[pairs.second]
     pairs = pairs.only((place[pairs.first] >= 0) & (place[pairs.second] >= 0) & is_measured)
     j, k = place[pairs.first], place[pairs.second]
@@ -76,7 +83,10 @@ def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) ->
     error = se3.log(se3.inverse(truth.T_world_imu[k]) @ truth.T_world_imu[j] @ se3.inverse(motion))
     if truth.noise is not None:
         N, A = pose_noise_covariance(truth.noise, truth.T_world_imu, result.time_s[truth.frame]), se3.adjoint(motion)
-        covariance = covariance + N[k] + A @ N[j] @ np.swapaxes(A, -1, -2)
+        covariance = covariance + N[k] + A @ N[j] @ np.swapaxes(A, -1, -2) + turned_body_covariance(truth.noise, A)
+        covariance = covariance + drift_covariance(
+            truth.noise, result.time_s[pairs.second] - result.time_s[pairs.first]
+        )
     return pairs, nees(error, covariance)
 
 

@@ -17,9 +17,11 @@ def with_truth_noise(sequence: Sequence, settings: TruthConfig) -> Sequence:
         "first_pitch_rad": settings.pitch_deg,
         "first_yaw_rad": settings.yaw_deg,
         "attitude_rad": settings.attitude_deg,
+        "world_tilt_rad": settings.world_tilt_deg,
+        "turn_rad": settings.turn_deg,
     }
     given = {name: math.radians(angle) for name, angle in angles_deg.items() if angle is not None}
-    others = {name: getattr(settings, name) for name in ("first_position_m", "stamp_s", "position_m")}
+    others = {name: getattr(settings, name) for name in ("first_position_m", "stamp_s", "position_m", "drift_m_sqrt_s")}
     given |= {name: value for name, value in others.items() if value is not None}
     if sequence.truth is None or not given:
         return sequence

@@ -81,7 +81,7 @@ def linearise(
     q = np.where(is_ahead[:, None], q, (0.0, 0.0, 1.0))
     A = rectified_jacobian(camera, q)
     H = np.concatenate([A, -A @ se3.skew(q)], axis=-1)
-    B = A @ T_now_before[:3, :3] @ np.linalg.inv(rectified_jacobian(camera, q_before))
+    B = A @ T_now_before[..., :3, :3] @ np.linalg.inv(rectified_jacobian(camera, q_before))
     r = now_px - project(camera, q)[:, :3] - (B @ (before_px - true_px)[..., None])[..., 0]
     k, finite = np.array([0.0, 0.0, 1.0]) - B[..., 2], np.where(is_ahead[:, None], r, 0.0)
     S = std_px**2 * (np.eye(3) + B @ np.swapaxes(B, -1, -2)) + TRACK_STD_PX**2 * k[..., None] * k[..., None, :]

@@ -181,15 +181,20 @@ SUMMARY_KEYS = {
 
 
 def erring_truth(truth, time_s, noise, rng):
-    """Another truth, as far from the given one as the noise says: the world is moved, then each pose errs."""
+    """Another truth, as far from the given one as the noise says: world and body are moved, then each pose errs."""
     first = np.array([noise.first_roll_rad, noise.first_pitch_rad, noise.first_yaw_rad])
     e0 = np.concatenate([noise.first_position_m * rng.standard_normal(3), first * rng.standard_normal(3)])
     T = se3.inverse(truth.T_world_imu)
+    e0[3:] += T[0, :3, :2] @ (noise.world_tilt_rad * rng.standard_normal(2))
+    turn = se3.exp(np.concatenate([np.zeros(3), noise.turn_rad * rng.standard_normal(3)]))
     step = se3.log(se3.inverse(truth.T_world_imu[:-1]) @ truth.T_world_imu[1:]) / np.diff(time_s)[:, None]
     own = np.repeat([noise.position_m, noise.attitude_rad], 3) * rng.standard_normal((len(T), 6))
     own[1:] -= noise.stamp_s * rng.standard_normal((len(step), 1)) * step
     moved = T @ se3.inverse(T[0]) @ se3.exp(e0) @ T[0]
-    return dataclasses.replace(truth, T_world_imu=se3.inverse(se3.exp(own) @ moved), noise=noise)
+    erring = se3.inverse(se3.exp(own) @ turn @ moved @ se3.inverse(T[0]) @ se3.inverse(turn) @ T[0])
+    walk = noise.drift_m_sqrt_s * np.sqrt(np.diff(time_s))[:, None] * rng.standard_normal((len(T) - 1, 3))
+    erring[1:, :3, 3] += np.cumsum(walk, axis=0)
+    return dataclasses.replace(truth, T_world_imu=erring, noise=noise)
 
 
 def grown(motion, flow_px):
