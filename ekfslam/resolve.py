@@ -4,7 +4,8 @@
 
 1. Velocities: stereo odometry if the recording has none.
 2. Landmarks: when they leave the state, and how many dormant ones stay (`settings_of`).
-3. Noise: the configuration, else the recording, else what the data show (`noise_of`).
+3. Noise: the configuration, else the recording, else what the data show (`noise_of`): white errors of tracks where
+   residuals along tracks show them (`ekfslam.models.track_noise`), else errors that walk.
 4. Automatic model: blocks of shared errors, calibration, least disparity (`settings_of`).
 5. Tracks: cleaned by `ekfslam.data.hygiene`.
 6. Form of the covariance: the cheaper one.
@@ -53,6 +54,7 @@ from ekfslam.models.noise import (
 )
 from ekfslam.models.odometry import stereo_odometry, vision_noise
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.models.track_noise import track_noise
 
 # Number of dormant landmarks kept in the state of a recording whose landmarks come back: their covariance has 160 MB.
 DORMANT_LIMIT = 1500
@@ -86,7 +88,7 @@ class Problem:
         model, settings = self.model, self.config.filter
         blocks = ", ".join(f"{block.name} ({block.size})" for block in model.layout.blocks)
         error = model.track_error
-        tracks = "pixel errors are white"
+        tracks = f"pixel errors are white, {np.mean(model.noise.pixel_std_px):.3g} px"
         if error is not None:
             first, walk = (", ".join(f"{value:.2g}" for value in std) for std in (error.first_std, error.walk_std))
             tracks = f"errors of tracks (u, v, disparity) start with {first} px and walk by {walk} px a frame"
@@ -101,7 +103,7 @@ class Problem:
         """The resolved values of settings that may be automatic, one line for each table."""
         config = self.config
         chosen = {
-            "noise": ("track_scale",),
+            "noise": ("sigma_px", "drift", "track_scale"),
             "filter": ("retire", "retire_after", "dormant", "covariance_form"),
             "hygiene": ("min_disparity_sigma",),
             "calibration": ("rotation_deg",),
@@ -127,9 +129,15 @@ def resolve(
         without = {**sequence.attributes, **WITHOUT_VELOCITIES}
         sequence = dataclasses.replace(sequence, attributes=without)
         sequence = sequence.with_velocities(stereo_odometry(sequence), "imu")
-    config = settings_of(sequence, config or Config())
-    noise, hygiene = noise_of(sequence, config), None
+    config = config or Config()
     account: dict[str, str | int | float] = {f"tuned_{key}": value for key, value in config.tuning.items()}
+    if mode != "dead-reckoning" and _has_open_scale(sequence, config) and (tracks := track_noise(sequence)):
+        account["found_tracks"] = tracks.text
+        if tracks.is_white:
+            white = {"model": "tuned", "sigma_px": tracks.sigma_px, "drift": 0.0}
+            config = config.with_overrides({"noise": white})
+    config = settings_of(sequence, config)
+    noise, hygiene = noise_of(sequence, config), None
     if is_automatic(sequence, config):
         account |= found_attributes(velocity_noise(sequence.twist))
     if is_inertial(sequence):

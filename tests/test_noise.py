@@ -123,7 +123,7 @@ def test_shared_errors_follow_what_velocities_are_worth():
 
 
 def test_blocks_of_the_automatic_model_give_way_to_what_is_configured():
-    unstated = without_noise(builtin("city?frames=60"))
+    unstated = drifting_tracks(frames=60)
     names = {"twist_bias", "camera_jitter", "vision_drift"}
     problem = resolve(unstated, Config().with_overrides({"blocks": {"camera_jitter": {"time_s": 2.0}}}))
     assert set(problem.config.blocks) == names and problem.model.observer.calibration is not None
@@ -158,6 +158,11 @@ def test_interpolated_velocities_are_trusted_less():
     assert weight[10:19].max() < 0.5 * np.median(weight[25:])
 
 
+def drifting_tracks(frames):
+    """Return a drive with noisy velocities whose errors of tracks walk."""
+    return without_noise(tracked(builtin(f"city?frames={frames}&outlier_fraction=0"), ERROR, 0))
+
+
 def scale_of(sequence):
     return resolve(sequence).config.noise.track_scale
 
@@ -179,7 +184,7 @@ def test_the_track_scale_brings_the_nis_of_the_run_to_its_target():
 
 
 def test_the_track_scale_of_noisy_velocities_is_that_of_the_long_run():
-    assert scale_of(without_noise(builtin("city?frames=10"))) == PERSISTENCE
+    assert scale_of(drifting_tracks(frames=10)) == PERSISTENCE
 
 
 def test_a_recording_that_states_its_noise_has_no_track_scale():
@@ -187,7 +192,7 @@ def test_a_recording_that_states_its_noise_has_no_track_scale():
 
 
 def test_the_problem_says_what_was_resolved():
-    decisions = resolve(without_noise(builtin("city?frames=10"))).decisions
+    decisions = resolve(drifting_tracks(frames=10)).decisions
     assert "noise: track_scale 3" in decisions
     assert "filter: retire unseen, retire_after 1, dormant 0, covariance_form dense" in decisions
 

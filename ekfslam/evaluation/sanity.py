@@ -35,6 +35,7 @@ _SURE = 4.0
 _OTHER_WAY = 0.3  # relative difference of motions from which the truth is another one
 _SAME_LENGTH = 0.1
 _REJECTED = 0.4
+_MOVING = 0.2  # share of the observations; hardly ever traffic
 _OFF_TRUTH = 0.1  # ATE as a share of the path from which the truth is another one
 
 
@@ -118,6 +119,10 @@ def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]
     if rejected > _REJECTED * max(accepted + rejected, 1):
         cause = warnings[0] if warnings else "tracks, velocities, stamps and T_cam_imu do not fit each other"
         return (f"{rejected / (accepted + rejected):.0%} of the observations were rejected: {cause}",)
+    moving = result.counts.get("rejected: moving", 0) / max(accepted + rejected, 1)
+    if moving > _MOVING:
+        cause = "traffic, or errors of tracks or velocities that are larger or of another kind than assumed"
+        return (f"{moving:.0%} of the observations were dropped as moving with the rig: {cause}",)
     truth = sequence.truth
     if truth is None or len(truth.frame) < 2 or warnings:
         return ()

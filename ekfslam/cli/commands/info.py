@@ -104,6 +104,8 @@ def _print_findings(sequence: Sequence) -> None:
         print(f"warning       {line}")
     problem = resolve(sequence)
     assert problem.hygiene is not None
+    if (found := problem.account.get("found_tracks")) is not None:
+        print(f"tracks        noise not stated; from the data: {found}")
     for line in problem.lines:
         print(f"state         {line}")
     for line in problem.decisions:

@@ -1,0 +1,190 @@
+"""Noise of tracks from the data: their white errors, and the walk of errors that persist, found without truth.
+
+With rows ``z_k``, the motion ``T_k`` between two frames, ``B_k = dh/dz``, white errors n (covariance Sigma) and steps w
+of a walk (covariance W), the residual of a track over one frame is
+
+    r_k = z_k - h(z_(k-1); T_k) = n_k - B_k n_(k-1) + w_k.
+
+Successive residuals share ``n_k``. Steps of a walk share nothing, and steps that persist have the other sign:
+
+    Sigma = -E r_k (B_(k+1)^-1 r_(k+1))^T,    W = E r_k r_k^T - Sigma - B_k Sigma B_k^T.
+
+Each motion is fitted to the same tracks and takes a part of each row, its leverage p, with it. Hence residuals are
+divided by ``sqrt(1 - p)``. The errors are those of a jackknife over parts of the recording.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.sequence import Sequence
+from ekfslam.geometry.camera import MOTION_FROM_PX, rectified_rows
+from ekfslam.geometry.stereo_motion import Alignment, align, sampled_motion
+from ekfslam.models.noise import with_error
+
+_STRETCH, _MOST_STRETCHES = 8, 12  # intervals, count
+_LEAST_POINTS, _LEAST_PAIRS = 6, 100  # of an interval, of the recording
+_BLOCKS, _SURE = 12, 3.0  # of the jackknife; standard errors
+# A first motion needs some limit in pixels; from there on all limits are multiples of the scatter that is found.
+_SAMPLES, _START_PX, _LEAST_PX = 200, 2.0, 1e-3
+_FITS, _SAME = 3, 1.5  # until the scatter changes by less than this factor
+_KERNEL, _OUTLIER, _AGREE_SHARE = 3.0, 5.0, 0.7  # standard deviations, standard deviations, of the tracks
+_LEAST_SHARE = 0.05  # of a row, which its leverage leaves
+_MAD_TO_STD = 1.4826
+_COORDINATES = np.array([1.0, 2.0, 1.0]) / 3.0  # weights of the variances of rows, in the variance of a coordinate
+
+
+@dataclass(frozen=True)
+class TrackNoise:
+    """White errors of tracks and steps of their walk, rows ``(uL, v, uR)``.
+
+    Args:
+        white: (3,) variances of white errors, px^2; negative if steps persist.
+        white_error: (3,) their standard errors.
+        step: (3,) variances of the walk from one frame to the next, px^2.
+        step_error: (3,) their standard errors.
+        length: Frames of the track of a typical observation.
+    """
+
+    white: Array
+    white_error: Array
+    step: Array
+    step_error: Array
+    length: int
+
+    @property
+    def is_white(self) -> bool:
+        """Whether white errors are seen in each row, and no walk that exceeds them half a track later."""
+        walk = self.step - _SURE * self.step_error
+        return bool(((self.white > _SURE * self.white_error) & (0.5 * self.length * walk < self.white)).all())
+
+    @property
+    def sigma_px(self) -> float:
+        """Standard deviation of a pixel coordinate; the row v is the mean of two."""
+        return max(float(self.white @ _COORDINATES), 0.0) ** 0.5
+
+    @property
+    def sigma_error_px(self) -> float:
+        """Standard error of `sigma_px`, if its rows err alike."""
+        return float(self.white_error @ _COORDINATES) / (2.0 * max(self.sigma_px, _LEAST_PX))
+
+    @property
+    def text(self) -> str:
+        """The kind of the errors and their size in words, in u of the left image."""
+        if not self.is_white:
+            return f"errors walk or persist, {max(float(self.step[0]), 0.0) ** 0.5:.2g} px a frame"
+        return f"errors are white, {with_error(self.sigma_px, self.sigma_error_px)} px"
+
+
+class _Residuals(NamedTuple):
+    """Residuals r (n, 3) of tracks (n,) over an interval, less the leverage; B (n, 3, 3)."""
+
+    ids: IntArray
+    r: Array
+    B: Array
+
+
+class _Moments(NamedTuple):
+    """Terms of the means of two successive intervals: of Sigma (n, 3, 3), of squared residuals (n, 3), and B."""
+
+    white: Array
+    square: Array
+    B: Array
+
+
+@dataclass
+class _Fit:
+    """Motion of the last interval and standard deviation of a row, from which the next fit starts."""
+
+    T_now_before: Array | None = None
+    std_px: float = _START_PX
+
+
+def track_noise(sequence: Sequence) -> TrackNoise | None:
+    """Return the noise of tracks from stretches of a recording; None: too few tracks."""
+    intervals = len(sequence) - 1
+    count = min(max(1, intervals // _STRETCH), _MOST_STRETCHES)
+    moments: list[_Moments] = []
+    for begin in (np.arange(count) * (intervals / count)).astype(int).tolist():
+        last, before = _Fit(), None
+        for k in range(begin + 1, min(begin + _STRETCH, intervals) + 1):
+            now = _residuals(sequence, k, last)
+            if before is not None and now is not None:
+                moments.append(_moments(before, now))
+            before = now
+    return None if sum(len(some.B) for some in moments) < _LEAST_PAIRS else _noise(moments, _length(sequence))
+
+
+def _noise(moments: list[_Moments], length: int) -> TrackNoise:
+    """Return the noise by moments of successive intervals."""
+    parts = np.array_split(np.arange(len(moments)), min(_BLOCKS, len(moments)))
+    left_out = np.array([_variances([m for i, m in enumerate(moments) if i not in part]) for part in parts])
+    white_error, step_error = np.sqrt((len(parts) - 1) * left_out.var(axis=0))
+    white, step = _variances(moments)
+    return TrackNoise(white, white_error, step, step_error, length)
+
+
+def _variances(moments: list[_Moments]) -> tuple[Array, Array]:
+    """Return the variances (3,) of white errors and of steps."""
+    if not moments:
+        return np.zeros(3), np.zeros(3)
+    white, square, B = (np.concatenate(some) for some in zip(*moments, strict=True))
+    Sigma = 0.5 * (white + np.swapaxes(white, 1, 2)).mean(axis=0)
+    both = Sigma + (B @ Sigma @ np.swapaxes(B, 1, 2)).mean(axis=0)
+    return np.diagonal(Sigma), square.mean(axis=0) - np.diagonal(both)
+
+
+def _moments(before: _Residuals, now: _Residuals) -> _Moments:
+    _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    back = np.linalg.solve(now.B[j], now.r[j][..., None])
+    return _Moments(-before.r[i][..., None] * np.swapaxes(back, 1, 2), now.r[j] ** 2, now.B[j])
+
+
+def _residuals(sequence: Sequence, k: int, last: _Fit) -> _Residuals | None:
+    """Return the residuals from frame k - 1 to k, and update the fit; None: too few tracks agree on a motion."""
+    (ids, before), (ids_now, now) = sequence.observations.at(k - 1), sequence.observations.at(k)
+    ids, i, j = np.intersect1d(ids, ids_now, assume_unique=True, return_indices=True)
+    rows, rows_now = (rectified_rows(pixels, np.ones(4))[0] for pixels in (before[i], now[j]))
+    disparity = np.minimum(rows[:, 0] - rows[:, 2], rows_now[:, 0] - rows_now[:, 2])
+    near = disparity >= MOTION_FROM_PX
+    if near.sum() < _LEAST_POINTS:
+        last.T_now_before = None
+        return None
+    found = _fitted(sequence, rows[near], rows_now[near], k, last)
+    r = found.residual_px
+    good = (np.abs(r) < _OUTLIER * _scatter(r)).all(axis=1) & (disparity[near] > _OUTLIER * last.std_px)
+    if good.mean() < _AGREE_SHARE or good.sum() < _LEAST_POINTS:
+        last.T_now_before = None
+        return None
+    taken = found.H @ np.linalg.solve(found.information, np.swapaxes(found.H, 1, 2) @ found.W)
+    share = (1.0 - np.diagonal(taken, axis1=1, axis2=2)).clip(_LEAST_SHARE)
+    return _Residuals(ids[near][good], (r / np.sqrt(share))[good], found.B[good])
+
+
+def _fitted(sequence: Sequence, rows: Array, rows_now: Array, k: int, last: _Fit) -> Alignment:
+    """Return the alignment of rows (n, 3), whose kernel is as wide as the scatter that it leaves."""
+    T, camera = last.T_now_before, sequence.camera
+    if T is None:
+        T = sampled_motion(camera, rows, rows_now, np.random.default_rng(k), _SAMPLES, _START_PX)
+    for _ in range(_FITS):
+        found, fitted = align(camera, rows, rows_now, T, last.std_px, _KERNEL), last.std_px
+        last.T_now_before = T = found.T_now_before
+        last.std_px = float(np.sqrt(np.mean(_scatter(found.residual_px) ** 2) / 2.0))
+        if 1.0 / _SAME < fitted / last.std_px < _SAME:
+            break
+    return found
+
+
+def _scatter(r: Array) -> Array:
+    """Return the standard deviations (3,) of residuals (n, 3) by their medians."""
+    return np.maximum(_MAD_TO_STD * np.median(np.abs(r), axis=0), _LEAST_PX)
+
+
+def _length(sequence: Sequence) -> int:
+    """Return the median over observations of the number of observations of their track."""
+    count = np.bincount(np.searchsorted(sequence.observations.ids, sequence.observations.landmark))
+    return int(np.median(np.repeat(count, count)))

@@ -1,0 +1,119 @@
+"""White errors of tracks, their walk, and mixtures of both are found from residuals along tracks."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ekfslam.config import Config
+from ekfslam.data.sequence import Observations, Sequence
+from ekfslam.data.simulate import builtin
+from ekfslam.evaluation.sanity import inspect_result
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import StereoCamera, project
+from ekfslam.models.track_noise import track_noise
+from ekfslam.resolve import resolve
+from ekfslam.runner import run
+
+CAMERA = StereoCamera(fu_px=707.0, fv_px=707.0, cu_px=602.0, cv_px=183.0, baseline_m=0.537)
+SMALL = StereoCamera(fu_px=230.0, fv_px=230.0, cu_px=188.0, cv_px=120.0, baseline_m=0.2)
+
+
+def seen(camera, white_px, walk_px, *, moves=True, tracks=60, frames=60, seed=0, persists=0.0):
+    """Points seen by a rig at rest, or by one that drives and turns; errors are white, walk, or both."""
+    rng = np.random.default_rng(seed)
+    width, height = 2.0 * camera.cu_px, 2.0 * camera.cv_px
+    z = rng.uniform(0.3, 1.0, tracks) * camera.fu_px * camera.baseline_m / 8.0
+    u, v = rng.uniform(0.05, 0.95, (2, tracks)) * np.array([[width], [height]])
+    points = np.stack([(u - camera.cu_px) / camera.fu_px * z, (v - camera.cv_px) / camera.fv_px * z, z], axis=-1)
+    time_s = 0.1 * np.arange(frames)
+    step = np.array([0.0, 0.0, 0.002 * z.mean(), 0.0, 0.002, 0.0]) if moves else np.zeros(6)
+    T_cam_world = se3.exp(-np.arange(frames)[:, None] * step)
+    pixels = project(camera, se3.apply(T_cam_world[:, None], points))
+    steps = rng.standard_normal(pixels.shape)
+    for k in range(1, frames):
+        steps[k] += persists * steps[k - 1]
+    pixels = pixels + white_px * rng.standard_normal(pixels.shape) + walk_px * np.cumsum(steps, axis=0)
+    return Sequence.from_tracks(time_s, pixels, camera)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("camera", [CAMERA, SMALL])
+@pytest.mark.parametrize("sigma_px", [0.1, 0.6])
+def test_white_errors_are_found_with_any_camera(camera, sigma_px, moves):
+    found = track_noise(seen(camera, sigma_px, 0.0, moves=moves))
+    assert found.is_white
+    assert found.sigma_px == pytest.approx(sigma_px, rel=0.08)
+    assert "white" in found.text
+
+
+def test_few_tracks_do_not_bias_white_errors():
+    """A motion that is fitted to eight tracks takes a quarter of their errors with it."""
+    sigma = [track_noise(seen(CAMERA, 0.3, 0.0, tracks=8, frames=100, seed=seed)).sigma_px for seed in range(4)]
+    assert np.mean(sigma) == pytest.approx(0.3, rel=0.06)
+
+
+def test_errors_that_walk_are_not_white():
+    assert not track_noise(seen(CAMERA, 0.0, 0.1)).is_white
+    found = track_noise(seen(CAMERA, 0.0, 0.1, moves=False))
+    assert not found.is_white and "walk" in found.text
+    np.testing.assert_allclose(np.sqrt(found.step), [0.1, 0.1 / np.sqrt(2.0), 0.1], rtol=0.1)
+
+
+def test_walks_whose_steps_persist_have_negative_white_errors():
+    found = track_noise(seen(CAMERA, 0.0, 0.1, persists=0.6))
+    assert (found.white < 0).all() and not found.is_white
+
+
+def test_both_parts_of_a_mixture_are_found_and_the_walk_decides():
+    found = track_noise(seen(CAMERA, 0.1, 0.1, moves=False))
+    np.testing.assert_allclose(np.sqrt(found.white), [0.1, 0.1 / np.sqrt(2.0), 0.1], rtol=0.15)
+    np.testing.assert_allclose(np.sqrt(found.step), [0.1, 0.1 / np.sqrt(2.0), 0.1], rtol=0.15)
+    assert not found.is_white
+
+
+def test_wrong_matches_do_not_count():
+    sequence = seen(CAMERA, 0.3, 0.0)
+    o, rng = sequence.observations, np.random.default_rng(1)
+    wrong = np.where(rng.random((len(o), 1)) < 0.03, rng.uniform(-30.0, 30.0, (len(o), 4)), 0.0)
+    found = track_noise(
+        dataclasses.replace(sequence, observations=Observations(o.frame, o.landmark, o.pixels_px + wrong))
+    )
+    assert found.is_white and found.sigma_px == pytest.approx(0.3, rel=0.1)
+
+
+def test_too_few_tracks_show_nothing():
+    assert track_noise(seen(CAMERA, 0.3, 0.0, tracks=5)) is None
+    assert track_noise(seen(CAMERA, 0.3, 0.0, frames=2)) is None
+
+
+def test_white_errors_replace_the_walk_and_are_said():
+    unstated = dataclasses.replace(builtin("city?frames=60"), noise=None)
+    problem = resolve(unstated, Config())
+    assert problem.model.track_error is None
+    np.testing.assert_allclose(problem.model.noise.pixel_std_px, 0.7, rtol=0.08)
+    assert "white" in problem.account["found_tracks"]
+    assert resolve(unstated, problem.config).config == problem.config
+    given = resolve(unstated, Config().with_overrides({"noise": {"track_scale": 1.0}}))
+    assert given.model.track_error is not None and "found_tracks" not in given.account
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("velocities", [False, True])
+def test_a_rig_at_rest_stays_where_it_is(seed, velocities):
+    sequence = seen(CAMERA, 0.3, 0.0, moves=False, frames=100, seed=seed)
+    if velocities:
+        twist = np.repeat([0.05, 0.005], 3) * np.random.default_rng(seed).standard_normal((100, 6))
+        sequence = dataclasses.replace(sequence, attributes={}).with_velocities(twist, "imu")
+    result = run(sequence)
+    assert np.linalg.norm(result.T_world_imu[-1, :3, 3]) < 0.02
+    assert result.counts["rejected: moving"] == 0
+
+
+def test_a_large_share_of_moving_tracks_is_a_symptom():
+    sequence = seen(CAMERA, 0.3, 0.0, moves=False, frames=10)
+    result = run(sequence)
+    moving = {**result.counts, "rejected: moving": len(sequence.observations) // 3}
+    (line,) = inspect_result(sequence, dataclasses.replace(result, counts=moving), ())
+    assert "dropped as moving" in line and "traffic, or" in line
