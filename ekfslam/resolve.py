@@ -39,7 +39,7 @@ from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import StateBlock
+from ekfslam.models.blocks import StateBlock, TwistBias
 from ekfslam.models.build import blocks_and_process, model_of
 from ekfslam.models.form import is_conditional_cheaper
 from ekfslam.models.model import Model
@@ -54,6 +54,7 @@ from ekfslam.models.noise import (
 )
 from ekfslam.models.odometry import stereo_odometry, vision_noise
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.models.tilt import first_tilt
 from ekfslam.models.track_noise import track_noise
 
 # Number of dormant landmarks kept in the state of a recording whose landmarks come back: their covariance has 160 MB.
@@ -204,6 +205,10 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
         stated = dataclasses.replace(stated, track_walk_px=given.track_scale * stated.track_walk_px)
     tilt = stated.tilt_rad if given.tilt_deg is None else float(np.deg2rad(given.tilt_deg))
     noise = dataclasses.replace(stated, twist_std=twist, pixel_std_px=pixels, tilt_rad=tilt)
+    if tilt and is_automatic(sequence, config):
+        found = velocity_noise(sequence.twist)
+        bias = TwistBias(**(TwistBias.automatic(found.sigma, found.is_clean, False) or {}))
+        noise = dataclasses.replace(noise, first_tilt=first_tilt(sequence, noise, bias))
     return noise if given.drift is None else with_drift(noise, given.drift)
 
 

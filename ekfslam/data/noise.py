@@ -92,6 +92,8 @@ class Noise:
         motion_std: (6,) error of the motion beyond ``twist_std``, which no averaging of velocities removes.
         tilt_rad: First roll and pitch against gravity of velocities in a level frame, which the joint filter then
             estimates. 0: the velocities are taken as those of the IMU frame.
+        first_tilt: (2, 2) roll and pitch of the first pose against gravity, and their standard deviations, rad. None:
+            level within ``tilt_rad``.
         track_first_px: (3,) error of a track at landmark initialisation (u, v, disparity), see `TrackError`. None:
             pixel noise is white.
         track_walk_px: (3,) change of that error from frame to frame (u, v, disparity).
@@ -104,6 +106,7 @@ class Noise:
     twist_walk_std: Array | None = None
     motion_std: Array = field(default_factory=lambda: np.zeros(6))
     tilt_rad: float = 0.0
+    first_tilt: Array | None = None
     track_first_px: Array | None = None
     track_walk_px: Array | None = None
     track_flow_px: float = np.inf
@@ -146,6 +149,12 @@ def validate_noise(noise: Noise) -> None:
             raise DataError("standard deviations must not be negative", field=f"noise.{name}")
     if not (np.isfinite(noise.tilt_rad) and noise.tilt_rad >= 0):
         raise DataError(f"must be finite and not negative, found {noise.tilt_rad}", field="noise.tilt_rad")
+    if noise.first_tilt is not None:
+        tilt = np.asarray(noise.first_tilt, dtype=float)
+        require_shape(tilt, (2, 2), "noise.first_tilt")
+        require_finite(tilt, "noise.first_tilt", np.pi)
+        if not (tilt[1] > 0).all():
+            raise DataError("standard deviations must be positive", field="noise.first_tilt")
     if (noise.track_first_px is None) != (noise.track_walk_px is None):
         raise DataError("track_first_px and track_walk_px belong together", field="noise.track_walk_px")
     if not noise.track_flow_px > 0:

@@ -60,12 +60,11 @@ def model_of(
     Raises:
         ConfigError: A calibration to estimate without a stereo rig; a block twice; a block that the sensor cannot use.
     """
-    up = T_imu_world[:3, :3].T @ np.array([0.0, 0.0, 1.0])
     chosen: list[StateBlock] = [
         Pose(T_imu_world, covariance),
         *_blocks_of(sensor, noise, calibration or CalibrationConfig(), coordinates),
         *([Twist(noise.twist_walk_std, measures_twist)] if noise.twist_walk_std is not None else []),
-        *([Up(up, noise.tilt_rad)] if noise.tilt_rad else []),
+        *([Up.of_first_pose(T_imu_world[:3, :3].T, noise)] if noise.tilt_rad else []),
         *([Anchor()] if isinstance(sensor, DelayedSensor) else []),
         *blocks,
     ]

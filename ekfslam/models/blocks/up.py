@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array
+from ekfslam.data.noise import Noise
 from ekfslam.geometry import motion, se3
 from ekfslam.models.blocks.base import Layout, StateBlock, Values
 
@@ -19,12 +20,14 @@ class Up(StateBlock):
     ``exp(phi^)``, ``phi = theta + R psi``: nothing when the world turns as a whole.
 
     Args:
-        direction: (3,) first estimate: the first pose's z axis.
-        tilt_rad: Standard deviation of its angles.
+        direction: (3,) first estimate.
+        tilt_rad: (3,) standard deviations of its angles about the axes of the first pose; the third one turns nothing.
+        R_world_imu: (3, 3) rotation of the first pose.
     """
 
     direction: Array
-    tilt_rad: float
+    tilt_rad: Array
+    R_world_imu: Array
 
     name = "up"
     size = 3
@@ -32,11 +35,21 @@ class Up(StateBlock):
     labels = ("roll", "pitch")
     units = ("rad", "rad")
 
+    @classmethod
+    def of_first_pose(cls, R_world_imu: Array, noise: Noise) -> Up:
+        """Return the block for a first rotation (3, 3), level by ``noise.tilt_rad`` or tilted as in ``first_tilt``."""
+        if noise.first_tilt is None:
+            return cls(R_world_imu[:, 2], np.full(3, noise.tilt_rad), R_world_imu)
+        (roll, pitch), (roll_std, pitch_std) = noise.first_tilt
+        up = [-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)]
+        return cls(R_world_imu @ np.array(up), np.array([roll_std, pitch_std, noise.tilt_rad]), R_world_imu)
+
     def initial(self) -> Array:
         return self.direction
 
     def prior_covariance(self) -> Array:
-        return self.tilt_rad**2 * np.eye(3)
+        root = self.R_world_imu * self.tilt_rad
+        return root @ root.T
 
     def retract(self, value: Array, correction: Array) -> Array:
         return (se3.so3_exp(correction) @ value[..., None])[..., 0]
@@ -65,4 +78,4 @@ class Up(StateBlock):
 
     @property
     def reported_prior_std(self) -> Array:
-        return np.full(2, self.tilt_rad)
+        return self.tilt_rad[:2]
