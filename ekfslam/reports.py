@@ -18,7 +18,7 @@ from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import EkfslamError, FilterError, IllPosedError, PosteriorError
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations
-from ekfslam.evaluation.summary import compare_table, summarise
+from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.check import plot_check
 from ekfslam.figures.older import older_figures, remove_figures
@@ -35,7 +35,13 @@ from ekfslam.studies.study import Study, StudyArchive, run_study
 from ekfslam.studies.summary import study_table, summarise_study
 
 # Key figures of a summary on the card of a `Comparison`.
-_KEY_FIGURES = {"ate_m": "ATE [m]", "pose_nees_mean": "pose NEES (6)", "nis_per_dof": "NIS / dof (1)", "total_s": "s"}
+_KEY_FIGURES = {
+    "ate_m": "ATE [m]",
+    "ate_aligned_m": "aligned [m]",
+    "pose_nees_mean": "pose NEES (6)",
+    "nis_per_dof": "NIS / dof (1)",
+    "total_s": "s",
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -112,12 +118,7 @@ def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | 
     results, skipped = _run_all(sequence, list(modes), config)
     if skipped and not results:
         raise FilterError("; ".join(f"no {mode}: {reason}" for mode, reason in skipped.items()))
-    summary = {
-        "sequence": sequence.name,
-        "frames": len(sequence),
-        "landmarks": len(sequence.observations.ids),
-        "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
-    }
+    summary = summarise_all(sequence, len(sequence.observations.ids), results)
     return Comparison(sequence, results, summary, skipped)
 
 

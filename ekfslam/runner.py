@@ -19,6 +19,7 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError, NoVelocitiesError
 from ekfslam.evaluation.relative import dead_reckoned_pairs, relative_pairs
 from ekfslam.evaluation.sanity import inspect_result, inspect_sequence, sanity_attributes
+from ekfslam.evaluation.sources import compare_sources, doubt_in_truth, in_words
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.innovations import collect_innovations
 from ekfslam.filters.joint import JointEKF
@@ -71,8 +72,11 @@ def run(
     with one_thread():
         estimate = _joint(problem, further) if mode == "full" else _dead_reckoned(problem, mode)
     result = _result(problem, mode, estimate)
-    lines = (*suspicions, *inspect_result(sequence, result, suspicions))
-    return dataclasses.replace(result, attributes={**result.attributes, **sanity_attributes(lines)})
+    compared = compare_sources(sequence) if mode == "full" and not suspicions else None
+    found = in_words(compared, sequence.time_s)
+    lines = sanity_attributes((*suspicions, *inspect_result(sequence, result, suspicions), *found))
+    doubts = doubt_in_truth(compared, sequence.time_s)
+    return dataclasses.replace(result, attributes={**result.attributes, **lines, **doubts})
 
 
 @dataclasses.dataclass(frozen=True)

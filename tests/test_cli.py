@@ -40,7 +40,7 @@ def test_compare_writes_archive_summaries_and_figures(tmp_path, capsys, undrawn)
     names = {path.name for path in folder.iterdir()}
     assert {"archive.h5", "summary.json", "summary.md", "map.png", "errors.png", "nis.png"} <= names
     summary = json.loads((folder / "summary.json").read_text())
-    assert {"sequence", "frames", "landmarks", "modes"} == set(summary)
+    assert {"sequence", "frames", "landmarks", "modes", "errors"} == set(summary)
     assert summary["frames"] == 20
     assert list(summary["modes"]) == ["dead-reckoning", "mapping-only", "full", "smoothed"]
     assert all(set(values) == SUMMARY_KEYS for values in summary["modes"].values())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from itertools import pairwise
 
 import numpy as np
@@ -18,10 +19,12 @@ from ekfslam.evaluation.consistency import (
     pose_error,
     pose_nees,
 )
-from ekfslam.evaluation.summary import compare_table, summarise
+from ekfslam.evaluation.summary import compare_table, error_in_words, summarise, summarise_all
 from ekfslam.evaluation.trajectory import (
+    PARTS,
     absolute_trajectory_error,
     align_se3,
+    error_parts,
     final_position_error,
     kitti_segment_errors,
     landmark_rmse,
@@ -292,7 +295,10 @@ def test_summary_has_exactly_its_keys_in_plain_numbers():
     summary = summarise(sequence, result)
     assert set(summary) == SUMMARY_KEYS
     # The road has no 100 m within the 100 frames that a pair may be apart.
-    assert {key for key, value in summary.items() if value is None} == {"pose_nees_relative_100_m_mean"}
+    assert {key for key, value in summary.items() if value is None} == {
+        "pose_nees_relative_100_m_mean",
+        "pose_nees_apart_mean",
+    }
     assert all(type(value) in (int, float) for value in summary.values() if value is not None)
     assert json.loads(json.dumps(summary)) == summary
     assert summary["nis_per_dof"] == pytest.approx(1.0, abs=0.05)
@@ -370,3 +376,42 @@ def test_table_has_a_row_a_mode_a_dash_for_nothing_and_no_empty_column():
     poses_only = {"full": summarise(dataclasses.replace(sequence, truth=truth), synthetic_result(sequence))}
     table = compare_table({"sequence": sequence.name, "frames": 40, "landmarks": 300, "modes": poses_only})
     assert "landmark RMSE" not in table, "no true position of a landmark is known"
+
+
+@pytest.mark.parametrize(("name", "value"), [("pitch", 0.02), ("yaw", -0.01), ("scale", 0.03), ("z", 2.0)])
+def test_the_parts_of_an_error_name_what_is_wrong(name, value):
+    T = synthetic_sequence(frames=150).truth.T_world_imu
+    moved = T.copy()
+    if name == "scale":
+        moved[:, :3, 3] = T[0, :3, 3] + (1 + value) * (T[:, :3, 3] - T[0, :3, 3])
+    elif name == "z":
+        moved[:, 2, 3] += value
+    else:
+        turn = np.zeros(6)
+        turn[PARTS.index(name) + 3] = value
+        moved = T[0] @ se3.exp(turn) @ se3.inverse(T[0]) @ T
+    moved[:, :3, 3] += 0.01 * np.random.default_rng(0).standard_normal((150, 3))
+    (part,) = error_parts(moved, T)
+    assert part.name == name
+    assert part.value == pytest.approx(value, rel=0.1)
+    assert part.share > 0.95
+
+
+def test_an_error_of_shape_has_no_parts_and_no_error_none():
+    T = synthetic_sequence(frames=150).truth.T_world_imu
+    bent = T.copy()
+    bent[:, 1, 3] += np.sin(np.arange(150))
+    assert error_parts(bent, T) == ()
+    assert error_parts(T, T) == ()
+
+
+def test_an_error_is_said_in_words():
+    sequence = synthetic_sequence(frames=150, landmarks=20)
+    T = sequence.truth.T_world_imu
+    pitched = T[0] @ se3.exp(np.array([0, 0, 0, 0, np.radians(1.6), 0])) @ se3.inverse(T[0]) @ T
+    result = dataclasses.replace(synthetic_result(sequence), T_world_imu=pitched)
+    words = error_in_words(result, sequence.truth)
+    pitch = "of its square is the first pose's pitch of +1.6 deg"
+    assert re.fullmatch(r"ATE 1\.\d\d m unaligned, 0\.\d+ m aligned: \d+% " + re.escape(pitch), words)
+    assert error_in_words(result, None) == ""
+    assert f"full: {words}." in compare_table(summarise_all(sequence, 20, {"full": result}))

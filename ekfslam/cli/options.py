@@ -12,7 +12,7 @@ from ekfslam.config import VARIANTS, Config
 from ekfslam.data.sequence import Sequence, stretch
 from ekfslam.errors import WriteError
 from ekfslam.evaluation.sanity import inspect_sequence
-from ekfslam.evaluation.summary import compare_table, summarise
+from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.filters.result import Result
 from ekfslam.frontend.opening import open_sequence
 from ekfslam.storage.archive import Archive
@@ -176,5 +176,4 @@ def require_ours(options: argparse.Namespace, path: Path, is_ours: Callable[[Pat
 
 def table(data: Sequence | Archive, landmarks: int | None, results: Mapping[str, Result]) -> str:
     """Return the table of figures of merit, one column per mode."""
-    modes = {mode: summarise(data, result) for mode, result in results.items()}
-    return compare_table({"sequence": data.name, "frames": len(data.time_s), "landmarks": landmarks, "modes": modes})
+    return compare_table(summarise_all(data, landmarks, results))

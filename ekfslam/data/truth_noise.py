@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,37 @@ class TruthNoise:
         drift = f"{self.drift_m_sqrt_s:.3g} m/sqrt(s)"
         slow = ((self.world_tilt_rad, f"world tilt {tilt}"), (self.turn_rad, f"body turned {turn}"))
         return "; ".join([text, *(words for value, words in (*slow, (self.drift_m_sqrt_s, f"drift {drift}")) if value)])
+
+
+class Doubt(NamedTuple):
+    """A stretch in which the truth contradicts velocities and vision, which agree.
+
+    Args:
+        begin, end: First and last frame.
+        axis: Axis 0 to 5 of the pose error in the IMU frame.
+        size: Offset of the later poses, m or rad.
+    """
+
+    begin: int
+    end: int
+    axis: int
+    size: float
+
+
+_DOUBTS, _DRIFT = "truth_doubts", "truth_drift_m_sqrt_s"
+
+
+def doubt_attributes(doubts: Iterable[Doubt], drift_m_sqrt_s: float) -> dict[str, str | float]:
+    """Return what a recording itself says against its truth as attributes of a result; empty without any."""
+    text = "; ".join(f"{one.begin}-{one.end} {one.axis} {one.size:.4g}" for one in doubts)
+    return ({_DOUBTS: text} if text else {}) | ({_DRIFT: drift_m_sqrt_s} if drift_m_sqrt_s else {})
+
+
+def doubts_of(attributes: Mapping[str, str | int | float]) -> tuple[tuple[Doubt, ...], float]:
+    """Return the doubts and the drift among attributes; text that is none holds no doubts."""
+    rows = re.findall(r"(\d+)-(\d+) ([0-5]) ([\d.e+-]+)", str(attributes.get(_DOUBTS, "")))
+    doubts = tuple(Doubt(int(begin), int(end), int(axis), float(size)) for begin, end, axis, size in rows)
+    return doubts, float(attributes.get(_DRIFT, 0.0))
 
 
 KITTI_TRUTH_NOISE = TruthNoise(

@@ -17,7 +17,7 @@ from scipy.special import chdtri, gammaincinv
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.interpolation import interpolated_poses, stretches
 from ekfslam.data.sequence import Truth
-from ekfslam.data.truth_noise import TruthNoise
+from ekfslam.data.truth_noise import TruthNoise, doubts_of
 from ekfslam.filters.result import Result
 from ekfslam.geometry import se3
 from ekfslam.geometry.motion import world_axes_covariance
@@ -158,14 +158,43 @@ def pose_nees(result: Result, truth: Truth, with_truth_noise: bool = False) -> t
     return truth.frame, values
 
 
+def pose_nees_apart(result: Result, truth: Truth) -> tuple[IntArray, Array] | None:
+    """Return `pose_nees` with truth noise, but without what velocities and vision together say against the truth.
+
+    Frames of doubtful stretches are left out. An offset e in the IMU frame of frame b adds ``(A e) (A e)^T`` with
+    ``A = Ad(T_hat_k T_hat_b^-1)`` to all later ones, and the drift found is that of `drift_covariance`. None if there
+    is nothing to say.
+    """
+    doubts, drift = doubts_of(result.attributes)
+    if not doubts and not drift:
+        return None
+    error, covariance = pose_errors(result, truth, with_truth_noise=True)
+    frame, kept = truth.frame, np.ones(len(truth.frame), dtype=bool)
+    covariance = covariance + drift_covariance(
+        TruthNoise(drift_m_sqrt_s=drift), result.time_s[frame] - result.time_s[0]
+    )
+    T = result.T_world_imu
+    for doubt in doubts:
+        kept &= (frame <= doubt.begin) | (frame > doubt.end)
+        moved = doubt.size * se3.adjoint(se3.inverse(T[frame]) @ T[doubt.begin])[..., doubt.axis]
+        moved[frame <= doubt.begin] = 0.0
+        covariance = covariance + moved[..., :, None] * moved[..., None, :]
+    values = np.where(np.isnan(pose_nees(result, truth)[1]), np.nan, nees(error, covariance))
+    return frame[kept], values[kept]
+
+
 def pose_nees_by_axis(result: Result, truth: Truth) -> Array:
     """Return squared errors divided by their variances (n, 6), truth noise included; 1 expected on each axis.
 
-    Axes are those of the IMU: position x, y, z, then rotation about them. NaN if the estimate's own variance is 0.
+    Axes are x, y, z of world for the position, those of the IMU for the rotation. NaN if the estimate's own variance
+    is 0.
     """
     error, covariance = pose_errors(result, truth, with_truth_noise=True)
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    is_uncertain = np.diagonal(result.covariance[truth.frame], axis1=-2, axis2=-1) > 0
+    R = np.tile(np.eye(6), (len(error), 1, 1))
+    R[:, :3, :3] = truth.T_world_imu[:, :3, :3]
+    error = (R @ error[..., None])[..., 0]
+    variance, own = (np.einsum("nij,njk,nik->ni", R, of, R) for of in (covariance, result.covariance[truth.frame]))
+    is_uncertain = own > 0
     return np.where(is_uncertain, error**2 / np.where(is_uncertain, variance, 1.0), np.nan)
 
 

@@ -21,12 +21,12 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation import trajectory
-from ekfslam.evaluation.consistency import measured_truth, pose_nees, pose_nees_by_axis
+from ekfslam.evaluation.consistency import measured_truth, pose_nees, pose_nees_apart, pose_nees_by_axis
 from ekfslam.evaluation.relative import FRAMES, PATHS_M, over_frames, over_path, relative_pose_nees
 from ekfslam.filters.result import Innovation, Result
 
 RPE_PATH_M = 10.0
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")  # of the error xi, in the IMU frame
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")  # of position in world, of rotation in the IMU frame
 
 Value = float | int | None
 Function = Callable[..., Any]
@@ -133,9 +133,16 @@ def nees_with_truth_noise(result: Result, measured: Truth) -> float | None:
     return _mean(pose_nees(result, measured, with_truth_noise=True)[1])
 
 
+@metric("pose_nees_apart_mean", f"pose NEES {_NOISE}, where truth, velocities and vision agree", ".2f")
+def nees_apart(result: Result, measured: Truth) -> float | None:
+    """Return the mean pose NEES without stretches in which the truth stands alone; None if there are none."""
+    found = pose_nees_apart(result, measured)
+    return None if found is None else _mean(found[1])
+
+
 @metrics(*((f"pose_nees_{axis}_mean", f"{axis} alone (1), with truth noise", ".2f") for axis in AXES))
 def nees_by_axis(result: Result, measured: Truth) -> list[float | None]:
-    """Return the mean squared error divided by its variance of each axis of ``xi``, truth noise included."""
+    """Return the mean squared error divided by its variance along each of `AXES`, truth noise included."""
     return [_mean(values) for values in pose_nees_by_axis(result, measured).T]
 
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from ekfslam.data.sequence import Sequence
+import numpy as np
+
+from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.metrics import METRICS, Value, computed, offered
-from ekfslam.evaluation.tables import document, markdown_table, number
+from ekfslam.evaluation.tables import document, markdown_table, number, significant
+from ekfslam.evaluation.trajectory import Part, absolute_trajectory_error, error_parts
 from ekfslam.filters.result import Result
 from ekfslam.storage.archive import Archive
 
+_LEAST_POSES = 10  # for a statement on the errors of a trajectory
 KEYS = METRICS.keys()  # of a summary, in the order of the table
 
 
@@ -23,12 +27,47 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, Value]:
     return computed(offered(result, sequence.truth, sequence.interpolated))
 
 
+def summarise_all(sequence: Sequence | Archive, landmarks: int | None, results: Mapping[str, Result]) -> dict[str, Any]:
+    """Return the summaries of all modes of a recording, and words on their trajectory errors, ready for JSON."""
+    said = {mode: error_in_words(result, sequence.truth) for mode, result in results.items()}
+    return {
+        "sequence": sequence.name,
+        "frames": len(sequence.time_s),
+        "landmarks": landmarks,
+        "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
+        "errors": {mode: words for mode, words in said.items() if words},
+    }
+
+
+def error_in_words(result: Result, truth: Truth | None) -> str:
+    """Return both ATE of a run, and the parts of the unaligned one in words; empty without true poses."""
+    if truth is None or len(truth.frame) < _LEAST_POSES:
+        return ""
+    T_est, T_true = result.T_world_imu[truth.frame], truth.T_world_imu
+    ate_m, aligned_m = (absolute_trajectory_error(T_est, T_true, align) for align in (False, True))
+    head = f"ATE {significant(ate_m)} m unaligned, {significant(aligned_m)} m aligned"
+    parts = error_parts(T_est, T_true)
+    if not parts:
+        return f"{head}: a matter of shape, no turn of the first pose, shift or scale explains it"
+    said = [f"{part.share:.0%} of its square is {_part_in_words(part)}" for part in parts]
+    return f"{head}: {', '.join([said[0], *(words.replace('of its square ', '') for words in said[1:])])}"
+
+
+def _part_in_words(part: Part) -> str:
+    if part.name == "scale":
+        return f"a scale of {100 * part.value:+.2g} %"
+    if part.name in "xyz":
+        return f"a shift of {part.value:+.2g} m along {part.name}"
+    return f"the first pose's {part.name} of {np.degrees(part.value):+.2g} deg"
+
+
 def compare_table(summary: Mapping[str, Any]) -> str:
-    """Return ``{"sequence", "frames", "landmarks", "modes": {mode: summarise(...)}}`` as a Markdown table."""
+    """Return what `summarise_all` returns as a Markdown table, with the words on errors below."""
     modes = summary["modes"]
     landmarks = "" if summary["landmarks"] is None else f", {summary['landmarks']} landmarks"
     title = f"**{summary['sequence']}**: {summary['frames']} frames{landmarks}"
-    return document(title, markdown_table(["", *modes], merit_rows(modes.values()), padded=True))
+    table = markdown_table(["", *modes], merit_rows(modes.values()), padded=True)
+    return document(title, table, *(f"{mode}: {words}." for mode, words in summary.get("errors", {}).items()))
 
 
 def merit_rows(summaries: Iterable[Mapping[str, Any]]) -> list[list[str]]:

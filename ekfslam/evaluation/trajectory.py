@@ -5,6 +5,8 @@ Trajectories are stacks of poses ``T_world_imu`` (n, 4, 4), estimate and truth a
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
@@ -14,6 +16,7 @@ from ekfslam.geometry import se3
 
 KITTI_SEGMENT_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_START_STEP = 10  # frames between the starts of segments
+LEAST_PART = 0.1  # of the squared error, from which a part of it is named
 PATH_TOLERANCE = 0.1  # largest relative difference of the path of a pair from the wanted one; the default of evo_rpe
 
 
@@ -39,6 +42,54 @@ def absolute_trajectory_error(T_est: Array, T_true: Array, align: bool) -> float
     if align:
         estimate = se3.apply(align_se3(estimate, truth), estimate)
     return float(np.sqrt(np.mean(np.sum((estimate - truth) ** 2, axis=1))))
+
+
+class Part(NamedTuple):
+    """A part of the squared trajectory error that one number explains.
+
+    Args:
+        name: ``roll``, ``pitch`` or ``yaw`` of the first pose, ``x``, ``y`` or ``z`` of a shift in world, or ``scale``.
+        value: Error of that number: rad, m, or a ratio.
+        share: Share of the squared error that it removes after the parts before it.
+    """
+
+    name: str
+    value: float
+    share: float
+
+
+PARTS = ("roll", "pitch", "yaw", "x", "y", "z", "scale")
+
+
+def error_parts(T_est: Array, T_true: Array) -> tuple[Part, ...]:
+    """Return the parts of an unaligned ATE, the largest first; what is left over is the shape of the trajectory.
+
+    To first order, errors of the positions p, from the first one, are ``phi x p + shift + scale p``, with phi along the
+    axes of the first IMU. Parts are chosen one by one, each for the least squares that all together leave.
+    """
+    error, p = T_est[:, :3, 3] - T_true[:, :3, 3], T_true[:, :3, 3] - T_true[0, :3, 3]
+    R = T_true[0, :3, :3]
+    columns = np.stack(
+        [*(np.cross(R[:, i], p) for i in range(3)), *(np.broadcast_to(axis, p.shape) for axis in np.eye(3)), p]
+    ).reshape(len(PARTS), -1)
+    b, total = error.ravel(), float((error**2).sum())
+    chosen: list[int] = []
+    shares: list[float] = []
+    left = total
+    found: Array = np.zeros(0)
+    while len(chosen) < len(PARTS) and total > 0:
+        fits = {
+            i: np.linalg.lstsq(columns[[*chosen, i]].T, b)[0].astype(float)
+            for i in range(len(PARTS))
+            if i not in chosen
+        }
+        rests = {i: float(((b - fit @ columns[[*chosen, i]]) ** 2).sum()) for i, fit in fits.items()}
+        best = min(rests, key=rests.__getitem__)
+        if left - rests[best] < LEAST_PART * total:
+            break
+        chosen, found = [*chosen, best], fits[best]
+        shares, left = [*shares, (left - rests[best]) / total], rests[best]
+    return tuple(Part(PARTS[i], float(value), share) for i, value, share in zip(chosen, found, shares, strict=True))
 
 
 def final_position_error(T_est: Array, T_true: Array) -> float:

@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 
 from ekfslam.arrays import BoolArray
 from ekfslam.data.sequence import Truth
+from ekfslam.evaluation.tables import significant
+from ekfslam.evaluation.trajectory import absolute_trajectory_error
 from ekfslam.figures import maps as maps  # registers figures, as the next one does
 from ekfslam.figures import posterior as posterior
 from ekfslam.figures import registry, series
@@ -39,10 +41,17 @@ def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolA
         for ax, error in zip(column, errors, strict=True):
             draw_series(ax, error, color, {"color": "black", "linewidth": 1.0}, levels=ZERO)
         inside = f"{100 * series.share_inside(errors):.1f} % inside {BAND_SIGMAS:g} sigma"
-        column[0].set_title(f"{title}\n{inside}{_nees_words(result, truth, interpolated)}")
+        nees = _nees_words(result, truth, interpolated)
+        column[0].set_title(f"{title}: {_ate_words(result, truth)}\n{inside}{nees}")
     figure.align_ylabels()
     figure.suptitle(f"{next(iter(results.values())).sequence_name}: estimate minus truth, world axes")
     return figure
+
+
+def _ate_words(result: Result, truth: Truth) -> str:
+    T = result.T_world_imu[truth.frame]
+    ate_m, aligned_m = (absolute_trajectory_error(T, truth.T_world_imu, align) for align in (False, True))
+    return f"ATE {significant(ate_m)} m, aligned {significant(aligned_m)} m"
 
 
 def _nees_words(result: Result, truth: Truth, interpolated: BoolArray | None) -> str:

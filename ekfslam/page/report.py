@@ -20,7 +20,7 @@ from ekfslam import files
 from ekfslam.config import Config
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.evidence import BLIND
-from ekfslam.evaluation.summary import merit_rows
+from ekfslam.evaluation.summary import error_in_words, merit_rows
 from ekfslam.evaluation.tables import MISSING
 from ekfslam.names import components, printable
 from ekfslam.page.content import PART, Run, Section, plotted, remarks_of, sections_of, told_apart
@@ -34,8 +34,15 @@ _JUDGED = (
     "Verdicts on <i>full</i> are by innovations, without truth; <code>ekfslam check</code> adds the smoother. "
     "Where there is truth, it has a verdict of its own; one drive is one sample."
 )
-_KEY_FIGURES = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_dof", "landmark_rmse_m")
-_ERRORS = ("ate_m", "t_rel_percent", "landmark_rmse_m")  # on cards, whose verdict has the others
+_KEY_FIGURES = (
+    "ate_m",
+    "ate_aligned_m",
+    "t_rel_percent",
+    "pose_nees_with_truth_noise_mean",
+    "nis_per_dof",
+    "landmark_rmse_m",
+)
+_ERRORS = ("ate_m", "ate_aligned_m", "t_rel_percent", "landmark_rmse_m")  # on cards, whose verdict has the others
 _MOST_CARDS = 4  # of more runs, only those judged by innovations have a card
 
 
@@ -163,7 +170,7 @@ def _card(run: Run) -> str:
     return f"""<article class="card {run.honesty.grade}">
 <h3>{escape(run.label)}</h3>
 <p class="verdict">{escape(head[:1].upper() + head[1:])}</p>
-{_list([*items, *run.result.remarks], "causes")}
+{_list([*items, *run.result.remarks, *filter(None, [error_in_words(run.result, run.truth)])], "causes")}
 {_pairs(figures, "")}
 </article>"""
 

@@ -29,7 +29,15 @@ from ekfslam.stored import TEXTS, Check, Item
 FORMAT, FORMAT_VERSION = "ekfslam-sweep", 1
 _RUNS, _ROW = "runs", "run"  # the length that all columns share, and its dimension
 _ANY_NUMBER = Check("f", "be numbers", lambda value, _: np.ones(value.shape, dtype=bool))  # a limit may be infinite
-SHOWN = ("ate_m", "t_rel_percent", "pose_nees_with_truth_noise_mean", "nis_per_dof", "landmark_rmse_m", "total_s")
+SHOWN = (
+    "ate_m",
+    "ate_aligned_m",
+    "t_rel_percent",
+    "pose_nees_with_truth_noise_mean",
+    "nis_per_dof",
+    "landmark_rmse_m",
+    "total_s",
+)
 
 
 @dataclass(frozen=True)

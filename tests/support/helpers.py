@@ -174,6 +174,7 @@ SUMMARY_KEYS = {
     "nis_per_dof",
     "pose_nees_mean",
     "pose_nees_with_truth_noise_mean",
+    "pose_nees_apart_mean",
     *(f"pose_nees_{axis}_mean" for axis in ("x", "y", "z", "roll", "pitch", "yaw")),
     *(f"pose_nees_relative_{stretch}_mean" for stretch in ("10", "50", "100", "50_m", "100_m")),
     "landmark_rmse_m",

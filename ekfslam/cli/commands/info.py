@@ -15,6 +15,7 @@ from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.evaluation.sanity import inspect_sequence
+from ekfslam.evaluation.sources import compare_sources, in_words
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.models.noise import velocity_noise
 from ekfslam.resolve import resolve
@@ -102,6 +103,8 @@ def _print_findings(sequence: Sequence) -> None:
         print(f"sanity        {line}")
     for line in sanity.warnings:
         print(f"warning       {line}")
+    for line in () if sanity.warnings else in_words(compare_sources(sequence), sequence.time_s):
+        print(f"sources       {line}")
     problem = resolve(sequence)
     assert problem.hygiene is not None
     if (found := problem.account.get("found_tracks")) is not None:
