@@ -2,7 +2,7 @@
 
 `resolve` decides in one order, and no module below it decides anything:
 
-1. Velocities: stereo odometry if the recording has none.
+1. Velocities: stereo odometry if the recording has none, also for linear or angular ones that were never filled in.
 2. Landmarks: when they leave the state, and how many dormant ones stay (`settings_of`).
 3. Noise: the configuration, else the recording, else what the data show (`noise_of`): white errors of tracks where
    residuals along tracks show them (`ekfslam.models.track_noise`), else errors that walk.
@@ -34,7 +34,7 @@ from ekfslam.config import LEAST_PX, BlockSetting, Config, Mode
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.noise import Noise
-from ekfslam.data.sequence import WITHOUT_TRACKS, WITHOUT_VELOCITIES, Sequence
+from ekfslam.data.sequence import MEASURED_KINDS, WITHOUT_TRACKS, WITHOUT_VELOCITIES, Sequence
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
@@ -52,10 +52,11 @@ from ekfslam.models.noise import (
     velocity_noise,
     with_drift,
 )
-from ekfslam.models.odometry import stereo_odometry, vision_noise
+from ekfslam.models.odometry import missing_velocities, stereo_odometry, vision_noise, with_vision
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.models.tilt import first_tilt
 from ekfslam.models.track_noise import track_noise
+from ekfslam.models.vehicle import odometry_text, with_vehicle
 
 # Number of dormant landmarks kept in the state of a recording whose landmarks come back: their covariance has 160 MB.
 DORMANT_LIMIT = 1500
@@ -126,10 +127,7 @@ def resolve(
     Raises:
         ConfigError: An unknown block, an unknown setting of a block, or pixel noise that is too small.
     """
-    if not sequence.has_velocities:
-        without = {**sequence.attributes, **WITHOUT_VELOCITIES}
-        sequence = dataclasses.replace(sequence, attributes=without)
-        sequence = sequence.with_velocities(stereo_odometry(sequence), "imu")
+    sequence = with_odometry(sequence)
     config = config or Config()
     account: dict[str, str | int | float] = {f"tuned_{key}": value for key, value in config.tuning.items()}
     if mode != "dead-reckoning" and _has_open_scale(sequence, config) and (tracks := track_noise(sequence)):
@@ -139,8 +137,10 @@ def resolve(
             config = config.with_overrides({"noise": white})
     config = settings_of(sequence, config)
     noise, hygiene = noise_of(sequence, config), None
+    if text := odometry_text(sequence.measured_axes, noise.twist_std):
+        account["odometry"] = text
     if is_automatic(sequence, config):
-        account |= found_attributes(velocity_noise(sequence.twist))
+        account |= found_attributes(noise_of_velocities(sequence))
     if is_inertial(sequence):
         account |= {f"inertial_{name}": value for name, value in vars(_densities(sequence)).items()}
     if mode != "dead-reckoning":
@@ -161,6 +161,27 @@ def resolve(
     return Problem(sequence, config, model, hygiene, account)
 
 
+def with_odometry(sequence: Sequence) -> Sequence:
+    """Return the recording with stereo odometry in place of velocities that were not measured or never filled in."""
+    measured = sequence.measured_axes.reshape(2, 3).any(axis=1)
+    if measured.all() or sequence.attributes.get("velocities") in MEASURED_KINDS:
+        return sequence
+    found = stereo_odometry(sequence)
+    if not measured.any():
+        without = {**sequence.attributes, **WITHOUT_VELOCITIES}
+        return dataclasses.replace(sequence, attributes=without).with_velocities(found, "imu")
+    if not missing_velocities(sequence, found):
+        return sequence
+    kind = MEASURED_KINDS[int(np.argmax(measured))]
+    twist = np.where(np.repeat(measured, 3), sequence.twist, found)
+    return dataclasses.replace(sequence, attributes={**sequence.attributes, "velocities": kind}).with_velocities(twist)
+
+
+def noise_of_velocities(sequence: Sequence) -> VelocityNoise:
+    """Return the noise of the measured velocities of a recording, as their differences show it or it is stated."""
+    return velocity_noise(sequence.twist, sequence.measured_axes, sequence.stated_twist_std)
+
+
 def settings_of(sequence: Sequence, config: Config) -> Config:
     """Return a configuration with every automatic setting resolved that depends on the recording alone.
 
@@ -177,7 +198,8 @@ def settings_of(sequence: Sequence, config: Config) -> Config:
     # Without velocities nothing observes the camera's rotation against the IMU.
     if config.calibration.rotation_deg is None and sequence.has_velocities:
         config = config.with_overrides({"calibration": {"rotation_deg": CAMERA_ROTATION_DEG}})
-    tables = shared_errors(sequence.twist if sequence.has_velocities else None, sequence.has_checked_tracks)
+    found = noise_of_velocities(sequence) if sequence.has_velocities else None
+    tables = shared_errors(found, sequence.has_checked_tracks)
     shared = {name: {**table, **config.blocks.get(name, {})} for name, table in tables.items()}
     return dataclasses.replace(config, blocks={**config.blocks, **shared})
 
@@ -186,7 +208,8 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
     """Return the noise of a filter: the configuration's, else the recording's, else the data's or a default."""
     given = config.noise
     if is_automatic(sequence, config):
-        stated = automatic_noise(sequence.twist, sequence.velocity_frame, sequence.has_checked_tracks)
+        found = noise_of_velocities(sequence)
+        stated = automatic_noise(found, sequence.velocity_frame, sequence.has_checked_tracks)
     else:
         stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
     if not sequence.has_velocities:
@@ -205,11 +228,26 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
         stated = dataclasses.replace(stated, track_walk_px=given.track_scale * stated.track_walk_px)
     tilt = stated.tilt_rad if given.tilt_deg is None else float(np.deg2rad(given.tilt_deg))
     noise = dataclasses.replace(stated, twist_std=twist, pixel_std_px=pixels, tilt_rad=tilt)
-    if tilt and is_automatic(sequence, config):
-        found = velocity_noise(sequence.twist)
+    if sequence.has_velocities:
+        noise = with_unmeasured(sequence, noise)
+    if tilt and is_automatic(sequence, config) and sequence.measured_axes.all():
+        found = noise_of_velocities(sequence)
         bias = TwistBias(**(TwistBias.automatic(found.sigma, found.is_clean, False) or {}))
         noise = dataclasses.replace(noise, first_tilt=first_tilt(sequence, noise, bias))
     return noise if given.drift is None else with_drift(noise, given.drift)
+
+
+def with_unmeasured(sequence: Sequence, noise: Noise) -> Noise:
+    """Return the noise with that of a vehicle, or of stereo odometry, for velocities that are not measured."""
+    measured = sequence.measured_axes
+    if measured.all():
+        return noise
+    if sequence.noise is None:
+        step_s = float(np.median(np.diff(sequence.time_s))) if len(sequence) > 1 else np.inf
+        noise = dataclasses.replace(noise, twist_std=with_vehicle(noise.twist_std, measured, step_s))
+    if sequence.attributes.get("velocities") in MEASURED_KINDS:
+        noise = with_vision(noise, sequence.twist, np.repeat(~measured.reshape(2, 3).any(axis=1), 3))
+    return noise
 
 
 def is_inertial(sequence: Sequence) -> bool:
@@ -282,7 +320,7 @@ def _has_open_scale(sequence: Sequence, config: Config) -> bool:
 
 def _track_scale(sequence: Sequence, config: Config, model: Model) -> float:
     """Return the scale of the walk of track errors, given a model with scale 1."""
-    if not sequence.has_velocities or not velocity_noise(sequence.twist).is_clean:
+    if not sequence.has_velocities or not noise_of_velocities(sequence).carries_motion:
         return PERSISTENCE
     count = min(max(1, round(len(sequence) / _EVERY)), _MOST_STRETCHES)
     begins = ((np.arange(count) + 0.5) * len(sequence) / count - _STRETCH / 2).astype(int).clip(0)

@@ -38,6 +38,7 @@ from support.bags import (
 from ekfslam import open_images
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.readers.messages import message_types
+from ekfslam.data.sequence import TWIST_STD
 from ekfslam.errors import (
     CalibrationError,
     EkfslamError,
@@ -92,6 +93,31 @@ def test_rectified_and_compressed_images(tmp_path, kind):
     np.testing.assert_allclose(found.calibration.T_right_left[:3, 3], [-BASELINE_M, 0, 0])
     np.testing.assert_allclose(found.T_cam_imu[:3, :3], R_LEFT @ T_BASE_CAM[:3, :3].T, atol=1e-9)
     assert any("/odom" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("variance", "expected"),
+    [
+        ([0.04, 0, 0, 0, 0, 0.0009], "0.2 0 0 0 0 0.03"),
+        ([0.04, 1e-12, 1e6, np.finfo(float).max, np.inf, 0.0009], "0.2 0 inf inf inf 0.03"),
+        ([0.04] * 6, "0.2 0.2 0.2 0.2 0.2 0.2"),
+        ([0] * 6, None),
+        ([1e-12] * 6, None),
+    ],
+)
+def test_noise_of_velocities_is_that_of_their_covariance_where_it_is_filled(tmp_path, variance, expected):
+    found = opened(write(tmp_path, stereo(velocities="odometry", covariance=np.diag(variance).ravel())))
+    stated = found.attributes.get(TWIST_STD)
+    assert (stated is None) == (expected is None) == (not any("Noise that covariances" in note for note in found.notes))
+    if expected is not None:  # two samples an interval, and their mean
+        np.testing.assert_allclose(np.array(stated.split(), float), np.array(expected.split(), float) / np.sqrt(2))
+
+
+def test_a_covariance_that_is_not_positive_definite_is_refused_with_a_note(tmp_path):
+    wrong = np.diag([0.04, 0, 0, 0, 0, 0.0009])
+    wrong[0, 5] = wrong[5, 0] = 0.1
+    found = opened(write(tmp_path, stereo(velocities="odometry", covariance=wrong.ravel())))
+    assert TWIST_STD not in found.attributes and any("not positive definite" in note for note in found.notes)
 
 
 def test_rectified_images_go_before_raw_ones(tmp_path):

@@ -92,7 +92,7 @@ def test_automatic_noise_is_for_recordings_that_state_none():
         assert noise_of(unstated, config).track_error is None
         assert noise_of(unstated, config).twist_walk_std is None
     # Velocities that are cleaner than what is there anyway are not filtered.
-    still = automatic_noise(np.zeros((100, 6)))
+    still = automatic_noise(velocity_noise(np.zeros((100, 6))))
     assert still.twist_walk_std is None
     np.testing.assert_array_equal(still.velocity_std, VELOCITY_STD)
 
@@ -115,7 +115,7 @@ def test_shared_errors_follow_what_velocities_are_worth():
     rng = np.random.default_rng(0)
     clean = np.cumsum(0.02 * rng.standard_normal((400, 6)), axis=0) * np.repeat([1.0, 0.02], 3)
     noisy = clean + np.repeat([0.5, 0.05], 3) * rng.standard_normal(clean.shape)
-    ours, theirs = shared_errors(clean), shared_errors(noisy)
+    ours, theirs = shared_errors(velocity_noise(clean)), shared_errors(velocity_noise(noisy))
     assert ours.keys() == theirs.keys() == {"twist_bias", "camera_jitter", "vision_drift"}
     assert theirs["twist_bias"]["sigma_w_rad_s"] == pytest.approx(0.005, rel=0.2)
     assert ours["twist_bias"]["sigma_v_m_s"] < theirs["twist_bias"]["sigma_v_m_s"]
@@ -169,7 +169,7 @@ def scale_of(sequence):
 
 def walking_tracks(factor):
     """Return a drive with clean velocities whose tracks err `factor` times as much as the automatic model says."""
-    walk = dataclasses.replace(automatic_noise(np.zeros((100, 6))).track_error, flow_px=np.inf)
+    walk = dataclasses.replace(automatic_noise(velocity_noise(np.zeros((100, 6)))).track_error, flow_px=np.inf)
     quiet = builtin("city?frames=60&outlier_fraction=0&sigma_v_m_s=0.01&sigma_w_rad_s=0.0002&max_tracks=60")
     return without_noise(tracked(quiet, dataclasses.replace(walk, walk_std=factor * walk.walk_std), 0))
 

@@ -18,6 +18,7 @@ from ekfslam.stored import FLAGS, attribute, stored
 
 VelocityFrame = Literal["imu", "level"]
 _GAP_STEPS = 3.0
+_ZERO = 1e-9  # m/s and rad/s, below which a velocity is a rounded 0
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,11 @@ class Velocities:
         found = interpolated_intervals(self.twist) if self.interpolated is None else self.interpolated
         require_shape(found, self.time_s.shape, "interpolated")
         object.__setattr__(self, "interpolated", frozen(np.asarray(found, dtype=bool)))
+
+    @property
+    def measured(self) -> BoolArray:
+        """Mask (6,) of the axes that are not exactly 0 throughout, such as four of a robot's wheel odometry."""
+        return is_measured(self.twist)
 
     @property
     def text(self) -> str:
@@ -207,6 +213,11 @@ class InertialSamples:
 
 Input = Velocities | InertialSamples
 AnyInput = TypeVar("AnyInput", Velocities, InertialSamples)
+
+
+def is_measured(twist: Array) -> BoolArray:
+    """Return the mask (6,) of velocities (T, 6) that are not exactly 0 throughout."""
+    return np.asarray((np.abs(twist) > _ZERO).any(axis=0))
 
 
 def linear(time_s: Array | IntArray, values: Array, wanted_s: Array | IntArray | float) -> Array:

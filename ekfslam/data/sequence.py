@@ -45,6 +45,10 @@ WITHOUT_TRACKS = {"tracks": "none"}
 CHECKED_TRACKS = {"tracks": "checked"}
 # Attributes of a recording whose velocities were not measured. Any it has are those of its own odometry.
 WITHOUT_VELOCITIES = {"velocities": "none"}
+# Velocities that were measured, if only one kind was: the others are those of stereo odometry.
+MEASURED_KINDS = ("linear", "angular")
+# Attribute with the noise that a sensor states of its velocities: six numbers, m/s and rad/s.
+TWIST_STD = "twist_std"
 
 LEVEL_VELOCITIES_NOTE = (
     "The velocities are forward, left and up over level ground, whatever the vehicle's roll and pitch: full SLAM "
@@ -270,8 +274,23 @@ class Sequence(Shown):
 
     @property
     def has_velocities(self) -> bool:
-        """Whether velocities of its body were measured."""
-        return self.velocities is not None and self.attributes.get("velocities") != WITHOUT_VELOCITIES["velocities"]
+        """Whether velocities of its body were measured; not if they are exactly 0 throughout."""
+        return bool(self.measured_axes.any())
+
+    @cached_property
+    def measured_axes(self) -> BoolArray:
+        """Mask (6,) of measured velocities; no measurement is exactly 0 throughout, see `Velocities.measured`."""
+        said = self.attributes.get("velocities")
+        if self.velocities is None or said == WITHOUT_VELOCITIES["velocities"]:
+            return np.zeros(6, dtype=bool)
+        kinds = np.repeat([said in (kind, None) or said not in MEASURED_KINDS for kind in MEASURED_KINDS], 3)
+        return self.velocities.measured & kinds & np.isfinite(self.stated_twist_std)
+
+    @cached_property
+    def stated_twist_std(self) -> Array:
+        """(6,) noise of a velocity sample that the attribute `TWIST_STD` states; 0: not stated, inf: not measured."""
+        stated = str(self.attributes.get(TWIST_STD, "")).split()
+        return np.array(stated, dtype=float) if len(stated) == 6 else np.zeros(6)
 
     @property
     def initial_T_world_imu(self) -> Array:

@@ -13,7 +13,7 @@ from ekfslam.data.images import ImageRecording
 from ekfslam.data.inputs import VelocitySamples, linear, means_between
 from ekfslam.data.interpolation import attributes_of_part, interpolation_attributes, known_intervals
 from ekfslam.data.readers.registry import Lateral, Source, expected, read_as
-from ekfslam.data.sequence import WITHOUT_VELOCITIES, Sequence, VelocityFrame
+from ekfslam.data.sequence import TWIST_STD, WITHOUT_VELOCITIES, Sequence, VelocityFrame
 from ekfslam.errors import ConfigError, LostDataError, UnknownFormatError
 from ekfslam.geometry import se3
 
@@ -61,7 +61,8 @@ def attach_velocities(
         samples = replace(samples, velocity_frame=velocity_frame)
     found: VelocitySamples = _on_clock_of(samples, recording.time_s, recording.source)
     twist, how = resample(found, recording.time_s)
-    own = {name: value for name, value in recording.attributes.items() if name not in (*WITHOUT_VELOCITIES, "lateral")}
+    others = (*WITHOUT_VELOCITIES, TWIST_STD, "lateral")
+    own = {name: value for name, value in recording.attributes.items() if name not in others}
     gaps = _interpolated_attributes(found, recording.time_s, twist)
     notes = [note for note in recording.notes if not note.startswith(_NO_VELOCITIES)]
     notes += [*found.notes, f"Velocities ({found.velocity_frame} frame) from {path}: {how}."]
@@ -73,7 +74,12 @@ def attach_velocities(
             T_old_new = se3.inverse(recording.T_cam_imu) @ found.T_cam_imu
             T_world_imu = recording.truth.T_world_imu @ T_old_new
             changes["truth"] = replace(recording.truth, T_world_imu=T_world_imu, motion=None)
-    return replace(recording, notes=tuple(notes), attributes={**own, **found.attributes, **gaps}, **changes)
+    return replace(
+        recording,
+        notes=tuple(notes),
+        attributes={**own, **found.attributes, **stated_at(found, recording.time_s), **gaps},
+        **changes,
+    )
 
 
 def read_velocities(path: Path, lateral: Lateral = "corrected") -> VelocitySamples:
@@ -97,7 +103,7 @@ def _of_recording(recording: Sequence | ImageRecording, path: str) -> VelocitySa
         raise UnknownFormatError(f"{path}: this recording has no velocities")
     gaps = known_intervals(recording.attributes, twist)
     attributes = attributes_of_part({}, gaps)
-    attributes |= {name: value for name, value in recording.attributes.items() if name == "lateral"}
+    attributes |= {name: value for name, value in recording.attributes.items() if name in ("lateral", TWIST_STD)}
     if "checksum_sha256" in recording.attributes:
         attributes["velocities_sha256"] = recording.attributes["checksum_sha256"]
     notes = tuple(f"{recording.name}: {note}" for note in recording.notes if "velocit" in note)
@@ -127,14 +133,27 @@ def resample(found: VelocitySamples, time_s: Array) -> tuple[Array, str]:
     stamps, twist = found.time_s, found.twist
     if len(stamps) < 2 or len(time_s) < 2:
         raise LostDataError(f"{len(stamps)} samples for {len(time_s)} frames; two are needed", source=found.source)
-    sample_s, frame_s = _step(stamps), _step(time_s)
+    sample_s = _step(stamps)
     _require_cover(found, time_s)
-    if sample_s * _DENSE <= frame_s * (1.0 + _SAME):
+    if _is_dense(stamps, time_s):
         return _means(stamps, twist, time_s), "means of the samples over each interval"
     nearest = np.clip(np.searchsorted(stamps, time_s - 0.5 * sample_s), 0, len(stamps) - 1)
     if (np.abs(stamps[nearest] - time_s) <= _SAME * sample_s).all():
         return twist[nearest], "frames and samples have the same stamps"
     return linear(stamps, twist, time_s), "linear between samples"
+
+
+def stated_at(found: VelocitySamples, time_s: Array) -> dict[str, str]:
+    """Return the attribute `TWIST_STD` of samples at the stamps of frames (T,): means of n have 1 / sqrt(n) of it."""
+    if TWIST_STD not in found.attributes:
+        return {}
+    count = _step(time_s) / _step(found.time_s) if _is_dense(found.time_s, time_s) else 1.0
+    std = np.array(str(found.attributes[TWIST_STD]).split(), dtype=float) / np.sqrt(count)
+    return {TWIST_STD: " ".join(map(repr, std.tolist()))}
+
+
+def _is_dense(stamps: Array, time_s: Array) -> bool:
+    return _step(stamps) * _DENSE <= _step(time_s) * (1.0 + _SAME)
 
 
 def is_covered(stamps: Array, time_s: Array) -> BoolArray:

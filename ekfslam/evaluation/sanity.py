@@ -1,8 +1,9 @@
 """Sanity of a recording and of a run: likely mistakes are named, one line each.
 
 The evidence is the flow of the tracks. A point that stereo has located moves in the next image as velocities, stamps
-and ``T_cam_imu`` predict. Each known mistake is undone in turn, and named if the prediction error falls much. Noise of
-velocities is no mistake: velocities that a remedy makes small must still explain more than none at all.
+and ``T_cam_imu`` predict. Each known mistake is undone in turn, and named if the prediction error falls much, and below
+that of standing still. Unless velocities predict the flow better than standing still, nothing else is suspected.
+Noise of velocities is no mistake.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Sequence
@@ -19,12 +21,14 @@ from ekfslam.evaluation.trajectory import absolute_trajectory_error, distance_al
 from ekfslam.filters.result import SANITY, SANITY_SEPARATOR, Result
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
+from ekfslam.models.odometry import missing_velocities
 
 _PAIRS = 5000  # observations that are examined; more say the same
 _LEAST_PAIRS = 60
 _SHARE_TURNING = 0.2  # of the frames, in which rotations are examined
 _BETTER = 0.7  # of the error, which a remedy must leave at most; a right recording leaves less than any remedy
-_EXPLAINS = 0.85  # of the error without the velocities that a remedy makes small, which it must leave at most
+_EXPLAINS = 0.85  # of the error of standing still, which velocities must leave at most
+_SMOOTHED = 9  # samples, over whose mean the noise of velocities falls to a third
 _AS_GOOD = 1.3  # times the least error: of remedies that do as well, the first is the likelier
 _NEAREST_M = 0.1
 _OUTSIDE_PX = 1e4  # error of a prediction behind the camera, and the largest one
@@ -93,11 +97,12 @@ _REMEDIES = (
 def inspect_sequence(sequence: Sequence) -> Sanity:
     """Return figures of a recording, and warnings about likely mistakes in it, before it is run."""
     figures, warnings = _tracks_in_front(sequence)
+    unfilled = _unfilled(sequence)
     tau = np.diff(sequence.time_s, prepend=sequence.time_s[:1])
     if len(sequence) > 1:
         figures.insert(0, f"median step {np.median(tau[1:]):.4g} s, longest {tau[1:].max():.4g} s")
     if len(sequence) < 2 or not sequence.has_velocities:
-        return Sanity(tuple(figures), tuple(warnings))
+        return Sanity(tuple(figures), (*warnings, *unfilled))
     speed, turning = (np.linalg.norm(sequence.twist[:, axes], axis=1) for axes in (slice(3), slice(3, 6)))
     path = f"path {float(speed @ tau):.4g} m by velocities"
     if sequence.truth is not None and len(sequence.truth.frame) > 1:
@@ -105,9 +110,9 @@ def inspect_sequence(sequence: Sequence) -> Sanity:
     turn = np.degrees(turning.max())
     figures.append(f"speed {np.median(speed):.3g} m/s, at most {speed.max():.3g}; turning at most {turn:.3g} deg/s")
     figures.append(path)
-    flow, suspicion = _inspect_flow(sequence, tau)
+    flow, suspicion, explains = _inspect_flow(sequence, tau)
     # Swapped images make depths wrong, and a flow that does not fit makes velocities wrong.
-    warnings = warnings or suspicion or _inspect_truth(sequence)
+    warnings = warnings or unfilled or suspicion or (_inspect_truth(sequence) if explains else [])
     return Sanity((*figures, *flow), tuple(warnings))
 
 
@@ -117,7 +122,8 @@ def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]
         return ()  # their poses drift, so that rejections and distances from the truth are no evidence
     accepted, rejected = int(result.innovation.accepted.sum()), int(result.innovation.rejected.sum())
     if rejected > _REJECTED * max(accepted + rejected, 1):
-        cause = warnings[0] if warnings else "tracks, velocities, stamps and T_cam_imu do not fit each other"
+        parts = "tracks, velocities, stamps and T_cam_imu" if sequence.has_velocities else "the tracks"
+        cause = warnings[0] if warnings else f"{parts} do not fit each other"
         return (f"{rejected / (accepted + rejected):.0%} of the observations were rejected: {cause}",)
     moving = result.counts.get("rejected: moving", 0) / max(accepted + rejected, 1)
     if moving > _MOVING:
@@ -150,11 +156,28 @@ def _tracks_in_front(sequence: Sequence) -> tuple[list[str], list[str]]:
     return figures, [swapped] if behind >= _BEHIND else []
 
 
-def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]:
-    """Return how well velocities predict the flow of tracks, and the mistake whose remedy predicts it better."""
+def _unfilled(sequence: Sequence) -> list[str]:
+    """Return a warning on velocities that are exactly 0 throughout while the images move."""
+    if sequence.velocities is None or sequence.measured_axes.reshape(2, 3).any(axis=1).all():
+        return []
+    earlier, later = _pairs(sequence)
+    pixels = sequence.observations.pixels_px
+    seen = np.linalg.norm(pixels[later, :2] - pixels[earlier, :2], axis=1)
+    if len(earlier) < _LEAST_PAIRS or np.median(seen) < cam.FLOW_FROM_PX:
+        return []
+    kinds = missing_velocities(sequence) if sequence.has_velocities else ("linear and angular",)
+    zeros = f"exactly 0 throughout, while tracks move by {np.median(seen):.3g} px a frame"
+    return [f"{kind} velocities look as if they were never filled in ({zeros}), and are not used" for kind in kinds]
+
+
+def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str], bool]:
+    """Return how well velocities predict the flow of tracks, the likely mistake, and whether they explain the flow.
+
+    Velocities, or their running means, explain the flow if they predict it better than standing still does.
+    """
     earlier, later = _pairs(sequence)
     if len(earlier) < _LEAST_PAIRS:
-        return [], []
+        return [], [], True
     at, pixels = sequence.observations.frame[later], sequence.observations.pixels_px
     seen = np.linalg.norm(pixels[later, :2] - pixels[earlier, :2], axis=1)
     turning = np.linalg.norm(sequence.twist[at, 3:], axis=1)
@@ -166,19 +189,26 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str]]
         moved = se3.apply(C @ motion.increment(u, tau) @ se3.inverse(C), points)
         return _off(sequence, moved, pixels[later, :2], turns)
 
-    given = sequence.T_cam_imu, sequence.twist[at], tau[at]
+    C, u, tau = given = sequence.T_cam_imu, sequence.twist[at], tau[at]
     straight, turn = error_px(*given)
+    smooth = sum(error_px(C, uniform_filter1d(sequence.twist, _SMOOTHED, axis=0)[at], tau))
+    still = sum(error_px(C, np.zeros_like(u), tau))
     predicted = f"the velocities predict it to {straight:.3g} px, where the rig turns most to {turn:.3g} px"
     figure = f"tracks move by {np.median(seen):.3g} px a frame; {predicted}"
     found = [(sum(error_px(*remedy.undo(*given))), remedy) for remedy in _REMEDIES]
     least = min(error for error, _ in found)
     best, remedy = next(entry for entry in found if entry[0] <= _AS_GOOD * least)
-    still = np.where(remedy.shrinks, 0.0, given[1])
-    unmoved = sum(error_px(given[0], still, given[2])) if remedy.shrinks.any() else np.inf
-    if best > _BETTER * (straight + turn) or best > _EXPLAINS * unmoved:
-        return [figure], []
+    unmoved = sum(error_px(C, np.where(remedy.shrinks, 0.0, u), tau)) if remedy.shrinks.any() else still
     off = f"{0.5 * (straight + turn):.3g} px" if straight + turn < _OUTSIDE_PX else "out of the image"
-    return [figure], [f"{remedy.text}: the flow of the tracks is predicted {off} off, otherwise {0.5 * best:.2g} px"]
+    if best <= _BETTER * (straight + turn) and best <= _EXPLAINS * unmoved:
+        text = f"{remedy.text}: the flow of the tracks is predicted {off} off, otherwise {0.5 * best:.2g} px"
+        return [figure], [text], False
+    explains = min(straight + turn, smooth) <= _EXPLAINS * still
+    is_noise = len(sequence) < _SMOOTHED**2 or smooth < _EXPLAINS * (straight + turn)
+    if not is_noise and smooth > still / _BETTER:
+        text = f"the velocities look like those of another recording: they predict the flow of the tracks {off} off"
+        return [figure], [f"{text}, standing still {0.5 * still:.3g} px"], False
+    return [figure], [], explains
 
 
 def _pairs(sequence: Sequence) -> tuple[IntArray, IntArray]:

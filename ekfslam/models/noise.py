@@ -5,6 +5,9 @@ autocovariance -s^2 at lag 1, those of a slow signal none below 0: ``s^2 = -cov(
 the vehicle shake.) If the velocity walks between samples, second differences d have variance ``q tau / 2``, and the
 integral by samples misses the path between them (a Brownian bridge) by ``q tau / 12`` a sample: the *sampling noise*,
 half of ``d / sqrt(1.5)``. No difference sees slow errors that all samples or tracks share: see `shared_errors`.
+
+The axes of a kind share the median of their noise, unless their own differs by more than three standard errors. Axes
+that are exactly 0 throughout are not measured: `ekfslam.models.vehicle` has their standard deviations.
 """
 
 from __future__ import annotations
@@ -14,10 +17,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, BoolArray
+from ekfslam.data.inputs import is_measured
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import VelocityFrame
 from ekfslam.models.blocks import OPTIONAL_BLOCKS
+from ekfslam.models.vehicle import AXES
 
 # Velocities of an automotive GNSS/INS unit: the data sheets of OXTS's RT3000 family state 0.05 to 0.1 km/h (0.014 to
 # 0.028 m/s) and 0.01 deg/s. White errors of a sample are at least of that order.
@@ -46,6 +51,7 @@ NOISY_FROM = np.repeat([0.15, 0.0025], 3)
 _BLOCKS = 20  # of the jackknife
 _ONE_SIDED_95 = 1.645  # deviations
 _SPAN = 10  # samples over which the slow walk of the velocities is measured
+_DIFFERS = 3.0  # standard errors by which an axis must differ from the others for a noise of its own
 
 
 @dataclass(frozen=True)
@@ -53,11 +59,14 @@ class VelocityNoise:
     """Noise of velocities as their differences show it.
 
     Args:
-        sigma: (2,) white noise per sample of the linear (m/s) and the angular velocities (rad/s), each axis.
+        sigma: (2,) white noise per sample of the linear (m/s) and the angular velocities (rad/s): the median of the
+            axes that are measured.
         sigma_error: (2,) standard errors (jackknife over 20 stretches); 0 if no noise is seen.
         limit: (2,) upper limits of sigma with a confidence of 95 %.
         walk: (2,) change of the true velocities per sample, root mean square.
         sampling: (6,) noise of taking a sample for the mean over its interval, each axis.
+        measured: (6,) whether an axis is measured.
+        axes: (6,) white noise of each axis, 0 if it is not measured. By default ``sigma``.
     """
 
     sigma: Array
@@ -65,49 +74,85 @@ class VelocityNoise:
     limit: Array
     walk: Array
     sampling: Array = field(default_factory=lambda: np.zeros(6))
+    measured: BoolArray = field(default_factory=lambda: np.ones(6, dtype=bool))
+    axes: Array = field(default=None)  # type: ignore[arg-type]  # filled in
+
+    def __post_init__(self) -> None:
+        if self.axes is None:
+            object.__setattr__(self, "axes", np.repeat(self.sigma, 3))
 
     @property
     def is_clean(self) -> bool:
-        """Whether the differences show no more white noise than a good unit has."""
-        return bool((np.repeat(self.sigma, 3) <= NOISY_FROM).all())
+        """Whether no axis shows more white noise than a good unit has."""
+        return bool((self.axes <= NOISY_FROM).all())
+
+    @property
+    def carries_motion(self) -> bool:
+        """Whether the velocities know slow motions better than vision: they are clean, and all six are measured."""
+        return self.is_clean and bool(self.measured.all())
 
     @property
     def texts(self) -> tuple[str, str]:
         """Noise of the linear and of the angular velocities in words: with its error, or its limit."""
-        v, w = (
-            with_error(sigma, error) if sigma > 0 else f"below {limit:.2g} (95 %)"
-            for sigma, error, limit in zip(self.sigma, self.sigma_error, self.limit, strict=True)
-        )
+        v, w = (self._text(kind) for kind in range(2))
         return v, w
 
+    def _text(self, kind: int) -> str:
+        sigma, error, limit = self.sigma[kind], self.sigma_error[kind], self.limit[kind]
+        axes = np.flatnonzero(self.measured[3 * kind : 3 * kind + 3]) + 3 * kind
+        if not len(axes):
+            return "not measured:"
+        if np.ptp(self.axes[axes]) > 0:
+            return ", ".join(f"{AXES[axis]} {self.axes[axis]:.3g}" for axis in axes)
+        return with_error(sigma, error) if sigma > 0 else f"below {limit:.2g} (95 %)"
 
-def velocity_noise(twist: Array) -> VelocityNoise:
-    """Return white noise and walk of velocities (T, 6), m/s and rad/s."""
-    d = np.diff(np.asarray(twist, dtype=float), axis=0)
+
+def velocity_noise(twist: Array, measured: BoolArray | None = None, stated_std: Array | None = None) -> VelocityNoise:
+    """Return white noise and walk of velocities (T, 6), m/s and rad/s.
+
+    Args:
+        measured: (6,) axes that are measured; by default those that are not exactly 0 throughout, or all if none is.
+        stated_std: (6,) white noise that the sensor states; an axis has at least this.
+    """
+    twist = np.asarray(twist, dtype=float)
+    measured = is_measured(twist) if measured is None else measured
+    measured = measured if measured.any() else np.ones(6, dtype=bool)
+    stated = np.where(measured, 0.0 if stated_std is None else stated_std, 0.0)
+    d = np.diff(twist, axis=0)
     if len(d) < 2:
-        return VelocityNoise(np.zeros(2), np.full(2, np.inf), np.full(2, np.inf), np.zeros(2))
-    product, square = d[1:] * d[:-1], d**2
-    sigma = _white(product.mean(axis=0))
-    parts = np.array_split(product, min(_BLOCKS, len(product)))
-    total = product.sum(axis=0)
-    left_out = np.array([(total - part.sum(axis=0)) / max(len(product) - len(part), 1) for part in parts])
-    error = _jackknife(np.array([_white(lag_1) for lag_1 in left_out]))
-    limit = _white(np.minimum(product.mean(axis=0), 0.0) - _ONE_SIDED_95 * _jackknife(left_out))
+        unknown = np.full(2, np.inf)
+        return VelocityNoise(_median(stated, measured), unknown, unknown, np.zeros(2), measured=measured, axes=stated)
+    product = d[1:] * d[:-1]
+    lag_1, left_out = product.mean(axis=0), _left_out(product)
+    error = _jackknife(_white(left_out, measured))
+    limit = _white(np.minimum(lag_1, 0.0) - _ONE_SIDED_95 * _jackknife(left_out), measured)
+    axes = np.maximum(_white_axes(lag_1, left_out, measured), stated)
+    sigma = np.maximum(_white(lag_1, measured), _median(stated, measured))
+    # Second differences of white noise have 6 times its variance; the rest is the motion between samples.
+    bent = np.maximum(((d[1:] - d[:-1]) ** 2).mean(axis=0) / 6.0 - axes**2, 0.0)
+    walk = _walk(twist, np.minimum(lag_1, 0.0), measured)
+    return VelocityNoise(sigma, error, np.maximum(limit, sigma), walk, 0.5 * np.sqrt(bent), measured, axes)
 
-    # The walk is the rest of the differences, or that of slow means if larger.
-    lag_1 = np.minimum(product.mean(axis=0), 0.0)
-    fast = np.maximum(square.mean(axis=0) + 2.0 * lag_1, 0.0)
+
+def _walk(twist: Array, lag_1: Array, measured: BoolArray) -> Array:
+    """Return the walk (2,): the rest of the differences without white noise, or that of slow means if larger."""
+    fast = np.maximum((np.diff(twist, axis=0) ** 2).mean(axis=0) + 2.0 * lag_1, 0.0)
     whole = len(twist) // _SPAN * _SPAN
     slow = np.zeros(6)
     if whole >= 2 * _SPAN:
-        means = np.asarray(twist)[:whole].reshape(-1, _SPAN, 6).mean(axis=1)
+        means = twist[:whole].reshape(-1, _SPAN, 6).mean(axis=1)
         # Means of n samples of a walk differ by n - (n^2 - 1) / (3 n) steps' variance, those of white noise by 2 / n.
         steps = _SPAN - (_SPAN**2 - 1) / (3 * _SPAN)
         slow = np.maximum((np.diff(means, axis=0) ** 2).mean(axis=0) + 2.0 / _SPAN * lag_1, 0.0) / steps
-    walk = np.maximum(*(np.sqrt(variance.reshape(2, 3).mean(axis=1)) for variance in (fast, slow)))
-    # Second differences of white noise have 6 times its variance; the rest is the motion between samples.
-    bent = np.maximum(((d[1:] - d[:-1]) ** 2).mean(axis=0) / 6.0 - np.repeat(sigma, 3) ** 2, 0.0)
-    return VelocityNoise(sigma, error, limit, walk, 0.5 * np.sqrt(bent))
+    share = measured.reshape(2, 3)
+    variances = ((np.where(share, variance.reshape(2, 3), 0.0)).sum(axis=1) for variance in (fast, slow))
+    return np.maximum(*(np.sqrt(variance / np.maximum(share.sum(axis=1), 1)) for variance in variances))
+
+
+def _left_out(product: Array) -> Array:
+    """Return the means (n, 6) of products (T, 6) with one of n stretches left out."""
+    parts, total = np.array_split(product, min(_BLOCKS, len(product))), product.sum(axis=0)
+    return np.array([(total - part.sum(axis=0)) / max(len(product) - len(part), 1) for part in parts])
 
 
 def _jackknife(left_out: Array) -> Array:
@@ -115,23 +160,39 @@ def _jackknife(left_out: Array) -> Array:
     return np.sqrt((len(left_out) - 1) * left_out.var(axis=0))
 
 
-def _white(lag_1: Array) -> Array:
-    """Return the noise (2,) of linear and angular velocities from lag-1 covariances (6,): the median of three axes."""
-    return np.median(np.sqrt(np.maximum(-lag_1, 0.0)).reshape(2, 3), axis=1)
+def _white(lag_1: Array, measured: BoolArray) -> Array:
+    """Return the noise (..., 2) of linear and angular velocities from lag-1 covariances (..., 6)."""
+    return _median(np.sqrt(np.maximum(-lag_1, 0.0)), measured)
 
 
-def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu", checked: bool = False) -> Noise:
-    """Return the noise for a recording that states none, from its velocities (T, 6).
+def _median(std: Array, measured: BoolArray) -> Array:
+    """Return the median (..., 2) of standard deviations (..., 6) over the measured axes of each kind, 0 without any."""
+    kinds = [std[..., kind][..., measured[kind]] for kind in (slice(3), slice(3, 6))]
+    return np.stack([np.median(each, axis=-1) if each.shape[-1] else std[..., 0] * 0.0 for each in kinds], axis=-1)
 
-    ``checked`` tracks are compared with their first sight, so that their errors are white.
+
+def _white_axes(lag_1: Array, left_out: Array, measured: BoolArray) -> Array:
+    """Return the noise (6,) of each axis, pooled unless an axis differs, from lag-1 covariances (6,), also (n, 6)."""
+
+    def off(lag_1: Array) -> Array:
+        return np.asarray(np.maximum(-lag_1, 0.0) - np.repeat(_white(lag_1, measured) ** 2, 3, axis=-1))
+
+    differs = np.abs(off(lag_1)) > _DIFFERS * _jackknife(off(left_out))
+    own = np.sqrt(np.maximum(-lag_1, 0.0))
+    return np.where(measured, np.where(differs, own, np.repeat(_white(lag_1, measured), 3)), 0.0)
+
+
+def automatic_noise(found: VelocityNoise, velocity_frame: VelocityFrame = "imu", checked: bool = False) -> Noise:
+    """Return the noise for a recording that states none, from the noise of its velocities.
+
+    Axes that are not measured have the least noise, see `ekfslam.models.vehicle.with_vehicle`. ``checked`` tracks are
+    compared with their first sight, so that their errors are white.
     """
-    found = velocity_noise(twist)
-    walk = None if found.is_clean else np.repeat(found.walk, 3)
     own = np.hypot(found.sampling, VELOCITY_STD)
     return Noise(
-        twist_std=own if found.is_clean else np.repeat(found.sigma, 3),
+        twist_std=np.hypot(own, found.axes) if found.is_clean else np.maximum(found.axes, VELOCITY_STD),
         pixel_std_px=np.full(4, CHECKED_PIXEL_STD_PX if checked else PIXEL_STD_PX),
-        twist_walk_std=walk,
+        twist_walk_std=None if found.is_clean else np.repeat(found.walk, 3),
         motion_std=np.zeros(6) if found.is_clean else own,
         track_first_px=None if checked else TRACK_FIRST_PX,
         track_walk_px=None if checked else TRACK_WALK_PX,
@@ -141,13 +202,13 @@ def automatic_noise(twist: Array, velocity_frame: VelocityFrame = "imu", checked
     )
 
 
-def shared_errors(twist: Array | None, checked: bool = False) -> dict[str, dict[str, float]]:
+def shared_errors(found: VelocityNoise | None, checked: bool = False) -> dict[str, dict[str, float]]:
     """Return tables ``[blocks.<name>]`` of the errors that all samples or all tracks of a recording share.
 
-    They come from `StateBlock.automatic`, given measured velocities (T, 6), or None, and whether tracks are checked.
+    They come from `StateBlock.automatic`, given the noise of measured velocities, or None, and whether tracks are
+    checked.
     """
-    found = None if twist is None else velocity_noise(twist)
-    white_std, is_clean = (None, False) if found is None else (found.sigma, found.is_clean)
+    white_std, is_clean = (None, False) if found is None else (found.sigma, found.carries_motion)
     tables = {name: block.automatic(white_std, is_clean, checked) for name, block in OPTIONAL_BLOCKS.items()}
     return {name: table for name, table in tables.items() if table is not None}
 

@@ -11,9 +11,9 @@ import dataclasses
 import numpy as np
 from scipy.ndimage import median_filter
 
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.noise import Noise
-from ekfslam.data.sequence import Sequence
+from ekfslam.data.sequence import MEASURED_KINDS, Sequence
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import MOTION_FROM_PX, rectified_rows
 from ekfslam.geometry.stereo_motion import agrees, align, sampled_motion
@@ -23,6 +23,8 @@ _SAMPLES = 200
 _NEIGHBOURS = 5
 _WALK_FACTOR = 3.0
 _LEAST_WALK = np.repeat([0.05, 0.005], 3)
+# Motion (m/s, rad/s) that odometry without any velocities of its kind cannot have overlooked.
+_MOVES = np.array([0.1, np.deg2rad(2.0)])
 # Prior of the first velocities, in steps of the walk: nearly nothing is known.
 _START_FACTOR = 10.0
 
@@ -58,6 +60,21 @@ def stereo_odometry(sequence: Sequence) -> Array:
     return _without_jumps(twist[np.where(last > 0, last, np.argmax(is_known))])
 
 
+def missing_velocities(sequence: Sequence, odometry: Array | None = None) -> tuple[str, ...]:
+    """Return the kind of velocities, ``linear`` or ``angular``, that were never filled in: 0, while images say other.
+
+    Args:
+        sequence: Recording, with velocities that are partly measured.
+        odometry: (T, 6) its `stereo_odometry`, if it is known.
+    """
+    zero = ~sequence.measured_axes.reshape(2, 3).any(axis=1)
+    if not zero.any():
+        return ()
+    moved = stereo_odometry(sequence) if odometry is None else odometry
+    rms = np.sqrt((moved.reshape(-1, 2, 3) ** 2).sum(axis=2).mean(axis=0))
+    return tuple(kind for kind, is_missing in zip(MEASURED_KINDS, zero & (rms > _MOVES), strict=True) if is_missing)
+
+
 def _without_jumps(twist: Array) -> Array:
     """Return velocities (T, 6) with those that are too far from their neighbours replaced by a median."""
     middle = median_filter(twist[1:], (_NEIGHBOURS, 1), mode="mirror")
@@ -84,3 +101,14 @@ def vision_noise(noise: Noise, twist: Array) -> Noise:
         tilt_rad=0.0,
         gap_std=np.zeros(6),
     )
+
+
+def with_vision(noise: Noise, twist: Array, axes: BoolArray) -> Noise:
+    """Return the noise with that of odometry on some axes (6,) of velocities (T, 6), as measured or as a walk."""
+    walk = _walk(twist)
+    if noise.twist_walk_std is None:
+        return dataclasses.replace(noise, twist_std=np.where(axes, walk, noise.twist_std))
+    found = vision_noise(noise, twist)
+    names = ("twist_std", "twist_walk_std", "motion_std")
+    changes = {name: np.where(axes, getattr(found, name), getattr(noise, name)) for name in names}
+    return dataclasses.replace(noise, **changes)

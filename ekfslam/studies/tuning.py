@@ -12,11 +12,11 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import Config, NoiseConfig, NoiseModel
 from ekfslam.data.hygiene import clean_tracks
 from ekfslam.data.sequence import Noise, Observations, Sequence, cut
@@ -28,12 +28,12 @@ from ekfslam.filters.loop import one_thread, run_filter, solvable
 from ekfslam.filters.reports import FrameReport
 from ekfslam.geometry import se3
 from ekfslam.models.build import optional_blocks
-from ekfslam.models.noise import NOISY_FROM, VelocityNoise, velocity_noise, with_drift, with_error
+from ekfslam.models.noise import NOISY_FROM, VelocityNoise, with_drift, with_error
 from ekfslam.models.sensors.base import BEHIND_CAMERA, GATE, MOVING
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.names import printable
 from ekfslam.progress import progress
-from ekfslam.resolve import found_attributes, noise_of, settings_of
+from ekfslam.resolve import found_attributes, noise_of, noise_of_velocities, settings_of
 
 # Share of wrong matches, and the window in which they fall.
 OUTLIER_SHARE = 0.02
@@ -182,11 +182,11 @@ def tune(
     config = settings_of(sequence, config or Config())
     model: NoiseModel = "white" if config.noise.model == "white" else "tuned"
     base = noise_of(sequence, dataclasses.replace(config, noise=NoiseConfig(model=model, drift=config.noise.drift)))
-    found = velocity_noise(sequence.twist)
+    found = noise_of_velocities(sequence)
     start, free = _start(base, found, drift)
     parts, gated, ungated = parts_of(sequence, config, base, observations)
     with one_thread():
-        peak = Likelihood(parts, base, free, gated, ungated).climb(start, f"{sequence.name}: tuning")
+        peak = Likelihood(parts, base, free, gated, ungated, found.measured).climb(start, f"{sequence.name}: tuning")
     estimates, frames = estimates_of(start, free, peak, found), sum(len(part) for part in parts)
     return TunedNoise(
         sequence.name, model, estimates, found, peak.log_likelihood, frames, peak.runs, converged=peak.converged
@@ -246,6 +246,7 @@ class Likelihood:
         base: Noise whose parameters are replaced.
         free: Names of the parameters.
         gated, ungated: Settings of the filter that reject wrong matches, and that reject nothing.
+        measured: (6,) velocities whose noise the parameters are.
     """
 
     parts: list[Sequence]
@@ -253,13 +254,14 @@ class Likelihood:
     free: list[str]
     gated: Config
     ungated: Config
+    measured: BoolArray = field(default_factory=lambda: np.ones(6, dtype=bool))
 
     def noise(self, x: Array) -> Noise:
         """Return the noise at logarithms (n,) of the parameters."""
         value = dict(zip(self.free, np.exp(x).tolist(), strict=True))
         twist = np.array(self.base.twist_std, dtype=float)
-        twist[:3] = value.get("sigma_v_m_s", twist[0])
-        twist[3:] = value.get("sigma_w_rad_s", twist[3])
+        for name, kind in (("sigma_v_m_s", slice(3)), ("sigma_w_rad_s", slice(3, 6))):
+            twist[kind] = np.where(self.measured[kind], value.get(name, twist[kind]), twist[kind])
         pixels = np.full(4, value["sigma_px"]) if "sigma_px" in value else self.base.pixel_std_px
         noise = dataclasses.replace(self.base, twist_std=twist, pixel_std_px=pixels)
         return with_drift(noise, value["drift"]) if "drift" in value else noise

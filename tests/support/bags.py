@@ -25,6 +25,7 @@ K = np.array([[400.0, 0, 5], [0, 401.0, 3], [0, 0, 1]])
 P = np.array([[390.0, 0, 5.5, 0], [0, 390.0, 3.5, 0], [0, 0, 1, 0]])
 T_BASE_CAM = se3.transform(R_CAM_BODY.T @ se3.so3_exp(np.array([0.1, 0.05, -0.1])), np.array([1.0, 0.2, 0.5]))
 KINDS = ("ros1", "ros2", "mcap")
+UNFILLED = np.zeros(36)  # covariance of a twist
 
 
 def picture(frame: int, side: int) -> np.ndarray:
@@ -114,7 +115,7 @@ def twist(stamp_ns: int, values: Any, frame: str = "base") -> Callable[[Any], An
     return make
 
 
-def odometry(stamp_ns: int, values: Any) -> Callable[[Any], Any]:
+def odometry(stamp_ns: int, values: Any, covariance: Any = UNFILLED) -> Callable[[Any], Any]:
     def make(types: Any) -> Any:
         inner = types["geometry_msgs/msg/Twist"](linear=vector(types, values[:3]), angular=vector(types, values[3:]))
         point = types["geometry_msgs/msg/Point"](x=0.0, y=0.0, z=0.0)
@@ -124,7 +125,7 @@ def odometry(stamp_ns: int, values: Any) -> Callable[[Any], Any]:
             header=header(types, stamp_ns, "odom"),
             child_frame_id="base",
             pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
-            twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=inner, covariance=np.zeros(36)),
+            twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=inner, covariance=covariance),
         )
 
     return make
@@ -147,7 +148,7 @@ def transforms(*edges: tuple[str, str, np.ndarray], norm: float = 1.0) -> Callab
     return make
 
 
-def stereo(raw: str = "image_raw", velocities: str = "twist") -> Written:
+def stereo(raw: str = "image_raw", velocities: str = "twist", covariance: Any = UNFILLED) -> Written:
     """A pair of five images, velocities that grow linearly, and where the camera is."""
     bag = Written()
     for frame in range(FRAMES):
@@ -165,7 +166,7 @@ def stereo(raw: str = "image_raw", velocities: str = "twist") -> Written:
         if velocities == "twist":
             bag.add("/velocity", "geometry_msgs/msg/TwistStamped", stamp, twist(stamp, values))
         elif velocities == "odometry":
-            bag.add("/odom", "nav_msgs/msg/Odometry", stamp, odometry(stamp, values))
+            bag.add("/odom", "nav_msgs/msg/Odometry", stamp, odometry(stamp, values, covariance))
     half = se3.exp(np.array([0.3, 0.1, 0.0, 0.2, 0.0, 0.1]))
     edges = (("base", "mast", half), ("mast", "optical_0", se3.inverse(half) @ T_BASE_CAM))
     bag.add("/tf_static", "tf2_msgs/msg/TFMessage", FIRST_NS, transforms(*edges))

@@ -17,8 +17,7 @@ from ekfslam.data.tracks import inspect_tracks
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.sources import compare_sources, in_words
 from ekfslam.evaluation.truth import with_truth_noise
-from ekfslam.models.noise import velocity_noise
-from ekfslam.resolve import resolve
+from ekfslam.resolve import noise_of_velocities, resolve
 from ekfslam.runner import versions
 from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT
 from ekfslam.storage.archive import read_archive
@@ -89,7 +88,7 @@ def _noise_line(sequence: Sequence) -> str:
     if not sequence.has_velocities:
         return "velocities    none: motion is a random walk started by stereo odometry"
     if sequence.noise is None:
-        v, w = velocity_noise(sequence.twist).texts
+        v, w = noise_of_velocities(sequence).texts
         return f"noise         not stated; white noise of the velocities, from the data: {v} m/s, {w} rad/s"
     return f"noise         twist {sequence.noise.twist_std} (m/s, rad/s), pixels {sequence.noise.pixel_std_px} px"
 
@@ -109,6 +108,8 @@ def _print_findings(sequence: Sequence) -> None:
     assert problem.hygiene is not None
     if (found := problem.account.get("found_tracks")) is not None:
         print(f"tracks        noise not stated; from the data: {found}")
+    if "odometry" in problem.account:
+        print(f"odometry      {problem.account['odometry']}")
     for line in problem.lines:
         print(f"state         {line}")
     for line in problem.decisions:

@@ -24,7 +24,8 @@ from ekfslam.data.readers.messages import CAMERA_INFO, COMPRESSED, IMAGE, ODOMET
 from ekfslam.data.readers.pictures import pair_stamps
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row
-from ekfslam.data.velocities import is_covered, resample
+from ekfslam.data.sequence import TWIST_STD
+from ekfslam.data.velocities import is_covered, resample, stated_at
 from ekfslam.errors import CalibrationError, LostDataError, StampError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import T_CAM_BODY
@@ -128,13 +129,14 @@ def open_bag(path: Path) -> ImageRecording:
         velocities, frame, found = _velocities(bag)
         T_optical_body, note = _body(bag, left, frame)
         notes = (*notes, *found, note)
-        twist, used = None, np.ones(len(time_s), dtype=bool)
+        twist, used, stated = None, np.ones(len(time_s), dtype=bool), {}
         if velocities is not None:
             used = is_covered(velocities.time_s, time_s)
             if not used.all():
                 notes = (*notes, f"{int((~used).sum())} frames before or after all velocities are left out.")
             twist, how = resample(velocities, time_s[used])
             notes = (*notes, f"Velocities ({printable(frame)}): {how}.")
+            stated = stated_at(velocities, time_s[used])
         chosen = (places[0][in_left[used]], places[1][in_right[used]])
         return ImageRecording(
             name=path.resolve().stem,
@@ -145,7 +147,7 @@ def open_bag(path: Path) -> ImageRecording:
             T_cam_imu=se3.transform(R_cam_optical, np.zeros(3)) @ T_optical_body,
             twist=twist,
             notes=notes,
-            attributes={"reader": READER.name, "topics": printable(f"{left.topic} {right.topic}")},
+            attributes={"reader": READER.name, "topics": printable(f"{left.topic} {right.topic}"), **stated},
         )
 
 
@@ -249,10 +251,11 @@ def _velocities(bag: Bag) -> tuple[VelocitySamples | None, str, tuple[str, ...]]
     others = [connection.topic for connection in streams if connection.topic != chosen.topic]
     topic = printable(chosen.topic)
     notes = (f"Velocities are those of {topic}.", *(f"Not used: velocities of {printable(name)}." for name in others))
-    rows, frame = [], ""
+    rows, frame, covariances = [], "", []
     for message in bag.messages(chosen):
         # With covariance a twist is one level further down.
         twist = message.twist if hasattr(message.twist, "linear") else message.twist.twist
+        covariances.append(getattr(message.twist, "covariance", np.zeros(36)))
         name = message.child_frame_id if chosen.msgtype == ODOMETRY else message.header.frame_id
         frame = frame or _frame(name)
         linear, angular = twist.linear, twist.angular
@@ -265,7 +268,10 @@ def _velocities(bag: Bag) -> tuple[VelocitySamples | None, str, tuple[str, ...]]
     if (np.diff(table[:, 0]) <= 0).any():
         index = int(np.argmax(np.diff(table[:, 0]) <= 0)) + 1
         raise StampError("the stamp does not increase", field=topic, index=index)
-    return VelocitySamples(str(bag.path), table[:, 0], table[:, 1:]), frame, notes
+    std, note = messages.stated_std(np.array(covariances, dtype=float))
+    attributes = {TWIST_STD: " ".join(map(repr, std.tolist()))} if std.any() else {}
+    notes += (note,) if note else ()
+    return VelocitySamples(str(bag.path), table[:, 0], table[:, 1:], attributes=attributes), frame, notes
 
 
 def _body(bag: Bag, left: Camera, frame: str) -> tuple[Array, str]:

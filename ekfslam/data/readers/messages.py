@@ -32,6 +32,8 @@ ROS1_MAGIC = b"#ROSBAG V2.0"
 MAGICS = (ROS1_MAGIC, b"\x89MCAP0\r\n", b"SQLite format 3\x00")
 # Bytes of a pixel.
 _BYTES = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "mono16": 2, "16UC1": 2}
+# Variances (m^2/s^2, rad^2/s^2) that drivers write for an axis without a value, and for one that is not measured.
+_UNSET, _UNKNOWN = 1e-10, 1e3
 _LUMA = np.array([0.299, 0.587, 0.114])
 
 
@@ -150,6 +152,28 @@ def gray_of(message: Any, source: str, size: tuple[int, int]) -> Image:
         return np.ascontiguousarray(rows[..., 0 if size_of_pixel == 1 or message.is_bigendian else 1])
     luma = _LUMA if encoding.startswith("rgb") else _LUMA[::-1]
     return np.round(rows[..., :3] @ luma).astype(np.uint8)
+
+
+def stated_std(covariances: Array) -> tuple[Array, str]:
+    """Return the noise (6,) that covariances (n, 36) of a twist state, and a note if there is something to say.
+
+    It is 0 for an axis that states nothing, and inf for one that is not measured: drivers write 1e6 or more. Some write
+    1e-12 while the robot stands still.
+    """
+    full = covariances.reshape(-1, 6, 6)
+    variance = np.diagonal(full, axis1=1, axis2=2)
+    filled = (variance > _UNSET) & (variance < _UNKNOWN)
+    states = filled.any(axis=0)
+    among = np.ix_(filled[:, states].all(axis=1), states, states)
+    together = full[among].mean(axis=0) if states.any() else np.eye(0)
+    if not np.isfinite(together).all() or (np.linalg.eigvalsh(together) <= 0).any():
+        return np.zeros(6), "Covariances of the velocities are not used: they are not positive definite."
+    std = np.where((variance >= _UNKNOWN).all(axis=0), np.inf, 0.0)
+    std[states] = np.sqrt(np.diag(together))
+    if not std.any():
+        return std, ""
+    texts = ", ".join("not measured" if np.isinf(value) else f"{value:.3g}" if value else "-" for value in std)
+    return std, f"Noise that covariances of the velocities state (m/s, rad/s): {texts}."
 
 
 def transform_of(transform: Any) -> Array:
