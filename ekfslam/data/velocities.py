@@ -68,18 +68,18 @@ def attach_velocities(
     notes += [*found.notes, f"Velocities ({found.velocity_frame} frame) from {path}: {how}."]
     changes: dict[str, Any] = {"twist": twist, "velocity_frame": found.velocity_frame}
     if found.T_cam_imu is not None:
-        changes["T_cam_imu"] = found.T_cam_imu
+        changes |= _of_body(recording, found.T_cam_imu)
         notes.append("The body is the IMU of the recording that the velocities are from, and T_cam_imu is its own.")
-        if recording.truth is not None:
-            T_old_new = se3.inverse(recording.T_cam_imu) @ found.T_cam_imu
-            T_world_imu = recording.truth.T_world_imu @ T_old_new
-            changes["truth"] = replace(recording.truth, T_world_imu=T_world_imu, motion=None)
-    return replace(
-        recording,
-        notes=tuple(notes),
-        attributes={**own, **found.attributes, **stated_at(found, recording.time_s), **gaps},
-        **changes,
-    )
+    attributes = {**own, **found.attributes, **stated_at(found, recording.time_s), **gaps}
+    return replace(recording, notes=tuple(notes), attributes=attributes, **changes)
+
+
+def _of_body(recording: Sequence | ImageRecording, T_cam_imu: Array) -> dict[str, Any]:
+    """Return the extrinsics of another body, and the truth of a recording for it."""
+    if recording.truth is None:
+        return {"T_cam_imu": T_cam_imu}
+    T_world_imu = recording.truth.T_world_imu @ se3.inverse(recording.T_cam_imu) @ T_cam_imu
+    return {"T_cam_imu": T_cam_imu, "truth": replace(recording.truth, T_world_imu=T_world_imu, motion=None)}
 
 
 def read_velocities(path: Path, lateral: Lateral = "corrected") -> VelocitySamples:
