@@ -151,7 +151,7 @@ def test_outliers_are_rejected_listed_and_a_jumped_track_is_split():
 @pytest.mark.parametrize("variant", ["standard", "invariant"])
 def test_conditional_gate_equals_leaving_each_landmark_out(variant):
     """Brute force: each landmark tested against the posterior of all others, dense and with explicit inverses."""
-    world = small_world(seed=10, sigma_v=1.0, sigma_w=0.15)
+    world = small_world(seed=10, sigma_v=1.0, sigma_w=0.07)
     config = Config(filter=FilterConfig(variant=variant, landmark_coordinates="xyz", split_after=0))
     rig, tau = Rig(world.camera, world.T_cam_imu, world.noise), np.diff(world.time_s, prepend=np.nan)
     ekf, free = (JointEKF(rig, f, world.initial_T_world_imu) for f in (config.filter, settings(variant=variant).filter))

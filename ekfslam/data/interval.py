@@ -20,12 +20,14 @@ class Interval:
         dt_s: (n,) durations of the pieces, in order of time; their sum is ``tau_s`` to rounding.
         inputs: (n, c) one row a piece.
         is_gap: Whether inputs were interpolated across a gap.
+        doubt: Factor of the inputs' standard deviations; above 1 where landmarks contradict them.
     """
 
     tau_s: float
     dt_s: Array
     inputs: Array
     is_gap: bool = False
+    doubt: float = 1.0
 
     @staticmethod
     def of_one(inputs: Array, tau_s: float, is_gap: bool = False) -> Interval:
@@ -39,7 +41,7 @@ class Intervals:
 
     Args:
         tau_s: (m,) durations.
-        is_gap: (m,) see `Interval`.
+        is_gap, doubt: (m,) see `Interval`.
         start: (m+1,) first piece of each interval, and N.
         dt_s, inputs: (N,), (N, c) of the pieces.
     """
@@ -49,6 +51,7 @@ class Intervals:
     start: IntArray
     dt_s: Array
     inputs: Array
+    doubt: Array | float = 1.0
 
     @property
     def have_one_piece(self) -> bool:
@@ -60,4 +63,6 @@ class Intervals:
 
     def __getitem__(self, index: int) -> Interval:
         pieces = slice(self.start[index], self.start[index + 1])
-        return Interval(float(self.tau_s[index]), self.dt_s[pieces], self.inputs[pieces], bool(self.is_gap[index]))
+        doubt = float(np.broadcast_to(self.doubt, self.tau_s.shape)[index])
+        is_gap = bool(self.is_gap[index])
+        return Interval(float(self.tau_s[index]), self.dt_s[pieces], self.inputs[pieces], is_gap, doubt)

@@ -31,9 +31,15 @@ class ProcessNoise:
     walk_std: Array | None
     gap_std: Array
 
-    def pose_std_during(self, is_gap: BoolArray | bool) -> Array:
-        """Return the error (..., 6) of velocities that move the pose, given whether (...) they were interpolated."""
-        return np.hypot(self.pose_std, np.where(np.asarray(is_gap)[..., None], self.gap_std, 0.0))
+    def pose_std_during(self, is_gap: BoolArray | bool, doubt: Array | float = 1.0) -> Array:
+        """Return the error (..., 6) of velocities that move the pose.
+
+        Args:
+            is_gap: (...) whether they were interpolated.
+            doubt: (...) factor of their standard deviations.
+        """
+        std = np.hypot(self.pose_std, np.where(np.asarray(is_gap)[..., None], self.gap_std, 0.0))
+        return std * np.asarray(doubt)[..., None]
 
     @property
     def velocity_std(self) -> Array:

@@ -48,6 +48,13 @@ class ConditionalProjection(Projection):
     def variances(self) -> Array:
         return kernels.own_variances(self.L, self.T, self.rows.variance)
 
+    @property
+    def S(self) -> Array:
+        k, d = self.rows.residual.shape
+        root, S = (self.L @ self.T).reshape(k * d, -1), np.zeros((k, d, k, d))
+        S[np.arange(k), :, np.arange(k), :] = self.L @ self.L.swapaxes(1, 2)
+        return S.reshape(k * d, k * d) + root @ root.T
+
     def only(self, which: IntArray) -> ConditionalProjection:
         return ConditionalProjection(self.rows.only(which), self.L[which], self.B[which], self.T[which], self.G[which])
 

@@ -9,7 +9,7 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate, Mean
-from ekfslam.filters.gaussian import Conditioned, Projection, Rows, Solution
+from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution
 from ekfslam.filters.innovations import FrameInnovations, innovations_of
 from ekfslam.filters.observing import observe
 from ekfslam.filters.retraction import carried_back, parts, retracted
@@ -33,6 +33,9 @@ class Correction:
         linear: Mean at which the accepted rows were linearised.
         coordinates: (body,) coordinates there.
         innovations: Innovations of the accepted rows in the first iteration.
+        is_wide: Whether the prediction is too uncertain to linearise at, see `_is_wide`.
+        gaussian: Covariance that ``solution`` belongs to, if it is not that of the prediction.
+        doubt: Factor of the noise of the inputs in it.
     """
 
     solution: Solution | None
@@ -45,6 +48,9 @@ class Correction:
     linear: Mean
     coordinates: Array
     innovations: FrameInnovations
+    is_wide: bool = False
+    gaussian: Gaussian | None = None
+    doubt: float = 1.0
 
 
 def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correction:
@@ -80,8 +86,37 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
         solution, at, coordinates = _iterated(e, at, frame, solution, rows.slot, measured)
         done = replace(done, correction=solution.done.correction)
     return Correction(
-        solution, done, rows.residual.size, verdict, rows.slot, measured, rows.variance, at, coordinates, innovations
+        solution,
+        done,
+        rows.residual.size,
+        verdict,
+        rows.slot,
+        measured,
+        rows.variance,
+        at,
+        coordinates,
+        innovations,
+        _is_wide(tried),
     )
+
+
+def _is_wide(tried: Projection) -> bool:
+    """Return whether the prior spreads rows so far that linearising them once costs more than their noise.
+
+    A rotation that moves a row by s px has a term of second order of ``s^2 / (2 f)`` there, f being the row's
+    derivative by the rotation (the focal length, or more). All landmarks of a frame share most of it, and their noise
+    averages out: wide means that in the median the term exceeds half of ``sigma / sqrt(k)``.
+    """
+    rows, k = tried.rows, len(tried.rows.residual)
+    if not k:
+        return False
+    spread = np.diagonal(tried.variances, axis1=1, axis2=2).max(axis=1)
+    return bool(np.median(spread / (focal_lengths(rows) * np.sqrt(rows.variance.min(axis=1)))) > 1.0 / np.sqrt(k))
+
+
+def focal_lengths(rows: Rows) -> Array:
+    """Return the largest derivative (k,) of each landmark's rows by a rotation, px/rad."""
+    return np.sqrt((rows.H_x[..., 3:6] ** 2).sum(axis=2).max(axis=1))
 
 
 def _gate_jointly(
@@ -180,12 +215,19 @@ def _iterated(
     """
     linear, coordinates = at, e.coordinates
     for _ in range(e.config.iterations - 1):
-        correction = solution.done.correction
-        x, d = parts(e, correction)
-        moved = retracted(e, correction)
-        linear = replace(moved.mean, imu_twist=at.imu_twist)
-        coordinates = e.coordinates + correction[: len(e.coordinates)]
-        _, rows = observe(e, linear, slot, measured)
-        rows = carried_back(e, rows, moved).corrected(-x, -d)
+        linear, coordinates, _, rows = relinearised(e, at, solution, slot, measured)
         solution = e.gaussian.solve(e.gaussian.project(rows, frame, e.ids[slot]), frame, e.ids[slot])
     return solution, linear, coordinates
+
+
+def relinearised(
+    e: Estimate, at: Mean, solution: Solution, slot: IntArray, measured: Array
+) -> tuple[Mean, Array, Seen, Rows]:
+    """Return the mean and coordinates after a solution, and views and rows there in the prior's coordinates."""
+    correction = solution.done.correction
+    x, d = parts(e, correction)
+    moved = retracted(e, correction)
+    linear = replace(moved.mean, imu_twist=at.imu_twist)
+    seen, rows = observe(e, linear, slot, measured)
+    coordinates = e.coordinates + correction[: len(e.coordinates)]
+    return linear, coordinates, seen, carried_back(e, rows, moved).corrected(-x, -d)

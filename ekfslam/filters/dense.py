@@ -31,6 +31,10 @@ class DenseProjection(Projection):
         own = np.arange(k)
         return self.HPH.reshape(k, d, k, d)[own, :, own, :]
 
+    @property
+    def S(self) -> Array:
+        return self.HPH + np.diag(self.rows.variance.ravel())
+
     def only(self, which: IntArray) -> DenseProjection:
         row = _columns(which, self.rows.residual.shape[1])
         return DenseProjection(self.rows.only(which), self.HP[row], self.HPH[np.ix_(row, row)])

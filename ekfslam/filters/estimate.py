@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class Motion:
         interval: Inputs.
         way_m: Length of the way.
         imu_twist_before: (6,) velocity of the IMU at the image before.
+        Q: (body, body) covariance of the noise that the process added.
     """
 
     T_departed: Array
@@ -55,12 +56,17 @@ class Motion:
     interval: Interval
     way_m: Array
     imu_twist_before: Array
+    Q: Array
 
     @staticmethod
     def none(T_imu_world: Array) -> Motion:
         """Return the motion before the first prediction."""
         nowhere = Interval.of_one(np.zeros(6), 0.0)
-        return Motion(T_imu_world, T_imu_world, T_imu_world, nowhere, np.zeros(()), np.zeros(6))
+        return Motion(T_imu_world, T_imu_world, T_imu_world, nowhere, np.zeros(()), np.zeros(6), np.zeros((0, 0)))
+
+    def doubted(self, doubt: float) -> Motion:
+        """Return the motion with a factor of the inputs' standard deviations."""
+        return replace(self, interval=replace(self.interval, doubt=doubt), Q=doubt**2 * self.Q)
 
     @property
     def tau_s(self) -> float:

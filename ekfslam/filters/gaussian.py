@@ -60,6 +60,11 @@ class Projection(ABC):
     def variances(self) -> Array:
         """``H_i P H_i^T`` (k, d, d) of each landmark's own rows."""
 
+    @property
+    @abstractmethod
+    def S(self) -> Array:
+        """``H P H^T + V`` (k d, k d), the joint covariance of all innovations."""
+
     @abstractmethod
     def only(self, which: IntArray) -> Projection:
         """Return the projection of some of the landmarks."""

@@ -15,8 +15,8 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import CalibrationConfig, FilterConfig
 from ekfslam.data.interval import Interval
 from ekfslam.errors import ConfigError
-from ekfslam.filters import lifecycle
-from ekfslam.filters.correction import Correction, correct
+from ekfslam.filters import consensus, lifecycle
+from ekfslam.filters.correction import Correction
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.lifecycle import Retired, Revival
 from ekfslam.filters.log import Log
@@ -132,7 +132,7 @@ class JointEKF(Estimate):
         # 3. Correct with known landmarks: solve eq. (6) for rows (3), (4), (10), then apply (6), (7) and (7').
         slot, is_known = self.table.lookup(ids)
         known = np.flatnonzero(is_known & (reason == ACCEPTED))
-        found = correct(self, frame, slot[known], rows[known])
+        found = consensus.correct(self, frame, slot[known], rows[known])
         self._take(found, frame)
         reason[known] = found.verdict
         self.table.misses[slot[known[missed(found.verdict)]]] += 1
@@ -153,6 +153,9 @@ class JointEKF(Estimate):
 
     def _take(self, found: Correction, frame: int) -> None:
         """Condition the covariance, eq. (6), and the mean, eq. (7), on a correction; count its observations."""
+        if found.gaussian is not None:
+            self.gaussian = found.gaussian
+            self.motion = self.motion.doubted(found.doubt)
         self._log.corrected(self, found)
         self.table.observed(found.slot, self.step, found.measured, self._log.last(len(found.slot)))
         if found.solution is not None:
@@ -168,7 +171,8 @@ class JointEKF(Estimate):
         done = found.done
         likelihood = self._log_likelihood + log_density(done.nis, done.log_det, found.dof)
         self._log_likelihood = 0.0
-        return FrameReport(frame, ids, reason, done.nis, found.dof, split, likelihood, found.innovations)
+        doubt = self.motion.interval.doubt
+        return FrameReport(frame, ids, reason, done.nis, found.dof, split, likelihood, found.innovations, doubt)
 
     def _rest(self, frame: int, ids: IntArray) -> None:
         """Let landmarks out of view sleep or retire."""

@@ -46,6 +46,7 @@ class Log:
         initial_covariance: (body, body) of all blocks before the first frame; (6, 6) of the pose in older archives.
         tau_s: (T,) length of the interval that led to each frame; 0 for the first one.
         is_gap: (T,) whether the inputs were interpolated across a gap.
+        doubt: (T,) factor of the inputs' standard deviations; above 1 where landmarks contradicted them.
         input_frame: (N,) frame to which each piece of the inputs led, ascending; none led to the first one.
         input_dt_s, inputs: (N,), (N, c) durations and inputs of the pieces, see `ekfslam.data.interval.Interval`.
         way_m: (T,) way driven during the interval.
@@ -75,6 +76,7 @@ class Log:
     )
     tau_s: Array = field(metadata=stored("T", "s", check=NOT_NEGATIVE, name="tau"))
     is_gap: BoolArray = field(metadata=stored("T", "truth value", check=FLAGS))
+    doubt: Array = field(metadata=stored("T", "1", check=POSITIVE))
     input_frame: IntArray = field(metadata=stored("piece", "frame index", check=FRAMES))
     input_dt_s: Array = field(metadata=stored("piece", "s", check=NOT_NEGATIVE, name="input_dt"))
     inputs: Array = field(metadata=stored("piece input", "of the process: m/s and rad/s, or rad/s and m/s^2", "inputs"))
@@ -112,7 +114,7 @@ class Log:
     def intervals(self) -> Intervals:
         """The T-1 intervals between frames."""
         start = np.searchsorted(self.input_frame, np.arange(1, self.frames + 1))
-        return Intervals(self.tau_s[1:], self.is_gap[1:], start, self.input_dt_s, self.inputs)
+        return Intervals(self.tau_s[1:], self.is_gap[1:], start, self.input_dt_s, self.inputs, self.doubt[1:])
 
     @property
     def measured(self) -> Measured:

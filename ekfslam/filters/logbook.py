@@ -55,6 +55,7 @@ class LogBook:
             {
                 "tau_s": motion.tau_s,
                 "is_gap": motion.interval.is_gap,
+                "doubt": motion.interval.doubt,
                 "way_m": motion.way_m,
                 "seen_twist": now.imu_twist,
                 "T_departed": motion.T_departed,
@@ -69,7 +70,7 @@ class LogBook:
             }
         )
 
-    def amend(self, **values: Array) -> None:
+    def amend(self, **values: Array | float) -> None:
         """Replace fields of the frame that is being written, by their names in `Log`."""
         self._frames[-1].update(values)
 
@@ -87,6 +88,7 @@ class LogBook:
         position_m = linear.position_m[slot]
         self._observed(now.step, table.log_row[slot], found.measured, found.variance, position_m, previous)
         self.amend(
+            doubt=now.motion.interval.doubt,
             seen_twist=linear.imu_twist,
             linear=found.coordinates.copy(),
             T_linear=linear.values["pose"],

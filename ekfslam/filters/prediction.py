@@ -56,7 +56,7 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     e.gaussian.propagate(whole.Phi, whole.Q)
     departed, T_departed = e.coordinates, e.T_imu_world
     e.coordinates, e.values = model.coordinates_after(step, departed), step.values
-    e.motion = Motion(T_departed, e.T_imu_world, e.motion.T_predicted, interval, way_m, e.imu_twist)
+    e.motion = Motion(T_departed, e.T_imu_world, e.motion.T_predicted, interval, way_m, e.imu_twist, step.Q)
     e.imu_twist, e.step = step.imu_twist, e.step + 1
     e.updated_pose = model.layout.clones.get("pose") if e.updated_pose == "pose" else None
     return Prediction(departed, measured, log_likelihood)

@@ -26,6 +26,7 @@ class FrameReport:
         split: Ids of tracks that were split: their observation starts a new landmark.
         log_likelihood: Log-density of the accepted innovations, and of measured velocities if these are in the state.
         innovations: Whitened innovations of the accepted updates (joint filter only).
+        doubt: Factor of the inputs' standard deviations; above 1 if the landmarks contradicted them.
     """
 
     frame: int
@@ -36,6 +37,7 @@ class FrameReport:
     split: IntArray
     log_likelihood: float
     innovations: FrameInnovations | None = None
+    doubt: float = 1.0
 
 
 def log_density(nis: float, log_det: float, dof: int) -> float:
@@ -71,4 +73,6 @@ def collect(reports: SequenceType[FrameReport]) -> tuple[Innovation, Rejections,
         count = int((reason == code).sum())
         if code != WAITING or count:
             counts[f"rejected: {name}"] = count
+    if doubted := sum(report.doubt > 1.0 for report in reports):
+        counts["rejected: velocities"] = doubted
     return innovation, rejections, counts

@@ -152,6 +152,7 @@ def _graph(result: Result, log: Log) -> Iterator[str]:
     moved, noise = log.T_departed[1:] @ se3.inverse(log.T_predicted[1:]), result.noise
     step, twist = _position_and_quaternion(moved), se3.log(moved) / log.tau_s[1:, None]
     std = np.where(log.is_gap[1:, None], np.hypot(noise.velocity_std, noise.gap_std), noise.velocity_std)
+    std = std * log.doubt[1:, None]
     Q = motion.process_noise(twist, log.tau_s[1:], std)
     # The vector part of a quaternion is half the rotation.
     twice = np.repeat([1.0, 2.0], 3)

@@ -47,6 +47,8 @@ def completed(record: type, found: dict[str, Any], version: int) -> dict[str, An
 
     A field that this version should have stays missing.
     """
+    if record is Log and "tau_s" in found:
+        found.setdefault("doubt", np.ones(len(found["tau_s"])))  # early releases of version 6 lack it
     if record is not Log or version > 5:
         return found
     if version < 4 and {"twist", "T_linear", "T_predicted", "T_updated", "frame"} <= found.keys():

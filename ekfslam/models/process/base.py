@@ -35,7 +35,7 @@ class Step:
         values: The blocks that it moves, after it, by name; they have p columns.
         imu_twist: (..., 6) velocity ``[v; w]`` of the IMU at the end of the step, m/s and rad/s in the IMU frame.
         Phi: (..., p, body) derivative of the errors of these blocks by all errors before the step.
-        Q: (..., p, p) covariance of the noise that the step adds.
+        Q: (..., p, p) covariance of the noise that the step adds; it grows as the square of `Interval.doubt`.
     """
 
     values: Values

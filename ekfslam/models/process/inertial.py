@@ -76,6 +76,7 @@ class Inertial(Process):
         white = _GAP_FACTOR if interval.is_gap else 1.0
         noise = self.noise
         density = np.repeat([white * noise.gyro, white * noise.accel, 0.0, noise.gyro_walk, noise.accel_walk], 3)
+        density *= interval.doubt
         dt_s = np.repeat(interval.dt_s / parts, parts)
         return increments(dt_s, inputs[:, :3] - gyro_bias, inputs[:, 3:] - accel_bias, density)
 

@@ -47,8 +47,8 @@ class VelocityInputs(Process):
         if by is not None:
             Phi -= G @ by
         std = self.noise.pose_std
-        if np.any(interval.is_gap):
-            std = self.noise.pose_std_during(interval.is_gap)
+        if np.any(interval.is_gap) or np.any(interval.doubt != 1.0):
+            std = self.noise.pose_std_during(interval.is_gap, interval.doubt)
         Q = motion.process_noise_by(G, std)
         return Step({"pose": T_next}, twist, Phi, Q)
 

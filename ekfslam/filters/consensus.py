@@ -1,0 +1,255 @@
+"""Consensus of the landmarks of a frame: which are wrong, these landmarks or the inputs?
+
+A gate tests each landmark against the prediction. One wild velocity makes all landmarks fail, and would be kept. So a
+frame in which many fail, or in which those that pass agree on a motion that is not the predicted one, is decided
+between two hypotheses: the inputs have their noise Q, or they say next to nothing and have ``doubt^2 Q``. Given the
+joint covariance ``S = H P H^T + V`` of the innovations r under a hypothesis, the landmarks A that agree are found from
+small samples and by the others of A (MSAC: Torr and Zisserman, "MLESAC", CVIU 2000). A hypothesis costs
+
+    r_A^T S_AA^-1 r_A + gate (k - |A|), and gate_6 more if it rejects the inputs,
+
+so each measurement that is rejected, a landmark or the inputs, costs as much as its gate. If the inputs are doubted, or
+the prior is wide, the rows are linearised again at each solution, because the prediction may be far off.
+
+*Trigger*, from the plain correction: more than a third of the landmarks are rejected, or the shared innovation c with
+covariance C (`ekfslam.filters.innovations`) explains more than gate_6 by an error e of the inputs of covariance
+``Q_e = (doubt^2 - 1) Q``: ``c^T (C + Q_e^-1)^-1 c``.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from itertools import combinations
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.filters import correction, gates
+from ekfslam.filters.correction import Correction, focal_lengths, relinearised
+from ekfslam.filters.estimate import Estimate, Mean
+from ekfslam.filters.gaussian import Gaussian, Rows, Solution
+from ekfslam.filters.innovations import innovations_of
+from ekfslam.filters.observing import observe
+from ekfslam.filters.retraction import parts
+from ekfslam.models.sensors.base import ACCEPTED, GATE, MOVING
+
+# Factor of the noise of rejected inputs: errors up to some 100 standard deviations leave the landmarks in charge.
+DOUBT = 30.0
+# Gate of the inputs, six components: one frame in 10 000 is looked at in vain.
+INPUT_GATE = gates.threshold(1.0 - 1e-4, 6)
+_SHARE = 1.0 / 3.0  # of rejected landmarks, from which a frame is looked at
+_SAMPLES = 100
+_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """A frame solved under one hypothesis: ``inside`` (k,) of its landmarks agree, and ``rows`` are theirs."""
+
+    solution: Solution
+    inside: BoolArray
+    rows: Rows
+    S: Array
+    linear: Mean
+    coordinates: Array
+    cost: float
+
+    @property
+    def is_majority(self) -> bool:
+        """Whether most landmarks agree."""
+        return bool(2 * self.inside.sum() > len(self.inside))
+
+
+def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correction:
+    """Solve eq. (6) as `ekfslam.filters.correction.correct` does, and decide doubtful frames by consensus.
+
+    Raises:
+        InnovationError: The innovation covariance is not positive definite.
+    """
+    evidence = e.table.evidence.copy()
+    found = correction.correct(e, frame, slot, measured)
+    gate = gates.threshold(e.config.gate_probability, e.sensor.dimension)
+    if not (len(slot) and e.motion.tau_s and np.isfinite(gate)):
+        return found
+    if not (found.is_wide or _is_suspect(e, found, gate)):
+        return found
+    candidates = np.flatnonzero(np.isin(found.verdict, (ACCEPTED, GATE)))
+    rounds = _ROUNDS if found.is_wide else 1
+    settled = _settled(e, e.gaussian, frame, slot[candidates], measured[candidates], gate, rounds)
+    cost = found.done.nis + gate * np.isin(found.verdict, (GATE, MOVING)).sum()
+    if settled is not None:
+        cost = min(cost, settled.cost + gate * (len(slot) - len(candidates)))
+        if settled.is_majority:
+            found = _correction(e, found, settled, candidates, measured)
+    if e.model.process.estimates_velocity or not _is_suspect(e, found, gate):
+        return found
+    candidates = np.flatnonzero(np.isin(found.verdict, (ACCEPTED, GATE, MOVING)))
+    wide = doubted(e, DOUBT)
+    settled = _settled(e, wide, frame, slot[candidates], measured[candidates], gate)
+    if settled is None or not settled.is_majority or settled.cost + INPUT_GATE >= cost:
+        return found
+    e.table.evidence = evidence
+    return replace(_correction(e, found, settled, candidates, measured), gaussian=wide, doubt=DOUBT)
+
+
+def doubted(e: Estimate, doubt: float) -> Gaussian:
+    """Return a copy of the covariance in which the last step has had inputs of ``doubt`` times their noise."""
+    gaussian = deepcopy(e.gaussian)
+    gaussian.propagate(np.eye(len(e.motion.Q)), (doubt**2 - 1.0) * e.motion.Q)
+    return gaussian
+
+
+def _is_suspect(e: Estimate, found: Correction, gate: float) -> bool:
+    """Return whether the trigger of the module holds."""
+    out = int(np.isin(found.verdict, (GATE, MOVING)).sum())
+    c, C = found.innovations.score, found.innovations.information
+    Q = (DOUBT**2 - 1.0) * e.motion.Q[:6, :6]
+    shared = c @ Q @ np.linalg.solve(np.eye(6) + C @ Q, c)
+    return bool(shared > INPUT_GATE or (out > _SHARE * len(found.verdict) and shared + gate * out > INPUT_GATE))
+
+
+def _settled(
+    e: Estimate, gaussian: Gaussian, frame: int, slot: IntArray, measured: Array, gate: float, rounds: int = _ROUNDS
+) -> _Settled | None:
+    """Solve eq. (6) under a covariance for the landmarks (k,) that agree, in some rounds; None: there are none."""
+    _, rows = observe(e, e.mean, slot, measured)
+    some, inside, found = np.arange(len(slot)), np.zeros(len(slot), dtype=bool), None
+    linear, coordinates = e.mean, e.coordinates
+    for _ in range(rounds):
+        if not len(some):
+            return None
+        projection = gaussian.project(rows, frame, e.ids[rows.slot])
+        S = projection.S
+        if found is None:
+            inside = agreeing(S, rows, gate, np.random.default_rng(frame))
+        agree = refined(S, rows.residual, inside[some], gate)
+        if not agree.any():
+            return None
+        inside[:] = False
+        inside[some[agree]] = True
+        solution = gaussian.solve(projection.only(np.flatnonzero(agree)), frame, e.ids[rows.slot[agree]])
+        cost = solution.done.nis + gate * (len(slot) - agree.sum())
+        found = _Settled(
+            solution,
+            inside.copy(),
+            rows.only(agree),
+            _blocks(S.reshape(*rows.residual.shape * 2))[agree],
+            linear,
+            coordinates,
+            cost,
+        )
+        linear, coordinates, seen, rows = relinearised(e, _at(e, solution), solution, slot, measured)
+        some = np.flatnonzero(e.sensor.in_view(seen.q, e.config.min_depth_m))
+        rows = rows.only(some)
+    return found
+
+
+def _correction(e: Estimate, plain: Correction, settled: _Settled, candidates: IntArray, measured: Array) -> Correction:
+    """Return a correction by the landmarks that agree among the ``candidates`` (k,) of a frame."""
+    verdict, rows, solution = plain.verdict.copy(), settled.rows, settled.solution
+    verdict[candidates] = np.where(settled.inside, ACCEPTED, GATE)
+    left = rows.corrected(*parts(e, solution.done.correction)).residual
+    return replace(
+        plain,
+        solution=solution,
+        done=solution.done,
+        dof=rows.residual.size,
+        verdict=verdict,
+        slot=rows.slot,
+        measured=measured[verdict == ACCEPTED],
+        variance=rows.variance,
+        linear=settled.linear,
+        coordinates=settled.coordinates,
+        innovations=innovations_of(solution, e.table.log_row[rows.slot], rows, settled.S, left),
+    )
+
+
+def _at(e: Estimate, solution: Solution) -> Mean:
+    """Return the mean with the velocity at the image that a solution corrects, if a time offset needs it, eq. (9)."""
+    if not e.model.observer.has_time_offset:
+        return e.mean
+    after = e.model.retract(e.values, solution.done.correction)
+    twist = e.model.process.imu_twist({"pose": e.motion.T_departed}, after, e.motion.interval)
+    return replace(e.mean, imu_twist=twist)
+
+
+def agreeing(S: Array, rows: Rows, gate: float, generator: np.random.Generator) -> BoolArray:
+    """Return which landmarks (k,) agree with the best of small samples of them.
+
+    A sample corrects the predictions of all other landmarks. What it moves by s px may be wrong by ``s^2 / f``, as
+    linearised.
+
+    Args:
+        S: (k d, k d) joint covariance of the innovations.
+        rows: The k landmarks.
+        gate: Threshold for one landmark.
+        generator: Source of samples, if there are too many to try them all.
+    """
+    (k, d), r = rows.residual.shape, rows.residual
+    sample = _samples(k, generator)
+    n, size = sample.shape
+    S = S.reshape(k, d, k, d)
+    S_ka = S[:, :, sample].transpose(2, 0, 1, 3, 4).reshape(n, k * d, size * d)
+    S_aa = S_ka.reshape(n, k, d, -1)[np.arange(n)[:, None], sample].reshape(n, size * d, size * d)
+    gain = np.linalg.solve(S_aa, S_ka.swapaxes(1, 2)).swapaxes(1, 2)
+    r_a = r[sample].reshape(n, size * d, 1)
+    moved = (gain @ r_a).reshape(n, k, d)
+    own = np.einsum("nkda,nkea->nkde", gain.reshape(n, k, d, -1), S_ka.reshape(n, k, d, -1))
+    bend = (moved**2).sum(axis=2) / focal_lengths(rows)
+    left = _blocks(S) - own + (bend**2)[..., None, None] * np.eye(d)
+    e = r - moved
+    left[np.arange(n)[:, None], sample], e[np.arange(n)[:, None], sample] = np.eye(d), 0.0
+    squares = (e * np.linalg.solve(left, e[..., None])[..., 0]).sum(axis=2)
+    of_sample = (r_a * np.linalg.solve(S_aa, r_a)).sum(axis=(1, 2))
+    best = (of_sample + np.minimum(squares, gate).sum(axis=1)).argmin()
+    return squares[best] <= gate
+
+
+def _samples(k: int, generator: np.random.Generator) -> IntArray:
+    """Return samples (n, size) of k landmarks: three each, or one less than there are."""
+    size = max(min(3, k - 1), 1)
+    if comb(k, size) <= _SAMPLES:
+        return np.array(list(combinations(range(k), size)))
+    return generator.random((_SAMPLES, k)).argpartition(size, axis=1)[:, :size]
+
+
+def refined(S: Array, residual: Array, inside: BoolArray, gate: float) -> BoolArray:
+    """Return the landmarks (k,) that agree with all others of them, starting from those ``inside`` (k,).
+
+    The worst one leaves first: with it inside, it may seem that others are wrong. Arguments are as in `squares_given`.
+    """
+    inside = inside.copy()
+    while inside.any():
+        squares = squares_given(S, residual, np.flatnonzero(inside))
+        worst = np.where(inside, squares, 0.0).argmax()
+        if squares[worst] <= gate:
+            return inside | (squares <= gate)
+        inside[worst] = False
+    return inside
+
+
+def squares_given(S: Array, residual: Array, inside: IntArray) -> Array:
+    """Return the normalised squares (k,) of innovations, each given those of all *other* landmarks ``inside`` (j,).
+
+    Args:
+        S: (k d, k d) joint covariance of the innovations (k, d).
+    """
+    k, d = residual.shape
+    S, j = S.reshape(k, d, k, d), len(inside)
+    K = np.linalg.inv(S[inside][:, :, inside].reshape(j * d, j * d))
+    S_ka = S[:, :, inside].reshape(k, d, j * d)
+    y = K @ residual[inside].ravel()
+    e, C = residual - S_ka @ y, _blocks(S) - (S_ka @ K) @ S_ka.swapaxes(1, 2)
+    # ((S_AA^-1)_ii)^-1 y_i is the innovation of a member given the others.
+    C[inside] = np.linalg.inv(np.asarray(_blocks(K.reshape(j, d, j, d))))
+    e[inside] = (C[inside] @ y.reshape(j, d, 1))[..., 0]
+    return (e * np.linalg.solve(C, e[..., None])[..., 0]).sum(axis=1)
+
+
+def _blocks(S: NDArray[np.floating]) -> Array:
+    """Return the diagonal blocks (k, d, d) of S (k, d, k, d)."""
+    own = np.arange(len(S))
+    return np.asarray(S[own, :, own, :], dtype=float)

@@ -1,0 +1,218 @@
+"""Consensus of a frame: which are wrong, its landmarks or its velocity?"""
+
+import dataclasses
+from itertools import combinations
+
+import numpy as np
+import pytest
+from support.everything import PRIOR
+from support.frozen import assert_equal_to_frozen_rows
+
+from ekfslam import LiveEKF
+from ekfslam.config import Config
+from ekfslam.data.inputs import InertialNoise
+from ekfslam.data.interval import Interval
+from ekfslam.data.simulate import builtin
+from ekfslam.evaluation.consistency import pose_nees
+from ekfslam.filters.consensus import DOUBT, agreeing, refined, squares_given
+from ekfslam.filters.gates import threshold
+from ekfslam.filters.gaussian import Rows
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
+from ekfslam.geometry import se3
+from ekfslam.models.blocks.base import Layout
+from ekfslam.models.blocks.pose import Pose
+from ekfslam.models.process import INERTIAL_BLOCKS
+from ekfslam.models.process.inertial import inertial
+from ekfslam.resolve import resolve
+from ekfslam.runner import run
+from ekfslam.smoother.posterior import smooth
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+WILD = 12  # frame
+GATE = threshold(0.999, 3)
+
+
+def spoiled(world, frames=(WILD,), sigmas=10.0):
+    """The world with velocities that are wrong in all six axes in some frames."""
+    twist = world.twist.copy()
+    signs = np.resize([1.0, -1.0, 1.0, -1.0, 1.0, 1.0], (len(frames), 6))
+    twist[list(frames)] += sigmas * world.noise.twist_std * signs
+    return dataclasses.replace(world, twist=twist)
+
+
+def filtered(world, **settings):
+    problem = resolve(world, Config().with_overrides({"filter": settings}))
+    ekf = JointEKF(problem.model, problem.config.filter)
+    return ekf, [frame.report for frame in run_filter(ekf, problem.sequence)]
+
+
+def errors(world, poses):
+    return np.linalg.norm(poses[:, :3, 3] - world.truth.T_world_imu[:, :3, 3], axis=1)
+
+
+@pytest.mark.parametrize("form", ["dense", "conditional"])
+@pytest.mark.parametrize("variant", ["invariant", "standard", "fej"])
+def test_a_wild_velocity_is_rejected_and_its_landmarks_are_kept(variant, form):
+    world = spoiled(builtin("city?frames=16&max_tracks=20"))
+    _, reports = filtered(world, variant=variant, covariance_form=form)
+    assert [report.frame for report in reports if report.doubt > 1.0] == [WILD]
+    of_frame = reports[WILD]
+    assert of_frame.doubt == DOUBT
+    assert (of_frame.reason == 0).sum() <= 2
+    assert of_frame.nis < 2.0 * of_frame.dof
+
+
+@pytest.mark.parametrize("tracks", [3, 4, 5])
+def test_a_wild_velocity_is_rejected_with_few_landmarks(tracks):
+    world = spoiled(builtin(f"loop?frames=20&max_tracks={tracks}&seed=1"))
+    result = run(world)
+    assert np.flatnonzero(result.log.doubt > 1.0).tolist() == [WILD]
+    assert result.counts["rejected: velocities"] == 1
+    assert pose_nees(result, world.truth)[1][-1] < 20.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gross_landmarks_alone_do_not_open_a_frame(seed):
+    world = builtin(f"city?frames=40&max_tracks=5&outlier_fraction=0.06&seed={seed}")
+    _, reports = filtered(world)
+    assert sum((report.reason == 0).sum() for report in reports) > 5
+    assert all(report.doubt == 1.0 for report in reports)
+
+
+def test_the_forms_of_the_covariance_agree_in_a_frame_that_rejects_its_velocity():
+    world = spoiled(builtin("loop?frames=16&landmarks=30"))
+    dense, conditional = (filtered(world, covariance_form=form)[0] for form in ("dense", "conditional"))
+    scale = np.sqrt(np.diag(dense.P))
+    assert np.abs((dense.P - conditional.P) / np.outer(scale, scale)).max() < 1e-7
+    np.testing.assert_allclose(dense.T_imu_world, conditional.T_imu_world, atol=1e-9)
+
+
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_frozen_rows_believe_the_same_of_a_rejected_velocity(variant):
+    world = spoiled(builtin("city?frames=16&max_tracks=20"))
+    ekf, reports = filtered(world, variant=variant, retire="never", **PRIOR)
+    assert reports[WILD].doubt == DOUBT
+    assert_equal_to_frozen_rows(ekf)
+
+
+def test_the_smoother_is_right_about_a_rejected_velocity():
+    world = spoiled(builtin("city?frames=20&max_tracks=20"))
+    smoothed, clean = (smooth(run(some)) for some in (world, builtin("city?frames=20&max_tracks=20")))
+    assert errors(world, smoothed.T_world_imu).max() < 1.5 * errors(world, clean.T_world_imu).max()
+
+
+def test_live_use_rejects_the_same_velocities():
+    world = spoiled(builtin("city?frames=16&max_tracks=20"))
+    problem = resolve(world)
+    batch, _ = filtered(world)
+    live = LiveEKF(JointEKF(problem.model, problem.config.filter))
+    reports = []
+    for k, t in enumerate(world.time_s):
+        reports += live.predict(world.twist[k], t)
+        reports += live.update(*world.observations.at(k), t)
+    reports += live.flush()
+    assert [report.frame for report in reports if report.doubt > 1.0] == [WILD]
+    np.testing.assert_array_equal(live.ekf.T_imu_world, batch.T_imu_world)
+
+
+def test_two_runs_are_bit_equal():
+    world = spoiled(builtin("city?frames=14&max_tracks=30"))
+    one, two = (filtered(world)[0] for _ in range(2))
+    np.testing.assert_array_equal(one.P, two.P)
+
+
+def test_the_first_frame_and_frames_without_known_landmarks_are_left_alone():
+    world = builtin("city?frames=10")
+    few = world.observations.frame < 3
+    observations = dataclasses.replace(
+        world.observations,
+        **{name: getattr(world.observations, name)[few] for name in ("frame", "landmark", "pixels_px")},
+    )
+    _, reports = filtered(dataclasses.replace(spoiled(world, (5,)), observations=observations))
+    assert all(report.doubt == 1.0 for report in reports)
+
+
+def test_doubt_multiplies_the_noise_of_every_process(rng):
+    T = se3.exp(rng.normal(size=6))
+    world = builtin("city?frames=4")
+    model = resolve(world).model
+    one, two = (
+        model.process.step(model.initial_values(), Interval(0.1, np.array([0.1]), world.twist[1:2], gap, d), T, False).Q
+        for gap, d in ((False, 1.0), (False, 7.0))
+    )
+    np.testing.assert_allclose(two, 49.0 * one, rtol=1e-12)
+    blocks = (Pose(T, np.eye(6)), *(block() for block in INERTIAL_BLOCKS.values()))
+    process = inertial(InertialNoise(1e-3, 1e-2, 1e-5, 1e-4))(Layout(blocks), world.noise)
+    values = {block.name: block.initial() for block in blocks}
+    inputs = rng.normal(size=(2, 6))
+    one, two = (
+        process.step(values, Interval(0.2, np.array([0.1, 0.1]), inputs, False, d), T, False).Q for d in (1.0, 7.0)
+    )
+    np.testing.assert_allclose(two, 49.0 * one, rtol=1e-9, atol=1e-18)
+
+
+# --- the maths ------------------------------------------------------------------------------------------------------
+
+
+def frame_of(rng, k=8, wrong=()):
+    """Joint covariance and rows of k landmarks that share an uncertain motion, with gross errors of some of them."""
+    J = rng.normal(size=(k, 3, 6)) * 100.0
+    S = (J.reshape(-1, 6) * 0.2**2) @ J.reshape(-1, 6).T + 0.5 * np.eye(3 * k)
+    r = np.linalg.cholesky(S) @ rng.normal(size=3 * k)
+    r.reshape(k, 3)[list(wrong)] += rng.choice([-1.0, 1.0], (len(wrong), 3)) * rng.uniform(20, 60, (len(wrong), 3))
+    H_x = np.concatenate([J[..., :3], 1e6 * J[..., 3:]], axis=2)  # nearly linear
+    return S, Rows(np.arange(k), H_x, np.zeros((k, 3, 3)), r.reshape(k, 3), np.full((k, 3), 0.5))
+
+
+def test_squares_given_the_others_are_those_of_conditional_gaussians(rng):
+    S, rows = frame_of(rng)
+    inside = np.array([6, 1, 3, 4])
+    found = squares_given(S, rows.residual, inside)
+    for i in range(8):
+        others = [j for j in inside if j != i]
+        a, b = (np.concatenate([3 * np.array(some) + axis for axis in range(3)]) for some in ([i], others))
+        K = S[np.ix_(a, b)] @ np.linalg.inv(S[np.ix_(b, b)])
+        e = rows.residual.ravel()[a] - K @ rows.residual.ravel()[b]
+        square = e @ np.linalg.solve(S[np.ix_(a, a)] - K @ S[np.ix_(b, a)], e)
+        np.testing.assert_allclose(found[i], square, rtol=1e-6)
+
+
+@pytest.mark.parametrize("k", [4, 5, 8, 30])
+def test_the_majority_is_found_whatever_the_minority(rng, k):
+    wrong = rng.permutation(k)[: (k - 2) // 2]
+    S, rows = frame_of(rng, k, wrong)
+    agree = refined(S, rows.residual, agreeing(S, rows, GATE, np.random.default_rng(0)), GATE)
+    assert not agree[wrong].any()
+    assert agree.sum() >= k - len(wrong) - 1
+
+
+def test_one_wrong_landmark_does_not_mask_the_others(rng):
+    S, rows = frame_of(rng, 4, [2])
+    everything = np.ones(4, dtype=bool)
+    assert (squares_given(S, rows.residual, np.arange(4)) > GATE).sum() > 1
+    assert refined(S, rows.residual, everything, GATE).tolist() == [True, True, False, True]
+
+
+def test_all_samples_are_tried_if_they_are_few(rng):
+    S, rows = frame_of(rng, 7, [0, 5])
+    found = {tuple(agreeing(S, rows, GATE, np.random.default_rng(seed))) for seed in range(3)}
+    assert len(found) == 1
+    assert len(list(combinations(range(7), 3))) == 35
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tracks", [5, 66])
+@pytest.mark.parametrize("name", ["city", "loop"])
+def test_one_velocity_in_a_hundred_may_be_wrong_by_ten_deviations(name, tracks):
+    nees = []
+    for seed in range(4):
+        world = builtin(f"{name}?frames=120&max_tracks={tracks}&seed={seed}")
+        wild = 1 + np.random.default_rng(seed).permutation(119)[:1]
+        nees.append(np.nanmean(pose_nees(run(spoiled(world, wild)), world.truth)[1]))
+    assert 3.0 < np.mean(nees) < 9.0
