@@ -19,13 +19,24 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from common import DENSE, REPORT, UTIAS, argument_parser, has_recordings, open_recording, swept, truth_of, write
+from common import (
+    DENSE,
+    REPORT,
+    UTIAS,
+    argument_parser,
+    has_recordings,
+    open_recording,
+    swept,
+    truth_of,
+    with_aligned,
+    write,
+)
 from real_data import recordings
 
 import ekfslam
 from ekfslam.data.inputs import Velocities
 from ekfslam.data.sequence import Sequence
-from ekfslam.evaluation.tables import document, markdown_table, number, plus_minus
+from ekfslam.evaluation.tables import document, markdown_table, plus_minus
 from ekfslam.figures.run import plot_parameters
 from ekfslam.geometry import se3
 from ekfslam.resolve import noise_of
@@ -62,8 +73,10 @@ def main() -> int:
     measured = swept("ablation", Sweep(found, cases=CASES, columns=ESTIMATES), parsed.workers)
     true = swept("true_motion", Sweep(truly, cases={CALIBRATED: CASES[CALIBRATED]}, columns=ESTIMATES), parsed.workers)
     errors: dict[str, Row] = {}
-    for row in measured.rows("recording", "case", "ate_m"):
+    aligned: dict[str, Row] = {}
+    for row in measured.rows("recording", "case", "ate_m", "ate_aligned_m"):
         errors.setdefault(row["recording"], {})[row["case"]] = row["ate_m"]
+        aligned.setdefault(row["recording"], {})[row["case"]] = row["ate_aligned_m"]
     calibrated = {"measured velocities": measured.groups("case")[CALIBRATED,], "true motion": true}
     estimates = {motion: table.rows("recording", *ESTIMATES) for motion, table in calibrated.items()}
     sequence = open_recording(parsed.data, f"utias/{SHOWN}.mat")
@@ -72,8 +85,8 @@ def main() -> int:
     write(
         parsed.out,
         "ablation",
-        {"ate_m": errors, "calibration": estimates},
-        markdown(errors, estimates),
+        {"ate_m": errors, "ate_aligned_m": aligned, "calibration": estimates},
+        markdown(errors, aligned, estimates),
         figures,
         indent=1,
     )
@@ -151,15 +164,19 @@ def remains(drive: dict[str, float], highway: dict[str, float]) -> str:
     )
 
 
-def markdown(errors: dict[str, Row], calibration: dict[str, list[Row]]) -> str:
+def markdown(errors: dict[str, Row], aligned: dict[str, Row], calibration: dict[str, list[Row]]) -> str:
     """Return the report of the experiment."""
     headings = list(next(iter(errors.values())))
     return document(
         "# What each part of the model brings",
-        "ATE of full SLAM in metres, unaligned, with one part left out (last column: one added).",
+        "ATE of full SLAM in metres, unaligned (in brackets: SE(3)-aligned), with one part left out (last column: one "
+        "added).",
         markdown_table(
             ["set", *headings],
-            ([name, *(number(row[key], ".2f") for key in headings)] for name, row in errors.items()),
+            (
+                [name, *(with_aligned({"ate_m": row[key], "ate_aligned_m": aligned[name][key]}) for key in headings)]
+                for name, row in errors.items()
+            ),
         ),
         remains(errors[SHOWN], errors[HIGHWAY]),
         "# What the recordings say about their calibration",

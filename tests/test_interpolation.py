@@ -200,3 +200,25 @@ def test_poses_at_rest_and_straight_lines_are_not_interpolated():
     assert not interpolated_poses(
         integrate(np.eye(4), np.tile([1.0, 0, 0, 0, 0, 0.1], (20, 1)), np.full(19, 0.1))
     ).any()
+
+
+def test_interpolated_true_poses_are_named_and_in_no_nees_without_velocities_that_show_them(tmp_path, capsys):
+    world = synthetic_sequence(frames=60, landmarks=20)
+    T = world.truth.T_world_imu.copy()
+    share = np.arange(1, 8)[:, None] / 8
+    T[21:28, :3, 3] = (1 - share) * T[20, :3, 3] + share * T[28, :3, 3]
+    T[21:28, :3, :3] = T[20, :3, :3] @ se3.so3_exp(share * se3.so3_log(T[20, :3, :3].T @ T[28, :3, :3]))
+    rng = np.random.default_rng(0)
+    wavy = T @ se3.exp(np.where(np.arange(60)[:, None] // 10 == 2, 0.0, 1e-4) * rng.standard_normal((60, 6)))
+    truth = dataclasses.replace(world.truth, T_world_imu=wavy, noise=TruthNoise(position_m=0.01))
+    nothing = np.zeros(60, dtype=bool)
+    kept = measured_truth(truth, nothing, world.time_s)
+    assert set(range(60)) - set(kept.frame.tolist()) == set(range(21, 29))
+    assert len(measured_truth(dataclasses.replace(truth, noise=None), nothing, world.time_s).frame) == 60
+    result = synthetic_result(world, "dead-reckoning")
+    pairs, _ = relative_pose_nees(result, truth, nothing)
+    assert len(pairs.first)
+    assert not ((pairs.first < 28) & (pairs.second > 20)).any()
+    write_sequence(dataclasses.replace(world, truth=truth), tmp_path / "w.h5")
+    assert main(["info", str(tmp_path / "w.h5")]) == 0
+    assert "the true poses of frames 21 to 28 lie on a line" in capsys.readouterr().out

@@ -127,3 +127,17 @@ def test_a_run_and_info_say_it(tmp_path, capsys):
     write_sequence(world, tmp_path / "w.h5")
     assert main(["info", str(tmp_path / "w.h5")]) == 0
     assert "sources       truth alone from" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_drift_of_the_truth_is_found_from_the_recording():
+    world = open_sequence(WORLD.format(1))
+    T, rng = world.truth.T_world_imu.copy(), np.random.default_rng(1)
+    T[1:, :3, 3] += np.cumsum(
+        0.5 * np.sqrt(np.diff(world.time_s))[:, None] * rng.standard_normal((len(T) - 1, 3)), axis=0
+    )
+    found = compare_sources(dataclasses.replace(world, truth=dataclasses.replace(world.truth, T_world_imu=T)))
+    assert found.alone == ()
+    assert found.drift_m_sqrt_s == pytest.approx(0.5, rel=0.3)
+    assert "the truth drifts by about 0.4" in in_words(found, world.time_s)[-1]
+    assert compare_sources(world).drift_m_sqrt_s == 0.0

@@ -17,7 +17,7 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation import whiteness
-from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_error, pose_nees
+from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_error, pose_nees, pose_nees_apart
 from ekfslam.evaluation.tables import plus_minus
 from ekfslam.filters.result import REASONS, Parameters, Result, WhitenedInnovations
 from ekfslam.geometry import se3
@@ -307,10 +307,13 @@ def smoother_agreement(result: Result, smoothed: Posterior) -> SmootherAgreement
 
 
 def truth_agreement(result: Result, truth: Truth | None, interpolated: BoolArray | None) -> TruthAgreement | None:
-    """Compare a run with the truth, without the frames after ``interpolated`` (T,) intervals; None if none is left."""
+    """Compare a run with the truth; None if none is left.
+
+    Frames after ``interpolated`` (T,) intervals, and stretches in which the truth stands alone, are left out.
+    """
     if truth is None or not len(truth.frame):
         return None
     measured = truth if interpolated is None else measured_truth(truth, interpolated, result.time_s)
-    _, nees = pose_nees(result, measured, with_truth_noise=True)
+    _, nees = pose_nees_apart(result, measured) or pose_nees(result, measured, with_truth_noise=True)
     low, high = chi2_bounds(POSE_DOF, _TRUTH_PROBABILITY)
     return TruthAgreement(float(np.nanmean(nees)), float(low), float(high)) if np.isfinite(nees).any() else None

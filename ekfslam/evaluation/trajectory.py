@@ -17,6 +17,7 @@ from ekfslam.geometry import se3
 KITTI_SEGMENT_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_START_STEP = 10  # frames between the starts of segments
 LEAST_PART = 0.1  # of the squared error, from which a part of it is named
+LEAST_LEVER = 0.2  # of the distances from the first pose, of a rotation that is named
 PATH_TOLERANCE = 0.1  # largest relative difference of the path of a pair from the wanted one; the default of evo_rpe
 
 
@@ -65,28 +66,24 @@ def error_parts(T_est: Array, T_true: Array) -> tuple[Part, ...]:
     """Return the parts of an unaligned ATE, the largest first; what is left over is the shape of the trajectory.
 
     To first order, errors of the positions p, from the first one, are ``phi x p + shift + scale p``, with phi along the
-    axes of the first IMU. Parts are chosen one by one, each for the least squares that all together leave.
+    axes of the first IMU. Parts are chosen one by one, each for the least squares that all together leave. A rotation
+    about the way itself is none of them: its lever is short, so that a small error would make it large.
     """
     error, p = T_est[:, :3, 3] - T_true[:, :3, 3], T_true[:, :3, 3] - T_true[0, :3, 3]
-    R = T_true[0, :3, :3]
-    columns = np.stack(
-        [*(np.cross(R[:, i], p) for i in range(3)), *(np.broadcast_to(axis, p.shape) for axis in np.eye(3)), p]
-    ).reshape(len(PARTS), -1)
-    b, total = error.ravel(), float((error**2).sum())
-    chosen: list[int] = []
-    shares: list[float] = []
-    left = total
+    turns = [np.cross(axis, p) for axis in T_true[0, :3, :3].T]
+    shifts = [np.broadcast_to(axis, p.shape) for axis in np.eye(3)]
+    columns, b, total = np.stack([*turns, *shifts, p]).reshape(len(PARTS), -1), error.ravel(), float((error**2).sum())
+    levers = np.linalg.norm(columns, axis=1) / max(float(np.linalg.norm(p)), np.finfo(float).tiny)
+    open_parts = [i for i in range(len(PARTS)) if PARTS[i] in ("x", "y", "z") or levers[i] >= LEAST_LEVER]
+    chosen, shares, left = list[int](), list[float](), total
     found: Array = np.zeros(0)
-    while len(chosen) < len(PARTS) and total > 0:
-        fits = {
-            i: np.linalg.lstsq(columns[[*chosen, i]].T, b)[0].astype(float)
-            for i in range(len(PARTS))
-            if i not in chosen
-        }
+    while open_parts and total > 0:
+        fits = {i: np.linalg.lstsq(columns[[*chosen, i]].T, b)[0].astype(float) for i in open_parts}
         rests = {i: float(((b - fit @ columns[[*chosen, i]]) ** 2).sum()) for i, fit in fits.items()}
         best = min(rests, key=rests.__getitem__)
         if left - rests[best] < LEAST_PART * total:
             break
+        open_parts.remove(best)
         chosen, found = [*chosen, best], fits[best]
         shares, left = [*shares, (left - rests[best]) / total], rests[best]
     return tuple(Part(PARTS[i], float(value), share) for i, value, share in zip(chosen, found, shares, strict=True))

@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_nees, world_axes_errors, world_axes_std
-from ekfslam.evaluation.trajectory import distance_along
+from ekfslam.evaluation.trajectory import align_se3, distance_along
 from ekfslam.figures.style import BAND_ALPHA, BOUNDS, EXPECTED, Style, log_axis
 from ekfslam.filters.result import Result
+from ekfslam.geometry import se3
 
 BAND_SIGMAS = 3.0
 PROBABILITY = 0.95  # of the bounds of NIS and NEES
@@ -144,9 +145,10 @@ def nis(result: Result) -> Series:
     return Series("NIS per dof", "", _time(result)[seen], y, low, high, True, (1.0,), is_positive=True, mean=mean)
 
 
-def distance_from_truth(result: Result, truth: Truth) -> Series:
-    """Return the distance of the estimated position from the true one, without alignment."""
-    off = result.T_world_imu[truth.frame, :3, 3] - truth.T_world_imu[:, :3, 3]
+def distance_from_truth(result: Result, truth: Truth, align: bool) -> Series:
+    """Return the distance of the estimated position from the true one, without or after `align_se3`."""
+    estimate, true = result.T_world_imu[truth.frame, :3, 3], truth.T_world_imu[:, :3, 3]
+    off = (se3.apply(align_se3(estimate, true), estimate) if align else estimate) - true
     x = _time(result)[truth.frame]
     return Series("distance from the truth", "m", x, np.linalg.norm(off, axis=1), is_positive=True)
 

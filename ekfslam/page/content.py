@@ -163,9 +163,10 @@ def _compared(section: Section) -> list[dict[str, Any]]:
     off: list[Curve] = []
     for j, run in shown:
         if run.truth is not None:
-            off.append((series.distance_from_truth(run.result, run.truth), run.label, "", j, None))
+            for align, name, kind in ((False, run.label, ""), (True, f"{run.label}, aligned", "thin")):
+                off.append((series.distance_from_truth(run.result, run.truth, align), name, kind, j, None))
     if off:
-        plots.append(_plot("Distance from the truth", "m, first pose aligned, nothing else", off))
+        plots.append(_plot("Distance from the truth", "m from a common first pose; thin: SE(3)-aligned", off))
     return plots
 
 

@@ -14,6 +14,7 @@ from ekfslam.data.interpolation import stretches
 from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import inspect_tracks
+from ekfslam.evaluation.consistency import interpolated_frames
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.sources import compare_sources, in_words
 from ekfslam.evaluation.truth import with_truth_noise
@@ -78,6 +79,9 @@ def _print_recording(sequence: Sequence) -> None:
         print(f"truth noise   {'none stated: taken as exact' if truth.noise is None else truth.noise.text}")
     gaps = ", ".join(f"{begin} to {end}" for begin, end in stretches(sequence.interpolated))
     print(f"gaps          {f'intervals {gaps} are interpolated' if gaps else 'none'}")
+    drawn = [] if truth is None else stretches(interpolated_frames(truth, len(sequence)))
+    for begin, end in drawn:
+        print(f"truth gap     the true poses of frames {begin} to {end} lie on a line: interpolated, in no NEES")
     for key, value in sequence.attributes.items():
         print(f"{key:13s} {value}")
 
