@@ -180,6 +180,8 @@ class FilterConfig:
         covariance_form: Form of the joint covariance; estimates are the same. ``dense``: one matrix. ``conditional``:
             linear in the number of landmarks, see `ekfslam.filters.conditional`. ``auto`` takes the cheaper one.
         iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. ``fej`` and ``xyz`` allow no more.
+        lag: Number of frames n of the relinearised window: after each update, the factors of the last n frames are
+            linearised again at their maximum a posteriori, see `ekfslam.smoother.fixed_lag`. 0 linearises each once.
         retire: ``unseen`` marginalises a landmark when it is out of view, ``never`` keeps all. ``auto`` is ``never``
             for a recording of at most 1500 landmarks some of which come back, else ``unseen``.
         retire_after: Frames without a sighting after which ``unseen`` applies: by default 1, or 10 if some landmarks of
@@ -204,6 +206,7 @@ class FilterConfig:
     landmark_coordinates: LandmarkCoordinates = field(default="image", metadata=_one_of(LandmarkCoordinates))
     covariance_form: CovarianceForm = field(default="auto", metadata=_one_of(CovarianceForm))
     iterations: int = field(default=1, metadata=_whole(1, 100))
+    lag: int = field(default=0, metadata=_whole(0, 1000))
     retire: Retire = field(default="auto", metadata=_one_of(Retire))
     retire_after: int | None = field(default=None, metadata=_whole(1))
     dormant: int | None = field(default=None, metadata=_whole(0))
@@ -349,6 +352,8 @@ class Config:
         object.__setattr__(self, "blocks", {name: dict(settings) for name, settings in self.blocks.items()})
         if self.filter.variant == "fej" and self.filter.iterations > 1:
             raise ConfigError("filter.iterations > 1 contradicts first estimates: choose invariant or standard")
+        if self.filter.variant == "fej" and self.filter.lag:
+            raise ConfigError("filter.lag contradicts first estimates: choose invariant or standard")
         if self.filter.landmark_coordinates == "xyz" and self.filter.iterations > 1:
             raise ConfigError(
                 "filter.iterations > 1 with filter.landmark_coordinates = 'xyz' makes distances too short (0.26 % in "

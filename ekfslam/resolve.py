@@ -275,11 +275,13 @@ def _with_retirement(sequence: Sequence, config: Config) -> Config:
     settings, come_back = config.filter, _landmarks_come_back(sequence)
     retire, retire_after, dormant = settings.retire, settings.retire_after, settings.dormant
     if retire == "auto":
-        retire = "never" if come_back and len(sequence.observations.ids) <= DORMANT_LIMIT else "unseen"
+        are_few = len(sequence.observations.ids) <= DORMANT_LIMIT
+        retire = "never" if come_back and are_few and not settings.lag else "unseen"
     if retire_after is None:
         retire_after = 10 if come_back else 1
     if dormant is None:
-        dormant = DORMANT_LIMIT if come_back and settings.retire == "auto" else 0
+        # In a relinearised window they would cost as much as landmarks in view: there they come back by map revival.
+        dormant = DORMANT_LIMIT if come_back and settings.retire == "auto" and not settings.lag else 0
     return config.with_overrides({"filter": {"retire": retire, "retire_after": retire_after, "dormant": dormant}})
 
 
@@ -324,13 +326,13 @@ def _track_scale(sequence: Sequence, config: Config, model: Model) -> float:
         return PERSISTENCE
     count = min(max(1, round(len(sequence) / _EVERY)), _MOST_STRETCHES)
     begins = ((np.arange(count) + 0.5) * len(sequence) / count - _STRETCH / 2).astype(int).clip(0)
-    nis, dof = 0.0, 0
+    nis, dof, settings = 0.0, 0, dataclasses.replace(config.filter, lag=0)
     try:
         with one_thread():
             for begin in begins.tolist():
                 frames = range(begin, min(begin + _STRETCH, len(sequence)))
                 # Without a revival: what comes back within a stretch starts again.
-                for frame in run_filter(JointEKF(model, config.filter), sequence, frames):
+                for frame in run_filter(JointEKF(model, settings), sequence, frames):
                     nis, dof = nis + frame.report.nis, dof + frame.report.dof
     except InnovationError:  # the run itself raises it, if it breaks down there too
         return 1.0
@@ -351,6 +353,8 @@ def _with_form(config: Config, sequence: Sequence, model: Model) -> Config:
     settings, layout = config.filter, model.layout
     if settings.covariance_form != "auto":
         return config
+    if settings.lag:  # the window writes all of the covariance in each frame
+        return config.with_overrides({"filter": {"covariance_form": "dense"}})
     # A block with a clone stays in the state for one more frame, as that clone.
     moving = (block for block in layout.blocks if block.is_seen and (block.per_frame or block.clones))
     group = sum(block.size for block in moving if block.name not in layout.clones)

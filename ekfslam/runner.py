@@ -33,6 +33,7 @@ from ekfslam.geometry import se3
 from ekfslam.models.sensors.velocities import VelocitySource
 from ekfslam.progress import progress
 from ekfslam.resolve import Problem, resolve
+from ekfslam.smoother.fixed_lag import FixedLag
 from ekfslam.smoother.posterior import smooth
 from ekfslam.smoother.revival import MapRevival
 from ekfslam.stored import empty
@@ -105,7 +106,7 @@ def _joint(problem: Problem, further: VelocitySource | None) -> _Estimate:
     sequence, settings, judged = problem.sequence, problem.config.filter, _judged(problem)
     count = len(sequence)
     revival = MapRevival(problem.model, settings) if settings.revive >= 0 else None
-    ekf = JointEKF(problem.model, settings, revival=revival)
+    ekf = JointEKF(problem.model, settings, revival=revival, window=FixedLag)
     references = None if judged is None else References(ekf, *judged)
     T_imu_world, covariance, ms = np.zeros((count, 4, 4)), np.zeros((count, 6, 6)), np.zeros(count)
     reports: list[FrameReport] = []

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.running import WHOLE
 
+from ekfslam.smoother.sparse.dense import DenseInformation
 from ekfslam.smoother.sparse.factors import GROUPS, Factor, FirstFrame, LinearSystem, Term
 from ekfslam.smoother.sparse.information import JointInformation
 from ekfslam.smoother.sparse.structure import Structure
@@ -169,6 +170,25 @@ def test_damping_adds_to_the_diagonal_in_units_of_the_prior():
     left = 0.5 * ((J @ x - r) ** 2).sum()
     np.testing.assert_allclose(found.cost, left, rtol=1e-9)
     np.testing.assert_allclose(found.gain, 0.5 * (r**2).sum() - left, rtol=1e-9)
+
+
+def test_the_dense_solution_equals_the_sparse_one():
+    """With a prior over the first frame, the drive and a shuffled choice of landmarks, in units of its root."""
+    rng = np.random.default_rng(8)
+    system, known, sizes = random_system(rng, 6, 9, 0.5, aux=3, drive=2, coupled=True), np.array([5, 1, 7]), (9, 2, 9)
+    others = [random_factor(rng, 1, size, ("drive", [0], 2)) for size in sizes[1:2]]
+    others.append(Factor(rng.normal(size=(3, 3)), (Term("landmarks", known, np.broadcast_to(np.eye(3), (3, 3, 3))),)))
+    drive = others[0].terms[0].J[0]
+    B = np.zeros((20, 20))
+    B[:9, :9], B[9:11, 9:11], B[11:, 11:] = system.first.B, np.linalg.inv(drive), np.eye(9)
+    zeta = np.concatenate([system.first.zeta, -others[0].r[0], -others[1].r.ravel()])
+    wide = dataclasses.replace(system, first=FirstFrame(B, zeta, system.first.width))
+    sparse = JointInformation(dataclasses.replace(system, factors=(*system.factors, *others)))
+    found = DenseInformation(wide, known)
+    for name in ("eps", "aux", "drive", "d", "gain"):
+        np.testing.assert_allclose(getattr(found, name), getattr(sparse, name), rtol=1e-8, atol=1e-9)
+    wanted = {"frames": [0, 4], "aux": [4], "drive": [0], "landmarks": [3, 7, 0, 1]}
+    np.testing.assert_allclose(found.covariance(**wanted), sparse.covariance(**wanted), rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.parametrize("certain", [[], [2], [0, 1, 7]])

@@ -19,12 +19,13 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import Values
 from ekfslam.models.model import Model
+from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
 
 # Largest ratio of distances across and along the optical axis for image coordinates.
 _MOST_OBLIQUE = 3.0
 # Largest factor by which a correction may change a disparity.
-_LARGEST_FACTOR = 4.0
+LARGEST_FACTOR = 4.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,9 @@ class CameraCoordinates:
         """
         q, xi = before.q, before.by_columns @ x[self.columns]
         step = xi[:3] + q @ se3.skew(xi[3:]).T + d @ before.R_linear.T
-        q_after, in_image = kernels.moved_by_image(q, step, self._is_in_image(q), _LARGEST_FACTOR)
+        q_after, in_image = kernels.moved_by_image(
+            q, step, is_in_image(self.model.sensor, q, self.min_depth_m), LARGEST_FACTOR
+        )
         return se3.apply(se3.inverse(self._T_cam_imu(after) @ after[self.pose]), q_after), in_image
 
     def change(self, slot: IntArray, before: View, after: View, in_image: BoolArray, turned: Array) -> Change:
@@ -131,9 +134,10 @@ class CameraCoordinates:
         """Return the estimated extrinsics (4, 4)."""
         return self.model.observer.sensor_at(self.model.observer.parameters(values)).T_cam_imu
 
-    def _is_in_image(self, q: Array) -> BoolArray:
-        """Return whether points (n, 3) are in front of the camera and near enough."""
-        sensor, z = self.model.sensor, q[:, 2]
-        furthest_m = sensor.camera.furthest_m if isinstance(sensor, Rig) else np.inf
-        is_ahead = np.abs(q[:, :2]).max(axis=1, initial=0.0) < _MOST_OBLIQUE * z
-        return is_ahead & (z > self.min_depth_m) & (z < furthest_m)
+
+def is_in_image(sensor: Sensor, q: Array, min_depth_m: float) -> BoolArray:
+    """Return whether points (n, 3) in the camera frame are in front of the camera and near enough for an image."""
+    z = q[:, 2]
+    furthest_m = sensor.camera.furthest_m if isinstance(sensor, Rig) else np.inf
+    is_ahead = np.abs(q[:, :2]).max(axis=1, initial=0.0) < _MOST_OBLIQUE * z
+    return is_ahead & (z > min_depth_m) & (z < furthest_m)

@@ -6,6 +6,7 @@ A frame on one page: `predict` is eq. (1) and (2), `update` is (3) to (7) and (1
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from collections.abc import Sequence as SequenceType
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ from ekfslam.errors import ConfigError
 from ekfslam.filters import consensus, lifecycle
 from ekfslam.filters.correction import Correction
 from ekfslam.filters.estimate import Estimate
-from ekfslam.filters.lifecycle import Retired, Revival
+from ekfslam.filters.lifecycle import Marginal, Relinearised, Retired, Revival
 from ekfslam.filters.log import Log
 from ekfslam.filters.logbook import LogBook
 from ekfslam.filters.prediction import predict
@@ -47,9 +48,10 @@ class JointEKF(Estimate):
             first `update`.
         blocks: Further state blocks.
         revival: Source of returning landmarks; None: they are initialised again.
+        window: Maker of the relinearised window that ``config.lag`` asks for: `ekfslam.smoother.fixed_lag.FixedLag`.
 
     Raises:
-        ConfigError: A calibration to estimate, but no `Rig`; or neither a model nor a first pose.
+        ConfigError: A calibration to estimate, but no `Rig`; neither a model nor a first pose; or a lag, but no window.
 
     Attributes:
         retired: Landmarks that have left the state.
@@ -65,6 +67,7 @@ class JointEKF(Estimate):
         *,
         blocks: SequenceType[StateBlock] = (),
         revival: Revival | None = None,
+        window: Callable[[Model, FilterConfig], Relinearised] | None = None,
     ) -> None:
         if isinstance(sensor, Model):
             model = sensor
@@ -75,7 +78,10 @@ class JointEKF(Estimate):
             coordinates = config.landmark_coordinates
             model = model_of(sensor, sensor.noise, se3.inverse(T_world_imu), P_pose, calibration, blocks, coordinates)
         super().__init__(model, config)
-        self.revival, self.retired = revival, Retired()
+        if config.lag and window is None:
+            raise ConfigError("filter.lag: hand JointEKF window=FixedLag, of ekfslam.smoother.fixed_lag")
+        self.window = window(model, config) if config.lag and window is not None else None
+        self.revival, self.retired, self._revived = revival, Retired(), False
         self._log = LogBook(self)
         self._reported: list[Array] = []  # estimates and standard deviations (2, p) after each frame
         delayed = model.sensor if isinstance(model.sensor, DelayedSensor) else None
@@ -149,6 +155,9 @@ class JointEKF(Estimate):
             self.updated_pose = "pose" if len(first_step) and (first_step == self.step).all() else None
         self.retired.start_again(ids[new][started])
         reason[np.flatnonzero(new)[~started]] = DISPARITY if self._waiting is None else WAITING
+        # 6. Linearise the last frames again.
+        if self.window is not None and self.step:
+            self._relinearise(self.window)
         return self._report(frame, ids, reason, split, found)
 
     def _take(self, found: Correction, frame: int) -> None:
@@ -207,15 +216,32 @@ class JointEKF(Estimate):
         assert self.revival is not None
         log, known = self._log.log(), self.landmarks()
         self.retired.fetch(self.table, known, log, ids, self.revival, frame)
-        found = self.revival.marginal(log, known.position_m, self.table.log_row)
-        self.values, self.table.position_m = {**self.values, **found.values}, found.position_m
-        self.gaussian.start_over(found.P)
-        self.coordinates[found.columns] = found.coordinates
+        self._adopt(self.revival.marginal(log, known.position_m, self.table.log_row))
+        self._revived = True
         if self.variant.first_estimates and not is_frozen_exactly(self.config):
             # All rows are linearised again: these are the first estimates from now on.
-            self.table.initial_m = found.position_m
+            self.table.initial_m = self.positions_m
             clone = self.values[self.model.layout.clones["pose"]]
             self.motion = replace(self.motion, T_predicted=self.T_imu_world, T_predicted_before=clone)
+
+    def _relinearise(self, window: Relinearised) -> None:
+        """Linearise the last frames again; after a map revival, they begin here."""
+        if self._revived:
+            self._revived = False
+            window.start_over(self)
+            return
+        known = np.concatenate([window.landmarks, self.table.log_row])
+        log, rows = self._log.since(window.first, window.observed, known)
+        if (found := window.marginal(self, log, rows)) is not None:
+            self._adopt(found)
+            self._log.amend(T_updated=self.T_imu_world, updated=self.coordinates.copy())
+
+    def _adopt(self, found: Marginal) -> None:
+        """Replace mean and covariance of blocks and active landmarks."""
+        self.values, self.table.position_m = {**self.values, **found.values}, found.position_m
+        self.gaussian.start_over(found.P)
+        self.coordinates = self.coordinates.copy()  # the log has those before
+        self.coordinates[found.columns] = found.coordinates
 
     def landmarks(self) -> Landmarks:
         """Return every landmark so far, in the order of landmark initialisation."""
@@ -235,5 +261,5 @@ class JointEKF(Estimate):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Totals of landmarks: retired, revived, reappeared (initialised again), and moving."""
-        return self.retired.counts
+        """Totals of landmarks: retired, revived, reappeared (initialised again), moving; and of given up windows."""
+        return {**self.retired.counts, **({"windows given up": self.window.given_up} if self.window else {})}

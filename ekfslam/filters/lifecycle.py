@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.landmarks import LandmarkTable
 from ekfslam.filters.log import Log
 from ekfslam.filters.result import Landmarks
@@ -42,6 +43,24 @@ class Revival(Protocol):
 
     def marginal(self, log: Log, positions_m: Array, landmarks: IntArray) -> Marginal:
         """Return the marginal over the last frame's blocks and landmarks (n,), given as rows of the log."""
+
+
+class Relinearised(Protocol):
+    """The last frames, solved again: `ekfslam.smoother.fixed_lag.FixedLag`, handed to the filter by its caller."""
+
+    first: int
+    observed: int
+    given_up: int
+
+    @property
+    def landmarks(self) -> IntArray:
+        """Rows in the log of landmarks that are known before the observations of the window."""
+
+    def marginal(self, e: Estimate, log: Log, rows: IntArray) -> Marginal | None:
+        """Return the marginal over the present frame and all active landmarks, given the log since ``first``."""
+
+    def start_over(self, e: Estimate) -> None:
+        """Begin at the present frame."""
 
 
 class Retired:

@@ -16,6 +16,13 @@ from ekfslam.filters.log import Log
 from ekfslam.filters.prediction import Prediction
 from ekfslam.models.process import Measured
 
+# Arrays over observations, pieces of inputs and measurements, by the one that holds their frames.
+_OF_FRAMES = {
+    "frame": ("frame", "landmark", "previous", "rows", "variance", "position_m"),
+    "input_frame": ("input_frame", "input_dt_s", "inputs"),
+    "measured_frame": ("measured_frame", *(f"measured_{field.name}" for field in fields(Measured))),
+}
+
 
 class LogBook:
     """Grows a `Log` frame by frame; arrays are joined when the log is read.
@@ -121,9 +128,42 @@ class LogBook:
 
     def log(self) -> Log:
         """Return the log so far."""
+        return self._log(0, {name: np.concatenate(parts) for name, parts in self._parts.items()})
+
+    def _log(self, first: int, arrays: dict[str, NDArray]) -> Log:
         return Log(
             first_estimates=self._first_estimates,
             initial_covariance=self._initial_covariance,
-            **{name: np.array([frame[name] for frame in self._frames]) for name in self._frames[0]},
-            **{name: np.concatenate(parts) for name, parts in self._parts.items()},
+            **{name: np.array([frame[name] for frame in self._frames[first:]]) for name in self._frames[0]},
+            **arrays,
         )
+
+    def since(self, first: int, observed: int, landmarks: IntArray) -> tuple[Log, IntArray]:
+        """Return the log since a frame, which becomes frame 0, at a cost that does not grow with the log.
+
+        Args:
+            first: That frame.
+            observed: Frame before which only observations of some landmarks are wanted.
+            landmarks: Rows (n,) of these; they are included even if they are not observed.
+
+        Returns:
+            The log, and the rows (m,) of its landmarks in the whole log, ascending.
+        """
+        arrays = {}
+        for key, names in _OF_FRAMES.items():
+            parts, begin = self._parts[key], first if key == "frame" else first + 1
+            count = next((n for n, part in enumerate(reversed(parts)) if len(part) and part[0] < begin), len(parts))
+            for name in names:
+                arrays[name] = np.concatenate([self._parts[name][0][:0], *self._parts[name][len(parts) - count :]])
+            arrays[key] = arrays[key] - first
+        before = self._observations - len(arrays["frame"])
+        wanted = (arrays["frame"] >= observed - first) | np.isin(arrays["landmark"], landmarks)
+        place = np.append(np.where(wanted, np.cumsum(wanted) - 1, -1), -1)
+        arrays["previous"] = place[np.maximum(arrays["previous"] - before, -1)]
+        arrays |= {name: arrays[name][wanted] for name in _OF_FRAMES["frame"]}
+        rows, place = np.unique(np.concatenate([arrays["landmark"], landmarks]), return_inverse=True)
+        arrays["landmark"] = place[: len(arrays["landmark"])]
+        for name in ("id", "first_position_m"):
+            self._parts[name] = [np.concatenate(self._parts[name])]
+            arrays[name] = self._parts[name][0][rows]
+        return self._log(first, arrays), rows

@@ -159,4 +159,4 @@ VARIANTS: dict[str, Standard] = {variant.name: variant for variant in (Invariant
 
 def is_frozen_exactly(config: FilterConfig) -> bool:
     """Return whether rows at the filter's linearisation points reproduce the filter, so that revivals can keep them."""
-    return config.landmark_coordinates == "xyz" and VARIANTS[config.variant].is_frozen_exactly
+    return config.landmark_coordinates == "xyz" and not config.lag and VARIANTS[config.variant].is_frozen_exactly

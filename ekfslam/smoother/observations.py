@@ -34,7 +34,7 @@ class ObservationFactors:
         _, first = np.unique(log.landmark, return_index=True)
         self._is_first = np.zeros(log.observations, dtype=bool)
         self._is_first[first] = True
-        self.first_frame = np.empty(log.landmarks, dtype=np.int64)
+        self.first_frame = np.zeros(log.landmarks, dtype=np.int64)
         self.first_frame[log.landmark[first]] = log.frame[first]
 
     # --- at a state ---------------------------------------------------------------------------------------------------

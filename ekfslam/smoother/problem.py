@@ -17,11 +17,14 @@ from ekfslam.models.model import Model
 from ekfslam.models.sensors.base import DelayedSensor
 from ekfslam.smoother.observations import ObservationFactors
 from ekfslam.smoother.process import ProcessFactors
+from ekfslam.smoother.sparse.dense import DenseInformation
 from ekfslam.smoother.sparse.factors import Factor, LinearSystem
 from ekfslam.smoother.sparse.information import JointInformation
 from ekfslam.smoother.unknowns import State, Unknowns
 
 __all__ = ["BatchProblem", "State"]
+
+Information = JointInformation | DenseInformation
 
 
 class BatchProblem:
@@ -52,9 +55,16 @@ class BatchProblem:
 
     def _system(self, factors: list[Factor], zeta: Array) -> LinearSystem:
         u, log = self.unknowns, self.log
-        return LinearSystem.of(tuple(factors), u.first_frame(zeta), log.frames, len(u.drive_columns), log.id)
+        first = u.first_frame(zeta[: len(u.B)])
+        return LinearSystem.of(tuple(factors), first, log.frames, len(u.drive_columns), log.id)
 
-    def moved(self, state: State, step: JointInformation) -> State:
+    def first_frame(self, zeta: Array) -> tuple[Array, Array, Array]:
+        """Return pose (4, 4), shared blocks (w-6,) and further blocks (a,) of the first frame at zeta."""
+        u, first = self.unknowns, self.unknowns.B @ zeta
+        T = se3.exp(first[:6]) @ self.log.T_predicted[0]
+        return T, u.shared_mean + first[6 : u.width], u.aux_mean + first[u.width :]
+
+    def moved(self, state: State, step: Information) -> State:
         """Return a state moved by a solution of its system.
 
         Landmarks move in the frame of the pose that saw them first, by the corrections to first order there. If a long
@@ -62,12 +72,10 @@ class BatchProblem:
         """
         u, before, zeta, d = self.unknowns, state.T_imu_world, state.zeta + step.zeta, step.d
         T = se3.exp(step.eps[:, :6]) @ before
-        # zeta gives the first frame exactly; eps is its first order.
-        first = u.B @ zeta
-        T[0] = se3.exp(first[:6]) @ self.log.T_predicted[0]
-        eps = np.concatenate([se3.log(T[:1] @ se3.inverse(before[:1])), step.eps[1:, :6]])
         shared, aux = state.shared + step.eps[:, 6:], state.aux + step.aux
-        shared[0], aux[0] = u.shared_mean + first[6 : u.width], u.aux_mean + first[u.width :]
+        # zeta gives the first frame exactly; eps is its first order.
+        T[0], shared[0], aux[0] = self.first_frame(zeta)
+        eps = np.concatenate([se3.log(T[:1] @ se3.inverse(before[:1])), step.eps[1:, :6]])
         k = self.observations.first_frame
         s = se3.apply(before[k], state.positions_m)
         turned = np.cross(eps[k, 3:], s) + (before[k, :3, :3] @ d[..., None])[..., 0]

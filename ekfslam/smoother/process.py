@@ -18,10 +18,11 @@ from ekfslam.smoother.unknowns import State, Unknowns, split
 
 
 class ProcessFactors:
-    """Factors of a log that do not concern landmarks."""
+    """Factors of a log that do not concern landmarks; ``has_start`` says that its first inputs start blocks."""
 
-    def __init__(self, log: Log, model: Model, unknowns: Unknowns) -> None:
+    def __init__(self, log: Log, model: Model, unknowns: Unknowns, has_start: bool = True) -> None:
         self._log, self._model, self._unknowns = log, model, unknowns
+        self._started = model.process.started if has_start else ()
         self._own = model.process.columns
 
     def frozen(self) -> list[Factor]:
@@ -128,7 +129,7 @@ class ProcessFactors:
             if not (moves[1] > 0).all():
                 raise IllPosedError(f"{block.name} without noise: it has no weight before frames", [1])
             phi, weight = (np.broadcast_to(part, (log.frames - 1, block.size)) for part in (moves[0], 1.0 / moves[1]))
-            starts = (np.arange(log.frames - 1) == 0)[:, None] & (block.name in self._model.process.started)
+            starts = (np.arange(log.frames - 1) == 0)[:, None] & (block.name in self._started)
             parts.append((phi, np.where(starts, 0.0, weight)))
         phi, weight = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
         return phi, weight

@@ -19,7 +19,9 @@ from ekfslam.filters.variants import is_frozen_exactly
 from ekfslam.models.model import Model
 from ekfslam.smoother.optimise import MOST_ITERATIONS, maximise
 from ekfslam.smoother.problem import BatchProblem, State
+from ekfslam.smoother.sparse.dense import DenseInformation
 from ekfslam.smoother.sparse.information import JointInformation
+from ekfslam.smoother.unknowns import Unknowns
 
 # Observations have passed the gate: no kernel. The mean must be the linearisation point, so the tolerance is tight.
 _MAXIMUM = PosteriorConfig(kernel="none", tolerance=1e-12)
@@ -74,7 +76,8 @@ class MapRevival:
             # The blocks' mean is the filter's already, but for rounding.
             positions = log.first_position_m[landmarks] + information.d[landmarks]
             none = np.empty(0, dtype=np.int64)
-            return Marginal({}, none, np.empty(0), positions, self.covariance(problem, information, landmarks))
+            P = filter_covariance(self._model, problem.unknowns, information, log.frames - 1, landmarks)
+            return Marginal({}, none, np.empty(0), positions, P)
         start = problem.filtered_state(positions_m)
         if self._last is not None:
             start = continued(self._last, start, log)
@@ -84,25 +87,27 @@ class MapRevival:
             problem.unknowns.last_values(state),
             *problem.unknowns.last_coordinates(state),
             state.positions_m[landmarks],
-            self.covariance(problem, information, landmarks),
+            filter_covariance(self._model, problem.unknowns, information, log.frames - 1, landmarks),
         )
 
-    def covariance(self, problem: BatchProblem, information: JointInformation, landmarks: IntArray) -> Array:
-        """Return the covariance (body+3n, body+3n) in the columns of the filter."""
-        last, u = problem.log.frames - 1, problem.unknowns
-        has_clone = self._model.has_clone and last > 0
-        frames = [last, last - 1] if has_clone else [last]
-        P = information.covariance(frames=frames, aux=[last], drive=[0], landmarks=landmarks)
-        # Of the frame before only what is cloned counts.
-        before, of_clones = (u.cloned, u.clone_columns) if has_clone else (np.empty(0, dtype=np.int64),) * 2
-        rest = np.arange(u.width * len(frames), len(P))
-        kept = np.concatenate([np.arange(u.width), u.width + before, rest])
-        columns = np.concatenate([u.frame_columns, of_clones, u.aux_columns, u.drive_columns])
-        body = self._model.layout.body
-        order = np.concatenate([columns, body + np.arange(3 * len(landmarks))])
-        wide = np.zeros((body + 3 * len(landmarks),) * 2)
-        wide[np.ix_(order, order)] = P[np.ix_(kept, kept)]
-        return wide
+
+def filter_covariance(
+    model: Model, u: Unknowns, information: JointInformation | DenseInformation, last: int, landmarks: IntArray
+) -> Array:
+    """Return the covariance (body+3n, body+3n) of the last frame and of landmarks (n,) in the columns of the filter."""
+    has_clone = model.has_clone and last > 0
+    frames = [last, last - 1] if has_clone else [last]
+    P = information.covariance(frames=frames, aux=[last], drive=[0], landmarks=landmarks)
+    # Of the frame before only what is cloned counts.
+    before, of_clones = (u.cloned, u.clone_columns) if has_clone else (np.empty(0, dtype=np.int64),) * 2
+    rest = np.arange(u.width * len(frames), len(P))
+    kept = np.concatenate([np.arange(u.width), u.width + before, rest])
+    columns = np.concatenate([u.frame_columns, of_clones, u.aux_columns, u.drive_columns])
+    body = model.layout.body
+    order = np.concatenate([columns, body + np.arange(3 * len(landmarks))])
+    wide = np.zeros((body + 3 * len(landmarks),) * 2)
+    wide[np.ix_(order, order)] = P[np.ix_(kept, kept)]
+    return wide
 
 
 def continued(last: State, state: State, log: Log) -> State:

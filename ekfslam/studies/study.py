@@ -41,6 +41,7 @@ from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.runner import versions
 from ekfslam.shown import Card, Shown, count
+from ekfslam.smoother.fixed_lag import FixedLag
 from ekfslam.stored import COUNTS, FLAGS, NUMBERS_OR_NONE, Check, Item, Shape, fixed_length
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME
 from ekfslam.studies.journal import Journal, Key, Record, flat, run_missing
@@ -227,7 +228,8 @@ def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str,
     record = _blank(frames)
     joint_frames = _joint_frames(frames)
 
-    ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, noise), config, sequence.initial_T_world_imu)
+    rig, start = Rig(sequence.camera, sequence.T_cam_imu, noise), sequence.initial_T_world_imu
+    ekf = JointEKF(rig, config, start, window=FixedLag)
     known = np.zeros(frames, dtype=bool)
     stopped = False
     try:

@@ -34,6 +34,7 @@ from ekfslam.models.sensors.stereo import Rig
 from ekfslam.names import printable
 from ekfslam.progress import progress
 from ekfslam.resolve import found_attributes, noise_of, noise_of_velocities, settings_of
+from ekfslam.smoother.fixed_lag import FixedLag
 
 # Share of wrong matches, and the window in which they fall.
 OUTLIER_SHARE = 0.02
@@ -429,7 +430,7 @@ def filter_reports(sequence: Sequence, noise: Noise, config: Config) -> list[Fra
     """Return the reports of a filter that assumes a noise and has the state blocks of a configuration."""
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise)
     start, blocks = sequence.initial_T_world_imu, optional_blocks(config.blocks)
-    ekf = JointEKF(rig, config.filter, start, calibration=config.calibration, blocks=blocks)
+    ekf = JointEKF(rig, config.filter, start, calibration=config.calibration, blocks=blocks, window=FixedLag)
     return [frame.report for frame in run_filter(ekf, sequence)]
 
 

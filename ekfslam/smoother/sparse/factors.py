@@ -13,7 +13,7 @@ To add a new kind of factor, build it from the state at which the system is line
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -190,10 +190,13 @@ class LinearSystem:
         ends = np.cumsum([self.counts[group] * self.sizes[group] for group in GROUPS]).tolist()
         return dict(zip(GROUPS, [0, *ends[:-1]], strict=True))
 
-    def rows(self) -> tuple[sp.csr_array, Array]:
-        """Return J (n, N) over all unknowns, the first frame as zeta, and r (n,): ``J^T J`` is their information."""
+    def rows(self, factors: Sequence[Factor] | None = None) -> tuple[sp.csr_array, Array]:
+        """Return J (n, N) over all unknowns, and r (n,), of some factors: ``J^T J`` is their information.
+
+        By default they are all, with the first frame as zeta.
+        """
         start, row, column, value, count, right = self.start, [], [], [], 0, []
-        for factor in self.over_zeta():
+        for factor in self.over_zeta() if factors is None else factors:
             first = count + np.arange(factor.r.size).reshape(factor.r.shape)
             for term in factor.terms:
                 size = term.J.shape[-1]
