@@ -256,3 +256,13 @@ def test_truth_noise_on_the_command_line(tmp_path, capsys):
     assert "unknown key truth.speed" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["info", "builtin:loop?frames=12", "--truth-noise", "yaw_deg"])
+
+
+def test_axes_of_the_position_are_those_of_world():
+    sequence = synthetic_sequence(frames=80, landmarks=40)
+    result, truth = synthetic_result(sequence), sequence.truth
+    turned = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2]))
+    T = turned @ truth.T_world_imu
+    moved = dataclasses.replace(result, T_world_imu=turned @ result.T_world_imu)
+    found = pose_nees_by_axis(moved, dataclasses.replace(truth, T_world_imu=T))
+    np.testing.assert_allclose(found[1:], pose_nees_by_axis(result, truth)[1:][:, [1, 0, 2, 3, 4, 5]], rtol=1e-6)
