@@ -243,14 +243,15 @@ class CalibrationConfig:
         rotation_deg: Rotation of the camera against the IMU, each axis. By default 0.5 in the automatic model, else 0.
         lever_arm_m: Position of the IMU in the camera frame, each axis.
         baseline: Length of the stereo baseline, as a share of it.
-        disparity_px: Offset of all disparities.
+        disparity_px: Offset of all disparities. By default in the automatic model, the standard deviation of the right
+            camera's yaw that the front end states, else 0.
         time_s: Delay of the exposure of images after their stamps.
     """
 
     rotation_deg: float | None = field(default=None, metadata=_FINITE)
     lever_arm_m: float = field(default=0.0, metadata=_FINITE)
     baseline: float = field(default=0.0, metadata=_FINITE)
-    disparity_px: float = field(default=0.0, metadata=_FINITE)
+    disparity_px: float | None = field(default=None, metadata=_FINITE)
     time_s: float = field(default=0.0, metadata=_FINITE)
 
 

@@ -34,7 +34,7 @@ from ekfslam.config import LEAST_PX, BlockSetting, Config, Mode
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.noise import Noise
-from ekfslam.data.sequence import MEASURED_KINDS, WITHOUT_TRACKS, WITHOUT_VELOCITIES, Sequence
+from ekfslam.data.sequence import MEASURED_KINDS, WITHOUT_TRACKS, WITHOUT_VELOCITIES, YAW_STD_PX, Sequence
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
@@ -108,7 +108,7 @@ class Problem:
             "noise": ("sigma_px", "drift", "track_scale"),
             "filter": ("retire", "retire_after", "dormant", "covariance_form"),
             "hygiene": ("min_disparity_sigma",),
-            "calibration": ("rotation_deg",),
+            "calibration": ("rotation_deg", "disparity_px"),
         }
         tables = {name: {key: getattr(getattr(config, name), key) for key in keys} for name, keys in chosen.items()}
         tables |= {f"blocks.{name}": dict(settings) for name, settings in config.blocks.items()}
@@ -188,16 +188,17 @@ def settings_of(sequence: Sequence, config: Config) -> Config:
     Explicit settings take precedence. `noise_of` gives the noise; `resolve` adds track scale and covariance form.
     """
     config = _with_retirement(sequence, config)
-    walks = noise_of(sequence, config).track_error is not None
-    if not (is_automatic(sequence, config) and (walks or sequence.has_checked_tracks)):
+    if not (is_automatic(sequence, config) and noise_of(sequence, config).track_error is not None):
         return config
-    if walks and config.hygiene.min_disparity_sigma is None:
+    if config.hygiene.min_disparity_sigma is None:
         config = config.with_overrides({"hygiene": {"min_disparity_sigma": MIN_DISPARITY_SIGMA}})
     if not config.noise.shared:
         return config
     # Without velocities nothing observes the camera's rotation against the IMU.
     if config.calibration.rotation_deg is None and sequence.has_velocities:
         config = config.with_overrides({"calibration": {"rotation_deg": CAMERA_ROTATION_DEG}})
+    if config.calibration.disparity_px is None and (yaw_px := sequence.attributes.get(YAW_STD_PX)) is not None:
+        config = config.with_overrides({"calibration": {"disparity_px": float(yaw_px)}})
     found = noise_of_velocities(sequence) if sequence.has_velocities else None
     tables = shared_errors(found, sequence.has_checked_tracks)
     shared = {name: {**table, **config.blocks.get(name, {})} for name, table in tables.items()}

@@ -20,11 +20,12 @@ from ekfslam.frontend.track import track
 from ekfslam.geometry import lens, se3
 from ekfslam.geometry.camera import StereoCamera, project
 from ekfslam.geometry.stereo_motion import agrees, align, sampled_motion
+from ekfslam.resolve import resolve
 from ekfslam.runner import run
 
 cv2 = pytest.importorskip("cv2")
 
-from support.rendered import BASELINE_M, SIZE, calibrated, drive, recording, write_kitti  # noqa: E402
+from support.rendered import BASELINE_M, SIZE, calibrated, drive, first_hits, recording, write_kitti  # noqa: E402
 
 CAMERA = StereoCamera(300.0, 300.0, 199.5, 99.5, BASELINE_M)
 ROTATION_RAD = np.deg2rad([0.10, -0.08, 0.06])
@@ -75,6 +76,52 @@ def test_from_images_to_poses_without_velocities(tracked):
     assert mapping["ate_m"] < 0.15
     with pytest.raises(NoVelocitiesError, match="room: no measured velocities"):
         run(sequence, "dead-reckoning")
+
+
+def errors_of_tracks(sequence):
+    """Errors (n, 3) in u, v and disparity of each track with four observations, and ways over depths (n - 1,).
+
+    The true point is the first one on the ray of the first observation.
+    """
+    observations, camera, found = sequence.observations, sequence.camera, []
+    T_cam_world = sequence.T_cam_imu @ se3.inverse(sequence.truth.T_world_imu)
+    T_world_cam = se3.inverse(T_cam_world)
+    for landmark in observations.ids:
+        which = observations.landmark == landmark
+        frames, pixels = observations.frame[which], observations.pixels_px[which]
+        if len(frames) < 4 or np.ptp(frames) >= len(frames):
+            continue
+        u, v = pixels[0, :2]
+        ray = T_world_cam[frames[0], :3, :3] @ [(u - camera.cu_px) / camera.fu_px, (v - camera.cv_px) / camera.fv_px, 1]
+        origin = T_world_cam[frames[0], :3, 3]
+        q = se3.apply(T_cam_world[frames], origin + first_hits(origin, ray[None])[0] * ray)
+        off = pixels - project(camera, q)
+        way = np.linalg.norm(np.diff(T_world_cam[frames, :3, 3], axis=0), axis=1)
+        found.append((np.column_stack([off[:, 0], off[:, 1], off[:, 0] - off[:, 2]]), way / q[1:, 2]))
+    return found
+
+
+@pytest.mark.slow
+def test_errors_of_tracks_are_as_large_as_stated_near_and_far(tracked):
+    """Spread by medians of the change over three frames, in stated standard deviations.
+
+    Medians, because few tracks follow an edge of the pillar.
+    """
+    sequence, _ = tracked
+    error = resolve(sequence).model.track_error
+    far, near, spread_px = [], [], ([], [])
+    for e, parallax in errors_of_tracks(sequence):
+        variance = error.step_variance(np.zeros((len(parallax), 3)), parallax)
+        for k in range(len(parallax) - 2):
+            is_near = parallax[k : k + 3].mean() > 0.06
+            change = e[k + 3] - e[k]
+            (near if is_near else far).append(change / np.sqrt(variance[k : k + 3].sum(axis=0)))
+            spread_px[int(is_near)].append(change)
+    for stated in (far, near):
+        assert len(stated) > 100
+        spread = 1.4826 * np.median(np.abs(stated), axis=0)
+        assert (spread > 0.15).all() and (spread < 1.3).all(), spread
+    assert np.median(np.abs(spread_px[1])) > 2.0 * np.median(np.abs(spread_px[0]))
 
 
 @pytest.mark.slow

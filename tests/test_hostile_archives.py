@@ -284,6 +284,7 @@ def test_what_leads_out_of_the_file_or_round_in_it_is_refused(whole, tmp_path, k
         ("noise_twist_std", np.full(6, np.nan), "twist_std"),
         ("noise_pixel_std_px", np.ones(3), "pixel_std_px"),
         ("noise_track_flow_px", -7.0, "track_flow_px"),
+        ("noise_track_parallax", 0.0, "track_parallax"),
         ("format_version", "four", "format_version of runs/full is no whole number"),
     ],
 )

@@ -46,6 +46,7 @@ TRACKS = {
     "track_first_px": np.array([0.3, 0.4, 0.8]),
     "track_walk_px": np.array([0.2, 0.25, 0.3]),
     "track_flow_px": 40.0,
+    "track_parallax": 0.05,
 }
 ERROR = TrackError(*TRACKS.values())
 
@@ -223,7 +224,7 @@ class NaiveTwistFilter:
         self.m, self.ids, self.first, self.last, self.pixels, self.k = np.empty((0, 3)), [], {}, {}, {}, 0
 
     def predict(self, measured, tau):
-        n = 3 * len(self.m)
+        n, self.way = 3 * len(self.m), np.linalg.norm(measured[:3]) * tau
         if self.u is None:
             self.u = measured.copy()
             assert not self.P[12:18].any()
@@ -274,7 +275,11 @@ class NaiveTwistFilter:
                 residual[-1] = residual[-1] - (self.pixels[i] - before)
                 row[:, 6:12] -= by_pose
                 row[:, at : at + 3] -= by_landmark
-                variance.append(tracks.track_walk_px**2 * grown(z - self.pixels[i], tracks.track_flow_px))
+                depth = (self.sequence.T_cam_imu @ self.T @ homogeneous(m))[2]
+                growth = (
+                    grown(z - self.pixels[i], tracks.track_flow_px) + (self.way / depth / tracks.track_parallax) ** 2
+                )
+                variance.append(tracks.track_walk_px**2 * growth)
             else:
                 variance.append(tracks.track_first_px**2)
                 for _ in range(self.k - self.first[i]):
@@ -482,9 +487,11 @@ def test_variances_of_tracks_are_those_of_errors_that_walk():
     for age in range(12):
         np.testing.assert_allclose(error.absolute_variance(np.array([age]))[0], e.var(axis=0), rtol=0.05)
         e = e + error.walk_std * rng.normal(size=e.shape)
-    still, moving = error.step_variance(np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0]]))
+    motion = np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    still, moving, near = error.step_variance(motion, np.array([0.0, 0.0, 0.1]))
     np.testing.assert_allclose(still, error.walk_std**2)
     np.testing.assert_allclose(moving, np.array([2.0, 1.35, 1.35]) * error.walk_std**2)
+    np.testing.assert_allclose(near, 5.0 * error.walk_std**2)
 
 
 @pytest.mark.slow
@@ -568,7 +575,7 @@ def test_the_posterior_of_what_walks_is_the_filter_as_filtered(variant):
 
 
 def test_observations_are_worth_what_is_known_of_the_error_of_their_track():
-    world = with_noise(with_gaps(small_world(frames=15)), **TRACKS)
+    world = with_noise(with_gaps(small_world(frames=15)), **{**TRACKS, "track_parallax": np.inf})
     log = run(world, "full", Config(filter=dataclasses.replace(STILL, retire="never"))).log
     first, last, kinds = {}, {}, [0, 0, 0]
     for i, (k, j) in enumerate(zip(log.frame.tolist(), log.landmark.tolist(), strict=True)):

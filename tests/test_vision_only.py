@@ -12,7 +12,7 @@ import ekfslam
 from ekfslam.config import Config
 from ekfslam.data.interval import Interval
 from ekfslam.data.noise import Noise
-from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations
+from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, YAW_STD_PX, Observations
 from ekfslam.errors import NoVelocitiesError
 from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.filters.joint import JointEKF
@@ -173,13 +173,23 @@ def test_dead_reckoning_is_left_out_of_a_comparison(tmp_path):
 @pytest.mark.slow
 def test_without_stated_noise_tracks_decide_what_is_believed():
     sequence = dataclasses.replace(ekfslam.open_sequence("builtin:city?frames=20"), noise=None)
-    walking = resolve(without_velocities(sequence))
+    walking = resolve(without_velocities(sequence), Config().with_overrides({"noise": {"track_scale": 1.0}}))
     names = set(walking.model.layout)
     assert {"twist", "vision_drift", "camera_jitter"} <= names
     assert not {"twist_bias", "up", "calibration"} & names
     checked = without_velocities(dataclasses.replace(sequence, attributes={**sequence.attributes, **CHECKED_TRACKS}))
     problem = resolve(checked)
-    assert problem.model.track_error is None and problem.model.noise.pixel_std_px[0] == 0.3
-    assert "camera_jitter" in problem.model.layout and "vision_drift" not in problem.model.layout
+    assert problem.model.track_error.parallax < 1 and problem.config.noise.track_scale is None
+    assert not {"camera_jitter", "vision_drift", "calibration"} & set(problem.model.layout)
     given = resolve(checked, Config().with_overrides({"noise": {"sigma_px": 0.6}}))
-    assert given.model.noise.pixel_std_px[0] == 0.6
+    assert given.model.track_error is None and given.model.noise.pixel_std_px[0] == 0.6
+
+
+def test_the_disparity_offset_is_as_uncertain_as_the_yaw_that_the_front_end_states():
+    sequence = dataclasses.replace(ekfslam.open_sequence("builtin:city?frames=5"), noise=None)
+    attributes = {**sequence.attributes, **CHECKED_TRACKS, YAW_STD_PX: 0.17}
+    checked = without_velocities(dataclasses.replace(sequence, attributes=attributes))
+    free = resolve(checked).model.layout.block("calibration")
+    assert free.labels == ("disparity offset",) and free.std[7] == 0.17
+    given = resolve(checked, Config().with_overrides({"calibration": {"disparity_px": 0.0}}))
+    assert "calibration" not in given.model.layout

@@ -57,26 +57,33 @@ class TrackError:
     """Error of a track in the image, eq. (10): it starts with the track and then walks.
 
     An observation is ``z(k) = h(k) + e(k)`` with ``e ~ N(0, first^2)`` at landmark initialisation. While the track goes
-    on, ``e(k) = e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2))``: features are followed worse the further they move.
+    on, ``e(k) = e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2 + (way / depth / parallax)^2))``: features are followed
+    worse the further they move, and the more their surroundings are deformed.
 
     Args:
         first_std: (3,) standard deviation at landmark initialisation, in the sensor's rows, px.
         walk_std: (3,) of the innovation from one frame to the next, px.
         flow_px: Motion in the image at which the variance of the walk has doubled; infinite: it never grows.
+        parallax: Way of the camera, as a share of the depth, at which the variance of the walk has doubled.
     """
 
     first_std: Array
     walk_std: Array
     flow_px: float
+    parallax: float = np.inf
 
-    def step_variance(self, motion_px: Array) -> Array:
-        """Return the variances (n, 3) of differences from the frame before, if rows moved by ``motion_px`` (n, 3).
+    def step_variance(self, motion_px: Array, parallax: Array) -> Array:
+        """Return the variances (n, 3) of differences from the frame before.
 
         The error of a row grows with its own motion, and with the share `ACROSS` of the others' motion.
+
+        Args:
+            motion_px: (n, 3) motion of the rows.
+            parallax: (n,) way of the camera over the depth.
         """
         square = np.asarray(motion_px) ** 2
         flow = (1.0 - ACROSS) * square + ACROSS * square.sum(axis=1, keepdims=True)
-        return self.walk_std**2 * (1.0 + flow / self.flow_px**2)
+        return self.walk_std**2 * (1.0 + flow / self.flow_px**2 + (parallax[:, None] / self.parallax) ** 2)
 
     def absolute_variance(self, age: IntArray) -> Array:
         """Return the variances (n, 3) of observations without a predecessor in the frame before, by age (n,) in frames.
@@ -104,6 +111,7 @@ class Noise:
             pixel noise is white.
         track_walk_px: (3,) change of that error from frame to frame (u, v, disparity).
         track_flow_px: Motion in the image at which the variance of the walk has doubled.
+        track_parallax: Way of the camera over the depth at which the variance of the walk has doubled.
         gap_std: (6,) further error of velocities that were interpolated across a gap.
     """
 
@@ -116,6 +124,7 @@ class Noise:
     track_first_px: Array | None = None
     track_walk_px: Array | None = None
     track_flow_px: float = np.inf
+    track_parallax: float = np.inf
     gap_std: Array = field(default_factory=lambda: np.zeros(6))
 
     @property
@@ -128,7 +137,9 @@ class Noise:
         """The part that belongs to tracks; None where pixel noise is white."""
         if self.track_first_px is None or self.track_walk_px is None:
             return None
-        return TrackError(np.asarray(self.track_first_px), np.asarray(self.track_walk_px), self.track_flow_px)
+        return TrackError(
+            np.asarray(self.track_first_px), np.asarray(self.track_walk_px), self.track_flow_px, self.track_parallax
+        )
 
     @property
     def velocity_std(self) -> Array:
@@ -163,5 +174,6 @@ def validate_noise(noise: Noise) -> None:
             raise DataError("standard deviations must be positive", field="noise.first_tilt")
     if (noise.track_first_px is None) != (noise.track_walk_px is None):
         raise DataError("track_first_px and track_walk_px belong together", field="noise.track_walk_px")
-    if not noise.track_flow_px > 0:
-        raise DataError(f"must be positive, found {noise.track_flow_px}", field="noise.track_flow_px")
+    for name in ("track_flow_px", "track_parallax"):
+        if not getattr(noise, name) > 0:
+            raise DataError(f"must be positive, found {getattr(noise, name)}", field=f"noise.{name}")

@@ -41,8 +41,10 @@ from ekfslam.stored import stored
 
 # Attributes of a recording that has no tracks by its nature; in any other, no observation at all is a defect.
 WITHOUT_TRACKS = {"tracks": "none"}
-# Attributes of a recording whose tracks are compared with their first sight in every frame: their errors do not walk.
+# Attributes of a recording whose tracks are compared with their first sight in every frame: those of `frontend`.
 CHECKED_TRACKS = {"tracks": "checked"}
+# Attribute of such a recording: standard deviation of the yaw of the right camera that the front end took out.
+YAW_STD_PX = "right_camera_yaw_std_px"
 # Attributes of a recording whose velocities were not measured. Any it has are those of its own odometry.
 WITHOUT_VELOCITIES = {"velocities": "none"}
 # Velocities that were measured, if only one kind was: the others are those of stereo odometry.
@@ -269,7 +271,7 @@ class Sequence(Shown):
 
     @property
     def has_checked_tracks(self) -> bool:
-        """Whether errors of its tracks do not walk, see `ekfslam.frontend`."""
+        """Whether its tracks are compared with their first sight, see `ekfslam.frontend`."""
         return self.attributes.get("tracks") == CHECKED_TRACKS["tracks"]
 
     @property

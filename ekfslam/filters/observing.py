@@ -52,5 +52,6 @@ def observe(e: Estimate, at: Mean, slot: IntArray, measured: Array) -> tuple[See
         residual[follows] -= rows_before - before.z
         H_x[follows] -= before.H_x
         H_m[follows] -= before.H_m
-        variance[follows] = error.step_variance(measured[follows] - rows_before)
+        parallax = e.motion.way_m / np.maximum(seen.q[follows, 2], e.config.min_depth_m)
+        variance[follows] = error.step_variance(measured[follows] - rows_before, parallax)
     return seen, Rows(slot, H_x, H_m, residual, variance)

@@ -221,7 +221,9 @@ def tracked(world, error, seed=1, movers=(), speed=0.3):
         else:
             k_last, e, seen_last = last[j]
             u, v, right, _ = seen - seen_last
-            growth = np.sqrt(grown(np.array([u, v, u - right]), error.flow_px))
+            depth = world.camera.fu_px * world.camera.baseline_m / (seen[0] - seen[2])
+            way = np.linalg.norm(truth.T_world_imu[k, :3, 3] - truth.T_world_imu[k - 1, :3, 3])
+            growth = np.sqrt(grown(np.array([u, v, u - right]), error.flow_px) + (way / depth / error.parallax) ** 2)
             for _ in range(k_last, k):
                 e = e + error.walk_std * growth * rng.normal(size=3)
         last[j] = k, e, seen

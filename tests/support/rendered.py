@@ -65,10 +65,8 @@ def textures(rng: np.random.Generator) -> list[np.ndarray]:
     return levels
 
 
-def render(seen: Camera, T_world_cam: np.ndarray, patterns: list[np.ndarray], focal_px: float) -> np.ndarray:
-    """What a camera sees (height, width), grey levels without noise."""
-    rays = seen.rays.reshape(-1, 3) @ T_world_cam[:3, :3].T
-    origin = T_world_cam[:3, 3]
+def first_hits(origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depths (n,) along rays (n, 3) in world of what they hit first, and its face (n,): a plane, or 10 and 11."""
     depth, face = np.full(len(rays), np.inf), np.zeros(len(rays), dtype=int)
     planes = [(np.array(n), d) for n, d in _PLANES]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -82,9 +80,17 @@ def render(seen: Camera, T_world_cam: np.ndarray, patterns: list[np.ndarray], fo
                 across = origin[1 - axis] + t * rays[:, 1 - axis]
                 nearer = (t > 0.05) & (t < depth) & (across > _PILLAR[1 - axis][0]) & (across < _PILLAR[1 - axis][1])
                 depth[nearer], face[nearer] = t[nearer], 10 + axis
+    return depth, face
+
+
+def render(seen: Camera, T_world_cam: np.ndarray, patterns: list[np.ndarray], focal_px: float) -> np.ndarray:
+    """What a camera sees (height, width), grey levels without noise."""
+    rays = seen.rays.reshape(-1, 3) @ T_world_cam[:3, :3].T
+    origin = T_world_cam[:3, 3]
+    depth, face = first_hits(origin, rays)
     point = origin + depth[:, None] * rays
     normal_axis = np.where(face == 10, 0, np.where(face == 11, 1, 0))
-    for i, (n, _) in enumerate(planes):
+    for i, (n, _) in enumerate(_PLANES):
         normal_axis[face == i] = int(np.argmax(n))
     s = np.where(normal_axis == 0, point[:, 1], point[:, 0]) + 7.3 * face
     t = np.where(normal_axis == 2, point[:, 1], point[:, 2]) + 3.1 * face

@@ -32,7 +32,7 @@ _ROTATION = slice(3, 6)
 def prior_std(config: CalibrationConfig) -> Array:
     """Return prior standard deviations (9,) of the parameters, in their `UNITS`; 0 takes one as given."""
     camera = np.repeat([config.lever_arm_m, np.deg2rad(config.rotation_deg or 0.0)], 3)
-    return np.array([*camera, config.baseline, config.disparity_px, config.time_s])
+    return np.array([*camera, config.baseline, config.disparity_px or 0.0, config.time_s])
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,8 @@ class CameraJitter(GaussMarkov):
 
     @classmethod
     def automatic(cls, white_std: Array | None, is_clean: bool, has_checked_tracks: bool) -> dict[str, float] | None:
-        return {}
+        """Return the defaults; None without velocities, if tracks are checked: no unit jitters against the camera."""
+        return None if has_checked_tracks and white_std is None else {}
 
     def camera_share(self, way_m: Array, is_difference: BoolArray) -> Array | None:
         return np.ones(np.shape(is_difference))
