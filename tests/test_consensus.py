@@ -24,6 +24,7 @@ from ekfslam.models.blocks.base import Layout
 from ekfslam.models.blocks.pose import Pose
 from ekfslam.models.process import INERTIAL_BLOCKS
 from ekfslam.models.process.inertial import inertial
+from ekfslam.models.sensors.stereo import Rig
 from ekfslam.resolve import resolve
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import smooth
@@ -82,6 +83,22 @@ def test_gross_landmarks_alone_do_not_open_a_frame(seed):
     world = builtin(f"city?frames=40&max_tracks=5&outlier_fraction=0.06&seed={seed}")
     _, reports = filtered(world)
     assert sum((report.reason == 0).sum() for report in reports) > 5
+    assert all(report.doubt == 1.0 for report in reports)
+
+
+def test_traffic_that_most_landmarks_follow_does_not_reject_the_velocity():
+    """All landmarks of a frame move along by the same 2 m, while the velocities go on as before."""
+    world = builtin("loop?frames=16&landmarks=30&sigma_v_m_s=0.05&sigma_w_rad_s=0.005")
+    T_cam_imu, camera, pixels = world.T_cam_imu, world.camera, world.observations.pixels_px.copy()
+    of_frame = world.observations.frame == WILD
+    rig = Rig(camera, T_cam_imu, world.noise)
+    q = rig.invert(rig.rows(pixels[of_frame])) + T_cam_imu[:3, :3] @ np.array([2.0, 0.0, 0.0])
+    u = camera.fu_px * q[:, 0] / q[:, 2] + camera.cu_px
+    v = camera.fv_px * q[:, 1] / q[:, 2] + camera.cv_px
+    pixels[of_frame] = np.column_stack([u, v, u - camera.fu_px * camera.baseline_m / q[:, 2], v])
+    observations = dataclasses.replace(world.observations, pixels_px=pixels)
+    _, reports = filtered(dataclasses.replace(world, observations=observations))
+    assert (reports[WILD].reason == 0).sum() > 5
     assert all(report.doubt == 1.0 for report in reports)
 
 

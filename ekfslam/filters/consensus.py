@@ -11,6 +11,9 @@ small samples and by the others of A (MSAC: Torr and Zisserman, "MLESAC", CVIU 2
 so each measurement that is rejected, a landmark or the inputs, costs as much as its gate. If the inputs are doubted, or
 the prior is wide, the rows are linearised again at each solution, because the prediction may be far off.
 
+What contradicts the inputs of one interval may be traffic: then the inputs go on as before, and the landmarks jump. So
+inputs are rejected only if the corrected motion is nearer to that of the interval before than they are, by Q.
+
 *Trigger*, from the plain correction: more than a third of the landmarks are rejected, or the shared innovation c with
 covariance C (`ekfslam.filters.innovations`) explains more than gate_6 by an error e of the inputs of covariance
 ``Q_e = (doubt^2 - 1) Q``: ``c^T (C + Q_e^-1)^-1 c``.
@@ -34,6 +37,7 @@ from ekfslam.filters.gaussian import Gaussian, Rows, Solution
 from ekfslam.filters.innovations import innovations_of
 from ekfslam.filters.observing import observe
 from ekfslam.filters.retraction import parts
+from ekfslam.geometry import se3
 from ekfslam.models.sensors.base import ACCEPTED, GATE, MOVING
 
 # Factor of the noise of rejected inputs: errors up to some 100 standard deviations leave the landmarks in charge.
@@ -76,23 +80,33 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
         return found
     if not (found.is_wide or _is_suspect(e, found, gate)):
         return found
-    candidates = np.flatnonzero(np.isin(found.verdict, (ACCEPTED, GATE)))
     rounds = _ROUNDS if found.is_wide else 1
-    settled = _settled(e, e.gaussian, frame, slot[candidates], measured[candidates], gate, rounds)
-    cost = found.done.nis + gate * np.isin(found.verdict, (GATE, MOVING)).sum()
-    if settled is not None:
-        cost = min(cost, settled.cost + gate * (len(slot) - len(candidates)))
-        if settled.is_majority:
-            found = _correction(e, found, settled, candidates, measured)
+
+    def settled(gaussian: Gaussian, verdicts: tuple[int, ...], rounds: int) -> tuple[IntArray, _Settled | None]:
+        some = np.flatnonzero(np.isin(found.verdict, verdicts))
+        return some, _settled(e, gaussian, frame, slot[some], measured[some], gate, rounds)
+
+    some, trusted = settled(e.gaussian, (ACCEPTED, GATE), rounds)
+    if trusted is not None and trusted.is_majority:
+        found = _correction(e, found, trusted, some, measured)
     if e.model.process.estimates_velocity or not _is_suspect(e, found, gate):
         return found
-    candidates = np.flatnonzero(np.isin(found.verdict, (ACCEPTED, GATE, MOVING)))
+    jump = _jump(e)
+    if 4.0 * jump @ jump < INPUT_GATE:
+        return found
+    # Tracks that seem to move may be made to by the inputs: both hypotheses are judged by all.
+    if (found.verdict == MOVING).any():
+        some, trusted = settled(e.gaussian, (ACCEPTED, GATE, MOVING), rounds)
     wide = doubted(e, DOUBT)
-    settled = _settled(e, wide, frame, slot[candidates], measured[candidates], gate)
-    if settled is None or not settled.is_majority or settled.cost + INPUT_GATE >= cost:
+    some, doubtful = settled(wide, (ACCEPTED, GATE, MOVING), _ROUNDS)
+    cost = gate * len(some) if trusted is None else trusted.cost
+    if doubtful is None or not doubtful.is_majority or doubtful.cost + INPUT_GATE >= cost:
+        return found
+    error = _in_noise(e, doubtful.solution.done.correction[:6])
+    if error @ jump < 0.5 * error @ error:
         return found
     e.table.evidence = evidence
-    return replace(_correction(e, found, settled, candidates, measured), gaussian=wide, doubt=DOUBT)
+    return replace(_correction(e, found, doubtful, some, measured), gaussian=wide, doubt=DOUBT)
 
 
 def doubted(e: Estimate, doubt: float) -> Gaussian:
@@ -102,13 +116,34 @@ def doubted(e: Estimate, doubt: float) -> Gaussian:
     return gaussian
 
 
+def _jump(e: Estimate) -> Array:
+    """Return the motion (6,) from the predicted pose to that of a rig that moves as in the interval before.
+
+    It is in units of the noise of the inputs, ``Q^-1/2``; NaN if there was no interval before.
+    """
+    if e.motion.last is None:
+        return np.full(6, np.nan)
+    moved, tau_s = e.motion.last
+    as_before = se3.exp(e.motion.tau_s / tau_s * se3.log(moved)) @ e.motion.T_departed
+    return _in_noise(e, se3.log(as_before @ se3.inverse(e.motion.T_predicted)))
+
+
+def _in_noise(e: Estimate, xi: Array) -> Array:
+    """Return a motion (6,) in units of the noise of the inputs; directions without noise count as nothing."""
+    variances, axes = np.linalg.eigh(e.motion.Q[:6, :6])
+    noisy = variances > 1e-12 * variances[-1]
+    return np.where(noisy, axes.T @ xi / np.sqrt(np.where(noisy, variances, 1.0)), 0.0)
+
+
 def _is_suspect(e: Estimate, found: Correction, gate: float) -> bool:
     """Return whether the trigger of the module holds."""
-    out = int(np.isin(found.verdict, (GATE, MOVING)).sum())
     c, C = found.innovations.score, found.innovations.information
     Q = (DOUBT**2 - 1.0) * e.motion.Q[:6, :6]
     shared = c @ Q @ np.linalg.solve(np.eye(6) + C @ Q, c)
-    return bool(shared > INPUT_GATE or (out > _SHARE * len(found.verdict) and shared + gate * out > INPUT_GATE))
+    return bool(
+        shared > INPUT_GATE
+        or (found.outside > _SHARE * len(found.verdict) and shared + gate * found.outside > INPUT_GATE)
+    )
 
 
 def _settled(
@@ -157,6 +192,7 @@ def _correction(e: Estimate, plain: Correction, settled: _Settled, candidates: I
         solution=solution,
         done=solution.done,
         dof=rows.residual.size,
+        outside=int((~settled.inside).sum()),
         verdict=verdict,
         slot=rows.slot,
         measured=measured[verdict == ACCEPTED],

@@ -33,6 +33,7 @@ class Correction:
         linear: Mean at which the accepted rows were linearised.
         coordinates: (body,) coordinates there.
         innovations: Innovations of the accepted rows in the first iteration.
+        outside: Number of landmarks outside of the gate, whether or not they seem to move, too.
         is_wide: Whether the prediction is too uncertain to linearise at, see `_is_wide`.
         gaussian: Covariance that ``solution`` belongs to, if it is not that of the prediction.
         doubt: Factor of the noise of the inputs in it.
@@ -48,6 +49,7 @@ class Correction:
     linear: Mean
     coordinates: Array
     innovations: FrameInnovations
+    outside: int = 0
     is_wide: bool = False
     gaussian: Gaussian | None = None
     doubt: float = 1.0
@@ -70,13 +72,14 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     at, solution, innovations = e.mean, None, FrameInnovations.none(e.sensor.dimension)
     seen, rows = observe(e, at, slot, measured)
     verdict[~e.sensor.in_view(seen.q, e.config.min_depth_m)] = BEHIND_CAMERA
-    some, tried = _gate_alone(e, frame, rows, seen, verdict, gate)
+    some, tried, outside = _gate_alone(e, frame, rows, seen, verdict, gate)
     if len(some):
         if e.model.observer.has_time_offset and e.motion.tau_s:
             at = replace(at, imu_twist=_corrected_twist(e, frame, tried))
             _, rows = observe(e, at, slot, measured)
             tried = e.gaussian.project(rows.only(some), frame, e.ids[slot[some]])
         solution, innovations = _gate_jointly(e, frame, tried, seen, some, verdict, gate)
+        outside += int((verdict[some] == GATE).sum())
     taken = verdict == ACCEPTED
     if not taken.all():
         rows, measured = rows.only(taken), measured[taken]
@@ -96,6 +99,7 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
         at,
         coordinates,
         innovations,
+        outside,
         _is_wide(tried),
     )
 
@@ -137,8 +141,11 @@ def _gate_jointly(
 
 def _gate_alone(
     e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArray, gate: float
-) -> tuple[IntArray, Projection]:
-    """Return the landmarks (j,) that pass the gate by themselves, with ``H P H^T``; write verdicts on others."""
+) -> tuple[IntArray, Projection, int]:
+    """Return the landmarks (j,) that pass the gate by themselves, with ``H P H^T``; write verdicts on others.
+
+    The last result is the number of those outside of the gate.
+    """
     some = np.flatnonzero(verdict == ACCEPTED)
     rows = rows if len(some) == len(verdict) else rows.only(some)
     tried = e.gaussian.project(rows, frame, e.ids[rows.slot])
@@ -152,6 +159,7 @@ def _gate_alone(
     squares = gates.normalised_squares(S, tried.rows.residual, frame, e.ids[tried.rows.slot])
     inside = squares <= gate
     verdict[some[~inside]] = GATE
+    outside = len(inside) - int(inside.sum())
     if _judges_motion(e) and not e.model.process.estimates_velocity:
         evidence = gates.evidence_alone(tried.rows, S, _motion(e, seen, some))
         moving = gates.moves_along(e.table, tried.rows.slot, evidence, squares, gate, e.config)
@@ -159,7 +167,7 @@ def _gate_alone(
         inside &= ~moving
     if not inside.all():
         some, tried = some[inside], tried.only(np.flatnonzero(inside))
-    return some, tried
+    return some, tried, outside
 
 
 def _gate_by_others(

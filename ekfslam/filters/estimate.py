@@ -48,6 +48,7 @@ class Motion:
         way_m: Length of the way.
         imu_twist_before: (6,) velocity of the IMU at the image before.
         Q: (body, body) covariance of the noise that the process added.
+        last: (4, 4) motion over the interval before, ``T_departed = last T``, and its duration in s, if there was one.
     """
 
     T_departed: Array
@@ -57,6 +58,7 @@ class Motion:
     way_m: Array
     imu_twist_before: Array
     Q: Array
+    last: tuple[Array, float] | None = None
 
     @staticmethod
     def none(T_imu_world: Array) -> Motion:

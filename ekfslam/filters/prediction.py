@@ -10,6 +10,7 @@ from ekfslam.errors import ConfigError
 from ekfslam.filters.estimate import Estimate, Motion
 from ekfslam.filters.reports import log_density
 from ekfslam.filters.retraction import retract
+from ekfslam.geometry import se3
 from ekfslam.models.model import Transition
 from ekfslam.models.process import Measured
 
@@ -56,7 +57,8 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     e.gaussian.propagate(whole.Phi, whole.Q)
     departed, T_departed = e.coordinates, e.T_imu_world
     e.coordinates, e.values = model.coordinates_after(step, departed), step.values
-    e.motion = Motion(T_departed, e.T_imu_world, e.motion.T_predicted, interval, way_m, e.imu_twist, step.Q)
+    last = (T_departed @ se3.inverse(e.motion.T_departed), e.motion.tau_s) if e.motion.tau_s else None
+    e.motion = Motion(T_departed, e.T_imu_world, e.motion.T_predicted, interval, way_m, e.imu_twist, step.Q, last)
     e.imu_twist, e.step = step.imu_twist, e.step + 1
     e.updated_pose = model.layout.clones.get("pose") if e.updated_pose == "pose" else None
     return Prediction(departed, measured, log_likelihood)
