@@ -309,6 +309,7 @@ class TruthConfig:
         position_m, attitude_deg: Each pose, each axis.
         world_tilt_deg, turn_deg: Vertical of the world, and axes of the body, about each axis.
         drift_m_sqrt_s: Random walk of the position, each axis.
+        scale: All distances, as a share of them.
     """
 
     roll_deg: float | None = field(default=None, metadata=_FINITE)
@@ -321,6 +322,7 @@ class TruthConfig:
     world_tilt_deg: float | None = field(default=None, metadata=_FINITE)
     turn_deg: float | None = field(default=None, metadata=_FINITE)
     drift_m_sqrt_s: float | None = field(default=None, metadata=_FINITE)
+    scale: float | None = field(default=None, metadata=_FINITE)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ SLOW = {
     "drift": TruthNoise(drift_m_sqrt_s=0.3),
     "world": TruthNoise(world_tilt_rad=0.03),
     "body": TruthNoise(turn_rad=0.02),
+    "scale": TruthNoise(scale=0.1),
 }
 
 
@@ -177,7 +178,8 @@ def test_kitti_is_stated_in_the_units_it_was_found_in():
     angles = (noise.first_roll_rad, noise.first_pitch_rad, noise.first_yaw_rad, noise.attitude_rad)
     np.testing.assert_allclose(np.degrees(angles), [0.2, 0.2, 0.5, 0.1])
     assert (noise.first_position_m, noise.stamp_s, noise.position_m) == (0.0, 0.003, 0.02)
-    assert noise.text == "first pose 0.2, 0.2, 0.5 deg (roll, pitch, yaw), 0 m; each pose 0.02 m, 0.1 deg, stamps 3 ms"
+    first = "first pose 0.2, 0.2, 0.5 deg (roll, pitch, yaw), 0 m"
+    assert noise.text == f"{first}; each pose 0.02 m, 0.1 deg, stamps 3 ms; scale 0.0015"
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])

@@ -22,6 +22,7 @@ class TruthNoise:
         world_tilt_rad: Error of the vertical of the world, about each level axis of it.
         turn_rad: Constant error of the axes of the true body, about each axis: of extrinsics, say.
         drift_m_sqrt_s: Random walk of the position, each axis: standard deviation after one second.
+        scale: Error of all distances, as a share of them: of a projection of the Earth, say.
         stamp_s: Jitter of the stamps: an error along the motion, in proportion to the velocities.
         position_m: Position of each pose, each axis.
         attitude_rad: Attitude of each pose, each axis.
@@ -37,6 +38,7 @@ class TruthNoise:
     world_tilt_rad: float = 0.0
     turn_rad: float = 0.0
     drift_m_sqrt_s: float = 0.0
+    scale: float = 0.0
 
     @property
     def text(self) -> str:
@@ -51,8 +53,9 @@ class TruthNoise:
         )
         tilt, turn = (f"{math.degrees(value):.3g} deg" for value in (self.world_tilt_rad, self.turn_rad))
         drift = f"{self.drift_m_sqrt_s:.3g} m/sqrt(s)"
-        slow = ((self.world_tilt_rad, f"world tilt {tilt}"), (self.turn_rad, f"body turned {turn}"))
-        return "; ".join([text, *(words for value, words in (*slow, (self.drift_m_sqrt_s, f"drift {drift}")) if value)])
+        slow = [(self.world_tilt_rad, f"world tilt {tilt}"), (self.turn_rad, f"body turned {turn}")]
+        slow += [(self.drift_m_sqrt_s, f"drift {drift}"), (self.scale, f"scale {self.scale:.3g}")]
+        return "; ".join([text, *(words for value, words in slow if value)])
 
 
 class Doubt(NamedTuple):
@@ -93,6 +96,7 @@ KITTI_TRUTH_NOISE = TruthNoise(
     stamp_s=0.003,
     position_m=0.02,
     attitude_rad=math.radians(0.1),
+    scale=0.0015,
 )
 """The GPS/INS unit of KITTI (OXTS RT3003), whose output is the truth of KITTI raw, KITTI odometry and the UTIAS drives.
 
@@ -100,4 +104,9 @@ Position and attitude are what Geiger, Lenz, Stiller, Urtasun, "Vision meets Rob
 state of it: 0.02 m and 0.1 deg. They agree with the drives themselves, where the truth's rotation differs from the
 unit's own gyros by 0.02 deg a root frame over 50 frames, and its stamps jitter by about 3 ms. Roll, pitch and heading
 of the first pose are those between the truth and the direction in which the vehicle really drives off.
+
+Positions are the Mercator projection of a sphere of 6378137 m. The radii of the ellipsoid at 49 degrees are 6390.3 km
+(east) and 6371.8 km (north), so eastward distances are 0.19 % too short, northward ones 0.10 % too long: 0.15 % root
+mean square. Velocities show it: on drive 0027 the ratio of true to measured length changes with the heading by an
+amplitude of 0.18 +- 0.05 %, where 0.145 % is expected.
 """

@@ -97,17 +97,27 @@ def first_pose_error_covariance(noise: TruthNoise, T_world_imu_est: Array) -> Ar
     """
     first = np.array([noise.first_roll_rad, noise.first_pitch_rad, noise.first_yaw_rad])
     variance = np.concatenate([np.full(3, noise.first_position_m), first]) ** 2
-    A = se3.adjoint(se3.inverse(T_world_imu_est) @ T_world_imu_est[0])
+    motion = se3.inverse(T_world_imu_est) @ T_world_imu_est[0]
+    A = se3.adjoint(motion)
     tilt = np.zeros((6, 6))
     level = T_world_imu_est[0, :2, :3]  # level axes of the world along those of the first IMU
     tilt[3:, 3:] = noise.world_tilt_rad**2 * level.T @ level
-    return A @ (np.diag(variance) + tilt) @ np.swapaxes(A, -1, -2) + turned_body_covariance(noise, A)
+    first_covariance = A @ (np.diag(variance) + tilt) @ np.swapaxes(A, -1, -2)
+    return first_covariance + turned_body_covariance(noise, A) + scale_covariance(noise, motion)
 
 
 def turned_body_covariance(noise: TruthNoise, A: Array) -> Array:
     """Return the covariance ``(A - I) E (A - I)^T`` (n, 6, 6) of motions with adjoints A, for a body that is turned."""
     turned = (A - np.eye(6))[..., 3:]
     return noise.turn_rad**2 * turned @ np.swapaxes(turned, -1, -2)
+
+
+def scale_covariance(noise: TruthNoise, motion: Array) -> Array:
+    """Return the covariance (n, 6, 6) of motions (n, 4, 4) whose translations t err by a share: ``xi = s (t, 0)``."""
+    covariance = np.zeros((len(motion), 6, 6))
+    t = noise.scale * motion[:, :3, 3]
+    covariance[:, :3, :3] = t[:, :, None] * t[:, None, :]
+    return covariance
 
 
 def drift_covariance(noise: TruthNoise, lapse_s: Array) -> Array:

@@ -11,6 +11,7 @@ from ekfslam.evaluation.consistency import (
     interpolated_frames,
     nees,
     pose_noise_covariance,
+    scale_covariance,
     turned_body_covariance,
 )
 from ekfslam.evaluation.trajectory import PATH_TOLERANCE, distance_along
@@ -70,8 +71,8 @@ def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) ->
     """Return pairs with true poses and the NEES (n,) of their relative pose, 6 degrees of freedom; NaN if singular.
 
     Truth noise adds ``N_k + A N_j A^T`` to `relative_covariance`, with N that of single true poses, and the covariances
-    of drift and turned body; errors of the first pose and of the world cancel. Pairs with an ``interpolated`` interval
-    (T,) between them are left out.
+    of drift, scale and turned body; errors of the first pose and of the world cancel. Pairs with an ``interpolated``
+    interval (T,) between them are left out.
     """
     pairs, place = result.pairs or empty(PosePairs), np.full(len(result.time_s), -1)
     place[truth.frame] = np.arange(len(truth.frame))
@@ -84,9 +85,8 @@ def relative_pose_nees(result: Result, truth: Truth, interpolated: BoolArray) ->
     if truth.noise is not None:
         N, A = pose_noise_covariance(truth.noise, truth.T_world_imu, result.time_s[truth.frame]), se3.adjoint(motion)
         covariance = covariance + N[k] + A @ N[j] @ np.swapaxes(A, -1, -2) + turned_body_covariance(truth.noise, A)
-        covariance = covariance + drift_covariance(
-            truth.noise, result.time_s[pairs.second] - result.time_s[pairs.first]
-        )
+        lapse_s = result.time_s[pairs.second] - result.time_s[pairs.first]
+        covariance = covariance + drift_covariance(truth.noise, lapse_s) + scale_covariance(truth.noise, motion)
     return pairs, nees(error, covariance)
 
 

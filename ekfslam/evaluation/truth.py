@@ -21,7 +21,8 @@ def with_truth_noise(sequence: Sequence, settings: TruthConfig) -> Sequence:
         "turn_rad": settings.turn_deg,
     }
     given = {name: math.radians(angle) for name, angle in angles_deg.items() if angle is not None}
-    others = {name: getattr(settings, name) for name in ("first_position_m", "stamp_s", "position_m", "drift_m_sqrt_s")}
+    names = ("first_position_m", "stamp_s", "position_m", "drift_m_sqrt_s", "scale")
+    others = {name: getattr(settings, name) for name in names}
     given |= {name: value for name, value in others.items() if value is not None}
     if sequence.truth is None or not given:
         return sequence

@@ -195,6 +195,7 @@ def erring_truth(truth, time_s, noise, rng):
     erring = se3.inverse(se3.exp(own) @ turn @ moved @ se3.inverse(T[0]) @ se3.inverse(turn) @ T[0])
     walk = noise.drift_m_sqrt_s * np.sqrt(np.diff(time_s))[:, None] * rng.standard_normal((len(T) - 1, 3))
     erring[1:, :3, 3] += np.cumsum(walk, axis=0)
+    erring[1:, :3, 3] += noise.scale * rng.standard_normal() * (erring[1:, :3, 3] - erring[0, :3, 3])
     return dataclasses.replace(truth, T_world_imu=erring, noise=noise)
 
 
