@@ -119,6 +119,9 @@ class NoiseConfig:
         sigma_v_m_s, sigma_w_rad_s, sigma_px: Linear and angular velocities, and pixels, each axis.
         drift: Random walk of track errors from frame to frame, px; 0 takes pixel noise as white.
         track_scale: Factor on that walk in the automatic model; None finds it from innovations (`ekfslam.resolve`).
+        sampling_v, sampling_w: Factors on the sampling noise of linear and angular velocities in the automatic model.
+            0: they are means over their intervals (integrated gyroscope, wheel encoders); 1: samples; more: they have
+            noise that their differences cannot tell from motion. None finds them by the likelihood of innovations.
         shared: Whether the automatic model has state blocks for errors that all samples or all tracks share.
         tilt_deg: For velocities in a level frame, the prior standard deviation of roll and pitch, which the joint
             filter estimates. 0 takes them as velocities of the IMU.
@@ -132,6 +135,8 @@ class NoiseConfig:
     sigma_px: float | None = field(default=None, metadata=_PIXELS)
     drift: float | None = field(default=None, metadata=_FINITE)
     track_scale: float | None = field(default=None, metadata=_POSITIVE)
+    sampling_v: float | None = field(default=None, metadata=_FINITE)
+    sampling_w: float | None = field(default=None, metadata=_FINITE)
     shared: bool = field(default=True, metadata=_SWITCH)
     tilt_deg: float | None = field(default=None, metadata=_FINITE)
     model: NoiseModel = field(default="auto", metadata=_one_of(NoiseModel))

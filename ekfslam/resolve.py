@@ -30,22 +30,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ekfslam.arrays import Array
 from ekfslam.config import LEAST_PX, BlockSetting, Config, Mode
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import MEASURED_KINDS, WITHOUT_TRACKS, WITHOUT_VELOCITIES, YAW_STD_PX, Sequence
 from ekfslam.errors import ConfigError, InnovationError
-from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.loop import one_thread, run_filter
+from ekfslam.filters.stretches import run_stretches, stretches_of, thinned
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import StateBlock, TwistBias
+from ekfslam.models.blocks import OPTIONAL_BLOCKS, StateBlock, TwistBias
 from ekfslam.models.build import blocks_and_process, model_of
 from ekfslam.models.form import is_conditional_cheaper
 from ekfslam.models.model import Model
 from ekfslam.models.noise import (
     CAMERA_ROTATION_DEG,
     MIN_DISPARITY_SIGMA,
+    VELOCITY_STD,
     VelocityNoise,
     automatic_noise,
     shared_errors,
@@ -66,6 +67,11 @@ PERSISTENCE = 3.0
 TARGET = 0.7
 _EXPONENT, _LEAST_DOF, _SCALES = 0.83, 100, (0.3, 4.0)
 _STRETCH, _EVERY, _MOST_STRETCHES = 8, 60, 25  # frames, frames, count
+# Sampling noise: factors that are tried, stretches (frames, count), tracks in each, and how clear the gain must be. A
+# logarithm of 20 is four times what Jeffreys calls decisive, because the model of tracks is approximate.
+_SAMPLING = ("sampling_v", "sampling_w")
+_FACTORS, _SAMPLING_STRETCHES, _SAMPLING_TRACKS = (0.0, 1.0, 2.0, 4.0), (10, 5), 25
+_SURE, _LEAST_GAIN = 3.0, 20.0  # standard errors
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,7 @@ class Problem:
         """The resolved values of settings that may be automatic, one line for each table."""
         config = self.config
         chosen = {
-            "noise": ("sigma_px", "drift", "track_scale"),
+            "noise": ("sigma_px", "drift", "track_scale", *_SAMPLING),
             "filter": ("retire", "retire_after", "dormant", "covariance_form"),
             "hygiene": ("min_disparity_sigma",),
             "calibration": ("rotation_deg", "disparity_px"),
@@ -127,7 +133,7 @@ def resolve(
     Raises:
         ConfigError: An unknown block, an unknown setting of a block, or pixel noise that is too small.
     """
-    sequence = with_odometry(sequence)
+    sequence = recording = with_odometry(sequence)
     config = config or Config()
     account: dict[str, str | int | float] = {f"tuned_{key}": value for key, value in config.tuning.items()}
     if mode != "dead-reckoning" and _has_open_scale(sequence, config) and (tracks := track_noise(sequence)):
@@ -135,7 +141,7 @@ def resolve(
         if tracks.is_white:
             white = {"model": "tuned", "sigma_px": tracks.sigma_px, "drift": 0.0}
             config = config.with_overrides({"noise": white})
-    config = settings_of(sequence, config)
+    given, config = config, settings_of(sequence, config)
     noise, hygiene = noise_of(sequence, config), None
     if text := odometry_text(sequence.measured_axes, noise.twist_std):
         account["odometry"] = text
@@ -154,10 +160,15 @@ def resolve(
         sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
     model = _model(sequence, config, noise, blocks)
     config = _with_form(config, sequence, model)
-    if mode in ("full", "smoothed") and _has_open_scale(sequence, config):
-        scale = _track_scale(sequence, config, model)
-        config = config.with_overrides({"noise": {"track_scale": scale}})
-        model = _model(sequence, config, noise_of(sequence, config), blocks)
+    if mode in ("full", "smoothed"):
+        if (sampling := _sampling(sequence, config)) is not None:
+            # Other settings follow from it.
+            again = resolve(recording, given.with_overrides({"noise": sampling}), mode, blocks)
+            return dataclasses.replace(again, account={**account, **again.account})
+        if _has_open_scale(sequence, config):
+            scale = _track_scale(sequence, config, model)
+            config = config.with_overrides({"noise": {"track_scale": scale}})
+            model = _model(sequence, config, noise_of(sequence, config), blocks)
     return Problem(sequence, config, model, hygiene, account)
 
 
@@ -177,9 +188,12 @@ def with_odometry(sequence: Sequence) -> Sequence:
     return dataclasses.replace(sequence, attributes={**sequence.attributes, "velocities": kind}).with_velocities(twist)
 
 
-def noise_of_velocities(sequence: Sequence) -> VelocityNoise:
-    """Return the noise of the measured velocities of a recording, as their differences show it or it is stated."""
-    return velocity_noise(sequence.twist, sequence.measured_axes, sequence.stated_twist_std)
+def noise_of_velocities(sequence: Sequence, config: Config | None = None) -> VelocityNoise:
+    """Return the noise of the measured velocities, as their differences and `NoiseConfig.sampling_v` say, or stated."""
+    found = velocity_noise(sequence.twist, sequence.measured_axes, sequence.stated_twist_std)
+    noise = (config or Config()).noise
+    factors = [1.0 if factor is None else factor for factor in (noise.sampling_v, noise.sampling_w)]
+    return found if factors == [1.0, 1.0] else found.scaled(factors)
 
 
 def settings_of(sequence: Sequence, config: Config) -> Config:
@@ -188,19 +202,23 @@ def settings_of(sequence: Sequence, config: Config) -> Config:
     Explicit settings take precedence. `noise_of` gives the noise; `resolve` adds track scale and covariance form.
     """
     config = _with_retirement(sequence, config)
-    if not (is_automatic(sequence, config) and noise_of(sequence, config).track_error is not None):
+    walks, is_white = noise_of(sequence, config).track_error is not None, _is_white(sequence, config)
+    if not (is_automatic(sequence, config) and (walks or is_white)):
         return config
-    if config.hygiene.min_disparity_sigma is None:
+    if walks and config.hygiene.min_disparity_sigma is None:
         config = config.with_overrides({"hygiene": {"min_disparity_sigma": MIN_DISPARITY_SIGMA}})
     if not config.noise.shared:
         return config
-    # Without velocities nothing observes the camera's rotation against the IMU.
-    if config.calibration.rotation_deg is None and sequence.has_velocities:
+    found = noise_of_velocities(sequence, config) if sequence.has_velocities else None
+    # Without velocities nothing observes the camera's rotation against the IMU, nor do noisy ones beside white tracks.
+    is_observed = found is not None and (found.is_clean or not is_white)
+    if config.calibration.rotation_deg is None and is_observed:
         config = config.with_overrides({"calibration": {"rotation_deg": CAMERA_ROTATION_DEG}})
     if config.calibration.disparity_px is None and (yaw_px := sequence.attributes.get(YAW_STD_PX)) is not None:
         config = config.with_overrides({"calibration": {"disparity_px": float(yaw_px)}})
-    found = noise_of_velocities(sequence) if sequence.has_velocities else None
     tables = shared_errors(found, sequence.has_checked_tracks)
+    if is_white:
+        tables = {name: table for name, table in tables.items() if OPTIONAL_BLOCKS[name].coupling == "velocity"}
     shared = {name: {**table, **config.blocks.get(name, {})} for name, table in tables.items()}
     return dataclasses.replace(config, blocks={**config.blocks, **shared})
 
@@ -209,7 +227,7 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
     """Return the noise of a filter: the configuration's, else the recording's, else the data's or a default."""
     given = config.noise
     if is_automatic(sequence, config):
-        found = noise_of_velocities(sequence)
+        found = noise_of_velocities(sequence, config)
         stated = automatic_noise(found, sequence.velocity_frame, sequence.has_checked_tracks)
     else:
         stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
@@ -232,7 +250,7 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
     if sequence.has_velocities:
         noise = with_unmeasured(sequence, noise)
     if tilt and is_automatic(sequence, config) and sequence.measured_axes.all():
-        found = noise_of_velocities(sequence)
+        found = noise_of_velocities(sequence, config)
         bias = TwistBias(**(TwistBias.automatic(found.sigma, found.is_clean, False) or {}))
         noise = dataclasses.replace(noise, first_tilt=first_tilt(sequence, noise, bias))
     return noise if given.drift is None else with_drift(noise, given.drift)
@@ -323,21 +341,64 @@ def _has_open_scale(sequence: Sequence, config: Config) -> bool:
 
 def _track_scale(sequence: Sequence, config: Config, model: Model) -> float:
     """Return the scale of the walk of track errors, given a model with scale 1."""
-    if not sequence.has_velocities or not noise_of_velocities(sequence).carries_motion:
+    if not sequence.has_velocities or not noise_of_velocities(sequence, config).carries_motion:
         return PERSISTENCE
     count = min(max(1, round(len(sequence) / _EVERY)), _MOST_STRETCHES)
-    begins = ((np.arange(count) + 0.5) * len(sequence) / count - _STRETCH / 2).astype(int).clip(0)
-    nis, dof, settings = 0.0, 0, dataclasses.replace(config.filter, lag=0)
+    stretches = stretches_of(len(sequence), _STRETCH, count)
     try:
-        with one_thread():
-            for begin in begins.tolist():
-                frames = range(begin, min(begin + _STRETCH, len(sequence)))
-                # Without a revival: what comes back within a stretch starts again.
-                for frame in run_filter(JointEKF(model, settings), sequence, frames):
-                    nis, dof = nis + frame.report.nis, dof + frame.report.dof
+        found = run_stretches(model, config.filter, sequence, stretches)
     except InnovationError:  # the run itself raises it, if it breaks down there too
         return 1.0
+    nis, dof = sum(each.nis for each in found), sum(each.dof for each in found)
     return 1.0 if dof < _LEAST_DOF else float(np.clip((nis / dof / TARGET) ** _EXPONENT, *_SCALES))
+
+
+def _is_white(sequence: Sequence, config: Config) -> bool:
+    """Return whether errors of tracks were found to be white, or are taken as white on request."""
+    return config.noise.drift == 0.0 and not (config.tuning or sequence.has_checked_tracks)
+
+
+def _sampling(sequence: Sequence, config: Config) -> dict[str, float] | None:
+    """Return the factors on the noise of velocities that are clearly likelier than 1; None: not open, or known."""
+    noise, found, is_white = config.noise, noise_of_velocities(sequence), _is_white(sequence, config)
+    given = (noise.sampling_v, noise.sampling_w, noise.sigma_v_m_s, noise.sigma_w_rad_s)
+    is_open = all(value is None for value in given) and (noise.model == "auto" or is_white)
+    is_open &= is_automatic(sequence, config) and sequence.has_velocities and not sequence.stated_twist_std.any()
+    white = np.where(found.sigma > _SURE * found.sigma_error, found.sigma, 0.0)
+    matters = found.sampling.reshape(2, 3).max(axis=1) > np.hypot(white, VELOCITY_STD[[0, 3]])
+    if not (is_open and matters.any()):
+        return None
+    # The scale of a walk of tracks is found for given velocities and could hide their noise: only its absence shows.
+    tried = [(_FACTORS if is_white else _FACTORS[:2]) if each else (1.0,) for each in matters]
+    return dict(zip(_SAMPLING, _likeliest_sampling(sequence, config, tried), strict=True))
+
+
+def _likeliest_sampling(
+    sequence: Sequence, config: Config, tried: SequenceType[SequenceType[float]]
+) -> tuple[float, float]:
+    """Return the factors on the noise of linear and angular velocities, by a search along one axis after the other."""
+    stretches = stretches_of(len(sequence), *_SAMPLING_STRETCHES)
+    few, scores = thinned(sequence, stretches, _SAMPLING_TRACKS), dict[tuple[float, float], Array]()
+
+    def score(factors: tuple[float, float]) -> float:
+        if factors not in scores:
+            given = config.with_overrides({"noise": dict(zip(_SAMPLING, factors, strict=True))})
+            model = _model(sequence, given, noise_of(sequence, given), ())
+            try:
+                found = run_stretches(model, config.filter, few, stretches)
+                scores[factors] = np.array([each.log_likelihood for each in found])
+            except InnovationError:
+                scores[factors] = np.full(len(stretches), -np.inf)
+        return float(scores[factors].sum())
+
+    best, before = (1.0, 1.0), None
+    while best != before:
+        before = best
+        best = max(((v, best[1]) for v in tried[0]), key=score)
+        best = max(((best[0], w) for w in tried[1]), key=score)
+    gain = scores[best] - scores[1.0, 1.0]
+    error = np.sqrt(len(gain)) * float(gain.std())
+    return best if gain.sum() > max(_SURE * error, _LEAST_GAIN) else (1.0, 1.0)
 
 
 def _settings(table: Mapping[str, BlockSetting | None]) -> str:

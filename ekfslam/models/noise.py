@@ -13,6 +13,7 @@ that are exactly 0 throughout are not measured: `ekfslam.models.vehicle` has the
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence as SequenceType
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -96,6 +97,15 @@ class VelocityNoise:
     def carries_motion(self) -> bool:
         """Whether the velocities know slow motions better than vision: they are clean, and all six are measured."""
         return self.is_clean and bool(self.measured.all())
+
+    def scaled(self, factors: SequenceType[float]) -> VelocityNoise:
+        """Return it with factors on the sampling noise of both kinds; those below 1 also act on unsure white noise."""
+        white = np.where(self.sigma > _DIFFERS * self.sigma_error, 1.0, np.minimum(factors, 1.0))
+        own = self.axes != np.repeat(self.sigma, 3)
+        axes = self.axes * np.where(own, 1.0, np.repeat(white, 3))
+        return dataclasses.replace(
+            self, sigma=white * self.sigma, sampling=np.repeat(factors, 3) * self.sampling, axes=axes
+        )
 
     @property
     def texts(self) -> tuple[str, str]:
