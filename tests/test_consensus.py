@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from support.everything import PRIOR
+from support.everything import PRIOR, with_everything
 from support.frozen import assert_equal_to_frozen_rows
 
 from ekfslam import LiveEKF
@@ -87,12 +87,12 @@ def test_gross_landmarks_alone_do_not_open_a_frame(seed):
 
 
 def test_traffic_that_most_landmarks_follow_does_not_reject_the_velocity():
-    """All landmarks of a frame move along by the same 2 m, while the velocities go on as before."""
-    world = builtin("loop?frames=16&landmarks=30&sigma_v_m_s=0.05&sigma_w_rad_s=0.005")
+    """All landmarks of a frame move along by the same distance, while the velocities go on as before."""
+    world = builtin("city?frames=16&max_tracks=30&sigma_v_m_s=0.05&sigma_w_rad_s=0.005")
     T_cam_imu, camera, pixels = world.T_cam_imu, world.camera, world.observations.pixels_px.copy()
     of_frame = world.observations.frame == WILD
     rig = Rig(camera, T_cam_imu, world.noise)
-    q = rig.invert(rig.rows(pixels[of_frame])) + T_cam_imu[:3, :3] @ np.array([2.0, 0.0, 0.0])
+    q = rig.invert(rig.rows(pixels[of_frame])) + T_cam_imu[:3, :3] @ np.array([0.3, 0.0, 0.0])
     u = camera.fu_px * q[:, 0] / q[:, 2] + camera.cu_px
     v = camera.fv_px * q[:, 1] / q[:, 2] + camera.cv_px
     pixels[of_frame] = np.column_stack([u, v, u - camera.fu_px * camera.baseline_m / q[:, 2], v])
@@ -122,6 +122,17 @@ def test_the_smoother_is_right_about_a_rejected_velocity():
     world = spoiled(builtin("city?frames=20&max_tracks=20"))
     smoothed, clean = (smooth(run(some)) for some in (world, builtin("city?frames=20&max_tracks=20")))
     assert errors(world, smoothed.T_world_imu).max() < 1.5 * errors(world, clean.T_world_imu).max()
+
+
+@pytest.mark.parametrize("variant", ["standard", "fej"])
+def test_a_wild_measurement_of_a_velocity_that_walks_is_weighted_down(variant):
+    world = with_everything(spoiled(builtin("city?frames=16&max_tracks=20"), sigmas=20.0))
+    ekf, reports = filtered(world, variant=variant, retire="never", **PRIOR)
+    assert [report.frame for report in reports if report.doubt > 1.0] == [WILD]
+    log = ekf.log()
+    assert np.unique(log.measured_frame[log.measured_std > np.tile(world.noise.twist_std, 15)]).tolist() == [WILD]
+    assert (log.doubt == 1.0).all()
+    assert_equal_to_frozen_rows(ekf)
 
 
 def test_live_use_rejects_the_same_velocities():

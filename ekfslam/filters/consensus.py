@@ -42,8 +42,7 @@ from ekfslam.models.sensors.base import ACCEPTED, GATE, MOVING
 
 # Factor of the noise of rejected inputs: errors up to some 100 standard deviations leave the landmarks in charge.
 DOUBT = 30.0
-# Gate of the inputs, six components: one frame in 10 000 is looked at in vain.
-INPUT_GATE = gates.threshold(1.0 - 1e-4, 6)
+INPUT_GATE = gates.of_inputs(6)
 _SHARE = 1.0 / 3.0  # of rejected landmarks, from which a frame is looked at
 _SAMPLES = 100
 _ROUNDS = 4

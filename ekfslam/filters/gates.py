@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.special import gammaincinv
 
@@ -19,6 +21,12 @@ SEEN_TO_MOVE = 3
 def threshold(probability: float, dimension: int) -> float:
     """Return the chi-square threshold of a gate for d rows; probability 1 accepts everything."""
     return 2.0 * float(gammaincinv(dimension / 2.0, probability))
+
+
+@lru_cache
+def of_inputs(dimension: int) -> float:
+    """Return the chi-square threshold of inputs with so many components: one in 10 000 is doubted wrongly."""
+    return threshold(1.0 - 1e-4, dimension)
 
 
 def diagonal(variance: Array) -> Array:

@@ -86,7 +86,7 @@ class JointEKF(Estimate):
         self._reported: list[Array] = []  # estimates and standard deviations (2, p) after each frame
         delayed = model.sensor if isinstance(model.sensor, DelayedSensor) else None
         self._waiting = None if delayed is None else Waiting(delayed, config.gate_probability)
-        self._log_likelihood = 0.0  # of the velocities measured since the last frame
+        self._log_likelihood, self._doubt = 0.0, 1.0  # of the velocities measured since the last frame
 
     def begin(self, inputs: Array) -> None:
         """Take the inputs (c,) at the first frame, for a time offset, eq. (9); no prediction leads to this frame."""
@@ -110,6 +110,7 @@ class JointEKF(Estimate):
         interval = inputs if isinstance(inputs, Interval) else Interval.of_one(inputs, tau_s, is_gap)
         found = predict(self, interval, also)
         self._log_likelihood += found.log_likelihood
+        self._doubt = found.doubt
         self._log.predicted(self, interval, found)
 
     def update(self, frame: int, ids: IntArray, measured: Array) -> FrameReport:
@@ -180,7 +181,7 @@ class JointEKF(Estimate):
         done = found.done
         likelihood = self._log_likelihood + log_density(done.nis, done.log_det, found.dof)
         self._log_likelihood = 0.0
-        doubt = self.motion.interval.doubt
+        doubt = max(self._doubt, self.motion.interval.doubt)
         return FrameReport(frame, ids, reason, done.nis, found.dof, split, likelihood, found.innovations, doubt)
 
     def _rest(self, frame: int, ids: IntArray) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.data.interval import Interval
 from ekfslam.errors import ConfigError
+from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate, Motion
 from ekfslam.filters.reports import log_density
 from ekfslam.filters.retraction import retract
@@ -23,11 +26,13 @@ class Prediction:
         departed: (body,) coordinates before the process moved its blocks.
         measured: Measurements of blocks during the interval, if any.
         log_likelihood: Log-density of these measurements, or 0.
+        doubt: Largest factor of the standard deviations of measurements that the state contradicts, or 1.
     """
 
     departed: Array
     measured: Measured | None
     log_likelihood: float
+    doubt: float = 1.0
 
 
 def predict(e: Estimate, interval: Interval, also: Measured | None) -> Prediction:
@@ -50,7 +55,7 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     e.coordinates = e.coordinates.copy()  # the log has those after the update
     if moved is not None:
         e.coordinates, e.values = moved.Phi @ e.coordinates, moved.values
-    moved, measured, log_likelihood = _measure(e, moved, interval, also)
+    moved, measured, log_likelihood, doubt = _measure(e, moved, interval, also)
     # Eq. (1): the mean, and Phi and Q of eq. (2).
     step = model.step(e.values, interval, e.linear_T_imu_world, e.variant.first_estimates)
     whole = step if moved is None else step.after(moved)
@@ -61,35 +66,52 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     e.motion = Motion(T_departed, e.T_imu_world, e.motion.T_predicted, interval, way_m, e.imu_twist, step.Q, last)
     e.imu_twist, e.step = step.imu_twist, e.step + 1
     e.updated_pose = model.layout.clones.get("pose") if e.updated_pose == "pose" else None
-    return Prediction(departed, measured, log_likelihood)
+    return Prediction(departed, measured, log_likelihood, doubt)
 
 
 def _measure(
     e: Estimate, moved: Transition | None, interval: Interval, also: Measured | None
-) -> tuple[Transition | None, Measured | None, float]:
+) -> tuple[Transition | None, Measured | None, float, float]:
     """Condition on measurements of blocks by the inputs, eq. (6); the first inputs start blocks instead.
 
     Returns:
-        The transition that the covariance still has to follow; the measurements, and their log-density.
+        The transition that the covariance still has to follow; the measurements, their log-density, and their doubt.
     """
     process, is_first = e.model.process, e.step == 0
     parts = [some for some in (process.measured(interval, is_first), also) if some is not None]
-    measured = Measured.concatenate(parts) if parts else None
+    begin: list[Measured] = []
     if is_first and (start := process.start(e.values, interval)) is not None:
         begun = e.model.widened(e.values, start)
         moved = begun if moved is None else begun.after(moved)
         e.values = moved.values
         for name, value in start.values.items():
             e.coordinates[e.model.layout[name]] = value
-        parts = [] if also is None else [also]
+        begin, parts = parts[:1], parts[1:]
     if not parts:
-        return moved, measured, 0.0
+        return moved, begin[0] if begin else None, 0.0, 1.0
     if moved is not None:
         e.gaussian.propagate(moved.Phi, moved.Q)
+    doubts = [_doubt(e, part) for part in parts]
+    parts = [replace(part, std=doubt * part.std) for part, doubt in zip(parts, doubts, strict=True)]
     used = Measured.concatenate(parts)
     H = process.jacobian(used)
     residual = used.value - H @ e.coordinates
     solution = e.gaussian.solve_body(H, residual, used.std**2, e.step + 1)
     e.gaussian.apply(solution)
     retract(e, solution.done.correction)
-    return None, measured, log_density(solution.done.nis, solution.done.log_det, len(residual))
+    log_likelihood = log_density(solution.done.nis, solution.done.log_det, len(residual))
+    return None, Measured.concatenate([*begin, *parts]), log_likelihood, max(doubts)
+
+
+def _doubt(e: Estimate, measured: Measured) -> float:
+    """Return the factor of the standard deviations of measurements at which their innovations are at the gate.
+
+    Its square is the normalised innovation squared over the gate, so that the pull of a wild measurement falls with its
+    size, as with Cauchy's kernel.
+    """
+    if e.config.gate_probability == 1.0:
+        return 1.0
+    H = e.model.process.jacobian(measured)
+    P, residual = e.gaussian.body_covariance[: H.shape[1], : H.shape[1]], measured.value - H @ e.coordinates
+    nis = residual @ np.linalg.solve(H @ P @ H.T + np.diag(measured.std**2), residual)
+    return max(1.0, float(np.sqrt(nis / gates.of_inputs(len(residual)))))
