@@ -160,6 +160,7 @@ class HygieneConfig:
         min_observations: Drop tracks, or pieces of cut tracks, with fewer observations.
         disparity_jump_sigma: Drop tracks across a frame in which most disparities jump so far from the prediction of
             the velocities.
+        moving: If velocities are noisy, drop tracks that more probably move over the ground than stand.
     """
 
     min_disparity_sigma: float | None = field(default=None, metadata=_FINITE)
@@ -171,6 +172,7 @@ class HygieneConfig:
     max_depth_error: float = field(default=0.0, metadata=_FINITE)
     min_observations: int = field(default=0, metadata=_whole(0))
     disparity_jump_sigma: float = field(default=3.0, metadata=_FINITE)
+    moving: bool = field(default=True, metadata=_SWITCH)
 
 
 @dataclass(frozen=True)

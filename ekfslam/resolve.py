@@ -155,7 +155,7 @@ def resolve(
                 f"{sequence.name}: the recording states a pixel noise of {least:g} px, with which innovation "
                 f"covariances are singular; give noise.sigma_px, at least {LEAST_PX:g}"
             )
-        observations, hygiene = clean_tracks(sequence, noise, config.hygiene)
+        observations, hygiene = clean_tracks(sequence, _in_the_long_run(sequence, config, noise), config.hygiene)
         attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
         sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
     model = _model(sequence, config, noise, blocks)
@@ -205,7 +205,9 @@ def settings_of(sequence: Sequence, config: Config) -> Config:
     walks, is_white = noise_of(sequence, config).track_error is not None, _is_white(sequence, config)
     if not (is_automatic(sequence, config) and (walks or is_white)):
         return config
-    if walks and config.hygiene.min_disparity_sigma is None:
+    # Beside noisy velocities far points are needed: they show how the rig turns.
+    are_noisy = sequence.has_velocities and not noise_of_velocities(sequence).is_clean
+    if walks and not are_noisy and config.hygiene.min_disparity_sigma is None:
         config = config.with_overrides({"hygiene": {"min_disparity_sigma": MIN_DISPARITY_SIGMA}})
     if not config.noise.shared:
         return config
@@ -399,6 +401,13 @@ def _likeliest_sampling(
     gain = scores[best] - scores[1.0, 1.0]
     error = np.sqrt(len(gain)) * float(gain.std())
     return best if gain.sum() > max(_SURE * error, _LEAST_GAIN) else (1.0, 1.0)
+
+
+def _in_the_long_run(sequence: Sequence, config: Config, noise: Noise) -> Noise:
+    """Return the noise with the errors of tracks as they add up over many frames, unless their scale is given."""
+    if noise.track_walk_px is None or not _has_open_scale(sequence, config):
+        return noise
+    return dataclasses.replace(noise, track_walk_px=PERSISTENCE * noise.track_walk_px)
 
 
 def _settings(table: Mapping[str, BlockSetting | None]) -> str:

@@ -19,6 +19,7 @@ RAW = HygieneConfig(
     restart_at_repeats=False,
     reused_id_sigma=0.0,
     disparity_jump_sigma=0.0,
+    moving=False,
 )
 STEP_S = 0.1
 NOISE = Noise.isotropic(0.1, 0.01, 0.5)

@@ -35,6 +35,7 @@ OFF = HygieneConfig(
     max_depth_error=0.0,
     min_observations=0,
     disparity_jump_sigma=0.0,
+    moving=False,
 )
 NOISE = Noise(np.zeros(6), np.ones(4))
 

@@ -17,6 +17,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import HygieneConfig
 from ekfslam.data.sequence import Noise, Observations, Sequence
 from ekfslam.data.tracks import adjacent, cut_tracks, repeated_frames, successive
+from ekfslam.data.traffic import moving_tracks
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
 from ekfslam.stored import COUNTS, FRAMES, attribute, layout_of, stored, whole, zeros
@@ -32,9 +33,10 @@ _SWITCHES: dict[str, str] = {
     "depth": "max_depth_error",
     "too short": "min_observations",
     "disparity jump": "disparity_jump_sigma",
+    "moves": "moving",
 }
 RULES: tuple[str, ...] = tuple(_SWITCHES)
-REPEATED_FRAME, JUMP, REUSED_ID, DISPARITY, ROW_MISMATCH, DEPTH, TOO_SHORT, DISPARITY_JUMP = range(len(RULES))
+REPEATED_FRAME, JUMP, REUSED_ID, DISPARITY, ROW_MISMATCH, DEPTH, TOO_SHORT, DISPARITY_JUMP, MOVES = range(len(RULES))
 
 _JUMP_STD = 2.0  # of the jump that `jumps` tests, due to white noise of 1 px
 _COMPANY = 5  # tracks of a frame that can tell how the frame as a whole moved
@@ -155,6 +157,8 @@ def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tup
         # The recorded tracks decide: if far ones have lost observations, the jump does not show.
         jumped = disparity_jumps(sequence, noise, config.disparity_jump_sigma)
         tracks.drop(DISPARITY_JUMP, np.isin(tracks.own, jumped))
+    if config.moving:
+        tracks.drop(MOVES, np.isin(tracks.kept.landmark, moving_tracks(sequence, tracks.kept, noise)))
     return tracks.kept, tracks.report()
 
 
