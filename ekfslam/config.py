@@ -247,7 +247,7 @@ class CalibrationConfig:
     """Prior standard deviations of the calibration that the joint filter estimates; 0 takes a parameter as given.
 
     Args:
-        rotation_deg: Rotation of the camera against the IMU, each axis. By default 0.5 in the automatic model, else 0.
+        rotation_deg: Rotation of the camera against the IMU, each axis. By default 0.4 in the automatic model, else 0.
         lever_arm_m: Position of the IMU in the camera frame, each axis.
         baseline: Length of the stereo baseline, as a share of it.
         disparity_px: Offset of all disparities. By default in the automatic model, the standard deviation of the right

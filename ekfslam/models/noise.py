@@ -33,7 +33,7 @@ GAP_STD = np.array([1.0, 0.1, 0.1, *np.deg2rad([2.0, 2.0, 2.0])])
 
 # Roll and pitch of a road vehicle, and how well the rotation of a camera against a unit elsewhere in a car is known.
 TILT_RAD = np.deg2rad(3.0)
-CAMERA_ROTATION_DEG = 0.5
+CAMERA_ROTATION_DEG = 0.4
 
 # Errors of KLT tracks (u, v, disparity) at landmark initialisation and their walk from frame to frame, which
 # `track_scale` multiplies (`ekfslam.data.noise.TrackError`). White pixel noise only sets the limits of hygiene.
