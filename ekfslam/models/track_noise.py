@@ -76,7 +76,9 @@ class TrackNoise:
     def text(self) -> str:
         """The kind of the errors and their size in words, in u of the left image."""
         if not self.is_white:
-            return f"errors walk or persist, {max(float(self.step[0]), 0.0) ** 0.5:.2g} px a frame"
+            # A white part that is negative stands for steps that persist: it is part of a step, not beside it.
+            step = float(self.step[0]) + 2.0 * min(float(self.white[0]), 0.0)
+            return f"errors walk or persist, about {max(step, 0.0) ** 0.5:.2g} px a frame"
         return f"errors are white, {with_error(self.sigma_px, self.sigma_error_px)} px"
 
 
