@@ -57,7 +57,7 @@ from ekfslam.models.odometry import missing_velocities, stereo_odometry, vision_
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.models.tilt import first_tilt
 from ekfslam.models.track_noise import track_noise
-from ekfslam.models.vehicle import odometry_text, with_vehicle
+from ekfslam.models.vehicle import odometry_text, slow_slip, with_vehicle
 
 # Number of dormant landmarks kept in the state of a recording whose landmarks come back: their covariance has 160 MB.
 DORMANT_LIMIT = 1500
@@ -221,6 +221,9 @@ def settings_of(sequence: Sequence, config: Config) -> Config:
     tables = shared_errors(found, sequence.has_checked_tracks)
     if is_white:
         tables = {name: table for name, table in tables.items() if OPTIONAL_BLOCKS[name].coupling == "velocity"}
+    if found is not None and not found.measured.all():
+        bias = tables[TwistBias.name]
+        tables[TwistBias.name] = bias | slow_slip(found.measured, sequence.twist, bias["sigma_v_m_s"])
     shared = {name: {**table, **config.blocks.get(name, {})} for name, table in tables.items()}
     return dataclasses.replace(config, blocks={**config.blocks, **shared})
 

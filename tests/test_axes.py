@@ -16,9 +16,10 @@ from ekfslam.data.simulate import builtin
 from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.trajectory import absolute_trajectory_error
-from ekfslam.models.noise import shared_errors, velocity_noise
-from ekfslam.models.vehicle import odometry_text, up_axis, vehicle_std
-from ekfslam.resolve import noise_of, resolve, with_odometry
+from ekfslam.models.blocks import TwistBias
+from ekfslam.models.noise import velocity_noise
+from ekfslam.models.vehicle import odometry_text, slow_slip, up_axis, vehicle_std
+from ekfslam.resolve import noise_of, resolve, settings_of, with_odometry
 
 DRIVE, HOLONOMIC, OPTICAL = (0, 5), (0, 1, 5), (2, 4)  # measured axes; the last is forward and down of a camera
 
@@ -62,8 +63,6 @@ def test_exact_zeros_do_not_dilute_the_noise_of_the_measured_axes():
 def test_clean_velocities_carry_slow_motions_only_if_all_six_are_measured():
     complete, planar = velocity_noise(walk()), velocity_noise(np.where(mask(DRIVE), walk(), 0.0))
     assert complete.is_clean and planar.is_clean and complete.carries_motion and not planar.carries_motion
-    drifts = [shared_errors(found)["vision_drift"]["rotation_deg_m"] for found in (complete, planar)]
-    assert drifts[1] < drifts[0]
 
 
 @pytest.mark.parametrize(
@@ -91,6 +90,25 @@ def test_all_axes_measured_or_none_are_no_odometry_of_a_vehicle():
 def test_slip_is_the_same_motion_at_any_rate():
     slow, fast = (vehicle_std(mask(DRIVE), step_s) for step_s in (0.1, 0.025))
     np.testing.assert_allclose(slow**2 * 0.1**2 * 10, fast**2 * 0.025**2 * 40)
+
+
+@pytest.mark.parametrize(("axes", "names"), [(DRIVE, "yz"), (HOLONOMIC, "z"), (OPTICAL, "xy")])
+def test_slow_slip_is_a_bias_of_the_zeros_that_grows_with_the_speed(axes, names):
+    measured = mask(axes)
+    slow, fast = (slow_slip(measured, speed * np.ones((50, 6)), 0.02) for speed in (4.0, 8.0))
+    assert slow.keys() == {f"slip_{name}_m_s" for name in names}
+    assert all(fast[key] == pytest.approx(2.0 * value) for key, value in slow.items())
+    vertical = f"slip_{'xyz'[up_axis(measured)]}_m_s"
+    assert all(slow[vertical] > 3.0 * value for key, value in slow.items() if key != vertical)
+    std = np.diag(TwistBias(**slow).prior_covariance()) ** 0.5
+    np.testing.assert_allclose(std[:3], [slow.get(f"slip_{name}_m_s", 0.05) for name in "xyz"])
+
+
+def test_slow_slip_is_in_the_model_of_planar_odometry_and_gives_way_to_settings():
+    settings = Config().with_overrides({"blocks": {"twist_bias": {"slip_y_m_s": 0.7}}})
+    biased = settings_of(only(world(), DRIVE), settings).blocks["twist_bias"]
+    assert biased["slip_y_m_s"] == 0.7 and biased["slip_z_m_s"] > 0.1
+    assert not any(key.startswith("slip") for key in settings_of(world(), Config()).blocks["twist_bias"])
 
 
 @pytest.mark.parametrize("axes", [DRIVE, HOLONOMIC])

@@ -9,17 +9,22 @@ and pitches a little. They are white noise of a density that does not depend on 
 - Roll and pitch rate: a car's body swings at 1 to 1.5 Hz (Gillespie, "Fundamentals of Vehicle Dynamics", 1992), by a
   degree or less: some 5 deg/s, taken at 10 Hz.
 
-They are loose on purpose: vision sees these motions better, and slip persists.
+Slip also persists: the frame of the odometry is mounted askew, and roads are cambered. So the zeros have a slow bias,
+too: sideways one degree of the speed, vertically more by the same factor sqrt(10).
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
 
-_LATERAL, _VERTICAL = 0.1, 0.1 * np.sqrt(10.0)  # m/s/sqrt(Hz)
-_TILT = np.deg2rad(5.0) / np.sqrt(10.0)  # rad/s/sqrt(Hz)
+_VERTICAL_SHARE = 10.0**0.5  # of lateral slip
+_LATERAL, _VERTICAL = 0.1, 0.1 * _VERTICAL_SHARE  # m/s/sqrt(Hz)
+_SLOW_SLIP = math.radians(1.0)  # share of the speed
+_TILT = math.radians(5.0) / 10.0**0.5  # rad/s/sqrt(Hz)
 AXES = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
 _PLANAR = {1: "differential drive", 2: "holonomic"}  # by the number of linear velocities
 
@@ -42,6 +47,19 @@ def vehicle_std(measured: BoolArray, step_s: float) -> Array:
 def with_vehicle(std: Array, measured: BoolArray, step_s: float) -> Array:
     """Return standard deviations (6,), those of a vehicle for the axes that are not measured."""
     return np.where(measured, std, vehicle_std(measured, step_s))
+
+
+def slow_slip(measured: BoolArray, twist: Array, least_m_s: float) -> dict[str, float]:
+    """Return settings of the block `TwistBias` for the linear velocities (T, 6) that are not measured.
+
+    Args:
+        measured: (6,) axes that are measured.
+        least_m_s: Least bias.
+    """
+    speed = float(np.sqrt((np.where(measured, twist, 0.0)[:, :3] ** 2).sum(axis=1).mean()))
+    up, lateral = up_axis(measured), max(least_m_s, _SLOW_SLIP * speed)
+    axes = np.flatnonzero(~measured[:3]).tolist() if measured[:3].any() else []
+    return {f"slip_{'xyz'[axis]}_m_s": lateral * (_VERTICAL_SHARE if up in (None, axis) else 1.0) for axis in axes}
 
 
 def odometry_text(measured: BoolArray, std: Array) -> str:

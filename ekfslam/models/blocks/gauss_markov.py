@@ -23,7 +23,7 @@ class GaussMarkov(StateBlock):
 
     def __post_init__(self) -> None:
         for key, value in vars(self).items():
-            if not 0 < value < np.inf:
+            if value is not None and not 0 < value < np.inf:
                 raise ConfigError(f"blocks.{self.name}.{key} must be positive, found {value}")
 
     @property

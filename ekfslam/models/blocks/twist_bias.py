@@ -24,12 +24,17 @@ class TwistBias(GaussMarkov):
     Args:
         sigma_v_m_s, sigma_w_rad_s: Stationary standard deviations for linear and angular velocities, each axis.
         time_v_s, time_w_s: Their time constants.
+        slip_x_m_s, slip_y_m_s, slip_z_m_s: Those of linear velocities that are 0 because nothing measures them
+            (`ekfslam.models.vehicle`); by default ``sigma_v_m_s``.
     """
 
     sigma_v_m_s: float = 0.05
     sigma_w_rad_s: float = 0.002
     time_v_s: float = 30.0
     time_w_s: float = 100.0
+    slip_x_m_s: float | None = None
+    slip_y_m_s: float | None = None
+    slip_z_m_s: float | None = None
 
     name = "twist_bias"
     labels = tuple(f"bias of {name}" for name in ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z"))
@@ -37,7 +42,9 @@ class TwistBias(GaussMarkov):
 
     @property
     def stationary_std(self) -> Array:
-        return np.repeat([self.sigma_v_m_s, self.sigma_w_rad_s], 3)
+        slip = (self.slip_x_m_s, self.slip_y_m_s, self.slip_z_m_s)
+        linear = [self.sigma_v_m_s if std is None else std for std in slip]
+        return np.array([*linear, *[self.sigma_w_rad_s] * 3])
 
     def lengths(self, tau_s: Array | float, way_m: Array | float) -> Array:
         return np.asarray(tau_s)[..., None] / np.repeat([self.time_v_s, self.time_w_s], 3)
