@@ -205,9 +205,7 @@ def settings_of(sequence: Sequence, config: Config) -> Config:
     walks, is_white = noise_of(sequence, config).track_error is not None, _is_white(sequence, config)
     if not (is_automatic(sequence, config) and (walks or is_white)):
         return config
-    # Beside noisy velocities far points are needed: they show how the rig turns.
-    are_noisy = sequence.has_velocities and not noise_of_velocities(sequence).is_clean
-    if walks and not are_noisy and config.hygiene.min_disparity_sigma is None:
+    if walks and config.hygiene.min_disparity_sigma is None:
         config = config.with_overrides({"hygiene": {"min_disparity_sigma": MIN_DISPARITY_SIGMA}})
     if not config.noise.shared:
         return config

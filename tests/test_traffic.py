@@ -75,6 +75,16 @@ def test_clean_velocities_and_white_pixels_leave_the_tracks_to_the_filter():
         assert not len(traffic.moving_tracks(world, world.observations, noise_of(world, **changes)))
 
 
+def test_velocities_that_hardly_walk_are_smoothed_to_their_mean():
+    world, _ = road(0.0, frames=21, landmarks=20)
+    frames = np.arange(1, 21)
+    prior = traffic.velocity_prior(world, frames, noise_of(world, twist_walk_std=np.zeros(6)))
+    x = np.linalg.solve(prior.information.reshape(120, 120), prior.vector.ravel()).reshape(20, 6)
+    twist = world.twist[frames]
+    assert ((twist + x).std(axis=0) < 0.2 * twist.std(axis=0)).all()
+    np.testing.assert_allclose(x.mean(axis=0), 0.0, atol=1e-9)
+
+
 def test_derivatives_of_the_flow_are_those_of_its_residuals():
     world, _ = road(0.0, frames=12)
     o, at = world.observations, np.arange(12)
