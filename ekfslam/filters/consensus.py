@@ -28,6 +28,7 @@ from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters import correction, gates
@@ -46,6 +47,7 @@ INPUT_GATE = gates.of_inputs(6)
 _SHARE = 1.0 / 3.0  # of rejected landmarks, from which a frame is looked at
 _SAMPLES = 100
 _ROUNDS = 4
+_BENT = 0.05  # error of the linearisation, in deviations of a pixel, below which another round would be in vain
 
 
 @dataclass(frozen=True)
@@ -80,12 +82,14 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     if not (found.is_wide or _is_suspect(e, found, gate)):
         return found
     rounds = _ROUNDS if found.is_wide else 1
+    begin = None if _is_suspect(e, found, gate) else found.verdict == ACCEPTED
 
-    def settled(gaussian: Gaussian, verdicts: tuple[int, ...], rounds: int) -> tuple[IntArray, _Settled | None]:
+    def settled(gaussian: Gaussian, rounds: int, *verdicts: int) -> tuple[IntArray, _Settled | None]:
         some = np.flatnonzero(np.isin(found.verdict, verdicts))
-        return some, _settled(e, gaussian, frame, slot[some], measured[some], gate, rounds)
+        first = None if begin is None else begin[some]
+        return some, _settled(e, gaussian, frame, slot[some], measured[some], gate, rounds, first)
 
-    some, trusted = settled(e.gaussian, (ACCEPTED, GATE), rounds)
+    some, trusted = settled(e.gaussian, rounds, ACCEPTED, GATE)
     if trusted is not None and trusted.is_majority:
         found = _correction(e, found, trusted, some, measured)
     if e.model.process.estimates_velocity or not _is_suspect(e, found, gate):
@@ -94,10 +98,11 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     if 4.0 * jump @ jump < INPUT_GATE:
         return found
     # Tracks that seem to move may be made to by the inputs: both hypotheses are judged by all.
+    begin = None
     if (found.verdict == MOVING).any():
-        some, trusted = settled(e.gaussian, (ACCEPTED, GATE, MOVING), rounds)
+        some, trusted = settled(e.gaussian, rounds, ACCEPTED, GATE, MOVING)
     wide = doubted(e, DOUBT)
-    some, doubtful = settled(wide, (ACCEPTED, GATE, MOVING), _ROUNDS)
+    some, doubtful = settled(wide, _ROUNDS, ACCEPTED, GATE, MOVING)
     cost = gate * len(some) if trusted is None else trusted.cost
     if doubtful is None or not doubtful.is_majority or doubtful.cost + INPUT_GATE >= cost:
         return found
@@ -146,18 +151,36 @@ def _is_suspect(e: Estimate, found: Correction, gate: float) -> bool:
 
 
 def _settled(
-    e: Estimate, gaussian: Gaussian, frame: int, slot: IntArray, measured: Array, gate: float, rounds: int = _ROUNDS
+    e: Estimate,
+    gaussian: Gaussian,
+    frame: int,
+    slot: IntArray,
+    measured: Array,
+    gate: float,
+    rounds: int,
+    begin: BoolArray | None,
 ) -> _Settled | None:
-    """Solve eq. (6) under a covariance for the landmarks (k,) that agree, in some rounds; None: there are none."""
+    """Solve eq. (6) under a covariance for the landmarks (k,) that agree; None: there are none.
+
+    Args:
+        e: Estimate at the prediction.
+        gaussian: Its covariance.
+        frame: Frame index, which also seeds the samples.
+        slot, measured: (k,), (k, d) landmarks and their rows.
+        gate: Threshold for one landmark.
+        rounds: Number of linearisations at most.
+        begin: (k,) landmarks that agree to begin with; None: they are found from samples.
+    """
     _, rows = observe(e, e.mean, slot, measured)
-    some, inside, found = np.arange(len(slot)), np.zeros(len(slot), dtype=bool), None
+    some, found = np.arange(len(slot)), None
+    inside = np.zeros(len(slot), dtype=bool) if begin is None else begin.copy()
     linear, coordinates = e.mean, e.coordinates
-    for _ in range(rounds):
+    for rounds_left in reversed(range(rounds)):
         if not len(some):
             return None
         projection = gaussian.project(rows, frame, e.ids[rows.slot])
         S = projection.S
-        if found is None:
+        if found is None and begin is None:
             inside = agreeing(S, rows, gate, np.random.default_rng(frame))
         agree = refined(S, rows.residual, inside[some], gate)
         if not agree.any():
@@ -165,20 +188,24 @@ def _settled(
         inside[:] = False
         inside[some[agree]] = True
         solution = gaussian.solve(projection.only(np.flatnonzero(agree)), frame, e.ids[rows.slot[agree]])
+        own = _blocks(S.reshape(*rows.residual.shape * 2))[agree]
         cost = solution.done.nis + gate * (len(slot) - agree.sum())
-        found = _Settled(
-            solution,
-            inside.copy(),
-            rows.only(agree),
-            _blocks(S.reshape(*rows.residual.shape * 2))[agree],
-            linear,
-            coordinates,
-            cost,
-        )
+        found = _Settled(solution, inside.copy(), rows.only(agree), own, linear, coordinates, cost)
+        if not rounds_left:
+            break
         linear, coordinates, seen, rows = relinearised(e, _at(e, solution), solution, slot, measured)
+        if _is_straight(e, found, rows.only(inside)):
+            break
         some = np.flatnonzero(e.sensor.in_view(seen.q, e.config.min_depth_m))
         rows = rows.only(some)
     return found
+
+
+def _is_straight(e: Estimate, settled: _Settled, rows: Rows) -> bool:
+    """Return whether rows that are linearised at a solution agree with those that it was found with."""
+    x, d = parts(e, settled.solution.done.correction)
+    bent = rows.corrected(x, d).residual - settled.rows.corrected(x, d).residual
+    return bool(np.mean(bent**2 / settled.rows.variance) < _BENT**2)
 
 
 def _correction(e: Estimate, plain: Correction, settled: _Settled, candidates: IntArray, measured: Array) -> Correction:
@@ -254,34 +281,54 @@ def _samples(k: int, generator: np.random.Generator) -> IntArray:
 def refined(S: Array, residual: Array, inside: BoolArray, gate: float) -> BoolArray:
     """Return the landmarks (k,) that agree with all others of them, starting from those ``inside`` (k,).
 
-    The worst one leaves first: with it inside, it may seem that others are wrong. Arguments are as in `squares_given`.
-    """
-    inside = inside.copy()
-    while inside.any():
-        squares = squares_given(S, residual, np.flatnonzero(inside))
-        worst = np.where(inside, squares, 0.0).argmax()
-        if squares[worst] <= gate:
-            return inside | (squares <= gate)
-        inside[worst] = False
-    return inside
-
-
-def squares_given(S: Array, residual: Array, inside: IntArray) -> Array:
-    """Return the normalised squares (k,) of innovations, each given those of all *other* landmarks ``inside`` (j,).
+    The innovation of a landmark given those of all others has the square ``y_i^T K_ii^-1 y_i`` with ``K = S_AA^-1`` and
+    ``y = K r_A``. The worst one leaves first: with it inside, it may seem that others are wrong.
 
     Args:
         S: (k d, k d) joint covariance of the innovations (k, d).
+        residual: The innovations.
+        inside: Where to start.
+        gate: Threshold for one landmark.
     """
-    k, d = residual.shape
-    S, j = S.reshape(k, d, k, d), len(inside)
-    K = np.linalg.inv(S[inside][:, :, inside].reshape(j * d, j * d))
-    S_ka = S[:, :, inside].reshape(k, d, j * d)
-    y = K @ residual[inside].ravel()
-    e, C = residual - S_ka @ y, _blocks(S) - (S_ka @ K) @ S_ka.swapaxes(1, 2)
-    # ((S_AA^-1)_ii)^-1 y_i is the innovation of a member given the others.
-    C[inside] = np.linalg.inv(np.asarray(_blocks(K.reshape(j, d, j, d))))
-    e[inside] = (C[inside] @ y.reshape(j, d, 1))[..., 0]
-    return (e * np.linalg.solve(C, e[..., None])[..., 0]).sum(axis=1)
+    (k, d), some = residual.shape, np.flatnonzero(inside)
+    S_kdkd = S.reshape(k, d, k, d)
+    K = inverse(S_kdkd[some][:, :, some].reshape(len(some) * d, len(some) * d))
+    while len(some):
+        own = np.asarray(_blocks(K.reshape(len(some), d, len(some), d)))
+        y = (K @ residual[some].ravel()).reshape(len(some), d)
+        squares = (y * np.linalg.solve(own, y[..., None])[..., 0]).sum(axis=1)
+        if squares.max() <= gate:
+            break
+        # Without rows i the inverse is K - K_:i K_ii^-1 K_i: .
+        worst = int(squares.argmax())
+        rows = slice(worst * d, (worst + 1) * d)
+        K = K - K[:, rows] @ np.linalg.solve(own[worst], K[rows])
+        K = np.delete(np.delete(K, rows, axis=0), rows, axis=1)
+        some = np.delete(some, worst)
+    agree = np.zeros(k, dtype=bool)
+    agree[some] = True
+    others = np.flatnonzero(~agree)
+    S_ja = S_kdkd[others][:, :, some].reshape(len(others), d, len(some) * d)
+    gain = S_ja @ K
+    e = residual[others] - gain @ residual[some].ravel()
+    C = _blocks(S_kdkd)[others] - gain @ S_ja.swapaxes(1, 2)
+    agree[others] = (e * np.linalg.solve(C, e[..., None])[..., 0]).sum(axis=1) <= gate
+    return agree
+
+
+def inverse(S: Array) -> Array:
+    """Return the inverse of a covariance, by Cholesky.
+
+    Raises:
+        LinAlgError: It is not positive definite.
+    """
+    if not len(S):
+        return S
+    L, failed = lapack.dpotrf(S, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("not positive definite")
+    K = lapack.dpotri(L, lower=1)[0]
+    return np.asarray(np.tril(K) + np.tril(K, -1).T)
 
 
 def _blocks(S: NDArray[np.floating]) -> Array:
