@@ -188,7 +188,8 @@ class FilterConfig:
             linear in the number of landmarks, see `ekfslam.filters.conditional`. ``auto`` takes the cheaper one.
         iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. ``fej`` and ``xyz`` allow no more.
         lag: Number of frames n of the relinearised window: after each update, the factors of the last n frames are
-            linearised again at their maximum a posteriori, see `ekfslam.smoother.fixed_lag`. 0 linearises each once.
+            linearised again at their maximum a posteriori, see `ekfslam.smoother.fixed_lag`. 0 linearises each once. By
+            default 10 for a recording without velocities (unless many landmarks come back, or ``fej``), else 0.
         retire: ``unseen`` marginalises a landmark when it is out of view, ``never`` keeps all. ``auto`` is ``never``
             for a recording of at most 1500 landmarks some of which come back, else ``unseen``.
         retire_after: Frames without a sighting after which ``unseen`` applies: by default 1, or 10 if some landmarks of
@@ -196,7 +197,7 @@ class FilterConfig:
         dormant: With ``unseen``, number of landmarks out of view that stay in the state, those seen last: by default 0,
             or 1500 if ``auto`` has chosen ``unseen`` although landmarks come back.
         revive: A retired landmark that is seen again comes back with its exact mean and covariance, together with up to
-            this many retired landmarks seen nearest to it in time. -1 starts it again.
+            this many retired landmarks seen nearest to it in time. -1 starts it again, as the automatic lag does.
         gate_probability: Chi-square gate on each observation, against the prediction and (joint filter) against the
             prediction as corrected by the frame's other landmarks; 1 accepts everything.
         split_after: Rejected observations in a row after which a new landmark replaces that of the track; 0 never
@@ -213,7 +214,7 @@ class FilterConfig:
     landmark_coordinates: LandmarkCoordinates = field(default="image", metadata=_one_of(LandmarkCoordinates))
     covariance_form: CovarianceForm = field(default="auto", metadata=_one_of(CovarianceForm))
     iterations: int = field(default=1, metadata=_whole(1, 100))
-    lag: int = field(default=0, metadata=_whole(0, 1000))
+    lag: int | None = field(default=None, metadata=_whole(0, 1000))
     retire: Retire = field(default="auto", metadata=_one_of(Retire))
     retire_after: int | None = field(default=None, metadata=_whole(1))
     dormant: int | None = field(default=None, metadata=_whole(0))

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekfslam.arrays import Array
+from ekfslam.arrays import Array, IntArray
 from ekfslam.config import LEAST_PX, BlockSetting, Config, Mode
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.inputs import InertialNoise
@@ -61,6 +61,10 @@ from ekfslam.models.vehicle import odometry_text, slow_slip, with_vehicle
 
 # Number of dormant landmarks kept in the state of a recording whose landmarks come back: their covariance has 160 MB.
 DORMANT_LIMIT = 1500
+# Frames for which a landmark of a recording whose landmarks come back stays in the state without being seen.
+COME_BACK_AFTER = 10
+# Relinearised window of a recording without velocities, frames; share of frames up to which landmarks may return there.
+VISION_LAG, MOST_RETURNS = 10, 0.1
 # Square root of the long-run variance of errors along KLT tracks over that of a frame, as `ekfslam check` finds it.
 PERSISTENCE = 3.0
 # NIS per degree of freedom: below 1, since errors persist.
@@ -112,7 +116,7 @@ class Problem:
         config = self.config
         chosen = {
             "noise": ("sigma_px", "drift", "track_scale", *_SAMPLING),
-            "filter": ("retire", "retire_after", "dormant", "covariance_form"),
+            "filter": ("lag", "retire", "retire_after", "dormant", "covariance_form"),
             "hygiene": ("min_disparity_sigma",),
             "calibration": ("rotation_deg", "disparity_px"),
         }
@@ -293,25 +297,42 @@ def found_attributes(found: VelocityNoise) -> dict[str, float]:
 
 
 def _with_retirement(sequence: Sequence, config: Config) -> Config:
-    """Return a configuration that says when landmarks leave the state."""
-    settings, come_back = config.filter, _landmarks_come_back(sequence)
+    """Return a configuration with the lag, and when landmarks leave the state."""
+    config = _with_lag(sequence, config)
+    settings, come_back = config.filter, bool(len(_returns(sequence)))
     retire, retire_after, dormant = settings.retire, settings.retire_after, settings.dormant
     if retire == "auto":
         are_few = len(sequence.observations.ids) <= DORMANT_LIMIT
         retire = "never" if come_back and are_few and not settings.lag else "unseen"
     if retire_after is None:
-        retire_after = 10 if come_back else 1
+        retire_after = COME_BACK_AFTER if come_back else 1
     if dormant is None:
         # In a relinearised window they would cost as much as landmarks in view: there they come back by map revival.
         dormant = DORMANT_LIMIT if come_back and settings.retire == "auto" and not settings.lag else 0
     return config.with_overrides({"filter": {"retire": retire, "retire_after": retire_after, "dormant": dormant}})
 
 
-def _landmarks_come_back(sequence: Sequence) -> bool:
+def _with_lag(sequence: Sequence, config: Config) -> Config:
+    """Return a configuration with the lag of the relinearised window.
+
+    Without velocities a prediction is wrong by tens of pixels: frames that are linearised once are believed too much.
+    """
+    if config.filter.lag is not None:
+        return config
+    is_blind = not (sequence.has_velocities or is_inertial(sequence))
+    # A map revival solves the whole log, and a new window begins. So few landmarks that come back start again instead;
+    # with many of them, dormant landmarks serve better than a window.
+    many = len(_returns(sequence, after=COME_BACK_AFTER)) > MOST_RETURNS * len(sequence)
+    has_window = is_blind and not many and config.filter.variant != "fej"
+    return config.with_overrides({"filter": {"lag": VISION_LAG, "revive": -1} if has_window else {"lag": 0}})
+
+
+def _returns(sequence: Sequence, after: int = 1) -> IntArray:
+    """Return the frames, distinct, in which a landmark is seen again more than some frames after it was seen last."""
     observations = sequence.observations
     order = np.lexsort((observations.frame, observations.landmark))
-    same = np.diff(observations.landmark[order]) == 0
-    return bool((same & (np.diff(observations.frame[order]) > 1)).any())
+    frame, landmark = observations.frame[order], observations.landmark[order]
+    return np.unique(frame[1:][(np.diff(landmark) == 0) & (np.diff(frame) > after)])
 
 
 def _model(sequence: Sequence, config: Config, noise: Noise, blocks: SequenceType[StateBlock]) -> Model:

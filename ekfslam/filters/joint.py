@@ -48,10 +48,11 @@ class JointEKF(Estimate):
             first `update`.
         blocks: Further state blocks.
         revival: Source of returning landmarks; None: they are initialised again.
-        window: Maker of the relinearised window that ``config.lag`` asks for: `ekfslam.smoother.fixed_lag.FixedLag`.
+        window: Maker of the relinearised window for ``config.lag``, `ekfslam.smoother.fixed_lag.FixedLag`; None: no
+            frame is linearised again.
 
     Raises:
-        ConfigError: A calibration to estimate, but no `Rig`; neither a model nor a first pose; or a lag, but no window.
+        ConfigError: A calibration to estimate, but no `Rig`; or neither a model nor a first pose.
 
     Attributes:
         retired: Landmarks that have left the state.
@@ -78,8 +79,6 @@ class JointEKF(Estimate):
             coordinates = config.landmark_coordinates
             model = model_of(sensor, sensor.noise, se3.inverse(T_world_imu), P_pose, calibration, blocks, coordinates)
         super().__init__(model, config)
-        if config.lag and window is None:
-            raise ConfigError("filter.lag: hand JointEKF window=FixedLag, of ekfslam.smoother.fixed_lag")
         self.window = window(model, config) if config.lag and window is not None else None
         self.revival, self.retired, self._revived = revival, Retired(), False
         self._log = LogBook(self)

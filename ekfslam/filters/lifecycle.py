@@ -62,6 +62,9 @@ class Relinearised(Protocol):
     def start_over(self, e: Estimate) -> None:
         """Begin at the present frame."""
 
+    def cross(self, step: int) -> Array | None:
+        """Return the cross-covariance (6, 6) of the pose at a step and of the last one; None: it is out of reach."""
+
 
 class Retired:
     """Landmarks that have left the state.

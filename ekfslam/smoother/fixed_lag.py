@@ -62,6 +62,8 @@ class FixedLag:
         self.prior: Prior | None = None
         self._state: State | None = None
         self._rows = np.empty(0, dtype=np.int64)
+        self._solution: DenseInformation | None = None  # the last one, of a window that began at `_begins`
+        self._begins = 0
 
     @property
     def landmarks(self) -> IntArray:
@@ -78,7 +80,7 @@ class FixedLag:
         values = {block.name: e.values[block.name] for block in u.of_drive}
         positions = e.table.position_m.copy()
         state = State(e.T_imu_world[None], positions, np.empty(0), shared[None], aux[None], drive, values)
-        self.first, self.observed, self._rows = e.step, e.step + 1, e.table.log_row.copy()
+        self.first, self.observed, self._rows, self._solution = e.step, e.step + 1, e.table.log_row.copy(), None
         self.prior, zeta = Prior.at_state(
             self.model, state, 0, self._rows, np.arange(len(positions)), np.zeros(len(P)), P, self.config.min_depth_m
         )
@@ -105,9 +107,21 @@ class FixedLag:
         P = filter_covariance(self.model, u, solution, log.frames - 1, active)
         marginal = Marginal(u.last_values(state), *u.last_coordinates(state), state.positions_m[active], P)
         self._state, self._rows = state, rows
-        if log.frames > self.config.lag:
+        self._solution, self._begins = solution, self.first
+        if log.frames > (self.config.lag or 0):
             self._shift(problem, system, active)
         return marginal
+
+    def cross(self, step: int) -> Array | None:
+        """Return ``cov(xi_j, xi_k)`` (6, 6) of the pose at a step j and the last one; None: j is out of the window.
+
+        Estimates of a filter are conditional means, so the errors of its estimates at j and k have the cross-covariance
+        of both poses given everything up to k.
+        """
+        if self._solution is None or not self._begins <= step:
+            return None
+        last, w = len(self._solution.eps) - 1, self.unknowns.width
+        return self._solution.covariance(frames=[step - self._begins, last])[:6, w : w + 6]
 
     def _solved(self, problem: WindowProblem, start: State) -> tuple[State, LinearSystem, DenseInformation]:
         """Return the maximum by Gauss-Newton with halved steps, and the factors and their solution next to it."""

@@ -90,7 +90,7 @@ class DenseInformation:
         W = np.zeros((len(columns), len(self._L)))
         is_reduced = self._place[columns] >= 0
         W[is_reduced] = self._basis[self._place[columns[is_reduced]]]
-        landmarks = np.asarray(wanted["landmarks"])
+        landmarks = np.asarray(wanted.get("landmarks", []), dtype=np.int64)
         at, place = np.flatnonzero(np.isin(landmarks, self.free)), np.searchsorted(self.free, landmarks)
         own = (len(columns) - 3 * len(landmarks) + 3 * at)[:, None] + np.arange(3)
         L_inverse = self._L_inverse[place[at]]
