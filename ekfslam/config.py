@@ -189,7 +189,8 @@ class FilterConfig:
         iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. ``fej`` and ``xyz`` allow no more.
         lag: Number of frames n of the relinearised window: after each update, the factors of the last n frames are
             linearised again at their maximum a posteriori, see `ekfslam.smoother.fixed_lag`. 0 linearises each once. By
-            default 10 for a recording without velocities (unless many landmarks come back, or ``fej``), else 0.
+            default 10 for a recording without velocities whose motion changes fast (unless many landmarks come back,
+            or ``fej``), else 0.
         retire: ``unseen`` marginalises a landmark when it is out of view, ``never`` keeps all. ``auto`` is ``never``
             for a recording of at most 1500 landmarks some of which come back, else ``unseen``.
         retire_after: Frames without a sighting after which ``unseen`` applies: by default 1, or 10 if some landmarks of

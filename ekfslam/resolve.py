@@ -65,6 +65,8 @@ DORMANT_LIMIT = 1500
 COME_BACK_AFTER = 10
 # Relinearised window of a recording without velocities, frames; share of frames up to which landmarks may return there.
 VISION_LAG, MOST_RETURNS = 10, 0.1
+# Second-order error of a prediction, in standard deviations of a pixel, from which a window is worth its time.
+CURVED = 0.1
 # Square root of the long-run variance of errors along KLT tracks over that of a frame, as `ekfslam check` finds it.
 PERSISTENCE = 3.0
 # NIS per degree of freedom: below 1, since errors persist.
@@ -313,18 +315,30 @@ def _with_retirement(sequence: Sequence, config: Config) -> Config:
 
 
 def _with_lag(sequence: Sequence, config: Config) -> Config:
-    """Return a configuration with the lag of the relinearised window.
-
-    Without velocities a prediction is wrong by tens of pixels: frames that are linearised once are believed too much.
-    """
+    """Return a configuration with the lag of the relinearised window."""
     if config.filter.lag is not None:
         return config
-    is_blind = not (sequence.has_velocities or is_inertial(sequence))
     # A map revival solves the whole log, and a new window begins. So few landmarks that come back start again instead;
     # with many of them, dormant landmarks serve better than a window.
     many = len(_returns(sequence, after=COME_BACK_AFTER)) > MOST_RETURNS * len(sequence)
-    has_window = is_blind and not many and config.filter.variant != "fej"
+    has_window = config.filter.variant != "fej" and not many and _curvature(sequence, config) > CURVED
     return config.with_overrides({"filter": {"lag": VISION_LAG, "revive": -1} if has_window else {"lag": 0}})
+
+
+def _curvature(sequence: Sequence, config: Config) -> float:
+    """Return the second-order error of a prediction without velocities, in standard deviations of a pixel; else 0.
+
+    With predictions that are wrong by s pixels it is about ``s^2 / f``. If s is tens of pixels, frames that are
+    linearised once are believed too much.
+    """
+    if sequence.has_velocities or is_inertial(sequence) or len(sequence) < 2 or not len(sequence.observations):
+        return 0.0
+    noise, camera = noise_of(sequence, config), sequence.camera
+    assert noise.twist_walk_std is not None
+    change = float(np.median(np.diff(sequence.time_s))) * noise.twist_walk_std
+    disparity_px = np.median(sequence.observations.pixels_px[:, 0] - sequence.observations.pixels_px[:, 2])
+    wrong_px = np.hypot(camera.fu_px * change[3:].max(), change[:3].max() * disparity_px / camera.baseline_m)
+    return float(wrong_px**2 / camera.fu_px / np.min(noise.pixel_std_px))
 
 
 def _returns(sequence: Sequence, after: int = 1) -> IntArray:

@@ -180,14 +180,16 @@ def test_reported_poses_have_the_cross_covariance_that_clones_have():
     np.testing.assert_allclose(by_window.cross[kept] / scale, by_clones.cross[kept] / scale, atol=2e-2)
 
 
-def test_recordings_without_velocities_have_a_window_unless_landmarks_come_back_often():
-    room = ekfslam.open_sequence("builtin:room?frames=30")
+def test_fast_recordings_without_velocities_have_a_window_unless_landmarks_come_back_often():
+    room = ekfslam.open_sequence("builtin:room?frames=50")
     assert resolve(room).config.filter.lag == 0
     blind = without_velocities(room)
     found = resolve(blind).config.filter
     assert (found.lag, found.retire, found.revive, found.covariance_form) == (10, "unseen", -1, "dense")
     assert resolve(blind, with_lag(3)).config.filter.lag == 3
     assert resolve(blind, with_lag(None, variant="fej")).config.filter.lag == 0
+    slow = without_velocities(ekfslam.open_sequence("builtin:city?frames=20"))
+    assert resolve(slow).config.filter.lag == 0
     ids, first = np.arange(20), np.arange(20) % 5
     pixels = np.tile([100.0, 50.0, 80.0, 50.0], (40, 1))
     returning = Observations(np.concatenate([first, first + 20]), np.tile(ids, 2), pixels)
