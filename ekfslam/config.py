@@ -202,7 +202,8 @@ class FilterConfig:
         gate_probability: Chi-square gate on each observation, against the prediction and (joint filter) against the
             prediction as corrected by the frame's other landmarks; 1 accepts everything.
         split_after: Rejected observations in a row after which a new landmark replaces that of the track; 0 never
-            does. By default 3; 1 if errors of tracks walk, since each observation then continues the last one.
+            does. By default 3; 1 if errors of tracks walk, since each observation then continues the last one, except
+            for tracks of the front end, which do not jump.
         moving_sigma, moving_share: If errors of tracks walk, a track that moves along with the rig is dropped for good:
             by more than this many standard deviations over all its observations, and this share of the way.
         min_depth_m: Reject observations of a landmark that is predicted nearer than this, or behind the camera.

@@ -208,6 +208,9 @@ def settings_of(sequence: Sequence, config: Config) -> Config:
     Explicit settings take precedence. `noise_of` gives the noise; `resolve` adds track scale and covariance form.
     """
     config = _with_retirement(sequence, config)
+    if sequence.has_checked_tracks and config.filter.split_after is None:
+        # They do not jump to another point: a new landmark would let a moving one in again.
+        config = config.with_overrides({"filter": {"split_after": config.filter.misses_to_split(tracks_walk=False)}})
     walks, is_white = noise_of(sequence, config).track_error is not None, _is_white(sequence, config)
     if not (is_automatic(sequence, config) and (walks or is_white)):
         return config

@@ -180,6 +180,7 @@ def test_without_stated_noise_tracks_decide_what_is_believed():
     checked = without_velocities(dataclasses.replace(sequence, attributes={**sequence.attributes, **CHECKED_TRACKS}))
     problem = resolve(checked)
     assert problem.model.track_error.parallax < 1 and problem.config.noise.track_scale is None
+    assert problem.config.filter.split_after == 3 and walking.config.filter.split_after is None
     assert not {"camera_jitter", "vision_drift", "calibration"} & set(problem.model.layout)
     given = resolve(checked, Config().with_overrides({"noise": {"sigma_px": 0.6}}))
     assert given.model.track_error is None and given.model.noise.pixel_std_px[0] == 0.6
