@@ -1,7 +1,7 @@
 """Calls that run, and write archives, tables and figures.
 
 `compare` runs several modes on one sequence. `check_consistency` judges covariances on simulations, whose truth is
-known. `check` judges one run without truth, by its innovations.
+known. `check` judges one run by its innovations, which need no truth.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import EkfslamError, FilterError, IllPosedError, PosteriorError
-from ekfslam.evaluation.honesty import Honesty, judge, require_innovations
+from ekfslam.evaluation.honesty import Honesty, judge, require_innovations, verdict_on
 from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.check import plot_check
@@ -29,7 +29,7 @@ from ekfslam.filters.result import Result
 from ekfslam.runner import run
 from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.posterior import posterior, smooth
-from ekfslam.storage.archive import archive_image, open_result, require_same_origin
+from ekfslam.storage.archive import archive_image, open_result, read_archive, require_same_origin
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed, open_executor
 from ekfslam.studies.study import Study, StudyArchive, run_study
 from ekfslam.studies.summary import study_table, summarise_study
@@ -73,6 +73,8 @@ class Comparison(Shown):
     def table(self) -> str:
         """The summary as a Markdown table, with reasons for missing modes and remarks."""
         lines = [f"No {mode}: {reason}" for mode, reason in self.skipped.items()]
+        if "full" in self.results:
+            lines.append(f"Verdict on full: {verdict_on(self.sequence, self.results['full'])}")
         remarks: dict[str, list[str]] = {}
         for mode, result in self.results.items():
             for remark in result.remarks:
@@ -252,9 +254,10 @@ class Check:
 
 
 def check(archive: str | Path, mode: str = "full", directory: str | Path | None = None) -> Check:
-    """Judge the covariance of a run without truth, and write ``check.json``, ``check.md`` and ``check.png``.
+    """Judge the covariance of a run, and write ``check.json``, ``check.md`` and ``check.png``.
 
-    The files go into ``directory``, by default the folder of the archive.
+    Innovations need no truth; if the archive has one, it is compared, too. The files go into ``directory``, by default
+    the folder of the archive.
 
     Raises:
         ArchiveError: The archive cannot be read or has no such mode.
@@ -264,12 +267,13 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
     values, table, figure = _targets(folder, "check.json", "check.md", "check.png")
     result = open_result(archive, mode)
     require_innovations(result)
+    recorded = read_archive(archive)
     smoothed, skipped = None, ""
     try:
         smoothed = posterior(result)
     except PosteriorError as error:
         skipped = str(error)
-    found = judge(result, smoothed, skipped)
+    found = judge(result, smoothed, skipped, recorded.truth, recorded.interpolated)
     files.write_all({values: _json(found.values), table: found.table, figure: png(plot_check(result, found))})
     return Check(found, [values, table, figure])
 

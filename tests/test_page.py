@@ -23,14 +23,14 @@ from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.evaluation.honesty import judge
 from ekfslam.figures import series
 from ekfslam.figures.maps import spread
-from ekfslam.filters.result import Innovation
+from ekfslam.filters.result import Innovation, Rejections
 from ekfslam.page.content import PART, packed, sections_of, told_apart
 from ekfslam.page.report import read_archives, report_page, write_report
 from ekfslam.runner import run
 from ekfslam.storage.archive import read_archive, write_archive
 from ekfslam.stored import empty
 
-HONEST = "honest as far as the truth of one drive can tell"
+HONEST = "consistent as far as NIS and the truth of one drive can tell"
 HOSTILE = "</script><script>alert('x')</script><img src=http://evil.example onerror=alert(1)>\x1b[31m"
 
 
@@ -105,20 +105,21 @@ def test_every_run_has_a_verdict_from_what_there_is(archive):
     known = read_archive(archive)
     full = known.results["full"]
     to_honest = 6.0 / sections_of({"some": known})[0].runs[-1].honesty.truth.nees
-    honest = dataclasses.replace(full, covariance=full.covariance / to_honest, whitened=None)
+    honest = dataclasses.replace(
+        full, covariance=full.covariance / to_honest, whitened=None, rejections=empty(Rejections)
+    )
     small = dataclasses.replace(honest, covariance=honest.covariance / 25.0)
     doubled = dataclasses.replace(
         honest, innovation=dataclasses.replace(honest.innovation, nis=4.0 * honest.innovation.dof)
     )
     bare = dataclasses.replace(honest, innovation=empty(Innovation, T=len(honest.time_s)))
     said = carded(known, first=honest, small=small, doubled=doubled, bare=bare)
-    assert said["bare"] == ("good", [HONEST, "pose NEES 6, where one honest drive has 1.2 to 14.4"])
+    assert said["bare"] == ("good", [f"{HONEST} (pose NEES 6, 6 expected)"])
     assert said["small"][0] == "bad"
-    assert "covariance optimistic by about 5.0x against the truth" in " ".join(said["small"][1])
-    kind, (head, figures, other) = said["doubled"]
-    assert (kind, head) == ("bad", "innovations are about 2.0x larger than expected")
-    assert figures.startswith("NIS 4 \N{PLUS-MINUS SIGN} ")
-    assert other.startswith(HONEST)
+    assert "standard deviations about 5.0x too small by the truth" in said["small"][1][0]
+    kind, (head, reason) = said["doubled"]
+    assert kind == "bad" and "the truth of one drive does not show it" in head
+    assert reason.startswith("innovations are about 2.0x larger than expected (NIS 4 \N{PLUS-MINUS SIGN} ")
     blind = dataclasses.replace(known, truth=None)
     assert carded(blind, bare=bare)["bare"][0] == "none"
     assert "no innovations to judge by" in carded(blind, bare=bare)["bare"][1][0]
@@ -135,14 +136,15 @@ def judged(tmp_path_factory):
 
 @pytest.mark.slow
 def test_evidence_is_that_of_check_and_of_the_truth(judged):
-    page, honesty = report_page({"first": judged}), judge(judged.results["full"])
+    honesty = judge(judged.results["full"], truth=judged.truth, interpolated=judged.interpolated)
+    page = report_page({"first": judged})
     for name, found, _ in honesty.evidence:
         row = re.search(rf'<tr><th scope="row">{re.escape(html.escape(name))}[^<]*</th>(.*?)</tr>', page)
         assert f"<td>{found}</td>" in row[1] or f"<td>{found} (" in row[1], name
     assert "filter less smoother" not in page
     assert "pose NEES, with truth noise (6, of one drive 1.2 to 14.4)" in page
     cards = carded(judged, **judged.results)
-    assert cards["full"][1][0] in honesty.verdict
+    assert cards["full"][1] == [honesty.headline, *honesty.reasons] and cards["full"][0] == honesty.grade
     for kind, said in cards.values():
         assert f'<article class="card {kind}">' in page
         assert all(html.escape(words[1:]) in page for words in said)

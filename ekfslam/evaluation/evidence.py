@@ -15,13 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.data.sequence import Truth
+from ekfslam.data.sequence import WITHOUT_VELOCITIES, Truth
 from ekfslam.evaluation import whiteness
 from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_error, pose_nees, pose_nees_apart
 from ekfslam.evaluation.tables import plus_minus
-from ekfslam.filters.result import REASONS, Parameters, Result, WhitenedInnovations
-from ekfslam.geometry import se3
-from ekfslam.smoother.posterior import Posterior
+from ekfslam.filters.result import REASONS, Result, WhitenedInnovations
+from ekfslam.geometry import motion, se3
+from ekfslam.models.blocks import OPTIONAL_BLOCKS
+from ekfslam.smoother.posterior import Posterior, is_inertial
 
 LAGS = 20  # frames over which autocorrelation is shown
 _LAGS_OF_SUMS = 60  # frames over which it is summed: a tenth of the drive, at most this
@@ -77,17 +78,12 @@ class SharedInnovations(Whiteness):
         std: (6,) standard deviation about 0; 1 expected.
         order: (6,) axes, worst first.
         factor_low: (6,) ``factor`` minus three standard errors.
-        mean, mean_error: (6,) means in standard deviations of a frame, and their standard errors.
-        rate: (6,) mean motion in m/s and rad/s: lower bound of a constant bias of the velocities.
         frames: Number of frames examined.
     """
 
     std: Array
     order: IntArray
     factor_low: Array
-    mean: Array
-    mean_error: Array
-    rate: Array
     frames: int
 
 
@@ -117,22 +113,6 @@ class RejectedShares:
     reasons: Mapping[str, float]
     gate: float | None = None
     expected: float | None = None
-
-
-@dataclass(frozen=True)
-class PriorAgreement:
-    """Agreement of a reported parameter with its prior.
-
-    Args:
-        name: Name of the parameter.
-        pull: Last estimate divided by ``sqrt(prior^2 - std^2)``; None if nothing was learnt.
-        increment: Root mean square of the changes over tenths of the drive, each divided by
-            ``sqrt(std_before^2 - std_after^2)``; None if the parameter is not constant, as its deviation does not fall.
-    """
-
-    name: str
-    pull: float | None
-    increment: float | None
 
 
 @dataclass(frozen=True)
@@ -187,30 +167,31 @@ def partial(whitened: WhitenedInnovations, axis: int, given: IntArray) -> Array:
     return np.where(enough, mean / np.sqrt(np.where(enough, variance, 1.0)), np.nan)
 
 
-def shared_innovations(whitened: WhitenedInnovations, examined: BoolArray, tau_s: Array) -> SharedInnovations:
-    """Return the errors common to all landmarks in the frames examined (T,), with intervals ``tau_s`` (T,)."""
+def lags_of_sums(frames: int) -> int:
+    """Return the lags over which the autocovariance of some frames is summed."""
+    return max(LAGS, min(_LAGS_OF_SUMS, frames // 10))
+
+
+def shared_innovations(whitened: WhitenedInnovations, examined: BoolArray) -> SharedInnovations:
+    """Return the errors common to all landmarks in the frames examined (T,)."""
     kept = dataclasses.replace(whitened, score=whitened.score[examined], information=whitened.information[examined])
     frames = int(examined.sum())
-    lags = max(LAGS, min(_LAGS_OF_SUMS, frames // 10))
+    lags = lags_of_sums(frames)
     own = whiteness.autocovariance(kept.shared, LAGS)
 
     def long_run(series: Array) -> float:
         return float(whiteness.long_run_variance(whiteness.autocovariance(series[:, None], lags))[0])
 
     order: list[int] = []
-    factor, mean, mean_error, persistence = (np.full(6, np.nan) for _ in range(4))
+    factor, persistence = np.full(6, np.nan), np.full(6, np.nan)
     while len(order) < 6:
         series = {a: partial(kept, a, np.array(order, dtype=np.int64)) for a in range(6) if a not in order}
         variances = {a: long_run(z) for a, z in series.items()}
         worst = max(variances, key=variances.__getitem__)
         z = series[worst]
-        mean[worst], variance = np.nanmean(z), float(np.nanvar(z))
-        about_mean = long_run(z - mean[worst])
         factor[worst] = np.sqrt(variances[worst])
-        mean_error[worst] = np.sqrt(max(about_mean, variance) / frames)
-        persistence[worst] = about_mean / variance
+        persistence[worst] = long_run(z - np.nanmean(z)) / np.nanvar(z)
         order.append(worst)
-    motion = kept.score.sum(axis=0) / np.diagonal(kept.information.sum(axis=0))
     return SharedInnovations(
         size=ratio(kept.shared_nis, np.full(frames, POSE_DOF)),
         std=np.sqrt(own[0]),
@@ -218,10 +199,7 @@ def shared_innovations(whitened: WhitenedInnovations, examined: BoolArray, tau_s
         order=np.array(order),
         factor=factor,
         factor_low=factor / np.sqrt(1.0 + SURE * whiteness.relative_error(frames, lags)),
-        mean=mean,
-        mean_error=mean_error,
         persistence=persistence,
-        rate=motion / np.mean(tau_s[examined]),
         frames=frames,
     )
 
@@ -266,20 +244,32 @@ def rejected_shares(result: Result, examined: BoolArray, gate: float, own_scale:
     return RejectedShares(reasons_of(result), share, whiteness.rejected_share(scale, dimension, gate))
 
 
-def prior_agreement(parameters: Parameters) -> tuple[PriorAgreement, ...]:
-    """Return the agreement of every parameter with its prior."""
-    at = np.linspace(0, len(parameters.value) - 1, 11).astype(int)
-    found = []
-    for i, name in enumerate(parameters.name):
-        value, std, prior = parameters.value[:, i], parameters.std[:, i], parameters.prior_std[i]
-        gained = prior**2 - std[-1] ** 2
-        learnt = -np.diff(std[at] ** 2)
-        told = learnt > 1e-3 * prior**2
-        is_constant = bool((learnt >= -1e-9 * prior**2).all()) and told.any()
-        squares = np.diff(value[at])[told] ** 2 / learnt[told]
-        pull = float(value[-1] / np.sqrt(gained)) if gained > 0.01 * prior**2 else None
-        found.append(PriorAgreement(name, pull, float(np.sqrt(squares.mean())) if is_constant else None))
-    return tuple(found)
+def measures_velocities(result: Result) -> bool:
+    """Return whether measured velocities moved the poses of a run."""
+    return not is_inertial(result) and result.attributes.get("velocities") != WITHOUT_VELOCITIES["velocities"]
+
+
+def vision_share(result: Result) -> Array | None:
+    """Return the share (6,) of the pose's variance by velocities alone that vision removes; None if it is unknown.
+
+    It is 1 without velocities. With blocks for errors that all tracks share, the errors of single ones decide little.
+    """
+    log = result.log
+    seen = (
+        name for name, block in OPTIONAL_BLOCKS.items() if block.is_seen and name in result.config.get("blocks", {})
+    )
+    if log is None or any(seen):
+        return None
+    if not measures_velocities(result):
+        return np.ones(6)
+    A = se3.adjoint(log.T_predicted @ se3.inverse(log.T_departed))
+    std = np.hypot(result.noise.velocity_std, np.where(log.is_gap[:, None], result.noise.gap_std, 0.0))
+    Q = motion.process_noise(log.seen_twist, log.tau_s, std)
+    alone = result.covariance.copy()
+    for k in range(1, len(alone)):
+        alone[k] = A[k] @ alone[k - 1] @ A[k].T + Q[k]
+    own, grown = (np.diagonal(P - P[0], axis1=1, axis2=2).sum(axis=0) for P in (result.covariance, alone))
+    return np.clip(1.0 - own / np.maximum(grown, np.finfo(float).tiny), 0.0, 1.0)
 
 
 def smoother_agreement(result: Result, smoothed: Posterior) -> SmootherAgreement:

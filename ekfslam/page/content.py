@@ -64,11 +64,8 @@ class Run:
 
     @property
     def said(self) -> list[str]:
-        """Verdicts in words: the main one, its reasons, and a line for each other verdict."""
-        if not self.honesty.judgements:
-            return [self.honesty.innovations_skipped]
-        main, *others = self.honesty.judgements
-        return [main.text, *main.reasons, *(f"{other.text}: {', '.join(other.reasons)}" for other in others)]
+        """The verdict of `ekfslam check` and its reasons."""
+        return [self.honesty.headline, *self.honesty.reasons]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Judge whether the covariance of a run is honest, without truth, from its innovations."""
+"""Judge whether the covariance of a run is honest, from its innovations, and name causes and next steps."""
 
 from __future__ import annotations
 

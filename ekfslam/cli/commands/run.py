@@ -8,6 +8,7 @@ from pathlib import Path
 from ekfslam import files
 from ekfslam.cli.options import configured, declare, declare_run, open_data, print_warnings, table
 from ekfslam.config import MODES
+from ekfslam.evaluation.honesty import verdict_on
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.older import older_figures, remove_figures
 from ekfslam.runner import run
@@ -41,6 +42,8 @@ def command(options: argparse.Namespace) -> None:
     print(", ".join(f"{name} {count}" for name, count in result.counts.items()))
     if result.parameters is not None:
         print("\n".join(result.parameters.lines))
+    if result.whitened is not None:
+        print(f"verdict: {verdict_on(sequence, result)}")
     for remark in result.remarks:
         print(f"note: {remark}")
     print(f"written to {options.out}")
