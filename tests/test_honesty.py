@@ -106,7 +106,6 @@ def test_a_true_model_is_consistent(seed):
     assert found.verdict == "consistent as far as innovations can tell" and found.grade == "good"
     assert found.factors is None and np.isnan(found.factor)  # nothing predicts it
     assert abs(found.nis.value - 1) < 4 * found.nis.error < 0.1
-    assert found.agreement == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.slow
@@ -192,8 +191,7 @@ def test_tracks_whose_errors_walk(seed):
 def test_outliers(seed):
     found = judged(world(seed, outlier_fraction=0.1))
     assert not found.causes and [finding.kind for finding in found.findings] == ["outliers"]
-    assert found.rejections.gate == pytest.approx(0.1, abs=0.025)
-    assert found.rejections.expected < 0.005
+    assert found.rejected["gate"] == pytest.approx(0.1, abs=0.025)
 
 
 @pytest.mark.slow
@@ -238,7 +236,7 @@ def test_failed_linearisation_shows_between_filter_and_smoother(one_run):
     bold = dataclasses.replace(one_run, T_world_imu=one_run.T_world_imu @ se3.exp(beside))
     found = judge(bold, smoothed)
     assert kinds(found)[0] == "smoother" and found.factors is None
-    assert "linearisation has failed" in found.verdict and "filter.lag = 10" in found.verdict
+    assert "failed linearisation" in found.verdict and "filter.lag = 10" in found.verdict
 
 
 @pytest.mark.slow
@@ -309,7 +307,7 @@ def one_run() -> Result:
 def test_smoother_against_filter(one_run):
     smoothed = posterior(one_run)
     found = evidence.smoother_agreement(one_run, smoothed)
-    assert 0.5 < found.size.value < 2.5
+    assert 0.7 < found.size < 1.6
     difference = pose_error(one_run.T_world_imu, smoothed.T_world_imu)
     for axis, std in enumerate(found.std):
         shares = []
@@ -322,7 +320,7 @@ def test_smoother_against_filter(one_run):
     # Poses that are beside where they should be, but promise as much as before.
     beside = np.full(6, 3.0) * np.sqrt(one_run.covariance[:, [0], 0])
     bold = dataclasses.replace(one_run, T_world_imu=one_run.T_world_imu @ se3.exp(beside))
-    assert evidence.smoother_agreement(bold, smoothed).size.value > 3 * found.size.value
+    assert evidence.smoother_agreement(bold, smoothed).size > 1.7 * found.size
 
 
 def test_values_table_and_figure_say_the_same(one_run):

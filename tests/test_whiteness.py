@@ -67,12 +67,10 @@ def test_scale_behind_a_gate_is_found(scale):
     gate = 16.266  # chi-square, 3 degrees of freedom, 99.9 %
     accepted = squares[squares <= gate]
     assert whiteness.gated_scale(accepted.mean() / 3, 3, 0.999) == pytest.approx(scale, rel=0.03)
-    assert whiteness.rejected_share(scale, 3, 0.999) == pytest.approx(1 - len(accepted) / len(squares), abs=0.003)
 
 
 def test_without_a_gate_the_mean_is_the_scale():
     assert whiteness.gated_scale(5.0, 3, 1.0) == 5.0
-    assert whiteness.rejected_share(5.0, 3, 1.0) == 0.0
     assert whiteness.gated_scale(3.24, 3, 0.999) > 50  # nearly as if uniform up to the gate
 
 

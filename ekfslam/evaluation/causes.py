@@ -7,7 +7,7 @@ too large: large where vision is better than the velocities, and those are wrong
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,7 +19,6 @@ from ekfslam.evaluation.evidence import (
     ROWS,
     SURE,
     Ratio,
-    RejectedShares,
     SharedInnovations,
     SmootherAgreement,
     TrackInnovations,
@@ -36,8 +35,8 @@ _COUNTS = 1.5  # factor from which a systematic error counts
 _STILL = 5.0  # standard deviations of the last position
 _MANY = 0.05  # share of the velocities that cannot all be wild samples
 # Errors of which innovations do not tell how much of them is the camera's.
-_UNSURE = frozenset({"bias", "delay", "shared drift", "motion"})
-_LEAST_OUTLIERS, _LEAST_MOVING = 0.01, 0.2  # shares of the observations
+_UNSURE = frozenset({"bias", "scale", "delay", "shared drift", "motion"})
+_LEAST_OUTLIERS, _LEAST_MOVING = 0.013, 0.2  # shares of the observations
 _SMOOTHER = 5.0  # filter minus smoother: healthy runs have up to 3, failed linearisation has 10 and more
 _SYSTEMATIC = {
     "bias": "velocities and camera disagree by {size} in {axis}: a bias of the velocities",
@@ -90,12 +89,12 @@ def causes_of(
     result: Result,
     shared: SharedInnovations,
     tracks: TrackInnovations,
-    rejections: RejectedShares,
+    rejected: Mapping[str, float],
     systematic: tuple[Systematic, ...],
     vision: Array | None,
 ) -> Causes:
     """Return the causes that innovations show, and what they mean for the pose."""
-    single = tuple(_track_causes(result, tracks, rejections))
+    single = tuple(_track_causes(result, tracks, rejected))
     t = max((cause.factor for cause in single), default=1.0)
     common = tuple(_shared_causes(result, shared, t))
     velocities, camera = grown_by(result, systematic, np.full(6, 0.5) if vision is None else vision)
@@ -147,7 +146,7 @@ def _velocity_remedy(result: Result, axes: IntArray, size: float) -> str:
     return f"give [noise] {_listed(given)}" if given and measures_velocities(result) else ""
 
 
-def _track_causes(result: Result, tracks: TrackInnovations, rejections: RejectedShares) -> Iterator[Cause]:
+def _track_causes(result: Result, tracks: TrackInnovations, rejected: Mapping[str, float]) -> Iterator[Cause]:
     size, names = float(np.sqrt(tracks.scale)), ROWS[: len(tracks.factor)]
     slow = np.flatnonzero(tracks.persistence > _PERSISTS)
     grown, where = float(tracks.factor[slow].max(initial=0.0)), tuple(names[i] for i in slow)
@@ -155,7 +154,7 @@ def _track_causes(result: Result, tracks: TrackInnovations, rejections: Rejected
     remedy = _REMEDY["tracks"] if is_white else ""
     if grown > max(_NOTABLE, size):
         text = f"errors persist along tracks in {_listed(where)}, where the model expects independent ones"
-        if _has_outliers(rejections):
+        if rejected.get("gate", 0.0) > _LEAST_OUTLIERS:
             text += ", and many are rejected: things move, or tracks slip"
             yield Cause("motion", where, grown, text, _REMEDY["motion"])
         else:
@@ -202,36 +201,31 @@ def nis_causes(nis: Ratio | None) -> Iterator[Cause]:
         yield Cause("nis", (), factor, f"innovations are about {size} than expected (NIS {nis} per degree of freedom)")
 
 
-def rejection_causes(result: Result, rejections: RejectedShares, causes: Sequence[Cause]) -> Iterator[Cause]:
+def rejection_causes(result: Result, rejected: Mapping[str, float], causes: Sequence[Cause]) -> Iterator[Cause]:
     """Yield what rejected observations and velocities show beyond other causes."""
-    moving, known = rejections.reasons.get("moving", 0.0), {cause.kind for cause in causes}
-    if _has_outliers(rejections):
-        expected = percent(rejections.expected)
-        text = f"the gates reject {percent(rejections.gate)} of the observations ({expected} expected): outliers"
-        yield Cause("outliers", (), np.nan, text)
+    known, gate, moving = {cause.kind for cause in causes}, rejected.get("gate", 0.0), rejected.get("moving", 0.0)
+    doubted, frames = int(result.counts.get("rejected: velocities", 0)), len(result.time_s)
+    is_noise = bool(known & {"shared noise", "pixel noise"})  # it explains what gates reject
+    text = f"landmarks contradict {doubted} of {frames} velocities"
+    if doubted > _MANY * frames and not is_noise:
+        is_noise = True
+        yield Cause("shared noise", (), np.nan, f"{text}: they are noisier than stated")
+    elif doubted and not is_noise:
+        yield Cause("velocities", (), np.nan, f"{text}: wild samples, which the filter does not use")
+    if gate > _LEAST_OUTLIERS and not is_noise:
+        yield Cause("outliers", (), np.nan, f"the gates reject {percent(gate)} of the observations: outliers")
     if moving > _LEAST_MOVING:
         text = f"{percent(moving)} of the observations are rejected as moving: traffic, or another noise than stated"
         yield Cause("moving", (), np.nan, text, "compare with the noise that `ekfslam info` finds")
-    doubted = int(result.counts.get("rejected: velocities", 0))
-    if doubted and not known & {"shared noise", "pixel noise"}:
-        text = f"landmarks contradict {doubted} of {len(result.time_s)} velocities"
-        is_noise = doubted > _MANY * len(result.time_s)
-        word = "they are noisier than stated" if is_noise else "wild samples, which the filter does not use"
-        yield Cause("shared noise" if is_noise else "velocities", (), np.nan, f"{text}: {word}")
 
 
 def smoother_causes(smoother: SmootherAgreement | None) -> Iterator[Cause]:
     """Yield the alarm of failed linearisation."""
-    if smoother is not None and smoother.size.value > _SMOOTHER**2:
-        factor = float(np.sqrt(smoother.size.value))
-        text = f"filter and smoother differ {factor:.1f}x more than their covariances allow: linearisation has failed"
-        yield Cause("smoother", (), factor, text, _REMEDY["smoother"])
-
-
-def _has_outliers(rejections: RejectedShares) -> bool:
-    gate, expected = rejections.gate, rejections.expected
-    # Two gates and a tail that is not quite Gaussian reject slightly more than one gate should.
-    return gate is not None and expected is not None and gate > 3.0 * expected + _LEAST_OUTLIERS
+    if smoother is not None and smoother.size > _SMOOTHER:
+        text = (
+            f"filter and smoother differ {smoother.size:.1f}x more than their covariances allow: failed linearisation"
+        )
+        yield Cause("smoother", (), smoother.size, text, _REMEDY["smoother"])
 
 
 def _mean(factors: Array) -> float:

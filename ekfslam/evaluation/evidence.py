@@ -9,7 +9,6 @@ velocities or at errors common to all tracks, the remainder of an observation at
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,34 +100,21 @@ class TrackInnovations(Whiteness):
 
 
 @dataclass(frozen=True)
-class RejectedShares:
-    """Shares of rejected observations.
-
-    Args:
-        reasons: Share of all observations by reason.
-        gate: Share of known landmarks that the gates rejected in calm frames; None without whitened innovations.
-        expected: Value of ``gate`` expected from the variances of accepted innovations.
-    """
-
-    reasons: Mapping[str, float]
-    gate: float | None = None
-    expected: float | None = None
-
-
-@dataclass(frozen=True)
 class SmootherAgreement:
     """Filtered minus smoothed poses, whose covariance is ``P_filter - P_smoothed``.
 
     Args:
-        size: Normalised square per degree of freedom, over the directions in which the smoother gained. Its error is
-            rough, and allows for correlation over a fifth of the drive.
-        std: (6,) root mean square of each axis alone; NaN if the smoother gained nothing there.
+        std: (6,) root mean square of each axis in expected deviations; NaN if the smoother gained nothing there.
         frames: Number of frames compared.
     """
 
-    size: Ratio
     std: Array
     frames: int
+
+    @property
+    def size(self) -> float:
+        """Root mean square of all axes; NaN if the smoother gained nothing."""
+        return float(np.sqrt(np.nanmean(self.std**2))) if np.isfinite(self.std).any() else np.nan
 
 
 @dataclass(frozen=True)
@@ -217,31 +203,11 @@ def track_innovations(result: Result, examined: BoolArray, gate: float) -> Track
     return TrackInnovations(size, products / products[0], np.sqrt(variance * persistence), persistence, scale, pairs)
 
 
-def reasons_of(result: Result) -> dict[str, float]:
+def rejected_shares(result: Result) -> dict[str, float]:
     """Return the share of all observations rejected for each reason that occurs."""
     total = max(int((result.innovation.accepted + result.innovation.rejected).sum()), 1)
     counts = np.bincount(result.rejections.reason, minlength=len(REASONS)).tolist()
     return {name: number / total for name, number in zip(REASONS, counts, strict=True) if number}
-
-
-def rejected_shares(result: Result, examined: BoolArray, gate: float, own_scale: float) -> RejectedShares:
-    """Return the rejected shares, and the share that gates of probability ``gate`` are expected to reject.
-
-    The second gate judges without the shared motion, so ``own_scale`` (of `TrackInnovations`) bounds the scale.
-    """
-    assert result.whitened is not None
-    whitened, rejections, frames = result.whitened, result.rejections, len(result.time_s)
-    # If the shared innovation of a frame is large, the gates reject good observations, too.
-    nis = whitened.shared_nis
-    calm = examined & (nis <= np.median(nis[examined]))
-    known = np.bincount(whitened.frame, minlength=frames)[calm].sum()
-    gated = rejections.frame[rejections.reason == REASONS.index("gate")]
-    at_gate = np.bincount(gated, minlength=frames)[calm].sum()
-    squares = whitened.alone[calm[whitened.frame]] ** 2
-    dimension = squares.shape[1]
-    scale = max(whiteness.gated_scale(float(np.nanmean(squares)), dimension, gate), own_scale)
-    share = float(at_gate / max(at_gate + known, 1))
-    return RejectedShares(reasons_of(result), share, whiteness.rejected_share(scale, dimension, gate))
 
 
 def measures_velocities(result: Result) -> bool:
@@ -276,24 +242,12 @@ def smoother_agreement(result: Result, smoothed: Posterior) -> SmootherAgreement
     """Compare filtered with smoothed poses."""
     difference = pose_error(result.T_world_imu, smoothed.T_world_imu)
     turned = se3.adjoint(se3.exp(-difference))
-    P, after = result.covariance, turned @ smoothed.pose_covariance @ turned.swapaxes(1, 2)
-    known = (np.diagonal(P, axis1=1, axis2=2) > 0).all(axis=1)
-    P, difference, gain = P[known], difference[known], P[known] - after[known]
-    std = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    correlation = P / (std[:, :, None] * std[:, None, :])
-    values, axes = np.linalg.eigh(correlation)
-    # W^T P W = I, so the shares are the relative gain of the smoother in each direction.
-    W = axes / np.sqrt(np.maximum(values, 1e-12))[:, None, :] / std[:, :, None]
-    shares, directions = np.linalg.eigh(W.swapaxes(1, 2) @ gain @ W)
-    along = np.einsum("tba,tcb,tc->ta", directions, W, difference)
-    counts = shares > _LEAST_GAIN
-    squares = np.where(counts, along**2 / np.where(counts, shares, 1.0), 0.0)
-    own = np.diagonal(gain, axis1=1, axis2=2)
-    gained = own > _LEAST_GAIN * std**2
+    after = turned @ smoothed.pose_covariance @ turned.swapaxes(1, 2)
+    variance, gain = (np.diagonal(P, axis1=1, axis2=2) for P in (result.covariance, result.covariance - after))
+    gained = gain > _LEAST_GAIN * np.where(variance > 0, variance, np.inf)
     with np.errstate(invalid="ignore", divide="ignore"):
-        axis = np.where(gained, difference**2 / own, 0.0).sum(axis=0) / gained.sum(axis=0)
-    size = ratio(squares.sum(axis=1), counts.sum(axis=1), max(LAGS, len(counts) // 5))
-    return SmootherAgreement(size, np.sqrt(axis), int(counts.any(axis=1).sum()))
+        std = np.sqrt(np.where(gained, difference**2 / gain, 0.0).sum(axis=0) / gained.sum(axis=0))
+    return SmootherAgreement(std, int(gained.any(axis=1).sum()))
 
 
 def truth_agreement(result: Result, truth: Truth | None, interpolated: BoolArray | None) -> TruthAgreement | None:

@@ -33,7 +33,8 @@ class Honesty:
     Args:
         name, frames: Name of the recording, number of frames.
         nis: NIS per degree of freedom.
-        shared, tracks, rejections, smoother, truth: The evidence.
+        shared, tracks, smoother, truth: The evidence.
+        rejected: Share of all observations by reason of rejection.
         systematic: Errors that all frames show.
         vision: (6,) share of the pose that vision decides, see `ekfslam.evaluation.evidence.vision_share`.
         smoother_skipped, innovations_skipped: Reason for a missing smoother or missing innovations; else empty.
@@ -48,7 +49,7 @@ class Honesty:
     nis: Ratio | None
     shared: SharedInnovations | None
     tracks: evidence.TrackInnovations | None
-    rejections: evidence.RejectedShares
+    rejected: dict[str, float]
     systematic: tuple[Systematic, ...]
     vision: Array | None
     smoother: evidence.SmootherAgreement | None
@@ -71,13 +72,6 @@ class Honesty:
             return np.nan
         is_usual = self.truth.low <= self.truth.nees <= self.truth.high
         return 1.0 if is_usual else float(np.sqrt(self.truth.nees / POSE_DOF))
-
-    @property
-    def agreement(self) -> float:
-        """Ratio of shared errors to those of single observations, in standard deviations; 1 expected."""
-        if self.shared is None or self.tracks is None:
-            return np.nan
-        return float(np.sqrt(self.shared.size.value / self.tracks.size.value))
 
     @property
     def is_judged(self) -> bool:
@@ -124,7 +118,7 @@ class Honesty:
     @property
     def values(self) -> dict[str, Any]:
         """Everything as plain values for JSON; None replaces what is not a number."""
-        words = {"verdict": self.verdict, "grade": self.grade, "factor": self.factor, "agreement": self.agreement}
+        words = {"verdict": self.verdict, "grade": self.grade, "factor": self.factor}
         words |= {"blind": BLIND, "axes": AXES, "rows": ROWS}
         return {name: _plain(value) for name, value in {**words, **dataclasses.asdict(self)}.items()}
 
@@ -141,12 +135,14 @@ class Honesty:
             rows += [
                 ["NIS shared by the landmarks of a frame", str(self.shared.size), "1"],
                 ["NIS of single observations, without that", str(self.tracks.size), "1"],
-                ["shared errors against single ones (deviations)", f"{self.agreement:.2f}", "1"],
                 ["variance of single ones, without the gate's cut", f"{self.tracks.scale:.3g}", "1"],
-                ["rejected by gates, calm frames", *map(percent, (self.rejections.gate, self.rejections.expected))],
             ]
-        rows += [[f"rejected: {name}", percent(share), ""] for name, share in self.rejections.reasons.items()]
-        return rows if self.smoother is None else [*rows, ["filter less smoother", str(self.smoother.size), "1"]]
+        rows += [[f"rejected: {name}", percent(share), ""] for name, share in self.rejected.items()]
+        return (
+            rows
+            if self.smoother is None
+            else [*rows, ["filter less smoother, deviations", f"{self.smoother.size:.3g}", "1"]]
+        )
 
     @property
     def table(self) -> str:
@@ -203,7 +199,7 @@ def judge(
         truth: Truth of the recording.
         interpolated: (T,) interpolated intervals; the frames after them are not compared with truth.
     """
-    rejections = evidence.RejectedShares(evidence.reasons_of(result))
+    rejected = evidence.rejected_shares(result)
     smoother = None if smoothed is None else evidence.smoother_agreement(result, smoothed)
     missing, innovation = _missing_innovations(result), result.innovation
     nis = evidence.ratio(innovation.nis, innovation.dof) if innovation.dof.sum() > 0 else None
@@ -213,10 +209,9 @@ def judge(
         examined = evidence.examined_frames(result)
         gate = float(result.config["filter"]["gate_probability"])
         tracks = evidence.track_innovations(result, examined, gate)
-        rejections = evidence.rejected_shares(result, examined, gate, tracks.scale)
         systematic, rest = systematic_errors(result, examined)
         shared, vision = evidence.shared_innovations(rest, examined), evidence.vision_share(result)
-        found = causes_of(result, shared, tracks, rejections, systematic, vision)
+        found = causes_of(result, shared, tracks, rejected, systematic, vision)
         alarm = tuple(smoother_causes(smoother))
         found = Causes(None, (*alarm, *found.causes), found.findings) if alarm else found
     return Honesty(
@@ -225,7 +220,7 @@ def judge(
         nis=nis,
         shared=shared,
         tracks=tracks,
-        rejections=rejections,
+        rejected=rejected,
         systematic=systematic,
         vision=vision,
         smoother=smoother,
@@ -234,7 +229,7 @@ def judge(
         innovations_skipped=missing,
         factors=found.factors,
         causes=found.causes,
-        findings=(*found.findings, *rejection_causes(result, rejections, found.causes)),
+        findings=(*found.findings, *rejection_causes(result, rejected, found.causes)),
     )
 
 

@@ -95,11 +95,3 @@ def gated_scale(mean: float, dimension: int, probability: float) -> float:
     from scipy.optimize import brentq  # takes longer to import than a short run
 
     return float(brentq(lambda scale: accepted_mean(scale) - mean, 1e-6 * mean, _LARGEST_SCALE))
-
-
-def rejected_share(scale: float, dimension: int, probability: float) -> float:
-    """Return the share of observations that a gate rejects if their variances are ``scale`` times the stated ones."""
-    if probability >= 1.0:
-        return 0.0
-    gate = float(gammaincinv(dimension / 2.0, probability))
-    return float(1.0 - gammainc(dimension / 2.0, gate / scale))
