@@ -195,7 +195,7 @@ def test_a_recording_that_states_its_noise_has_no_track_scale():
 def test_the_problem_says_what_was_resolved():
     decisions = resolve(drifting_tracks(frames=10)).decisions
     assert "noise: track_scale 3" in decisions
-    assert "filter: retire unseen, retire_after 1, dormant 0, covariance_form dense" in decisions
+    assert "filter: lag 0, retire unseen, retire_after 1, dormant 0, covariance_form dense" in decisions
 
 
 def test_too_few_innovations_leave_the_track_scale_at_one():
@@ -560,7 +560,7 @@ def test_the_whole_noise_is_stored(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", ["standard", "fej"])
 def test_the_posterior_of_what_walks_is_the_filter_as_filtered(variant):
-    world = without_noise(builtin(f"city?frames={60 if WHOLE else 20}"))
+    world = without_noise(tracked(builtin(f"city?frames={60 if WHOLE else 20}"), ERROR))
     settings = dataclasses.replace(STILL, variant=variant, retire="never")
     result = run(world, "full", Config(filter=settings))
     assert result.noise.track_error is not None and result.noise.twist_walk_std is not None

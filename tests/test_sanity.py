@@ -151,7 +151,7 @@ def test_lines_are_kept_in_the_archive_and_said(tmp_path, inverted, capsys):
     result = run(inverted)
     before, after = result.remarks
     assert before.startswith("T_cam_imu looks inverted")
-    assert after.endswith(f"of the observations were rejected: {before}") and int(after[:2]) > 40
+    assert after.endswith(f"of the velocities were rejected: {before}") and int(after[:2]) > 40
     write_archive(tmp_path / "a.h5", inverted, {"full": result})
     assert read_archive(tmp_path / "a.h5").results["full"].remarks == result.remarks
     assert main(["info", str(tmp_path / "a.h5")]) == 0

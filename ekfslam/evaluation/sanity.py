@@ -125,6 +125,10 @@ def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]
         parts = "tracks, velocities, stamps and T_cam_imu" if sequence.has_velocities else "the tracks"
         cause = warnings[0] if warnings else f"{parts} do not fit each other"
         return (f"{rejected / (accepted + rejected):.0%} of the observations were rejected: {cause}",)
+    doubted = result.counts.get("rejected: velocities", 0) / len(sequence)
+    if doubted > _REJECTED:
+        cause = warnings[0] if warnings else "tracks, velocities, stamps and T_cam_imu do not fit each other"
+        return (f"{doubted:.0%} of the velocities were rejected: {cause}",)
     moving = result.counts.get("rejected: moving", 0) / max(accepted + rejected, 1)
     if moving > _MOVING:
         cause = "traffic, or errors of tracks or velocities that are larger or of another kind than assumed"

@@ -18,7 +18,6 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import Config, NoiseConfig, NoiseModel
-from ekfslam.data.hygiene import clean_tracks
 from ekfslam.data.sequence import Noise, Observations, Sequence, cut
 from ekfslam.errors import EmptyTracksError
 from ekfslam.evaluation.tables import MISSING, document, markdown_table
@@ -33,7 +32,7 @@ from ekfslam.models.sensors.base import BEHIND_CAMERA, GATE, MOVING
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.names import printable
 from ekfslam.progress import progress
-from ekfslam.resolve import found_attributes, noise_of, noise_of_velocities, settings_of
+from ekfslam.resolve import found_attributes, noise_of, noise_of_velocities, resolve, settings_of
 from ekfslam.smoother.fixed_lag import FixedLag
 
 # Share of wrong matches, and the window in which they fall.
@@ -473,8 +472,7 @@ def stretches(sequence: Sequence, config: Config, observations: int) -> list[Seq
     Tracks are cleaned as in every run. The first pose of a stretch, by dead reckoning, is its only truth. All stretches
     together have about so many ``observations``.
     """
-    noise = noise_of(sequence, config)
-    tracks, _ = clean_tracks(sequence, noise, config.hygiene)
+    noise, tracks = noise_of(sequence, config), resolve(sequence, config, "mapping-only").sequence.observations
     T_imu_world, _ = dead_reckon(sequence, noise, config.filter.initial_covariance)
     T_world_imu = se3.inverse(T_imu_world)
     frames = len(sequence)
