@@ -152,9 +152,11 @@ def _track_causes(result: Result, tracks: TrackInnovations, rejected: Mapping[st
     grown, where = float(tracks.factor[slow].max(initial=0.0)), tuple(names[i] for i in slow)
     is_white = result.noise.track_first_px is None
     remedy = _REMEDY["tracks"] if is_white else ""
-    if grown > max(_NOTABLE, size):
+    if grown > max(_NOTABLE, _LEAST_SLOW * size):
         text = f"errors persist along tracks in {_listed(where)}, where the model expects independent ones"
-        if rejected.get("gate", 0.0) > _LEAST_OUTLIERS:
+        # Things move along the ground, and tracks err in all rows alike.
+        is_uneven = float(tracks.persistence.min()) < 0.5 * float(tracks.persistence.max())
+        if rejected.get("gate", 0.0) > _LEAST_OUTLIERS and is_uneven:
             text += ", and many are rejected: things move, or tracks slip"
             yield Cause("motion", where, grown, text, _REMEDY["motion"])
         else:
@@ -205,7 +207,7 @@ def rejection_causes(result: Result, rejected: Mapping[str, float], causes: Sequ
     """Yield what rejected observations and velocities show beyond other causes."""
     known, gate, moving = {cause.kind for cause in causes}, rejected.get("gate", 0.0), rejected.get("moving", 0.0)
     doubted, frames = int(result.counts.get("rejected: velocities", 0)), len(result.time_s)
-    is_noise = bool(known & {"shared noise", "pixel noise"})  # it explains what gates reject
+    is_noise = bool(known & {"shared noise", "pixel noise", "tracks"})  # it explains what gates reject
     text = f"landmarks contradict {doubted} of {frames} velocities"
     if doubted > _MANY * frames and not is_noise:
         is_noise = True
