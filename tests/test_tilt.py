@@ -42,7 +42,7 @@ def drive(rng=None, roll=0.0, pitch=0.0, grade=0.0, noise=CLEAN, speed=10.0):
     if rng is not None:
         bias = [wandering(rng, BIAS.sigma_w_rad_s, BIAS.time_w_s) for _ in range(2)]
         twist[:, 3:5] += np.transpose(bias)
-        twist[:, 2:5] += noise.twist_std[2:5] * rng.normal(size=(len(twist), 3))
+        twist[:, 1:] += noise.twist_std[1:] * rng.normal(size=(len(twist), 5))
     return dataclasses.replace(WORLD, twist=twist, velocity_frame="level", noise=None)
 
 
