@@ -34,7 +34,7 @@ class VisionDrift(GaussMarkov):
     """
 
     translation_percent: float = 4.0
-    rotation_deg_m: float = 0.03
+    rotation_deg_m: float = 0.02
     length_m: float = 20.0
 
     name = "vision_drift"
@@ -49,13 +49,8 @@ class VisionDrift(GaussMarkov):
 
     @classmethod
     def automatic(cls, white_std: Array | None, is_clean: bool, has_checked_tracks: bool) -> dict[str, float] | None:
-        """Return the defaults; for noisy velocities, a third of the rotation. Checked tracks do not drift.
-
-        Without good turn rates the heading of a long drive hangs on vision, whose rotations hardly add up.
-        """
-        if has_checked_tracks:
-            return None
-        return {} if white_std is None or is_clean else {"rotation_deg_m": 0.01}
+        """Return the defaults, for whatever velocities; checked tracks do not drift."""
+        return None if has_checked_tracks else {}
 
     def camera_share(self, way_m: Array, is_difference: BoolArray) -> Array | None:
         return np.where(is_difference, np.maximum(way_m, _LEAST_WAY_M), 0.0)
