@@ -78,7 +78,7 @@ def error_parts(T_est: Array, T_true: Array) -> tuple[Part, ...]:
     chosen, shares, left = list[int](), list[float](), total
     found: Array = np.zeros(0)
     while open_parts and total > 0:
-        fits = {i: np.linalg.lstsq(columns[[*chosen, i]].T, b)[0].astype(float) for i in open_parts}
+        fits = {i: np.linalg.lstsq(columns[[*chosen, i]].T, b, rcond=None)[0].astype(float) for i in open_parts}
         rests = {i: float(((b - fit @ columns[[*chosen, i]]) ** 2).sum()) for i, fit in fits.items()}
         best = min(rests, key=rests.__getitem__)
         if left - rests[best] < LEAST_PART * total:
