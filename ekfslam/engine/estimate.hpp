@@ -40,6 +40,7 @@ struct Config {
     Variant variant = Variant::invariant;
     bool image_coordinates = true;
     double gate = 0, gate_probability = 1, min_depth_m = 0.1;
+    double moving_sigma = 1.5, moving_share = 0.05;
     Index retire_after = 1, misses_to_split = 0;
     Index dormant = 0;  // -1: never retire
     double input_gate = 0, doubt = 30;
