@@ -60,7 +60,7 @@ archive-page: $(READY)
 
 setup: $(READY)
 
-$(READY): pyproject.toml setup.py ekfslam/kernels/_compiled.c .ci/setup
+$(READY): pyproject.toml .ci/setup ekfslam/engine/CMakeLists.txt $(wildcard ekfslam/engine/*.?pp ekfslam/kernels/*.c)
 	PYTHON="$(PYTHON)" VENV="$(VENV)" sh .ci/setup
 	@touch $@
 

@@ -25,6 +25,7 @@ ROOMS: tuple[tuple[str, ...], ...] = (
     ("frontend",),
     ("models",),
     ("filters",),
+    ("engine",),
     ("smoother",),
     ("storage",),
     ("evaluation",),

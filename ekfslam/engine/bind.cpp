@@ -1,0 +1,40 @@
+// The Python module `ekfslam.engine._engine`.
+#include <nanobind/eigen/dense.h>
+#include <nanobind/nanobind.h>
+
+#include "lapack.hpp"
+#include "types.hpp"
+
+namespace nb = nanobind;
+using namespace ekfslam;
+
+namespace {
+
+lapack::Found find(const char* module, const char* name) {
+    const nb::object routines = nb::module_::import_(module).attr("__pyx_capi__");
+    if (!routines.attr("__contains__")(name)) return {};
+    const nb::object capsule = routines[name];
+    const char* signature = PyCapsule_GetName(capsule.ptr());
+    return {PyCapsule_GetPointer(capsule.ptr(), signature), signature};
+}
+
+Matrix cholesky(Matrix P) {
+    if (P.rows() != P.cols()) throw nb::value_error("P must be square");
+    char uplo = 'L';
+    int n = static_cast<int>(P.rows()), lda = n > 0 ? n : 1, info = 0;
+    lapack::dpotrf(&uplo, &n, P.data(), &lda, &info);
+    if (info != 0) throw nb::value_error("P is not positive definite");
+    return P.triangularView<Eigen::Lower>();
+}
+
+}  // namespace
+
+NB_MODULE(_engine, module) {
+    module.doc() = "The filter in C++; `ekfslam.engine` is its face.";
+    try {
+        lapack::load(&find);
+    } catch (const std::runtime_error& error) {
+        throw nb::import_error(error.what());
+    }
+    module.def("cholesky", &cholesky, nb::arg("P"), "Return the lower Cholesky factor of a covariance.");
+}
