@@ -25,6 +25,7 @@ Variant = Literal["invariant", "fej", "standard"]
 LandmarkCoordinates = Literal["image", "xyz"]
 Retire = Literal["auto", "unseen", "never"]
 CovarianceForm = Literal["auto", "dense", "conditional"]
+Engine = Literal["auto", "engine", "reference"]
 Linearisation = Literal["map", "filtered"]
 NoiseModel = Literal["auto", "tuned", "white"]
 Kernel = Literal["huber", "cauchy", "none"]
@@ -32,6 +33,7 @@ BlockSetting = float | int | str | bool
 
 MODES: tuple[Mode, ...] = get_args(Mode)
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
+ENGINES: tuple[Engine, ...] = get_args(Engine)
 LEAST_PX = 1e-3  # least pixel noise with which covariances of landmarks keep digits
 
 _KINDS: dict[type, str] = {float: "number", int: "whole number", str: "string", bool: "truth value"}
@@ -210,6 +212,8 @@ class FilterConfig:
         relative_frames: If truth is known, keep cross-covariances of reported poses up to this many frames apart, for
             the NEES of relative poses. It slows the filter down; estimates do not depend on it.
         initial_position_std_m, initial_rotation_std_rad: Standard deviations of the first pose, each axis.
+        engine: Implementation of the joint filter; estimates are the same. ``engine``: in C++ (`ekfslam.engine`).
+            ``reference``: in NumPy. ``auto`` takes the engine if it can run the model, see `ekfslam.engine.choice`.
     """
 
     variant: Variant = field(default="invariant", metadata=_one_of(Variant))
@@ -229,6 +233,7 @@ class FilterConfig:
     relative_frames: int = field(default=0, metadata=_whole(0))
     initial_position_std_m: float = field(default=0.0, metadata=_FINITE)
     initial_rotation_std_rad: float = field(default=0.0, metadata=_FINITE)
+    engine: Engine = field(default="auto", metadata=_one_of(Engine))
 
     @property
     def gate(self) -> float:

@@ -36,6 +36,7 @@ from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import MEASURED_KINDS, WITHOUT_TRACKS, WITHOUT_VELOCITIES, YAW_STD_PX, Sequence
+from ekfslam.engine.choice import in_words
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.stretches import run_stretches, stretches_of, thinned
 from ekfslam.geometry import se3
@@ -167,6 +168,7 @@ def resolve(
     model = _model(sequence, config, noise, blocks)
     config = _with_form(config, sequence, model)
     if mode in ("full", "smoothed"):
+        account["engine"] = in_words(model, config.filter)
         if (sampling := _sampling(sequence, config)) is not None:
             # Other settings follow from it.
             again = resolve(recording, given.with_overrides({"noise": sampling}), mode, blocks)

@@ -302,5 +302,6 @@ def test_compare_goes_on_without_a_posterior_that_is_ill_posed(tmp_path, capsys)
 def test_info_says_which_kernels_run(capsys):
     assert main(["info", "--build"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split()[:2] in (["kernels", "compiled,"], ["kernels", "plain,"])
+    assert lines[0].split()[0] == "engine"
+    assert lines[1].split()[:2] in (["kernels", "compiled,"], ["kernels", "plain,"])
     assert any(line.split()[0] == "BLAS" for line in lines)

@@ -24,6 +24,7 @@ ROOMS: tuple[tuple[str, ...], ...] = (
     ("data",),
     ("frontend",),
     ("models",),
+    ("engine",),
     ("filters",),
     ("engine",),
     ("smoother",),

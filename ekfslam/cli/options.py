@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ekfslam import files
-from ekfslam.config import VARIANTS, Config
+from ekfslam.config import ENGINES, VARIANTS, Config
 from ekfslam.data.sequence import Sequence, stretch
 from ekfslam.errors import WriteError
 from ekfslam.evaluation.sanity import inspect_sequence
@@ -98,6 +98,7 @@ DATA = (*PLACES, "--frames", "--extrinsics", "--truth-noise")
 
 # Flags that override a setting, the table and key of it, and how argparse declares the flag.
 _SETTINGS: tuple[tuple[str, str, dict[str, Any], str], ...] = (
+    ("--engine", "filter.engine", {"choices": ENGINES}, "implementation of the joint filter: C++ or NumPy (reference)"),
     ("--variant", "filter.variant", {"choices": VARIANTS}, "linearisation of the joint filter"),
     ("--iterations", "filter.iterations", {"type": int, "metavar": "N"}, "Gauss-Newton iterations of an update"),
     ("--retire", "filter.retire", {"choices": ("auto", "unseen", "never")}, "when landmarks leave the state"),

@@ -14,6 +14,7 @@ from ekfslam.data.interpolation import stretches
 from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import inspect_tracks
+from ekfslam.engine.choice import MISSING
 from ekfslam.evaluation.consistency import interpolated_frames
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.sources import compare_sources, in_words
@@ -29,7 +30,7 @@ EXAMPLES = ("info 0027.npz", "info results/local/city/archive.h5")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "data", *DATA)
     parser.add_argument(
-        "--build", action="store_true", help="show the kernels, libraries and threads of this installation instead"
+        "--build", action="store_true", help="show engine, kernels, libraries and threads of this installation instead"
     )
 
 
@@ -114,6 +115,7 @@ def _print_findings(sequence: Sequence) -> None:
         print(f"tracks        noise not stated; from the data: {found}")
     if "odometry" in problem.account:
         print(f"odometry      {problem.account['odometry']}")
+    print(f"filter        {problem.account['engine']}")
     for line in problem.lines:
         print(f"state         {line}")
     for line in problem.decisions:
@@ -128,6 +130,7 @@ def _is_archive(data: str) -> bool:
 
 def _print_build() -> None:
     how = "compiled, C" if kernels.FORM == "compiled" else "plain, NumPy: not compiled, or EKFSLAM_KERNELS=plain is set"
+    print(f"engine        {MISSING or 'compiled, C++'}")
     print(f"kernels       {how}")
     for name, version in versions().items():
         print(f"{name.removeprefix('version_'):13s} {version}")

@@ -15,6 +15,9 @@ Values = Mapping[str, Array]
 
 # A block is added to the measured velocities, turns them, moves the camera, changes the sensor, or none of these.
 Coupling = Literal["none", "velocity", "level", "camera", "sensor"]
+# The error of a block: a vector is added, a pose or a direction is premultiplied by exp, of a calibration only the free
+# parameters move; a class that overrides `StateBlock.retract` has its own, unless it says otherwise.
+Retraction = Literal["vector", "pose", "direction", "calibration", "own"]
 _COUPLED_BY: dict[str, Coupling] = {
     "velocity_offset": "velocity",
     "turn_velocities": "level",
@@ -29,6 +32,7 @@ class StateBlock:
 
     Attributes:
         coupling: Role in the model; set by the method that a subclass overrides.
+        retraction: Kind of its error.
         name: Key of its value, and of its columns in the `Layout`.
         size: Number of columns of its error.
         per_frame: Whether it has a value for each frame, or one for the whole drive.
@@ -40,6 +44,7 @@ class StateBlock:
     """
 
     coupling: ClassVar[Coupling] = "none"
+    retraction: ClassVar[Retraction] = "vector"
     per_frame: ClassVar[bool] = False
     is_seen: ClassVar[bool] = False
     is_curved: ClassVar[bool] = False
@@ -50,6 +55,8 @@ class StateBlock:
         for method, coupling in _COUPLED_BY.items():
             if method in vars(cls):
                 cls.coupling = coupling
+        if "retract" in vars(cls) and "retraction" not in vars(cls):
+            cls.retraction = "own"
 
     @property
     def name(self) -> str:

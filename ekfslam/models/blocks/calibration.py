@@ -47,6 +47,7 @@ class Calibration(StateBlock):
 
     name = "calibration"
     coupling = "sensor"
+    retraction = "calibration"
     is_seen = True
 
     @cached_property

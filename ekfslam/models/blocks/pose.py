@@ -15,6 +15,7 @@ class _PoseBlock(StateBlock):
     size = 6
     is_seen = True
     is_pose = True
+    retraction = "pose"
 
     def retract(self, value: Array, correction: Array) -> Array:
         return se3.exp(correction) @ value

@@ -15,6 +15,7 @@ class Previous(StateBlock):
     block: StateBlock
 
     is_seen = True
+    retraction = "vector"
 
     @property
     def name(self) -> str:

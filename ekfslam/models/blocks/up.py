@@ -32,6 +32,7 @@ class Up(StateBlock):
     name = "up"
     size = 3
     is_curved = True
+    retraction = "direction"
     labels = ("roll", "pitch")
     units = ("rad", "rad")
 
