@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
@@ -20,19 +20,16 @@ from ekfslam.errors import EkfslamError, FilterError, IllPosedError, PosteriorEr
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations, verdict_on
 from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.evaluation.truth import with_truth_noise
-from ekfslam.figures.check import plot_check
 from ekfslam.figures.older import older_figures, remove_figures
-from ekfslam.figures.run import draw_figures
-from ekfslam.figures.study import draw_study_figures
-from ekfslam.figures.style import png, pngs
 from ekfslam.filters.result import Result
 from ekfslam.runner import run
 from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import archive_image, open_result, read_archive, require_same_origin
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed, open_executor
-from ekfslam.studies.study import Study, StudyArchive, run_study
-from ekfslam.studies.summary import study_table, summarise_study
+
+if TYPE_CHECKING:
+    from ekfslam.studies.study import Study, StudyArchive
 
 # Key figures of a summary on the card of a `Comparison`.
 _KEY_FIGURES = {
@@ -95,13 +92,16 @@ class Comparison(Shown):
         if not force:
             require_same_origin(archive, self.sequence)
         notes = "".join(f"- {note}\n" for note in self.sequence.notes)
-        drawn = draw_figures(self.results, self.sequence.truth, self.sequence.interpolated) if figures else {}
-        contents = {
+        contents: dict[Path, str | bytes] = {
             archive: archive_image(self.sequence, self.results),
             summary: _json(self.summary),
             table: self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""),
-            **pngs(directory, drawn),
         }
+        if figures:
+            from ekfslam.figures.run import draw_figures
+            from ekfslam.figures.style import pngs
+
+            contents |= pngs(directory, draw_figures(self.results, self.sequence.truth, self.sequence.interpolated))
         older = older_figures(directory)
         files.write_all(contents)
         remove_figures(older, contents)
@@ -221,6 +221,8 @@ class ConsistencyReport(Shown):
     @property
     def table(self) -> str:
         """The summary as a Markdown table."""
+        from ekfslam.studies.summary import study_table
+
         return study_table(self.summary)
 
 
@@ -235,6 +237,11 @@ def check_consistency(
         ArchiveError: The directory holds another study, or cannot be written.
         ConfigError: The executor is unknown, not installed or not reachable.
     """
+    from ekfslam.figures.study import draw_study_figures
+    from ekfslam.figures.style import pngs
+    from ekfslam.studies.study import run_study
+    from ekfslam.studies.summary import study_table, summarise_study
+
     archive_path, summary_path, table_path = _targets(Path(directory), "study.h5", "summary.json", "table.md")
     with open_executor(executor, workers) as opened:
         archive = run_study(study, archive_path, opened)
@@ -263,6 +270,9 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
         ArchiveError: The archive cannot be read or has no such mode.
         HonestyError: The run has no innovations: another mode than full, or an older release.
     """
+    from ekfslam.figures.check import plot_check
+    from ekfslam.figures.style import png
+
     folder = Path(archive).parent if directory is None else Path(directory)
     values, table, figure = _targets(folder, "check.json", "check.md", "check.png")
     result = open_result(archive, mode)

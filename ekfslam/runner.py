@@ -9,7 +9,6 @@ from importlib.metadata import version
 from time import perf_counter
 from typing import Any
 
-import h5py
 import numpy as np
 import scipy
 
@@ -184,5 +183,5 @@ def versions() -> dict[str, str]:
         "version_python": platform.python_version(),
         "version_numpy": np.__version__,
         "version_scipy": scipy.__version__,
-        "version_h5py": h5py.__version__,
+        "version_h5py": version("h5py"),
     }

@@ -35,8 +35,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     from ekfslam.figures.style import png
 
     picture = png(Figure(figsize=(1, 1)))
-    for place in ("figures.style", "reports"):
-        monkeypatch.setattr(f"ekfslam.{place}.png", lambda *_: picture)
+    monkeypatch.setattr("ekfslam.figures.style.png", lambda *_: picture)
 
 
 @pytest.fixture

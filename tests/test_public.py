@@ -27,3 +27,34 @@ def test_start_up_imports_nothing_heavy(statement):
     )
     done = subprocess.run([sys.executable, "-c", program + statement], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "loaded: []"
+
+
+# Packages that take long to import and that few runs need, each of them imported where it is used.
+RARE = [
+    "matplotlib",
+    "PIL",
+    "scipy.stats",
+    "scipy.spatial",
+    "scipy.ndimage",
+    "scipy.optimize",
+    "tqdm",
+    "multiprocessing",
+    "cv2",
+]
+
+
+@pytest.mark.parametrize("module", ["ekfslam.cli.commands.run", "ekfslam.cli.commands.compare", "ekfslam.reports"])
+def test_a_command_imports_no_package_that_few_runs_need(module):
+    program = f"import sys, {module}; print([name for name in {RARE} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_run_without_figures_draws_with_no_package(tmp_path):
+    program = (
+        "import sys; from ekfslam.cli import main\n"
+        f"code = main(['run', 'builtin:loop', '--frames', '0:8', '--out', {str(tmp_path / 'run.h5')!r}])\n"
+        f"print(code, [name for name in {RARE} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "0 []"

@@ -139,9 +139,9 @@ def archive(tmp_path_factory) -> Path:
 @pytest.fixture
 def drawn_already(monkeypatch, undrawn) -> None:
     """Figures that are nothing but their files."""
-    for place in ("cli.commands.posterior.draw_posterior_figures", "figures.run.draw_figures", "reports.draw_figures"):
+    for place in ("cli.commands.posterior.draw_posterior_figures", "figures.run.draw_figures"):
         monkeypatch.setattr(f"ekfslam.{place}", lambda *_, **__: {"one": None, "another": None})
-    monkeypatch.setattr("ekfslam.reports.plot_check", lambda *_: None)
+    monkeypatch.setattr("ekfslam.figures.check.plot_check", lambda *_: None)
 
 
 @pytest.mark.slow

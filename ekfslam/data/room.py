@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array
 from ekfslam.data.inputs import InertialNoise, InertialSamples
@@ -136,6 +135,8 @@ def _trajectory(world: Room, duration_s: float, rng: np.random.Generator) -> Pos
 
 def _poses(path: Path) -> tuple[Array, Array]:
     """Return stamps (n,) from 0 and poses ``T_world_imu`` (n, 4, 4) of a TUM file (time tx ty tz qx qy qz qw)."""
+    from scipy.spatial.transform import Rotation
+
     try:
         table = np.loadtxt(path, ndmin=2)
         stamps, position, quaternion = np.split(table, [1, 4], axis=1)

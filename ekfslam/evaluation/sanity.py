@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Sequence
@@ -195,7 +194,7 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str],
 
     C, u, tau = given = sequence.T_cam_imu, sequence.twist[at], tau[at]
     straight, turn = error_px(*given)
-    smooth = sum(error_px(C, uniform_filter1d(sequence.twist, _SMOOTHED, axis=0)[at], tau))
+    smooth = sum(error_px(C, _smoothed(sequence.twist)[at], tau))
     still = sum(error_px(C, np.zeros_like(u), tau))
     predicted = f"the velocities predict it to {straight:.3g} px, where the rig turns most to {turn:.3g} px"
     figure = f"tracks move by {np.median(seen):.3g} px a frame; {predicted}"
@@ -213,6 +212,12 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str],
         text = f"the velocities look like those of another recording: they predict the flow of the tracks {off} off"
         return [figure], [f"{text}, standing still {0.5 * still:.3g} px"], False
     return [figure], [], explains
+
+
+def _smoothed(twist: Array) -> Array:
+    """Return running means over `_SMOOTHED` samples of velocities (T, 6), which are reflected at both ends."""
+    padded = np.pad(twist, ((_SMOOTHED // 2, _SMOOTHED // 2), (0, 0)), mode="symmetric")
+    return np.lib.stride_tricks.sliding_window_view(padded, _SMOOTHED, axis=0).mean(axis=-1)
 
 
 def _pairs(sequence: Sequence) -> tuple[IntArray, IntArray]:

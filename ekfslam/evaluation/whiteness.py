@@ -92,6 +92,9 @@ def gated_scale(mean: float, dimension: int, probability: float) -> float:
 
     if accepted_mean(_LARGEST_SCALE) <= mean:
         return _LARGEST_SCALE
-    from scipy.optimize import brentq  # takes longer to import than a short run
-
-    return float(brentq(lambda scale: accepted_mean(scale) - mean, 1e-6 * mean, _LARGEST_SCALE))
+    # Bisection: importing a root finder of SciPy takes longer than a short run.
+    low, high = 1e-6 * mean, _LARGEST_SCALE
+    while high - low > 1e-12 * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if accepted_mean(middle) < mean else (low, middle)
+    return 0.5 * (low + high)

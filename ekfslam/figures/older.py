@@ -6,15 +6,18 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from PIL import Image
-
 MADE_BY = "ekfslam"  # in every figure
 
 
 def older_figures(directory: Path) -> list[Path]:
     """Return the figures in a folder that `ekfslam.figures.style.png` has made."""
-    found = []
-    for path in sorted(directory.glob("*.png")):
+    found: list[Path] = []
+    pictures = sorted(directory.glob("*.png"))
+    if not pictures:
+        return found
+    from PIL import Image
+
+    for path in pictures:
         with suppress(OSError, ValueError, SyntaxError), Image.open(path) as picture:
             if picture.info.get("Software") == MADE_BY:
                 found.append(path)

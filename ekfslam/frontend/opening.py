@@ -11,7 +11,6 @@ from ekfslam.data.readers.registry import Extrinsics, Lateral
 from ekfslam.data.sequence import Sequence, VelocityFrame
 from ekfslam.data.velocities import attach_velocities
 from ekfslam.errors import ConfigError
-from ekfslam.frontend.track import track
 
 
 def open_sequence(
@@ -49,6 +48,8 @@ def open_sequence(
         raise ConfigError("velocity_frame (--velocity-frame) is given without velocities (--velocities)")
     recording = open_recording(source, extrinsics=extrinsics, lateral=lateral)
     if isinstance(recording, ImageRecording):
+        from ekfslam.frontend.track import track
+
         if velocities is not None:
             recording = attach_velocities(recording, velocities, velocity_frame=velocity_frame, lateral=lateral)
         recording, velocities = track(recording, front_end)[0], None

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.noise import Noise
@@ -77,6 +76,8 @@ def missing_velocities(sequence: Sequence, odometry: Array | None = None) -> tup
 
 def _without_jumps(twist: Array) -> Array:
     """Return velocities (T, 6) with those that are too far from their neighbours replaced by a median."""
+    from scipy.ndimage import median_filter  # takes 30 ms to import
+
     middle = median_filter(twist[1:], (_NEIGHBOURS, 1), mode="mirror")
     jumps = (np.abs(twist[1:] - middle) > _START_FACTOR * _walk(twist)).any(axis=1)
     found = np.where(jumps[:, None], middle, twist[1:])

@@ -17,7 +17,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ekfslam import files
 from ekfslam.arrays import Array
@@ -176,6 +175,8 @@ def _triangulated(result: Result, log: Log) -> tuple[Array, Array]:
 
 def _position_and_quaternion(T: Array) -> Array:
     """Return ``x y z qx qy qz qw`` (..., 7) of transforms (..., 4, 4)."""
+    from scipy.spatial.transform import Rotation
+
     return np.concatenate([T[..., :3, 3], Rotation.from_matrix(T[..., :3, :3]).as_quat()], axis=-1)
 
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array
 from ekfslam.errors import ArchiveError, MissingPackageError
@@ -40,6 +39,8 @@ def covariance_columns(P: Array, name: str = "cov_{}_m2") -> Columns:
 
 
 def _trajectory(result: Result) -> Columns:
+    from scipy.spatial.transform import Rotation
+
     T = result.T_world_imu
     return {
         "time_s": result.time_s,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -73,6 +72,9 @@ def open_executor(spec: str = "processes", workers: int | None = None) -> Iterat
     if spec == "serial":
         yield SerialExecutor()
     elif spec == "processes":
+        import multiprocessing
+        from concurrent.futures import ProcessPoolExecutor
+
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(workers or os.cpu_count(), context, _end_with_parent) as processes:
             yield processes
@@ -118,8 +120,10 @@ def _missing(spec: str, error: Exception) -> ConfigError:
 
 def _end_with_parent() -> None:
     """Leave Ctrl-C to the parent of a worker, and exit if the parent is killed."""
+    from multiprocessing import parent_process
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
+    parent = parent_process()
     assert parent is not None
 
     def watch() -> None:

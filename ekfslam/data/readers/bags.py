@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.checks import spelled_as_in
@@ -222,6 +221,8 @@ def _calibration(left: Camera, right: Camera) -> tuple[PairCalibration, Array]:
 
 def _rotation(camera: Camera) -> Array:
     """Return the rotation from the optical frame to rectified images; all zeros stand for the identity."""
+    from scipy.spatial.transform import Rotation
+
     R = messages.matrix_of(camera.info, "r", 3)
     if not R.any():
         return np.eye(3)

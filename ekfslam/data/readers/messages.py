@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array
 from ekfslam.data.images import Image
@@ -178,6 +177,8 @@ def stated_std(covariances: Array) -> tuple[Array, str]:
 
 def transform_of(transform: Any) -> Array:
     """Return the pose (4, 4) of the child frame of a Transform in its parent."""
+    from scipy.spatial.transform import Rotation
+
     t, q = transform.translation, transform.rotation
     quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
     if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-3:

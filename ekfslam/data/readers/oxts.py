@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.inputs import linear
@@ -242,6 +241,8 @@ def _columns(packets: Array, names: tuple[str, ...]) -> Array:
 
 def _body_twist(packets: Array, lateral: Lateral) -> Array:
     """Return (n, 6) velocities in the IMU frame."""
+    from scipy.spatial.transform import Rotation
+
     R_level_imu = Rotation.from_euler("YX", _columns(packets, ("pitch", "roll")))
     level = with_lateral(_columns(packets, _TWIST), lateral)
     return np.hstack([R_level_imu.apply(level[:, i : i + 3], inverse=True) for i in (0, 3)])
@@ -249,6 +250,8 @@ def _body_twist(packets: Array, lateral: Lateral) -> Array:
 
 def _poses(packets: Array) -> Array:
     """Return (n, 4, 4) ``T_world_imu``."""
+    from scipy.spatial.transform import Rotation
+
     lat, lon = np.radians(_columns(packets, ("lat", "lon")).T)
     scale_m = EARTH_RADIUS_M * np.cos(lat[0])
     east, north = scale_m * lon, scale_m * np.log(np.tan(np.pi / 4 + lat / 2))

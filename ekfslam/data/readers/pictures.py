@@ -7,10 +7,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from PIL import Image as Pillow
-from PIL import UnidentifiedImageError
 
 from ekfslam.arrays import IntArray
 from ekfslam.data.images import Image
@@ -18,11 +17,13 @@ from ekfslam.data.readers.poses import nearest
 from ekfslam.errors import CalibrationError, LostDataError, UnknownFormatError
 from ekfslam.limits import Budget, require_file
 
+if TYPE_CHECKING:
+    from PIL import Image as Pillow
+
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp")
 LEAST_PAIRED = 0.9  # of the images, that must have a partner
 _TOLERANCE_NS = 5_000_000  # cameras that are not triggered together are no stereo pair
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM")  # PPM includes pgm
-_DAMAGES = (OSError, ValueError, SyntaxError, UnidentifiedImageError, Pillow.DecompressionBombError)
 
 
 def read_gray(path: Path, size: tuple[int, int] | None = None) -> Image:
@@ -56,10 +57,12 @@ def size_of(path: Path) -> tuple[int, int]:
 
 @contextmanager
 def _opened(file: Path | io.BytesIO, source: str) -> Iterator[Pillow.Image]:
+    from PIL import Image as Pillow
+
     try:
         with Pillow.open(file, formats=_FORMATS) as image:
             yield image
-    except _DAMAGES as error:
+    except (OSError, ValueError, SyntaxError, Pillow.DecompressionBombError) as error:
         raise UnknownFormatError(f"{source}: not a readable image ({error})") from None
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.readers.text import Table
@@ -37,6 +36,8 @@ class Poses:
 
 def stamped_poses(table: Table) -> Poses:
     """Return the poses in rows of seconds, metres (3), and a quaternion (4) with w last."""
+    from scipy.spatial.transform import Rotation
+
     table.require_increasing()
     time_s, position_m, quaternion = table.values[:, 0], table.values[:, 1:4], table.values[:, 4:]
     defect = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0)
