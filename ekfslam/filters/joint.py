@@ -1,7 +1,7 @@
 """The joint EKF over state blocks and all active landmarks, with full cross-covariance.
 
-A frame on one page: `predict` is eq. (1) and (2), `update` is (3) to (7) and (10). The equations are in the modules
-`prediction` (1, 2), `observing` (3, 4, 10), `correction` (6), `retraction` (7, 7') and `starting` (5) of this package.
+`predict` is eq. (1) and (2), `update` is (3) to (7) and (10): one page in `ekfslam.filters.frame`. The equations are in
+the modules `prediction` (1, 2), `observing` (3, 4, 10), `correction` (6), `retraction` (7, 7') and `starting` (5).
 """
 
 from __future__ import annotations
@@ -12,28 +12,26 @@ from dataclasses import replace
 
 import numpy as np
 
-from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.arrays import Array, IntArray
 from ekfslam.config import CalibrationConfig, FilterConfig
 from ekfslam.data.interval import Interval
 from ekfslam.errors import ConfigError
-from ekfslam.filters import consensus, lifecycle
-from ekfslam.filters.correction import Correction
 from ekfslam.filters.estimate import Estimate
+from ekfslam.filters.frame import rest, update
 from ekfslam.filters.lifecycle import Marginal, Relinearised, Retired, Revival
 from ekfslam.filters.log import Log
 from ekfslam.filters.logbook import LogBook
 from ekfslam.filters.prediction import predict
-from ekfslam.filters.reports import FrameReport, log_density, missed
+from ekfslam.filters.reports import FrameReport, log_density
 from ekfslam.filters.result import Landmarks, Parameters
-from ekfslam.filters.retraction import retract
-from ekfslam.filters.starting import Waiting, start
+from ekfslam.filters.starting import Waiting
 from ekfslam.filters.variants import is_frozen_exactly
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import StateBlock
 from ekfslam.models.build import model_of
 from ekfslam.models.model import Model
 from ekfslam.models.process import Measured
-from ekfslam.models.sensors.base import ACCEPTED, DISPARITY, MOVING, WAITING, DelayedSensor, Sensor
+from ekfslam.models.sensors.base import DelayedSensor, Sensor
 
 
 class JointEKF(Estimate):
@@ -127,89 +125,21 @@ class JointEKF(Estimate):
             InnovationError: The innovation covariance is not positive definite.
         """
         # 1. Retire landmarks out of view, revive those that come back.
-        self._rest(frame, ids)
+        rest(self, self.retired, frame, ids)
         if self.revival is not None and (returning := self.retired.among(ids)):
             self._revive(frame, returning)
-        # 2. Screen observations that cannot be used at all.
-        rows = self.sensor.rows(measured)
-        reason = self.sensor.screen(measured, self.config.min_depth_m)
-        if known_to_move := self.retired.moving.intersection(ids.tolist()):
-            reason[np.isin(ids, list(known_to_move))] = MOVING
-        # 3. Correct with known landmarks: solve eq. (6) for rows (3), (4), (10), then apply (6), (7) and (7').
-        slot, is_known = self.table.lookup(ids)
-        known = np.flatnonzero(is_known & (reason == ACCEPTED))
-        found = consensus.correct(self, frame, slot[known], rows[known])
-        self._take(found, frame)
-        reason[known] = found.verdict
-        self.table.misses[slot[known[missed(found.verdict)]]] += 1
-        # 4. Retire tracks that move for good, and start tracks that jumped again.
-        split = self._split(slot[known[found.verdict == MOVING]])
-        new = (~is_known & (reason == ACCEPTED)) | np.isin(ids, split)
-        reason[new] = ACCEPTED
-        self._log.amend(T_updated=self.T_imu_world, updated=self.coordinates)
-        # 5. Start new landmarks, eq. (5), or let them wait.
-        enter = start if self._waiting is None else self._waiting.start
-        started = enter(self, self._log, frame, ids[new], rows[new])
-        if not found.dof:  # no update; but if every active landmark is new, its image coordinates refer to this pose
-            first_step = self.table.first_step[self.table.asleep == 0]
-            self.updated_pose = "pose" if len(first_step) and (first_step == self.step).all() else None
-        self.retired.start_again(ids[new][started])
-        reason[np.flatnonzero(new)[~started]] = DISPARITY if self._waiting is None else WAITING
-        # 6. Linearise the last frames again.
+        # 2. Correct with known landmarks, start new ones.
+        found = update(self, self._log, self.retired, self._waiting, frame, ids, measured)
+        # 3. Linearise the last frames again.
         if self.window is not None and self.step:
             self._relinearise(self.window)
-        return self._report(frame, ids, reason, split, found)
-
-    def _take(self, found: Correction, frame: int) -> None:
-        """Condition the covariance, eq. (6), and the mean, eq. (7), on a correction; count its observations."""
-        if found.gaussian is not None:
-            self.gaussian = found.gaussian
-            self.motion = self.motion.doubted(found.doubt)
-        self._log.corrected(self, found)
-        self.table.observed(found.slot, self.step, found.measured, self._log.last(len(found.slot)))
-        if found.solution is not None:
-            self.gaussian.apply(found.solution)
-        self.imu_twist = found.linear.imu_twist
-        retract(self, found.done.correction)
-        self.updated_pose = "pose" if found.dof else self.updated_pose
-        self.table.accepted(found.slot, frame)
-
-    def _report(self, frame: int, ids: IntArray, reason: IntArray, split: IntArray, found: Correction) -> FrameReport:
-        """Return the report on a frame, and keep the estimates of blocks with labels."""
         self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
-        done = found.done
-        likelihood = self._log_likelihood + log_density(done.nis, done.log_det, found.dof)
+        likelihood = self._log_likelihood + log_density(found.nis, found.log_det, found.dof)
         self._log_likelihood = 0.0
         doubt = max(self._doubt, self.motion.interval.doubt)
-        return FrameReport(frame, ids, reason, done.nis, found.dof, split, likelihood, found.innovations, doubt)
-
-    def _rest(self, frame: int, ids: IntArray) -> None:
-        """Let landmarks out of view sleep or retire."""
-        out = lifecycle.out_of_view(self.table, ids, frame, self.config.retire_after or 1)
-        limit = None if self.config.retire == "never" else self.config.dormant or 0
-        asleep = lifecycle.at_rest(out, self.table, limit)
-        stay = ~out | asleep
-        self._retire(~stay, may_return=True)
-        self.table.asleep[:] = asleep[stay]
-        self.gaussian.rest(asleep[stay])
-
-    def _retire(self, gone: BoolArray, may_return: bool = False) -> None:
-        """Marginalise landmarks (n,): drop their rows and columns, keep their last estimate."""
-        if gone.any():
-            self.retired.add(self.table, self.gaussian.landmark_blocks(np.flatnonzero(gone)), gone, may_return)
-            self.gaussian.marginalise(~gone)
-            self.table.keep(~gone)
-
-    def _split(self, moving: IntArray) -> IntArray:
-        """Retire landmarks at slots that move, for good, and those that missed too often; return ids of the latter."""
-        moves = np.zeros(len(self.ids), dtype=bool)
-        moves[moving] = True
-        split_after = self.config.misses_to_split(self.model.track_error is not None)
-        jumped = (self.table.misses >= split_after) & (split_after > 0) & ~moves
-        ids = self.ids[jumped]
-        self.retired.moving.update(self.ids[moves].tolist())
-        self._retire(jumped | moves)
-        return ids
+        return FrameReport(
+            frame, ids, found.reason, found.nis, found.dof, found.split, likelihood, found.innovations, doubt
+        )
 
     def _revive(self, frame: int, ids: list[int]) -> None:
         """Bring retired landmarks and their neighbours back: the state becomes the marginal of the batch problem."""
