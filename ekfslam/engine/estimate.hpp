@@ -27,10 +27,11 @@ struct Config {
     bool image_coordinates = true;
     double gate = 0, gate_probability = 1, min_depth_m = 0.1;  // threshold for the rows of one landmark
     double waiting_gate = 0;                                   // for the rows that two views leave (monocular)
-    double moving_sigma = 1.5, moving_share = 0.05;
+    double moving_sigma = 1.5, moving_share = 0.05;            // of a track that moves, see moves_along
+    bool estimates_velocity = false;                           // `Process.estimates_velocity`
     Index retire_after = 1, misses_to_split = 0;
-    Index dormant = 0;  // -1: never retire
-    double input_gate = 0, doubt = 30;
+    Index dormant = 0;                   // landmarks out of view that stay; -1: all
+    double input_gate = 0, doubt = 30;  // threshold for inputs, and the factor of the noise of rejected ones
 };
 
 struct Table {  // one entry a landmark, columns as in filters/landmarks.py

@@ -1,0 +1,161 @@
+#include <algorithm>
+#include <numeric>
+
+#include "consensus.hpp"
+#include "lapack.hpp"
+
+namespace ekfslam {
+namespace {
+
+constexpr Index SAMPLES = 100;
+
+// e^T C^-1 e.
+double square(const Block3& C, const Vector& e) { return e.dot(C.partialPivLu().solve(e)); }
+
+// Rows of landmarks, d each.
+Slots rows_of(const Slots& landmarks, Index d) {
+    Slots rows;
+    rows.reserve(landmarks.size() * static_cast<std::size_t>(d));
+    for (Index i : landmarks) {
+        for (Index j = 0; j < d; ++j) rows.push_back(i * d + j);
+    }
+    return rows;
+}
+
+// The inverse of a covariance, by Cholesky.
+Matrix inverse(Matrix S) {
+    int n = static_cast<int>(S.rows()), info = 0;
+    if (!n) return S;
+    char lower = 'L';
+    lapack::dpotrf(&lower, &n, S.data(), &n, &info);
+    if (!info) lapack::dpotri(&lower, &n, S.data(), &n, &info);
+    if (info) throw Error("the innovation covariance is not positive definite");
+    S.triangularView<Eigen::StrictlyUpper>() = S.transpose();
+    return S;
+}
+
+std::vector<Slots> combinations(Index k, Index size) {
+    std::vector<Slots> all;
+    Slots one(size);
+    std::iota(one.begin(), one.end(), Index{0});
+    while (true) {
+        all.push_back(one);
+        Index last = size - 1;
+        while (last >= 0 && one[last] == k - size + last) --last;
+        if (last < 0) return all;
+        ++one[last];
+        for (Index i = last + 1; i < size; ++i) one[i] = one[i - 1] + 1;
+    }
+}
+
+// The cost of a sample, and the squares (k) of all landmarks given it: 0 for its own.
+struct Tally {
+    double cost;
+    Vector squares;
+};
+
+Tally tally(const Matrix& S, const Matrix& residual, const Vector& focal, double gate, const Slots& sample) {
+    const Index d = residual.rows(), k = residual.cols();
+    const Slots rows = rows_of(sample, d);
+    const Matrix S_ka = S(Eigen::all, rows), S_aa = S_ka(rows, Eigen::all);
+    const Vector r_a = residual.reshaped()(rows);
+    const Eigen::PartialPivLU<Matrix> solver(S_aa);
+    const Matrix gain = solver.solve(S_ka.transpose());  // (rows, k d)
+    const Vector moved = gain.transpose() * r_a;
+    Tally found{r_a.dot(solver.solve(r_a)), Vector::Zero(k)};
+    for (Index i = 0; i < k; ++i) {
+        if (std::find(sample.begin(), sample.end(), i) != sample.end()) continue;
+        const Vector by = moved.segment(i * d, d);
+        const double bend = by.squaredNorm() / focal[i];
+        Block3 left = S.block(i * d, i * d, d, d);
+        left -= gain.middleCols(i * d, d).transpose() * S_ka.middleRows(i * d, d).transpose();
+        left.diagonal().array() += bend * bend;
+        found.squares[i] = square(left, residual.col(i) - by);
+    }
+    found.cost += found.squares.cwiseMin(gate).sum();
+    return found;
+}
+
+// Inverse covariance of the landmarks A, from which the worst one can be taken out.
+struct Agreeing {
+    Index d;
+    Slots some;
+    Matrix K;
+
+    // The largest y_i^T K_ii^-1 y_i, y = K r_A, and its place.
+    std::pair<double, Index> worst(const Matrix& residual) const {
+        const Vector y = K * columns(residual, some).reshaped();
+        Vector squares(static_cast<Index>(some.size()));
+        for (Index i = 0; i < squares.size(); ++i) {
+            squares[i] = square(K.block(i * d, i * d, d, d), y.segment(i * d, d));
+        }
+        Index at = 0;
+        const double most = squares.maxCoeff(&at);
+        return {most, at};
+    }
+
+    // Without rows i the inverse is K - K_:i K_ii^-1 K_i: .
+    void drop(Index i) {
+        const Block3 own = K.block(i * d, i * d, d, d);
+        K -= (K.middleCols(i * d, d) * own.partialPivLu().solve(Matrix(K.middleRows(i * d, d)))).eval();
+        some.erase(some.begin() + i);
+        Slots left(some.size());
+        std::iota(left.begin(), left.end(), Index{0});
+        for (std::size_t j = static_cast<std::size_t>(i); j < left.size(); ++j) ++left[j];
+        const Slots rows = rows_of(left, d);
+        K = Matrix(K(rows, rows));
+    }
+};
+
+}  // namespace
+
+std::vector<Slots> samples_of(Index k, Index frame, const Uniform& uniform) {
+    const Index size = std::max<Index>(std::min<Index>(3, k - 1), 1);
+    const Index combined = size == 3 ? k * (k - 1) * (k - 2) / 6 : size == 2 ? k * (k - 1) / 2 : k;
+    if (combined <= SAMPLES) return combinations(k, size);
+    const Matrix numbers = uniform(frame, SAMPLES, k);
+    std::vector<Slots> samples;
+    Slots order(k);
+    for (Index i = 0; i < SAMPLES; ++i) {
+        std::iota(order.begin(), order.end(), Index{0});
+        std::partial_sort(order.begin(), order.begin() + size, order.end(),
+                          [&](Index a, Index b) { return numbers(i, a) < numbers(i, b); });
+        samples.emplace_back(order.begin(), order.begin() + size);
+    }
+    return samples;
+}
+
+Flags agreeing(const Matrix& S, const Matrix& residual, const Vector& focal, double gate,
+               const std::vector<Slots>& samples) {
+    Tally best = tally(S, residual, focal, gate, samples.front());
+    for (std::size_t i = 1; i < samples.size(); ++i) {
+        Tally next = tally(S, residual, focal, gate, samples[i]);
+        if (next.cost < best.cost) best = std::move(next);
+    }
+    Flags agree(static_cast<std::size_t>(residual.cols()));
+    for (Index i = 0; i < residual.cols(); ++i) agree[i] = best.squares[i] <= gate;
+    return agree;
+}
+
+Flags refined(const Matrix& S, const Matrix& residual, const Flags& inside, double gate) {
+    const Index d = residual.rows();
+    Slots rows = rows_of(where(inside), d);
+    Agreeing with{d, where(inside), inverse(S(rows, rows))};
+    while (!with.some.empty()) {
+        const auto [most, at] = with.worst(residual);
+        if (most <= gate) break;
+        with.drop(at);
+    }
+    Flags agree(inside.size(), false);
+    for (Index i : with.some) agree[i] = true;
+    rows = rows_of(with.some, d);
+    const Vector r_a = columns(residual, with.some).reshaped();
+    for (Index i : where(agree, false)) {
+        const Matrix S_ia = S.middleRows(i * d, d)(Eigen::all, rows), gain = S_ia * with.K;
+        const Block3 C = S.block(i * d, i * d, d, d) - gain * S_ia.transpose();
+        agree[i] = square(C, residual.col(i) - gain * r_a) <= gate;
+    }
+    return agree;
+}
+
+}  // namespace ekfslam

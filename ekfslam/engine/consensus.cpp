@@ -1,0 +1,251 @@
+#include "consensus.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "retraction.hpp"
+#include "se3.hpp"
+
+namespace ekfslam {
+namespace {
+
+constexpr double SHARE = 1.0 / 3.0;  // of rejected landmarks, from which a frame is looked at
+constexpr int ROUNDS = 4;
+constexpr double BENT = 0.05;  // error of the linearisation, in deviations of a pixel: below, a round would be in vain
+
+// A frame solved under one hypothesis: `inside` (k) of its candidates agree, and `rows` are theirs.
+struct Settled {
+    Slots candidates;  // among the landmarks of the frame
+    Solution solution;
+    Vector change;
+    Flags inside;
+    Rows rows;
+    Blocks S;
+    Mean linear;
+    Vector coordinates;
+    double cost = 0;
+
+    Index agree() const { return std::count(inside.begin(), inside.end(), true); }
+    bool is_majority() const { return 2 * agree() > static_cast<Index>(inside.size()); }
+};
+
+// A frame, and how it shall be settled.
+struct Frame {
+    const Estimate& e;
+    Index frame;
+    const Slots& slots;
+    const Matrix& measured;
+    const Uniform& uniform;
+};
+
+bool is_one_of(int verdict, std::initializer_list<int> some) {
+    return std::find(some.begin(), some.end(), verdict) != some.end();
+}
+
+// Whether the trigger holds: many landmarks are rejected, or those that pass agree on an error of the inputs.
+bool is_suspect(const Estimate& e, const Correction& found) {
+    const Vector6& c = found.innovations.score;
+    const Matrix6& C = found.innovations.information;
+    const Matrix6 Q = (e.config.doubt * e.config.doubt - 1.0) * e.motion.Q.topLeftCorner<6, 6>();
+    const Matrix6 M = Matrix6::Identity() + C * Q;
+    const double shared = c.dot(Q * M.partialPivLu().solve(c)), most = e.config.input_gate;
+    const auto outside = static_cast<double>(found.outside);
+    return shared > most ||
+           (outside > SHARE * static_cast<double>(found.verdict.size()) && shared + e.config.gate * outside > most);
+}
+
+// A motion in units of the noise of the inputs; directions without noise count as nothing.
+Vector6 in_noise(const Estimate& e, const Vector6& xi) {
+    const Matrix6 Q = e.motion.Q.topLeftCorner<6, 6>();
+    const Eigen::SelfAdjointEigenSolver<Matrix6> own(Q);
+    const Vector6 variances = own.eigenvalues(), along = own.eigenvectors().transpose() * xi;
+    Vector6 units = Vector6::Zero();
+    for (int i = 0; i < 6; ++i) {
+        if (variances[i] > 1e-12 * variances[5]) units[i] = along[i] / std::sqrt(variances[i]);
+    }
+    return units;
+}
+
+// The motion from the predicted pose to that of a rig that moves as in the interval before, in units of the noise of
+// the inputs; NaN if there was no interval before.
+Vector6 jump(const Estimate& e) {
+    const Motion& motion = e.motion;
+    if (!motion.has_last) return Vector6::Constant(std::numeric_limits<double>::quiet_NaN());
+    const Vector6 xi = motion.tau_s / motion.tau_last_s * se3::log(motion.moved_last);
+    const Matrix4 as_before = se3::exp(xi) * motion.T_departed;
+    return in_noise(e, se3::log(as_before * se3::inverse(motion.T_predicted)));
+}
+
+// Whether rows that are linearised at a solution agree with those that it was found with.
+bool is_straight(const Estimate& e, const Settled& settled, const Rows& rows) {
+    const Parts change = parts(e, settled.change);
+    const Matrix bent = left_by(rows, change) - left_by(settled.rows, change);
+    return bent.cwiseAbs2().cwiseQuotient(settled.rows.variance).mean() < BENT * BENT;
+}
+
+Vector6 twist_at(const Estimate& e, const Vector& change) {
+    return e.has_time_offset() ? e.twist_after(retract_values(e, change)) : e.imu_twist;
+}
+
+Block3 own_block(const Matrix& S, Index i, Index d) { return S.block(i * d, i * d, d, d); }
+
+// Solve eq. (6) under a covariance for the candidates that agree; nothing if there are none.
+class Settling {
+   public:
+    Settling(const Frame& at, const Gaussian& gaussian, Slots candidates, const Flags* begin)
+        : at_(at), gaussian_(gaussian), begin_(begin) {
+        slots_ = picked(at.slots, candidates);
+        measured_ = columns(at.measured, candidates);
+        found_.candidates = std::move(candidates);
+    }
+
+    std::optional<Settled> run(int rounds) {
+        const Estimate& e = at_.e;
+        Rows rows = observe(e, e.mean(), slots_, measured_).rows;
+        Slots some = where(Flags(slots_.size(), true));
+        found_.inside = begin_ ? picked_flags(*begin_, found_.candidates) : Flags(slots_.size(), false);
+        found_.linear = e.mean();
+        found_.coordinates = e.coordinates;
+        for (int round = 0; round < rounds; ++round) {
+            if (some.empty() || !settle(rows, some, round == 0)) return std::nullopt;
+            if (round + 1 == rounds) break;
+            Relinearised next = relinearised(e, twist_at(e, found_.change), found_.change, slots_, measured_);
+            if (is_straight(e, found_, next.seen.rows.only(where(found_.inside)))) break;
+            some.clear();
+            for (Index i = 0; i < next.seen.q.cols(); ++i) {
+                if (e.sensor.in_view(next.seen.q.col(i), e.config.min_depth_m)) some.push_back(i);
+            }
+            rows = next.seen.rows.only(some);
+            linear_ = std::move(next.linear);
+            coordinates_ = std::move(next.coordinates);
+        }
+        return std::move(found_);
+    }
+
+   private:
+    static Flags picked_flags(const Flags& flags, const Slots& which) {
+        Flags some(which.size());
+        for (std::size_t i = 0; i < some.size(); ++i) some[i] = flags[which[i]];
+        return some;
+    }
+
+    // One linearisation: rows of `some` candidates; false if none of them agree.
+    bool settle(const Rows& rows, const Slots& some, bool is_first) {
+        const double gate = at_.e.config.gate;
+        const Projection projection = gaussian_.project(rows);
+        const Matrix S = projection.S();
+        if (is_first && !begin_) {
+            const Vector focal = focal_lengths(by_pose(at_.e, rows), rows.dimension());
+            const auto samples = samples_of(rows.count(), at_.frame, at_.uniform);
+            found_.inside = agreeing(S, rows.residual, focal, gate, samples);
+        }
+        const Slots agree = where(refined(S, rows.residual, picked_flags(found_.inside, some), gate));
+        if (agree.empty()) return false;
+        found_.inside.assign(slots_.size(), false);
+        for (Index i : agree) found_.inside[some[i]] = true;
+        found_.solution = gaussian_.solve(projection.only(agree));
+        found_.change = gaussian_.correction(found_.solution);
+        found_.rows = rows.only(agree);
+        found_.S.clear();
+        for (Index i : agree) found_.S.push_back(own_block(S, i, rows.dimension()));
+        found_.cost = found_.solution.nis + gate * static_cast<double>(slots_.size() - agree.size());
+        if (!is_first) {
+            found_.linear = linear_;
+            found_.coordinates = coordinates_;
+        }
+        return true;
+    }
+
+    const Frame& at_;
+    const Gaussian& gaussian_;
+    const Flags* begin_;  // landmarks of the frame that agree to begin with; null: they are found from samples
+    Slots slots_;
+    Matrix measured_;
+    Mean linear_;
+    Vector coordinates_;
+    Settled found_;
+};
+
+// The candidates with some verdicts, settled.
+std::optional<Settled> settled(const Frame& at, const Gaussian& gaussian, const Verdicts& verdict, int rounds,
+                               const Flags* begin, std::initializer_list<int> verdicts) {
+    Slots candidates;
+    for (std::size_t i = 0; i < verdict.size(); ++i) {
+        if (is_one_of(verdict[i], verdicts)) candidates.push_back(static_cast<Index>(i));
+    }
+    return Settling(at, gaussian, std::move(candidates), begin).run(rounds);
+}
+
+// A correction by the landmarks that agree among the candidates.
+void take(Correction& found, const Frame& at, const Gaussian& gaussian, Settled settled) {
+    for (std::size_t i = 0; i < settled.inside.size(); ++i) {
+        found.verdict[settled.candidates[i]] = settled.inside[i] ? ACCEPTED : GATE;
+    }
+    Slots accepted;
+    for (std::size_t i = 0; i < found.verdict.size(); ++i) {
+        if (found.verdict[i] == ACCEPTED) accepted.push_back(static_cast<Index>(i));
+    }
+    const Matrix left = left_by(settled.rows, parts(at.e, settled.change));
+    found.innovations = innovations_of(at.e, gaussian, settled.solution, settled.rows, settled.S, left);
+    found.outside = static_cast<Index>(settled.inside.size()) - settled.agree();
+    found.nis = settled.solution.nis;
+    found.log_det = settled.solution.log_det;
+    found.dof = settled.rows.residual.size();
+    found.slot = settled.rows.slot;
+    found.variance = settled.rows.variance;
+    found.measured = columns(at.measured, accepted);
+    found.solution = std::move(settled.solution);
+    found.change = std::move(settled.change);
+    found.linear = std::move(settled.linear);
+    found.coordinates = std::move(settled.coordinates);
+}
+
+std::optional<double> cost_of(const std::optional<Settled>& settled) {
+    return settled ? std::optional<double>(settled->cost) : std::nullopt;
+}
+
+// Whether the inputs are rejected: at the cost of their gate, with most landmarks, and towards the motion before.
+bool rejects_inputs(const Estimate& e, const Settled& doubtful, std::optional<double> trusted, const Vector6& jump) {
+    const double most = trusted ? *trusted : e.config.gate * static_cast<double>(doubtful.inside.size());
+    if (!doubtful.is_majority() || doubtful.cost + e.config.input_gate >= most) return false;
+    const Vector6 error = in_noise(e, doubtful.change.head<6>());
+    return !(error.dot(jump) < 0.5 * error.squaredNorm());
+}
+
+}  // namespace
+
+Correction correct(Estimate& e, Index frame, const Slots& slots, const Matrix& measured, const Uniform& uniform) {
+    const Matrix evidence = e.table.evidence;
+    Correction found = correct_plainly(e, slots, measured);
+    if (slots.empty() || !e.motion.tau_s || !std::isfinite(e.config.gate)) return found;
+    const bool suspect = is_suspect(e, found);
+    if (!found.is_wide && !suspect) return found;
+    const Frame at{e, frame, slots, measured, uniform};
+    const int rounds = found.is_wide ? ROUNDS : 1;
+    Flags accepted(slots.size());
+    for (std::size_t i = 0; i < accepted.size(); ++i) accepted[i] = found.verdict[i] == ACCEPTED;
+    const Flags* begin = suspect ? nullptr : &accepted;
+    auto trusted = settled(at, e.gaussian, found.verdict, rounds, begin, {ACCEPTED, GATE});
+    auto cost = cost_of(trusted);
+    if (trusted && trusted->is_majority()) take(found, at, e.gaussian, std::move(*trusted));
+    if (e.config.estimates_velocity || !is_suspect(e, found)) return found;
+    const Vector6 jumped = jump(e);
+    if (4.0 * jumped.squaredNorm() < e.config.input_gate) return found;
+    // Tracks that seem to move may be made to by the inputs: both hypotheses are judged by all.
+    if (std::count(found.verdict.begin(), found.verdict.end(), MOVING)) {
+        trusted = settled(at, e.gaussian, found.verdict, rounds, nullptr, {ACCEPTED, GATE, MOVING});
+        cost = cost_of(trusted);
+    }
+    Gaussian wide = e.gaussian;
+    wide.add_noise((e.config.doubt * e.config.doubt - 1.0) * e.motion.Q);
+    auto doubtful = settled(at, wide, found.verdict, ROUNDS, nullptr, {ACCEPTED, GATE, MOVING});
+    if (!doubtful || !rejects_inputs(e, *doubtful, cost, jumped)) return found;
+    e.table.evidence = evidence;
+    take(found, at, wide, std::move(*doubtful));
+    found.gaussian = std::move(wide);
+    found.doubt = e.config.doubt;
+    return found;
+}
+
+}  // namespace ekfslam

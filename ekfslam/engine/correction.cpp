@@ -1,0 +1,232 @@
+#include "correction.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "retraction.hpp"
+#include "se3.hpp"
+
+namespace ekfslam {
+namespace {
+
+// Largest variance of an innovation, in those of the measurement, at which linearising still means anything.
+constexpr double MOST_BLURRED = 1e8;
+
+// Landmarks (j) of a frame that are tried, their rows, and S of each by itself.
+struct Tried {
+    Slots some;
+    Projection projection;
+    Blocks S;
+    Index outside = 0;  // landmarks outside of the gate by themselves
+
+    void keep(const Flags& inside) {
+        const Slots which = where(inside);
+        if (which.size() == inside.size()) return;
+        some = picked(some, which);
+        projection = projection.only(which);
+        S = picked(S, which);
+    }
+};
+
+// Whether tracks are tested for motion: if they have errors, from the second frame on.
+bool judges_motion(const Estimate& e) { return e.track_error && e.motion.tau_s > 0; }
+
+// Derivative (d, j) of the rows by a motion of their landmarks along the last step of the rig.
+Matrix along_step(const Estimate& e, const Observed& seen, const Slots& some) {
+    const Matrix3 R = se3::rotation(e.values.pose());
+    const Vector3 step = R.transpose() * (e.imu_twist.head<3>() * e.motion.tau_s);
+    const Index d = seen.rows.dimension();
+    Matrix h(d, static_cast<Index>(some.size()));
+    for (Index i = 0; i < h.cols(); ++i) h.col(i) = seen.H_m.middleCols(some[i] * d, d).transpose() * step;
+    return h;
+}
+
+// So near to the camera plane that its image may be anywhere: linearised, it would spoil the whole frame.
+void reject_blurred(Tried& tried, Verdicts& verdict) {
+    const Matrix& variance = tried.projection.rows.variance;
+    Flags sharp(tried.some.size());
+    for (std::size_t i = 0; i < sharp.size(); ++i) {
+        const Vector own = tried.S[i].diagonal(), most = MOST_BLURRED * variance.col(static_cast<Index>(i));
+        sharp[i] = !(own.array() > most.array()).any();
+        if (!sharp[i]) verdict[tried.some[i]] = BEHIND_CAMERA;
+    }
+    tried.keep(sharp);
+}
+
+// The landmarks that pass the gate by themselves; verdicts are written on others.
+Tried gate_alone(Estimate& e, const Observed& seen, Verdicts& verdict) {
+    Slots some;
+    for (std::size_t i = 0; i < verdict.size(); ++i) {
+        if (verdict[i] == ACCEPTED) some.push_back(static_cast<Index>(i));
+    }
+    Tried tried{some, e.gaussian.project(some.size() == verdict.size() ? seen.rows : seen.rows.only(some)), {}};
+    tried.S = own_covariances(tried.projection);
+    reject_blurred(tried, verdict);
+    const Rows& rows = tried.projection.rows;
+    const Vector squares = normalised_squares(tried.S, rows.residual, rows.slot);
+    Flags inside(tried.some.size());
+    for (Index i = 0; i < squares.size(); ++i) {
+        inside[i] = squares[i] <= e.config.gate;
+        if (!inside[i]) verdict[tried.some[i]] = GATE;
+    }
+    tried.outside = std::count(inside.begin(), inside.end(), false);
+    if (judges_motion(e) && !e.config.estimates_velocity) {
+        const Evidence evidence = evidence_alone(rows.residual, tried.S, along_step(e, seen, tried.some));
+        const Flags moves = moves_along(e.table, rows.slot, evidence, squares, e.config.gate, e.config);
+        for (Index i : where(moves)) {
+            verdict[tried.some[i]] = MOVING;
+            inside[i] = false;
+        }
+    }
+    tried.keep(inside);
+    return tried;
+}
+
+// Verdicts on tried landmarks by all others, given the residuals that the correction by all of them leaves.
+Verdicts gate_by_others(Estimate& e, const Solution& solution, const Matrix& left_by_all, const Tried& tried,
+                        const Observed& seen) {
+    Verdicts verdict(tried.some.size(), ACCEPTED);
+    const bool judges = judges_motion(e) && e.config.estimates_velocity;
+    const double gate = e.config.gate;
+    if (!std::isfinite(gate) && !judges) return verdict;
+    const Rows& rows = tried.projection.rows;
+    Slots doubtful;
+    if (judges) {
+        doubtful = where(Flags(verdict.size(), true));
+    } else {
+        const Vector most = most_given_others(left_by_all, rows.variance, tried.S);
+        for (Index i = 0; i < most.size(); ++i) {
+            if (!(most[i] <= gate)) doubtful.push_back(i);
+        }
+    }
+    if (doubtful.empty()) return verdict;
+    const Matrix left = columns(left_by_all, doubtful), variance = columns(rows.variance, doubtful);
+    const std::vector<Matrix> C = e.gaussian.given_others(solution, doubtful);
+    const Judged found = agrees_with_others(left, variance, C);
+    Flags moves(doubtful.size(), false);
+    if (judges) {
+        // Noisy velocities would accuse all tracks of a frame alike: only what others leave counts.
+        const Evidence evidence = evidence_given_others(left, variance, C, along_step(e, seen, tried.some));
+        moves = moves_along(e.table, rows.slot, evidence, found.squares, gate, e.config);
+    }
+    for (std::size_t i = 0; i < doubtful.size(); ++i) {
+        if (found.squares[static_cast<Index>(i)] > gate) verdict[doubtful[i]] = GATE;
+        if (moves[i] && found.judged[i]) verdict[doubtful[i]] = MOVING;
+    }
+    return verdict;
+}
+
+// Solve eq. (6) for tried rows, and remove those that others reject.
+void gate_jointly(Estimate& e, Tried& tried, const Observed& seen, Correction& found) {
+    Solution solution = e.gaussian.solve(tried.projection);
+    found.change = e.gaussian.correction(solution);
+    Matrix left = left_by(tried.projection.rows, parts(e, found.change));
+    const Verdicts verdict = gate_by_others(e, solution, left, tried, seen);
+    Flags out(verdict.size());
+    for (std::size_t i = 0; i < verdict.size(); ++i) {
+        out[i] = verdict[i] != ACCEPTED;
+        found.verdict[tried.some[i]] = verdict[i];
+        found.outside += verdict[i] == GATE;
+    }
+    const Slots inside = where(out, false);
+    Rows accepted = tried.projection.rows;
+    Blocks S = tried.S;
+    if (inside.size() < out.size()) {
+        solution = e.gaussian.without(std::move(solution), out);
+        found.change = e.gaussian.correction(solution);
+        accepted = accepted.only(inside);
+        S = picked(S, inside);
+        left = left_by(accepted, parts(e, found.change));
+    }
+    found.innovations = innovations_of(e, e.gaussian, solution, accepted, S, left);
+    found.nis = solution.nis;
+    found.log_det = solution.log_det;
+    found.solution = std::move(solution);
+}
+
+double median(std::vector<double> values) {
+    const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+    std::nth_element(values.begin(), middle, values.end());
+    if (values.size() % 2) return *middle;
+    return 0.5 * (*middle + *std::max_element(values.begin(), middle));
+}
+
+// Whether the prior spreads rows so far that linearising them once costs more than their noise. A rotation that moves a
+// row by s px has a term of second order of s^2 / (2 f) there, f being the row's derivative by the rotation. All
+// landmarks share most of it, and their noise averages out: wide means that in the median it exceeds half of
+// sigma / sqrt(k).
+bool is_wide(const Estimate& e, const Tried& tried) {
+    const Rows& rows = tried.projection.rows;
+    if (!rows.count()) return false;
+    const Vector focal = focal_lengths(by_pose(e, rows), rows.dimension());
+    std::vector<double> spread;
+    for (Index i = 0; i < rows.count(); ++i) {
+        const double most = (tried.S[i].diagonal() - rows.variance.col(i)).maxCoeff();
+        spread.push_back(most / (focal[i] * std::sqrt(rows.variance.col(i).minCoeff())));
+    }
+    return median(spread) > 1.0 / std::sqrt(static_cast<double>(rows.count()));
+}
+
+// The velocity at this frame as corrected by its observations, for eq. (9). With the measured velocity a time offset
+// would be estimated far too small: its noise is in the innovations, too.
+Vector6 corrected_twist(const Estimate& e, const Tried& tried) {
+    const Vector change = e.gaussian.correction(e.gaussian.solve(tried.projection));
+    return e.twist_after(retract_values(e, change));
+}
+
+}  // namespace
+
+Vector focal_lengths(const Matrix& by_pose, Index dimension) {
+    const Vector squares = by_pose.rightCols(3).rowwise().squaredNorm();
+    return squares.reshaped(dimension, squares.size() / dimension).colwise().maxCoeff().cwiseSqrt();
+}
+
+Correction correct_plainly(Estimate& e, const Slots& slots, const Matrix& measured) {
+    Correction found;
+    found.linear = e.mean();
+    found.coordinates = e.coordinates;
+    found.verdict.assign(slots.size(), ACCEPTED);
+    found.innovations.alone = found.innovations.apart = Matrix(measured.rows(), 0);
+    Observed seen = observe(e, found.linear, slots, measured);
+    for (Index i = 0; i < seen.q.cols(); ++i) {
+        if (!e.sensor.in_view(seen.q.col(i), e.config.min_depth_m)) found.verdict[i] = BEHIND_CAMERA;
+    }
+    Tried tried = gate_alone(e, seen, found.verdict);
+    found.outside = tried.outside;
+    if (!tried.some.empty()) {
+        if (e.has_time_offset() && e.motion.tau_s) {
+            found.linear.imu_twist = corrected_twist(e, tried);
+            seen.rows = observe(e, found.linear, slots, measured).rows;
+            tried.projection = e.gaussian.project(seen.rows.only(tried.some));
+            tried.S = own_covariances(tried.projection);
+        }
+        gate_jointly(e, tried, seen, found);
+    } else {
+        found.change = Vector::Zero(e.gaussian.considered() + e.columns.body + 3 * e.gaussian.landmarks());
+    }
+    Flags taken(slots.size());
+    for (std::size_t i = 0; i < taken.size(); ++i) taken[i] = found.verdict[i] == ACCEPTED;
+    const Slots which = where(taken);
+    found.slot = picked(slots, which);
+    found.measured = columns(measured, which);
+    found.variance = columns(seen.rows.variance, which);
+    found.dof = found.variance.size();
+    found.is_wide = is_wide(e, tried);
+    return found;
+}
+
+Relinearised relinearised(const Estimate& e, const Vector6& imu_twist, const Vector& change, const Slots& slots,
+                          const Matrix& measured) {
+    const Moved moved = retracted(e, change);
+    Relinearised found{moved.mean, e.coordinates + change.head(e.coordinates.size()), {}};
+    found.linear.imu_twist = imu_twist;
+    found.seen = observe(e, found.linear, slots, measured);
+    found.seen.rows = carried_back(e, std::move(found.seen.rows), moved);
+    Parts back = parts(e, change);
+    back.x = -back.x;
+    back.d = -back.d;
+    found.seen.rows.residual = left_by(found.seen.rows, back);
+    return found;
+}
+
+}  // namespace ekfslam
