@@ -104,7 +104,8 @@ struct Estimate {
     Index step = 0;
     Updated updated = Updated::view;
     bool is_open = false;        // whether the view of this frame is in the state: from open_views to close_views
-    std::optional<View> drifted;  // the view of differences, as opened, if it is another one
+    View opened;                  // the view of this frame as open_views found it
+    std::optional<View> drifted;  // that of differences, if it is another one
     // `Process.imu_twist` of Python, from T_departed to values after a correction: for a time offset.
     std::function<Vector6(const Values& after)> twist_after;
 
