@@ -8,13 +8,15 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from support.helpers import synthetic_result, synthetic_sequence
 
 from ekfslam.figures import series
 from ekfslam.figures.maps import ellipse_axes, plot_landmark_arrows, plot_map
-from ekfslam.figures.run import plot_errors, plot_nis, plot_parameters, save_figures
+from ekfslam.figures.run import draw_figures, plot_errors, plot_nis, plot_parameters, save_figures
 from ekfslam.figures.views import plot_trajectory
 from ekfslam.filters.result import Parameters, Result
 from ekfslam.geometry import se3
@@ -225,6 +227,40 @@ def test_files_are_written_and_small(sequence, results, tmp_path):
 def test_only_figures_with_content_are_written(results, tmp_path):
     paths = save_figures(tmp_path, {"dead-reckoning": results["dead-reckoning"]})
     assert [path.name for path in paths] == ["map.png", "side.png"]
+
+
+def boxes(figure: Figure) -> list[tuple[str, np.ndarray]]:
+    """Return the texts of a figure with their corners (2, 2) in pixels; tick labels and legends as a whole each."""
+    FigureCanvasAgg(figure).draw()
+    texts = [*figure.texts, *(text for ax in figure.axes for text in (ax.title, ax.xaxis.label, ax.yaxis.label))]
+    found = [(text.get_text(), text.get_window_extent()) for text in texts if text.get_text()]
+    found += [("legend", legend.get_window_extent()) for legend in figure.legends]
+    for axis in (axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)):
+        low, high = sorted(axis.get_view_interval())
+        inside = [tick.label1 for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high]
+        shown = [label.get_window_extent() for label in inside if label.get_visible()]
+        found += [("numbers of an axis", Bbox.union(shown))] if shown else []
+    return [(text, box.get_points()) for text, box in found]
+
+
+@pytest.mark.parametrize("modes", [MODES, ("full",)])
+@pytest.mark.parametrize("scale", [1.0, 1e-4])
+def test_no_text_is_cut_or_lies_on_another(sequence, results, modes, scale):
+    value = np.tile(np.linspace(-scale, scale, len(sequence))[:, None], 7)
+    names = tuple(f"bias of v_{i}" for i in range(7))
+    parameters = Parameters(names, ("rad/s",) * 7, np.full(7, scale), value, np.abs(value))
+    named = "2011_09_26_drive_0001_sync_KLT"
+    runs = {mode: dataclasses.replace(results[mode], sequence_name=named) for mode in modes}
+    runs["full"] = dataclasses.replace(runs["full"], parameters=parameters)
+    drawn = draw_figures(runs, sequence.truth) | {"trajectory": plot_trajectory(runs["full"], sequence.truth)}
+    assert {"map", "side", "errors", "nis", "parameters", "landmarks_full"} <= set(drawn)
+    for name, figure in drawn.items():
+        all_of_it = figure.get_size_inches() * figure.dpi
+        found = boxes(figure)
+        for i, (text, (low, high)) in enumerate(found):
+            assert (low > -1.0).all() and (high < all_of_it + 1.0).all(), f"{name}: {text!r} is cut"
+            for other, (begin, end) in found[:i]:
+                assert not ((low < end) & (begin < high)).all(), f"{name}: {text!r} lies on {other!r}"
 
 
 def test_drawing_leaves_no_global_state_behind(sequence, results):

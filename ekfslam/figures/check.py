@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from textwrap import fill
+from textwrap import wrap
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +13,7 @@ from ekfslam.evaluation.evidence import AXES, LAGS, ROWS, Whiteness
 from ekfslam.evaluation.honesty import Honesty
 from ekfslam.figures import series
 from ekfslam.figures.series import PROBABILITY, draw_series
-from ekfslam.figures.style import BOUNDS, SERIES, ZERO, line_of, styled
+from ekfslam.figures.style import BOUNDS, SERIES, ZERO, arrange, line_of, styled
 from ekfslam.filters.result import REASONS, Result
 
 _SIGMAS = 1.96  # of white noise, with `PROBABILITY`
@@ -37,7 +37,9 @@ def plot_check(result: Result, found: Honesty) -> Figure:
     for ax, axes, title in zip(panels[2], (range(3), range(3, 6)), ("translation", "rotation"), strict=True):
         _over_time(ax, time_s, shared, axes)
         ax.set_title(f"shared innovation, {title}: mean of {LAGS} frames")
-    figure.suptitle(fill(f"{found.name}: {found.verdict}".replace(" %", "\N{NO-BREAK SPACE}%"), 130), fontsize=10)
+    words = wrap(f"{found.name}: {found.verdict}".replace(" %", "\N{NO-BREAK SPACE}%"), 130)
+    figure.suptitle("\n".join(words), fontsize=10)
+    arrange(figure, top=0.55 + 0.17 * len(words), gaps=(0.8, 0.8))
     return figure
 
 

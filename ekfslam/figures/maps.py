@@ -16,12 +16,13 @@ from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.trajectory import distance_along
 from ekfslam.figures import registry
 from ekfslam.figures.series import BAND_SIGMAS, draw_series, height
-from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, legend_of, line_of, style_of
+from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, arrange, legend_of, line_of, style_of
 from ekfslam.filters.result import Result
 from ekfslam.geometry.motion import world_axes_covariance
 
 SIGMAS = 2.0  # of ellipses
 
+_ROOM, _ABOVE = 2.2, 0.5  # inches, above and below a map, and above it for a title of two lines
 _MARKS = 10  # markers, pose ellipses and arrows along a trajectory
 _ELLIPSES = 400  # of landmarks on a map; more are one blot
 _HELD = f"{100 * (1 - np.exp(-(SIGMAS**2) / 2)):.0f} %"  # of a Gaussian in the plane, within an ellipse
@@ -108,7 +109,7 @@ def plot_side(results: Mapping[str, Result], truth: Truth | None = None) -> Figu
     low, high = min(z.min() for z in heights), max(z.max() for z in heights)
     margin = 0.06 * (high - low) + 0.05
     ax.set_ylim(low - margin, high + margin)
-    legend_below(figure, ax)
+    legend_below(figure, ax, keep_size=True)
     ax.set_title(f"{mapper.sequence_name}: from the side, {BAND_SIGMAS:g}-sigma bands")
     return figure
 
@@ -138,7 +139,7 @@ def map_axes(results: Mapping[str, Result], truth: Truth | None, points: Array) 
     aspect = (high[1] - low[1]) / (high[0] - low[0])
     width = min(8.0, 7.0 / aspect)
     # Room for labels, title and legend around axes of the right shape.
-    figure = Figure(figsize=(max(width + 0.8, 6.0), max(width * aspect, 1.5) + 2.2))
+    figure = Figure(figsize=(max(width + 0.85, 6.0), max(width * aspect, 1.5) + _ROOM))
     ax = figure.subplots()
     look_from_above(ax, low, high)
     ax.set_ylabel("y [m]")
@@ -221,10 +222,17 @@ def _outside_text(outside: BoolArray) -> str:
     return f", {outside.sum()} outside the view" if outside.any() else ""
 
 
-def legend_below(figure: Figure, ax: Axes) -> None:
-    """Add a legend below a map, with marks of start and end if they are drawn."""
+def legend_below(figure: Figure, ax: Axes, keep_size: bool = False) -> None:
+    """Add a legend below a map, with marks of start and end if they are drawn, and fit the figure around both.
+
+    With ``keep_size`` the axes become lower instead.
+    """
     marks = []
     if any(line.get_marker() == "X" for line in ax.lines):
         look: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": ""}
         marks = [Line2D([], [], marker=marker, label=label, **look) for marker, label in (("o", "start"), ("X", "end"))]
-    legend_of(figure, [ax], 3 if figure.get_figwidth() > 7.0 else 2, extra=marks)
+    below = 0.5 + legend_of(figure, [ax], 3 if figure.get_figwidth() > 7.0 else 2, extra=marks)
+    if not keep_size:
+        width, height = figure.get_size_inches()
+        figure.set_size_inches(width, height - _ROOM + below + _ABOVE)
+    arrange(figure, bottom=below, top=_ABOVE)

@@ -18,7 +18,7 @@ from ekfslam.figures.maps import (
     look_from_above,
     position_covariance,
 )
-from ekfslam.figures.style import LANDMARK_COLOR, legend_of, styled
+from ekfslam.figures.style import LANDMARK_COLOR, arrange, legend_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.smoother.sparse.information import JointInformation
 
@@ -54,7 +54,7 @@ def plot_map_before_and_after(full: Result, smoothed: Result, truth: Truth | Non
         medians = f"position {of_poses} m, landmark {_median_std(covariance)} m"
         ax.set_title(f"{title}, median standard deviations:\n{medians}")
     axes[0].set_ylabel("y [m]")
-    legend_of(figure, axes, 5)
+    arrange(figure, bottom=0.5 + legend_of(figure, axes, 5), top=0.5, gaps=(0.25, 0.0))
     return figure
 
 

@@ -16,7 +16,7 @@ from ekfslam.figures import maps as maps  # registers figures, as the next one d
 from ekfslam.figures import posterior as posterior
 from ekfslam.figures import registry, series
 from ekfslam.figures.series import BAND_SIGMAS, draw_series
-from ekfslam.figures.style import PRIOR, ZERO, Format, legend_of, save_all, style_of
+from ekfslam.figures.style import PRIOR, ZERO, Format, arrange, legend_of, save_all, style_of
 from ekfslam.filters.result import Result
 
 
@@ -42,9 +42,10 @@ def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolA
             draw_series(ax, error, color, {"color": "black", "linewidth": 1.0}, levels=ZERO)
         inside = f"{100 * series.share_inside(errors):.1f} % inside {BAND_SIGMAS:g} sigma"
         nees = _nees_words(result, truth, interpolated)
-        column[0].set_title(f"{title}: {_ate_words(result, truth)}\n{inside}{nees}")
-    figure.align_ylabels()
-    figure.suptitle(f"{next(iter(results.values())).sequence_name}: estimate minus truth, world axes")
+        column[0].set_title(f"{title}\n{_ate_words(result, truth)}, {inside}{nees}")
+    name, break_ = next(iter(results.values())).sequence_name, "\n" if len(columns) == 1 else " "
+    figure.suptitle(f"{name}:{break_}estimate minus truth, world axes")
+    arrange(figure, left=0.8, top=1.2 if len(columns) == 1 else 1.0, gaps=(0.8, 0.13))
     return figure
 
 
@@ -59,7 +60,7 @@ def _nees_words(result: Result, truth: Truth, interpolated: BoolArray | None) ->
     exact, noisy = (series.nees(result, truth, interpolated, noise).mean for noise in (False, True))
     if exact is None:
         return ""
-    words = f", mean NEES {exact:.3g} (6 expected)"
+    words = f"\nmean NEES {exact:.3g} (6 expected)"
     return words if truth.noise is None else f"{words}, {noisy:.3g} with truth noise"
 
 
@@ -77,8 +78,9 @@ def plot_nis(results: Mapping[str, Result]) -> Figure:
         draw_series(ax, nis, style["color"], {**dots, "linestyle": ""})
         inside = f"{100 * nis.share_inside:.1f} % of {len(nis.y)} frames inside"
         ax.set_title(f"{mode}: {inside}, mean {nis.mean:.3g} (1 expected)")
-    legend_of(figure, axes[:1], 2)
+    legend = legend_of(figure, axes[:1], 2)
     figure.suptitle(f"{next(iter(results.values())).sequence_name}: normalised innovation squared")
+    arrange(figure, bottom=0.5 + legend, top=0.6)
     return figure
 
 
@@ -93,12 +95,13 @@ def plot_parameters(full: Result) -> Figure:
         raise ValueError("there are no parameters to show")
     columns = min(len(drawn), 3)
     rows = -(-len(drawn) // columns)
-    figure = Figure(figsize=(3.6 * columns, 0.6 + 2.2 * rows))
+    figure = Figure(figsize=(3.9 * columns, 0.3 + 2.2 * rows))
     for i, (one, is_observed) in enumerate(zip(drawn, full.parameters.is_observed, strict=True)):
         ax = figure.add_subplot(rows, columns, i + 1)
         draw_series(ax, one, color, {"color": color}, levels=PRIOR)
         title = one.name + ("" if is_observed else " (not observable)")
         ax.set(title=title, xlabel=one.labels[0], ylabel=f"[{one.unit or '-'}]")
+    arrange(figure, left=0.85, gaps=(0.9, 0.7))
     return figure
 
 

@@ -11,7 +11,7 @@ from ekfslam.errors import TruthError
 from ekfslam.figures.maps import plot_map
 from ekfslam.figures.run import plot_errors
 from ekfslam.figures.series import BAND_SIGMAS, draw_series, trajectory
-from ekfslam.figures.style import TRUTH, legend_of, line_of, styled
+from ekfslam.figures.style import TRUTH, arrange, legend_of, line_of, styled
 from ekfslam.filters.result import Result
 
 
@@ -53,9 +53,8 @@ def plot_trajectory(result: Result, truth: Truth | None = None) -> Figure:
         if true is not None:
             draw_series(ax, true, color, TRUTH, label="truth")
         draw_series(ax, one, color, line_of(result.mode), label=f"{result.mode}, {BAND_SIGMAS:g} sigma")
-    figure.align_ylabels()
     figure.suptitle(f"{result.sequence_name}, {result.mode}: pose of the IMU in world")
-    legend_of(figure, axes[0, :1], 2)
+    arrange(figure, bottom=0.5 + legend_of(figure, axes[0, :1], 2), top=0.5, gaps=(0.8, 0.13))
     return figure
 
 
