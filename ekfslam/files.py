@@ -1,12 +1,12 @@
 """Atomic writing: a file is written as a whole or not at all.
 
 The complete content goes to a file next to the target, to the disk (fsync), and replaces the target by renaming. A full
-disk, a limit or a kill leaves the older file unchanged.
+disk, a limit or a kill leaves the older file unchanged. Windows has no locks of folders: callers do not wait for each
+other there, and unfinished files of killed processes stay.
 """
 
 from __future__ import annotations
 
-import fcntl
 import itertools
 import os
 import stat
@@ -15,6 +15,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ekfslam.errors import WriteError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 _PREFIX, _SUFFIX = ".ekfslam.", ".tmp"  # names of unfinished files, with the number of the process between
 _counter = itertools.count()
@@ -96,8 +101,12 @@ def alone(path: str | Path) -> Iterator[None]:
     Raises:
         WriteError: There is no such folder.
     """
+    parent = _target(path).parent
+    if fcntl is None and parent.is_dir():
+        yield
+        return
     try:
-        folder = os.open(_target(path).parent, os.O_RDONLY)
+        folder = os.open(parent, os.O_RDONLY)
     except OSError as error:
         raise WriteError(f"{path}: {error.strerror or error}") from None
     try:
@@ -125,9 +134,10 @@ def _target(path: str | Path) -> Path:
 def _write_to_disk(unfinished: Path, data: bytes, target: Path) -> None:
     """Write a new file with the permissions of the target, and wait until it is on the disk."""
     with unfinished.open("xb") as file:
-        with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_EX)  # tells `_sweep` that the writer is alive
-        if target.exists():
+        if fcntl is not None:
+            with suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_EX)  # tells `_sweep` that the writer is alive
+        if fcntl is not None and target.exists():
             older = target.stat()
             with suppress(OSError):
                 os.fchown(file.fileno(), older.st_uid, older.st_gid)
@@ -149,6 +159,8 @@ def _sync_folder(folder: Path) -> None:
 
 def _sweep(folder: Path) -> None:
     """Remove unfinished files of dead processes."""
+    if fcntl is None:  # os.kill(process, 0) would interrupt the process there
+        return
     for scrap in folder.glob(f"{_PREFIX}*{_SUFFIX}"):
         number = scrap.name.removeprefix(_PREFIX).partition(".")[0]
         if not number.isdigit() or _is_alive(int(number)):

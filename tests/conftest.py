@@ -9,6 +9,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 from support.running import FORKS, recording
 
+from ekfslam.smoother.sparse import solvers
+
 # How long an example takes says nothing on a machine that has other work to do.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
@@ -36,6 +38,12 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
     picture = png(Figure(figsize=(1, 1)))
     monkeypatch.setattr("ekfslam.figures.style.png", lambda *_: picture)
+
+
+@pytest.fixture(params=sorted({solvers.solver, solvers.SuperLU}, key=lambda kind: kind.__name__))
+def each_solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sparse matrices are factorised by the library that is chosen here, then by SuperLU."""
+    monkeypatch.setattr(solvers, "solver", request.param)
 
 
 @pytest.fixture

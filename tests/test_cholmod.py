@@ -1,10 +1,12 @@
-"""Sparse block Cholesky factorisation against dense linear algebra."""
+"""Sparse block Cholesky factorisation against dense linear algebra, by every library at hand."""
 
 import numpy as np
 import pytest
 from support.blocks import block_cholesky
 
 from ekfslam.smoother.sparse.cholmod import BlockPattern, NotPositiveDefiniteError, SparseCholesky
+
+pytestmark = pytest.mark.usefixtures("each_solver")
 
 SIZES = np.array([6, 3, 6, 1, 3, 6, 3, 16, 6, 3])
 EDGES = [(1, 0), (2, 0), (4, 2), (5, 0), (5, 4), (7, 3), (7, 6), (8, 5), (9, 1), (9, 8)]

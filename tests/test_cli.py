@@ -304,4 +304,5 @@ def test_info_says_which_kernels_run(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split()[0] == "engine"
     assert lines[1].split()[:2] in (["kernels", "compiled,"], ["kernels", "plain,"])
+    assert lines[2].split()[:2] in (["smoother", "CHOLMOD"], ["smoother", "SuperLU"])
     assert any(line.split()[0] == "BLAS" for line in lines)

@@ -320,3 +320,29 @@ def test_figures_of_an_earlier_run_do_not_stay_beside_a_new_archive(tmp_path, un
     assert main([*full, "--modes", "dead-reckoning"]) == 0
     names = {path.name for path in folder.iterdir()}
     assert names == {"archive.h5", "summary.json", "summary.md", "map.png", "side.png", "errors.png", "mine.png"}
+
+
+def test_without_the_locks_of_posix_files_are_written_all_the_same(tmp_path):
+    """Windows has neither fcntl nor fchmod and fchown, and its os.kill(process, 0) interrupts the process."""
+    code = f"""
+import os, sys
+from pathlib import Path
+sys.modules["fcntl"] = None
+del os.fchmod, os.fchown, os.kill
+import ekfslam
+from ekfslam import files
+folder = Path({str(tmp_path)!r})
+scrap = folder / ".ekfslam.4194304.0.tmp"
+scrap.write_text("unfinished")
+for text in ("first", "second"):
+    with files.alone(folder / "a.txt"):
+        files.write(folder / "a.txt", text)
+assert (folder / "a.txt").read_text() == "second" and scrap.exists()
+try:
+    with files.alone(folder / "none" / "a.txt"):
+        raise AssertionError
+except ekfslam.errors.WriteError:
+    pass
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -21,6 +21,7 @@ from ekfslam.evaluation.sources import compare_sources, in_words
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.resolve import noise_of_velocities, resolve
 from ekfslam.runner import versions
+from ekfslam.smoother.sparse import solvers
 from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT
 from ekfslam.storage.archive import read_archive
 
@@ -132,6 +133,7 @@ def _print_build() -> None:
     how = "compiled, C" if kernels.FORM == "compiled" else "plain, NumPy: not compiled, or EKFSLAM_KERNELS=plain is set"
     print(f"engine        {MISSING or 'compiled, C++'}")
     print(f"kernels       {how}")
+    print(f"smoother      {solvers.describe()}")
     for name, version in versions().items():
         print(f"{name.removeprefix('version_'):13s} {version}")
     for library in threadpool_info():

@@ -1,4 +1,4 @@
-"""Sparse block Cholesky factorisation by CHOLMOD; the only module that imports scikit-sparse.
+"""Sparse block Cholesky factorisation, by CHOLMOD or SuperLU (see `ekfslam.smoother.sparse.solvers`).
 
 The fill-reducing order is sought on the graph of blocks: it has a thirtieth of the edges of the graph of scalars, and
 every block stays contiguous in the factor, so that whole blocks of the inverse can be read off it.
@@ -10,10 +10,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import scipy.sparse as sp
-from sksparse import cholmod
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.errors import EkfslamError
+from ekfslam.smoother.sparse import solvers
 
 
 class NotPositiveDefiniteError(EkfslamError):
@@ -104,29 +104,26 @@ class SparseCholesky:
 
     def __init__(self, pattern: BlockPattern, matrix: sp.csc_matrix, like: SparseCholesky | None = None) -> None:
         self.pattern = pattern
-        # Supernodal: a true L L^T; the simplicial L D L^T would accept indefinite matrices.
-        self._symbolic: cholmod.Factor = (
-            like._symbolic if like else cholmod.analyze(matrix, mode="supernodal", ordering_method="natural")
-        )
+        self._analysis: solvers.Analysis = like._analysis if like else solvers.solver(matrix)
         undefined = np.flatnonzero(~np.isfinite(matrix.data))
         if len(undefined):  # not every BLAS stops at NaN
             raise pattern.not_positive_definite(int(np.searchsorted(matrix.indptr, undefined[0], side="right")) - 1)
         try:
-            self._factor = self._symbolic.cholesky(matrix)
-        except cholmod.CholmodNotPositiveDefiniteError as error:
+            self._factor = self._analysis.factorise(matrix)
+        except solvers.PivotError as error:
             raise pattern.not_positive_definite(error.column) from None
 
     def solve(self, b: Array) -> Array:
         """Return ``A^-1 b`` for b (n,) or (n, k)."""
-        return self._unpermuted(self._factor.solve_A(b[self.pattern.permutation]))
+        return self._unpermuted(self._factor.solve(b[self.pattern.permutation]))
 
     def half_solve(self, b: Array) -> Array:
         """Return ``X = L^-1 P b`` for b (n,) or (n, k): ``b^T A^-1 b = X^T X`` at half the work of `solve`."""
-        return self._factor.solve_L(b[self.pattern.permutation], use_LDLt_decomposition=False)
+        return self._factor.solve_lower(b[self.pattern.permutation])
 
     def sample_transform(self, z: Array) -> Array:
         """Return ``W z = P^T L^-T z`` for z (n,) or (n, k): white noise z gets the covariance ``W W^T = A^-1``."""
-        return self._unpermuted(self._factor.solve_Lt(z, use_LDLt_decomposition=False))
+        return self._unpermuted(self._factor.solve_transposed(z))
 
     def _unpermuted(self, x: Array) -> Array:
         result = np.empty_like(x)
@@ -135,19 +132,18 @@ class SparseCholesky:
 
     def factor(self) -> sp.csc_array:
         """Return L (n, n), its row indices sorted; CHOLMOD may store zeros where this joins small supernodes."""
-        return sp.csc_array(self._factor.L())
+        return self._factor.lower()
 
     @property
     def log_determinant(self) -> float:
         """Natural logarithm of det(A)."""
-        return float(self._factor.logdet())
+        return float(self._factor.log_determinant())
 
 
 def _fill_reducing_order(row: IntArray, column: IntArray, blocks: int) -> IntArray:
-    """Return CHOLMOD's default fill-reducing order of the blocks of a lower triangle, postordered."""
+    """Return the fill-reducing order of the blocks of a lower triangle, postordered."""
     graph = sp.csc_array(sp.coo_array((np.ones(len(row), dtype=bool), (row, column)), shape=(blocks, blocks)))
-    symbolic = cholmod.analyze(graph.astype(float), mode="simplicial", ordering_method="default")
-    return np.asarray(symbolic.P(), dtype=np.int64)
+    return solvers.solver.order(graph.astype(float))
 
 
 def concatenated_ranges(start: IntArray, length: IntArray) -> IntArray:
