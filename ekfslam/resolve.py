@@ -140,10 +140,10 @@ def resolve(
     Raises:
         ConfigError: An unknown block, an unknown setting of a block, or pixel noise that is too small.
     """
-    sequence = recording = with_odometry(sequence)
+    sequence = recording = sequence.once(with_odometry)
     config = config or Config()
     account: dict[str, str | int | float] = {f"tuned_{key}": value for key, value in config.tuning.items()}
-    if mode != "dead-reckoning" and _has_open_scale(sequence, config) and (tracks := track_noise(sequence)):
+    if mode != "dead-reckoning" and _has_open_scale(sequence, config) and (tracks := sequence.once(track_noise)):
         account["found_tracks"] = tracks.text
         if tracks.is_white:
             white = {"model": "tuned", "sigma_px": tracks.sigma_px, "drift": 0.0}
@@ -162,7 +162,7 @@ def resolve(
                 f"{sequence.name}: the recording states a pixel noise of {least:g} px, with which innovation "
                 f"covariances are singular; give noise.sigma_px, at least {LEAST_PX:g}"
             )
-        observations, hygiene = clean_tracks(sequence, _in_the_long_run(sequence, config, noise), config.hygiene)
+        observations, hygiene = sequence.once(clean_tracks, _in_the_long_run(sequence, config, noise), config.hygiene)
         attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
         sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
     model = _model(sequence, config, noise, blocks)

@@ -67,7 +67,7 @@ def run(
         )
     if mode == "smoothed":
         return smooth(run(sequence, "full", config, further))
-    suspicions = inspect_sequence(sequence).warnings
+    suspicions = sequence.once(inspect_sequence).warnings
     problem = resolve(sequence, config, mode)
     with one_thread():
         estimate = _joint(problem, further) if mode == "full" else _dead_reckoned(problem, mode)

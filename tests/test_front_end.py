@@ -19,7 +19,7 @@ from ekfslam.frontend.rotation import RightRotation, correction
 from ekfslam.frontend.track import track
 from ekfslam.geometry import lens, se3
 from ekfslam.geometry.camera import StereoCamera, project
-from ekfslam.geometry.stereo_motion import agrees, align, sampled_motion
+from ekfslam.geometry.stereo_motion import agrees, align, linearise, sampled_motion
 from ekfslam.resolve import resolve
 from ekfslam.runner import run
 
@@ -241,6 +241,31 @@ def test_motion_is_exact_and_robust():
     np.testing.assert_allclose(found.T_now_before, T, atol=1e-3)
     np.testing.assert_array_equal(agrees(found, 2.0), ~wrong)
     assert (sampled_motion(CAMERA, before[:2], now[:2], rng, 10, 2.0) == np.eye(4)).all()
+
+
+@pytest.mark.parametrize("angle", [1e-3, 0.4, 3.0])
+def test_derivatives_and_weights_of_an_alignment_are_right(angle):
+    rng, h = np.random.default_rng(5), 1e-6
+    turn = se3.transform(se3.so3_exp(np.array([0.1, angle, -0.05])), np.array([2.0, -1.0, 45.0]))
+    before, now = pairs(rng, 12, turn, std=1.0)
+    before[:, 2] = np.minimum(before[:, 2], before[:, 0] - 3.0)
+
+    def found(T=turn, true_px=before):
+        return linearise(CAMERA, true_px, now, T, true_px, 0.2, 2.0)
+
+    for j, step in enumerate(h * np.eye(6)):
+        ahead, back = (found(se3.exp(sign * step) @ turn).residual_px for sign in (1.0, -1.0))
+        np.testing.assert_allclose(found().H[..., j], (back - ahead) / (2 * h), rtol=1e-5, atol=1e-3)
+    for j, step in enumerate(h * np.eye(3)):
+        ahead, back = (found(true_px=before + sign * step).residual_px for sign in (1.0, -1.0))
+        np.testing.assert_allclose(found().B[..., j], (back - ahead) / (2 * h), rtol=1e-4, atol=1e-4)
+    B, W = found().B, found().W
+    k = np.array([0.0, 0.0, 1.0]) - B[..., 2]
+    S = 0.2**2 * (np.eye(3) + B @ np.swapaxes(B, 1, 2)) + 0.3**2 * k[..., None] * k[:, None]
+    weight = (W @ S)[:, :1, :1]
+    np.testing.assert_allclose(W @ S, weight * np.eye(3), atol=1e-8)
+    information = sum(H.T @ w @ H for H, w in zip(found().H, W, strict=True))
+    np.testing.assert_allclose(found().information, information, rtol=1e-10)
 
 
 @pytest.mark.parametrize("std", [0.0, 0.2])

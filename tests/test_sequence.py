@@ -263,3 +263,16 @@ def test_interpolated_intervals_of_a_stretch_have_other_numbers():
 def test_what_is_no_stretch_is_refused(frames, words):
     with pytest.raises(ShapeError, match=words):
         builtin("city?frames=60")[frames]
+
+
+def test_what_is_found_once_is_kept_with_its_arguments_and_leaves_with_the_recording():
+    sequence, calls = builtin("loop"), []
+
+    def find(recording: Sequence, *arguments: object) -> int:
+        calls.append((recording, *arguments))
+        return len(calls)
+
+    assert [sequence.once(find), sequence.once(find, np.ones(2)), sequence.once(find, np.ones(2))] == [1, 2, 2]
+    assert sequence.once(find, np.zeros(2)) == 3
+    assert sequence[:50].once(find) == 4
+    assert sequence.once(find) == 1

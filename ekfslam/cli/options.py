@@ -165,7 +165,7 @@ def open_data(options: argparse.Namespace, data: str) -> Sequence:
 
 def print_warnings(sequence: Sequence) -> None:
     """Print the warnings about a recording."""
-    for line in inspect_sequence(sequence).warnings:
+    for line in sequence.once(inspect_sequence).warnings:
         print(f"{sequence.name}: warning: {line}", flush=True)
 
 

@@ -27,6 +27,7 @@ from ekfslam.data.observations import (
     validate_observations,
     validate_truth,
 )
+from ekfslam.data.once import Once
 from ekfslam.errors import (
     CalibrationError,
     ExtrinsicsError,
@@ -59,7 +60,7 @@ LEVEL_VELOCITIES_NOTE = (
 
 
 @dataclass(frozen=True, repr=False, init=False)
-class Sequence(Shown):
+class Sequence(Once, Shown):
     """One recording of a stereo rig, with velocities or inertial samples of its body.
 
     Args:

@@ -187,14 +187,16 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str],
     turns = turning >= np.quantile(turning, 1.0 - _SHARE_TURNING)
     points = cam.triangulate(sequence.camera, cam.rectified_rows(pixels[earlier], np.ones(4))[0])
 
+    frames, which = np.unique(at, return_inverse=True)
+
     def error_px(C: Array, u: Array, tau: Array) -> tuple[float, float]:
         """Return the median distance of prediction and observation, on straight stretches and in turns."""
-        moved = se3.apply(C @ motion.increment(u, tau) @ se3.inverse(C), points)
-        return _off(sequence, moved, pixels[later, :2], turns)
+        T = C @ motion.increment(u, tau) @ se3.inverse(C)
+        return _off(sequence, se3.apply(T[which], points), pixels[later, :2], turns)
 
-    C, u, tau = given = sequence.T_cam_imu, sequence.twist[at], tau[at]
+    C, u, tau = given = sequence.T_cam_imu, sequence.twist[frames], tau[frames]
     straight, turn = error_px(*given)
-    smooth = sum(error_px(C, _smoothed(sequence.twist)[at], tau))
+    smooth = sum(error_px(C, _smoothed(sequence.twist)[frames], tau))
     still = sum(error_px(C, np.zeros_like(u), tau))
     predicted = f"the velocities predict it to {straight:.3g} px, where the rig turns most to {turn:.3g} px"
     figure = f"tracks move by {np.median(seen):.3g} px a frame; {predicted}"

@@ -18,12 +18,13 @@ import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.geometry import se3
-from ekfslam.geometry.camera import StereoCamera, project, rectified_jacobian, triangulate
+from ekfslam.geometry.camera import StereoCamera, project, triangulate
 
 _ITERATIONS = 12
 _CONVERGED = 1e-4  # m and rad of a step, after which the next would be far smaller
 _LEAST_DEPTH_M = 0.1
 TRACK_STD_PX = 0.3  # s_c
+_OF_ROWS = [0, 1, 0]  # coordinate of a point across the image, for rows (uL, v, uR)
 _FITS = 9.0  # mean square of a point's rows, in variances
 
 
@@ -50,12 +51,12 @@ class Alignment:
     @property
     def information(self) -> Array:
         """(6, 6) information about xi."""
-        return np.einsum("nij,nik,nkl->jl", self.H, self.W, self.H)
+        return (self.W @ self.H).reshape(-1, 6).T @ self.H.reshape(-1, 6)
 
     def gradient(self, by: Array) -> Array:
         """``sum by^T W r`` of derivatives ``by`` (n, 3, p): (p,)."""
         r = np.where(np.isfinite(self.residual_px), self.residual_px, 0.0)
-        return np.einsum("nij,nik,nk->j", by, self.W, r)
+        return (self.W @ r[..., None]).reshape(-1) @ by.reshape(-1, by.shape[-1])
 
 
 def linearise(
@@ -75,17 +76,28 @@ def linearise(
         std_px: Standard deviation s of one row.
         scale: Scale of the Geman-McClure kernel, in standard deviations; its weight is ``(1 + e^2 / scale^2)^-2``.
     """
-    q_before = triangulate(camera, true_px)
+    q_before, R = triangulate(camera, true_px), T_now_before[..., :3, :3]
     q = se3.apply(T_now_before, q_before)
     is_ahead = q[:, 2] > _LEAST_DEPTH_M
     q = np.where(is_ahead[:, None], q, (0.0, 0.0, 1.0))
-    A = rectified_jacobian(camera, q)
-    H = np.concatenate([A, -A @ se3.skew(q)], axis=-1)
-    B = A @ T_now_before[..., :3, :3] @ np.linalg.inv(rectified_jacobian(camera, q_before))
-    r = now_px - project(camera, q)[:, :3] - (B @ (before_px - true_px)[..., None])[..., 0]
+    of_q = np.empty((len(q), 3, 6))
+    of_q[..., :3], of_q[..., 3:] = np.eye(3), -se3.skew(q)
+    H, predicted_px = _projected(camera, q, of_q)
+    # By the rows before: depth is f b over the disparity, so a disparity moves a point along its ray.
+    along = np.where(is_ahead[:, None], q - T_now_before[..., :3, 3], 0.0) / (true_px[:, 0] - true_px[:, 2])[:, None]
+    of_rows = np.stack(
+        [
+            R[..., 0] * (q_before[:, 2] / camera.fu_px)[:, None] - along,
+            R[..., 1] * (q_before[:, 2] / camera.fv_px)[:, None],
+            along,
+        ],
+        axis=-1,
+    )
+    B, _ = _projected(camera, q, of_rows)
+    r = now_px - predicted_px - (B @ (before_px - true_px)[..., None])[..., 0]
     k, finite = np.array([0.0, 0.0, 1.0]) - B[..., 2], np.where(is_ahead[:, None], r, 0.0)
-    S = std_px**2 * (np.eye(3) + B @ np.swapaxes(B, -1, -2)) + TRACK_STD_PX**2 * k[..., None] * k[..., None, :]
-    W = np.linalg.inv(S)
+    root = np.concatenate([std_px * B, TRACK_STD_PX * k[..., None]], axis=-1)
+    W = _inverse(std_px**2 * np.eye(3) + root @ np.swapaxes(root, -1, -2))
     Wr = (W @ finite[..., None])[..., 0]
     squared = (finite * Wr).sum(axis=1) / 3.0
     weight = np.where(is_ahead, (1.0 + squared / scale**2) ** -2, 0.0)
@@ -95,6 +107,22 @@ def linearise(
     fits = (squared < _FITS) & (moved[:, 0] - moved[:, 2] > 0.5 * (before_px[:, 0] - before_px[:, 2]))
     true_px = np.where(fits[:, None], moved, before_px)
     return Alignment(T_now_before, true_px, np.where(is_ahead[:, None], r, np.inf), H, B, W * weight[:, None, None])
+
+
+def _projected(camera: StereoCamera, q: Array, of_q: Array) -> tuple[Array, Array]:
+    """Return derivatives (n, 3, p) of rows, given those of points q (n, 3), and the rows (n, 3)."""
+    f = np.array([camera.fu_px, camera.fv_px, camera.fu_px])
+    ray = (q[:, _OF_ROWS] - (0.0, 0.0, camera.baseline_m)) / q[:, 2:]
+    A = (of_q[:, _OF_ROWS] - ray[..., None] * of_q[:, 2:]) * (f / q[:, 2:])[..., None]
+    return A, f * ray + (camera.cu_px, camera.cv_px, camera.cu_px)
+
+
+def _inverse(S: Array) -> Array:
+    """Return the inverses of symmetric matrices (n, 3, 3), by cofactors."""
+    a, b, c, d, e, f = (S[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    rows = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * rows[0] + b * rows[1] + c * rows[2]
+    return np.stack(rows)[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]].transpose(2, 0, 1) / determinant[:, None, None]
 
 
 def align(

@@ -162,8 +162,9 @@ def _residuals(sequence: Sequence, k: int, last: _Fit) -> _Residuals | None:
     if good.mean() < _AGREE_SHARE or good.sum() < _LEAST_POINTS:
         last.T_now_before = None
         return None
-    taken = found.H @ np.linalg.solve(found.information, np.swapaxes(found.H, 1, 2) @ found.W)
-    share = (1.0 - np.diagonal(taken, axis1=1, axis2=2)).clip(_LEAST_SHARE)
+    # The diagonal of H (H^T W H)^-1 H^T W.
+    taken = ((found.H @ np.linalg.inv(found.information)) * (found.W @ found.H)).sum(axis=2)
+    share = (1.0 - taken).clip(_LEAST_SHARE)
     return _Residuals(ids[near][good], (r / np.sqrt(share))[good], found.B[good])
 
 
