@@ -2,6 +2,7 @@
 #include <nanobind/eigen/dense.h>
 #include <nanobind/nanobind.h>
 
+#include "bind_gaussian.hpp"
 #include "lapack.hpp"
 #include "types.hpp"
 
@@ -36,5 +37,6 @@ NB_MODULE(_engine, module) {
     } catch (const std::runtime_error& error) {
         throw nb::import_error(error.what());
     }
+    bind_gaussian(module);
     module.def("cholesky", &cholesky, nb::arg("P"), "Return the lower Cholesky factor of a covariance.");
 }

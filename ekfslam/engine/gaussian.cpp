@@ -1,0 +1,290 @@
+// Covariances that leave the Gaussian, and the body: propagation, transformation, considered columns.
+#include "gaussian.hpp"
+
+#include <algorithm>
+#include <numeric>
+#include <utility>
+
+#include "blas.hpp"
+
+namespace ekfslam {
+
+namespace {
+std::vector<Index> range(Index begin, Index size) {
+    std::vector<Index> places(static_cast<std::size_t>(size));
+    std::iota(places.begin(), places.end(), begin);
+    return places;
+}
+
+bool contains(const std::vector<Index>& some, Index value) {
+    return std::find(some.begin(), some.end(), value) != some.end();
+}
+
+bool is_within(Index j, Index begin) { return begin >= 0 && j >= begin && j < begin + 6; }
+}  // namespace
+
+Gaussian::Gaussian(const Matrix& P_body, Columns columns) : columns_(std::move(columns)) {
+    const Columns& c = columns_;
+    for (Index j = 0; j < c.body; ++j)
+        if (!is_within(j, c.view) && !is_within(j, c.previous) && !is_within(j, c.anchor) && !contains(c.front, j))
+            rest_.push_back(j);
+    replace(P_body);
+}
+
+Lead Gaussian::lead() const {
+    Lead lead;
+    lead.front = front_size() + (columns_.anchor >= 0 ? 6 : 0);
+    lead.width = lead.front;
+    const auto next = [&lead] { return std::exchange(lead.width, lead.width + 6); };
+    if (has_drifted_) lead.drifted = next();
+    lead.view = next();
+    if (columns_.previous >= 0) lead.previous = next();
+    return lead;
+}
+
+const Gaussian::View* Gaussian::view_at(Index at) const {
+    if (at == columns_.view) return &view_;
+    if (at >= 0 && at == columns_.previous) return &previous_;
+    if (at >= 0 && at == columns_.anchor) return &anchor_;
+    return nullptr;
+}
+
+Gaussian::View* Gaussian::view_at(Index at) { return const_cast<View*>(std::as_const(*this).view_at(at)); }
+
+std::vector<Index> Gaussian::body_places() const {
+    const Index e = P_AA_.rows();
+    std::vector<Index> places(static_cast<std::size_t>(columns_.body + considered_));
+    const auto set = [&places](Index column, Index place) { places[static_cast<std::size_t>(column)] = place; };
+    for (Index i = 0; i < static_cast<Index>(rest_.size()); ++i) set(rest_[static_cast<std::size_t>(i)], e + i);
+    for (Index i = 0; i < front_size(); ++i) set(columns_.front[static_cast<std::size_t>(i)], front_at() + i);
+    for (Index at : {columns_.view, columns_.previous, columns_.anchor})
+        for (Index i = 0; at >= 0 && i < 6; ++i) set(at + i, view_at(at)->column + i);
+    for (Index i = 0; i < considered_; ++i) set(columns_.body + i, e + static_cast<Index>(rest_.size()) + i);
+    return places;
+}
+
+double Gaussian::entry(Index i, Index j) const {
+    const Index n = P_AA_.rows();
+    if (i < n) return j < n ? P_AA_(i, j) : P_eA_(j - n, i);
+    return j < n ? P_eA_(i - n, j) : P_ee_(i - n, j - n);
+}
+
+Matrix Gaussian::gathered(const std::vector<Index>& rows, const std::vector<Index>& columns) const {
+    Matrix P(static_cast<Index>(rows.size()), static_cast<Index>(columns.size()));
+    for (Index j = 0; j < P.cols(); ++j)
+        for (Index i = 0; i < P.rows(); ++i)
+            P(i, j) = entry(rows[static_cast<std::size_t>(i)], columns[static_cast<std::size_t>(j)]);
+    return P;
+}
+
+void Gaussian::turn_views(Matrix& P) const {
+    for (Index at : {columns_.view, columns_.previous, columns_.anchor}) {
+        if (at < 0) continue;
+        const Matrix6& E = view_at(at)->E;
+        P.middleRows(at, 6) = (E * P.middleRows(at, 6)).eval();
+        P.middleCols(at, 6) = (P.middleCols(at, 6) * E.transpose()).eval();
+    }
+}
+
+Matrix Gaussian::body_covariance() const {
+    const std::vector<Index> places = body_places();
+    Matrix P = gathered(places, places);
+    turn_views(P);
+    return P;
+}
+
+std::vector<Index> Gaussian::dormant_of(const Slots& slots) const {
+    std::vector<Index> which(row_.size(), -1), found;
+    for (Index i = 0; i < dormant_.size(); ++i)
+        which[static_cast<std::size_t>(dormant_.slot[static_cast<std::size_t>(i)])] = i;
+    for (Index slot : slots) found.push_back(which[static_cast<std::size_t>(slot)]);
+    return found;
+}
+
+Matrix Gaussian::dependence(const Slots& slots) const {
+    const std::vector<Index> dormant = dormant_of(slots);
+    Matrix K = Matrix::Zero(P_AA_.rows(), static_cast<Index>(3 * slots.size()));
+    for (std::size_t i = 0; i < slots.size(); ++i) {
+        auto own = K.middleCols(static_cast<Index>(3 * i), 3);
+        if (dormant[i] >= 0) {
+            own = dormant_.K.middleCols(3 * dormant[i], 3);
+            continue;
+        }
+        const Awake& landmark = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slots[i])])];
+        if (landmark.own >= 0) own.middleRows(landmark.own, 3).setIdentity();
+        else own.bottomRows(P_AA_.rows() - landmark.begin) = tail(const_cast<Awake&>(landmark));
+    }
+    return K;
+}
+
+Matrix Gaussian::own_covariance(const Slots& slots) const {
+    const std::vector<Index> dormant = dormant_of(slots);
+    Matrix S = Matrix::Zero(static_cast<Index>(3 * slots.size()), static_cast<Index>(3 * slots.size()));
+    std::vector<Index> asleep, at;
+    for (std::size_t i = 0; i < slots.size(); ++i) {
+        if (dormant[i] >= 0) {
+            asleep.push_back(dormant[i]);
+            at.push_back(static_cast<Index>(i));
+        } else {
+            const Index own = static_cast<Index>(3 * i);
+            S.block<3, 3>(own, own) = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slots[i])])].S;
+        }
+    }
+    if (!at.empty()) S(triples(at), triples(at)) = dormant_.rows(triples(asleep))(Eigen::all, triples(asleep));
+    return S;
+}
+
+Matrix Gaussian::covariance_of(const Slots& slots) const {
+    const Index b = columns_.body + considered_, m = static_cast<Index>(3 * slots.size()), n = P_AA_.rows();
+    const std::vector<Index> places = body_places(), dormant = dormant_of(slots);
+    const Matrix K = dependence(slots);
+    Matrix P_ed(P_eA_.rows(), m), P_Ad(n, m);
+    blas::multiply('N', 'N', 1.0, P_AA_, K, 0.0, P_Ad);
+    blas::multiply('N', 'N', 1.0, P_eA_, K, 0.0, P_ed);
+    for (std::size_t i = 0; i < slots.size(); ++i)
+        if (dormant[i] >= 0) P_ed.middleCols(static_cast<Index>(3 * i), 3) += dormant_.cross.middleCols(3 * dormant[i], 3);
+    Matrix P(b + m, b + m);
+    P.topLeftCorner(b, b) = gathered(places, places);
+    for (Index j = 0; j < b; ++j) {
+        const Index place = places[static_cast<std::size_t>(j)];
+        P.row(j).tail(m) = place < n ? P_Ad.row(place) : P_ed.row(place - n);
+    }
+    P.bottomLeftCorner(m, b) = P.topRightCorner(b, m).transpose();
+    turn_views(P);
+    Matrix own = own_covariance(slots);
+    blas::multiply('T', 'N', 1.0, K, P_Ad, 1.0, own);
+    P.bottomRightCorner(m, m) = 0.5 * (own + own.transpose());
+    return P;
+}
+
+std::vector<Matrix3> Gaussian::landmark_blocks(const Slots& slots) const {
+    const std::vector<Index> dormant = dormant_of(slots);
+    const Matrix K = dependence(slots);
+    Matrix PK(K.rows(), K.cols());
+    blas::multiply('N', 'N', 1.0, P_AA_, K, 0.0, PK);
+    std::vector<Matrix3> blocks;
+    for (std::size_t i = 0; i < slots.size(); ++i) {
+        const Index at = static_cast<Index>(3 * i);
+        const Matrix3 given = dormant[i] >= 0
+                                  ? dormant_.block(dormant[i])
+                                  : awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slots[i])])].S;
+        const Matrix3 P = K.middleCols(at, 3).transpose() * PK.middleCols(at, 3) + given;
+        blocks.push_back(0.5 * (P + P.transpose()));
+    }
+    return blocks;
+}
+
+Gaussian::Over Gaussian::over(const Matrix& H) const {
+    Over rows{Matrix::Zero(H.rows(), P_AA_.rows()), Matrix::Zero(H.rows(), P_eA_.rows())};
+    for (Index i = 0; i < static_cast<Index>(rest_.size()); ++i) rows.e.col(i) = H.col(rest_[static_cast<std::size_t>(i)]);
+    for (Index i = 0; i < front_size(); ++i)
+        rows.A.col(front_at() + i) = H.col(columns_.front[static_cast<std::size_t>(i)]);
+    for (Index at : {columns_.view, columns_.previous, columns_.anchor})
+        if (at >= 0) rows.A.middleCols(view_at(at)->column, 6) += H.middleCols(at, 6) * view_at(at)->E;
+    return rows;
+}
+
+void Gaussian::propagate(const Matrix& Phi, const Matrix& Q) {
+    std::vector<Index> body = rest_, changed;
+    body.insert(body.end(), columns_.front.begin(), columns_.front.end());
+    for (Index i = 0; i < front_size(); ++i) {
+        const Index j = columns_.front[static_cast<std::size_t>(i)];
+        const bool stays = Phi(j, j) == 1.0 && (Phi.row(j).array() != 0.0).count() == 1;
+        if (!stays || !Q.row(j).isZero(0.0)) changed.push_back(i);
+    }
+    if (!changed.empty()) push_front(changed);
+    const Index r = static_cast<Index>(rest_.size()), n = P_AA_.rows(), b = static_cast<Index>(body.size());
+    std::vector<Index> at = range(n, r), all = range(0, n + P_eA_.rows());
+    for (Index i = 0; i < front_size(); ++i) at.push_back(front_at() + i);
+    const Matrix Phi_b = Phi(body, body), Q_b = Q(body, body), before = gathered(at, all);
+    Matrix rows(b, before.cols());
+    blas::multiply('N', 'N', 1.0, Phi_b, before, 0.0, rows);
+    const Matrix P_bb = Matrix(rows(Eigen::all, at)) * Phi_b.transpose() + Q_b;
+    rows(Eigen::all, at) = 0.5 * (P_bb + P_bb.transpose());
+    const Matrix P_fe = rows.bottomRows(front_size()).rightCols(P_eA_.rows());
+    P_eA_.topRows(r) = rows.topRows(r).leftCols(n);
+    P_eA_.middleCols(front_at(), front_size()) = P_fe.transpose();
+    P_ee_.topRows(r) = rows.topRows(r).rightCols(P_eA_.rows());
+    P_ee_.leftCols(r) = P_ee_.topRows(r).transpose();
+    P_AA_.middleRows(front_at(), front_size()) = rows.bottomRows(front_size()).leftCols(n);
+    P_AA_.middleCols(front_at(), front_size()) = P_AA_.middleRows(front_at(), front_size()).transpose();
+    root_.reset();
+    if (!dormant_.size()) return;
+    const Matrix cross = Phi_b.leftCols(r) * dormant_.cross.topRows(r);
+    dormant_.cross.topRows(r) = cross.topRows(r);
+    std::vector<Index> entered, of;
+    for (Index i : changed) entered.push_back(front_at() + i), of.push_back(r + i);
+    if (!entered.empty()) absorb(entered, cross(of, Eigen::all));
+}
+
+void Gaussian::transform_body(Index at, const Matrix& A) {
+    if (View* view = view_at(at)) {
+        view->E = A * view->E;
+        return;
+    }
+    const std::vector<Index> places = body_places();
+    std::vector<Index> some[2], of[2];  // places in A and in e, and the rows of the matrix
+    for (Index i = 0; i < A.rows(); ++i) {
+        const Index place = places[static_cast<std::size_t>(at + i)], is_e = place >= P_AA_.rows();
+        some[is_e].push_back(place);
+        of[is_e].push_back(i);
+    }
+    if (!A(of[0], of[1]).isZero(0.0) || !A(of[1], of[0]).isZero(0.0))
+        throw Error("a transformation mixes columns on which landmarks depend with others");
+    for (int part : {0, 1})
+        if (!of[part].empty()) transform_columns(some[part], A(of[part], of[part]));
+}
+
+void Gaussian::transform_columns(const std::vector<Index>& at, const Matrix& A) {
+    const Index n = P_AA_.rows();
+    std::vector<Index> in_e;
+    for (Index place : at) in_e.push_back(place - n);
+    if (at.front() >= n) {
+        P_eA_(in_e, Eigen::all) = (A * P_eA_(in_e, Eigen::all)).eval();
+        P_ee_(in_e, Eigen::all) = (A * P_ee_(in_e, Eigen::all)).eval();
+        P_ee_(Eigen::all, in_e) = (P_ee_(Eigen::all, in_e) * A.transpose()).eval();
+        dormant_.cross(in_e, Eigen::all) = (A * dormant_.cross(in_e, Eigen::all)).eval();
+        root_.reset();
+        return;
+    }
+    P_AA_(at, Eigen::all) = (A * P_AA_(at, Eigen::all)).eval();
+    P_AA_(Eigen::all, at) = (P_AA_(Eigen::all, at) * A.transpose()).eval();
+    P_eA_(Eigen::all, at) = (P_eA_(Eigen::all, at) * A.transpose()).eval();
+    const Matrix back = A.inverse().transpose();
+    dormant_.K(at, Eigen::all) = (back * dormant_.K(at, Eigen::all)).eval();
+    for (Awake& landmark : awake_) {
+        if (landmark.own >= 0) continue;
+        std::vector<Index> rows;
+        for (Index place : at) rows.push_back(place - landmark.begin);
+        tail(landmark)(rows, Eigen::all) = (back * tail(landmark)(rows, Eigen::all)).eval();
+    }
+    root_.reset();
+}
+
+Index Gaussian::consider(Index columns) {
+    const Index first = columns_.body + considered_, e = P_eA_.rows() + columns;
+    considered_ += columns;
+    P_eA_.conservativeResizeLike(Matrix::Zero(e, P_eA_.cols()));
+    P_ee_.conservativeResizeLike(Matrix::Zero(e, e));
+    dormant_.cross.conservativeResizeLike(Matrix::Zero(e, dormant_.cross.cols()));
+    root_.reset();
+    return first;
+}
+
+void Gaussian::clone(Index source, Index size, Index to) {
+    Matrix H = Matrix::Zero(size, columns_.body);
+    H.middleCols(source, size).setIdentity();
+    const Over rows = over(H);
+    const Index at = static_cast<Index>(rest_.size()) + to - columns_.body;
+    const Matrix P_A = rows.A * P_AA_ + rows.e * P_eA_;
+    Matrix P_e = rows.A * P_eA_.transpose() + rows.e * P_ee_;
+    const Matrix own = P_A * rows.A.transpose() + P_e * rows.e.transpose();
+    P_e.middleCols(at, size) = 0.5 * (own + own.transpose());
+    P_eA_.middleRows(at, size) = P_A;
+    P_ee_.middleRows(at, size) = P_e;
+    P_ee_.middleCols(at, size) = P_e.transpose();
+    dormant_.cross.middleRows(at, size) = (rows.e * dormant_.cross).eval();
+    root_.reset();
+}
+
+}  // namespace ekfslam

@@ -1,0 +1,73 @@
+#include "root.hpp"
+
+#include "blas.hpp"
+
+namespace ekfslam {
+
+namespace {
+// Smallest pivot of a Cholesky factorisation, in the variance of its column, that is more than rounding.
+constexpr double LEAST_PIVOT = 1e-14;
+}  // namespace
+
+Root::Root(const Matrix& P, const Vector& of) {
+    const Index n = P.rows();
+    // An upper root is the reversed lower root of the reversed matrix.
+    Matrix reversed(n, n);
+    for (Index j = 0; j < n; ++j) reversed.col(j).tail(n - j) = P.col(n - 1 - j).head(n - j).reverse();
+    regular = blas::factorise(reversed);
+    for (Index j = 0; regular && j < n; ++j)
+        regular = std::pow(reversed(j, j), 2) > LEAST_PIVOT * of(n - 1 - j);
+    if (!regular) {
+        pivot(P, of);
+        return;
+    }
+    F.resize(n, n);
+    for (Index j = 0; j < n; ++j) {
+        F.col(n - 1 - j).head(n - j) = reversed.col(j).tail(n - j).reverse();
+        F.col(n - 1 - j).tail(j).setZero();
+    }
+}
+
+void Root::pivot(const Matrix& P, const Vector& of) {
+    const Index n = P.rows();
+    if (!P.allFinite()) throw Error("the covariance is not finite");
+    const Vector std = of.cwiseMax(0.0).cwiseSqrt();
+    const Vector scale = std.unaryExpr([](double s) { return s > 0.0 ? 1.0 / s : 0.0; });
+    Matrix L = scale.asDiagonal() * P * scale.asDiagonal();
+    char lower = 'L';
+    int size = blas::size(n), rank = 0, failed = 0;
+    double tolerance = LEAST_PIVOT;
+    std::vector<int> order(static_cast<std::size_t>(n));
+    std::vector<double> work(static_cast<std::size_t>(2 * n));
+    if (n) lapack::dpstrf(&lower, &size, L.data(), &size, order.data(), &rank, &tolerance, work.data(), &failed);
+    F.setZero(n, rank);
+    L_.setZero(rank, rank);
+    for (Index i = 0; i < n; ++i) {
+        const Index row = order[static_cast<std::size_t>(i)] - 1, length = std::min<Index>(i + 1, rank);
+        F.row(row).head(length) = std(row) * L.row(i).head(length);
+        if (i >= rank) continue;
+        pivots_.push_back(row);
+        L_.row(i).head(length) = F.row(row).head(length);
+    }
+}
+
+Matrix Root::coefficients(const Matrix& P_oA) const {
+    Matrix F_o = regular ? P_oA : Matrix(P_oA(Eigen::all, pivots_));
+    if (regular) blas::solve('R', 'U', 'T', F, F_o);
+    else blas::solve('R', 'L', 'T', L_, F_o);
+    return F_o;
+}
+
+Matrix Root::regression(const Matrix& F_o) const {
+    Matrix C = F_o;
+    if (regular) {
+        blas::solve('R', 'U', 'N', F, C);
+        return C;
+    }
+    blas::solve('R', 'L', 'N', L_, C);
+    Matrix wide = Matrix::Zero(F_o.rows(), F.rows());
+    wide(Eigen::all, pivots_) = C;
+    return wide;
+}
+
+}  // namespace ekfslam

@@ -1,0 +1,354 @@
+// The columns of A: views enter it and leave it, landmarks are promoted to it.
+#include <algorithm>
+#include <numeric>
+#include <utility>
+
+#include "blas.hpp"
+#include "gaussian.hpp"
+
+namespace ekfslam {
+
+namespace {
+void append_range(std::vector<Index>& places, Index begin, Index end) {
+    for (Index i = begin; i < end; ++i) places.push_back(i);
+}
+
+std::vector<Index> complement(const std::vector<Index>& some, Index size) {
+    std::vector<bool> is_in(static_cast<std::size_t>(size), false);
+    for (Index i : some) is_in[static_cast<std::size_t>(i)] = true;
+    std::vector<Index> others;
+    for (Index i = 0; i < size; ++i)
+        if (!is_in[static_cast<std::size_t>(i)]) others.push_back(i);
+    return others;
+}
+
+// Rows, and columns if `both`, of a matrix in a new order; -1: zeros.
+Matrix picked(const Matrix& P, const std::vector<Index>& rows, const std::vector<Index>& columns) {
+    Matrix new_P(static_cast<Index>(rows.size()), static_cast<Index>(columns.size()));
+    for (Index j = 0; j < new_P.cols(); ++j) {
+        const Index from = columns[static_cast<std::size_t>(j)];
+        for (Index i = 0; i < new_P.rows(); ++i) {
+            const Index row = rows[static_cast<std::size_t>(i)];
+            new_P(i, j) = from < 0 || row < 0 ? 0.0 : P(row, from);
+        }
+    }
+    return new_P;
+}
+
+std::vector<Index> all(Index size) {
+    std::vector<Index> places;
+    append_range(places, 0, size);
+    return places;
+}
+}  // namespace
+
+Gaussian::Tail Gaussian::tail(Awake& landmark) const {
+    return Tail(landmark.K.data(), P_AA_.rows() - landmark.begin, 3);
+}
+
+// Lets a landmark depend on columns from `begin` on.
+void Gaussian::extend(Awake& landmark, Index begin) const {
+    if (landmark.own >= 0 || begin >= landmark.begin) return;
+    const Index rows = P_AA_.rows() - begin, before = P_AA_.rows() - landmark.begin;
+    std::vector<double> K(static_cast<std::size_t>(3 * rows), 0.0);
+    Tail(K.data(), rows, 3).bottomRows(before) = tail(landmark);
+    landmark.K.swap(K);
+    landmark.begin = begin;
+}
+
+// Whether a landmark that is not promoted depends on columns of A.
+bool Gaussian::is_used(Index column, Index size) const {
+    for (const Awake& landmark : awake_) {
+        if (landmark.own >= 0) continue;
+        const Index begin = std::max(column, landmark.begin);
+        if (begin >= column + size) continue;
+        const Tail K = tail(const_cast<Awake&>(landmark));
+        if (!K.middleRows(begin - landmark.begin, column + size - begin).isZero(0.0)) return true;
+    }
+    return false;
+}
+
+// Puts the columns of A in a new order: new column j is `from[j]`, or zero if that is -1. If a column is there twice,
+// landmarks depend on the first one.
+void Gaussian::rearrange(const std::vector<Index>& from) {
+    const Index before = P_AA_.rows(), n = static_cast<Index>(from.size());
+    std::vector<Index> to(static_cast<std::size_t>(before + 1), -1), first = from;
+    for (Index j = 0; j < n; ++j) {
+        const Index old = from[static_cast<std::size_t>(j)];
+        if (old < 0) continue;
+        if (to[static_cast<std::size_t>(old)] >= 0) first[static_cast<std::size_t>(j)] = -1;
+        else to[static_cast<std::size_t>(old)] = j;
+    }
+    for (Awake& landmark : awake_) {
+        if (landmark.own >= 0) {
+            landmark.own = landmark.begin = to[static_cast<std::size_t>(landmark.own)];
+            continue;
+        }
+        Index begin = 0;
+        while (begin < n && first[static_cast<std::size_t>(begin)] < landmark.begin) ++begin;
+        std::vector<double> K(static_cast<std::size_t>(3 * (n - begin)), 0.0);
+        for (Index axis = 0; axis < 3; ++axis)
+            for (Index j = begin; j < n; ++j) {
+                const Index row = first[static_cast<std::size_t>(j)] - landmark.begin;
+                if (row < 0) continue;
+                K[static_cast<std::size_t>(axis * (n - begin) + j - begin)] =
+                    landmark.K[static_cast<std::size_t>(axis * (before - landmark.begin) + row)];
+            }
+        landmark.K.swap(K);
+        landmark.begin = begin;
+    }
+    for (View* view : {&view_, &previous_, &anchor_})
+        if (view->column >= 0) view->column = to[static_cast<std::size_t>(view->column)];
+    P_AA_ = picked(P_AA_, from, from);
+    P_eA_ = picked(P_eA_, all(P_eA_.rows()), from);
+    dormant_.K = picked(dormant_.K, first, all(dormant_.K.cols()));
+    root_.reset();
+}
+
+// Makes dormant landmarks independent of columns that leave A, see dormant.hpp.
+Matrix Gaussian::release(const std::vector<Index>& leaving) {
+    Matrix covariance = Matrix::Zero(static_cast<Index>(leaving.size()), 3 * dormant_.size());
+    if (!dormant_.size() || leaving.empty()) return covariance;
+    const Matrix K_o = dormant_.K(leaving, Eigen::all);
+    if (K_o.isZero(0.0)) return covariance;
+    const std::vector<Index> kept = complement(leaving, P_AA_.rows());
+    const Root root(P_AA_(kept, kept));
+    const Matrix F_o = root.coefficients(P_AA_(leaving, kept)), C = root.regression(F_o);
+    const Matrix D = P_AA_(leaving, leaving) - F_o * F_o.transpose();
+    dormant_.K(kept, Eigen::all) += C.transpose() * K_o;
+    dormant_.K(leaving, Eigen::all).setZero();
+    dormant_.add(K_o.transpose() * Root(D).F, 1.0);
+    dormant_.cross += (P_eA_(Eigen::all, leaving) - P_eA_(Eigen::all, kept) * C.transpose()) * K_o;
+    return D * K_o;
+}
+
+void Gaussian::drop(const std::vector<Index>& leaving) {
+    if (leaving.empty()) return;
+    release(leaving);
+    rearrange(complement(leaving, P_AA_.rows()));
+}
+
+// Makes dormant landmarks depend on columns that entered A and have a covariance with eps_B, see dormant.hpp.
+void Gaussian::absorb(const std::vector<Index>& entered, const Matrix& cross) {
+    if (!dormant_.size() || cross.isZero(0.0)) return;
+    const std::vector<Index> others = complement(entered, P_AA_.rows());
+    const Root root(P_AA_(others, others));
+    const Matrix F_n = root.coefficients(P_AA_(entered, others)), C = root.regression(F_n);
+    const Matrix F_e = root.coefficients(P_eA_(Eigen::all, others));
+    const Matrix P_nn = P_AA_(entered, entered);
+    const Root given(P_nn - F_n * F_n.transpose(), P_nn.diagonal());
+    const Matrix white = given.coefficients(cross.transpose()), gain = given.regression(white).transpose();
+    dormant_.K(others, Eigen::all) -= C.transpose() * gain;
+    dormant_.K(entered, Eigen::all) += gain;
+    dormant_.add(white, -1.0);
+    dormant_.cross -= (P_eA_(Eigen::all, entered) - F_e * F_n.transpose()) * gain;
+}
+
+// Appends columns K x_A + eps, K^T (n_A, m), to the promoted ones, with S (m, m) of eps and its covariance (e, m) with
+// the other columns. Returns the first one.
+Index Gaussian::join(const Matrix& K, const Matrix& S, const Matrix& cross) {
+    const Index m = K.cols(), n = P_AA_.rows(), at = promoted_;
+    Matrix P_Am(n, m), P_em = cross, P_mm = S;
+    blas::multiply('N', 'N', 1.0, P_AA_, K, 0.0, P_Am);
+    blas::multiply('N', 'N', 1.0, P_eA_, K, 1.0, P_em);
+    blas::multiply('T', 'N', 1.0, K, P_Am, 1.0, P_mm);
+    std::vector<Index> from;
+    append_range(from, 0, at);
+    from.insert(from.end(), static_cast<std::size_t>(m), -1);
+    append_range(from, at, n);
+    rearrange(from);
+    P_AA_.block(0, at, at, m) = P_Am.topRows(at);
+    P_AA_.block(at + m, at, n - at, m) = P_Am.bottomRows(n - at);
+    P_AA_.block(at, at, m, m) = 0.5 * (P_mm + P_mm.transpose());
+    P_AA_.middleRows(at, m) = P_AA_.middleCols(at, m).transpose();
+    P_eA_.middleCols(at, m) = P_em;
+    promoted_ += m;
+    return at;
+}
+
+void Gaussian::promote(const std::vector<Index>& rows) {
+    if (rows.empty()) return;
+    Slots slots;
+    for (Index row : rows) slots.push_back(awake_[static_cast<std::size_t>(row)].slot);
+    const Index m = static_cast<Index>(3 * rows.size());
+    const Matrix K = dependence(slots), S = own_covariance(slots);
+    Index own = join(K, S, Matrix::Zero(P_eA_.rows(), m));
+    for (Index row : rows) {
+        Awake& landmark = awake_[static_cast<std::size_t>(row)];
+        landmark = Awake{landmark.slot, own, own, {}, Matrix3::Zero()};
+        own += 3;
+    }
+}
+
+// Promotes landmarks so that A becomes smallest without the views that only they depend on; returns these columns.
+std::vector<Index> Gaussian::cut() {
+    Index best = 0, end = promoted_, dropped = 0;
+    std::size_t groups = 0;
+    Index width = 0, cost_of_best = 0;
+    std::vector<Index> begins;
+    for (const Awake& landmark : awake_)
+        if (landmark.own < 0) begins.push_back(landmark.begin);
+    std::sort(begins.begin(), begins.end());
+    for (std::size_t c = 0; c < groups_.size(); ++c) {
+        end += groups_[c];
+        width += groups_[c];
+        if (previous_.column >= promoted_ && previous_.column < end) break;
+        const auto needed = std::lower_bound(begins.begin(), begins.end(), end) - begins.begin();
+        if (3 * needed - width >= cost_of_best) continue;
+        cost_of_best = 3 * needed - width;
+        groups = c + 1;
+        best = end;
+        dropped = width;
+    }
+    if (!groups) return {};
+    std::vector<Index> joined, leaving;
+    for (std::size_t i = 0; i < awake_.size(); ++i)
+        if (awake_[i].own < 0 && awake_[i].begin < best) joined.push_back(static_cast<Index>(i));
+    promote(joined);
+    groups_.erase(groups_.begin(), groups_.begin() + static_cast<std::ptrdiff_t>(groups));
+    append_range(leaving, promoted_, promoted_ + dropped);
+    return leaving;
+}
+
+void Gaussian::close_view() {
+    if (columns_.previous >= 0) previous_ = view_;
+}
+
+void Gaussian::open_view(const Matrix& Y, const std::optional<Matrix>& Yd) {
+    std::vector<Index> leaving = cut(), from, group;
+    const Index z = view_column(), front = front_at(), n = P_AA_.rows();
+    const Index groups = promoted_ + static_cast<Index>(leaving.size());
+    const bool is_anchor = columns_.anchor >= 0 && anchor_.column == z;
+    if (is_anchor) {
+    } else if (is_used(z, 6) || (columns_.previous >= 0 && previous_.column == z)) append_range(group, z, z + 6);
+    else append_range(leaving, z, z + 6);
+    if (has_drifted_) append_range(is_used(z + 6, 6) ? group : leaving, z + 6, z + 12);
+    release(leaving);
+    append_range(from, 0, promoted_);
+    append_range(from, groups, z);
+    from.insert(from.end(), group.begin(), group.end());
+    from.insert(from.end(), Yd ? 12 : 6, -1);
+    append_range(from, front, n);
+    if (is_anchor) append_range(from, z, z + 6);
+    rearrange(from);
+    if (!group.empty()) groups_.push_back(static_cast<Index>(group.size()));
+    has_anchor_ = has_anchor_ || is_anchor;
+    has_drifted_ = Yd.has_value();
+    Y_ = Y;
+    Yd_ = Yd ? *Yd : Matrix();
+    open_again();
+}
+
+// Fills the columns z and zd, which are zero.
+void Gaussian::open_again() {
+    view_ = View{view_column()};
+    enter(view_column(), Y_);
+    std::vector<Index> entered;
+    append_range(entered, view_column(), front_at());
+    if (has_drifted_) enter(view_column() + 6, Yd_);
+    if (!dormant_.size()) return;
+    Matrix cross(static_cast<Index>(entered.size()), dormant_.cross.cols());
+    cross.topRows(6) = over(Y_).e * dormant_.cross;
+    if (has_drifted_) cross.bottomRows(6) = over(Yd_).e * dormant_.cross;
+    absorb(entered, cross);
+}
+
+// Renews the views of this frame that a replaced covariance lacks: zd, and z of a model without a block for it.
+void Gaussian::restore_views() {
+    root_.reset();
+    const bool lacks_view = columns_.view < 0, has_drifted = std::exchange(has_drifted_, false);
+    std::vector<Index> from = all(P_AA_.rows());
+    const Index at = front_at() - (lacks_view ? 0 : 6);
+    from.insert(from.begin() + front_at(), (lacks_view ? 6 : 0) + (has_drifted ? 6 : 0), -1);
+    rearrange(from);
+    has_drifted_ = has_drifted;
+    view_ = View{at};
+    if (lacks_view && Y_.size()) enter(at, Y_);
+    if (has_drifted) enter(at + 6, Yd_);
+}
+
+// Fills columns Y x of A.
+void Gaussian::enter(Index column, const Matrix& Y) {
+    const Over rows = over(Y);
+    const Index q = Y.rows();
+    Matrix P_A(q, P_AA_.rows()), P_e(q, P_eA_.rows());
+    blas::multiply('N', 'N', 1.0, rows.A, P_AA_, 0.0, P_A);
+    blas::multiply('N', 'N', 1.0, rows.e, P_eA_, 1.0, P_A);
+    blas::multiply('N', 'T', 1.0, rows.A, P_eA_, 0.0, P_e);
+    blas::multiply('N', 'N', 1.0, rows.e, P_ee_, 1.0, P_e);
+    const Matrix own = P_A * rows.A.transpose() + P_e * rows.e.transpose();
+    P_A.middleCols(column, q) = 0.5 * (own + own.transpose());
+    P_AA_.middleRows(column, q) = P_A;
+    P_AA_.middleCols(column, q) = P_A.transpose();
+    P_eA_.middleCols(column, q) = P_e.transpose();
+    root_.reset();
+}
+
+void Gaussian::hold_anchor() {
+    if (has_anchor_) {
+        const Index a = P_AA_.rows() - 6, z = view_column();
+        const bool stays = is_used(a, 6) || (columns_.previous >= 0 && previous_.column == a);
+        std::vector<Index> from, own;
+        append_range(own, a, a + 6);
+        if (!stays) release(own);
+        append_range(from, 0, z);
+        if (stays) from.insert(from.end(), own.begin(), own.end());
+        append_range(from, z, a);
+        anchor_.column = -1;
+        rearrange(from);
+        has_anchor_ = false;
+        if (stays) groups_.push_back(6);
+    }
+    anchor_ = view_;
+}
+
+// Lets columns of the front that are about to change stay in the window, if landmarks depend on them.
+void Gaussian::push_front(const std::vector<Index>& changed) {
+    bool stays = dormant_.size() > 0;
+    for (Index i : changed) stays = stays || is_used(front_at() + i, 1);
+    if (!stays) return;
+    std::vector<Index> from;
+    append_range(from, 0, view_column());
+    for (Index i : changed) from.push_back(front_at() + i);
+    append_range(from, view_column(), P_AA_.rows());
+    rearrange(from);
+    groups_.push_back(static_cast<Index>(changed.size()));
+}
+
+void Gaussian::add_noise(const Matrix& Q) {
+    std::vector<Index> noisy, leaving, of;
+    for (Index i = 0; i < front_size(); ++i) {
+        if (Q.row(columns_.front[static_cast<std::size_t>(i)]).isZero(0.0)) continue;
+        noisy.push_back(front_at() + i);
+    }
+    append_range(leaving, view_column(), front_at());
+    const std::size_t views = leaving.size();
+    leaving.insert(leaving.end(), noisy.begin(), noisy.end());
+    const Matrix cross = release(leaving);
+    for (std::size_t i = views; i < leaving.size(); ++i) of.push_back(static_cast<Index>(i));
+    std::vector<Index> from = all(P_AA_.rows());
+    std::fill(from.begin() + view_column(), from.begin() + front_at(), -1);
+    rearrange(from);
+    const Index r = static_cast<Index>(rest_.size());
+    P_ee_.topLeftCorner(r, r) += Q(rest_, rest_);
+    P_eA_.block(0, front_at(), r, front_size()) += Q(rest_, columns_.front);
+    P_AA_.block(front_at(), front_at(), front_size(), front_size()) += Q(columns_.front, columns_.front);
+    absorb(noisy, cross(of, Eigen::all));
+    open_again();
+}
+
+Matrix Gaussian::lead_over(const Matrix& H_x) const {
+    Matrix H = Matrix::Zero(P_AA_.rows(), H_x.cols());
+    const Lead at = lead();
+    H.middleRows(front_at(), front_size()) = H_x.topRows(front_size());
+    const auto add = [&](const View& view, Index row) {
+        H.middleRows(view.column, 6) += view.E.transpose() * H_x.middleRows(row, 6);
+    };
+    if (columns_.anchor >= 0) add(anchor_, front_size());
+    if (at.drifted >= 0) H.middleRows(view_column() + 6, 6) += H_x.middleRows(at.drifted, 6);
+    add(view_, at.view);
+    if (at.previous >= 0) add(previous_, at.previous);
+    return H;
+}
+
+}  // namespace ekfslam
