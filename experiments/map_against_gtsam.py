@@ -256,8 +256,9 @@ def log_of(result: Result) -> Log:
 def start_of(result: Result, rows: BatchProblem) -> tuple[Array, Array]:
     """Return the start of the posterior: poses and map of the filter; landmarks behind a camera are triangulated."""
     log = log_of(result)
-    q = rows.observations.points(rows.filtered_state(result.landmarks.position_m))
-    hidden = np.isin(np.arange(log.landmarks), log.landmark[q[:, 2] <= result.config["filter"]["min_depth_m"]])
+    sight = rows.observations.at(rows.filtered_state(result.landmarks.position_m))
+    unseen = ~sight.in_view(result.config["filter"]["min_depth_m"])
+    hidden = np.isin(np.arange(log.landmarks), log.landmark[unseen])
     return se3.inverse(log.T_updated), np.where(hidden[:, None], log.first_position_m, result.landmarks.position_m)
 
 
@@ -269,7 +270,7 @@ def cost_of(
     start = rows.filtered_state(positions_m)
     state = replace(start, T_imu_world=se3.inverse(T_world_imu), zeta=0 * start.zeta)
     found = evaluate(rows, state, config, 0.0)
-    return found.cost if found else None, int((rows.observations.points(state)[:, 2] <= 0.0).sum())
+    return found.cost if found else None, int((~rows.observations.at(state).in_view(0.0)).sum())
 
 
 def orthonormal(T: Array) -> Array:

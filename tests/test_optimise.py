@@ -40,7 +40,7 @@ def state(filtered):
 
 
 def cost_of_landmarks(problem, state):
-    s = problem.observations.norms(state)
+    s = problem.observations.at(state).norms()
     cost = robust(CONFIG, s)[0]
     return np.array([cost[problem.log.landmark == i].sum() for i in range(problem.log.landmarks)])
 

@@ -434,7 +434,7 @@ def test_residuals_of_the_batch_problem():
     found, expected = np.zeros_like(log.rows), []
     for factor in (factor for factor in problem.observations.factors(state) if factor.observation is not None):
         found[factor.observation] = factor.r
-    np.testing.assert_allclose(problem.observations.norms(state), np.linalg.norm(found, axis=1), rtol=1e-9)
+    np.testing.assert_allclose(problem.observations.at(state).norms(), np.linalg.norm(found, axis=1), rtol=1e-9)
     found *= np.sqrt(log.variance)
     for i, previous in enumerate(log.previous):
         expected.append(left(i, previous >= 0) - (left(previous, False) if previous >= 0 else 0.0))

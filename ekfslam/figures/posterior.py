@@ -96,14 +96,14 @@ def draw_posterior_figures(
 def block_patterns(information: JointInformation) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray], int]:
     """Return rows and columns of the blocks of the information matrix, of its Cholesky factor, and their number.
 
-    Of the information matrix those in the lower triangle: frames, aux, drive, landmarks. Those of the factor in the
-    order of elimination.
+    Of the information matrix those in the lower triangle: frames (seen, then hidden), drive, landmarks. Those of the
+    factor in the order of elimination.
     """
     s, factor = information.structure, information.factor
     before, eliminated = s.first["landmarks"], np.flatnonzero(~s.is_kept)
     count = before + len(s.ids)
     own = np.arange(count)
-    blocks = [product.places for product in s.products if product.places is not None]
+    blocks = [product.places for product in s.products]
     blocks = [np.stack([own, own], axis=-1), *(places[places[:, 0] < before] for places in blocks)]
     blocks += [pairs + np.array([before, s.first[group]]) for group, pairs in s.pairs.items()]
     row, column = np.unique(np.concatenate(blocks), axis=0).T

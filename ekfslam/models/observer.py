@@ -92,14 +92,15 @@ class Observer:
         return tuple(block for block in self.layout.blocks if block.is_seen and block.per_frame and not block.is_pose)
 
     @cached_property
-    def _moves_camera(self) -> tuple[StateBlock, ...]:
+    def moves_camera(self) -> tuple[StateBlock, ...]:
+        """Blocks that move the camera."""
         return tuple(block for block in self.layout.coupled("camera") if block in self.shared)
 
     @cached_property
     def has_drift(self) -> bool:
         """Whether a difference of observations sees the present frame otherwise than a single one does."""
         one = np.ones(())
-        differs = (block.camera_share(one, one > 0) != block.camera_share(one, one < 0) for block in self._moves_camera)
+        differs = (block.camera_share(one, one > 0) != block.camera_share(one, one < 0) for block in self.moves_camera)
         return any(differs)
 
     def see(
@@ -120,8 +121,8 @@ class Observer:
         """
         layout, sensor = self.layout, self.sensor_at(moment.calibration)
         T, T_linear, offset = moment.T_imu_world, moment.T_linear, None
-        if self._moves_camera:
-            offset, shares = self._camera_offset(moment, is_difference)
+        if self.moves_camera:
+            offset, shares = self.camera_offset(moment, is_difference)
             moved = se3.exp(offset)
             T, T_linear = moved @ T, moved @ T_linear
         if self.calibration is None:
@@ -139,7 +140,7 @@ class Observer:
             H_x[..., layout[self.calibration.name]] = H_c
         if offset is not None:
             H_offset = H_pose @ se3.left_jacobian(offset)
-            for block, share in zip(self._moves_camera, shares, strict=True):
+            for block, share in zip(self.moves_camera, shares, strict=True):
                 if (at := self._columns_in(block, pose)) is not None:
                     H_x[..., at] = share[..., None, None] * H_offset
         return Seen(q, sensor.predict(q), H_x, H_m)
@@ -151,7 +152,7 @@ class Observer:
         clone = self.layout.clones.get(block.name)
         return None if clone is None else self.layout[clone]
 
-    def _camera_offset(self, moment: Moment, is_difference: BoolArray | None) -> tuple[Array, list[Array]]:
+    def camera_offset(self, moment: Moment, is_difference: BoolArray | None) -> tuple[Array, list[Array]]:
         """Return the tangent by which shared blocks move the camera, and the share of each, eq. (11).
 
         Shapes are (n, 6) and (n,) only where observations of one frame differ, and otherwise without n.
@@ -160,10 +161,10 @@ class Observer:
             is_difference = np.zeros(np.shape(moment.way_m), dtype=bool)
         elif is_difference.all():
             is_difference = np.ones(np.shape(moment.way_m), dtype=bool)
-        shares = [block.camera_share(moment.way_m, is_difference) for block in self._moves_camera]
+        shares = [block.camera_share(moment.way_m, is_difference) for block in self.moves_camera]
         parts = [
             np.asarray(share)[..., None] * moment.shared[block.name]
-            for block, share in zip(self._moves_camera, shares, strict=True)
+            for block, share in zip(self.moves_camera, shares, strict=True)
         ]
         return sum(parts[1:], parts[0]), [np.asarray(share) for share in shares]
 
@@ -173,8 +174,8 @@ class Observer:
 
     def _T_cam_world(self, moment: Moment, is_difference: BoolArray | None) -> Array:
         T = moment.T_imu_world
-        if self._moves_camera:
-            T = se3.exp(self._camera_offset(moment, is_difference)[0]) @ T
+        if self.moves_camera:
+            T = se3.exp(self.camera_offset(moment, is_difference)[0]) @ T
         if self.calibration is not None:
             T = to_exposure(moment.calibration, moment.twist) @ T
         return self.sensor_at(moment.calibration).T_cam_imu @ T

@@ -5,7 +5,8 @@ An observation whose track walks is a *difference* from the observation before, 
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -16,9 +17,76 @@ from ekfslam.models.model import Model
 from ekfslam.models.observer import GIVEN, Moment, Seen
 from ekfslam.smoother.sparse.factors import Factor, Term
 from ekfslam.smoother.unknowns import State, Unknowns, split
+from ekfslam.smoother.views import Views, drive_place, views_of_frame
 
 # Prior of a landmark about its initialisation: too weak to matter to a landmark with a depth.
 LANDMARK_PRIOR_M = 1e4
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Observations of one kind.
+
+    Args:
+        which: (n,) their numbers in the log.
+        view, view_before: (n,) views that see them; those that differences are from, or None.
+        landmark: (n,) rows of the landmarks in the log.
+        rows, scale: (n, d) rows or their differences, and reciprocals of their standard deviations.
+    """
+
+    which: IntArray
+    view: IntArray
+    view_before: IntArray | None
+    landmark: IntArray
+    rows: Array
+    scale: Array
+
+
+class Sight:
+    """Observations at a state.
+
+    Args:
+        views: Cameras of all frames.
+        batches: Kinds of observations.
+        positions_m: (M, 3) landmarks.
+
+    Attributes:
+        residuals: Whitened residuals (n, d) of each kind.
+    """
+
+    def __init__(self, views: Views, batches: tuple[Observed, Observed], positions_m: Array) -> None:
+        self.views, self.batches = views, batches
+        self._q = [
+            [
+                (views.points(view, positions_m[o.landmark]), view)
+                for view in (o.view, o.view_before)
+                if view is not None
+            ]
+            for o in batches
+        ]
+        self.residuals = []
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for o, seen in zip(batches, self._q, strict=True):
+                z = [views.sensor.predict(q) for q, _ in seen]
+                self.residuals.append(o.scale * (o.rows - z[0] + (z[1] if len(z) > 1 else 0.0)))
+
+    def seen(self, kind: int) -> list[tuple[Array, IntArray]]:
+        """Return points (n, 3) in the cameras that see them, and their views; then those before, of differences."""
+        return self._q[kind]
+
+    def norms(self) -> Array:
+        """Return the norms (K,) of the whitened residuals."""
+        s = np.empty(sum(len(o.which) for o in self.batches))
+        for o, r in zip(self.batches, self.residuals, strict=True):
+            s[o.which] = np.sqrt(np.einsum("ij,ij->i", r, r))
+        return s
+
+    def in_view(self, min_depth_m: float) -> BoolArray:
+        """Return whether the camera of each observation (K,) can see its landmark."""
+        found = np.empty(sum(len(o.which) for o in self.batches), dtype=bool)
+        for o, seen in zip(self.batches, self._q, strict=True):
+            found[o.which] = self.views.sensor.in_view(seen[0][0], min_depth_m)
+        return found
 
 
 class ObservationFactors:
@@ -36,42 +104,67 @@ class ObservationFactors:
         self._is_first[first] = True
         self.first_frame = np.zeros(log.landmarks, dtype=np.int64)
         self.first_frame[log.landmark[first]] = log.frame[first]
+        self._seen: tuple[State, Sight] | None = None
 
     # --- at a state ---------------------------------------------------------------------------------------------------
 
-    def points(self, state: State) -> Array:
-        """Return every observed landmark (K, 3) m in the frame of the sensor."""
-        moment = self._moments(state).at(self._log.frame)
-        return self._model.observer.points(moment, state.positions_m[self._log.landmark], self._is_difference)
+    @cached_property
+    def batches(self) -> tuple[Observed, Observed]:
+        """Single observations, and differences."""
+        log, h, rows = self._log, views_of_frame(self._model.observer), self._log.rows.copy()
+        rows[self._follows] -= log.rows[self._previous]
+        found = []
+        for which, before in ((np.flatnonzero(~self._is_difference), None), (self._follows, self._previous)):
+            view = h * log.frame[which] + (0 if before is None else h - 1)
+            view_before = None if before is None else h * log.frame[before]
+            scale = 1.0 / np.sqrt(log.variance[which])
+            found.append(Observed(which, view, view_before, log.landmark[which], rows[which], scale))
+        return found[0], found[1]
 
-    def norms(self, state: State) -> Array:
-        """Return the norms (K,) of the whitened residuals at a state."""
-        log, moments, model = self._log, self._moments(state), self._model
-        now, before = moments.at(log.frame), moments.at(log.frame[self._previous])
-        positions = state.positions_m[log.landmark]
-        z = model.observer.predicted(now, model.observer.points(now, positions, self._is_difference))
-        z_before = model.observer.predicted(before, model.observer.points(before, positions[self._follows]))
-        return np.linalg.norm(self._residuals(z, z_before) / np.sqrt(log.variance), axis=1)
-
-    def _residuals(self, z: Array, z_before: Array) -> Array:
-        """Return residuals (K, d), given predicted rows, and those of the observations that differences start from."""
-        r = self._log.rows - z
-        r[self._follows] -= self._log.rows[self._previous] - z_before
-        return r
+    def at(self, state: State) -> Sight:
+        """Return the observations as seen at a state; the last one is remembered."""
+        if self._seen is None or self._seen[0] is not state:
+            views = Views.of(self._model.observer, self._unknowns, self._moments(state))
+            self._seen = state, Sight(views, self.batches, state.positions_m)
+        return self._seen[1]
 
     def factors(self, state: State) -> list[Factor]:
         """Return the factors linearised at a state."""
-        log, follows, moments = self._log, self._follows, self._moments(state)
-        positions = state.positions_m[log.landmark]
-        seen = self._model.observer.see(moments.at(log.frame), positions, positions, "pose", self._is_difference)
-        H_x, H_m, z_before = seen.H_x, seen.H_m, seen.z[:0]
-        if len(follows):
-            at, positions = moments.at(log.frame[self._previous]), positions[follows]
-            before = self._model.observer.see(at, positions, positions, self._clone)
-            H_x[follows] -= before.H_x
-            H_m[follows] -= before.H_m
-            z_before = before.z
-        return [*self._whitened(H_x, H_m, self._residuals(seen.z, z_before)), *self._near(state)]
+        sight, factors = self.at(state), []
+        for kind, (observed, r) in enumerate(zip(self.batches, sight.residuals, strict=True)):
+            if not len(r):
+                continue
+            by_view, by_before, by_landmark, by_drive = self._jacobians(sight, kind)
+            terms = [
+                Term("views", observed.view, by_view),
+                Term("drive", np.zeros(len(r), dtype=np.int64), by_drive),
+                Term("landmarks", observed.landmark, by_landmark),
+            ]
+            if observed.view_before is not None:
+                terms.append(Term("views", observed.view_before, -by_before))
+            factors.append(Factor(r, tuple(terms), observed.which))
+        return [*factors, *self._near(state)]
+
+    def _jacobians(self, sight: Sight, kind: int) -> tuple[Array, Array, Array, Array]:
+        """Return the whitened Jacobians by the view, the view before, the landmark and the drive."""
+        found, observed = [], self.batches[kind]
+        for q, view in sight.seen(kind):
+            A, by_view = sight.views.linearised(q, observed.scale)
+            by_landmark = A @ sight.views.T_view_world[view, :3, :3]
+            by_drive = by_view @ sight.views.by_drive[view]
+            calibration = self._model.observer.calibration
+            if calibration is not None and len(calibration.intrinsic):
+                own = drive_place(self._model.observer, self._unknowns)[calibration.intrinsic]
+                of_both = calibration.by_intrinsics(sight.views.rig, q)[
+                    ..., calibration.free[calibration.intrinsic] - 6
+                ]
+                by_drive[..., own] += observed.scale[..., None] * of_both
+            found.append((by_view, by_landmark, by_drive))
+        by_view, by_landmark, by_drive = found[0]
+        if len(found) == 1:
+            return by_view, by_view[:0], by_landmark, by_drive
+        before, landmark_before, drive_before = found[1]
+        return by_view, before, by_landmark - landmark_before, by_drive - drive_before
 
     def _moments(self, state: State) -> Moment:
         """Return the moments of all frames."""

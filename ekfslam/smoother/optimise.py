@@ -49,10 +49,10 @@ class Evaluation:
 
 def evaluate(problem: BatchProblem, state: State, config: PosteriorConfig, min_depth_m: float) -> Evaluation | None:
     """Return cost and system at a state; None if a landmark is behind a camera that saw it."""
-    if not problem.model.sensor.in_view(problem.observations.points(state), min_depth_m).all():
+    sight = problem.observations.at(state)
+    if not sight.in_view(min_depth_m).all():
         return None
-    system = problem.relinearised(state)
-    s = system.norms(problem.log.observations)
+    system, s = problem.relinearised(state), sight.norms()
     costs, weight = robust(config, s)
     cost = float(costs.sum() + system.half_square - 0.5 * (s**2).sum())
     return Evaluation(state, cost, weight, system if config.kernel == "none" else system.weighted(weight))
@@ -107,10 +107,8 @@ def better_start(problem: BatchProblem, state: State, config: PosteriorConfig, m
     log = problem.log
 
     def costs(positions_m: Array) -> Array:
-        moved = replace(state, positions_m=positions_m)
-        visible = problem.model.sensor.in_view(problem.observations.points(moved), min_depth_m)
-        with np.errstate(all="ignore"):
-            s = problem.observations.norms(moved)
+        sight = problem.observations.at(replace(state, positions_m=positions_m))
+        visible, s = sight.in_view(min_depth_m), sight.norms()
         cost = np.where(visible & ~np.isnan(s), robust(config, s)[0], np.inf)
         return np.asarray(np.bincount(log.landmark, weights=cost, minlength=log.landmarks), dtype=float)
 

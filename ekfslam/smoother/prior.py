@@ -161,7 +161,8 @@ def first_of(system: LinearSystem, landmarks: IntArray) -> LinearSystem:
     for factor in system.factors:
         early = np.ones(len(factor.r), dtype=bool)
         for term in factor.terms:
-            early &= place[term.index] >= 0 if term.group == "landmarks" else term.index <= 1
+            last = 1 if system.views is None or term.group != "views" else system.views.shape[1] // 3 - 1
+            early &= place[term.index] >= 0 if term.group == "landmarks" else term.index <= last
         if early.any():
             part = factor.only(early)
             terms = tuple(

@@ -21,6 +21,7 @@ from ekfslam.smoother.sparse.dense import DenseInformation
 from ekfslam.smoother.sparse.factors import Factor, LinearSystem
 from ekfslam.smoother.sparse.information import JointInformation
 from ekfslam.smoother.unknowns import State, Unknowns
+from ekfslam.smoother.views import Views
 
 __all__ = ["BatchProblem", "State"]
 
@@ -51,12 +52,14 @@ class BatchProblem:
 
     def relinearised(self, state: State) -> LinearSystem:
         """Return the system linearised at a state."""
-        return self._system([*self.process.factors(state), *self.observations.factors(state)], state.zeta)
+        factors, views = self.observations.factors(state), self.observations.at(state).views
+        return self._system([*self.process.factors(state), *factors], state.zeta, views)
 
-    def _system(self, factors: list[Factor], zeta: Array) -> LinearSystem:
+    def _system(self, factors: list[Factor], zeta: Array, views: Views | None = None) -> LinearSystem:
         u, log = self.unknowns, self.log
         first = u.first_frame(zeta[: len(u.B)])
-        return LinearSystem.of(tuple(factors), first, log.frames, len(u.drive_columns), log.id)
+        of_views = () if views is None else (views.by_frame, views.seen)
+        return LinearSystem.of(tuple(factors), first, log.frames, len(u.drive_columns), log.id, *of_views)
 
     def first_frame(self, zeta: Array) -> tuple[Array, Array, Array]:
         """Return pose (4, 4), shared blocks (w-6,) and further blocks (a,) of the first frame at zeta."""

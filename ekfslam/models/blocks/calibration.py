@@ -120,12 +120,19 @@ class Calibration(StateBlock):
             A = H_m @ T_cam_linear[..., :3, :3].swapaxes(-1, -2)
             moved = np.concatenate([A, -A @ se3.skew(q_linear)], axis=-1)
             H[..., _EXTRINSIC] = moved @ se3.left_jacobian(parameters[_EXTRINSIC])
-        if _BASELINE in self.free:
-            H[..., _BASELINE] = rig.by_log_baseline(q)
-        if _DISPARITY in self.free:
-            H[..., _DISPARITY] = rig.by_disparity(q)
+        if len(self.intrinsic):
+            H[..., _BASELINE : _DISPARITY + 1] = self.by_intrinsics(rig, q)
         H[..., TIME] = -(H_x @ twist[..., None])[..., 0]
         return q, H_x @ se3.adjoint(delay), H[..., self.free], H_m
+
+    @cached_property
+    def intrinsic(self) -> IntArray:
+        """Columns of the block that change the rows of a point in the camera."""
+        return np.flatnonzero((self.free == _BASELINE) | (self.free == _DISPARITY))
+
+    def by_intrinsics(self, rig: Rig, q: Array) -> Array:
+        """Return the derivatives (n, 3, 2) of the rows of points (n, 3) by the parameters of baseline and disparity."""
+        return np.stack([rig.by_log_baseline(q), rig.by_disparity(q)], axis=-1)
 
     def landmarks_by_rotation(self, rig: Rig, parameters: Array, T_imu_world: Array, moved_m: Array) -> Array:
         """Return the landmark errors (n, 3, 3) by the camera's rotation after a correction by ``moved_m`` (n, 3).

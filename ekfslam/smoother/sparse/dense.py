@@ -36,7 +36,7 @@ class DenseInformation:
         first = np.concatenate([*of_frame, self._at["drive"], self._columns("landmarks", known)])
         self.free = np.setdiff1d(np.arange(counts["landmarks"]), known)
         free = self._columns("landmarks", self.free)
-        J, r = system.rows(system.factors)
+        J, r = system.rows_without_prior()
         rest = np.setdiff1d(np.arange(J.shape[1]), np.concatenate([first, free]))
         A, zeta = system.first.B, system.first.zeta
         # All unknowns but free landmarks by the reduced ones: zeta, then the rest.

@@ -2,7 +2,8 @@
 
 A factor is a batch of n alike constraints ``sum_t J_t x_t = r`` with unit noise. Unknowns have four groups: ``frames``
 (T, w), the pose of each frame and the shared blocks that its observations depend on; ``aux`` (T, a), further blocks of
-each frame; ``drive`` (1, g), blocks with one value for the drive; ``landmarks`` (M, 3).
+each frame; ``drive`` (1, g), blocks with one value for the drive; ``landmarks`` (M, 3). A term may also touch
+``views``, the errors (6,) of the cameras of a frame: `LinearSystem.views` says how they follow from ``frames``.
 
 To add a new kind of factor, build it from the state at which the system is linearised, and append it to the list:
 
@@ -13,7 +14,7 @@ To add a new kind of factor, build it from the state at which the system is line
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -32,7 +33,7 @@ class Term:
     """The part of a factor over one group of unknowns.
 
     Args:
-        group: One of `GROUPS`.
+        group: One of `GROUPS`, or ``views``.
         index: (n,) unknown that each constraint touches.
         J: (n, d, size) whitened Jacobian.
     """
@@ -77,7 +78,7 @@ class FirstFrame:
     Unknowns of the first frame count in units of their prior, so that its covariance ``B B^T`` may be singular.
 
     Args:
-        B: (w+a, w+a) root of the covariance; its block [:w, w:] is 0.
+        B: (w+a, w+a) root of the covariance.
         zeta: (w+a,) where the system is linearised.
         width: Size w of ``eps_0``.
     """
@@ -86,52 +87,11 @@ class FirstFrame:
     zeta: Array
     width: int
 
-    @property
-    def frames(self) -> Array:
-        """(w, w) ``eps_0`` by its own part of zeta."""
-        return self.B[: self.width, : self.width]
-
-    @property
-    def aux(self) -> Array:
-        """(a, a) ``aux_0`` by its own part of zeta."""
-        return self.B[self.width :, self.width :]
-
-    @property
-    def coupling(self) -> Array:
-        """(a, w) ``aux_0`` by the part of zeta of ``eps_0``."""
-        return self.B[self.width :, : self.width]
-
     @cached_property
     def log_determinant(self) -> float:
         """Log of the determinant of ``B B^T``, without directions that are known for certain."""
         scales = np.linalg.svd(self.B, compute_uv=False)
         return 2.0 * float(np.log(scales[scales > _SINGULAR * max(scales[0], 1.0)]).sum())
-
-    def factor(self) -> Factor:
-        """Return the prior itself, over zeta."""
-        rows, first = np.eye(len(self.B))[None], np.zeros(1, dtype=np.int64)
-        parts = Term("frames", first, rows[..., : self.width]), Term("aux", first, rows[..., self.width :])
-        return Factor(-self.zeta[None], parts)
-
-    def in_units(self, factor: Factor) -> list[Factor]:
-        """Return a factor over ``eps_0`` and ``aux_0`` as factors over zeta."""
-        terms, coupled = [], np.zeros(len(factor.r), dtype=bool)
-        further: list[Term] = []
-        for term in factor.terms:
-            first, J = term.index == 0, term.J
-            if term.group in ("frames", "aux") and first.any():
-                J = J.copy()
-                J[first] = J[first] @ (self.frames if term.group == "frames" else self.aux)
-                if term.group == "aux" and self.coupling.any():
-                    coupled |= first
-                    by_frame = np.where(first[:, None, None], term.J, 0.0) @ self.coupling
-                    further.append(Term("frames", np.zeros_like(term.index), by_frame))
-            terms.append(Term(term.group, term.index, J))
-        changed = dataclasses.replace(factor, terms=tuple(terms))
-        if not further:
-            return [changed]
-        also = dataclasses.replace(factor, terms=(*terms, *further)).only(coupled)
-        return [also] if coupled.all() else [changed.only(~coupled), also]
 
 
 @dataclass(frozen=True)
@@ -144,6 +104,9 @@ class LinearSystem:
         counts: Number of unknowns of each of the `GROUPS`.
         sizes: Columns of one unknown of each group.
         ids: (M,) landmark ids, for error messages.
+        views: (T, 6 h, w) derivative of the h views of each frame by its unknowns ``frames``; view ``h k + i`` is the
+            i-th one of frame k. None: no term touches views.
+        seen: (s,) columns of ``frames`` by which ``views`` is regular, or all; None: all.
     """
 
     factors: tuple[Factor, ...]
@@ -151,24 +114,30 @@ class LinearSystem:
     counts: Mapping[str, int]
     sizes: Mapping[str, int]
     ids: IntArray = field(repr=False)
+    views: Array | None = None
+    seen: IntArray | None = None
 
     @staticmethod
-    def of(factors: tuple[Factor, ...], first: FirstFrame, frames: int, drive: int, ids: IntArray) -> LinearSystem:
+    def of(
+        factors: tuple[Factor, ...],
+        first: FirstFrame,
+        frames: int,
+        drive: int,
+        ids: IntArray,
+        views: Array | None = None,
+        seen: IntArray | None = None,
+    ) -> LinearSystem:
         """Return the system of T frames, g columns of the drive, and landmarks with the ids (M,)."""
         sizes = {"frames": first.width, "aux": len(first.B) - first.width, "drive": drive, "landmarks": 3}
         counts = {"frames": frames, "aux": frames, "drive": 1, "landmarks": len(ids)}
         counts = {group: count if sizes[group] else 0 for group, count in counts.items()}
-        return LinearSystem(factors, first, counts, sizes, ids)
+        return LinearSystem(factors, first, counts, sizes, ids, views, seen)
 
     @property
     def half_square(self) -> float:
         """Half the sum of squares of all residuals: the cost where the system is linearised."""
         own = sum(float(np.square(factor.r).sum()) for factor in self.factors)
         return 0.5 * (own + float(np.square(self.first.zeta).sum()))
-
-    def over_zeta(self) -> list[Factor]:
-        """Return all factors, with the first frame in units of its prior."""
-        return [self.first.factor(), *(part for factor in self.factors for part in self.first.in_units(factor))]
 
     def norms(self, observations: int) -> Array:
         """Return the norms (K,) of the residuals of the factors that come from observations."""
@@ -190,20 +159,36 @@ class LinearSystem:
         ends = np.cumsum([self.counts[group] * self.sizes[group] for group in GROUPS]).tolist()
         return dict(zip(GROUPS, [0, *ends[:-1]], strict=True))
 
-    def rows(self, factors: Sequence[Factor] | None = None) -> tuple[sp.csr_array, Array]:
-        """Return J (n, N) over all unknowns, and r (n,), of some factors: ``J^T J`` is their information.
+    @property
+    def first_columns(self) -> IntArray:
+        """Columns (w+a,) of the first frame, if all unknowns stand in the order of `GROUPS`."""
+        w = self.first.width
+        return np.concatenate([np.arange(w), self.start["aux"] + np.arange(len(self.first.B) - w)])
 
-        By default they are all, with the first frame as zeta.
-        """
+    def rows(self) -> tuple[sp.csr_array, Array]:
+        """Return J (n, N) over all unknowns, and r (n,): the first frame is zeta, and its prior comes first."""
+        J, r = self.rows_without_prior()
+        n, at = len(self.first.B), self.first_columns
+        units = sp.eye_array(J.shape[1], format="lil")
+        units[np.ix_(at, at)] = self.first.B
+        prior = sp.csr_array((np.ones(n), (np.arange(n), at)), shape=(n, J.shape[1]))
+        return sp.csr_array(sp.vstack([prior, J @ units.tocsr()])), np.concatenate([-self.first.zeta, r])
+
+    def rows_without_prior(self) -> tuple[sp.csr_array, Array]:
+        """Return J (n, N) over all unknowns, and r (n,), of the factors: ``J^T J`` is their information."""
         start, row, column, value, count, right = self.start, [], [], [], 0, []
-        for factor in self.over_zeta() if factors is None else factors:
+        for factor in self.factors:
             first = count + np.arange(factor.r.size).reshape(factor.r.shape)
             for term in factor.terms:
-                size = term.J.shape[-1]
-                at = start[term.group] + size * term.index[:, None, None] + np.arange(size)
-                row.append(np.broadcast_to(first[:, :, None], term.J.shape).ravel())
-                column.append(np.broadcast_to(at, term.J.shape).ravel())
-                value.append(term.J.ravel())
+                group, index, J = term.group, term.index, term.J
+                if group == "views":
+                    assert self.views is not None
+                    by_frame = self.views.reshape(-1, 6, self.views.shape[-1])
+                    group, index, J = "frames", index // (self.views.shape[1] // 6), J @ by_frame[index]
+                at = start[group] + J.shape[-1] * index[:, None, None] + np.arange(J.shape[-1])
+                row.append(np.broadcast_to(first[:, :, None], J.shape).ravel())
+                column.append(np.broadcast_to(at, J.shape).ravel())
+                value.append(J.ravel())
             count += factor.r.size
             right.append(factor.r.ravel())
         width = sum(self.counts[group] * self.sizes[group] for group in GROUPS)
@@ -218,21 +203,19 @@ class LinearSystem:
         Raises:
             PosteriorError: The first frame is known for certain in a direction that is no axis.
         """
-        J, B = self.rows()[0], self.first.B
+        J, B = self.rows_without_prior()[0], self.first.B
         known = np.abs(B).max(axis=1) > 0
         scales = np.linalg.svd(B[known], compute_uv=False)
         if known.any() and scales[-1] <= _SINGULAR * scales[0]:
             raise PosteriorError(
                 "the first pose is known for certain in a direction that is no axis: no information matrix"
             )
-        w, at_aux = self.first.width, self.start["aux"]
-        columns = np.concatenate([np.arange(w), at_aux + np.arange(len(B) - w)])
-        # (eps_0, aux_0) = B zeta, and of zeta nothing else is observed.
-        of_zeta = np.linalg.pinv(B[known]) if known.any() else np.empty((len(B), 0))
         kept = np.ones(J.shape[1], dtype=bool)
-        kept[columns] = False
-        order = np.concatenate([columns[known], np.flatnonzero(kept)])
-        J = sp.hstack([J[:, columns] @ sp.csr_array(of_zeta), J[:, np.flatnonzero(kept)]], format="csc")
-        ascending = np.argsort(order)
-        J = J[:, ascending]
-        return sp.csc_array(J.T @ J), order[ascending]
+        kept[self.first_columns[~known]] = False
+        information = sp.csc_array(J.T @ J)
+        if known.any():
+            of_zeta, at = np.linalg.pinv(B[known]), self.first_columns[known]
+            entries = np.repeat(at, len(at)), np.tile(at, len(at))
+            information += sp.csc_array(((of_zeta.T @ of_zeta).ravel(), entries), shape=information.shape)
+        own = np.flatnonzero(kept)
+        return sp.csc_array(information[own][:, own]), own

@@ -17,14 +17,15 @@ import scipy.sparse as sp
 from ekfslam.arrays import Array, IntArray
 from ekfslam.errors import IllPosedError
 from ekfslam.smoother.sparse.cholmod import NotPositiveDefiniteError, SparseCholesky
-from ekfslam.smoother.sparse.factors import GROUPS, LinearSystem
+from ekfslam.smoother.sparse.coordinates import REDUCED, SOLVED, Coordinates
+from ekfslam.smoother.sparse.factors import LinearSystem
 from ekfslam.smoother.sparse.normal_equations import NormalEquations, normal_equations, sum_by
 from ekfslam.smoother.sparse.selected_inverse import SelectedInverse
-from ekfslam.smoother.sparse.structure import AT_ONCE, REDUCED, Structure
+from ekfslam.smoother.sparse.structure import AT_ONCE, Structure
 
 _UNDETERMINED = {
-    "frames": "frame without enough information",
-    "aux": "frame whose velocities have not enough information",
+    "seen": "frame without enough information",
+    "hidden": "frame without enough information",
     "drive": "too little information about blocks of the whole drive",
     "landmarks": "landmark without enough information",
 }
@@ -64,8 +65,9 @@ class JointInformation:
         structure: Structure | None = None,
     ) -> None:
         self.structure = s = structure or (like.structure if like else Structure(system))
-        self._first = system.first  # not the factors: they take more memory than all else kept
-        equations = normal_equations(s, system.over_zeta())
+        # Not the factors: they take more memory than all else kept.
+        self._first, self._coordinates = system.first, Coordinates.of(system)
+        equations = normal_equations(s, self._coordinates.factors(system), self._coordinates)
         self._factorise(equations, damping, like)
         g = equations.gradient
         whitened = (self._L_inverse @ g["landmarks"][..., None])[..., 0]
@@ -77,23 +79,25 @@ class JointInformation:
             reduced[group][...] = g[group] - sum_by(index, s.counts[group], taken)
         reduced["landmarks"][...] = g["landmarks"][s.kept]
         x = s.reduced(self.factor.solve(right))
-        self.zeta = np.concatenate([x["frames"][0], *x["aux"][:1]])
         self.d = self._landmarks_given(x, whitened)
         # With (H + damping I) x = g: |r|^2 - |r - J x|^2 = 2 g^T x - x^T H x = g^T x + damping x^T x.
         solved = {**x, "landmarks": self.d}
-        self.gain = 0.5 * sum(float((solved[group] * (g[group] + damping * solved[group])).sum()) for group in GROUPS)
+        self.gain = 0.5 * sum(float((solved[group] * (g[group] + damping * solved[group])).sum()) for group in SOLVED)
         self.cost = system.half_square - self.gain
-        self.eps, self.aux = self._from_zeta(x)
+        u = self._of_frames(x)
+        self.zeta = self._coordinates.Q_first @ u[0]
+        self.eps, self.aux = self._coordinates.unknowns(u)
         self.drive = x["drive"].ravel()
 
     def _factorise(self, equations: NormalEquations, damping: float, like: JointInformation | None) -> None:
         """Take the Schur complements of the landmarks, then call CHOLMOD."""
-        s, own, self._Y = self.structure, dict(equations.own), equations.pairs
-        if damping:
-            for group in GROUPS:
-                own[group] += damping * np.eye(s.sizes[group])
-        L = _cholesky_of_landmarks(own["landmarks"], s.ids)
-        own["landmarks"] = own["landmarks"][s.kept]
+        s, self._Y = self.structure, equations.pairs
+        own = [
+            np.broadcast_to(damping * np.eye(s.sizes[group]), (s.counts[group],) + 2 * (s.sizes[group],))
+            for group in REDUCED
+        ]
+        of_landmarks = equations.landmarks + damping * np.eye(3)
+        L = _cholesky_of_landmarks(of_landmarks, s.ids)
         self._L_inverse = np.asarray(np.linalg.inv(L), dtype=float)
         self._log_det_landmarks = 2.0 * float(np.log(np.diagonal(L[~s.is_kept], axis1=1, axis2=2)).sum())
         # Y_k^T Y_l is what an eliminated landmark takes from the block of the unknowns of its pairs k and l.
@@ -105,11 +109,11 @@ class JointInformation:
                 part = slice(begin, begin + AT_ONCE)
                 Y[part] = self._L_inverse[landmark[part]] @ Y[part]
             Y[kept] = 0.0
-        matrix = s.pattern.assemble((*own.values(), *equations.products, *self._complements(), *of_kept))
+        matrix = s.pattern.assemble((*own, of_landmarks[s.kept], *equations.products, *self._complements(), *of_kept))
         try:
             self.factor = SparseCholesky(s.pattern, matrix, like.factor if like else None)
         except NotPositiveDefiniteError as error:
-            group = [group for group in GROUPS if s.first[group] <= error.block][-1]
+            group = [group for group in SOLVED if s.first[group] <= error.block][-1]
             number = error.block - s.first[group]
             of_landmarks = s.ids[s.kept[number : number + 1]].tolist()
             culprits = {"landmarks": of_landmarks, "drive": []}.get(group, [number])
@@ -137,13 +141,9 @@ class JointInformation:
         d[s.kept] = x["landmarks"]
         return d
 
-    def _from_zeta(self, x: dict[str, Array]) -> tuple[Array, Array]:
-        """Return frames (T, w) and aux (T, a), the first frame in its own units."""
-        w, frames = self._first.width, x["frames"].copy()
-        aux = np.array(x["aux"]).reshape(len(frames), -1)
-        first = self._first.B @ np.concatenate([frames[0], aux[0]])
-        frames[0], aux[0] = first[:w], first[w:]
-        return frames, aux
+    def _of_frames(self, x: dict[str, Array]) -> Array:
+        """Return the coordinates (T, w+a) of all frames."""
+        return np.concatenate([x["seen"], x["hidden"].reshape(len(x["seen"]), -1)], axis=1)
 
     @property
     def log_determinant(self) -> float:
@@ -156,20 +156,25 @@ class JointInformation:
 
     def frame_covariances(self) -> Array:
         """Return the marginal covariances (T, w, w) of all frames, by selected inversion."""
-        own = np.arange(self.structure.counts["frames"])
-        covariance = self._selected.blocks(own, own)
-        covariance[0] = self._first.frames @ covariance[0] @ self._first.frames.T
-        return covariance
+        by_u = self._coordinates.rows_of("frames")
+        return by_u @ self._frame_covariances @ by_u.swapaxes(1, 2)
 
     def aux_covariances(self) -> Array:
         """Return the marginal covariances (T, a, a) of the further blocks of the frames, by selected inversion."""
-        s = self.structure
-        if not s.counts["aux"]:
-            return np.empty((s.counts["frames"], 0, 0))
-        own = s.blocks("aux", np.arange(s.counts["aux"]))
-        covariance = self._selected.blocks(own, own)
-        covariance[0] = self.covariance(aux=[0])
-        return covariance
+        by_u = self._coordinates.rows_of("aux")
+        return by_u @ self._frame_covariances @ by_u.swapaxes(1, 2)
+
+    @cached_property
+    def _frame_covariances(self) -> Array:
+        """(T, w+a, w+a) of the coordinates of all frames."""
+        own = np.arange(self.structure.counts["seen"])
+        seen = self._selected.blocks(own, own)
+        if not self.structure.counts["hidden"]:
+            return seen
+        hidden = self.structure.blocks("hidden", own)
+        across = self._selected.blocks(hidden, own)
+        below = np.concatenate([across, self._selected.blocks(hidden, hidden)], axis=2)
+        return np.concatenate([np.concatenate([seen, across.swapaxes(1, 2)], axis=2), below], axis=1)
 
     def drive_covariance(self) -> Array:
         """Return the marginal covariance (g, g) of the drive."""
@@ -205,34 +210,33 @@ class JointInformation:
         index = {group: np.asarray(chosen, dtype=np.int64) for group, chosen in wanted.items()}
         half = self.factor.half_solve(self._selection(index).T.toarray())
         covariance = half.T @ half
-        start = 0
-        for group, chosen in index.items():
-            if group == "landmarks":
-                given_rest = self._L_inverse[chosen].swapaxes(1, 2) @ self._L_inverse[chosen]
-                given_rest[self.structure.is_kept[chosen]] = 0.0
-                place = start + 3 * np.arange(len(chosen))[:, None] + np.arange(3)
-                covariance[place[:, :, None], place[:, None, :]] += given_rest
-            start += self.structure.sizes[group] * len(chosen)
+        if (chosen := index.get("landmarks")) is not None:  # the last group
+            given_rest = self._L_inverse[chosen].swapaxes(1, 2) @ self._L_inverse[chosen]
+            given_rest[self.structure.is_kept[chosen]] = 0.0
+            place = len(covariance) - 3 * len(chosen) + 3 * np.arange(len(chosen))[:, None] + np.arange(3)
+            covariance[place[:, :, None], place[:, None, :]] += given_rest
         return covariance
 
     def _selection(self, wanted: dict[str, IntArray]) -> sp.csr_array:
         """Return the matrix that picks unknowns out of the reduced ones: an eliminated landmark follows its pairs."""
-        s, first, start = self.structure, self._first, 0
+        s, start = self.structure, 0
+        sizes = {"frames": self._first.width, "aux": len(self._first.B) - self._first.width, **s.sizes}
         parts: list[tuple[IntArray, IntArray, Array]] = []  # rows, reduced blocks, and (n, ., .) between them
         for group, index in wanted.items():
-            size = s.sizes[group]
+            size = sizes[group]
             row = start + size * np.arange(len(index))
             start += size * len(index)
             if not size:
                 continue
-            blocks = np.broadcast_to(np.eye(size), (len(index), size, size)).copy()
-            kept = np.flatnonzero(s.blocks(group, index) >= 0)
             if group in ("frames", "aux"):
-                blocks[index == 0] = first.frames if group == "frames" else first.aux
-            parts.append((row[kept], s.blocks(group, index[kept]), blocks[kept]))
-            if group == "aux":
-                at = np.flatnonzero(index == 0)
-                parts.append((row[at], 0 * at, np.broadcast_to(first.coupling, (len(at), *first.coupling.shape))))
+                by_u = self._coordinates.rows_of(group)[index]
+                parts.append((row, s.blocks("seen", index), by_u[..., : s.sizes["seen"]]))
+                if s.sizes["hidden"]:
+                    parts.append((row, s.blocks("hidden", index), by_u[..., s.sizes["seen"] :]))
+                continue
+            kept = np.flatnonzero(s.blocks(group, index) >= 0)
+            blocks = np.broadcast_to(np.eye(size), (len(kept), size, size))
+            parts.append((row[kept], s.blocks(group, index[kept]), blocks))
             if group == "landmarks":
                 place = np.full(len(s.ids), -1)
                 place[index] = row
@@ -255,7 +259,7 @@ class JointInformation:
         for i in range(size):
             x = s.reduced(reduced[:, i])
             d[i] = self.d + self._landmarks_given(x, rng.standard_normal(self.d.shape))
-            eps[i] = self.eps + self._from_zeta(x)[0]
+            eps[i] = self.eps + self._coordinates.unknowns(self._of_frames(x))[0]
         return eps, d
 
 

@@ -1,15 +1,14 @@
 """Structure of a linear system: which blocks of its normal equations are not zero, and what adds to each.
 
 It follows from the indices of the factors' terms alone, and serves for every linearisation. Landmarks with few
-observations are eliminated first, all at once, by their Schur complements. The rest is the *reduced* system: one block
-for each frame, aux, the drive and each kept landmark.
+observations are eliminated first, all at once, by their Schur complements. The rest is the *reduced* system: blocks
+for what each frame has *seen* and *hidden* (`ekfslam.smoother.sparse.coordinates`), the drive and each kept landmark.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,39 +16,72 @@ from numpy.typing import NDArray
 from ekfslam.arrays import Array, IntArray
 from ekfslam.errors import IllPosedError
 from ekfslam.smoother.sparse.cholmod import BlockPattern, concatenated_ranges
-from ekfslam.smoother.sparse.factors import GROUPS, Factor, LinearSystem
+from ekfslam.smoother.sparse.coordinates import REDUCED, SOLVED, Coordinates
+from ekfslam.smoother.sparse.factors import Factor, LinearSystem
 
 # Landmarks observed from more frames than this are kept for CHOLMOD: eliminating one couples all frames that observed
 # it, pair by pair, and their number grows with the square.
 ELIMINATE_UP_TO = 40
 AT_ONCE = 20_000  # constraints or pairs of them, so that temporary arrays stay in the cache
-REDUCED = GROUPS[:3]
+
+
+@dataclass(frozen=True)
+class Side:
+    """Columns of the constraints of a factor that touch the same unknowns, other than landmarks.
+
+    Args:
+        group: One of `REDUCED`; views count as what their frames have seen.
+        index: (s,) unknown of each stretch of constraints.
+        term: Number of the term.
+        view: (s,) number of the view among those of its frame; None: the term is over coordinates.
+    """
+
+    group: str
+    index: IntArray
+    term: int
+    view: IntArray | None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The constraints of a factor, in *stretches* that touch the same unknowns other than landmarks.
+
+    Args:
+        order: (n,) constraints, those of a stretch together; None: they are so already.
+        start: (s,) first one of each stretch.
+        sides: Terms that are not over landmarks.
+        landmarks: Numbers of the terms over landmarks.
+        pairs: For each such term and each side, the pair (n,) of each constraint in order; over views the number of
+            the view among those of all pairs.
+    """
+
+    order: IntArray | None
+    start: IntArray
+    sides: tuple[Side, ...]
+    landmarks: tuple[int, ...]
+    pairs: dict[tuple[int, int], IntArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Product:
-    """Blocks ``J_row^T J_column`` of two terms of a factor, and the places to which they are added.
+    """Blocks ``J_row^T J_column`` of two terms of a factor, and the blocks of the reduced matrix they are added to.
 
     Args:
-        factor, row, column: Numbers of the factor and of the terms.
-        rows: Constraints (m,) of the factor that take part.
+        batch: Number of the factor.
+        row, column: Numbers of sides, or of the terms over landmarks.
+        which: Stretches (m,), or constraints of two landmarks, that take part.
         index: (m,) place of each among the `places`.
-        places: (p, 2) blocks of the reduced matrix; None for pairs with landmarks and for a term with itself.
-        pairs: Group of the pairs with landmarks; "": none.
+        places: (p, 2) blocks of the reduced matrix.
+        of_landmarks: Whether both are landmarks.
     """
 
-    factor: int
+    batch: int
     row: int
     column: int
-    rows: IntArray | slice
+    which: IntArray
     index: IntArray
-    places: IntArray | None = None
-    pairs: str = ""
-
-    @cached_property
-    def is_sum(self) -> bool:
-        """Whether several constraints go to one place."""
-        return len(np.unique(self.index)) < len(self.index)
+    places: IntArray
+    of_landmarks: bool = False
 
 
 @dataclass(frozen=True)
@@ -96,6 +128,8 @@ class Structure:
         is_kept, kept: Whether (M,) a landmark is kept for CHOLMOD, and the numbers of kept ones.
         first: First reduced block of each group.
         block_sizes, start: Columns of each reduced block; the first of them, and the number of all.
+        views: Number of views of a frame.
+        batches: Constraints of the factors; `normal_equations` adds their products.
         products, couplings: Terms of the normal equations, and of the elimination.
         kept_pairs: For each reduced group, numbers of the pairs with kept landmarks.
         pattern: Pattern of the reduced matrix. Its sets: groups, products, couplings, kept pairs.
@@ -105,30 +139,41 @@ class Structure:
     """
 
     def __init__(self, system: LinearSystem, eliminate_up_to: int = ELIMINATE_UP_TO) -> None:
-        self.counts, self.sizes, self.ids = system.counts, system.sizes, system.ids
-        factors = system.over_zeta()
+        coordinates = Coordinates.of(system)
+        factors, seen = coordinates.factors(system), coordinates.seen
+        frames, landmarks = system.counts["frames"], system.counts["landmarks"]
+        self.sizes = {
+            "seen": seen,
+            "hidden": len(system.first.B) - seen,
+            "drive": system.sizes["drive"],
+            "landmarks": 3,
+        }
+        self.counts = {"seen": frames, "hidden": frames, "drive": 1, "landmarks": landmarks}
+        self.counts = {group: count if self.sizes[group] else 0 for group, count in self.counts.items()}
+        self.ids = system.ids
+        self.batches = [_batch(factor, coordinates) for factor in factors]
+        self.views = coordinates.C.shape[1] // 6
         self._find_pairs(factors)
-        seen = np.bincount(self.pairs["frames"][:, 0], minlength=self.counts["landmarks"])
-        if (seen == 0).any():
-            raise IllPosedError("landmarks without an observation", self.ids[seen == 0])
-        self.is_kept = seen > eliminate_up_to
-        for factor in factors:
-            of_landmarks = [term for term in factor.terms if term.group == "landmarks"]
-            for term in of_landmarks[1:] and of_landmarks:
-                self.is_kept[term.index] = True
+        observed = np.bincount(self.pairs["seen"][:, 0], minlength=landmarks)
+        if (observed == 0).any():
+            raise IllPosedError("landmarks without an observation", self.ids[observed == 0])
+        self.is_kept = observed > eliminate_up_to
+        for factor, batch in zip(factors, self.batches, strict=True):
+            for term in batch.landmarks[1:] and batch.landmarks:
+                self.is_kept[factor.terms[term].index] = True
         self.kept = np.flatnonzero(self.is_kept)
 
         counts = [*(self.counts[group] for group in REDUCED), len(self.kept)]
-        self.first = dict(zip(GROUPS, (np.cumsum(counts) - counts).tolist(), strict=True))
-        self.block_sizes = np.repeat([self.sizes[group] for group in GROUPS], counts)
+        self.first = dict(zip(SOLVED, (np.cumsum(counts) - counts).tolist(), strict=True))
+        self.block_sizes = np.repeat([self.sizes[group] for group in SOLVED], counts)
         self.start = np.concatenate([[0], np.cumsum(self.block_sizes)])
-        self._block_of_landmark = np.full(len(seen), -1)
+        self._block_of_landmark = np.full(landmarks, -1)
         self._block_of_landmark[self.kept] = self.first["landmarks"] + np.arange(len(self.kept))
         self.products = [product for i, factor in enumerate(factors) for product in self._products(i, factor)]
         couples = ((row, column) for i, row in enumerate(REDUCED) for column in REDUCED[: i + 1])
         self.couplings = [self._coupling(*one) for one in couples if all(len(self.pairs[group]) for group in one)]
         self.kept_pairs = {group: np.flatnonzero(self.is_kept[pairs[:, 0]]) for group, pairs in self.pairs.items()}
-        self._lay_out(factors, counts)
+        self._lay_out(counts)
 
     def blocks(self, group: str, index: IntArray) -> IntArray:
         """Return the reduced blocks of some unknowns of a group; -1 for landmarks that are eliminated."""
@@ -136,53 +181,61 @@ class Structure:
 
     def reduced(self, x: Array) -> dict[str, Array]:
         """Return views (count, size, ...) of an array (n, ...) over the reduced unknowns, by group."""
-        parts = np.split(x, [self.start[self.first[group]] for group in GROUPS[1:]])
+        parts = np.split(x, [self.start[self.first[group]] for group in SOLVED[1:]])
         size = self.sizes
         return {
             group: part.reshape(len(part) // size[group] if size[group] else 0, size[group], *x.shape[1:])
-            for group, part in zip(GROUPS, parts, strict=True)
+            for group, part in zip(SOLVED, parts, strict=True)
         }
 
     def _find_pairs(self, factors: Sequence[Factor]) -> None:
+        """Find all pairs of a landmark and another unknown, and those of the constraints of each batch."""
         found: dict[str, list[IntArray]] = {group: [np.empty(0, dtype=np.int64)] for group in REDUCED}
-        for factor in factors:
-            for landmark in (term for term in factor.terms if term.group == "landmarks"):
-                for term in (term for term in factor.terms if term.group != "landmarks"):
-                    found[term.group].append(landmark.index * self.counts[term.group] + term.index)
-        self._keys, self._numbers, self.pairs = {}, {}, {}
-        for group, keys in found.items():
-            self._keys[group], first = np.unique(np.concatenate(keys), return_index=True)
+        touched = []
+        for factor, batch in zip(factors, self.batches, strict=True):
+            lengths = np.diff(batch.start, append=len(factor.r))
+            for term in batch.landmarks:
+                landmark = factor.terms[term].index
+                landmark = landmark if batch.order is None else landmark[batch.order]
+                for i, side in enumerate(batch.sides):
+                    keys = landmark * self.counts[side.group] + np.repeat(side.index, lengths)
+                    found[side.group].append(keys)
+                    view = None if side.view is None else np.repeat(side.view, lengths)
+                    touched.append((batch, (term, i), side.group, keys, view))
+        self._numbers, self.pairs, by_key = {}, {}, {}
+        for group, parts in found.items():
+            by_key[group], first = np.unique(np.concatenate(parts), return_index=True)
             order = np.argsort(first)
             self._numbers[group] = np.empty_like(order)
             self._numbers[group][order] = np.arange(len(order))
-            self.pairs[group] = np.stack(np.divmod(self._keys[group][order], max(self.counts[group], 1)), axis=-1)
+            self.pairs[group] = np.stack(np.divmod(by_key[group][order], max(self.counts[group], 1)), axis=-1)
+        for batch, one, group, keys, view in touched:
+            numbers = self._numbers[group][np.searchsorted(by_key[group], keys)]
+            batch.pairs[one] = numbers if view is None else numbers * self.views + view
 
     def _products(self, number: int, factor: Factor) -> Iterator[Product]:
-        """Yield the products of every two terms of a factor, each term with itself included."""
-        for i, one in enumerate(factor.terms):
-            yield Product(number, i, i, slice(None), one.index)
-            for j, other in enumerate(factor.terms[:i]):
-                is_later = GROUPS.index(one.group) >= GROUPS.index(other.group)
-                row, column = (i, j) if is_later else (j, i)
-                high, low = factor.terms[row], factor.terms[column]
-                if high.group == low.group:
-                    # The later unknown has the row. One that a constraint touches twice adds both ways.
-                    for a, b in ((row, column), (column, row)):
-                        which = np.flatnonzero(factor.terms[a].index >= factor.terms[b].index)
-                        if len(which):
-                            yield self._reduced_product(number, factor, a, b, which)
-                elif high.group == "landmarks":
-                    place = np.searchsorted(self._keys[low.group], high.index * self.counts[low.group] + low.index)
-                    index = self._numbers[low.group][place]
-                    yield Product(number, row, column, slice(None), index, pairs=low.group)
-                else:
-                    yield self._reduced_product(number, factor, row, column, slice(None))
+        """Yield the products of every two sides of a batch, and of every two landmarks that a constraint touches."""
+        batch = self.batches[number]
+        blocks = [self.blocks(side.group, side.index) for side in batch.sides]
+        for i in range(len(blocks)):
+            for j in range(i + 1):
+                yield from self._both_ways(number, i, j, blocks[i], blocks[j])
+        for i in batch.landmarks:
+            for j in (j for j in batch.landmarks if j < i):
+                of_i, of_j = (self.blocks("landmarks", factor.terms[term].index) for term in (i, j))
+                yield from self._both_ways(number, i, j, of_i, of_j, of_landmarks=True)
 
-    def _reduced_product(self, number: int, factor: Factor, row: int, column: int, rows: IntArray | slice) -> Product:
+    def _both_ways(
+        self, number: int, i: int, j: int, of_i: IntArray, of_j: IntArray, of_landmarks: bool = False
+    ) -> Iterator[Product]:
+        """Yield the products of two terms: the later block has the row; one that both touch adds both ways."""
         n = len(self.block_sizes)
-        high, low = (self.blocks(factor.terms[i].group, factor.terms[i].index[rows]) for i in (row, column))
-        keys, index = np.unique(high * n + low, return_inverse=True)
-        return Product(number, row, column, rows, index, np.stack(np.divmod(keys, n), axis=-1))
+        for row, column, high, low in ((i, j, of_i, of_j), (j, i, of_j, of_i))[: 1 if i == j else 2]:
+            which = np.flatnonzero(high >= low)
+            if len(which):
+                keys, index = np.unique(high[which] * n + low[which], return_inverse=True)
+                places = np.stack(np.divmod(keys, n), axis=-1)
+                yield Product(number, row, column, which, index, places, of_landmarks)
 
     def _coupling(self, row: str, column: str) -> Coupling:
         """Return the couples of unknowns of two groups that eliminated landmarks connect."""
@@ -203,15 +256,17 @@ class Structure:
         couples += [self.first[row], self.first[column]]
         return Coupling(row, column, later[by_key], earlier[by_key], sizes[by_size], couples)
 
-    def _lay_out(self, factors: Sequence[Factor], counts: Sequence[int]) -> None:
+    def _lay_out(self, counts: Sequence[int]) -> None:
         places = []
-        for group, count in zip(GROUPS, counts, strict=True):
+        for group, count in zip(SOLVED, counts, strict=True):
             own = self.first[group] + np.arange(count)
             places.append((np.stack([own, own], axis=-1), (self.sizes[group],) * 2))
         for product in self.products:
-            if product.places is not None:
-                high, low = (factors[product.factor].terms[i].group for i in (product.row, product.column))
-                places.append((product.places, (self.sizes[high], self.sizes[low])))
+            sides = self.batches[product.batch].sides
+            row, column = (
+                "landmarks" if product.of_landmarks else sides[i].group for i in (product.row, product.column)
+            )
+            places.append((product.places, (self.sizes[row], self.sizes[column])))
         for coupling in self.couplings:
             places.append((coupling.couples, (self.sizes[coupling.row], self.sizes[coupling.column])))
         for group, kept in self.kept_pairs.items():
@@ -219,3 +274,23 @@ class Structure:
             blocks = np.stack([self.blocks("landmarks", landmark), self.blocks(group, index)], axis=-1)
             places.append((blocks, (3, self.sizes[group])))
         self.pattern = BlockPattern(self.block_sizes, places)
+
+
+def _batch(factor: Factor, coordinates: Coordinates) -> Batch:
+    """Return the stretches of a factor over coordinates, views and landmarks."""
+    n, sides, keys = len(factor.r), [], [np.zeros(len(factor.r), dtype=np.int64)]
+    for i, term in enumerate(factor.terms):
+        if term.group == "landmarks":
+            continue
+        group, index, view = term.group, term.index, None
+        if group == "views":
+            group, (index, view) = "seen", coordinates.index_of_views(index)
+        sides.append(Side(group, index, i, view))
+        keys.append(term.index)
+    order = np.lexsort(keys[::-1])
+    ordered = np.stack(keys, axis=-1)[order]
+    start = np.flatnonzero(np.any(ordered != np.roll(ordered, 1, axis=0), axis=1) | (np.arange(n) == 0))
+    first = order[start]
+    own = (Side(s.group, s.index[first], s.term, None if s.view is None else s.view[first]) for s in sides)
+    landmarks = tuple(i for i, term in enumerate(factor.terms) if term.group == "landmarks")
+    return Batch(None if np.array_equal(order, np.arange(n)) else order, start, tuple(own), landmarks)
