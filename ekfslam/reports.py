@@ -27,6 +27,7 @@ from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import archive_image, open_result, read_archive, require_same_origin
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed, open_executor
+from ekfslam.timings import Timings
 
 if TYPE_CHECKING:
     from ekfslam.studies.study import Study, StudyArchive
@@ -79,7 +80,9 @@ class Comparison(Shown):
         lines += [f"Note on {', '.join(modes)}: {remark}" for remark, modes in remarks.items()]
         return compare_table(self.summary) + "".join(f"\n{line}\n" for line in lines)
 
-    def save(self, directory: str | Path, force: bool = False, figures: bool = True) -> list[Path]:
+    def save(
+        self, directory: str | Path, force: bool = False, figures: bool = True, timings: Timings | None = None
+    ) -> list[Path]:
         """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures into a folder; return their paths.
 
         All are written or none. Figures of an earlier run are removed.
@@ -87,29 +90,36 @@ class Comparison(Shown):
         Raises:
             WriteError: The folder cannot be written, or holds another recording and ``force`` is false.
         """
-        directory = Path(directory)
+        directory, timings = Path(directory), timings or Timings()
         archive, summary, table = (directory / name for name in ("archive.h5", "summary.json", "summary.md"))
         if not force:
             require_same_origin(archive, self.sequence)
         notes = "".join(f"- {note}\n" for note in self.sequence.notes)
-        contents: dict[Path, str | bytes] = {
-            archive: archive_image(self.sequence, self.results),
-            summary: _json(self.summary),
-            table: self.table + (f"\nThe reader notes:\n\n{notes}" if notes else ""),
-        }
+        with timings.part("archive"):
+            contents: dict[Path, str | bytes] = {archive: archive_image(self.sequence, self.results)}
+        with timings.part("evaluation"):
+            contents |= {summary: _json(self.summary)}
+            contents |= {table: self.table + (f"\nThe reader notes:\n\n{notes}" if notes else "")}
         if figures:
-            from ekfslam.figures.run import draw_figures
-            from ekfslam.figures.style import pngs
-
-            contents |= pngs(directory, draw_figures(self.results, self.sequence.truth, self.sequence.interpolated))
-        older = older_figures(directory)
-        files.write_all(contents)
-        remove_figures(older, contents)
+            with timings.part("imports"):
+                from ekfslam.figures.run import draw_figures
+                from ekfslam.figures.style import pngs
+            with timings.part("figures"):
+                contents |= pngs(directory, draw_figures(self.results, self.sequence.truth, self.sequence.interpolated))
+        with timings.part("archive"):
+            older = older_figures(directory)
+            files.write_all(contents)
+            remove_figures(older, contents)
         return list(contents)
 
 
-def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | None = None) -> Comparison:
-    """Run several modes with one configuration.
+def compare(
+    sequence: Sequence,
+    modes: Iterable[Mode] = MODES,
+    config: Config | None = None,
+    timings: Timings | None = None,
+) -> Comparison:
+    """Run several modes with one configuration; ``timings`` are those of `run`.
 
     Raises:
         ConfigError: Unknown mode.
@@ -117,14 +127,18 @@ def compare(sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | 
     """
     if config is not None:
         sequence = with_truth_noise(sequence, config.truth)
-    results, skipped = _run_all(sequence, list(modes), config)
+    timings = timings or Timings()
+    results, skipped = _run_all(sequence, list(modes), config, timings)
     if skipped and not results:
         raise FilterError("; ".join(f"no {mode}: {reason}" for mode, reason in skipped.items()))
-    summary = summarise_all(sequence, len(sequence.observations.ids), results)
+    with timings.part("evaluation"):
+        summary = summarise_all(sequence, len(sequence.observations.ids), results)
     return Comparison(sequence, results, summary, skipped)
 
 
-def _run_all(sequence: Sequence, modes: list[Mode], config: Config | None) -> tuple[dict[str, Result], dict[str, str]]:
+def _run_all(
+    sequence: Sequence, modes: list[Mode], config: Config | None, timings: Timings
+) -> tuple[dict[str, Result], dict[str, str]]:
     """Return the result of each mode, and the reason for each mode without one."""
     results: dict[str, Result] = {}
     skipped: dict[str, str] = {}
@@ -132,10 +146,12 @@ def _run_all(sequence: Sequence, modes: list[Mode], config: Config | None) -> tu
         if mode == "smoothed" and "full" in skipped:
             skipped[mode] = skipped["full"]
             continue
-        # The filter that "smoothed" starts from need not run twice.
-        known = mode == "smoothed" and "full" in results
         try:
-            results[mode] = smooth(results["full"]) if known else run(sequence, mode, config)
+            if mode == "smoothed" and "full" in results:  # the filter need not run twice
+                with timings.part(mode):
+                    results[mode] = smooth(results["full"])
+            else:
+                results[mode] = run(sequence, mode, config, timings=timings)
         except (IllPosedError, FilterError) as error:
             skipped[mode] = str(error)
     return results, skipped
@@ -149,6 +165,7 @@ def compare_into(
     *,
     force: bool = False,
     figures: bool = True,
+    timings: Timings | None = None,
 ) -> str:
     """Save `compare` into a folder, and return the text for a terminal: notes of the reader, table and files written.
 
@@ -156,10 +173,13 @@ def compare_into(
         ArchiveError: The folder holds results of another recording, or cannot be written.
         FilterError: No mode has a result.
     """
-    comparison = compare(sequence, modes, config)
-    paths = comparison.save(folder, force, figures)
+    timings = timings or Timings()
+    comparison = compare(sequence, modes, config, timings)
+    paths = comparison.save(folder, force, figures, timings)
     notes = "".join(f"{sequence.name}: {note}\n" for note in sequence.notes)
-    return f"{notes}\n{comparison.table}\nwritten to {folder}: {', '.join(path.name for path in paths)}"
+    with timings.part("evaluation"):
+        table = comparison.table
+    return f"{notes}\n{table}\nwritten to {folder}: {', '.join(path.name for path in paths)}"
 
 
 def compare_all(
@@ -167,7 +187,7 @@ def compare_all(
     executor: Executor,
     modes: Iterable[Mode] = MODES,
     config: Config | None = None,
-    **options: bool,
+    **options: Any,
 ) -> Iterator[str]:
     """Run `compare_into` for many recordings, by folder, in parallel, and yield the text of each as it finishes.
 
@@ -189,7 +209,7 @@ def compare_all(
 
 
 def _compared(
-    sequence: Sequence, folder: Path, modes: Iterable[Mode], config: Config | None, options: Mapping[str, bool]
+    sequence: Sequence, folder: Path, modes: Iterable[Mode], config: Config | None, options: Mapping[str, Any]
 ) -> tuple[str, str]:
     """Return the text of `compare_into` and the reason for failure; one of them is empty."""
     with ONE_RUN_AT_A_TIME:

@@ -36,6 +36,7 @@ from ekfslam.smoother.fixed_lag import FixedLag
 from ekfslam.smoother.posterior import smooth
 from ekfslam.smoother.revival import MapRevival
 from ekfslam.stored import empty
+from ekfslam.timings import Timings
 
 
 @solvable()
@@ -44,6 +45,7 @@ def run(
     mode: Mode = "full",
     config: Config | None = None,
     further: VelocitySource | None = None,
+    timings: Timings | None = None,
 ) -> Result:
     """Estimate trajectory and map of a sequence.
 
@@ -51,6 +53,7 @@ def run(
         mode: ``dead-reckoning`` (prediction only), ``mapping-only`` (the report: independent landmark EKFs on dead
             reckoning's poses), ``full`` (joint EKF SLAM) or ``smoothed`` (the posterior of a full run).
         further: Velocity measurements of other sensors, for the joint filter (`ekfslam.models.sensors.velocities`).
+        timings: Clock that the parts of the run are charged to.
 
     Raises:
         ConfigError: Unknown mode.
@@ -65,18 +68,23 @@ def run(
         raise NoVelocitiesError(
             f"{sequence.name}: no measured velocities, so no dead reckoning; the other modes use vision"
         )
+    timings = timings or Timings()
     if mode == "smoothed":
-        return smooth(run(sequence, "full", config, further))
-    suspicions = sequence.once(inspect_sequence).warnings
-    problem = resolve(sequence, config, mode)
-    with one_thread():
+        full = run(sequence, "full", config, further, timings)
+        with timings.part(mode):
+            return smooth(full)
+    with timings.part("automatic model"):
+        suspicions = sequence.once(inspect_sequence).warnings
+        problem = resolve(sequence, config, mode)
+    with timings.part(mode), one_thread():
         estimate = _joint(problem, further) if mode == "full" else _dead_reckoned(problem, mode)
-    result = _result(problem, mode, estimate)
-    compared = compare_sources(sequence) if mode == "full" and not suspicions else None
-    found = in_words(compared, sequence.time_s)
-    lines = sanity_attributes((*suspicions, *inspect_result(sequence, result, suspicions), *found))
-    doubts = doubt_in_truth(compared, sequence.time_s)
-    return dataclasses.replace(result, attributes={**result.attributes, **lines, **doubts})
+    with timings.part("evaluation"):
+        result = _result(problem, mode, estimate)
+        compared = compare_sources(sequence) if mode == "full" and not suspicions else None
+        found = in_words(compared, sequence.time_s)
+        lines = sanity_attributes((*suspicions, *inspect_result(sequence, result, suspicions), *found))
+        doubts = doubt_in_truth(compared, sequence.time_s)
+        return dataclasses.replace(result, attributes={**result.attributes, **lines, **doubts})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -46,6 +46,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     "data": {"nargs": "?", "default": DEFAULT_DATA, "metavar": "DATA", "help": f"default: {DEFAULT_DATA}"},
     "archive": {"type": Path, "metavar": "ARCHIVE", "help": "as written by run or compare"},
     "--out": {"type": Path, "metavar": "DIR", "help": "default: the folder of the archive"},
+    "--timings": {"action": "store_true", "help": "print the CPU and wall-clock time of each part"},
     "--force": {"action": "store_true", "help": "overwrite the output even if it holds something else"},
     "--no-figures": {"action": "store_true", "help": "draw no figures, which saves time"},
     "--workers": {"type": int, "metavar": "N", "help": "processes (default: one per core)"},

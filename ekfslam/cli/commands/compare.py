@@ -14,6 +14,7 @@ from ekfslam.names import components
 from ekfslam.reports import compare_all
 from ekfslam.storage.archive import require_same_origin
 from ekfslam.studies.executors import open_executor
+from ekfslam.timings import Timings
 
 EXAMPLES = (
     "compare",
@@ -27,27 +28,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "data", nargs="*", default=[DEFAULT_DATA])
     parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), metavar="MODE", help=", ".join(MODES))
     declare(parser, "--out", default=Path("results/local"), help="default: %(default)s")
-    declare(parser, "--no-figures", *EXECUTOR)
+    declare(parser, "--no-figures", "--timings", *EXECUTOR)
     declare_run(parser)
 
 
 def command(options: argparse.Namespace) -> None:
     config = configured(options)
-    if options.truth and len(options.data) > 1:
-        raise ConfigError("--truth belongs to one recording, but several are given; compare them one by one")
+    for flag in ("truth", "timings"):
+        if getattr(options, flag) and len(options.data) > 1:
+            raise ConfigError(f"--{flag} belongs to one recording, but several are given; compare them one by one")
+    timings = Timings()
     # Read everything first: a mistyped last name should not cost the first hour.
-    sequences = [open_data(options, data) for data in options.data]
+    with timings.part("reading"):
+        sequences = [open_data(options, data) for data in options.data]
     folders = [options.out / name for name in components(sequence.name for sequence in sequences)]
     for sequence, folder in zip(sequences, folders, strict=True):
         files.require_writable(folder / "archive.h5")
         if not options.force:
             require_same_origin(folder / "archive.h5", sequence)
-    for sequence in sequences:
-        print_warnings(sequence)
+    with timings.part("automatic model"):
+        for sequence in sequences:
+            print_warnings(sequence)
     recordings = dict(zip(folders, sequences, strict=True))
     where = "serial" if len(recordings) == 1 and options.executor == "processes" else options.executor
     workers = options.workers or min(len(recordings), os.cpu_count() or 1)
     chosen = {"force": options.force, "figures": not options.no_figures}
+    if where == "serial":  # the clock is that of this process
+        chosen["timings"] = timings
     with open_executor(where, workers) as executor:
         for said in compare_all(recordings, executor, options.modes, config, **chosen):
             print(said)
+    if options.timings:
+        print(timings.table)
