@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-whole check lint docs archive-page lower-bounds wheel results setup clean
+.PHONY: demo test test-whole check lint docs archive-page lower-bounds sanitize wheel results setup clean
 
 demo: $(READY)
 	$(BIN)/ekfslam compare builtin:city --out results/local
@@ -24,6 +24,7 @@ check: lint
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run --Werror ekfslam/engine/*.?pp
 	$(BIN)/mypy
 
 # The documentation as a site in build/site, without a network: no warning, no dead link.
@@ -34,6 +35,10 @@ docs: $(VENV)/.docs
 # Part of the tests, in an environment of its own with the oldest versions that pyproject.toml allows.
 lower-bounds:
 	PYTHON="$(PYTHON)" sh .ci/lower-bounds
+
+# The engine's tests with the sanitizers of the compiler, which find wrong addresses and undefined behaviour.
+sanitize: $(READY)
+	VENV="$(VENV)" sh .ci/sanitize
 
 # A wheel in build/wheel.
 wheel: $(READY)

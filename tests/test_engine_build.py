@@ -1,9 +1,16 @@
-"""The compiled module: it is built with the package and computes with SciPy's LAPACK."""
+"""The compiled module: it computes with SciPy's LAPACK, and its stub names what it has."""
 
 from __future__ import annotations
 
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
+
+import ekfslam.engine
 
 engine = pytest.importorskip("ekfslam.engine._engine", reason="the engine is not built", exc_type=ImportError)
 
@@ -14,10 +21,41 @@ def test_a_factor_is_that_of_numpy():
     np.testing.assert_allclose(engine.cholesky(P), np.linalg.cholesky(P), rtol=1e-12, atol=1e-12)
 
 
-def test_what_has_no_factor_is_refused():
+def test_a_matrix_without_a_factor_is_refused():
     with pytest.raises(ValueError, match="not positive definite"):
         engine.cholesky(np.diag([1.0, -1.0]))
     with pytest.raises(ValueError, match="square"):
         engine.cholesky(np.ones((2, 3)))
     with pytest.raises(TypeError):
         engine.cholesky("no matrix")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("del routines['dtrmm']", "needs scipy.linalg.cython_blas.dtrmm, which this SciPy lacks"),
+        ("routines['dsyrk'] = routines['dgemm']", "cannot call scipy.linalg.cython_blas.dsyrk of this SciPy"),
+    ],
+)
+def test_a_scipy_that_does_not_fit_is_named_at_import(change, message):
+    code = f"from scipy.linalg.cython_blas import __pyx_capi__ as routines; {change}; import ekfslam.engine._engine"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert f"ImportError: the engine {message}" in done.stderr
+
+
+def names(body: list[ast.stmt]) -> set[str]:
+    """Return the public names that the statements of a stub define."""
+    found = {node.name for node in body if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
+    found |= {node.target.id for node in body if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)}
+    return {name for name in found if not name.startswith("_")}
+
+
+def test_the_stub_names_what_the_module_has():
+    stub = ast.parse(Path(ekfslam.engine.__file__).with_name("_engine.pyi").read_text(encoding="utf-8"))
+    public = {name for name in vars(engine) if not name.startswith("_")}
+    assert names(stub.body) == public
+    for node in stub.body:
+        if isinstance(node, ast.ClassDef):
+            members = {name for name in vars(getattr(engine, node.name)) if not name.startswith("_")}
+            assert names(node.body) == members, node.name

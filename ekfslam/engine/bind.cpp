@@ -12,8 +12,8 @@ using namespace ekfslam;
 namespace {
 
 lapack::Found find(const char* module, const char* name) {
-    const nb::object routines = nb::module_::import_(module).attr("__pyx_capi__");
-    if (!routines.attr("__contains__")(name)) return {};
+    const nb::dict routines = nb::module_::import_(module).attr("__pyx_capi__");
+    if (!routines.contains(name)) return {};
     const nb::object capsule = routines[name];
     const char* signature = PyCapsule_GetName(capsule.ptr());
     return {PyCapsule_GetPointer(capsule.ptr(), signature), signature};

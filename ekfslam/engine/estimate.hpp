@@ -30,7 +30,7 @@ struct Config {
     double moving_sigma = 1.5, moving_share = 0.05;            // of a track that moves, see moves_along
     bool estimates_velocity = false;                           // `Process.estimates_velocity`
     Index retire_after = 1, misses_to_split = 0;
-    Index dormant = 0;                   // landmarks out of view that stay; -1: all
+    Index dormant = 0;                  // landmarks out of view that stay; -1: all
     double input_gate = 0, doubt = 30;  // threshold for inputs, and the factor of the noise of rejected ones
 };
 
@@ -96,14 +96,14 @@ struct Estimate {
     std::vector<Block> blocks;
     Columns columns;
     Values values;
-    Vector coordinates;                     // (body), as in the log
-    Vector6 imu_twist = Vector6::Zero();    // at the last frame
+    Vector coordinates;                   // (body), as in the log
+    Vector6 imu_twist = Vector6::Zero();  // at the last frame
     Table table;
     Gaussian gaussian;
     Motion motion;
     Index step = 0;
     Updated updated = Updated::view;
-    bool is_open = false;        // whether the view of this frame is in the state: from open_views to close_views
+    bool is_open = false;         // whether the view of this frame is in the state: from open_views to close_views
     View opened;                  // the view of this frame as open_views found it
     std::optional<View> drifted;  // that of differences, if it is another one
     // `Process.imu_twist` of Python, from T_departed to values after a correction: for a time offset.

@@ -25,7 +25,8 @@ std::string shortened(const std::string& signature) {
         const std::size_t end = signature.find_first_of(",)", start);
         if (end == std::string::npos) break;
         const std::string argument = signature.substr(start, end - start);
-        const bool is_double = argument == "double *" || (argument.size() > 4 && argument.rfind("_d *") == argument.size() - 4);
+        const bool is_double =
+            argument == "double *" || (argument.size() > 4 && argument.rfind("_d *") == argument.size() - 4);
         letters += argument == "char *" ? 'c' : argument == "int *" ? 'i' : is_double ? 'd' : '?';
         from = signature[end] == ')' ? signature.size() : end;
     }
@@ -33,7 +34,8 @@ std::string shortened(const std::string& signature) {
 }
 
 template <class Routine>
-void fill(Routine& pointer, Found (*find)(const char*, const char*), const char* module, const char* name, const char* arguments) {
+void fill(Routine& pointer, Found (*find)(const char*, const char*), const char* module, const char* name,
+          const char* arguments) {
     const Found found = find(module, name);
     const std::string full = std::string(module) + "." + name;
     if (found.routine == nullptr) throw std::runtime_error("the engine needs " + full + ", which this SciPy lacks");

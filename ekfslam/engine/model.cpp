@@ -61,8 +61,7 @@ void retract_block(const Block& block, const Vector& correction, Values& values)
             break;
         }
         case Kind::calibration:
-            for (Index j = 0; j < block.size; ++j)
-                values.flat[block.value_at + block.free[j]] += d[j];
+            for (Index j = 0; j < block.size; ++j) values.flat[block.value_at + block.free[j]] += d[j];
             break;
     }
 }

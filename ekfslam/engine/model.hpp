@@ -30,7 +30,8 @@ struct Intrinsics {
 };
 
 // Landmarks as predicted: points in the camera of their rows (3, k), derivative (3, k d) of a single observation by the
-// landmark, and the linearised rows of measurements (d, k). A row that follows another one is their difference, eq. (10).
+// landmark, and the linearised rows of measurements (d, k). A row that follows another one is their difference, eq.
+// (10).
 struct Observed {
     Matrix q, H_m;
     Rows rows;

@@ -165,8 +165,7 @@ Parts parts(const Estimate& e, const Vector& correction) {
     const Lead lead = e.gaussian.lead();
     const auto body = correction.head(e.columns.body);
     Parts out{Vector::Zero(lead.width), Matrix(3, e.table.size())};
-    for (std::size_t j = 0; j < e.columns.front.size(); ++j)
-        out.x[static_cast<Index>(j)] = body[e.columns.front[j]];
+    for (std::size_t j = 0; j < e.columns.front.size(); ++j) out.x[static_cast<Index>(j)] = body[e.columns.front[j]];
     if (e.columns.anchor >= 0) out.x.segment<6>(lead.front - 6) = body.segment<6>(e.columns.anchor);
     if (e.drifted && lead.drifted >= 0) out.x.segment<6>(lead.drifted) = e.drifted->Y * body;
     if (lead.view >= 0) {

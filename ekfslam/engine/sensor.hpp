@@ -42,7 +42,7 @@ struct Sensor {
     // Whether an inverted point is in front of the rig and near enough to have a depth.
     bool has_depth(const Vector3& q) const { return q.z() > 0 && q.z() < furthest_m(); }
     Vector3 predict(const Vector3& q) const;
-    Matrix3 jacobian(const Vector3& q) const;  // d rows / d q
+    Matrix3 jacobian(const Vector3& q) const;                            // d rows / d q
     double by_disparity() const { return sees_disparity ? 1.0 : -1.0; }  // of the third row, as the next one
     double by_log_baseline(const Vector3& q) const { return by_disparity() * (fu_px * baseline_m / q.z()); }
     Vector3 invert(const Vector3& rows) const;

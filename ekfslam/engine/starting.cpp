@@ -68,9 +68,9 @@ Started start(Estimate& e, Index frame, const Ids& ids, const Matrix& rows) {
 
 // --- Waiting for a second view ---------------------------------------------------------------------------------------
 //
-// Once the parallax from the anchor suffices, both views of a landmark, r = H_x x + H_m d + n whitened, are split by the
-// QR factorisation H_m = [Q_1 Q_2] [R; 0]: d = R^-1 Q_1^T (r - H_x x - n) starts it, and Q_2^T r = Q_2^T H_x x + Q_2^T n
-// is a measurement of both views. Li and Mourikis, "Optimization-based estimator design", RSS 2012.
+// Once the parallax from the anchor suffices, both views of a landmark, r = H_x x + H_m d + n whitened, are split by
+// the QR factorisation H_m = [Q_1 Q_2] [R; 0]: d = R^-1 Q_1^T (r - H_x x - n) starts it, and Q_2^T r = Q_2^T H_x x +
+// Q_2^T n is a measurement of both views. Li and Mourikis, "Optimization-based estimator design", RSS 2012.
 
 namespace {
 

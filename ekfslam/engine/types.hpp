@@ -29,10 +29,10 @@ struct Error : std::runtime_error {
 
 // Leading columns of X that rows may depend on: [front | drifted view zd | view z | view of the frame before z'].
 struct Lead {
-    Index front = 0;        // columns of the body on which landmarks depend directly: Columns::front, then the anchor's view
-    Index drifted = -1;     // first column of zd; -1: there is none
-    Index view = -1;        // of z
-    Index previous = -1;    // of z'
+    Index front = 0;  // columns of the body on which landmarks depend directly: Columns::front, then the anchor's view
+    Index drifted = -1;   // first column of zd; -1: there is none
+    Index view = -1;      // of z
+    Index previous = -1;  // of z'
     Index width = 0;
 };
 
