@@ -10,6 +10,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,7 +68,7 @@ class Comparison(Shown):
         of = f"{self.sequence.name}, {count(len(self.sequence), 'frame')}"
         return Card(of, facts, ("print(comparison.table)", 'comparison.results["full"]', 'comparison.save("out")'))
 
-    @property
+    @cached_property
     def table(self) -> str:
         """The summary as a Markdown table, with reasons for missing modes and remarks."""
         lines = [f"No {mode}: {reason}" for mode, reason in self.skipped.items()]
