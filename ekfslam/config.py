@@ -108,6 +108,7 @@ _CONSTANTS_OF_THE_FRONT_END = (
 RETIRED = {
     "blocks.stereo_rotation": "the block is gone: it improved nothing. Pitch and roll of the right camera are the mean "
     "of vL - vR over the tracks of a recording",
+    "hygiene.restart_above_px": "it changed no accuracy; every track is cut at a repeated frame",
     "posterior.max_iterations": "the optimiser stops after 50 iterations at most",
     **{f"front_end.{name}": "it is a constant of the front end now" for name in _CONSTANTS_OF_THE_FRONT_END},
 }
@@ -155,7 +156,6 @@ class HygieneConfig:
             default 1, but 3 in the automatic model, whose tracks have a constant error of their disparity.
         max_row_mismatch_sigma: Drop observations with larger ``|vL - vR|``, in sigmas of that difference.
         restart_at_repeats: Cut every track at a frame that repeats the pixels of the previous one while the rig moves.
-        restart_above_px: Do not cut tracks there that move by no more than this in the adjacent frames.
         jump_sigma: Cut a track if its pixels jump so far off its course and that of the frame's other tracks.
         reused_id_sigma: Cut a track if it comes back after a gap so far off the pixels that the velocities predict.
         max_depth_error: Drop tracks whose depth is never known better than this, as a share of the depth.
@@ -168,7 +168,6 @@ class HygieneConfig:
     min_disparity_sigma: float | None = field(default=None, metadata=_FINITE)
     max_row_mismatch_sigma: float = field(default=10.0, metadata=_FINITE)
     restart_at_repeats: bool = field(default=True, metadata=_SWITCH)
-    restart_above_px: float = field(default=0.0, metadata=_FINITE)
     jump_sigma: float = field(default=0.0, metadata=_FINITE)
     reused_id_sigma: float = field(default=3.0, metadata=_FINITE)
     max_depth_error: float = field(default=0.0, metadata=_FINITE)

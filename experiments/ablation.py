@@ -49,7 +49,6 @@ WITHOUT = {
     "no shared errors": Case({"noise": {"shared": False}}),
     "landmarks in xyz": Case({"filter": {"landmark_coordinates": "xyz"}}),
     "no tilt": Case({"noise": {"tilt_deg": 0.0}}),
-    "slow tracks stay at repeats": Case({"hygiene": {"restart_above_px": 7.0}}),
     "no test for moving tracks": Case({"filter": {"moving_sigma": float("inf")}}),
     "no drift along the way": Case({"noise": {"drift": 0.0}}),
     "repeated frames not cut": Case({"hygiene": {"restart_at_repeats": False}}),

@@ -92,7 +92,5 @@ def test_dense_noisy_recording_gains_threefold_over_dead_reckoning(data_path):
     truth = data_path("kitti_odometry_poses/07.txt")
     sequence = open_sequence(data_path("ece276a/0027_dense_noisy.npz"), truth=truth)
     sequence = sequence if WHOLE else sequence[:300]
-    # Only velocities lead across the frames that repeat others, and white they are worth little: slow tracks stay.
-    config = NOISY.with_overrides({"hygiene": {"restart_above_px": 7.0}})
-    reckoned, full = (summarise(sequence, run(sequence, mode, config)) for mode in ("dead-reckoning", "full"))
+    reckoned, full = (summarise(sequence, run(sequence, mode, NOISY)) for mode in ("dead-reckoning", "full"))
     assert reckoned["ate_m"] > 3 * full["ate_m"]

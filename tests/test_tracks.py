@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from reprojection import reprojection_errors
 from support.reference import small_world
-from support.running import WHOLE
 from support.same import assert_same
 
 from ekfslam import open_sequence
@@ -590,25 +589,3 @@ def test_hygiene_brings_down_the_reprojection_errors_of_the_dense_recording(data
     assert (before > 5).sum() / np.isfinite(before).sum() > 0.2
     assert (after > 5).sum() / np.isfinite(after).sum() < 0.045
     assert report.dropped < 0.06 * len(sequence.observations)
-
-
-@pytest.mark.data
-@pytest.mark.slow
-def test_slow_tracks_may_stay_whole_at_repeated_frames(data_path):
-    """Cut are those alone that move before or after; where velocities are noisy and white that helps the poses."""
-    truth = data_path("kitti_odometry_poses/07.txt")
-    sequence = open_sequence(data_path("ece276a/0027_dense_noisy.npz"), truth=truth)
-    sequence = sequence if WHOLE else sequence[:400]
-    noise = noise_of(sequence, Config())
-    every, some = (
-        clean_tracks(sequence, noise, only(restart_at_repeats=True, restart_above_px=limit))[1] for limit in (0.0, 7.0)
-    )
-    pairs = [set(zip(report.frame.tolist(), report.landmark.tolist(), strict=True)) for report in (every, some)]
-    assert pairs[1] < pairs[0]
-    tracks = sequence.observations
-    at = {(k, i): z for k, i, z in zip(tracks.frame.tolist(), tracks.landmark.tolist(), tracks.pixels_px, strict=True)}
-    for k, i in sorted(pairs[0])[::7]:
-        steps = [
-            np.abs(at[b, i] - at[a, i]).max() for a, b in ((k - 2, k - 1), (k, k + 1)) if {(a, i), (b, i)} <= set(at)
-        ]
-        assert ((k, i) in pairs[1]) == (not steps or max(steps) > 7.0)

@@ -133,7 +133,7 @@ def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tup
     disparity_std, row_std = np.hypot(std[0], std[2]), np.hypot(std[1], std[3])
     if config.restart_at_repeats:
         starts = _first_at_or_after(tracks.kept, repeated_frames(tracks.kept, sequence.twist))
-        tracks.cut(REPEATED_FRAME, starts & ~_is_slow(tracks.kept, config.restart_above_px))
+        tracks.cut(REPEATED_FRAME, starts)
     if config.jump_sigma:
         tracks.cut(JUMP, jumps(tracks.kept, noise, config.jump_sigma))
     if config.reused_id_sigma:
@@ -269,17 +269,6 @@ def disparity_jumps(sequence: Sequence, noise: Noise, sigma: float) -> IntArray:
     together = np.bincount(at, minlength=1)[at] >= _COMPANY
     frames = np.unique(at[together & (_median_by(at, beyond[:, None])[:, 0] > sigma)])
     return np.unique(o.landmark[later[np.isin(o.frame[later], frames)]])
-
-
-def _is_slow(observations: Observations, limit_px: float) -> BoolArray:
-    """Return whether (K,) a track moves by at most ``limit_px`` to the frame before, and from this one to the next."""
-    earlier, later = adjacent(observations)
-    moved = np.abs(observations.pixels_px[later] - observations.pixels_px[earlier]).max(axis=1)
-    onward, hither, before = np.full((3, len(observations)), -1.0)
-    onward[earlier] = hither[later] = moved
-    before[later] = hither[earlier]
-    fastest = np.maximum(before, onward)  # -1: neither motion is known
-    return (fastest >= 0) & (fastest <= limit_px)
 
 
 def _after_gaps(observations: Observations) -> BoolArray:
