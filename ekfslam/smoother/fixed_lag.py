@@ -13,15 +13,12 @@ import dataclasses
 
 import numpy as np
 
-from ekfslam import kernels
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig, PosteriorConfig
 from ekfslam.errors import ConfigError, IllPosedError
-from ekfslam.filters.coordinates import LARGEST_FACTOR, is_in_image
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.lifecycle import Marginal
 from ekfslam.filters.log import Log
-from ekfslam.geometry import se3
 from ekfslam.models.model import Model
 from ekfslam.models.sensors.base import DelayedSensor
 from ekfslam.smoother.observations import ObservationFactors
@@ -208,7 +205,7 @@ class WindowProblem(BatchProblem):
         self.observations = ObservationFactors(log, self.model, self.unknowns)
         self.known = np.searchsorted(rows, self.prior.landmarks)
         self._is_free = ~np.isin(np.arange(len(rows)), self.known)
-        self._since, self._min_depth_m = window.observed - window.first, window.config.min_depth_m
+        self._since = window.observed - window.first
 
     def relinearised(self, state: State) -> LinearSystem:
         """Return the factors after the prior, linearised at a state."""
@@ -237,14 +234,6 @@ class WindowProblem(BatchProblem):
         return first.T_imu_world, first.shared, first.aux
 
     def moved(self, state: State, step: Information) -> State:
-        """Return a state moved by a solution: landmarks by their images in the camera that saw them first, eq. (7')."""
-        found, C = super().moved(state, step), self.model.sensor.T_cam_imu
-        k, xi = self.observations.first_frame, se3.log(found.T_imu_world @ se3.inverse(state.T_imu_world))
-        before, after, xi = C @ state.T_imu_world[k], C @ found.T_imu_world[k], (xi @ se3.adjoint(C).T)[k]
-        q = se3.apply(before, state.positions_m)
-        by = xi[:, :3] + np.cross(xi[:, 3:], q) + (before[:, :3, :3] @ step.d[..., None])[..., 0]
-        in_image = is_in_image(self.model.sensor, q, self._min_depth_m)
-        q, _ = kernels.moved_by_image(q, by, in_image, LARGEST_FACTOR)
-        found.positions_m[:] = se3.apply(se3.inverse(after), q)
+        found = super().moved(state, step)
         found.positions_m[self.known] = self.prior.at(found.zeta).positions_m
         return found

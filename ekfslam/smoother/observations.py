@@ -5,7 +5,7 @@ An observation whose track walks is a *difference* from the observation before, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,80 +17,20 @@ from ekfslam.models.model import Model
 from ekfslam.models.observer import GIVEN, Moment, Seen
 from ekfslam.smoother.sparse.factors import Factor, Term
 from ekfslam.smoother.unknowns import State, Unknowns, split
-from ekfslam.smoother.views import Views, drive_place, views_of_frame
+from ekfslam.smoother.views import Observed, Sight, Views, views_of_frame
 
 # Prior of a landmark about its initialisation: too weak to matter to a landmark with a depth.
 LANDMARK_PRIOR_M = 1e4
 
 
-@dataclass(frozen=True)
-class Observed:
-    """Observations of one kind.
-
-    Args:
-        which: (n,) their numbers in the log.
-        view, view_before: (n,) views that see them; those that differences are from, or None.
-        landmark: (n,) rows of the landmarks in the log.
-        rows, scale: (n, d) rows or their differences, and reciprocals of their standard deviations.
-    """
-
-    which: IntArray
-    view: IntArray
-    view_before: IntArray | None
-    landmark: IntArray
-    rows: Array
-    scale: Array
-
-
-class Sight:
-    """Observations at a state.
-
-    Args:
-        views: Cameras of all frames.
-        batches: Kinds of observations.
-        positions_m: (M, 3) landmarks.
+class ObservationFactors:
+    """Factors of a log that concern landmarks.
 
     Attributes:
-        residuals: Whitened residuals (n, d) of each kind.
+        first_frame: (M,) frame of each landmark's first observation.
+        first_position_m: (M, 3) its initialisation.
+        prior_weight: Reciprocal of the standard deviation of a weak prior of landmarks there; 0: none.
     """
-
-    def __init__(self, views: Views, batches: tuple[Observed, Observed], positions_m: Array) -> None:
-        self.views, self.batches = views, batches
-        self._q = [
-            [
-                (views.points(view, positions_m[o.landmark]), view)
-                for view in (o.view, o.view_before)
-                if view is not None
-            ]
-            for o in batches
-        ]
-        self.residuals = []
-        with np.errstate(divide="ignore", invalid="ignore"):
-            for o, seen in zip(batches, self._q, strict=True):
-                z = [views.sensor.predict(q) for q, _ in seen]
-                self.residuals.append(o.scale * (o.rows - z[0] + (z[1] if len(z) > 1 else 0.0)))
-
-    def seen(self, kind: int) -> list[tuple[Array, IntArray]]:
-        """Return points (n, 3) in the cameras that see them, and their views; then those before, of differences."""
-        return self._q[kind]
-
-    def norms(self) -> Array:
-        """Return the norms (K,) of the whitened residuals."""
-        s = np.empty(sum(len(o.which) for o in self.batches))
-        for o, r in zip(self.batches, self.residuals, strict=True):
-            s[o.which] = np.sqrt(np.einsum("ij,ij->i", r, r))
-        return s
-
-    def in_view(self, min_depth_m: float) -> BoolArray:
-        """Return whether the camera of each observation (K,) can see its landmark."""
-        found = np.empty(sum(len(o.which) for o in self.batches), dtype=bool)
-        for o, seen in zip(self.batches, self._q, strict=True):
-            found[o.which] = self.views.sensor.in_view(seen[0][0], min_depth_m)
-        return found
-
-
-class ObservationFactors:
-    """Factors of a log that concern landmarks; ``first_frame`` (M,) is that of each landmark's first observation."""
 
     def __init__(self, log: Log, model: Model, unknowns: Unknowns) -> None:
         self._log, self._model, self._unknowns = log, model, unknowns
@@ -104,6 +44,9 @@ class ObservationFactors:
         self._is_first[first] = True
         self.first_frame = np.zeros(log.landmarks, dtype=np.int64)
         self.first_frame[log.landmark[first]] = log.frame[first]
+        self.first_position_m = log.first_position_m
+        # Differences of successive observations leave the disparity itself open: some tracks fit best at infinity.
+        self.prior_weight = 0.0 if model.track_error is None else 1.0 / LANDMARK_PRIOR_M
         self._seen: tuple[State, Sight] | None = None
 
     # --- at a state ---------------------------------------------------------------------------------------------------
@@ -115,10 +58,9 @@ class ObservationFactors:
         rows[self._follows] -= log.rows[self._previous]
         found = []
         for which, before in ((np.flatnonzero(~self._is_difference), None), (self._follows, self._previous)):
-            view = h * log.frame[which] + (0 if before is None else h - 1)
-            view_before = None if before is None else h * log.frame[before]
+            views = [h * log.frame[which]] if before is None else [h * log.frame[which] + h - 1, h * log.frame[before]]
             scale = 1.0 / np.sqrt(log.variance[which])
-            found.append(Observed(which, view, view_before, log.landmark[which], rows[which], scale))
+            found.append(Observed(which, tuple(views), log.landmark[which], rows[which], scale))
         return found[0], found[1]
 
     def at(self, state: State) -> Sight:
@@ -128,43 +70,24 @@ class ObservationFactors:
             self._seen = state, Sight(views, self.batches, state.positions_m)
         return self._seen[1]
 
+    def remember(self, state: State, sight: Sight) -> None:
+        """Take a sight as that of a state."""
+        self._seen = state, sight
+
     def factors(self, state: State) -> list[Factor]:
         """Return the factors linearised at a state."""
         sight, factors = self.at(state), []
-        for kind, (observed, r) in enumerate(zip(self.batches, sight.residuals, strict=True)):
-            if not len(r):
+        for kind, observed in enumerate(self.batches):
+            if not len(observed.which):
                 continue
-            by_view, by_before, by_landmark, by_drive = self._jacobians(sight, kind)
+            r, by_views = sight.residuals[kind], sight.by_views(kind)
             terms = [
-                Term("views", observed.view, by_view),
-                Term("drive", np.zeros(len(r), dtype=np.int64), by_drive),
-                Term("landmarks", observed.landmark, by_landmark),
+                *(Term("views", view, J) for view, J in zip(observed.views, by_views, strict=True)),
+                Term("drive", np.zeros(len(r), dtype=np.int64), sight.by_drive(kind, by_views)),
+                Term("landmarks", observed.landmark, sight.by_landmark[kind]),
             ]
-            if observed.view_before is not None:
-                terms.append(Term("views", observed.view_before, -by_before))
             factors.append(Factor(r, tuple(terms), observed.which))
         return [*factors, *self._near(state)]
-
-    def _jacobians(self, sight: Sight, kind: int) -> tuple[Array, Array, Array, Array]:
-        """Return the whitened Jacobians by the view, the view before, the landmark and the drive."""
-        found, observed = [], self.batches[kind]
-        for q, view in sight.seen(kind):
-            A, by_view = sight.views.linearised(q, observed.scale)
-            by_landmark = A @ sight.views.T_view_world[view, :3, :3]
-            by_drive = by_view @ sight.views.by_drive[view]
-            calibration = self._model.observer.calibration
-            if calibration is not None and len(calibration.intrinsic):
-                own = drive_place(self._model.observer, self._unknowns)[calibration.intrinsic]
-                of_both = calibration.by_intrinsics(sight.views.rig, q)[
-                    ..., calibration.free[calibration.intrinsic] - 6
-                ]
-                by_drive[..., own] += observed.scale[..., None] * of_both
-            found.append((by_view, by_landmark, by_drive))
-        by_view, by_landmark, by_drive = found[0]
-        if len(found) == 1:
-            return by_view, by_view[:0], by_landmark, by_drive
-        before, landmark_before, drive_before = found[1]
-        return by_view, before, by_landmark - landmark_before, by_drive - drive_before
 
     def _moments(self, state: State) -> Moment:
         """Return the moments of all frames."""
@@ -178,16 +101,18 @@ class ObservationFactors:
         shared = split(self._unknowns.shared, state.shared)
         return Moment(T, T, model.observer.parameters(state.drive_values), twist, shared, self._way_m)
 
-    def _near(self, state: State) -> list[Factor]:
-        """Return weak priors of landmarks if errors of tracks walk.
+    def first_cameras(self, views: Views) -> Array:
+        """Return the cameras (M, 4, 4) that saw each landmark first."""
+        return views.T_view_world[views_of_frame(self._model.observer) * self.first_frame]
 
-        Differences of successive observations leave the disparity itself open: some tracks fit best at infinity.
-        """
-        if self._model.track_error is None:
+    def _near(self, state: State) -> list[Factor]:
+        """Return weak priors of landmarks if errors of tracks walk."""
+        if not self.prior_weight:
             return []
-        weight, landmarks = 1.0 / LANDMARK_PRIOR_M, np.arange(self._log.landmarks)
-        J = np.broadcast_to(weight * np.eye(3), (len(landmarks), 3, 3))
-        return [Factor(weight * (self._log.first_position_m - state.positions_m), (Term("landmarks", landmarks, J),))]
+        landmarks = np.arange(self._log.landmarks)
+        J = np.broadcast_to(self.prior_weight * np.eye(3), (len(landmarks), 3, 3))
+        r = self.prior_weight * (self.first_position_m - state.positions_m)
+        return [Factor(r, (Term("landmarks", landmarks, J),))]
 
     def _whitened(self, H_x: Array, H_m: Array, r: Array) -> list[Factor]:
         """Return the factors of single observations and of differences, from Jacobians and residuals (K, d, ...)."""

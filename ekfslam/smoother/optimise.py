@@ -8,17 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.config import PosteriorConfig
 from ekfslam.errors import IllPosedError
+from ekfslam.smoother.landmarks import settled
 from ekfslam.smoother.problem import BatchProblem, State
 from ekfslam.smoother.sparse.factors import LinearSystem
 from ekfslam.smoother.sparse.information import JointInformation
 
 MOST_ITERATIONS = 50
+# Landmarks settle until a step lowers their cost by less than this share of what ends the iterations.
+_SETTLED = 0.01
 
 
 def robust(config: PosteriorConfig, s: Array) -> tuple[Array, Array]:
@@ -81,7 +85,14 @@ def maximise(
     costs, damping, growth, step = [here.cost], 1e-7, 2.0, None
     for _ in iterations:
         step = JointInformation(here.system, damping, like=step)
-        there = evaluate(problem, problem.moved(here.state, step), config, min_depth_m)
+        moved = settled(
+            problem.observations,
+            problem.moved(here.state, step),
+            partial(robust, config),
+            min_depth_m,
+            _SETTLED * config.tolerance * here.cost,
+        )
+        there = evaluate(problem, moved, config, min_depth_m)
         gain = here.cost - there.cost if there else -np.inf
         if there is None or not gain >= 0:
             damping, growth = damping * growth, 2.0 * growth

@@ -15,6 +15,7 @@ from ekfslam.filters.log import Log
 from ekfslam.geometry import se3
 from ekfslam.models.model import Model
 from ekfslam.models.sensors.base import DelayedSensor
+from ekfslam.smoother.landmarks import moved_in_image
 from ekfslam.smoother.observations import ObservationFactors
 from ekfslam.smoother.process import ProcessFactors
 from ekfslam.smoother.sparse.dense import DenseInformation
@@ -70,19 +71,20 @@ class BatchProblem:
     def moved(self, state: State, step: Information) -> State:
         """Return a state moved by a solution of its system.
 
-        Landmarks move in the frame of the pose that saw them first, by the corrections to first order there. If a long
-        stretch of the trajectory moves and turns as a whole, its landmarks go along to all orders.
+        Landmarks move in the image of the camera that saw them first, eq. (7'). If a long stretch of the trajectory
+        moves and turns as a whole, its landmarks go along to all orders.
         """
-        u, before, zeta, d = self.unknowns, state.T_imu_world, state.zeta + step.zeta, step.d
+        u, before, zeta, sensor = self.unknowns, state.T_imu_world, state.zeta + step.zeta, self.model.sensor
         T = se3.exp(step.eps[:, :6]) @ before
         shared, aux = state.shared + step.eps[:, 6:], state.aux + step.aux
         # zeta gives the first frame exactly; eps is its first order.
         T[0], shared[0], aux[0] = self.first_frame(zeta)
-        eps = np.concatenate([se3.log(T[:1] @ se3.inverse(before[:1])), step.eps[1:, :6]])
-        k = self.observations.first_frame
-        s = se3.apply(before[k], state.positions_m)
-        turned = np.cross(eps[k, 3:], s) + (before[k, :3, :3] @ d[..., None])[..., 0]
-        positions = se3.apply(se3.inverse(T[k]), s + eps[k, :3] + turned)
+        k, C = self.observations.first_frame, sensor.T_cam_imu
+        xi = se3.log(T @ se3.inverse(before)) @ se3.adjoint(C).T
+        camera, camera_after = (C @ before)[k], (C @ T)[k]
+        turned = np.cross(xi[k, 3:], se3.apply(camera, state.positions_m))
+        by = xi[k, :3] + turned + (camera[:, :3, :3] @ step.d[..., None])[..., 0]
+        positions = moved_in_image(sensor, camera, camera_after, state.positions_m, by)
         drive = u.drive_values(step.drive, state.drive_values)
         return State(T, positions, zeta, shared, aux, state.drive + step.drive, drive)
 

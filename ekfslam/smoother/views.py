@@ -7,12 +7,15 @@ A difference of observations, eq. (10), may see the present frame through anothe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.geometry import se3
+from ekfslam.models.blocks import Calibration
 from ekfslam.models.blocks.calibration import TIME, to_exposure
 from ekfslam.models.observer import Moment, Observer
 from ekfslam.models.sensors.base import Sensor
@@ -25,18 +28,22 @@ class Views:
     """Cameras of T frames, h of each: that of single observations and, if it differs, that of differences.
 
     Args:
+        observer: Sensor with the blocks that observations depend on.
         sensor: Sensor with its calibration.
         T_view_world: (T h, 4, 4) cameras.
         by_frame: (T, 6 h, w) derivative of their errors by the unknowns of their frame.
         by_drive: (T h, 6, g) derivative by the unknowns of the drive.
+        drive_place: (c,) places of the calibration's columns among those of the drive.
         seen: (s,) columns of a frame by which its views are regular: the pose and, if there are two views, a block of
             which they have different shares. All, if there is none.
     """
 
+    observer: Observer
     sensor: Sensor
     T_view_world: Array
     by_frame: Array
     by_drive: Array
+    drive_place: IntArray
     seen: IntArray
 
     @staticmethod
@@ -65,8 +72,11 @@ class Views:
             if max(apart) > 0:
                 own = columns[observer.moves_camera[int(np.argmax(apart))].name]
                 seen = np.concatenate([np.arange(6), np.arange(own.start, own.stop)])
-        by_drive = np.repeat(_by_drive(observer, unknowns, moment), len(kinds), axis=0)
-        return Views(sensor, T.reshape(-1, 4, 4), by_frame.reshape(frames, -1, w), by_drive, seen)
+        place, by_drive = _drive_place(observer, unknowns), np.zeros((frames, 6, len(unknowns.drive_columns)))
+        if observer.calibration is not None:
+            _add_calibration(by_drive, observer.calibration, sensor, place, moment)
+        by_drive = np.repeat(by_drive, len(kinds), axis=0)
+        return Views(observer, sensor, T.reshape(-1, 4, 4), by_frame.reshape(frames, -1, w), by_drive, place, seen)
 
     @property
     def rig(self) -> Rig:
@@ -79,19 +89,128 @@ class Views:
         T = self.T_view_world[view]
         return np.einsum("nij,nj->ni", T[:, :3, :3], positions_m) + T[:, :3, 3]
 
-    def linearised(self, q: Array, scale: Array) -> tuple[Array, Array]:
-        """Return the derivatives of rows by points q (n, 3) and by the errors of their views, (n, d, 3) and (n, d, 6).
 
-        Rows are multiplied by ``scale`` (n, d).
-        """
-        A = scale[..., None] * self.sensor.jacobian(q)
-        x, y, z = q[:, None, 0], q[:, None, 1], q[:, None, 2]
-        by_view = np.empty((*A.shape[:2], 6))
-        by_view[..., :3] = A
-        by_view[..., 3] = y * A[..., 2] - z * A[..., 1]
-        by_view[..., 4] = z * A[..., 0] - x * A[..., 2]
-        by_view[..., 5] = x * A[..., 1] - y * A[..., 0]
-        return A, by_view
+@dataclass(frozen=True)
+class Observed:
+    """Observations of one kind: single ones, or differences.
+
+    Args:
+        which: (n,) their numbers in the log.
+        views: The view (n,) of each; then, of differences, the view (n,) before.
+        landmark: (n,) rows of the landmarks in the log.
+        rows, scale: (n, d) rows or their differences, and reciprocals of their standard deviations.
+    """
+
+    which: IntArray
+    views: tuple[IntArray, ...]
+    landmark: IntArray
+    rows: Array
+    scale: Array
+
+    def only(self, some: BoolArray) -> Observed:
+        """Return some (n,) of the observations."""
+        views = tuple(view[some] for view in self.views)
+        return Observed(self.which[some], views, self.landmark[some], self.rows[some], self.scale[some])
+
+
+class Sight:
+    """Observations at a state, linearised by views and landmarks.
+
+    Args:
+        views: Cameras of all frames.
+        batches: Kinds of observations.
+        positions_m: (M, 3) landmarks.
+
+    Attributes:
+        residuals: Whitened residuals (n, d) of each kind.
+    """
+
+    def __init__(self, views: Views, batches: Sequence[Observed], positions_m: Array) -> None:
+        self.views, self.batches, self.residuals = views, batches, []
+        self._q = [[views.points(view, positions_m[o.landmark]) for view in o.views] for o in batches]
+        with np.errstate(all="ignore"):
+            for o, q in zip(batches, self._q, strict=True):
+                z = [views.sensor.predict(points) for points in q]
+                self.residuals.append(o.scale * (o.rows - z[0] + sum(z[1:], 0.0)))
+
+    def norms_of(self, kind: int) -> Array:
+        """Return the norms (n,) of the whitened residuals of a kind."""
+        return np.sqrt(np.einsum("ij,ij->i", self.residuals[kind], self.residuals[kind]))
+
+    def can_see(self, kind: int, min_depth_m: float) -> BoolArray:
+        """Return whether the camera of each observation (n,) of a kind can see its landmark."""
+        return self.views.sensor.in_view(self._q[kind][0], min_depth_m)
+
+    def norms(self) -> Array:
+        """Return the norms (K,) of the whitened residuals of all observations."""
+        s = np.empty(sum(len(o.which) for o in self.batches))
+        for kind, o in enumerate(self.batches):
+            s[o.which] = self.norms_of(kind)
+        return s
+
+    def in_view(self, min_depth_m: float) -> BoolArray:
+        """Return whether the camera of each observation (K,) can see its landmark."""
+        found = np.empty(sum(len(o.which) for o in self.batches), dtype=bool)
+        for kind, o in enumerate(self.batches):
+            found[o.which] = self.can_see(kind, min_depth_m)
+        return found
+
+    @cached_property
+    def _by_points(self) -> list[list[Array]]:
+        """Derivatives (n, d, 3) of the whitened rows by the points in each view."""
+        jacobian, signs = self.views.sensor.jacobian, (1.0, -1.0)
+        return [
+            [sign * o.scale[..., None] * jacobian(points) for points, sign in zip(q, signs, strict=False)]
+            for o, q in zip(self.batches, self._q, strict=True)
+        ]
+
+    @cached_property
+    def by_landmark(self) -> list[Array]:
+        """Derivatives (n, d, 3) of the whitened rows of each kind by landmarks."""
+        R = self.views.T_view_world[:, :3, :3]
+        return [
+            sum((A @ R[view] for A, view in zip(by_points, o.views, strict=True)), np.zeros(()))
+            for o, by_points in zip(self.batches, self._by_points, strict=True)
+        ]
+
+    def by_views(self, kind: int) -> list[Array]:
+        """Return the derivatives (n, d, 6) of the whitened rows of a kind by the errors of each view."""
+        found = []
+        for A, q in zip(self._by_points[kind], self._q[kind], strict=True):
+            x, y, z = q[:, None, 0], q[:, None, 1], q[:, None, 2]
+            J = np.empty((*A.shape[:2], 6))
+            J[..., :3] = A
+            J[..., 3] = y * A[..., 2] - z * A[..., 1]
+            J[..., 4] = z * A[..., 0] - x * A[..., 2]
+            J[..., 5] = x * A[..., 1] - y * A[..., 0]
+            found.append(J)
+        return found
+
+    def by_drive(self, kind: int, by_views: Sequence[Array]) -> Array:
+        """Return the derivatives (n, d, g) of the whitened rows of a kind by the unknowns of the drive."""
+        o, views, calibration = self.batches[kind], self.views, self.views.observer.calibration
+        J = sum((of @ views.by_drive[view] for of, view in zip(by_views, o.views, strict=True)), np.zeros(()))
+        if calibration is not None and len(calibration.intrinsic):
+            own, parameters = views.drive_place[calibration.intrinsic], calibration.free[calibration.intrinsic] - 6
+            for q, sign in zip(self._q[kind], (1.0, -1.0), strict=False):
+                of_both = sign * o.scale[..., None] * calibration.by_intrinsics(views.rig, q)
+                J[..., own] += of_both[..., parameters]
+        return J
+
+    def only(self, landmarks: BoolArray, positions_m: Array) -> Sight:
+        """Return the observations of some landmarks (M,) at other positions (M, 3)."""
+        return Sight(self.views, [o.only(landmarks[o.landmark]) for o in self.batches], positions_m)
+
+    def take(self, landmarks: BoolArray, part: Sight) -> None:
+        """Take everything about some landmarks (M,) from a part, made by `only`."""
+        for kind, o in enumerate(self.batches):
+            at = landmarks[o.landmark]
+            mine, others = (
+                [sight.residuals[kind], sight.by_landmark[kind], *sight._q[kind], *sight._by_points[kind]]
+                for sight in (self, part)
+            )
+            for own, new in zip(mine, others, strict=True):
+                own[at] = new
 
 
 def views_of_frame(observer: Observer) -> int:
@@ -105,23 +224,19 @@ def _columns(unknowns: Unknowns) -> dict[str, slice]:
     return {b.name: slice(end - b.size, end) for b, end in zip(unknowns.shared, ends.tolist(), strict=True)}
 
 
-def _by_drive(observer: Observer, unknowns: Unknowns, moment: Moment) -> Array:
-    """Return the derivative (T, 6, g) of the errors of all cameras by the unknowns of the drive."""
-    frames, calibration = len(moment.T_imu_world), observer.calibration
-    found = np.zeros((frames, 6, len(unknowns.drive_columns)))
-    if calibration is None:
-        return found
-    own = drive_place(observer, unknowns)
-    found[..., own[calibration.extrinsic]] = calibration.camera_by_extrinsic(moment.calibration)
-    if observer.has_time_offset:
-        turn = se3.adjoint(observer.sensor_at(moment.calibration).T_cam_imu)
-        found[..., own[calibration.free == TIME]] = -(moment.twist @ turn.T)[..., None]
-    return found
-
-
-def drive_place(observer: Observer, unknowns: Unknowns) -> IntArray:
+def _drive_place(observer: Observer, unknowns: Unknowns) -> IntArray:
     """Return the places of the calibration's columns among those of the drive."""
-    calibration = observer.calibration
-    assert calibration is not None
-    at = observer.layout[calibration.name]
+    if observer.calibration is None:
+        return np.empty(0, dtype=np.int64)
+    at = observer.layout[observer.calibration.name]
     return np.searchsorted(unknowns.drive_columns, np.arange(at.start, at.stop))
+
+
+def _add_calibration(
+    by_drive: Array, calibration: Calibration, sensor: Sensor, place: IntArray, moment: Moment
+) -> None:
+    """Add the derivative of the errors of all cameras by extrinsics and time offset."""
+    by_drive[..., place[calibration.extrinsic]] = calibration.camera_by_extrinsic(moment.calibration)
+    if (calibration.free == TIME).any():
+        delayed = -(moment.twist @ se3.adjoint(sensor.T_cam_imu).T)
+        by_drive[..., place[calibration.free == TIME]] = delayed[..., None]

@@ -21,7 +21,7 @@ from ekfslam.smoother.sparse.factors import Factor, LinearSystem
 
 # Landmarks observed from more frames than this are kept for CHOLMOD: eliminating one couples all frames that observed
 # it, pair by pair, and their number grows with the square.
-ELIMINATE_UP_TO = 40
+ELIMINATE_UP_TO = 25
 AT_ONCE = 20_000  # constraints or pairs of them, so that temporary arrays stay in the cache
 
 
