@@ -30,14 +30,14 @@ Equations (docstrings cite these numbers)::
     S = H P H^T + V = L L^T,  Y = L^-1 H P,  (xi, d) = Y^T L^-1 r,  P -= Y^T Y       (6) update
     e_theta = -C^T xi_theta,  e_i = d_i + m_i^ e_theta,
     T+ = exp(xi) T,  m_i+ = exp(e_theta) m_i + J_l(e_theta) e_i,  P+ = J P J^T       (7) invariant retraction
-    y = f(T_cam_imu T_p m),  f(x, y, z) = (x/z, y/z, 1/z),  T_p+ = exp(xi_p) T_p,
-    m_i+ = (T_cam_imu T_p+)^-1 f^-1(y_i + Y_x,i xi_p + Y_m,i d_i),                    (7') landmarks as images
-    d_i+ = M_i d_i + B_i xi_p,  M = Y_m+^-1 Y_m,  B = Y_m+^-1 (Y_x - Y_x+ D_p),
-    xi+ = D xi,  xi_p+ = D_p xi_p,  D = Ad(T+ T^-1) (invariant) or 1,  P+ = G P G^T
+    W = T_cam_world,  W_true = exp(z^) W,  z = Y x,  y = f(q) = (x/z, y/z, 1/z),  q = W m,  J = df/dq,
+    m_i+ = (W+)^-1 f^-1(y_i + J_i ([I, -q_i^] z + R_W d_i)),                          (7') landmarks as images
+    d_i+ = M_i d_i + B_i z,  M = R_W+^T J+^-1 J R_W,  B = R_W+^T (J+^-1 J [I, -q^] - [I, -q+^] D),
+    xi+ = Ad(T+ T^-1) xi (invariant) or xi,  z+ = D z,  D = Ad(W+ W^-1) or 1,  P+ = G P G^T
     u = diag(R, R) u_level,  R = [x, up^ x, up],  x ~ forward - (forward . up) up    (8) velocities over level ground
     q = exp(c^) T_cam_imu exp(-c_time u^) T_imu_world m                              (9) calibration in the state
     z(k) = h(k) + e(k),  e(k) = f e(k-1) + w,  hence
-    z(k) - f z(k-1) = h(k) - f h(k-1) + w  over pose k, pose k-1 and landmark        (10) errors of tracks
+    z(k) - f z(k-1) = h(k) - f h(k-1) + w  over frame k, view k-1 and landmark       (10) errors of tracks
     q = T_cam_imu exp((n + l b)^) T_imu_world m, l the way in z(k) of a difference (10),
     else 0                                                                           (11) errors that landmarks share
     R1 = R0 dR,  v1 = v0 + g tau + R0 dv,  p1 = p0 + v0 tau + g tau^2 / 2 + R0 dp,  u1 = R1^T v1,
@@ -59,7 +59,8 @@ Glossary:
   two reported poses (`ekfslam.evaluation.relative`), independent of the error of the first.
 - *considered*: in the covariance, but never corrected (`ekfslam.filters.references`).
 - *variant*: linearisation point of the joint filter, and action of a correction: invariant, fej, standard.
-- *image coordinates*: (7') for landmarks, T_p the last updated pose, Y_x and Y_m derivatives of y; else *xyz*.
+- *view*: the camera of a frame in world, W, with one error z for all that moves it (`ekfslam.models.blocks.view`).
+- *image coordinates*: (7') for landmarks, W the last updated view; else *xyz*.
 - *gauge*: directions that no observation depends on: position and heading of the world, with (1) its whole rotation.
 - *track*: observations under one id; *hygiene*: cutting and dropping tracks before an estimator uses them.
 - *retire*: marginalise a landmark out of view; *dormant*: out of view, but still in the state; *map revival*: bring a

@@ -215,7 +215,11 @@ def read_record(
     """
     layout = stored.layout_of(record)
     found: dict[str, Any] = {}
+    defaults = {field.name: field.default for field in dataclasses.fields(record)}
     for name, (kind, _) in stored.attributes_of(record).items():
+        if name not in group.attrs and defaults[name] is not dataclasses.MISSING:  # older releases lack it
+            found[name] = defaults[name]
+            continue
         value = attribute(group, name)
         found[name] = texts(value) if kind is tuple else printable(str(value)) if kind is str else kind(value)
     coordinates = {**coordinates, **_named_entries(record, found)}

@@ -467,9 +467,8 @@ def _with_form(config: Config, sequence: Sequence, model: Model) -> Config:
         return config
     if settings.lag:  # the window writes all of the covariance in each frame
         return config.with_overrides({"filter": {"covariance_form": "dense"}})
-    # A block with a clone stays in the state for one more frame, as that clone.
-    moving = (block for block in layout.blocks if block.is_seen and (block.per_frame or block.clones))
-    group = sum(block.size for block in moving if block.name not in layout.clones)
+    # The view stays in the state for one more frame, as the previous one.
+    group = sum(block.size for block in layout.blocks if block.is_seen and (block.per_frame or block.clones))
     kept = len(sequence.observations.ids) if settings.retire == "never" else settings.dormant or 0
     stay = settings.retire_after or 1
     cheaper = is_conditional_cheaper(sequence.observations, len(sequence), layout.body, group, stay, kept)

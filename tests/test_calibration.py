@@ -45,8 +45,12 @@ def seen(T, c, m):
 
 def linearised(T, c, m, linear):
     """Points, rows by pose and parameters (n, 3, 15), rows by landmarks."""
-    q, H_x, H_c, H_m = ALL.linearise(cal.calibrated(RIG, c), c, TWIST, T, m, T, linear)
-    return q, np.concatenate([H_x, H_c], axis=-1), H_m
+    seen = observer_of(T, ALL).see(Moment(T, T, c, TWIST), m, linear)
+    return seen.q, seen.H_x, seen.H_m
+
+
+def observer_of(T, block):
+    return Model(RIG, RIG.noise, (Pose(T, np.eye(6)), block)).observer
 
 
 def points(T, c):
@@ -81,9 +85,10 @@ def test_without_parameters_it_is_the_sensor_as_given(T):
 @poses
 def test_new_landmarks_with_parameters(T, c):
     z = seen_rows(T, c, TWIST, points(T, c)) + np.array([0.5, -0.2, 0.3])
-    model = Model(RIG, RIG.noise, (Pose(T, np.eye(6)), ALL))
-    moment = Moment(T, T, c, TWIST)
-    positions, G, covariance = model.observer.initialise(moment, model.observer.inverted(moment, z)[0], RIG.variance(z))
+    observer = observer_of(T, ALL)
+    camera, q = observer.camera(Moment(T, T, c, TWIST)), observer.inverted(c, z)[0]
+    W = camera.T_cam_imu @ T
+    positions, G, covariance = observer.initialise(c, W, W, camera.by, q, RIG.variance(z))
     np.testing.assert_allclose(positions, sighted(T, c, TWIST, z), rtol=1e-9, atol=1e-9)
     _, H, H_m = linearised(T, c, positions, positions)
     V = np.diag(RIG.variance_px2)
@@ -273,9 +278,9 @@ def test_parameters_that_are_not_free_stay_as_given(calibrated):
     block, m = cal.Calibration(cal.prior_std(calibrated)), points(np.eye(4), np.zeros(9))
     assert block.size == len(free)
     np.testing.assert_allclose(block.retract(C, np.ones(len(free))) - C, np.isin(np.arange(9), free), atol=1e-15)
-    arguments = cal.calibrated(RIG, C), C, TWIST, np.eye(4), m, np.eye(4), m
-    for ours, theirs in zip(block.linearise(*arguments), ALL.linearise(*arguments), strict=True):
-        np.testing.assert_array_equal(ours, theirs[..., free] if theirs.shape[-1] == 9 else theirs)
+    moment = Moment(np.eye(4), np.eye(4), C, TWIST)
+    ours, theirs = (observer_of(np.eye(4), own).see(moment, m, m).H_x for own in (block, ALL))
+    np.testing.assert_array_equal(ours, theirs[..., np.concatenate([np.arange(6), 6 + free])])
 
 
 @pytest.mark.parametrize("name", ["rotation_deg", "lever_arm_m", "baseline", "disparity_px", "time_s"])

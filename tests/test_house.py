@@ -21,8 +21,8 @@ from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.smoother.revival import MapRevival
 
-SHARED = ["camera_jitter", "vision_drift", "previous_camera_jitter"]
-ALL_BLOCKS = ["pose", "previous_pose", "calibration", *SHARED, "twist", "up", "twist_bias"]
+SHARED = ["camera_jitter", "vision_drift"]
+ALL_BLOCKS = ["pose", "view", "previous_view", "calibration", *SHARED, "twist", "up", "twist_bias"]
 TRACK_ERROR = TrackError(np.array([0.3, 0.4, 0.8]), np.array([0.2, 0.25, 0.3]), 40.0, 0.05)
 UNSHARED = [name for name in ALL_BLOCKS if name not in SHARED]
 
@@ -109,8 +109,8 @@ def test_every_block_by_itself(variant, part):
     settings = {"filter": {"variant": variant, **PRIOR}}
     settings |= {"calibration": CALIBRATION} if part == "calibration" else {}
     settings |= {"blocks": {part: BLOCKS[part]}} if part in BLOCKS else {}
-    clone = ["previous_pose"] if part in ("track", "vision_drift") else []
-    assert_equal_to_frozen_rows(drive(world, settings, ["pose", *clone, *([] if part == "track" else [part])]))
+    views = ["view", "previous_view"] if part in ("track", "vision_drift") else []
+    assert_equal_to_frozen_rows(drive(world, settings, ["pose", *views, *([] if part == "track" else [part])]))
 
 
 @pytest.mark.slow

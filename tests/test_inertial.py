@@ -66,7 +66,7 @@ def pieces(which=slice(None)):
 
 
 def values(T, u=U):
-    return {"previous_pose": T, "pose": T, "velocity": u, "gyro_bias": BIAS[:3], "accel_bias": BIAS[3:]}
+    return {"view": T, "previous_view": T, "pose": T, "velocity": u, "gyro_bias": BIAS[:3], "accel_bias": BIAS[3:]}
 
 
 def moved(before, x, columns):

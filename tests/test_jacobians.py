@@ -29,7 +29,7 @@ def from_one_sight(rig, T, z):
 
 
 def retract_invariant(T, m, xi, d):
-    return se3.exp(xi) @ T, VARIANTS["invariant"].retract_landmarks(T, m, xi, d)
+    return se3.exp(xi) @ T, VARIANTS["invariant"].retract_landmarks(m, -T[:3, :3].T @ xi[3:], d)
 
 
 def transport_invariant(P, T, T_after, moved):
@@ -38,7 +38,7 @@ def transport_invariant(P, T, T_after, moved):
     gaussian = DenseGaussian(np.eye(6), 6)
     gaussian.replace(P.copy())
     variant, before = VARIANTS["invariant"], {"pose": T}
-    change = variant.change(model, before, np.arange(len(moved)), moved)
+    change = variant.change(T, np.eye(6), np.arange(len(moved)), moved)
     variant.transport(gaussian, model, before, {"pose": T_after}, [change])
     return gaussian.P
 

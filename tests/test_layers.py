@@ -137,7 +137,7 @@ def names_a_block(node: ast.AST, names: set[str], kinds: set[str]) -> bool:
 def test_no_other_file_names_a_block():
     names = block_names()
     kinds = {kind for kind in vars(blocks) if isinstance(vars(blocks)[kind], type)} - {"StateBlock", "Layout"}
-    assert {"twist", "calibration", "velocity", "previous_pose"} <= names
+    assert {"twist", "calibration", "velocity", "previous_view"} <= names
     root = Path(ekfslam.__file__).parent
     found = [
         f"{path.relative_to(root)}:{node.lineno}"

@@ -112,20 +112,19 @@ def test_transition_and_noise_of_everything(name, T, walks):
     T_next, u = moved(T, W, twist, tau)
     np.testing.assert_allclose(step.values["pose"], T_next, atol=1e-12)
     np.testing.assert_allclose(step.imu_twist, u, atol=1e-13)
-    names = ["pose", "previous_pose", "calibration", *(["twist"] if walks else []), "up", "twist_bias"]
+    names = ["pose", "view", "previous_view", "calibration", *(["twist"] if walks else []), "up", "twist_bias"]
     ends = np.cumsum([block.size for block in model.layout.blocks])
     assert list(model.layout) == names
     assert [at.stop for at in model.layout.values()] == ends.tolist()
 
     def after(e):
-        v = twist + e[..., 21:27] if walks else twist - e[..., -6:]
+        v = twist + e[..., 27:33] if walks else twist - e[..., -6:]
         W_e = se3.so3_exp(e[..., -9:-6]) @ W
         return difference(moved(se3.exp(e[..., :6]) @ T, W_e, v, tau)[0], T_next)
 
-    size = 36 if walks else 30
+    size = 42 if walks else 36
     Phi, G = np.eye(size), np.zeros((size, 6))
     Phi[:6] = stencil(after, size)
-    Phi[6:12] = np.eye(size)[:6]
     G[:6] = stencil(lambda errors: difference(moved(T, W, twist, tau, errors)[0], T_next), 6)
     np.testing.assert_allclose(step.Phi, Phi, atol=1e-9)
     std = noise.motion_std if walks else noise.twist_std
@@ -213,8 +212,9 @@ def test_filter_of_everything_equals_the_literal_one(case):
             np.testing.assert_allclose(ekf.values["twist_bias"], literal.b, atol=accuracy)
         if walks and k:
             np.testing.assert_allclose(ekf.values["twist"], literal.twist, atol=accuracy)
-        if literal.has_clone and k:
-            np.testing.assert_allclose(ekf.values["previous_pose"], literal.before, rtol=accuracy, atol=accuracy)
+        if literal.has_views and k:
+            for name, value in (("view", literal.view), ("previous_view", literal.before)):
+                np.testing.assert_allclose(ekf.values[name], value, rtol=accuracy, atol=accuracy)
     assert len(ekf.ids) > 6
     assert follow > 20 and again > 5
     assert (literal.by_position > 0) == (coordinates == "image")

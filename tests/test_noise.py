@@ -19,7 +19,7 @@ from ekfslam.data.sequence import Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
-from ekfslam.filters.observing import moment_before, observe
+from ekfslam.filters.observing import observe
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import motion, se3
 from ekfslam.models.noise import (
@@ -342,12 +342,16 @@ def test_filter_with_velocities_and_errors_of_tracks_equals_the_naive_one():
 
 
 def assert_same_state(ekf, naive):
-    np.testing.assert_allclose(ekf.P, naive.P, atol=1e-10)
+    E = np.insert(np.eye(len(naive.P)), [6] * 6, 0.0, axis=0)  # the view is the pose in the camera frame
+    E[6:12, :6] = E[12:18, 6:12] = se3.adjoint(ekf.sensor.T_cam_imu)
+    np.testing.assert_allclose(ekf.P, E @ naive.P @ E.T, atol=1e-10)
     np.testing.assert_array_equal(ekf.P, ekf.P.T)
     assert ekf.ids.tolist() == naive.ids
     np.testing.assert_allclose(ekf.positions_m, naive.m, atol=1e-10)
     np.testing.assert_allclose(ekf.T_imu_world, naive.T, atol=1e-11)
-    np.testing.assert_allclose(ekf.values["previous_pose"], naive.T_before, atol=1e-11)
+    if naive.k:
+        C = ekf.sensor.T_cam_imu
+        np.testing.assert_allclose(ekf.values["previous_view"], C @ naive.T_before, atol=1e-11)
     if naive.u is not None:
         np.testing.assert_allclose(ekf.values["twist"], naive.u, atol=1e-11)
 
@@ -363,10 +367,7 @@ def test_transition_and_measurement_jacobians_know_of_the_velocities(tracks):
     at = ekf.model.layout["twist"]
     F = transition_jacobian(ekf, Interval.of_one(ekf.values["twist"], 0.1)).toarray()
     np.testing.assert_allclose(F[:6, at], -motion.twist_jacobian(ekf.values["twist"], 0.1))
-    expected = np.eye(len(F))
-    if tracks:
-        expected[6:12] = expected[:6]
-    np.testing.assert_array_equal(F[6:], expected[6:])
+    np.testing.assert_array_equal(F[6:], np.eye(len(F))[6:])
     N = gauge_of_all(ekf)
     H = measurement_jacobian(ekf, ekf.ids)
     assert np.abs(H @ N).max() < 1e-9 * np.abs(H.toarray()).max() * np.abs(N).max()
@@ -379,18 +380,19 @@ def test_transition_and_measurement_jacobians_know_of_the_velocities(tracks):
     N = gauge_of_all(ekf)
     by = rows.H_x @ N[: ekf.gaussian.seen] + rows.H_m @ N[ekf.gaussian.body :].reshape(-1, 3, 6)
     assert np.abs(by).max() < 1e-9 * np.abs(rows.H_x).max() * np.abs(N).max()
-    differs = np.abs(rows.H_x[..., 6:12]).max(axis=(1, 2)) > 0
+    differs = np.abs(rows.H_x[..., ekf.model.layout["previous_view"]]).max(axis=(1, 2)) > 0
     np.testing.assert_array_equal(differs, seen_then)
     assert differs.sum() > 3
 
 
 def gauge_of_all(ekf):
-    """What moving the world does to all errors: of the pose and the one before, and of landmarks."""
+    """What moving the world does to all errors: of pose and views, and of landmarks."""
     layout, N = ekf.model.layout, gauge_directions(ekf.linear_T_imu_world, ekf.linear_positions_m)
     body = np.zeros((ekf.gaussian.body, 6))
     body[layout["pose"]] = N[:6]
-    if "previous_pose" in layout:
-        body[layout["previous_pose"]] = -se3.adjoint(moment_before(ekf, ekf.mean).T_linear)
+    first = dict(zip(layout.views, (ekf.motion.W_predicted, ekf.motion.W_predicted_before), strict=False))
+    for name in layout.views:
+        body[layout[name]] = -se3.adjoint(ekf.variant.linear(ekf.values[name], first[name]))
     return np.vstack([body, N[6:]])
 
 
@@ -437,8 +439,9 @@ def test_no_information_about_the_gauge_comes_with_velocities_and_errors_of_trac
         ekf.update(k, *world.observations.at(k))
         if k == 0:
             continue  # nothing is known of the velocities, and P is singular
-        N = gauge_of_all(ekf)
-        ratio = np.linalg.eigvals(np.linalg.solve(prior, N.T @ np.linalg.solve(ekf.P, N))).real
+        view = ekf.model.layout["view"]  # a function of the pose, so that P is singular
+        N, P = np.delete(gauge_of_all(ekf), view, 0), np.delete(np.delete(ekf.P, view, 0), view, 1)
+        ratio = np.linalg.eigvals(np.linalg.solve(prior, N.T @ np.linalg.solve(P, N))).real
         assert ratio.max() < 1 + 1e-6
 
 

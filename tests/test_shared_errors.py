@@ -16,7 +16,6 @@ from support.literal import (
     TILTED,
     TRACKS,
     Literal,
-    camera_pose,
     filter_of,
     gauge_information,
     in_level_frame,
@@ -30,12 +29,12 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
-from ekfslam.filters.observing import observe
+from ekfslam.filters.observing import moment, observe
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import CameraJitter, Previous, TwistBias, VisionDrift
+from ekfslam.models.blocks import CameraJitter, TwistBias, VisionDrift
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.build import model_of
-from ekfslam.models.observer import Moment
+from ekfslam.models.observer import Moment, Seen
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.smoother.problem import BatchProblem
 
@@ -54,7 +53,6 @@ ERRORS = {
     "calibration": np.array([0.05, -0.08, 0.06, 0.02, -0.03, 0.025, 0.03, 0.7, 0.03]),
     "camera_jitter": np.array([0.04, -0.03, 0.05, 0.02, -0.01, 0.015]),
     "vision_drift": np.array([0.02, 0.03, -0.01, 0.004, 0.003, -0.005]),
-    "previous_camera_jitter": np.array([-0.02, 0.05, 0.03, -0.015, 0.02, 0.01]),
 }
 TWIST = np.array([7.0, 0.4, -0.3, 0.1, -0.2, 0.5])
 LEAST_WAY_M = 0.1
@@ -66,18 +64,21 @@ def pixel(q):
     return np.array([CAMERA.fu_px * q[0] / q[2] + CAMERA.cu_px, CAMERA.fv_px * q[1] / q[2] + CAMERA.cv_px])
 
 
+def literal_camera(values, way_m, follows, twist):
+    """The camera in world (4, 4)."""
+    c, offset = values["calibration"], values["camera_jitter"]
+    if follows:
+        offset = offset + max(way_m, LEAST_WAY_M) * values["vision_drift"]
+    return se3.exp(c[:6]) @ T_CAM_IMU @ se3.exp(-c[8] * twist) @ se3.exp(offset) @ values["pose"]
+
+
 def literal_rows(values, m, way_m, follows, twist, before=False, disparity=True):
-    """Rows (n, 3) of landmarks (n, 3), those that follow another observation with the drift; or in the frame before."""
-    prefix = "previous_" if before else ""
-    T, jitter = (values[prefix + name] for name in ("pose", "camera_jitter"))
+    """Rows (n, 3) of landmarks (n, 3), those that follow another observation with the drift; or in the view before."""
     c, rows = values["calibration"], []
     right_of_both = NOISE.pixel_std_px[1] ** 2 / (NOISE.pixel_std_px[1] ** 2 + NOISE.pixel_std_px[3] ** 2)
     for point, follows_one in zip(m, follows, strict=True):
-        offset = jitter
-        if follows_one and not before:
-            offset = offset + max(way_m, LEAST_WAY_M) * values["vision_drift"]
-        moved = se3.exp(-c[8] * twist) @ se3.exp(offset) @ T
-        q = se3.apply(se3.exp(c[:6]) @ T_CAM_IMU @ moved, point)
+        W = values["previous_view"] if before else literal_camera(values, way_m, follows_one, twist)
+        q = se3.apply(W, point)
         baseline = np.array([CAMERA.baseline_m * np.exp(c[6]), 0.0, 0.0])
         left, right = pixel(q), pixel(q - baseline)
         v = (1 - right_of_both) * left[1] + right_of_both * right[1]
@@ -88,16 +89,39 @@ def literal_rows(values, m, way_m, follows, twist, before=False, disparity=True)
 def everything(T, noise, blocks=BLOCKS):
     """The model with every block, and values of it of which none is zero."""
     model = model_of(Rig(CAMERA, T_CAM_IMU, noise), noise, T, P0, EVERYTHING, blocks)
-    T_before = se3.exp(np.array([0.6, 0.1, -0.05, 0.01, 0.02, -0.05])) @ T
-    values = {**model.initial_values(), "previous_pose": T_before, "pose": T, **ERRORS}
+    W_before = T_CAM_IMU @ se3.exp(np.array([0.6, 0.1, -0.05, 0.01, 0.02, -0.05])) @ T
+    values = {**model.initial_values(), "previous_view": W_before, "pose": T, **ERRORS}
     return model, {name: value for name, value in values.items() if name in model.layout}
 
 
-def moment_of(model, values, way_m, before=False):
-    prefix = "previous_" if before else ""
-    shared = {block.name: values.get(prefix + block.name, values[block.name]) for block in model.observer.shared}
-    T = values[prefix + "pose"]
-    return Moment(T, T, values["calibration"], TWIST, shared, np.array(way_m))
+def moment_of(model, values, way_m):
+    shared = {block.name: values[block.name] for block in model.observer.shared}
+    return Moment(values["pose"], values["pose"], values["calibration"], TWIST, shared, np.array(way_m))
+
+
+@pytest.mark.parametrize("way_m", [1.7, 0.03])
+@pytest.mark.parametrize("twist", [np.zeros(6), TWIST], ids=["at rest", "driving"])
+@poses
+def test_the_camera_in_world_by_every_block(T, twist, way_m):
+    """Of single observations and of differences: with jitter, drift, extrinsic calibration and time offset."""
+    model, values = everything(T, KINDS["tracks"])
+    body = model.layout.body
+    moment = dataclasses.replace(moment_of(model, values, way_m), twist=twist)
+    cameras = model.observer.cameras(moment)
+    for kind in (0, 1):
+        W = cameras.T_cam_imu[kind] @ T
+        np.testing.assert_allclose(W, literal_camera(values, way_m, kind, twist), atol=1e-12 * np.abs(W).max())
+
+        def error(x, kind=kind, W=W):
+            return se3.log(literal_camera(model.retract(values, x), way_m, kind, twist) @ se3.inverse(W))
+
+        Y = np.pad(cameras.by[kind], ((0, 0), (0, body - model.layout.seen)))
+        numeric = central(error, body)
+        np.testing.assert_allclose(Y, numeric, rtol=1e-6, atol=1e-7 * np.abs(numeric).max())
+        names = ["pose", "camera_jitter", "calibration", *(["vision_drift"] if kind else [])]
+        assert [name for name in model.layout if np.abs(Y[:, model.layout[name]]).max() > 0] == [
+            name for name in model.layout if name in names
+        ]
 
 
 def wide(seen, body, slots, landmarks):
@@ -140,12 +164,12 @@ def test_rows_by_every_block_and_landmark(T, noise, follows, way_m):
     assert_equal_rows(H, central(rows, len(nothing)))
     drift = H[:, model.layout["vision_drift"]].reshape(4, 3, 6)
     assert (np.abs(drift).max(axis=(1, 2)) > 0).tolist() == follow.tolist()
-    q = model.observer.points(moment_of(model, values, way_m), m[slots], follow)
+    q = model.observer.points(moment_of(model, values, way_m), m[slots], is_difference=follow)
     np.testing.assert_allclose(model.observer.predicted(moment_of(model, values, way_m), q), seen.z, rtol=1e-13)
 
 
 @poses
-def test_rows_in_the_frame_before_by_every_block_and_landmark(T):
+def test_rows_in_the_view_before_by_every_block_and_landmark(T):
     model, values = everything(T, KINDS["tracks"])
     m, slots, body = visible_points(T, 5), np.array([3, 0, 4]), model.layout.body
     none = np.zeros(3, dtype=bool)
@@ -154,11 +178,14 @@ def test_rows_in_the_frame_before_by_every_block_and_landmark(T):
         points = (m + x[body:].reshape(-1, 3))[slots]
         return literal_rows(model.retract(values, x[:body]), points, 1.7, none, TWIST, before=True).ravel()
 
-    seen = model.observer.see(moment_of(model, values, 0.0, before=True), m[slots], m[slots], "previous_pose")
-    np.testing.assert_allclose(seen.z.ravel(), rows(np.zeros(body + 15)), rtol=1e-11)
+    by = np.zeros((6, model.layout.seen))
+    by[:, model.layout["previous_view"]] = np.eye(6)
+    sight = model.observer.project(values["calibration"], values["previous_view"], m[slots])
+    np.testing.assert_allclose(sight.z.ravel(), rows(np.zeros(body + 15)), rtol=1e-11)
+    seen = Seen(sight.q, sight.z, model.observer.by_body(sight, by), sight.H_m)
     H = wide(seen, body, slots, len(m))
     assert_equal_rows(H, central(rows, body + 15))
-    for name in ("pose", "camera_jitter", "vision_drift"):
+    for name in ("pose", "camera_jitter", "vision_drift", "view"):
         assert not H[:, model.layout[name]].any()
 
 
@@ -191,7 +218,7 @@ def test_observations_of_the_filter_by_every_block_and_landmark(T):
     def residual(x):
         moved, points = model.retract(values, x[:body]), (ekf.positions_m + x[body:].reshape(-1, 3))[slots]
         now = measured - literal_rows(moved, points, way_m, follows, ekf.imu_twist)
-        last = before - literal_rows(moved, points, way_m, follows, ekf.motion.imu_twist_before, before=True)
+        last = before - literal_rows(moved, points, way_m, follows, None, before=True)
         return (now - follows[:, None] * last).ravel()
 
     _, rows = observe(ekf, ekf.mean, slots, measured)
@@ -201,7 +228,9 @@ def test_observations_of_the_filter_by_every_block_and_landmark(T):
 
 
 def new_landmarks(model, moment, z, variance):
-    return model.observer.initialise(moment, model.observer.inverted(moment, z)[0], variance)
+    observer, camera = model.observer, model.observer.camera(moment)
+    W, q = camera.T_cam_imu @ moment.T_imu_world, observer.inverted(moment.calibration, z)[0]
+    return observer.initialise(moment.calibration, W, W, camera.by, q, variance)
 
 
 @kinds
@@ -227,48 +256,50 @@ def test_new_landmarks_by_every_block(T, noise):
         by_row = central(lambda d, i=i: new_landmarks(model, moment, z + d, variance)[0][i], 3)
         expected = by_row @ np.diag(variance[i]) @ by_row.T
         np.testing.assert_allclose(covariance[i], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
-    assert model.observer.inverted(moment, z)[1].all()
+    assert model.observer.inverted(moment.calibration, z)[1].all()
 
 
 # --- the model ------------------------------------------------------------------------------------------------------
 
 
-def test_which_blocks_have_clones():
-    names = list(
-        model_of(Rig(CAMERA, T_CAM_IMU, KINDS["tracks"]), KINDS["tracks"], np.eye(4), P0, blocks=SHARED).layout
-    )
-    assert [name for name in names if name.startswith("previous_")] == [
-        "previous_pose",
-        "previous_camera_jitter",
-    ]
-    white = model_of(Rig(CAMERA, T_CAM_IMU, NOISE), NOISE, np.eye(4), P0, blocks=SHARED)
-    assert not white.clones
+def test_which_models_have_views():
+    def views(noise, coordinates):
+        rig = Rig(CAMERA, T_CAM_IMU, noise)
+        return model_of(rig, noise, np.eye(4), P0, blocks=SHARED, coordinates=coordinates).layout.views
+
+    assert views(KINDS["tracks"], "xyz") == views(NOISE, "image") == ("view", "previous_view")
+    assert views(NOISE, "xyz") == ()
     with pytest.raises(ConfigError, match=r"there twice: .*camera_jitter"):
         model_of(Rig(CAMERA, T_CAM_IMU, NOISE), NOISE, np.eye(4), P0, blocks=[*SHARED, CameraJitter()])
 
 
-def test_a_clone_is_its_block_before_it_changed():
-    """Value and cross-covariances are those of the block before the prediction, and both wander apart."""
+def test_views_of_a_prediction():
+    """The view before is the view; the view is the camera of the blocks, which wander on."""
     model, _ = everything(np.eye(4), KINDS["tracks"])
     ekf, rng, layout = JointEKF(model, OPEN), np.random.default_rng(0), model.layout
     root = rng.normal(size=(layout.body, layout.body))
     P = root @ root.T
     ekf.P = P.copy()
-    ekf.values = {**ekf.values, **{name: ERRORS[name] for name in ("camera_jitter", "vision_drift")}}
+    values = {name: ERRORS[name] for name in ("camera_jitter", "vision_drift", "calibration")}
+    ekf.values = {**ekf.values, **values, "view": se3.exp(0.1 * TWIST) @ T_CAM_IMU}
     before = ekf.values
     ekf.predict(TWIST, 0.2)
     way_m = 0.2 * np.linalg.norm(TWIST[:3])
     assert ekf.motion.way_m == pytest.approx(way_m)
     kept = {"camera_jitter": 0.2 / 0.6, "vision_drift": way_m / 20.0}
+    view, last = layout["view"], layout["previous_view"]
+    np.testing.assert_array_equal(ekf.values["previous_view"], before["view"])
+    np.testing.assert_allclose(ekf.P[last, last], P[view, view])
     for block in SHARED:
         at, phi = layout[block.name], np.exp(-kept[block.name])
         own, std = P[at, at], block.stationary_std
         np.testing.assert_allclose(ekf.values[block.name], phi * before[block.name])
         np.testing.assert_allclose(ekf.P[at, at], phi**2 * own + np.diag(std**2 * (1 - phi**2)))
-        if (clone := Previous(block).name) in layout:
-            np.testing.assert_array_equal(ekf.values[clone], before[block.name])
-            np.testing.assert_allclose(ekf.P[layout[clone], layout[clone]], own)
-            np.testing.assert_allclose(ekf.P[at, layout[clone]], phi * own)
+        np.testing.assert_allclose(ekf.P[at, last], phi * P[at, view])
+    np.testing.assert_allclose(ekf.values["view"], literal_camera(ekf.values, way_m, False, ekf.imu_twist), atol=1e-12)
+    Y = np.zeros((6, layout.body))
+    Y[:, : layout.seen] = model.observer.camera(moment(ekf, ekf.mean)).by
+    np.testing.assert_allclose(ekf.P[view], Y @ ekf.P, atol=1e-9 * np.abs(ekf.P).max())
 
 
 @pytest.mark.parametrize("tracks", [TRACKS, {}], ids=["tracks", "white"])
@@ -296,23 +327,20 @@ def test_information_about_the_gauge_with_shared_errors(variant, coordinates, tr
 class LiteralShared(Literal):
     """The textbook EKF with shared errors; their columns come after those of all other blocks."""
 
-    OWN = ("jitter", "drift", "jitter_before")
-    SIZE = (6, 6, 6)
+    OWN = ("jitter", "drift")
 
     def __init__(self, sequence, variant, images):
         super().__init__(sequence, variant, np.arange(9), prior_std(EVERYTHING), TILTED[:, 2], BIAS, images)
-        kept = len(self.SIZE) if self.tracks is not None else 2
-        for name, size in zip(self.OWN[:kept], self.SIZE[:kept], strict=True):
-            self.at[name] = slice(self.body, self.body + size)
-            self.body += size
+        for name in self.OWN:
+            self.at[name] = slice(self.body, self.body + 6)
+            self.body += 6
         self.P = np.pad(self.P, (0, self.body - len(self.P)))
-        for block, name in zip(SHARED, self.OWN[:2], strict=True):
+        for block, name in zip(SHARED, self.OWN, strict=True):
             self.P[self.at[name], self.at[name]] = np.diag(block.stationary_std**2)
-        vars(self).update({name: np.zeros(size) for name, size in zip(self.OWN, self.SIZE, strict=True)})
+        vars(self).update({name: np.zeros(6) for name in self.OWN})
 
     def moved_by(self, e):
-        own = {name: getattr(self, name) for name in self.OWN}
-        own |= {name: own[name] + e[..., self.at[name]] for name in self.OWN if name in self.at}
+        own = {name: getattr(self, name) + e[..., self.at[name]] for name in self.OWN}
         return {**super().moved_by(e), **own}
 
     def predict(self, measured, tau):
@@ -320,14 +348,9 @@ class LiteralShared(Literal):
         super().predict(measured, tau)
 
     def wander(self, tau):
-        F = np.eye(len(self.P))
-        if "jitter_before" in self.at:
-            F[self.at["jitter_before"]] = np.eye(len(self.P))[self.at["jitter"]]
-            self.jitter_before = self.jitter
-        self.P = F @ self.P @ F.T
         super().wander(tau)
         lengths = tau / 0.6, max(self.way_m, LEAST_WAY_M) / 20.0
-        for block, name, length in zip(SHARED, self.OWN[:2], lengths, strict=True):
+        for block, name, length in zip(SHARED, self.OWN, lengths, strict=True):
             F, kept = np.eye(len(self.P)), np.exp(-length)
             F[self.at[name], self.at[name]] *= kept
             self.P = F @ self.P @ F.T
@@ -335,11 +358,8 @@ class LiteralShared(Literal):
             setattr(self, name, kept * getattr(self, name))
 
     def look(self, x, m, before=False, follows=False):
-        offset = x["jitter_before"] if before else x["jitter"]
-        if follows:
-            offset = offset + max(self.way_m, LEAST_WAY_M) * x["drift"]
-        T, u = (x["before"], self.u_before) if before else (x["T"], self.u)
-        q = se3.apply(camera_pose(se3.exp(offset) @ T, x["c"], u, T_CAM_IMU)[..., None, :, :], m)
+        W = x["before"] if before else self.camera(x, follows)
+        q = se3.apply(W[..., None, :, :], m)
         baseline = CAMERA.baseline_m * np.exp(x["c"][..., 6])
         right = q - baseline[..., None, None] * np.eye(3)[0]
         left, right = (np.moveaxis(pixel(np.moveaxis(p, -1, 0)), 0, -1) for p in (q, right))
@@ -347,11 +367,11 @@ class LiteralShared(Literal):
         rows = np.stack([left[..., 0], (left[..., 1] + right[..., 1]) / 2, disparity], axis=-1)
         return rows if self.tracks is not None else rows @ BY_DISPARITY.T
 
-    def point(self, x, row):
-        moved, rows = {**x, "T": se3.exp(x["jitter"]) @ x["T"]}, row
-        for _ in range(10):
-            rows = rows + row - self.look(x, super().point(moved, rows)[..., None, :])[..., 0, :]
-        return super().point(moved, rows)
+    def camera(self, x, follows=False):
+        offset = x["jitter"]
+        if follows:
+            offset = offset + max(self.way_m, LEAST_WAY_M) * x["drift"]
+        return super().camera({**x, "T": se3.exp(offset) @ x["T"]})
 
 
 @pytest.mark.slow
@@ -379,8 +399,8 @@ def test_filter_with_shared_errors_equals_the_literal_one(variant, coordinates, 
         ekf.model.layout,
         np.random.default_rng(3),
     )
-    names = ["pose", "previous_pose", "calibration", "twist", "up", "twist_bias", *(block.name for block in SHARED)]
-    names += ["previous_camera_jitter"]
+    names = ["pose", "view", "previous_view", "calibration", "twist", "up", "twist_bias"]
+    names += [block.name for block in SHARED]
     body = layout.columns(name for name in names if name in layout)
     accuracy = 1e-9 if coordinates == "xyz" else 2e-8
     for k in range(len(world)):
@@ -399,7 +419,7 @@ def test_filter_with_shared_errors_equals_the_literal_one(variant, coordinates, 
         literal.update(ids[some], pixels[some])
         assert literal.ids == ekf.ids.tolist()
         columns = np.concatenate([body, np.arange(layout.body, len(ekf.P))])
-        own = zip(names[6:], literal.OWN, strict=True)
+        own = zip(names[7:], literal.OWN, strict=True)
         pairs = [(ekf.values[name], getattr(literal, value)) for name, value in own if name in layout]
         for ours, theirs in (
             *pairs,

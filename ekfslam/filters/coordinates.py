@@ -1,24 +1,21 @@
-"""Coordinates in which a correction acts on landmarks: eq. (7'), the image in the last updated camera.
+"""Coordinates in which a correction acts on landmarks: eq. (7'), the image in the view that was updated last.
 
 The error of a landmark seen once is Gaussian in the image (u, v, disparity), not in world. (x/z, y/z, 1/z), linear in
-that image, needs no intrinsics and no second camera. The camera must belong to an updated pose: a predicted one turns
-by degrees in the update, and images are not linear in that. Sources: Castellanos, Martinez-Cantin, Tardos, Neira,
-"Robocentric map joining", RAS 2007 (a clone of the last pose); Civera, Davison, Montiel, "Inverse depth
-parametrization for monocular SLAM", T-RO 2008.
+that image, needs no intrinsics and no second camera. The view must be an updated one: a predicted one turns by degrees
+in the update, and images are not linear in that. Sources: Castellanos, Martinez-Cantin, Tardos, Neira, "Robocentric map
+joining", RAS 2007 (a clone of the last pose); Civera, Davison, Montiel, "Inverse depth parametrization for monocular
+SLAM", T-RO 2008.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ekfslam import kernels
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import Values
-from ekfslam.models.model import Model
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
 
@@ -51,88 +48,75 @@ class Change:
 
 
 @dataclass(frozen=True)
-class View:
-    """Landmarks in the camera frame.
+class CameraPoints:
+    """Landmarks in the frame of a camera.
 
     Args:
         q: (n, 3) points.
         q_linear, R_linear: (n, 3), (3, 3) points and rotation from world at which derivatives are taken.
-        by_columns: (6, c) error of the camera's pose by columns of the body, ``dq = [I, -q^] by_columns x``.
     """
 
     q: Array
     q_linear: Array
     R_linear: Array
-    by_columns: Array
 
 
 @dataclass(frozen=True)
 class CameraCoordinates:
-    """Image coordinates of landmarks in the camera of a pose in the state.
+    """Image coordinates of landmarks in a view.
 
     A landmark counts by its position (x, y, z) in the camera frame instead if it is behind the camera, far off its axis
     or without disparity, or if a correction would change its disparity by too large a factor.
 
     Args:
-        model: Model of the filter.
-        pose: Name of the pose's block.
+        sensor: Sensor of the filter.
         min_depth_m: Depth below which a landmark is behind the camera.
     """
 
-    model: Model
-    pose: str
+    sensor: Sensor
     min_depth_m: float
 
-    def view(self, values: Values, positions_m: Array, T_linear: Array, linear_positions_m: Array) -> View:
-        """Return the view of landmarks (n, 3) in world; derivatives are at T_linear and other positions (FEJ)."""
-        calibration, T_cam_imu = self.model.observer.calibration, self._T_cam_imu(values)
-        by_columns = np.asarray(se3.adjoint(T_cam_imu), dtype=float)
-        if calibration is not None:
-            by_calibration = calibration.camera_by_extrinsic(values[calibration.name])
-            by_columns = np.concatenate([by_columns, by_calibration], axis=1)
-        q = q_linear = se3.apply(T_cam_imu @ values[self.pose], positions_m)
-        if T_linear is not values[self.pose]:
-            q_linear = se3.apply(T_cam_imu @ T_linear, linear_positions_m)
-        return View(q, q_linear, T_cam_imu[:3, :3] @ T_linear[:3, :3], by_columns)
-
-    def retract(self, before: View, after: Values, x: Array, d: Array) -> tuple[Array, BoolArray]:
+    def retract(self, before: CameraPoints, T_after: Array, z: Array, d: Array) -> tuple[Array, BoolArray]:
         """Return ``m+`` (n, 3) of eq. (7'), and whether (n,) each landmark counts by its image.
 
         Args:
-            before: View before the correction, with derivatives at the estimate.
-            after: Blocks after the correction.
-            x, d: (seen,), (n, 3) correction of the blocks and of the landmarks.
+            before: Points before the correction, with derivatives at the estimate.
+            T_after: (4, 4) ``T_cam_world`` after the correction.
+            z, d: (6,), (n, 3) correction of the view and of the landmarks.
         """
-        q, xi = before.q, before.by_columns @ x[self.columns]
-        step = xi[:3] + q @ se3.skew(xi[3:]).T + d @ before.R_linear.T
-        q_after, in_image = kernels.moved_by_image(
-            q, step, is_in_image(self.model.sensor, q, self.min_depth_m), LARGEST_FACTOR
-        )
-        return se3.apply(se3.inverse(self._T_cam_imu(after) @ after[self.pose]), q_after), in_image
+        q = before.q
+        step = z[:3] + q @ se3.skew(z[3:]).T + d @ before.R_linear.T
+        in_image = is_in_image(self.sensor, q, self.min_depth_m)
+        q_after, in_image = kernels.moved_by_image(q, step, in_image, LARGEST_FACTOR)
+        return se3.apply(se3.inverse(T_after), q_after), in_image
 
-    def change(self, slot: IntArray, before: View, after: View, in_image: BoolArray, turned: Array) -> Change:
-        """Return ``M`` and ``B`` of eq. (7') from the views before and after; ``turned`` is its D_p (6, 6)."""
-        by_after = after.by_columns.copy()
-        by_after[:, :6] = by_after[:, :6] @ turned
-        B, M = kernels.change_by_image(
-            (before.q, before.q_linear, before.R_linear, before.by_columns),
-            (after.q, after.q_linear, after.R_linear, by_after),
-            in_image,
-        )
-        return Change(slot, self.columns, B, M)
 
-    @cached_property
-    def columns(self) -> IntArray:
-        """Columns (c,) of pose and camera in the body."""
-        layout, calibration = self.model.layout, self.model.observer.calibration
-        columns = layout.columns([self.pose])
-        if calibration is None:
-            return columns
-        return np.concatenate([columns, layout[calibration.name].start + calibration.extrinsic])
+def points_in(T_cam_world: Array, positions_m: Array, T_linear: Array, linear_positions_m: Array) -> CameraPoints:
+    """Return landmarks (n, 3) in a camera (4, 4); derivatives are at T_linear and other positions (FEJ)."""
+    q = q_linear = se3.apply(T_cam_world, positions_m)
+    if T_linear is not T_cam_world:
+        q_linear = se3.apply(T_linear, linear_positions_m)
+    return CameraPoints(q, q_linear, T_linear[:3, :3])
 
-    def _T_cam_imu(self, values: Values) -> Array:
-        """Return the estimated extrinsics (4, 4)."""
-        return self.model.observer.sensor_at(self.model.observer.parameters(values)).T_cam_imu
+
+def change_in_view(
+    slot: IntArray, columns: IntArray, before: CameraPoints, after: CameraPoints, in_image: BoolArray, turned: Array
+) -> Change:
+    """Return ``M`` and ``B`` of eq. (7').
+
+    Args:
+        slot: (n,) slots of the landmarks.
+        columns: (6,) body columns of the view.
+        before, after: The landmarks before and after the correction.
+        in_image: (n,) whether they count by their images.
+        turned: (6, 6) D of eq. (7').
+    """
+    B, M = kernels.change_by_image(
+        (before.q, before.q_linear, before.R_linear, np.eye(6)),
+        (after.q, after.q_linear, after.R_linear, turned),
+        in_image,
+    )
+    return Change(slot, columns, B, M)
 
 
 def is_in_image(sensor: Sensor, q: Array, min_depth_m: float) -> BoolArray:

@@ -13,7 +13,7 @@ from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, So
 from ekfslam.filters.innovations import FrameInnovations, innovations_of
 from ekfslam.filters.observing import observe
 from ekfslam.filters.retraction import carried_back, parts, retracted
-from ekfslam.models.observer import Seen
+from ekfslam.models.observer import Projected
 from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, MOVING
 
 # Largest variance of an innovation, in those of the measurement, at which linearising still means anything.
@@ -124,7 +124,7 @@ def focal_lengths(rows: Rows) -> Array:
 
 
 def _gate_jointly(
-    e: Estimate, frame: int, tried: Projection, seen: Seen, some: IntArray, verdict: IntArray, gate: float
+    e: Estimate, frame: int, tried: Projection, seen: Projected, some: IntArray, verdict: IntArray, gate: float
 ) -> tuple[Solution, FrameInnovations]:
     """Solve eq. (6) for rows (j), and remove those that others reject; write their verdicts (k,)."""
     S = tried.variances + gates.diagonal(tried.rows.variance)
@@ -140,7 +140,7 @@ def _gate_jointly(
 
 
 def _gate_alone(
-    e: Estimate, frame: int, rows: Rows, seen: Seen, verdict: IntArray, gate: float
+    e: Estimate, frame: int, rows: Rows, seen: Projected, verdict: IntArray, gate: float
 ) -> tuple[IntArray, Projection, int]:
     """Return the landmarks (j,) that pass the gate by themselves, with ``H P H^T``; write verdicts on others.
 
@@ -171,7 +171,7 @@ def _gate_alone(
 
 
 def _gate_by_others(
-    e: Estimate, solution: Solution, left: Rows, S: Array, seen: Seen, some: IntArray, gate: float
+    e: Estimate, solution: Solution, left: Rows, S: Array, seen: Projected, some: IntArray, gate: float
 ) -> IntArray:
     """Return verdicts (j,) on ``some`` landmarks by all others, given the residuals ``left`` and prior S (j, d, d)."""
     verdict, judges_motion = np.full(len(some), ACCEPTED), _judges_motion(e) and e.model.process.estimates_velocity
@@ -197,7 +197,7 @@ def _judges_motion(e: Estimate) -> bool:
     return e.model.track_error is not None and e.motion.tau_s > 0
 
 
-def _motion(e: Estimate, seen: Seen, some: IntArray) -> Array:
+def _motion(e: Estimate, seen: Projected, some: IntArray) -> Array:
     """Return the derivative (j, d) of the rows by a motion of their landmarks along the last step of the rig."""
     return seen.H_m[some] @ (e.T_imu_world[:3, :3].T @ (e.imu_twist[:3] * e.motion.tau_s))
 
@@ -230,12 +230,12 @@ def _iterated(
 
 def relinearised(
     e: Estimate, at: Mean, solution: Solution, slot: IntArray, measured: Array
-) -> tuple[Mean, Array, Seen, Rows]:
+) -> tuple[Mean, Array, Projected, Rows]:
     """Return the mean and coordinates after a solution, and views and rows there in the prior's coordinates."""
     correction = solution.done.correction
     x, d = parts(e, correction)
     moved = retracted(e, correction)
     linear = replace(moved.mean, imu_twist=at.imu_twist)
-    seen, rows = observe(e, linear, slot, measured)
+    seen, rows = observe(e, linear, slot, measured, at)
     coordinates = e.coordinates + correction[: len(e.coordinates)]
     return linear, coordinates, seen, carried_back(e, rows, moved).corrected(-x, -d)

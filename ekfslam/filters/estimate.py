@@ -17,6 +17,7 @@ from ekfslam.filters.gaussian import Gaussian
 from ekfslam.filters.landmarks import LandmarkTable
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
+from ekfslam.models.blocks import PreviousView, View
 from ekfslam.models.build import has_image_coordinates
 from ekfslam.models.model import Model
 from ekfslam.models.sensors.base import Sensor
@@ -43,20 +44,22 @@ class Motion:
 
     Args:
         T_departed: (4, 4) ``T_imu_world`` before it.
-        T_predicted, T_predicted_before: (4, 4) predicted ``T_imu_world`` of this frame and of the one before.
+        T_predicted: (4, 4) predicted ``T_imu_world`` of this frame.
+        W_predicted, W_predicted_before: (4, 4) first estimates of the view of this frame and of that of the one before.
         interval: Inputs.
         way_m: Length of the way.
-        imu_twist_before: (6,) velocity of the IMU at the image before.
-        Q: (body, body) covariance of the noise that the process added.
+        T_cam_imu_before: (4, 4) extrinsics of the frame before, after its update: the view's for the pose.
+        Q: (body, body) covariance of the noise that the process added, to the view, too.
         last: (4, 4) motion over the interval before, ``T_departed = last T``, and its duration in s, if there was one.
     """
 
     T_departed: Array
     T_predicted: Array
-    T_predicted_before: Array
+    W_predicted: Array
+    W_predicted_before: Array
     interval: Interval
     way_m: Array
-    imu_twist_before: Array
+    T_cam_imu_before: Array
     Q: Array
     last: tuple[Array, float] | None = None
 
@@ -64,7 +67,8 @@ class Motion:
     def none(T_imu_world: Array) -> Motion:
         """Return the motion before the first prediction."""
         nowhere = Interval.of_one(np.zeros(6), 0.0)
-        return Motion(T_imu_world, T_imu_world, T_imu_world, nowhere, np.zeros(()), np.zeros(6), np.zeros((0, 0)))
+        T, one = T_imu_world, np.eye(4)
+        return Motion(T, T, one, one, nowhere, np.zeros(()), one, np.zeros((0, 0)))
 
     def doubted(self, doubt: float) -> Motion:
         """Return the motion with a factor of the inputs' standard deviations."""
@@ -84,7 +88,7 @@ class Estimate:
         config: Settings of the filter; the form ``auto`` of the covariance means ``dense``.
 
     Raises:
-        ConfigError: Landmarks in image coordinates, but no clone of the last pose in the model.
+        ConfigError: Landmarks in image coordinates, but no view in the model.
 
     Attributes:
         values: Estimate of every state block by name.
@@ -92,9 +96,9 @@ class Estimate:
         imu_twist: (6,) velocity of the IMU at the last frame, for a time offset, eq. (9).
         table: The active landmarks, in the order of their blocks in P.
         step: Number of predictions so far.
-        updated_pose: Block of the last updated pose: the pose itself between an update and the next prediction, then
-            its clone. None: the observations of the frame before have not updated it.
-        cameras: Image coordinates in the cameras of the pose and of its clone, eq. (7'); none with ``xyz``.
+        updated_view: Block of the last updated view: ``view`` between an update and the next prediction, then
+            ``previous_view``. None: the observations of the frame before have not updated it.
+        images: Image coordinates, eq. (7'); None with ``xyz``.
     """
 
     def __init__(self, model: Model, config: FilterConfig) -> None:
@@ -106,13 +110,12 @@ class Estimate:
         form = ConditionalGaussian if config.covariance_form == "conditional" else DenseGaussian
         self.gaussian: Gaussian = form(model.prior_covariance, model.layout.seen)
         self.motion, self.step = Motion.none(self.values["pose"]), 0
-        self.updated_pose: str | None = "pose"
-        self.cameras: dict[str, CameraCoordinates] = {}
+        self.updated_view: str | None = View.name
+        self.images: CameraCoordinates | None = None
         if has_image_coordinates(model.sensor, config.landmark_coordinates):
-            if not model.has_clone:
-                raise ConfigError("filter.landmark_coordinates: 'image' needs a clone of the pose, see model_of")
-            for name in ("pose", model.layout.clones["pose"]):
-                self.cameras[name] = CameraCoordinates(model, name, config.min_depth_m)
+            if not {View.name, PreviousView.name} <= model.layout.keys():
+                raise ConfigError("filter.landmark_coordinates: 'image' needs views, see model_of")
+            self.images = CameraCoordinates(model.sensor, config.min_depth_m)
 
     @property
     def mean(self) -> Mean:
@@ -123,7 +126,7 @@ class Estimate:
         """Return an estimate of the blocks alone, to look ahead with `ekfslam.filters.prediction.predict`."""
         alone, body = Estimate(self.model, self.config), self.model.layout.body
         alone.values, alone.coordinates, alone.imu_twist = self.values, self.coordinates, self.imu_twist
-        alone.motion, alone.step, alone.updated_pose = self.motion, self.step, self.updated_pose
+        alone.motion, alone.step, alone.updated_view = self.motion, self.step, self.updated_view
         alone.gaussian = DenseGaussian(self.gaussian.body_covariance[:body, :body], self.model.layout.seen)
         return alone
 

@@ -13,9 +13,11 @@ from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.innovations import FrameInnovations
 from ekfslam.filters.lifecycle import Retired
 from ekfslam.filters.logbook import LogBook
+from ekfslam.filters.observing import look_again
 from ekfslam.filters.reports import missed
 from ekfslam.filters.retraction import retract
 from ekfslam.filters.starting import Waiting, start
+from ekfslam.models.blocks import View
 from ekfslam.models.sensors.base import ACCEPTED, DISPARITY, MOVING, WAITING
 
 
@@ -85,9 +87,9 @@ def update(
     # 4. Start new landmarks, eq. (5), or let them wait.
     enter = start if waiting is None else waiting.start
     started = enter(e, log, frame, ids[new], rows[new])
-    if not found.dof:  # no update; but if every active landmark is new, its image coordinates refer to this pose
+    if not found.dof:  # no update; but if every active landmark is new, its image coordinates refer to this view
         first_step = e.table.first_step[e.table.asleep == 0]
-        e.updated_pose = "pose" if len(first_step) and (first_step == e.step).all() else None
+        e.updated_view = View.name if len(first_step) and (first_step == e.step).all() else None
     retired.start_again(ids[new][started])
     reason[np.flatnonzero(new)[~started]] = DISPARITY if waiting is None else WAITING
     return Outcome(reason, found.done.nis, found.done.log_det, found.dof, split, found.innovations)
@@ -100,11 +102,15 @@ def _take(e: Estimate, log: LogBook, found: Correction, frame: int) -> None:
         e.motion = e.motion.doubted(found.doubt)
     log.corrected(e, found)
     e.table.observed(found.slot, e.step, found.measured, log.last(len(found.slot)))
+    correction = found.done.correction
     if found.solution is not None:
         e.gaussian.apply(found.solution)
-    e.imu_twist = found.linear.imu_twist
-    retract(e, found.done.correction)
-    e.updated_pose = "pose" if found.dof else e.updated_pose
+    if e.model.observer.has_time_offset:  # the view as the corrected velocity has it
+        e.imu_twist = found.linear.imu_twist
+        if (E := look_again(e)) is not None:
+            correction = np.concatenate([E @ correction[: len(E)], correction[len(E) :]])
+    retract(e, correction)
+    e.updated_view = View.name if found.dof else e.updated_view
     e.table.accepted(found.slot, frame)
 
 

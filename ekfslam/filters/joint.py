@@ -21,13 +21,14 @@ from ekfslam.filters.frame import rest, update
 from ekfslam.filters.lifecycle import Marginal, Relinearised, Retired, Revival
 from ekfslam.filters.log import Log
 from ekfslam.filters.logbook import LogBook
+from ekfslam.filters.observing import look, look_again
 from ekfslam.filters.prediction import predict
 from ekfslam.filters.reports import FrameReport, log_density
 from ekfslam.filters.result import Landmarks, Parameters
 from ekfslam.filters.starting import Waiting
 from ekfslam.filters.variants import is_frozen_exactly
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import StateBlock
+from ekfslam.models.blocks import PreviousView, StateBlock
 from ekfslam.models.build import model_of
 from ekfslam.models.model import Model
 from ekfslam.models.process import Measured
@@ -78,6 +79,7 @@ class JointEKF(Estimate):
             model = model_of(sensor, sensor.noise, se3.inverse(T_world_imu), P_pose, calibration, blocks, coordinates)
         super().__init__(model, config)
         self.window = window(model, config) if config.lag and window is not None else None
+        look_again(self)
         self.revival, self.retired, self._revived = revival, Retired(), False
         self._log = LogBook(self)
         self._reported: list[Array] = []  # estimates and standard deviations (2, p) after each frame
@@ -88,6 +90,7 @@ class JointEKF(Estimate):
     def begin(self, inputs: Array) -> None:
         """Take the inputs (c,) at the first frame, for a time offset, eq. (9); no prediction leads to this frame."""
         self.imu_twist = self.model.process.begin(self.values, np.asarray(inputs, dtype=float))
+        look_again(self)
         self._log.amend(seen_twist=self.imu_twist)
 
     def predict(
@@ -151,8 +154,9 @@ class JointEKF(Estimate):
         if self.variant.first_estimates and not is_frozen_exactly(self.config):
             # All rows are linearised again: these are the first estimates from now on.
             self.table.initial_m = self.positions_m
-            clone = self.values[self.model.layout.clones["pose"]]
-            self.motion = replace(self.motion, T_predicted=self.T_imu_world, T_predicted_before=clone)
+            before = self.values.get(PreviousView.name, self.motion.W_predicted_before)
+            self.motion = replace(self.motion, T_predicted=self.T_imu_world, W_predicted_before=before)
+            look(self)
 
     def _relinearise(self, window: Relinearised) -> None:
         """Linearise the last frames again; after a map revival, they begin here."""
@@ -172,6 +176,7 @@ class JointEKF(Estimate):
         self.gaussian.start_over(found.P)
         self.coordinates = self.coordinates.copy()  # the log has those before
         self.coordinates[found.columns] = found.coordinates
+        look_again(self)
 
     def landmarks(self) -> Landmarks:
         """Return every landmark so far, in the order of landmark initialisation."""

@@ -2,7 +2,7 @@
 
 From it `ekfslam.smoother.posterior` rebuilds the posterior over *all* poses and landmarks. *Coordinates* (body,) of the
 state blocks are sums of corrections, in the columns of the layout: of a pose since its prediction; of a vector, its
-value.
+value; of a view, ``Y`` times those of its frame.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ class Log:
         seen_twist: (T, 6) velocity of the IMU for a time offset in the update, eq. (9).
         T_departed, T_predicted, T_updated: (T, 4, 4) ``T_imu_world`` before and after the prediction, and after the
             update.
-        T_linear, T_linear_before: (T, 4, 4) ``T_imu_world`` and its clone at which the update was linearised. They
-            differ from the prediction if the update was iterated or a landmark came back.
+        T_linear, T_linear_before: (T, 4, 4) ``T_imu_world`` of this frame and of the one before (as its view has it) at
+            which the update was linearised. They differ from the prediction if the update was iterated or a landmark
+            came back.
         departed: (T, body) coordinates before the process moved its own blocks; all others are of this frame.
         linear, updated: (T, body) coordinates at which the update was linearised, and after it.
         curved: (T, v) values at the prediction of blocks whose value is no sum of corrections.
@@ -68,6 +69,7 @@ class Log:
         position_m: (K, 3) landmark position of the linearisation, in world.
         measured_frame: (S,) frame of each scalar measurement of blocks by inputs.
         measured_axis, measured_value, measured_std, measured_is_biased: (S,) see `ekfslam.models.process.Measured`.
+        has_views: Whether coordinates have columns of views; older releases cloned pose and jitter instead.
     """
 
     first_estimates: bool = field(metadata=attribute(bool))
@@ -104,6 +106,7 @@ class Log:
     measured_value: Array = field(metadata=stored("measured", "of the component", "inputs"))
     measured_std: Array = field(metadata=stored("measured", "of the component", "inputs", NOT_NEGATIVE))
     measured_is_biased: BoolArray = field(metadata=stored("measured", "truth value", check=FLAGS))
+    has_views: bool = field(default=False, metadata=attribute(bool))
 
     @property
     def frames(self) -> int:

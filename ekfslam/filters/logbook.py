@@ -14,6 +14,8 @@ from ekfslam.filters.correction import Correction
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.log import Log
 from ekfslam.filters.prediction import Prediction
+from ekfslam.geometry import se3
+from ekfslam.models.blocks import PreviousView
 from ekfslam.models.process import Measured
 
 # Arrays over observations, pieces of inputs and measurements, by the one that holds their frames.
@@ -91,7 +93,9 @@ class LogBook:
         table, slot = now.table, found.slot
         follows = (table.last_step[slot] == now.step - 1) & (now.model.track_error is not None)
         previous = np.where(follows, table.last_observation[slot], -1)
-        linear, clone = found.linear, now.model.layout.clones.get("pose")
+        linear, T_before = found.linear, now.motion.T_departed
+        if (view := linear.values.get(PreviousView.name)) is not None and now.step:
+            T_before = se3.inverse(now.motion.T_cam_imu_before) @ view
         position_m = linear.position_m[slot]
         self._observed(now.step, table.log_row[slot], found.measured, found.variance, position_m, previous)
         self.amend(
@@ -99,7 +103,7 @@ class LogBook:
             seen_twist=linear.imu_twist,
             linear=found.coordinates.copy(),
             T_linear=linear.values["pose"],
-            T_linear_before=now.motion.T_departed if clone is None else linear.values[clone],
+            T_linear_before=T_before,
         )
 
     def started(self, ids: IntArray, positions_m: Array, *views: tuple[int, Array, Array]) -> IntArray:
@@ -133,6 +137,7 @@ class LogBook:
     def _log(self, first: int, arrays: dict[str, NDArray]) -> Log:
         return Log(
             first_estimates=self._first_estimates,
+            has_views=True,
             initial_covariance=self._initial_covariance,
             **{name: np.array([frame[name] for frame in self._frames[first:]]) for name in self._frames[0]},
             **arrays,

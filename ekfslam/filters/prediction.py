@@ -11,9 +11,11 @@ from ekfslam.data.interval import Interval
 from ekfslam.errors import ConfigError
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate, Motion
+from ekfslam.filters.observing import look
 from ekfslam.filters.reports import log_density
 from ekfslam.filters.retraction import retract
 from ekfslam.geometry import se3
+from ekfslam.models.blocks import PreviousView, View
 from ekfslam.models.model import Transition
 from ekfslam.models.process import Measured
 
@@ -49,9 +51,12 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     model, process = e.model, e.model.process
     if also is not None and not process.estimates_velocity:
         raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
-    way_m = process.way_m(e.values, interval)
+    way_m, T_cam_imu = process.way_m(e.values, interval), np.eye(4)
+    if View.name in model.layout:
+        T_cam_imu = e.values[View.name] @ se3.inverse(e.T_imu_world)
     # Clones and walking blocks, then the first or measured inputs, eq. (6).
     moved = model.wander(e.values, interval.tau_s, way_m)
+    e.updated_view = PreviousView.name if e.updated_view == View.name else None
     e.coordinates = e.coordinates.copy()  # the log has those after the update
     if moved is not None:
         e.coordinates, e.values = moved.Phi @ e.coordinates, moved.values
@@ -59,13 +64,18 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     # Eq. (1): the mean, and Phi and Q of eq. (2).
     step = model.step(e.values, interval, e.linear_T_imu_world, e.variant.first_estimates)
     whole = step if moved is None else step.after(moved)
-    e.gaussian.propagate(whole.Phi, whole.Q)
-    departed, T_departed = e.coordinates, e.T_imu_world
+    departed, T_departed, last = e.coordinates, e.T_imu_world, None
     e.coordinates, e.values = model.coordinates_after(step, departed), step.values
-    last = (T_departed @ se3.inverse(e.motion.T_departed), e.motion.tau_s) if e.motion.tau_s else None
-    e.motion = Motion(T_departed, e.T_imu_world, e.motion.T_predicted, interval, way_m, e.imu_twist, step.Q, last)
+    if e.motion.tau_s:
+        last = T_departed @ se3.inverse(e.motion.T_departed), e.motion.tau_s
+    W_before = e.motion.W_predicted
+    e.motion = Motion(T_departed, e.T_imu_world, W_before, W_before, interval, way_m, T_cam_imu, step.Q, last)
     e.imu_twist, e.step = step.imu_twist, e.step + 1
-    e.updated_pose = model.layout.clones.get("pose") if e.updated_pose == "pose" else None
+    # The view of this frame is where its camera is now.
+    if (E := look(e)) is not None:
+        whole = replace(whole, Phi=E @ whole.Phi, Q=E @ whole.Q @ E.T)
+        e.motion = replace(e.motion, Q=E @ step.Q @ E.T)
+    e.gaussian.propagate(whole.Phi, whole.Q)
     return Prediction(departed, measured, log_likelihood, doubt)
 
 

@@ -1,10 +1,10 @@
 """Equation (5): how new landmarks enter the state, at once or after waiting for a second view.
 
-*Delayed*: one clone of the pose, the anchor, serves all waiting tracks. Once the parallax from there suffices, both
+*Delayed*: one clone of the view, the anchor, serves all waiting tracks. Once the parallax from there suffices, both
 views of a landmark, ``r = H_x x + H_m d + n`` whitened, are split by the QR factorisation ``H_m = [Q_1 Q_2] [R; 0]``:
 
     d = R^-1 Q_1^T (r - H_x x - n)      initialises it, as eq. (5) does,
-    Q_2^T r = Q_2^T H_x x + Q_2^T n     is an ordinary measurement of pose and anchor.
+    Q_2^T r = Q_2^T H_x x + Q_2^T n     is an ordinary measurement of view and anchor.
 
 Source: Li and Mourikis, "Optimization-based estimator design for vision-aided inertial navigation", RSS 2012.
 """
@@ -17,11 +17,10 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.logbook import LogBook
-from ekfslam.filters.observing import moment
+from ekfslam.filters.observing import Present, present
 from ekfslam.filters.retraction import retract
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import Anchor
-from ekfslam.models.observer import Moment
 from ekfslam.models.sensors.base import DelayedSensor
 
 
@@ -37,14 +36,16 @@ def start(e: Estimate, log: LogBook, frame: int, ids: IntArray, rows: Array) -> 
     Returns:
         Whether (n,) each track is in front of the sensor and has a landmark now.
     """
-    error, now = e.model.track_error, moment(e, e.mean)
-    q, has_depth = e.model.observer.inverted(now, rows)
+    error, parameters = e.model.track_error, e.model.observer.parameters(e.values)
+    q, has_depth = e.model.observer.inverted(parameters, rows)
     ids, rows, q = ids[has_depth], rows[has_depth], q[has_depth]
     if len(ids):
         none = np.zeros(len(ids), dtype=np.int64)
         variance = e.sensor.variance(rows) if error is None else error.absolute_variance(none)
-        linear = now.linearised_at(e.variant.linear(now.T_imu_world, e.motion.T_predicted))
-        positions, G, covariance = e.model.observer.initialise(linear, q, variance)
+        now = present(e)
+        positions, G, covariance = e.model.observer.initialise(
+            parameters, now.T_cam_world, now.T_linear, now.by, q, variance
+        )
         e.gaussian.augment(G, covariance)
         _append(e, log, frame, ids, positions, rows, (e.step, rows, variance))
     return has_depth
@@ -61,7 +62,7 @@ class Waiting:
     def __init__(self, sensor: DelayedSensor, gate_probability: float) -> None:
         self._sensor, self._gate_probability = sensor, gate_probability
         self._ids, self._rows = np.empty(0, dtype=np.int64), np.empty((0, 0))
-        self._step, self._T_linear = 0, np.eye(4)
+        self._step, self._W_linear = 0, np.eye(4)
 
     def start(self, e: Estimate, log: LogBook, frame: int, ids: IntArray, rows: Array) -> BoolArray:
         """Append the landmarks that two views initialise; arguments and result as of the function `start`."""
@@ -96,25 +97,23 @@ class Waiting:
         """Return the new tracks (k,) with enough parallax, their rows (k, d) at the anchor, and positions (k, 3)."""
         which = np.flatnonzero(np.isin(ids, self._ids))
         then = self._rows[np.searchsorted(self._ids, ids[which])] if len(which) else np.empty((0, rows.shape[1]))
-        T_cam_world = e.sensor.T_cam_imu @ e.T_imu_world
-        T_now_anchor = T_cam_world @ se3.inverse(e.sensor.T_cam_imu @ e.values[Anchor.name])
+        T_cam_world = present(e).T_cam_world
+        T_now_anchor = T_cam_world @ se3.inverse(e.values[Anchor.name])
         q, is_ready = self._sensor.triangulate(then, rows[which], T_now_anchor)
         return which[is_ready], then[is_ready], se3.apply(se3.inverse(T_cam_world), q)[is_ready]
 
-    def _views(self, e: Estimate, position: Array, then: Array, now: Array) -> tuple[Array, Array, Array]:
+    def _views(self, e: Estimate, position: Array, then: Array, rows_now: Array) -> tuple[Array, Array, Array]:
         """Return whitened H_x (k, 2d, seen), H_m (k, 2d, 3) and r (k, 2d) of both views."""
-        T_anchor, present = e.values[Anchor.name], moment(e, e.mean)
-        T_linear = e.variant.linear(present.T_imu_world, e.motion.T_predicted)
-        anchor = Moment(T_anchor, e.variant.linear(T_anchor, self._T_linear), present.calibration, present.twist)
-        present = present.linearised_at(T_linear)
-        views = (
-            (e.model.observer.see(anchor, position, position, Anchor.name), then),
-            (e.model.observer.see(present, position, position), now),
-        )
+        observer, now, W = e.model.observer, present(e), e.values[Anchor.name]
+        by_anchor = np.zeros_like(now.by)
+        by_anchor[:, e.model.layout[Anchor.name]] = np.eye(6)
+        anchor = Present(W, e.variant.linear(W, self._W_linear), by_anchor)
         H_x, H_m, r = [], [], []
-        for seen, rows in views:
+        for camera, rows in ((anchor, then), (now, rows_now)):
+            parameters = observer.parameters(e.values)
+            seen = observer.project(parameters, camera.T_cam_world, position, camera.T_linear, position)
             scale = 1.0 / np.sqrt(e.sensor.variance(rows))
-            H_x.append(scale[..., None] * seen.H_x)
+            H_x.append(scale[..., None] * observer.by_body(seen, camera.by))
             H_m.append(scale[..., None] * seen.H_m)
             r.append(scale * (rows - seen.z))
         return np.concatenate(H_x, axis=1), np.concatenate(H_m, axis=1), np.concatenate(r, axis=1)
@@ -125,13 +124,12 @@ class Waiting:
         self._ids, self._rows = self._ids[still], self._rows[still]
         if len(self._ids) and e.step - self._step < self._sensor.patience:
             return
-        # All tracks start to wait again, from here: the anchor takes the pose's place.
-        layout = e.model.layout
-        Phi = np.eye(layout.body)
-        Phi[layout[Anchor.name], layout[Anchor.name]], Phi[layout[Anchor.name], layout["pose"]] = 0.0, np.eye(6)
+        # All tracks start to wait again, from here: the anchor takes the view's place.
+        now, at, Phi = present(e), e.model.layout[Anchor.name], np.eye(e.model.layout.body)
+        Phi[at], Phi[at, : e.gaussian.seen] = 0.0, now.by
         e.gaussian.propagate(Phi, np.zeros_like(Phi))
-        e.values = {**e.values, Anchor.name: e.T_imu_world}
-        self._ids, self._rows, self._step, self._T_linear = ids, rows, e.step, e.motion.T_predicted
+        e.values = {**e.values, Anchor.name: now.T_cam_world}
+        self._ids, self._rows, self._step, self._W_linear = ids, rows, e.step, now.T_linear
 
 
 def _append(

@@ -13,7 +13,7 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
 from ekfslam.filters.coordinates import Change
-from ekfslam.filters.gaussian import Gaussian, Rows
+from ekfslam.filters.gaussian import Gaussian
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import Values
 from ekfslam.models.model import Model
@@ -38,42 +38,32 @@ class Standard:
         """Return the linearisation point of a pose or of landmarks, given estimate and first estimate."""
         return first if self.first_estimates else estimate
 
-    def retract_landmarks(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> Array:
-        """Return ``m+ = m + d`` (n, 3) for ``T+ = exp(xi^) T``; pose and landmarks are those before the correction."""
+    def retract_landmarks(self, positions_m: Array, e_theta: Array, d: Array) -> Array:
+        """Return ``m+ = m + d`` (n, 3), given landmarks before the correction and its rotation (3,) of the world."""
         return positions_m + d
 
     def turned(self, before: Array, after: Array) -> Array:
-        """Return the matrix (6, 6) from the stored error of a pose before a correction to that after it: here I."""
+        """Return the matrix (6, 6) from the error of a pose or view before a correction to that after it: here I."""
         return np.eye(6)
 
     def derivative(self, before: Array, after: Array) -> Array:
         """Return the matrix (6, 6) for rows of an iterated update: the derivative of ``exp(xi^) T``."""
         return np.asarray(se3.left_jacobian(se3.log(after @ se3.inverse(before))), dtype=float)
 
-    def change(self, model: Model, before: Values, slot: IntArray, moved_m: Array) -> Change:
-        """Return the change of landmark errors in xyz by a correction that moved them by ``moved_m`` (n, 3): none."""
+    def change(self, T_cam_world: Array, by: Array, slot: IntArray, moved_m: Array) -> Change:
+        """Return the change of landmark errors in xyz by a correction that moved them by ``moved_m`` (n, 3): none.
+
+        The camera (4, 4) before the correction has an error with the derivative ``by`` (6, seen).
+        """
         return Change(slot, np.empty(0, dtype=np.int64), np.empty((len(moved_m), 3, 0)))
 
     def transport(
         self, gaussian: Gaussian, model: Model, before: Values, after: Values, changes: Iterable[Change]
     ) -> None:
-        """Re-express the covariance by ``P <- G P G^T``: G has the changes, and `turned` of each pose."""
+        """Re-express the covariance by ``P <- G P G^T``: G has the changes, and `turned` of pose and views."""
         for change in changes:
             if len(change.columns) and len(change.slot):
                 gaussian.transform_landmarks(change.slot, change.M, change.B, change.columns)
-
-    def carry_back(self, rows: Rows, model: Model, before: Values, after: Values, change: Change) -> Rows:
-        """Return rows taken at a corrected state in the errors before the correction, by the chain rule.
-
-        The change is that of the landmarks of the rows, with `derivative` for its pose.
-        """
-        H_x = rows.H_x.copy()
-        for name in model.layout.poses:
-            at = model.layout[name]
-            H_x[..., at] = H_x[..., at] @ self.derivative(before[name], after[name])
-        H_x[..., change.columns] += rows.H_m @ change.B
-        H_m = rows.H_m if change.M is None else rows.H_m @ change.M
-        return Rows(rows.slot, H_x, H_m, rows.residual, rows.variance)
 
     def landmark_error(self, m_hat: Array, m_true: Array, T_world_imu_hat: Array, T_world_imu_true: Array) -> Array:
         """Return the landmark errors d (..., 3) that P is about, given poses at the time of P; shapes broadcast."""
@@ -104,15 +94,14 @@ class Invariant(Standard):
     name = "invariant"
     is_frozen_exactly = False
 
-    def retract_landmarks(self, T_imu_world: Array, positions_m: Array, xi: Array, d: Array) -> Array:
+    def retract_landmarks(self, positions_m: Array, e_theta: Array, d: Array) -> Array:
         """Return ``m+`` (n, 3) of eq. (7): a rigid rotation of all landmarks, plus the remainder of each."""
-        e_theta = -T_imu_world[:3, :3].T @ xi[3:]
         e = d - positions_m @ se3.skew(e_theta).T
         R, J = se3.so3_exp_and_left_jacobian(e_theta)
         return positions_m @ R.T + e @ J.T
 
     def turned(self, before: Array, after: Array) -> Array:
-        """Return ``Ad(T+ T^-1)``, J of eq. (7) for a pose.
+        """Return ``Ad(T+ T^-1)``, J of eq. (7) for a pose or a view.
 
         It is not the derivative of the retraction: it keeps the *invariant* error. So ``G N(X) = N(X+)`` for the
         unobservable directions N, and rows carried back through G contain no information along them. The exact
@@ -122,24 +111,20 @@ class Invariant(Standard):
 
     derivative = turned
 
-    def change(self, model: Model, before: Values, slot: IntArray, moved_m: Array) -> Change:
-        """Return the change of landmark errors in xyz by the rotation of the pose, and of the camera if estimated."""
-        start = model.layout["pose"].start + 3
-        columns, by = np.arange(start, start + 3), se3.skew(moved_m) @ before["pose"][:3, :3].T
-        calibration = model.observer.calibration
-        if calibration is None or not len(calibration.turns_camera):
-            return Change(slot, columns, by)
-        by_camera = calibration.landmarks_by_rotation(
-            model.observer.rig, before[calibration.name], before["pose"], moved_m
-        )
-        columns = np.concatenate([columns, model.layout[calibration.name].start + calibration.turns_camera])
-        return Change(slot, columns, np.concatenate([by, by_camera], axis=-1))
+    def change(self, T_cam_world: Array, by: Array, slot: IntArray, moved_m: Array) -> Change:
+        """Return the change of landmark errors in xyz, ``d+ = d - moved^ e_theta`` with ``e_theta = -R_W^T z_theta``.
+
+        If camera and landmarks turn about it as one, images stay the same. So errors count with the camera's rotation;
+        in world the filter would learn that of its calibration from noise.
+        """
+        columns = np.flatnonzero(by[3:].any(axis=0))
+        return Change(slot, columns, se3.skew(moved_m) @ (T_cam_world[:3, :3].T @ by[3:, columns]))
 
     def transport(
         self, gaussian: Gaussian, model: Model, before: Values, after: Values, changes: Iterable[Change]
     ) -> None:
         super().transport(gaussian, model, before, after, changes)
-        for name in model.layout.poses:
+        for name in ("pose", *model.layout.views):
             gaussian.transform_body(model.layout[name], self.turned(before[name], after[name]))
 
     def landmark_error(self, m_hat: Array, m_true: Array, T_world_imu_hat: Array, T_world_imu_true: Array) -> Array:

@@ -7,8 +7,6 @@ from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as SequenceType
 from typing import Any
 
-import numpy as np
-
 from ekfslam.arrays import Array
 from ekfslam.config import CalibrationConfig, FilterConfig, LandmarkCoordinates, require_setting
 from ekfslam.data.inputs import InertialNoise
@@ -19,11 +17,11 @@ from ekfslam.models.blocks import (
     Anchor,
     Calibration,
     Pose,
-    Previous,
-    PreviousPose,
+    PreviousView,
     StateBlock,
     Twist,
     Up,
+    View,
 )
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.model import Model
@@ -53,7 +51,7 @@ def model_of(
         T_imu_world, covariance: (4, 4) first pose, and (6, 6) covariance of its error.
         calibration: Prior standard deviations of the calibration to estimate; None: it is not estimated.
         blocks: Further state blocks.
-        coordinates: Coordinates of landmarks; ``image`` needs the pose of the last updated camera in the state.
+        coordinates: Coordinates of landmarks; ``image`` needs views in the state.
         measures_twist: Whether velocities are measured, see `Twist`.
         make_process: The process that moves the blocks; its own blocks besides the pose are among ``blocks``.
 
@@ -71,8 +69,6 @@ def model_of(
     shared = [block for block in blocks if block.is_seen and block.per_frame]
     if shared and isinstance(sensor, DelayedSensor):
         raise ConfigError(f"{shared[0].name}: not with landmarks that wait for a second view")
-    if noise.track_error is not None:
-        chosen.extend(Previous(block) for block in shared if _is_seen_before(block))
     names = [block.name for block in chosen]
     if len(set(names)) < len(names):
         raise ConfigError(f"a state block is there twice: {', '.join(names)}")
@@ -82,20 +78,15 @@ def model_of(
 def _blocks_of(
     sensor: Sensor, noise: Noise, calibration: CalibrationConfig, coordinates: LandmarkCoordinates
 ) -> Iterator[StateBlock]:
-    """Yield the blocks that observations of landmarks need: the clone of the last pose, and the calibration."""
+    """Yield the blocks that observations of landmarks need: the views of two frames, and the calibration."""
     if noise.track_error is not None or has_image_coordinates(sensor, coordinates):
-        yield PreviousPose()
+        yield View()
+        yield PreviousView()
     std = prior_std(calibration)
     if std.any():
         if not isinstance(sensor, Rig):
             raise ConfigError(f"calibration: only a stereo rig has parameters to estimate, not {type(sensor).__name__}")
         yield Calibration(std)
-
-
-def _is_seen_before(block: StateBlock) -> bool:
-    """Return whether the view from the previous frame depends on a block."""
-    share = block.camera_share(np.ones(()), np.zeros((), dtype=bool))
-    return share is None or bool(share != 0)
 
 
 def has_image_coordinates(sensor: Sensor, coordinates: LandmarkCoordinates) -> bool:

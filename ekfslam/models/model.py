@@ -78,17 +78,6 @@ class Model:
         return self.noise.track_error
 
     @cached_property
-    def has_clone(self) -> bool:
-        """Whether the pose of the frame before is in the state."""
-        return "pose" in self.layout.clones
-
-    @cached_property
-    def clones(self) -> tuple[tuple[str, str], ...]:
-        """Clones of shared blocks, as pairs of names: the clone's and the block's."""
-        pairs = ((clone, name) for name, clone in self.layout.clones.items())
-        return tuple((clone, name) for clone, name in pairs if name != "pose")
-
-    @cached_property
     def wandering(self) -> tuple[StateBlock, ...]:
         """Blocks that change from frame to frame by themselves, in the order of their columns."""
         return tuple(block for block in self.layout.blocks if block.transition(0.0, 0.0) is not None)
@@ -141,14 +130,12 @@ class Model:
     # --- from one frame to the next -----------------------------------------------------------------------------------
 
     def wander(self, values: Values, tau_s: float, way_m: Array) -> Transition | None:
-        """Return the transition of walking blocks, and of clones of blocks that the process does not own, if any."""
-        own = self.process.own
-        clones = [(self.layout.clones[name], name) for name in self.layout.clones if name not in own]
-        if not clones and not self.wandering:
-            return None
+        """Return the transition of walking blocks, and of clones, if there are any."""
         layout, moved = self.layout, dict(values)
+        if not layout.clones and not self.wandering:
+            return None
         Phi, Q = np.eye(layout.body), np.zeros((layout.body, layout.body))
-        for clone, name in clones:
+        for name, clone in layout.clones.items():
             at, of = layout[clone], layout[name]
             Phi[at, at], Phi[at, of] = 0.0, np.eye(at.stop - at.start)
             moved[clone] = values[name]
@@ -161,34 +148,23 @@ class Model:
         return Transition(moved, Phi, Q)
 
     def step(self, values: Values, interval: Interval, T_linear: Array, first_estimates: bool) -> Transition:
-        """Return the step of the process, in which clones of its own blocks take their values.
-
-        Arguments are those of `Process.step`.
-        """
-        moved = self.widened(values, self.process.step(values, interval, T_linear, first_estimates))
-        for name in self.process.own:
-            if (clone := self.layout.clones.get(name)) is not None:
-                at = self.layout[clone]
-                moved.Phi[at, at], moved.Phi[at, self.layout[name]] = 0.0, np.eye(at.stop - at.start)
-                moved.values[clone] = values[name]
-        return moved
+        """Return the step of the process; arguments are those of `Process.step`."""
+        return self.widened(values, self.process.step(values, interval, T_linear, first_estimates))
 
     def coordinates_after(self, step: Transition, departed: Array) -> Array:
         """Return the coordinates (body,) after a step, given those before it.
 
-        Those of a pose count from its prediction: they start at 0. Those of other moved blocks are their values.
+        Those of the pose count from its prediction: they start at 0. Those of other moved blocks are their values.
         """
-        coordinates, layout = departed.copy(), self.layout
+        coordinates = departed.copy()
         for name in self.process.own:
-            coordinates[layout[name]] = 0.0 if name in layout.poses else step.values[name]
-            if (clone := layout.clones.get(name)) is not None:
-                coordinates[layout[clone]] = departed[layout[name]]
+            coordinates[self.layout[name]] = 0.0 if name == "pose" else step.values[name]
         return coordinates
 
     def widened(self, values: Values, step: Step) -> Transition:
         """Return a step of some blocks as a transition of all blocks."""
         Phi, Q = np.eye(self.layout.body), np.zeros((self.layout.body, self.layout.body))
-        if len(step.values) == 1:  # a view, and no index
+        if len(step.values) == 1:  # a slice, and no index
             at = self.layout[next(iter(step.values))]
             Phi[at], Q[at, at] = step.Phi, step.Q
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import cast
@@ -13,7 +12,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import Calibration, Layout, StateBlock, Values
 from ekfslam.models.blocks.calibration import TIME, calibrated, to_exposure
-from ekfslam.models.observation import linearise
+from ekfslam.models.observation import landmark_by_pose
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
 
@@ -41,15 +40,43 @@ class Moment:
     shared: Values = field(default_factory=dict)
     way_m: Array = field(default_factory=lambda: np.zeros(()))
 
-    def at(self, index: IntArray) -> Moment:
+    def at(self, index: IntArray | int) -> Moment:
         """Return the moments of observations, given the frame (n,) of each, from a moment of all frames."""
         shared = {name: value[index] for name, value in self.shared.items()}
         way = self.way_m[index] if self.way_m.ndim else self.way_m
         return Moment(self.T_imu_world[index], self.T_linear[index], self.calibration, self.twist[index], shared, way)
 
-    def linearised_at(self, T_linear: Array) -> Moment:
-        """Return the moment with its error linearised at another pose."""
-        return dataclasses.replace(self, T_linear=T_linear)
+
+@dataclass(frozen=True)
+class Camera:
+    """The camera of a frame: ``W = T_cam_imu T_imu_world``, with the error ``W_true = exp(z^) W``, ``z = by x``.
+
+    Args:
+        T_cam_imu: (..., 4, 4) extrinsics of that frame, with calibration, time offset and shared errors.
+        by: (..., 6, seen) Y, derivative of z by the leading columns of the layout.
+    """
+
+    T_cam_imu: Array
+    by: Array
+
+    def at(self, *index: IntArray | int) -> Camera:
+        """Return the cameras at indices of the leading dimensions."""
+        return Camera(self.T_cam_imu[index], self.by[index])
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Landmarks as projected into a camera in world: points ``q`` (n, 3), rows ``z`` (n, d), and Jacobians of the rows.
+
+    ``H_z`` (n, d, 6) is by the error of the camera, ``H_i`` (n, d, i) by the columns `Observer.intrinsic`, ``H_m``
+    (n, d, 3) by the landmark positions.
+    """
+
+    q: Array
+    z: Array
+    H_z: Array
+    H_i: Array
+    H_m: Array
 
 
 @dataclass(frozen=True)
@@ -92,9 +119,71 @@ class Observer:
         return tuple(block for block in self.layout.blocks if block.is_seen and block.per_frame and not block.is_pose)
 
     @cached_property
+    def intrinsic(self) -> IntArray:
+        """Columns (i,) of the layout that change rows while the camera stays where it is."""
+        calibration = self.calibration
+        if calibration is None:
+            return np.empty(0, dtype=np.int64)
+        return self.layout[calibration.name].start + calibration.intrinsic
+
+    # --- the camera in world ------------------------------------------------------------------------------------------
+
+    def camera(self, moment: Moment, is_difference: BoolArray | bool = False) -> Camera:
+        """Return the camera ``C D exp(o^)`` of a moment and its derivative, eq. (9) and (11).
+
+        ``C = exp(c^) T_cam_imu`` has the calibration, D leads to the exposure, o is the sum of the shares of blocks.
+
+        Args:
+            moment: Of one frame, or of several ones (...).
+            is_difference: (...) whether a difference of observations sees it, eq. (10), or a single one.
+        """
+        C, CD, offset, shares = self._parts(moment, is_difference)
+        T, layout = CD, self.layout
+        if offset is not None:
+            T = CD @ se3.exp(offset)
+        shape = np.broadcast_shapes(moment.T_imu_world.shape[:-2], T.shape[:-2], np.shape(is_difference))
+        by = np.zeros((*shape, 6, layout.seen))
+        by[..., layout["pose"]] = se3.adjoint(T)
+        if offset is not None:
+            by_offset = se3.adjoint(CD) @ se3.left_jacobian(offset)
+            for block, share in zip(self.moves_camera, shares, strict=True):
+                by[..., layout[block.name]] = share[..., None, None] * by_offset
+        if self.calibration is not None:
+            by[..., layout[self.calibration.name]] = self.calibration.camera_by(moment.calibration, C, moment.twist)
+        return Camera(np.broadcast_to(T, (*shape, 4, 4)), by)
+
+    def cameras(self, moment: Moment) -> Camera:
+        """Return the cameras (2, ...) of single observations and of differences."""
+        shape = moment.T_imu_world.shape[:-2]
+        if not self.has_drift:
+            one = self.camera(moment)
+            return Camera(*(np.broadcast_to(part, (2, *part.shape)) for part in (one.T_cam_imu, one.by)))
+        is_difference = np.array([False, True]).reshape(2, *(1 for _ in shape))
+        return self.camera(moment, np.broadcast_to(is_difference, (2, *shape)))
+
+    @cached_property
     def moves_camera(self) -> tuple[StateBlock, ...]:
         """Blocks that move the camera."""
         return tuple(block for block in self.layout.coupled("camera") if block in self.shared)
+
+    def _parts(self, moment: Moment, is_difference: BoolArray | bool) -> tuple[Array, Array, Array | None, list[Array]]:
+        """Return C, C D, o (..., 6) or None, and the shares (...) of blocks in o."""
+        C = CD = self.sensor_at(moment.calibration).T_cam_imu
+        if self.calibration is not None:
+            CD = C @ to_exposure(moment.calibration, moment.twist)
+        if not self.moves_camera:
+            return C, CD, None, []
+        shape = np.broadcast_shapes(np.shape(is_difference), np.shape(moment.way_m))
+        kind = np.broadcast_to(np.asarray(is_difference), shape)
+        shares = [np.asarray(block.camera_share(moment.way_m, kind)) for block in self.moves_camera]
+        parts = [s[..., None] * moment.shared[block.name] for s, block in zip(shares, self.moves_camera, strict=True)]
+        return C, CD, sum(parts[1:], parts[0]), shares
+
+    def points(self, moment: Moment, positions_m: Array, is_difference: BoolArray | bool = False) -> Array:
+        """Return landmarks (n, 3) in the frame of the sensor; moments are of one frame or of each landmark's."""
+        _, CD, offset, _ = self._parts(moment, is_difference)
+        T = moment.T_imu_world if offset is None else se3.exp(offset) @ moment.T_imu_world
+        return se3.apply(CD @ T, positions_m)
 
     @cached_property
     def has_drift(self) -> bool:
@@ -103,113 +192,97 @@ class Observer:
         differs = (block.camera_share(one, one > 0) != block.camera_share(one, one < 0) for block in self.moves_camera)
         return any(differs)
 
+    # --- landmarks ----------------------------------------------------------------------------------------------------
+
+    def project(
+        self,
+        parameters: Array,
+        T_cam_world: Array,
+        positions_m: Array,
+        T_linear: Array | None = None,
+        linear_positions_m: Array | None = None,
+    ) -> Projected:
+        """Return landmarks as a camera in world sees them, eq. (3) and (4).
+
+        Args:
+            parameters: (9,) calibration, of which the intrinsics count here.
+            T_cam_world, positions_m: (4, 4) or (n, 4, 4), (n, 3) the estimates, at which A is taken.
+            T_linear, linear_positions_m: Those for the rest of H: by default the estimates, or (FEJ) the first ones.
+        """
+        sensor, q = self.sensor_at(parameters), se3.apply(T_cam_world, positions_m)
+        A, q_linear = sensor.jacobian(q), q
+        if T_linear is None or linear_positions_m is None:
+            T_linear = T_cam_world
+        elif T_linear is not T_cam_world or linear_positions_m is not positions_m:
+            q_linear = se3.apply(T_linear, linear_positions_m)
+        H_z = np.concatenate([A, -A @ se3.skew(q_linear)], axis=-1)
+        H_i = np.empty((*A.shape[:-1], 0))
+        if self.calibration is not None:
+            assert isinstance(sensor, Rig)
+            H_i = self.calibration.rows_by_intrinsic(sensor, q)
+        return Projected(q, sensor.predict(q), H_z, H_i, A @ T_linear[..., :3, :3])
+
+    def by_body(self, seen: Projected, by: Array) -> Array:
+        """Return the rows' derivative H_x (n, d, seen), given that of the camera's error (6, seen) or (n, 6, seen)."""
+        H_x = seen.H_z @ by
+        H_x[..., self.intrinsic] += seen.H_i
+        return H_x
+
     def see(
         self,
         moment: Moment,
         positions_m: Array,
         linear_positions_m: Array,
-        pose: str = "pose",
-        is_difference: BoolArray | None = None,
+        is_difference: BoolArray | bool = False,
     ) -> Seen:
-        """Return landmarks (n, 3) as the sensor sees them, eq. (3), (4), (9) and (11).
+        """Return landmarks (n, 3) as the sensor sees them, by the blocks of their frame: eq. (3), (4), (9) and (11).
 
         Args:
-            positions_m, linear_positions_m: As in `ekfslam.models.observation.linearise`.
-            pose: Block whose columns the pose of the moment has: the pose, or a clone. With the clone of the previous
-                pose, shared blocks have the columns of their clones, too.
-            is_difference: (n,) whether observations are differences from the frame before; None: none is.
+            moment: Moment of their frame, or moments (n) of the frame of each.
+            positions_m, linear_positions_m: As of `project`.
+            is_difference: (n,) whether observations are differences from the frame before.
         """
-        layout, sensor = self.layout, self.sensor_at(moment.calibration)
-        T, T_linear, offset = moment.T_imu_world, moment.T_linear, None
-        if self.moves_camera:
-            offset, shares = self.camera_offset(moment, is_difference)
-            moved = se3.exp(offset)
-            T, T_linear = moved @ T, moved @ T_linear
-        if self.calibration is None:
-            q, H_pose, H_m = linearise(sensor, T, positions_m, T_linear, linear_positions_m)
-        else:
-            assert isinstance(sensor, Rig)
-            q, H_pose, H_c, H_m = self.calibration.linearise(
-                sensor, moment.calibration, moment.twist, T, positions_m, T_linear, linear_positions_m
-            )
-        if layout.seen == 6:
-            return Seen(q, sensor.predict(q), H_pose, H_m)
-        H_x = np.zeros((*H_pose.shape[:2], layout.seen))
-        H_x[..., layout[pose]] = H_pose if offset is None else H_pose @ se3.adjoint(moved)
-        if self.calibration is not None:
-            H_x[..., layout[self.calibration.name]] = H_c
-        if offset is not None:
-            H_offset = H_pose @ se3.left_jacobian(offset)
-            for block, share in zip(self.moves_camera, shares, strict=True):
-                if (at := self._columns_in(block, pose)) is not None:
-                    H_x[..., at] = share[..., None, None] * H_offset
-        return Seen(q, sensor.predict(q), H_x, H_m)
-
-    def _columns_in(self, block: StateBlock, pose: str) -> slice | None:
-        """Return the columns of a shared block in a view from a pose; None: the view does not depend on the block."""
-        if pose != self.layout.clones.get("pose"):
-            return self.layout[block.name]
-        clone = self.layout.clones.get(block.name)
-        return None if clone is None else self.layout[clone]
-
-    def camera_offset(self, moment: Moment, is_difference: BoolArray | None) -> tuple[Array, list[Array]]:
-        """Return the tangent by which shared blocks move the camera, and the share of each, eq. (11).
-
-        Shapes are (n, 6) and (n,) only where observations of one frame differ, and otherwise without n.
-        """
-        if is_difference is None or not self.has_drift or not is_difference.any():
-            is_difference = np.zeros(np.shape(moment.way_m), dtype=bool)
-        elif is_difference.all():
-            is_difference = np.ones(np.shape(moment.way_m), dtype=bool)
-        shares = [block.camera_share(moment.way_m, is_difference) for block in self.moves_camera]
-        parts = [
-            np.asarray(share)[..., None] * moment.shared[block.name]
-            for block, share in zip(self.moves_camera, shares, strict=True)
-        ]
-        return sum(parts[1:], parts[0]), [np.asarray(share) for share in shares]
-
-    def points(self, moment: Moment, positions_m: Array, is_difference: BoolArray | None = None) -> Array:
-        """Return landmarks (n, 3) in the frame of the sensor; arguments as of `see`."""
-        return se3.apply(self._T_cam_world(moment, is_difference), positions_m)
-
-    def _T_cam_world(self, moment: Moment, is_difference: BoolArray | None) -> Array:
-        T = moment.T_imu_world
-        if self.moves_camera:
-            T = se3.exp(self.camera_offset(moment, is_difference)[0]) @ T
-        if self.calibration is not None:
-            T = to_exposure(moment.calibration, moment.twist) @ T
-        return self.sensor_at(moment.calibration).T_cam_imu @ T
+        camera = self.camera(moment, is_difference)
+        W, W_linear = camera.T_cam_imu @ moment.T_imu_world, camera.T_cam_imu @ moment.T_linear
+        found = self.project(moment.calibration, W, positions_m, W_linear, linear_positions_m)
+        return Seen(found.q, found.z, self.by_body(found, camera.by), found.H_m)
 
     def predicted(self, moment: Moment, q: Array) -> Array:
         """Return the rows (n, d) of points (n, 3) in the frame of the sensor."""
         return self.sensor_at(moment.calibration).predict(q)
 
-    def inverted(self, moment: Moment, rows: Array) -> tuple[Array, BoolArray]:
+    def inverted(self, parameters: Array, rows: Array) -> tuple[Array, BoolArray]:
         """Return the points (n, 3) in the sensor's frame that rows (n, 3) see, and whether (n,) they have a depth.
 
         A calibrated sensor may see disparities below that of infinity, which `screen` of the given one accepts.
         """
-        sensor = self.sensor_at(moment.calibration)
+        sensor = self.sensor_at(parameters)
         q = sensor.invert(rows)
         if sensor is self.sensor:
             return q, np.ones(len(rows), dtype=bool)
         assert isinstance(sensor, Rig)
         return q, sensor.has_depth(q)
 
-    def initialise(self, moment: Moment, q: Array, variance: Array) -> tuple[Array, Array, Array]:
+    def initialise(
+        self, parameters: Array, T_cam_world: Array, T_linear: Array, by: Array, q: Array, variance: Array
+    ) -> tuple[Array, Array, Array]:
         """Return positions (n, 3) of new landmarks, G (n, 3, seen), and the measurement's part (n, 3, 3), eq. (5).
 
-        Rows stay the same, ``H_x x + H_m d = 0``, hence ``G = -H_m^-1 H_x``. The moment is that of the first
-        observations, q (n, 3) are points of `inverted`, and variance (n, 3) is that of the rows.
+        Rows stay the same, ``H_z z + H_i x + H_m d = 0``.
+
+        Args:
+            parameters, T_cam_world: (9,) calibration and (4, 4) camera of the first observations.
+            T_linear: (4, 4) camera at which G is taken: the same, or (FEJ) the predicted one.
+            by: (6, seen) derivative of the camera's error.
+            q: (n, 3) points of `inverted`.
+            variance: (n, 3) variance of the rows.
         """
-        positions = se3.apply(se3.inverse(self._T_cam_world(moment, None)), q)
-        here = self.see(moment.linearised_at(moment.T_imu_world), positions, positions)
+        positions = se3.apply(se3.inverse(T_cam_world), q)
+        here = self.project(parameters, T_cam_world, positions)
         by_rows = np.linalg.inv(here.H_m)
         covariance = (by_rows * variance[:, None, :]) @ by_rows.swapaxes(-1, -2)
-        G = -by_rows @ here.H_x
-        if moment.T_linear is not moment.T_imu_world:
-            pose, there = self.layout["pose"], self.see(moment, positions, positions)
-            G[..., pose] = -np.linalg.solve(there.H_m, there.H_x[..., pose])
+        G = landmark_by_pose(T_linear, positions) @ by
+        G[..., self.intrinsic] -= by_rows @ here.H_i
         return positions, G, 0.5 * (covariance + covariance.swapaxes(-1, -2))
 
     def sensor_at(self, parameters: Array) -> Sensor:

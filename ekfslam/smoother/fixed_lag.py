@@ -26,7 +26,7 @@ from ekfslam.smoother.optimise import better_start, evaluate
 from ekfslam.smoother.prior import Prior, first_of
 from ekfslam.smoother.problem import BatchProblem, Information, State
 from ekfslam.smoother.process import ProcessFactors
-from ekfslam.smoother.revival import filter_covariance
+from ekfslam.smoother.revival import marginal_of
 from ekfslam.smoother.sparse.dense import DenseInformation
 from ekfslam.smoother.sparse.factors import FirstFrame, LinearSystem
 from ekfslam.smoother.unknowns import Unknowns
@@ -93,7 +93,7 @@ class FixedLag:
         """
         if self.prior is None:
             self._begin()
-        u, problem = self.unknowns, WindowProblem(self, log, rows)
+        problem = WindowProblem(self, log, rows)
         try:
             state, system, solution = self._solved(problem, self._continued(e, log, rows))
         except IllPosedError:
@@ -101,8 +101,7 @@ class FixedLag:
             self.start_over(e)
             return None
         active = np.searchsorted(rows, e.table.log_row)
-        P = filter_covariance(self.model, u, solution, log.frames - 1, active)
-        marginal = Marginal(u.last_values(state), *u.last_coordinates(state), state.positions_m[active], P)
+        marginal = marginal_of(problem, state, solution, active)
         self._state, self._rows = state, rows
         self._solution, self._begins = solution, self.first
         if log.frames > (self.config.lag or 0):

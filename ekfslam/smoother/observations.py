@@ -13,8 +13,10 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.filters.log import Log
 from ekfslam.geometry import se3
+from ekfslam.models.blocks import PreviousView, View
 from ekfslam.models.model import Model
-from ekfslam.models.observer import GIVEN, Moment, Seen
+from ekfslam.models.observation import landmark_by_pose
+from ekfslam.models.observer import GIVEN, Camera, Moment, Projected
 from ekfslam.smoother.sparse.factors import Factor, Term
 from ekfslam.smoother.unknowns import State, Unknowns, split
 from ekfslam.smoother.views import Observed, Sight, Views, views_of_frame
@@ -36,7 +38,6 @@ class ObservationFactors:
         self._log, self._model, self._unknowns = log, model, unknowns
         self._way_m = log.way_m
         self._is_difference = log.previous >= 0
-        self._clone = model.layout.clones.get("pose", "pose")  # differences need the clone
         self._follows = np.flatnonzero(self._is_difference)
         self._previous = log.previous[self._follows]
         _, first = np.unique(log.landmark, return_index=True)
@@ -89,6 +90,12 @@ class ObservationFactors:
             factors.append(Factor(r, tuple(terms), observed.which))
         return [*factors, *self._near(state)]
 
+    def views(self, state: State) -> tuple[Array, Array]:
+        """Return the cameras ``T_cam_world`` (T, 4, 4) at a state, and their derivatives (T, 6, seen)."""
+        moments = self._moments(state)
+        camera = self._model.observer.camera(moments)
+        return camera.T_cam_imu @ moments.T_imu_world, camera.by
+
     def _moments(self, state: State) -> Moment:
         """Return the moments of all frames."""
         log, model, T = self._log, self._model, state.T_imu_world
@@ -114,112 +121,136 @@ class ObservationFactors:
         r = self.prior_weight * (self.first_position_m - state.positions_m)
         return [Factor(r, (Term("landmarks", landmarks, J),))]
 
-    def _whitened(self, H_x: Array, H_m: Array, r: Array) -> list[Factor]:
-        """Return the factors of single observations and of differences, from Jacobians and residuals (K, d, ...)."""
+    def _whitened(self, H_x: Array, H_before: Array, H_m: Array, r: Array) -> list[Factor]:
+        """Return the factors of single observations and of differences.
+
+        Args:
+            H_x: (K, d, seen) Jacobians by the blocks of the frame of each observation.
+            H_before: (j, d, seen) those of differences by the blocks of the frame before.
+            H_m, r: (K, d, 3), (K, d).
+        """
         log, u, scale = self._log, self._unknowns, 1.0 / np.sqrt(self._log.variance)
         observed, factors = u.drive_columns < H_x.shape[-1], []
+        drive = u.drive_columns[observed]
         for is_difference in (False, True):
             which = np.flatnonzero(self._is_difference == is_difference)
             if not len(which):
                 continue
             H, wide, n = H_x[which], scale[which][..., None], len(which)
             J_drive = np.zeros((*H.shape[:2], len(observed)))
-            J_drive[..., observed] = wide * H[..., u.drive_columns[observed]]
+            J_drive[..., observed] = wide * (H[..., drive] - H_before[..., drive] if is_difference else H[..., drive])
             terms = [
                 Term("frames", log.frame[which], wide * H[..., u.frame_columns]),
                 Term("drive", np.zeros(n, dtype=np.int64), J_drive),
                 Term("landmarks", log.landmark[which], wide * H_m[which]),
             ]
             if is_difference:
-                J_before = np.zeros((*H.shape[:2], u.width))
-                J_before[..., u.cloned] = wide * H[..., u.clone_columns]
-                terms.append(Term("frames", log.frame[which] - 1, J_before))
+                terms.append(Term("frames", log.frame[which] - 1, -wide * H_before[..., u.frame_columns]))
             factors.append(Factor(scale[which] * r[which], tuple(terms), which))
         return factors
 
     # --- as filtered --------------------------------------------------------------------------------------------------
 
+    @cached_property
+    def frozen_views(self) -> Camera:
+        """The cameras (T) of single observations where the filter predicted them."""
+        return self._cameras(self._log.departed).at(0)
+
     def frozen(self) -> list[Factor]:
         """Return the factors where the filter linearised them; residuals count from the coordinates of the log."""
         log, first, layout = self._log, self._is_first, self._model.layout
-        position, first_position = log.position_m, log.first_position_m[log.landmark]
+        k, position, first_position = log.frame, log.position_m, log.first_position_m[log.landmark]
         linear_position = first_position if log.first_estimates else position
         # A new landmark is initialised after the update of its frame; all others are linearised before it.
-        T = np.where(first[:, None, None], log.T_updated[log.frame], log.T_linear[log.frame])
-        x = np.where(first[:, None], log.updated[log.frame], log.linear[log.frame])
-        T_linear = T
-        if log.first_estimates:
-            T_linear = np.where(first[:, None, None], T, log.T_predicted[log.frame])
-        group = 2 * log.frame + first
-        seen = self._see(group, log.frame, T, T_linear, x, position, linear_position, "pose", self._is_difference)
-        H_x, H_m = seen.H_x, seen.H_m
-        if log.first_estimates:
-            # A new landmark follows the predicted pose.
-            frame, place = log.frame[first], first_position[first]
-            there = self._see(group[first], frame, T[first], log.T_predicted[frame], x[first], place, place)
-            H_x[first, :, layout["pose"]] = H_m[first] @ np.linalg.solve(there.H_m, there.H_x[..., layout["pose"]])
-        H_x = _carried_back(H_x, layout["pose"], log.T_linear, log.T_predicted, log.frame, ~first)
+        at = self._is_difference.astype(np.int64), k
+        updated, predicted = self._cameras(log.updated).at(0).at(k), self._cameras(log.departed).at(*at)
+        T_cam_imu = np.where(first[:, None, None], updated.T_cam_imu, self._cameras(log.linear).at(*at).T_cam_imu)
+        W = T_cam_imu @ np.where(first[:, None, None], log.T_updated[k], log.T_linear[k])
+        W_first, by = predicted.T_cam_imu @ log.T_predicted[k], predicted.by
+        by = _carried_back(W, W_first, ~first) @ by
+        if View.name not in layout:  # nothing remembers the prediction
+            by[first], W_first[first] = updated.by[first], (updated.T_cam_imu @ log.T_predicted[k])[first]
+        W_linear = np.where(first[:, None, None], W, T_cam_imu @ log.T_predicted[k]) if log.first_estimates else W
+        x = np.where(first[:, None], log.updated[k], log.linear[k])
+        seen = self._projected(2 * k + first, x, W, position, W_linear, linear_position)
+        if log.first_estimates:  # a new landmark follows the predicted camera
+            seen.H_z[first] = -seen.H_m[first] @ landmark_by_pose(W_first[first], first_position[first])
+        H_x, H_m = self._model.observer.by_body(seen, by), seen.H_m
         r = log.rows - seen.z + (H_x @ (x - log.departed[0])[:, : layout.seen, None])[..., 0]
+        H_before = H_x[:0]
         if len(self._follows):
-            self._subtract_frozen_before(H_x, H_m, r, x, linear_position)
+            H_before = self._subtract_frozen_before(H_m, r, x[self._follows], linear_position[self._follows])
         r += (H_m @ (position - first_position)[..., None])[..., 0]
-        return self._whitened(H_x, H_m, r)
+        return self._whitened(H_x, H_before, H_m, r)
 
-    def _subtract_frozen_before(self, H_x: Array, H_m: Array, r: Array, x: Array, linear_position: Array) -> None:
-        """Turn observations into differences, in place: the same landmarks from the clones of the frames before."""
-        log, follows, layout = self._log, self._follows, self._model.layout
-        frame = log.frame[follows]
-        T = log.T_linear_before[frame]
-        T_linear = log.T_predicted[frame - 1] if log.first_estimates else T
-        positions = log.position_m[follows], linear_position[follows]
-        before = self._see(frame, frame, T, T_linear, x[follows], *positions, self._clone)
-        B_x = _carried_back(before.H_x, layout[self._clone], log.T_linear_before, log.T_departed, frame)
-        shifted = (B_x @ (x[follows] - log.departed[0])[:, : layout.seen, None])[..., 0]
+    def _subtract_frozen_before(self, H_m: Array, r: Array, x: Array, linear_position: Array) -> Array:
+        """Turn observations into differences, in place; return their H (j, d, seen) by the frame before."""
+        log, follows, layout, observer = self._log, self._follows, self._model.layout, self._model.observer
+        k, view, start = log.frame[follows], layout[PreviousView.name], log.departed[0]
+        predicted, updated = self.frozen_views.at(k - 1), self._cameras(log.updated).at(0).at(k - 1)
+        W, W_updated = (updated.T_cam_imu @ T for T in (log.T_linear_before[k], log.T_updated[k - 1]))
+        z_updated = (predicted.by @ log.updated[k - 1, : layout.seen, None])[..., 0]
+        if log.has_views:
+            z, z_predicted = x[:, view], log.departed[k, view]
+        else:
+            z, z_predicted = z_updated + se3.log(W @ se3.inverse(W_updated)), z_updated
+        D = _carried_back(W, se3.exp(z_predicted - z_updated) @ W_updated)
+        W_linear = predicted.T_cam_imu @ log.T_predicted[k - 1] if log.first_estimates else W
+        before = self._projected(k, x, W, log.position_m[follows], W_linear, linear_position)
+        z -= (predicted.by @ start[: layout.seen, None])[..., 0]
+        shifted = (before.H_z @ D @ z[..., None])[..., 0]
+        shifted += (before.H_i @ (x - start)[:, observer.intrinsic, None])[..., 0]
         r[follows] -= log.rows[log.previous[follows]] - before.z + shifted
-        H_x[follows] -= B_x
         H_m[follows] -= before.H_m
+        return observer.by_body(before, D @ predicted.by)
 
-    def _see(
+    def _cameras(self, coordinates: Array) -> Camera:
+        """Return the cameras (2, T) of single observations and of differences, given the coordinates (T, body)."""
+        log, model, layout = self._log, self._model, self._model.layout
+        shared = {block.name: coordinates[:, layout[block.name]] for block in model.observer.shared}
+        moments = Moment(log.T_predicted, log.T_predicted, GIVEN, log.seen_twist, shared, self._way_m)
+        if model.observer.calibration is None:
+            return model.observer.cameras(moments)
+        found = [
+            model.observer.cameras(replace(moments.at(k), calibration=self._parameters(coordinates[k])))
+            for k in range(log.frames)
+        ]
+        T_cam_imu, by = (np.stack([getattr(camera, name) for camera in found], 1) for name in ("T_cam_imu", "by"))
+        return Camera(T_cam_imu, by)
+
+    def _parameters(self, coordinates: Array) -> Array:
+        """Return the calibration parameters (9,) at coordinates (body,)."""
+        calibration = self._model.observer.calibration
+        if calibration is None:
+            return GIVEN
+        return calibration.retract(calibration.initial(), coordinates[self._model.layout[calibration.name]])
+
+    def _projected(
         self,
         group: IntArray,
-        frame: IntArray,
-        T: Array,
-        T_linear: Array,
         coordinates: Array,
+        T_cam_world: Array,
         positions_m: Array,
+        T_linear: Array,
         linear_positions_m: Array,
-        pose: str = "pose",
-        is_difference: BoolArray | None = None,
-    ) -> Seen:
-        """Return landmarks (n, 3) as observed in frames (n,) from poses (n, 4, 4), given coordinates (n, body).
-
-        Coordinates of the drive's blocks are equal within a group (n,).
-        """
-        model, calibration, layout = self._model, self._model.observer.calibration, self._model.layout
-        twist, way_m = self._log.seen_twist[frame - (pose != "pose")], self._way_m[frame]
-        clones = layout.clones if pose == layout.clones.get("pose") else {}
-        shared = {
-            block.name: coordinates[:, layout[clones.get(block.name, block.name)]] for block in model.observer.shared
-        }
-        moment = Moment(T, T_linear, GIVEN, twist, shared, way_m)
-        if calibration is None:
-            return model.observer.see(moment, positions_m, linear_positions_m, pose, is_difference)
+    ) -> Projected:
+        """Return landmarks (n, 3) as cameras (n, 4, 4) see them, given coordinates (n, body), equal in a group (n,)."""
+        if self._model.observer.calibration is None:
+            return self._model.observer.project(GIVEN, T_cam_world, positions_m, T_linear, linear_positions_m)
         parts, order = [], np.argsort(group, kind="stable")
         for some in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-            found = calibration.retract(calibration.initial(), coordinates[some[0], layout[calibration.name]])
-            here = replace(moment.at(some), calibration=found)
-            differs = None if is_difference is None else is_difference[some]
-            parts.append(model.observer.see(here, positions_m[some], linear_positions_m[some], pose, differs))
+            arrays = (array[some] for array in (T_cam_world, positions_m, T_linear, linear_positions_m))
+            parts.append(self._model.observer.project(self._parameters(coordinates[some[0]]), *arrays))
         back = np.argsort(order, kind="stable")
-        return Seen(*(np.concatenate([getattr(part, field.name) for part in parts])[back] for field in fields(Seen)))
+        return Projected(
+            *(np.concatenate([getattr(part, field.name) for part in parts])[back] for field in fields(Projected))
+        )
 
 
-def _carried_back(
-    H_x: Array, at: slice, T_linear: Array, T_reference: Array, frame: IntArray, which: BoolArray | bool = True
-) -> Array:
-    """Return rows of iterated updates in the coordinates before the update, by the chain rule."""
+def _carried_back(T_linear: Array, T_reference: Array, which: BoolArray | bool = True) -> Array:
+    """Return the derivatives D (n, 6, 6) that carry rows at cameras (n, 4, 4) of iterated updates back, or I."""
     shift = se3.log(T_linear @ se3.inverse(T_reference))
-    moved = np.any(np.abs(shift) > 1e-12, axis=1)[frame] & which
-    if moved.any():
-        H_x[moved, :, at] = H_x[moved, :, at] @ se3.left_jacobian(shift[frame[moved]])
-    return H_x
+    moved = np.any(np.abs(shift) > 1e-12, axis=1) & which
+    D = np.broadcast_to(np.eye(6), (len(shift), 6, 6)).copy()
+    D[moved] = se3.left_jacobian(shift[moved])
+    return D

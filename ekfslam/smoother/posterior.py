@@ -215,9 +215,10 @@ def posterior(result: Result, config: PosteriorConfig | None = None) -> Posterio
     if result.log is None:
         raise PosteriorError(f"{result.sequence_name}: a result of mode {result.mode!r} has no log; run mode 'full'")
     stored = _config_of(result)
+    model = model_of_result(result)
     return posterior_of_log(
-        result.log,
-        model_of_result(result),
+        in_layout(result.log, model),
+        model,
         result.landmarks.position_m,
         config or stored.posterior,
         stored.filter.min_depth_m,
@@ -255,18 +256,51 @@ def model_of_result(result: Result) -> Model:
     blocks, process = blocks_and_process(stored.blocks, densities)
     coordinates = stored.filter.landmark_coordinates
     model = model_of(rig, result.noise, *start, stored.calibration, blocks, coordinates, make_process=process)
-    if model.layout.body == log.departed.shape[1] and len(log.initial_covariance) in (6, model.layout.body):
+    if (body := len(_columns_of(log, model))) == log.departed.shape[1] and len(log.initial_covariance) in (6, body):
         return model
     if not log.departed.shape[1] == len(log.initial_covariance) == 6:
         raise PosteriorError(
             f"{result.sequence_name}: the log has {log.departed.shape[1]} coordinates of state blocks, expected "
-            f"{model.layout.body} by its configuration"
+            f"{body} by its configuration"
         )
     # Archives before format version 4 know of poses alone: velocities are white there, and so are pixels.
     noise = dataclasses.replace(
         result.noise, twist_walk_std=None, tilt_rad=0.0, track_first_px=None, track_walk_px=None
     )
     return model_of(dataclasses.replace(rig, noise=noise), noise, *start, coordinates="xyz")
+
+
+def _columns_of(log: Log, model: Model) -> IntArray:
+    """Return the columns (b,) of the layout that a log's coordinates have; -1: none, a clone of an older release."""
+    layout = model.layout
+    if log.has_views or not layout.views:
+        return np.arange(layout.body)
+    blocks = [block for block in layout.blocks if not block.is_view]
+    seen, rest = ([block.name for block in blocks if block.is_seen is is_seen] for is_seen in (True, False))
+    is_cloned = model.track_error is not None and "camera_jitter" in seen
+    jitter = np.full(6 * is_cloned, -1)
+    return np.concatenate(
+        [layout.columns(["pose"]), np.full(6, -1), layout.columns(seen[1:]), jitter, layout.columns(rest)]
+    )
+
+
+def in_layout(log: Log, model: Model) -> Log:
+    """Return a log with the coordinates of a model: older releases cloned pose and jitter, and had no views."""
+    columns = _columns_of(log, model)
+    if log.has_views or not model.layout.views:
+        return log
+    kept = np.flatnonzero(columns >= 0)
+
+    def wide(array: Array) -> Array:
+        found = np.zeros((len(array), model.layout.body))
+        found[:, columns[kept]] = array[:, kept]
+        return found
+
+    initial = log.initial_covariance
+    if len(initial) > 6:
+        initial = wide(wide(initial).T)
+    departed, linear, updated = wide(log.departed), wide(log.linear), wide(log.updated)
+    return dataclasses.replace(log, initial_covariance=initial, departed=departed, linear=linear, updated=updated)
 
 
 def _config_of(result: Result) -> Config:

@@ -35,7 +35,7 @@ class ProcessFactors:
         start = 0
         for name in self._model.process.own:
             size = layout[name].stop - layout[name].start
-            if name not in layout.poses:  # coordinates of poses count from the prediction
+            if name != "pose":  # its coordinates count from the prediction
                 error[:, start : start + size] -= self._predicted.values[name]
             start += size
         by_before, by_after = np.zeros((2, *Phi.shape))

@@ -16,6 +16,7 @@ from ekfslam.config import FilterConfig, PosteriorConfig
 from ekfslam.filters.lifecycle import Marginal
 from ekfslam.filters.log import Log
 from ekfslam.filters.variants import is_frozen_exactly
+from ekfslam.models.blocks import PreviousView, View
 from ekfslam.models.model import Model
 from ekfslam.smoother.optimise import MOST_ITERATIONS, maximise
 from ekfslam.smoother.problem import BatchProblem, State
@@ -76,38 +77,56 @@ class MapRevival:
             # The blocks' mean is the filter's already, but for rounding.
             positions = log.first_position_m[landmarks] + information.d[landmarks]
             none = np.empty(0, dtype=np.int64)
-            P = filter_covariance(self._model, problem.unknowns, information, log.frames - 1, landmarks)
+            by = problem.observations.frozen_views.by
+            P = filter_covariance(self._model, problem.unknowns, information, log.frames - 1, landmarks, by)
             return Marginal({}, none, np.empty(0), positions, P)
         start = problem.filtered_state(positions_m)
         if self._last is not None:
             start = continued(self._last, start, log)
         found, _, information = maximise(problem, start, _MAXIMUM, self._config.min_depth_m, range(MOST_ITERATIONS))
-        self._last = state = found.state
-        return Marginal(
-            problem.unknowns.last_values(state),
-            *problem.unknowns.last_coordinates(state),
-            state.positions_m[landmarks],
-            filter_covariance(self._model, problem.unknowns, information, log.frames - 1, landmarks),
-        )
+        self._last = found.state
+        return marginal_of(problem, found.state, information, landmarks)
+
+
+def marginal_of(
+    problem: BatchProblem, state: State, information: JointInformation | DenseInformation, landmarks: IntArray
+) -> Marginal:
+    """Return the marginal of the last frame and of some landmarks (n,) at a solution."""
+    model, u, last = problem.model, problem.unknowns, len(state.T_imu_world) - 1
+    W, by = problem.observations.views(state)
+    values = u.last_values(state)
+    if PreviousView.name in model.layout and last:
+        values[PreviousView.name] = W[-2]
+    P = filter_covariance(model, u, information, last, landmarks, by)
+    return Marginal(values, *u.last_coordinates(state), state.positions_m[landmarks], P)
 
 
 def filter_covariance(
-    model: Model, u: Unknowns, information: JointInformation | DenseInformation, last: int, landmarks: IntArray
+    model: Model,
+    u: Unknowns,
+    information: JointInformation | DenseInformation,
+    last: int,
+    landmarks: IntArray,
+    by: Array,
 ) -> Array:
-    """Return the covariance (body+3n, body+3n) of the last frame and of landmarks (n,) in the columns of the filter."""
-    has_clone = model.has_clone and last > 0
-    frames = [last, last - 1] if has_clone else [last]
+    """Return the covariance (body+3n, body+3n) of the last frame and of landmarks (n,) in the columns of the filter.
+
+    Views are functions ``z = Y x`` of their frames, with Y = ``by`` (T, 6, seen).
+    """
+    layout, n = model.layout, len(landmarks)
+    frames = [last, last - 1] if PreviousView.name in layout and last else [last]
     P = information.covariance(frames=frames, aux=[last], drive=[0], landmarks=landmarks)
-    # Of the frame before only what is cloned counts.
-    before, of_clones = (u.cloned, u.clone_columns) if has_clone else (np.empty(0, dtype=np.int64),) * 2
-    rest = np.arange(u.width * len(frames), len(P))
-    kept = np.concatenate([np.arange(u.width), u.width + before, rest])
-    columns = np.concatenate([u.frame_columns, of_clones, u.aux_columns, u.drive_columns])
-    body = model.layout.body
-    order = np.concatenate([columns, body + np.arange(3 * len(landmarks))])
-    wide = np.zeros((body + 3 * len(landmarks),) * 2)
-    wide[np.ix_(order, order)] = P[np.ix_(kept, kept)]
-    return wide
+    width, drive = u.width * len(frames), u.drive_columns < layout.seen
+    columns = np.concatenate([u.frame_columns, u.aux_columns, u.drive_columns, layout.body + np.arange(3 * n)])
+    E = np.zeros((layout.body + 3 * n, len(P)))
+    E[columns, np.concatenate([np.arange(u.width), np.arange(width, len(P))])] = 1.0
+    of_drive = width + len(u.aux_columns) + np.flatnonzero(drive)
+    for i, name in enumerate([View.name, PreviousView.name][: len(frames)]):
+        if name in layout:
+            at, Y = layout[name], by[frames[i]]
+            E[at, i * u.width : (i + 1) * u.width] = Y[:, u.frame_columns]
+            E[at, of_drive] = Y[:, u.drive_columns[drive]]
+    return np.asarray(E @ P @ E.T, dtype=float)
 
 
 def continued(last: State, state: State, log: Log) -> State:

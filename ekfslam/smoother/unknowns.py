@@ -53,15 +53,13 @@ class Unknowns:
         shared_mean, aux_mean: (w-6,), (a,) prior means of the first frame's blocks.
         drive_covariance: (g, g) prior covariance of the drive's blocks.
         B: (w+a, w+a) root of the first frame's covariance, see `FirstFrame`.
-        cloned, clone_columns: Columns (c,) of a frame with clones in the filter, and the layout's columns of these.
     """
 
     def __init__(self, model: Model, initial_covariance: Array, mean: Array) -> None:
         layout = model.layout
         self.shared: Sequence[StateBlock] = model.observer.shared
         self.aux = [block for block in layout.blocks if block.per_frame and not block.is_seen]
-        of_drive = (block for block in layout.blocks if not block.per_frame and not block.clones)
-        self.of_drive = [block for block in of_drive if not block.is_pose]
+        self.of_drive = [block for block in layout.blocks if not (block.per_frame or block.is_view)]
         self.frame_columns = layout.columns(["pose", *(block.name for block in self.shared)])
         self.aux_columns = layout.columns(block.name for block in self.aux)
         self.drive_columns = layout.columns(block.name for block in self.of_drive)
@@ -75,11 +73,6 @@ class Unknowns:
         self.drive_covariance = covariance[np.ix_(self.drive_columns, self.drive_columns)]
         if covariance[np.ix_(first, self.drive_columns)].any():
             raise PosteriorError("the prior couples blocks of the drive with blocks of the first frame")
-        at = {column: i for i, column in enumerate(self.frame_columns.tolist())}
-        names = [name for name in layout.clones if name == "pose" or layout[name].start in at]
-        self.clone_columns = layout.columns(layout.clones[name] for name in names)
-        self.cloned = np.array([at[column] for column in layout.columns(names).tolist()], dtype=np.int64)
-        self._clones, self._previous_pose = model.clones, layout.clones.get("pose")
 
     def first_frame(self, zeta: Array) -> FirstFrame:
         """Return the prior of the first frame, linearised at zeta (w+a,)."""
@@ -104,25 +97,15 @@ class Unknowns:
         return {**self.values(state), **of_drive, "pose": state.T_imu_world}
 
     def last_values(self, state: State) -> dict[str, Array]:
-        """Return the values of a filter's blocks at the last frame."""
+        """Return the values of a filter's blocks but views at the last frame."""
         of_frames = split(self.shared, state.shared) | split(self.aux, state.aux)
         values = dict(state.drive_values) | {name: value[-1] for name, value in of_frames.items()}
-        values["pose"] = state.T_imu_world[-1]
-        if len(state.T_imu_world) > 1:
-            values |= {clone: of_frames[name][-2] for clone, name in self._clones}
-            if self._previous_pose is not None:
-                values[self._previous_pose] = state.T_imu_world[-2]
-        return values
+        return {**values, "pose": state.T_imu_world[-1]}
 
     def last_coordinates(self, state: State) -> tuple[IntArray, Array]:
-        """Return the columns (c,) of all blocks but poses, and their coordinates at the last frame."""
-        of_shared = self.cloned >= 6
-        columns = [self.aux_columns, self.drive_columns, self.frame_columns[6:]]
-        parts = [state.aux[-1], state.drive, state.shared[-1]]
-        if of_shared.any() and len(state.shared) > 1:
-            columns.append(self.clone_columns[of_shared])
-            parts.append(state.shared[-2, self.cloned[of_shared] - 6])
-        return np.concatenate(columns), np.concatenate(parts)
+        """Return the columns (c,) of all blocks but pose and views, and their coordinates at the last frame."""
+        columns = np.concatenate([self.aux_columns, self.drive_columns, self.frame_columns[6:]])
+        return columns, np.concatenate([state.aux[-1], state.drive, state.shared[-1]])
 
 
 def split(blocks: Sequence[StateBlock], array: Array) -> dict[str, Array]:

@@ -1,7 +1,6 @@
 """Cameras of all frames at a state, and how their errors follow from the unknowns: the only way to landmarks.
 
-A camera is ``W = C(c) D(c_time) exp(o^) T_imu_world`` with extrinsics C, motion to the exposure D, and the offset o of
-blocks that move the camera, eq. (9) and (11). Its error z, ``W_true = exp(z^) W``, is linear in those of the unknowns.
+The error z of a camera, ``W_true = exp(z^) W``, is linear in those of the unknowns (`ekfslam.models.observer.Camera`).
 A difference of observations, eq. (10), may see the present frame through another camera than a single observation.
 """
 
@@ -14,9 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
-from ekfslam.geometry import se3
-from ekfslam.models.blocks import Calibration
-from ekfslam.models.blocks.calibration import TIME, to_exposure
+from ekfslam.models.blocks import StateBlock
 from ekfslam.models.observer import Moment, Observer
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.stereo import Rig
@@ -49,34 +46,22 @@ class Views:
     @staticmethod
     def of(observer: Observer, unknowns: Unknowns, moment: Moment) -> Views:
         """Return the views at the moments of all frames."""
-        sensor, kinds, w = observer.sensor_at(moment.calibration), range(views_of_frame(observer)), unknowns.width
-        T_body, frames = np.broadcast_to(sensor.T_cam_imu, moment.T_imu_world.shape), len(moment.T_imu_world)
-        if observer.calibration is not None:
-            T_body = T_body @ to_exposure(moment.calibration, moment.twist)
-        turn, columns = se3.adjoint(T_body), _columns(unknowns)
-        T, by_frame = np.empty((frames, len(kinds), 4, 4)), np.zeros((frames, len(kinds), 6, w))
-        of_kinds = []
-        for kind in kinds:
-            T[:, kind], by_frame[:, kind, :, :6] = T_body @ moment.T_imu_world, turn
-            if observer.moves_camera:
-                offset, shares = observer.camera_offset(moment, np.full(frames, bool(kind)))
-                moved = se3.exp(offset)
-                T[:, kind], by_offset = T_body @ moved @ moment.T_imu_world, turn @ se3.left_jacobian(offset)
-                by_frame[:, kind, :, :6] = turn @ se3.adjoint(moved)
-                for block, share in zip(observer.moves_camera, shares, strict=True):
-                    by_frame[:, kind, :, columns[block.name]] = share[:, None, None] * by_offset
-                of_kinds.append(shares)
-        seen = np.arange(6) if len(kinds) == 1 else np.arange(w)
-        if len(kinds) == 2:
-            apart = [np.abs(one - other).min() for one, other in zip(*of_kinds, strict=True)]
+        kinds, shape = views_of_frame(observer), moment.T_imu_world.shape[:-2]
+        found = observer.cameras(moment)
+        T = (found.T_cam_imu[:kinds] @ moment.T_imu_world).swapaxes(0, 1)
+        by, free = found.by[:kinds].swapaxes(0, 1), unknowns.drive_columns < found.by.shape[-1]
+        by_frame = by[..., unknowns.frame_columns].reshape(*shape, 6 * kinds, unknowns.width)
+        by_drive = np.zeros((*by.shape[:-1], len(free)))
+        by_drive[..., free] = by[..., unknowns.drive_columns[free]]
+        seen = np.arange(6 if kinds == 1 else unknowns.width)
+        if kinds == 2:
+            apart = [_apart(block, moment) for block in observer.moves_camera]
             if max(apart) > 0:
-                own = columns[observer.moves_camera[int(np.argmax(apart))].name]
+                own = _columns(unknowns)[observer.moves_camera[int(np.argmax(apart))].name]
                 seen = np.concatenate([np.arange(6), np.arange(own.start, own.stop)])
-        place, by_drive = _drive_place(observer, unknowns), np.zeros((frames, 6, len(unknowns.drive_columns)))
-        if observer.calibration is not None:
-            _add_calibration(by_drive, observer.calibration, sensor, place, moment)
-        by_drive = np.repeat(by_drive, len(kinds), axis=0)
-        return Views(observer, sensor, T.reshape(-1, 4, 4), by_frame.reshape(frames, -1, w), by_drive, place, seen)
+        sensor, place = observer.sensor_at(moment.calibration), _drive_place(observer, unknowns)
+        by_drive = by_drive.reshape(np.prod(by.shape[:2]), 6, len(free))
+        return Views(observer, sensor, T.reshape(-1, 4, 4), by_frame, by_drive, place, seen)
 
     @property
     def rig(self) -> Rig:
@@ -191,10 +176,9 @@ class Sight:
         o, views, calibration = self.batches[kind], self.views, self.views.observer.calibration
         J = sum((of @ views.by_drive[view] for of, view in zip(by_views, o.views, strict=True)), np.zeros(()))
         if calibration is not None and len(calibration.intrinsic):
-            own, parameters = views.drive_place[calibration.intrinsic], calibration.free[calibration.intrinsic] - 6
+            own = views.drive_place[calibration.intrinsic]
             for q, sign in zip(self._q[kind], (1.0, -1.0), strict=False):
-                of_both = sign * o.scale[..., None] * calibration.by_intrinsics(views.rig, q)
-                J[..., own] += of_both[..., parameters]
+                J[..., own] += sign * o.scale[..., None] * calibration.rows_by_intrinsic(views.rig, q)
         return J
 
     def only(self, landmarks: BoolArray, positions_m: Array) -> Sight:
@@ -224,19 +208,16 @@ def _columns(unknowns: Unknowns) -> dict[str, slice]:
     return {b.name: slice(end - b.size, end) for b, end in zip(unknowns.shared, ends.tolist(), strict=True)}
 
 
+def _apart(block: StateBlock, moment: Moment) -> float:
+    """Return the least difference between the shares of a block in the two views of a frame."""
+    shape = np.shape(moment.way_m)
+    one, other = (block.camera_share(moment.way_m, np.full(shape, kind)) for kind in (False, True))
+    return 0.0 if one is None or other is None else float(np.abs(other - one).min())
+
+
 def _drive_place(observer: Observer, unknowns: Unknowns) -> IntArray:
     """Return the places of the calibration's columns among those of the drive."""
     if observer.calibration is None:
         return np.empty(0, dtype=np.int64)
     at = observer.layout[observer.calibration.name]
     return np.searchsorted(unknowns.drive_columns, np.arange(at.start, at.stop))
-
-
-def _add_calibration(
-    by_drive: Array, calibration: Calibration, sensor: Sensor, place: IntArray, moment: Moment
-) -> None:
-    """Add the derivative of the errors of all cameras by extrinsics and time offset."""
-    by_drive[..., place[calibration.extrinsic]] = calibration.camera_by_extrinsic(moment.calibration)
-    if (calibration.free == TIME).any():
-        delayed = -(moment.twist @ se3.adjoint(sensor.T_cam_imu).T)
-        by_drive[..., place[calibration.free == TIME]] = delayed[..., None]

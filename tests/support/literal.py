@@ -75,7 +75,12 @@ def camera_pose(T, c, u, T_cam_imu):
 
 def seen_rows(T, c, u, m, camera=CAMERA, T_cam_imu=T_CAM_IMU):
     """Rows (uL, v, uR) that a rig with calibration parameters c (9,) has of points (n, 3)."""
-    q = se3.apply(camera_pose(T, c, u, T_cam_imu)[..., None, :, :], m)
+    return rows_from(camera_pose(T, c, u, T_cam_imu), c, m, camera)
+
+
+def rows_from(W, c, m, camera=CAMERA):
+    """As `seen_rows`, from cameras W in world."""
+    q = se3.apply(W[..., None, :, :], m)
     left = camera.fu_px * q[..., 0] / q[..., 2] + camera.cu_px
     v = camera.fv_px * q[..., 1] / q[..., 2] + camera.cv_px
     disparity = camera.fu_px * camera.baseline_m * np.exp(c[..., None, 6]) / q[..., 2] + c[..., None, 7]
@@ -84,9 +89,14 @@ def seen_rows(T, c, u, m, camera=CAMERA, T_cam_imu=T_CAM_IMU):
 
 def sighted(T, c, u, rows, camera=CAMERA, T_cam_imu=T_CAM_IMU):
     """The point (3,) that `seen_rows` sees so."""
+    return sighted_from(camera_pose(T, c, u, T_cam_imu), c, rows, camera)
+
+
+def sighted_from(W, c, rows, camera=CAMERA):
+    """As `sighted`, from cameras W in world."""
     z = camera.fu_px * camera.baseline_m * np.exp(c[..., 6]) / (rows[..., 0] - rows[..., 2] - c[..., 7])
     x, y = (rows[..., 0] - camera.cu_px) / camera.fu_px * z, (rows[..., 1] - camera.cv_px) / camera.fv_px * z
-    return se3.apply(np.linalg.inv(camera_pose(T, c, u, T_cam_imu)), np.stack([x, y, z], axis=-1))
+    return se3.apply(np.linalg.inv(W), np.stack([x, y, z], axis=-1))
 
 
 # From (uL, v, uR) to (u, v, disparity), and back.
@@ -96,26 +106,27 @@ BY_DISPARITY = np.array([[1.0, 0, 0], [0, 1, 0], [1, 0, -1]])
 class Literal:
     """Textbook EKF: full-width numeric F, H and G, S^-1, Joseph's form. Nothing is gated or retired.
 
-    The state is pose, pose before, free calibration parameters, velocities, up, bias, landmarks, as in `JointEKF`;
-    where the noise knows no tracks, velocities or bias, these have no columns. With ``images`` landmarks are corrected
-    in pixels (u, v, disparity) of the last updated camera, eq. (7').
+    The state is pose, view, view before, free calibration parameters, velocities, up, bias, landmarks, as in
+    `JointEKF`; where the noise knows no tracks, velocities or bias, these have no columns. With ``images`` landmarks
+    are corrected in pixels (u, v, disparity) of the last updated view, eq. (7').
     """
 
     def __init__(self, sequence, variant, free, std, up=Z, bias=None, images=False, P=P0):
         self.sequence, self.noise, self.variant, self.free = sequence, sequence.noise, variant, free
-        self.images, self.updated, self.by_position = images, "T", 0
+        self.images, self.updated, self.by_position = images, "view", 0
         self.T = self.departed = np.linalg.inv(sequence.initial_T_world_imu)
-        self.before, self.c, self.twist, self.b = np.eye(4), np.zeros(9), None, np.zeros(6)
-        self.u = self.u_before = np.zeros(6)
+        self.view, self.before, self.c, self.twist, self.b = np.eye(4), np.eye(4), np.zeros(9), None, np.zeros(6)
+        self.u = np.zeros(6)
         self.W = self.T[:3, :3].T @ level_axes(up)
         self.m, self.ids, self.first, self.last, self.rows = np.empty((0, 3)), [], {}, {}, {}
         self.walks, self.bias, self.tracks = self.noise.twist_walk_std is not None, bias, self.noise.track_error
-        self.has_clone = images or self.tracks is not None
+        self.has_views = images or self.tracks is not None
         self.k, self.body, self.at = 0, 0, {}
         of_bias = np.zeros(0) if bias is None else np.repeat([bias.sigma_v_m_s, bias.sigma_w_rad_s], 3)
         prior = {
             "pose": P,
-            "before": np.zeros((6 * self.has_clone,) * 2),
+            "view": np.zeros((6 * self.has_views,) * 2),
+            "before": np.zeros((6 * self.has_views,) * 2),
             "c": np.diag(std**2),
             "twist": np.zeros((6 * self.walks,) * 2),
             "up": self.noise.tilt_rad**2 * np.eye(3),
@@ -132,14 +143,16 @@ class Literal:
         """The blocks with errors e."""
         found = {
             "T": se3.exp(e[..., self.at["pose"]]) @ self.T,
+            "view": self.view,
             "before": self.before,
             "c": self.c + e[..., self.at["c"]] @ np.eye(9)[self.free],
             "twist": self.twist,
             "W": se3.so3_exp(e[..., self.at["up"]]) @ self.W,
             "b": self.b,
         }
-        if self.has_clone:
-            found["before"] = se3.exp(e[..., self.at["before"]]) @ self.before
+        if self.has_views:
+            for name in ("view", "before"):
+                found[name] = se3.exp(e[..., self.at[name]]) @ getattr(self, name)
         if self.twist is not None:
             found["twist"] = self.twist + e[..., self.at["twist"]]
         if self.bias is not None:
@@ -148,8 +161,25 @@ class Literal:
 
     def begin(self, measured):
         self.u = moved(self.T, self.W, measured, 0.0)[1]
+        self.set_view()
+
+    def camera(self, x, follows=False):
+        """The camera in world with blocks x, as a single observation sees it or a difference."""
+        return camera_pose(x["T"], x["c"], self.u, T_CAM_IMU)
+
+    def set_view(self):
+        """The view is where the camera is, and its error that of the blocks."""
+        if not self.has_views:
+            return
+        E, here = np.eye(len(self.P)), self.camera(self.moved_by(np.zeros(len(self.P))))
+        E[self.at["view"]] = stencil(lambda e: difference(self.camera(self.moved_by(e)), here), len(self.P))
+        self.P, self.view = E @ self.P @ E.T, here
 
     def predict(self, measured, tau):
+        if self.has_views:
+            F = np.eye(len(self.P))
+            F[self.at["before"]] = F[self.at["view"]]
+            self.P, self.before, self.updated = F @ self.P @ F.T, self.view, "before"
         self.wander(tau)
         if self.walks:
             self.measure(measured)
@@ -168,12 +198,10 @@ class Literal:
         F, G = np.eye(len(self.P)), np.zeros((len(self.P), 6))
         F[:6] = stencil(after, len(self.P))
         G[:6] = stencil(lambda errors: difference(moved(self.T, self.W, twist, tau, errors)[0], T), 6)
-        if self.has_clone:
-            F[self.at["before"]] = np.eye(len(self.P))[:6]
         std = self.noise.motion_std if self.walks else np.hypot(self.noise.twist_std, self.noise.motion_std)
         self.P = F @ self.P @ F.T + G @ np.diag(std**2) @ G.T
-        self.before, self.departed, self.updated = self.T, self.T, "before"
-        self.T, self.u, self.u_before, self.tau, self.k = T, u, self.u, tau, self.k + 1
+        self.departed, self.T, self.u, self.tau, self.k = self.T, T, u, tau, self.k + 1
+        self.set_view()
 
     def wander(self, tau):
         """Velocities walk once they are known, the bias forgets."""
@@ -218,23 +246,23 @@ class Literal:
             u = -difference(self.T, self.departed) / self.tau
             vars(self).update(trial)
             self.u = u
+            self.set_view()
             self.correct(seen)
         for i, z in zip(ids.tolist(), rows, strict=True):
             if i not in self.ids:
                 self.start(i, z)
             self.last[i], self.rows[i] = self.k, z
-        self.updated = "T"
+        self.updated = "view"
 
     def look(self, x, m, before=False, follows=False):
         """Rows of points (..., n, 3) now, or in the frame before, with disparities where tracks err."""
-        T, u = (x["before"], self.u_before) if before else (x["T"], self.u)
-        rows = seen_rows(T, x["c"], u, m)
+        rows = rows_from(x["before"] if before else self.camera(x, follows), x["c"], m)
         return rows if self.tracks is None else rows @ BY_DISPARITY.T
 
     def point(self, x, row):
         """The point (3,) that is seen so now."""
         back = np.eye(3) if self.tracks is None else BY_DISPARITY
-        return sighted(x["T"], x["c"], self.u, row @ back.T)
+        return sighted_from(x["view"] if self.has_views else self.camera(x), x["c"], row @ back.T)
 
     def correct(self, seen):
         variance = []
@@ -283,21 +311,33 @@ class Literal:
         self.first[i] = self.k
 
     def to_stored(self):
-        """L, stored errors of poses and landmarks by the right-invariant ones; identity in between."""
-        L = np.eye(len(self.P))
+        """L, stored errors of poses, views and landmarks by the right-invariant ones; identity in between.
+
+        Landmarks turn with the view, or else with the camera.
+        """
+        n, L = len(self.P), np.eye(len(self.P))
         L[:6, :6] = -se3.adjoint(self.T)
-        if self.has_clone:
-            L[self.at["before"], self.at["before"]] = -se3.adjoint(self.before)
-        for j, m in enumerate(self.m):
-            L[self.body + 3 * j : self.body + 3 * j + 3, 3:6] = -se3.skew(m)
+        if self.has_views:
+            for name in ("view", "before"):
+                L[self.at[name], self.at[name]] = -se3.adjoint(getattr(self, name))
+            turned = np.eye(n)[self.at["view"]][3:]
+        else:
+            here = self.camera(self.moved_by(np.zeros(n)))
+            turned = stencil(lambda e: difference(self.camera(self.moved_by(e)), here), n)[3:]
+        W = self.view if self.has_views else here
+        self.rotation = -W[:3, :3].T @ turned @ L
+        self.turn_landmarks(L, self.rotation)
         return L
+
+    def turn_landmarks(self, L, rotation):
+        for j, m in enumerate(self.m):
+            L[self.body + 3 * j : self.body + 3 * j + 3, : self.body] = -se3.skew(m) @ rotation[:, : self.body]
 
     def image(self, e, by_position):
         """Landmarks (n, 3) as the last updated camera has them, intrinsics as given; by positions where told so."""
         x, m = self.moved_by(e), self.m + e[..., self.body :].reshape(*e.shape[:-1], -1, 3)
-        c = x["c"] * (np.arange(9) < 6)
-        q = se3.apply(camera_pose(x[self.updated], c, np.zeros(6), T_CAM_IMU)[..., None, :, :], m)
-        y = seen_rows(x[self.updated], c, np.zeros(6), m) @ BY_DISPARITY.T
+        q = se3.apply(x[self.updated][..., None, :, :], m)
+        y = rows_from(x[self.updated], np.zeros_like(x["c"]), m) @ BY_DISPARITY.T
         return np.where(by_position[:, None], q, y)
 
     def act_on_images(self, x):
@@ -318,16 +358,17 @@ class Literal:
 
         H = stencil(coordinates, len(x), 2e-3)
         moved_to = (coordinates(zero) + H @ x).reshape(-1, 3)
-        poses = {"pose": self.T, "before": self.before}
+        poses = {"pose": self.T, "view": self.view, "before": self.before}
         vars(self).update(self.moved_by(x))
-        c, camera = self.c * (np.arange(9) < 6), getattr(self, self.updated)
-        from_pixels = sighted(camera, c, np.zeros(6), np.where(away[:, None], 1.0, moved_to) @ BY_DISPARITY.T)
-        from_positions = se3.apply(np.linalg.inv(camera_pose(camera, c, np.zeros(6), T_CAM_IMU)), moved_to)
+        self.view = self.camera(self.moved_by(zero))
+        W = getattr(self, self.updated)
+        from_pixels = sighted_from(W, np.zeros(9), np.where(away[:, None], 1.0, moved_to) @ BY_DISPARITY.T)
+        from_positions = se3.apply(np.linalg.inv(W), moved_to)
         self.m = np.where(away[:, None], from_positions, from_pixels)
         G, H_after = np.eye(len(x)), stencil(coordinates, len(x), 2e-3)
         if self.variant == "invariant":
             for name, T in poses.items():
-                T_after = self.T if name == "pose" else self.before
+                T_after = self.T if name == "pose" else getattr(self, name)
                 G[self.at[name], self.at[name]] = se3.adjoint(T_after @ np.linalg.inv(T))
         rest = H.copy()
         rest[:, : self.body] -= H_after[:, : self.body] @ G[: self.body, : self.body]
@@ -341,24 +382,23 @@ class Literal:
         if self.images:
             self.act_on_images(x)
             return
-        stored, T_before, m_before, c_before = self.to_stored(), self.T, self.m, self.c
+        stored = self.to_stored()
         after = self.moved_by(x)
-        vars(self).update({name: value for name, value in after.items() if name not in ("T", "before")})
+        vars(self).update({name: value for name, value in after.items() if name not in ("T", "before", "view")})
         if self.variant == "standard":
             self.T, self.before, self.m = after["T"], after["before"], self.m + x[self.body :].reshape(-1, 3)
+            self.view = self.camera(self.moved_by(np.zeros(len(x))))
             return
-        e = np.linalg.inv(stored) @ x
+        rotation, e = self.rotation, np.linalg.inv(stored) @ x
         self.T = self.T @ se3.exp(-e[:6])
-        if self.has_clone:
+        if self.has_views:
             self.before = self.before @ se3.exp(-e[self.at["before"]])
-        R, J = se3.so3_exp(e[3:6]), se3.so3_left_jacobian(e[3:6])
+        R, J = se3.so3_exp(rotation @ e), se3.so3_left_jacobian(rotation @ e)
         self.m = self.m @ R.T + e[self.body :].reshape(-1, 3) @ J.T
-        transport = self.to_stored() @ np.linalg.inv(stored)
-        R_cam_world = (se3.exp(c_before[:6]) @ T_CAM_IMU @ T_before)[:3, :3]
-        for i, place in enumerate(self.free):
-            if place in (3, 4, 5):
-                axis = R_cam_world.T @ se3.so3_left_jacobian(c_before[3:6])[:, place - 3]
-                transport[self.body :, self.at["c"].start + i] += np.cross(self.m - m_before, axis).ravel()
+        self.view = self.camera(self.moved_by(np.zeros(len(x))))
+        after = self.to_stored()
+        self.turn_landmarks(after, rotation)
+        transport = after @ np.linalg.inv(stored)
         self.P = transport @ self.P @ transport.T
 
 
@@ -403,11 +443,11 @@ TILTED = se3.so3_exp(np.array([0.3, -0.2, 0.0]))
 
 
 def gauge_information(ekf):
-    """Information (6, 6) about where the world is, from all but clones: exact velocities tell that of the pose."""
+    """Information (6, 6) about where the world is, from all but views: exact velocities tell those of the pose."""
     body, layout = np.zeros((ekf.gaussian.body, 6)), ekf.model.layout
     N = gauge_directions(ekf.linear_T_imu_world, ekf.linear_positions_m)
     body[layout["pose"]] = N[:6]
     body[layout["up"], 3:] = np.eye(3)
-    clones = layout.columns(layout.clones.values())
-    N, P = np.delete(np.vstack([body, N[6:]]), clones, 0), np.delete(np.delete(ekf.P, clones, 0), clones, 1)
+    views = layout.columns(layout.views)
+    N, P = np.delete(np.vstack([body, N[6:]]), views, 0), np.delete(np.delete(ekf.P, views, 0), views, 1)
     return N.T @ np.linalg.solve(P, N)

@@ -4,11 +4,11 @@ from ekfslam.models.blocks.base import OPTIONAL_BLOCKS, Layout, StateBlock, Valu
 from ekfslam.models.blocks.calibration import Calibration
 from ekfslam.models.blocks.camera_jitter import CameraJitter
 from ekfslam.models.blocks.inertial import AccelBias, GyroBias, Velocity
-from ekfslam.models.blocks.pose import Anchor, Pose, PreviousPose
-from ekfslam.models.blocks.previous import Previous
+from ekfslam.models.blocks.pose import Pose
 from ekfslam.models.blocks.twist import Twist
 from ekfslam.models.blocks.twist_bias import TwistBias
 from ekfslam.models.blocks.up import Up
+from ekfslam.models.blocks.view import Anchor, PreviousView, View
 from ekfslam.models.blocks.vision_drift import VisionDrift
 
 __all__ = [
@@ -20,14 +20,14 @@ __all__ = [
     "GyroBias",
     "Layout",
     "Pose",
-    "Previous",
-    "PreviousPose",
+    "PreviousView",
     "StateBlock",
     "Twist",
     "TwistBias",
     "Up",
     "Values",
     "Velocity",
+    "View",
     "VisionDrift",
     "optional_block",
 ]

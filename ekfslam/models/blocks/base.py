@@ -38,7 +38,8 @@ class StateBlock:
         per_frame: Whether it has a value for each frame, or one for the whole drive.
         is_seen: Whether observations of landmarks depend on it.
         is_curved: Whether its value is a vector but no sum of corrections, so that the log keeps it.
-        is_pose: Whether it is a pose ``T_imu_world``: the pose itself, or a clone of it.
+        is_pose: Whether it is the pose ``T_imu_world``.
+        is_view: Whether it is a view ``T_cam_world``, whose error is a function of the errors of other blocks.
         clones: Name of the block whose previous value it is; "" if it is no clone.
         labels, units: Names and units of the estimates that `reported` returns.
     """
@@ -49,6 +50,7 @@ class StateBlock:
     is_seen: ClassVar[bool] = False
     is_curved: ClassVar[bool] = False
     is_pose: ClassVar[bool] = False
+    is_view: ClassVar[bool] = False
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -158,7 +160,7 @@ class Layout(dict[str, slice]):
     Attributes:
         body: Number of columns of all blocks.
         seen: Number of leading columns that observations of landmarks depend on.
-        poses: Names of the pose and of its clones.
+        views: Names of the views.
         clones: Name of the clone of each block that has one in the frame before.
         curved: Blocks whose values are no sums of corrections.
     """
@@ -170,7 +172,7 @@ class Layout(dict[str, slice]):
             (block.name, slice(stop - block.size, stop)) for block, stop in zip(self.blocks, end, strict=True)
         )
         self.body = end[-1]
-        self.poses = tuple(block.name for block in self.blocks if block.is_pose)
+        self.views = tuple(block.name for block in self.blocks if block.is_view)
         self.clones = {block.clones: block.name for block in self.blocks if block.clones}
         self.curved = tuple(block for block in self.blocks if block.is_curved)
         self.seen = sum(block.size for block in self.blocks if block.is_seen)

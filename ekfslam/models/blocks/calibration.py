@@ -17,7 +17,6 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.config import CalibrationConfig
 from ekfslam.geometry import motion, se3
 from ekfslam.models.blocks.base import Layout, StateBlock, Values
-from ekfslam.models.observation import linearise
 from ekfslam.models.sensors.stereo import Rig
 
 NAMES = (
@@ -26,7 +25,6 @@ NAMES = (
 )
 UNITS = ("m", "m", "m", "rad", "rad", "rad", "1", "px", "s")
 _EXTRINSIC, _BASELINE, _DISPARITY, TIME = slice(0, 6), 6, 7, 8
-_ROTATION = slice(3, 6)
 
 
 def prior_std(config: CalibrationConfig) -> Array:
@@ -81,69 +79,29 @@ class Calibration(StateBlock):
     def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
         return values[self.name][self.free], np.sqrt(np.diag(covariance)[layout[self.name]])
 
-    @cached_property
-    def extrinsic(self) -> IntArray:
-        """Columns of the block that move or turn the camera."""
-        return np.flatnonzero(self.free < _EXTRINSIC.stop)
+    def camera_by(self, parameters: Array, T_cam_imu: Array, twist: Array) -> Array:
+        """Return the derivative (..., 6, size) of the error of the camera in world, eq. (9), by the free parameters.
 
-    def camera_by_extrinsic(self, parameters: Array) -> Array:
-        """Return the derivative (6, e) of the camera's pose error by the columns `extrinsic`."""
-        return np.asarray(se3.left_jacobian(parameters[_EXTRINSIC])[:, self.free[self.extrinsic]], dtype=float)
-
-    @cached_property
-    def turns_camera(self) -> IntArray:
-        """Columns of the block that turn the camera."""
-        return np.flatnonzero((self.free >= _ROTATION.start) & (self.free < _ROTATION.stop))
-
-    def linearise(
-        self,
-        rig: Rig,
-        parameters: Array,
-        twist: Array,
-        T_imu_world: Array,
-        positions_m: Array,
-        T_linear: Array,
-        linear_positions_m: Array,
-    ) -> tuple[Array, Array, Array, Array]:
-        """Linearise eq. (4) at parameters (9,), with the `calibrated` rig and velocities (6,) or (n, 6) of the IMU.
-
-        Returns:
-            Values of `ekfslam.models.observation.linearise`, with H (n, 3, size) by the free parameters before H_m.
+        Args:
+            parameters: (9,).
+            T_cam_imu: (4, 4) extrinsics with the parameters applied.
+            twist: (..., 6) velocities of the IMU.
         """
-        delay = to_exposure(parameters, twist)
-        q, H_x, H_m = linearise(rig, delay @ T_imu_world, positions_m, delay @ T_linear, linear_positions_m)
-        T_cam_linear = rig.T_cam_imu @ delay @ T_linear
-        H = np.zeros((len(q), 3, 9))
-        if len(self.extrinsic):
-            # First estimates here, too: turning the camera and all landmarks about it must stay unobservable.
-            q_linear = se3.apply(T_cam_linear, linear_positions_m)
-            A = H_m @ T_cam_linear[..., :3, :3].swapaxes(-1, -2)
-            moved = np.concatenate([A, -A @ se3.skew(q_linear)], axis=-1)
-            H[..., _EXTRINSIC] = moved @ se3.left_jacobian(parameters[_EXTRINSIC])
-        if len(self.intrinsic):
-            H[..., _BASELINE : _DISPARITY + 1] = self.by_intrinsics(rig, q)
-        H[..., TIME] = -(H_x @ twist[..., None])[..., 0]
-        return q, H_x @ se3.adjoint(delay), H[..., self.free], H_m
+        by = np.zeros((*twist.shape, 9))
+        by[..., _EXTRINSIC] = se3.left_jacobian(parameters[_EXTRINSIC])
+        by[..., TIME] = -(se3.adjoint(T_cam_imu) @ twist[..., None])[..., 0]
+        return by[..., self.free]
 
     @cached_property
     def intrinsic(self) -> IntArray:
-        """Columns of the block that change the rows of a point in the camera."""
+        """Columns of the block that change the rows of a camera that stays where it is."""
         return np.flatnonzero((self.free == _BASELINE) | (self.free == _DISPARITY))
 
-    def by_intrinsics(self, rig: Rig, q: Array) -> Array:
-        """Return the derivatives (n, 3, 2) of the rows of points (n, 3) by the parameters of baseline and disparity."""
-        return np.stack([rig.by_log_baseline(q), rig.by_disparity(q)], axis=-1)
-
-    def landmarks_by_rotation(self, rig: Rig, parameters: Array, T_imu_world: Array, moved_m: Array) -> Array:
-        """Return the landmark errors (n, 3, 3) by the camera's rotation after a correction by ``moved_m`` (n, 3).
-
-        If camera and landmarks turn about it as one, images stay the same. So errors count in the camera's frame; in
-        world the filter would learn the rotation from noise. Pose (4, 4) and parameters (9,) are those before the
-        correction.
-        """
-        R_world_cam = (se3.exp(parameters[_EXTRINSIC]) @ rig.T_cam_imu @ T_imu_world)[:3, :3].T
-        by_rotation = se3.skew(moved_m) @ R_world_cam @ se3.so3_left_jacobian(parameters[_ROTATION])
-        return by_rotation[..., self.free[self.turns_camera] - _ROTATION.start]
+    def rows_by_intrinsic(self, rig: Rig, q: Array) -> Array:
+        """Return the derivative (n, 3, i) of the rows of a `calibrated` rig by the columns `intrinsic`."""
+        by = {_BASELINE: rig.by_log_baseline, _DISPARITY: rig.by_disparity}
+        columns = [by[i](q) for i in self.free[self.intrinsic]]
+        return np.stack(columns, axis=-1) if columns else np.empty((*q.shape, 0))
 
 
 def calibrated(rig: Rig, parameters: Array) -> Rig:
