@@ -146,6 +146,13 @@ void transport(Gaussian& gaussian, const Change& change) {
     if (!change.slot.empty()) gaussian.transform_landmarks(change.slot, change.M, change.B, change.at);
 }
 
+// Without the block `view`, the covariance has a view all the same: it stays that of the pose.
+void turn_hidden_view(Estimate& e, const Values& after) {
+    const Matrix4 W = camera_pose(e, after, e.imu_twist, false);
+    if (e.config.variant == Variant::invariant) e.gaussian.transform_body(-1, turned(e, e.opened.W, W));
+    e.opened.W = W;
+}
+
 void carry_change(const Change& change, Index at, Rows& rows) {
     const Index d = rows.dimension();
     for (Index i = 0; i < rows.count(); ++i) {
@@ -221,6 +228,7 @@ void retract(Estimate& e, const Vector& correction) {
             e.gaussian.transform_body(block.at, turned(e, before, after.matrix(block.value_at)));
         }
     }
+    if (e.columns.view < 0) turn_hidden_view(e, after);
     e.values = after;
     e.table.position_m = moved.mean.position_m;
     e.coordinates += correction.head(e.coordinates.size());
