@@ -166,7 +166,7 @@ def test_errors_have_a_row_an_axis_and_a_column_a_trajectory(sequence, results):
 def test_errors_are_drawn_with_their_bounds(sequence, results):
     figure = plot_errors({"full": results["full"]}, sequence.truth)
     for ax, error in zip(figure.axes, series.errors(results["full"], sequence.truth), strict=True):
-        (band,) = ax.collections
+        band, *_ = ax.collections
         vertices = band.get_paths()[0].vertices
         assert [vertices[:, 1].min(), vertices[:, 1].max()] == pytest.approx([error.low.min(), error.high.max()])
         np.testing.assert_array_equal(ax.lines[-1].get_ydata(), error.y)

@@ -76,3 +76,15 @@ def test_files_keep_the_colour_of_large_areas(tmp_path, packed):
     written = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"))
     grey = np.round(255 * np.array(to_rgb(style.BOUNDS["color"]))).astype(np.uint8)
     assert (written == grey).all(axis=-1).mean() > 0.2
+
+
+def test_axes_above_each_other_share_their_view_and_the_ticks_of_the_lowest():
+    upper, lower = Figure().subplots(2, 1)
+    upper.plot([0.0, 10.0], [0.0, 1.0])
+    lower.plot([2.0, 30.0], [0.0, 1.0])
+    style.share_x(upper, lower)
+    assert upper.get_xlim() == lower.get_xlim()
+    assert lower.get_xlim()[0] < 0.0 and lower.get_xlim()[1] > 30.0
+    assert lower.xaxis.get_visible() and not upper.xaxis.get_visible()
+    (grid,) = upper.collections
+    assert {path.vertices[0, 0] for path in grid.get_paths()} == {0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0}

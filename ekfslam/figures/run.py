@@ -16,7 +16,7 @@ from ekfslam.figures import maps as maps  # registers figures, as the next one d
 from ekfslam.figures import posterior as posterior
 from ekfslam.figures import registry, series
 from ekfslam.figures.series import BAND_SIGMAS, draw_series
-from ekfslam.figures.style import PRIOR, ZERO, Format, arrange, legend_of, save_all, style_of
+from ekfslam.figures.style import PRIOR, ZERO, Format, arrange, legend_of, save_all, share_x, style_of
 from ekfslam.filters.result import Result
 
 
@@ -35,13 +35,14 @@ def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolA
         else:
             columns[f"{twin}, {mode}"] = columns.pop(twin)
     figure = Figure(figsize=(4.4 * len(columns) + 0.4, 8.8))
-    axes = figure.subplots(6, len(columns), sharex=True, squeeze=False)
+    axes = figure.subplots(6, len(columns), squeeze=False)
     for column, (title, result) in zip(axes.T, columns.items(), strict=True):
         errors, color = series.errors(result, truth), style_of(result.mode)["color"]
         for ax, error in zip(column, errors, strict=True):
             draw_series(ax, error, color, {"color": "black", "linewidth": 1.0}, levels=ZERO)
         inside = f"{100 * series.share_inside(errors):.1f} % inside {BAND_SIGMAS:g} sigma"
         nees = _nees_words(result, truth, interpolated)
+        share_x(*column)
         column[0].set_title(f"{title}\n{_ate_words(result, truth)}, {inside}{nees}")
     name, break_ = next(iter(results.values())).sequence_name, "\n" if len(columns) == 1 else " "
     figure.suptitle(f"{name}:{break_}estimate minus truth, world axes")
@@ -71,13 +72,14 @@ def plot_nis(results: Mapping[str, Result]) -> Figure:
     if not updated:
         raise ValueError("no mode has an innovation to show")
     figure = Figure(figsize=(9.0, 0.6 + 2.9 * len(updated)))
-    axes = figure.subplots(len(updated), 1, sharex=True, squeeze=False)[:, 0]
+    axes = figure.subplots(len(updated), 1, squeeze=False)[:, 0]
     for ax, (mode, result) in zip(axes, updated.items(), strict=True):
         nis, style = series.nis(result), style_of(mode)
         dots = {"color": style["color"], "marker": style["marker"], "markersize": 2.8, "markeredgewidth": 0}
         draw_series(ax, nis, style["color"], {**dots, "linestyle": ""})
         inside = f"{100 * nis.share_inside:.1f} % of {len(nis.y)} frames inside"
         ax.set_title(f"{mode}: {inside}, mean {nis.mean:.3g} (1 expected)")
+    share_x(*axes)
     legend = legend_of(figure, axes[:1], 2)
     figure.suptitle(f"{next(iter(results.values())).sequence_name}: normalised innovation squared")
     arrange(figure, bottom=0.5 + legend, top=0.6)
@@ -101,7 +103,9 @@ def plot_parameters(full: Result) -> Figure:
         draw_series(ax, one, color, {"color": color}, levels=PRIOR)
         title = one.name + ("" if is_observed else " (not observable)")
         ax.set(title=title, xlabel=one.labels[0], ylabel=f"[{one.unit or '-'}]")
-    arrange(figure, left=0.85, gaps=(0.9, 0.7))
+    for i in range(columns):
+        share_x(*figure.axes[i::columns])
+    arrange(figure, left=0.85, gaps=(0.9, 0.35 if len(drawn) % columns == 0 else 0.7))
     return figure
 
 

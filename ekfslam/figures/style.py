@@ -17,6 +17,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
@@ -141,6 +142,23 @@ def _written(figure: Figure) -> list[Text]:
     legends = [*figure.legends, *(ax.get_legend() for ax in figure.axes)]
     in_legends = [text for legend in legends if legend is not None for text in legend.get_texts()]
     return [*figure.texts, *in_legends, *(text for ax in figure.axes for text in (ax.title, *ax.texts))]
+
+
+def share_x(*column: Axes) -> None:
+    """Give axes above each other the view of all along x; only the lowest shows its x axis, the others its grid.
+
+    Ticks take most of the time of a drawing, so the axes above have none.
+    """
+    *upper, lowest = column
+    views = [ax.get_xlim() for ax in column]
+    lowest.set_xlim(min(low for low, _ in views), max(high for _, high in views))
+    low, high = lowest.get_xlim()
+    lines = [((x, 0.0), (x, 1.0)) for x in lowest.get_xticks() if low <= x <= high]
+    look = {"colors": RC["grid.color"], "linewidths": RC["grid.linewidth"], "zorder": 0.5}
+    for ax in upper:
+        ax.set(xlim=(low, high), xlabel="")
+        ax.xaxis.set_visible(False)
+        ax.add_collection(LineCollection(lines, transform=ax.get_xaxis_transform(), **look), autolim=False)
 
 
 def legend_of(

@@ -11,7 +11,7 @@ from ekfslam.errors import TruthError
 from ekfslam.figures.maps import plot_map
 from ekfslam.figures.run import plot_errors
 from ekfslam.figures.series import BAND_SIGMAS, draw_series, trajectory
-from ekfslam.figures.style import TRUTH, arrange, legend_of, line_of, styled
+from ekfslam.figures.style import TRUTH, arrange, legend_of, line_of, share_x, styled
 from ekfslam.filters.result import Result
 
 
@@ -47,12 +47,14 @@ def plot_trajectory(result: Result, truth: Truth | None = None) -> Figure:
     The attitude is yaw about z of world, then pitch, then roll.
     """
     figure = Figure(figsize=(8.0, 7.6))
-    axes = figure.subplots(3, 2, sharex=True)
+    axes = figure.subplots(3, 2)
     color = line_of(result.mode)["color"]
     for ax, (one, true) in zip(axes.T.ravel(), trajectory(result, truth), strict=True):
         if true is not None:
             draw_series(ax, true, color, TRUTH, label="truth")
         draw_series(ax, one, color, line_of(result.mode), label=f"{result.mode}, {BAND_SIGMAS:g} sigma")
+    for column in axes.T:
+        share_x(*column)
     figure.suptitle(f"{result.sequence_name}, {result.mode}: pose of the IMU in world")
     arrange(figure, bottom=0.5 + legend_of(figure, axes[0, :1], 2), top=0.5, gaps=(0.8, 0.13))
     return figure
