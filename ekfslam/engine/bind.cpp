@@ -3,6 +3,7 @@
 #include <nanobind/nanobind.h>
 
 #include "bind_gaussian.hpp"
+#include "bind_gates.hpp"
 #include "lapack.hpp"
 #include "types.hpp"
 
@@ -38,5 +39,6 @@ NB_MODULE(_engine, module) {
         throw nb::import_error(error.what());
     }
     bind_gaussian(module);
+    bind_gates(module);
     module.def("cholesky", &cholesky, nb::arg("P"), "Return the lower Cholesky factor of a covariance.");
 }

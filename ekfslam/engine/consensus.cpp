@@ -21,18 +21,19 @@ struct Settled {
     Vector change;
     Flags inside;
     Rows rows;
+    Matrix left;  // residuals (d, j) of the rows
     Blocks S;
     Mean linear;
     Vector coordinates;
+    std::optional<Estimate> prior;
     double cost = 0;
 
     Index agree() const { return std::count(inside.begin(), inside.end(), true); }
     bool is_majority() const { return 2 * agree() > static_cast<Index>(inside.size()); }
 };
 
-// A frame, and how it shall be settled.
+// The observations of a frame.
 struct Frame {
-    const Estimate& e;
     Index frame;
     const Slots& slots;
     const Matrix& measured;
@@ -77,108 +78,112 @@ Vector6 jump(const Estimate& e) {
     return in_noise(e, se3::log(as_before * se3::inverse(motion.T_predicted)));
 }
 
-// Whether rows that are linearised at a solution agree with those that it was found with.
-bool is_straight(const Estimate& e, const Settled& settled, const Rows& rows) {
-    const Parts change = parts(e, settled.change);
-    const Matrix bent = left_by(rows, change) - left_by(settled.rows, change);
-    return bent.cwiseAbs2().cwiseQuotient(settled.rows.variance).mean() < BENT * BENT;
-}
-
-Vector6 twist_at(const Estimate& e, const Vector& change) {
-    return e.has_time_offset() ? e.twist_after(retract_values(e, change)) : e.imu_twist;
-}
-
 Block3 own_block(const Matrix& S, Index i, Index d) { return S.block(i * d, i * d, d, d); }
 
-// Solve eq. (6) under a covariance for the candidates that agree; nothing if there are none.
+Flags picked_flags(const Flags& flags, const Slots& which) {
+    Flags some(which.size());
+    for (std::size_t i = 0; i < some.size(); ++i) some[i] = flags[which[i]];
+    return some;
+}
+
+// Solves eq. (6) under a prior for the candidates that agree.
 class Settling {
    public:
-    Settling(const Frame& at, const Gaussian& gaussian, Slots candidates, const Flags* begin)
-        : at_(at), gaussian_(gaussian), begin_(begin) {
+    Settling(Estimate prior, const Frame& at, Slots candidates, const Flags* begin)
+        : e_(std::move(prior)), at_(at), begin_(begin) {
         slots_ = picked(at.slots, candidates);
         measured_ = columns(at.measured, candidates);
         found_.candidates = std::move(candidates);
     }
 
+    // At most so many linearisations; nothing if no candidates agree.
     std::optional<Settled> run(int rounds) {
-        const Estimate& e = at_.e;
-        Rows rows = observe(e, e.mean(), slots_, measured_).rows;
+        Rows rows = observe(e_, e_.mean(), slots_, measured_).rows;
         Slots some = where(Flags(slots_.size(), true));
         found_.inside = begin_ ? picked_flags(*begin_, found_.candidates) : Flags(slots_.size(), false);
-        found_.linear = e.mean();
-        found_.coordinates = e.coordinates;
+        Mean linear = e_.mean();
+        Vector coordinates = e_.coordinates;
         for (int round = 0; round < rounds; ++round) {
             if (some.empty() || !settle(rows, some, round == 0)) return std::nullopt;
+            found_.linear = std::move(linear);
+            found_.coordinates = std::move(coordinates);
             if (round + 1 == rounds) break;
-            Relinearised next = relinearised(e, twist_at(e, found_.change), found_.change, slots_, measured_);
-            if (is_straight(e, found_, next.seen.rows.only(where(found_.inside)))) break;
+            Settled settled = found_;
+            settled.prior = e_;
+            if (e_.has_time_offset()) turn(e_.twist_after(retract_values(e_, found_.change)));
+            Relinearised next = relinearised(e_, found_.change, slots_, measured_);
+            if (is_straight(next.seen.rows.only(where(found_.inside)))) return settled;
             some.clear();
             for (Index i = 0; i < next.seen.q.cols(); ++i) {
-                if (e.sensor.in_view(next.seen.q.col(i), e.config.min_depth_m)) some.push_back(i);
+                if (e_.sensor.in_view(next.seen.q.col(i), e_.config.min_depth_m)) some.push_back(i);
             }
             rows = next.seen.rows.only(some);
-            linear_ = std::move(next.linear);
-            coordinates_ = std::move(next.coordinates);
+            linear = std::move(next.linear);
+            coordinates = std::move(next.coordinates);
         }
+        found_.prior = std::move(e_);
         return std::move(found_);
     }
 
    private:
-    static Flags picked_flags(const Flags& flags, const Slots& which) {
-        Flags some(which.size());
-        for (std::size_t i = 0; i < some.size(); ++i) some[i] = flags[which[i]];
-        return some;
+    // Takes another velocity at the image; the error of the view, and the correction in it, are those with it.
+    void turn(const Vector6& imu_twist) {
+        look_at(e_, imu_twist);
+        if (e_.columns.view < 0) return;
+        const Vector6 z = e_.opened.Y * found_.change.head(e_.columns.body);
+        found_.change.segment<6>(e_.columns.view) = z;
+    }
+
+    // Whether rows that are linearised at a solution agree with those that it was found with.
+    bool is_straight(const Rows& rows) const {
+        const Matrix bent = left_by(rows, parts(e_, found_.change)) - found_.left;
+        return bent.cwiseAbs2().cwiseQuotient(found_.rows.variance).mean() < BENT * BENT;
     }
 
     // One linearisation: rows of `some` candidates; false if none of them agree.
     bool settle(const Rows& rows, const Slots& some, bool is_first) {
-        const double gate = at_.e.config.gate;
-        const Projection projection = gaussian_.project(rows);
+        const double gate = e_.config.gate;
+        const Gaussian& gaussian = e_.gaussian;
+        const Projection projection = gaussian.project(rows);
         const Matrix S = projection.S();
         if (is_first && !begin_) {
-            const Vector focal = focal_lengths(by_pose(at_.e, rows), rows.dimension());
-            const auto samples = samples_of(rows.count(), at_.frame, at_.uniform);
-            found_.inside = agreeing(S, rows.residual, focal, gate, samples);
+            const Vector focal = focal_lengths(by_pose(e_, rows), rows.dimension());
+            found_.inside = agreeing(S, rows.residual, focal, gate, samples_of(rows.count(), at_.frame, at_.uniform));
         }
         const Slots agree = where(refined(S, rows.residual, picked_flags(found_.inside, some), gate));
         if (agree.empty()) return false;
         found_.inside.assign(slots_.size(), false);
         for (Index i : agree) found_.inside[some[i]] = true;
-        found_.solution = gaussian_.solve(projection.only(agree));
-        found_.change = gaussian_.correction(found_.solution);
+        found_.solution = gaussian.solve(projection.only(agree));
+        found_.change = gaussian.correction(found_.solution);
         found_.rows = rows.only(agree);
+        found_.left = found_.solution.residual();
         found_.S.clear();
         for (Index i : agree) found_.S.push_back(own_block(S, i, rows.dimension()));
         found_.cost = found_.solution.nis + gate * static_cast<double>(slots_.size() - agree.size());
-        if (!is_first) {
-            found_.linear = linear_;
-            found_.coordinates = coordinates_;
-        }
         return true;
     }
 
+    Estimate e_;
     const Frame& at_;
-    const Gaussian& gaussian_;
     const Flags* begin_;  // landmarks of the frame that agree to begin with; null: they are found from samples
     Slots slots_;
     Matrix measured_;
-    Mean linear_;
-    Vector coordinates_;
     Settled found_;
 };
 
 // The candidates with some verdicts, settled.
-std::optional<Settled> settled(const Frame& at, const Gaussian& gaussian, const Verdicts& verdict, int rounds,
-                               const Flags* begin, std::initializer_list<int> verdicts) {
+std::optional<Settled> settled(Estimate prior, const Frame& at, const Verdicts& verdict, int rounds, const Flags* begin,
+                               std::initializer_list<int> verdicts) {
     Slots candidates;
     for (std::size_t i = 0; i < verdict.size(); ++i) {
         if (is_one_of(verdict[i], verdicts)) candidates.push_back(static_cast<Index>(i));
     }
-    return Settling(at, gaussian, std::move(candidates), begin).run(rounds);
+    return Settling(std::move(prior), at, std::move(candidates), begin).run(rounds);
 }
 
 // A correction by the landmarks that agree among the candidates.
-void take(Correction& found, const Frame& at, const Gaussian& gaussian, Settled settled) {
+void take(Correction& found, const Frame& at, Settled settled) {
     for (std::size_t i = 0; i < settled.inside.size(); ++i) {
         found.verdict[settled.candidates[i]] = settled.inside[i] ? ACCEPTED : GATE;
     }
@@ -186,8 +191,8 @@ void take(Correction& found, const Frame& at, const Gaussian& gaussian, Settled 
     for (std::size_t i = 0; i < found.verdict.size(); ++i) {
         if (found.verdict[i] == ACCEPTED) accepted.push_back(static_cast<Index>(i));
     }
-    const Matrix left = left_by(settled.rows, parts(at.e, settled.change));
-    found.innovations = innovations_of(at.e, gaussian, settled.solution, settled.rows, settled.S, left);
+    const Estimate& prior = *settled.prior;
+    found.innovations = innovations_of(prior, prior.gaussian, settled.solution, settled.rows, settled.S, settled.left);
     found.outside = static_cast<Index>(settled.inside.size()) - settled.agree();
     found.nis = settled.solution.nis;
     found.log_det = settled.solution.log_det;
@@ -199,6 +204,7 @@ void take(Correction& found, const Frame& at, const Gaussian& gaussian, Settled 
     found.change = std::move(settled.change);
     found.linear = std::move(settled.linear);
     found.coordinates = std::move(settled.coordinates);
+    found.prior = std::move(settled.prior);
 }
 
 std::optional<double> cost_of(const std::optional<Settled>& settled) {
@@ -217,34 +223,36 @@ bool rejects_inputs(const Estimate& e, const Settled& doubtful, std::optional<do
 
 Correction correct(Estimate& e, Index frame, const Slots& slots, const Matrix& measured, const Uniform& uniform) {
     const Matrix evidence = e.table.evidence;
+    const Vector6 predicted = e.imu_twist;
     Correction found = correct_plainly(e, slots, measured);
     if (slots.empty() || !e.motion.tau_s || !std::isfinite(e.config.gate)) return found;
     const bool suspect = is_suspect(e, found);
     if (!found.is_wide && !suspect) return found;
-    const Frame at{e, frame, slots, measured, uniform};
+    const Frame at{frame, slots, measured, uniform};
     const int rounds = found.is_wide ? ROUNDS : 1;
+    Estimate prior = e;
+    if (e.has_time_offset()) look_at(prior, predicted);
     Flags accepted(slots.size());
     for (std::size_t i = 0; i < accepted.size(); ++i) accepted[i] = found.verdict[i] == ACCEPTED;
     const Flags* begin = suspect ? nullptr : &accepted;
-    auto trusted = settled(at, e.gaussian, found.verdict, rounds, begin, {ACCEPTED, GATE});
+    auto trusted = settled(prior, at, found.verdict, rounds, begin, {ACCEPTED, GATE});
     auto cost = cost_of(trusted);
-    if (trusted && trusted->is_majority()) take(found, at, e.gaussian, std::move(*trusted));
+    if (trusted && trusted->is_majority()) take(found, at, std::move(*trusted));
     if (e.config.estimates_velocity || !is_suspect(e, found)) return found;
     const Vector6 jumped = jump(e);
     if (4.0 * jumped.squaredNorm() < e.config.input_gate) return found;
     // Tracks that seem to move may be made to by the inputs: both hypotheses are judged by all.
     if (std::count(found.verdict.begin(), found.verdict.end(), MOVING)) {
-        trusted = settled(at, e.gaussian, found.verdict, rounds, nullptr, {ACCEPTED, GATE, MOVING});
-        cost = cost_of(trusted);
+        cost = cost_of(settled(prior, at, found.verdict, rounds, nullptr, {ACCEPTED, GATE, MOVING}));
     }
-    Gaussian wide = e.gaussian;
-    wide.add_noise((e.config.doubt * e.config.doubt - 1.0) * e.motion.Q);
-    auto doubtful = settled(at, wide, found.verdict, ROUNDS, nullptr, {ACCEPTED, GATE, MOVING});
+    const double doubt = e.config.doubt * e.config.doubt;
+    prior.gaussian.add_noise((doubt - 1.0) * e.motion.Q);
+    prior.motion.Q *= doubt;
+    prior.motion.doubt = e.config.doubt;
+    auto doubtful = settled(std::move(prior), at, found.verdict, ROUNDS, nullptr, {ACCEPTED, GATE, MOVING});
     if (!doubtful || !rejects_inputs(e, *doubtful, cost, jumped)) return found;
     e.table.evidence = evidence;
-    take(found, at, wide, std::move(*doubtful));
-    found.gaussian = std::move(wide);
-    found.doubt = e.config.doubt;
+    take(found, at, std::move(*doubtful));
     return found;
 }
 

@@ -31,10 +31,13 @@ struct Tried {
 // Whether tracks are tested for motion: if they have errors, from the second frame on.
 bool judges_motion(const Estimate& e) { return e.track_error && e.motion.tau_s > 0; }
 
-// Derivative (d, j) of the rows by a motion of their landmarks along the last step of the rig.
-Matrix along_step(const Estimate& e, const Observed& seen, const Slots& some) {
-    const Matrix3 R = se3::rotation(e.values.pose());
-    const Vector3 step = R.transpose() * (e.imu_twist.head<3>() * e.motion.tau_s);
+// The last step of the rig in world.
+Vector3 last_step(const Estimate& e) {
+    return se3::rotation(e.values.pose()).transpose() * (e.imu_twist.head<3>() * e.motion.tau_s);
+}
+
+// Derivative (d, j) of the rows by a motion of their landmarks along a step.
+Matrix along(const Vector3& step, const Observed& seen, const Slots& some) {
     const Index d = seen.rows.dimension();
     Matrix h(d, static_cast<Index>(some.size()));
     for (Index i = 0; i < h.cols(); ++i) h.col(i) = seen.H_m.middleCols(some[i] * d, d).transpose() * step;
@@ -71,7 +74,7 @@ Tried gate_alone(Estimate& e, const Observed& seen, Verdicts& verdict) {
     }
     tried.outside = std::count(inside.begin(), inside.end(), false);
     if (judges_motion(e) && !e.config.estimates_velocity) {
-        const Evidence evidence = evidence_alone(rows.residual, tried.S, along_step(e, seen, tried.some));
+        const Evidence evidence = evidence_alone(rows.residual, tried.S, along(last_step(e), seen, tried.some));
         const Flags moves = moves_along(e.table, rows.slot, evidence, squares, e.config.gate, e.config);
         for (Index i : where(moves)) {
             verdict[tried.some[i]] = MOVING;
@@ -82,14 +85,15 @@ Tried gate_alone(Estimate& e, const Observed& seen, Verdicts& verdict) {
     return tried;
 }
 
-// Verdicts on tried landmarks by all others, given the residuals that the correction by all of them leaves.
-Verdicts gate_by_others(Estimate& e, const Solution& solution, const Matrix& left_by_all, const Tried& tried,
-                        const Observed& seen) {
+// Verdicts on tried landmarks by all others, given the last step of the rig.
+Verdicts gate_by_others(Estimate& e, const Solution& solution, const Tried& tried, const Observed& seen,
+                        const Vector3& step) {
     Verdicts verdict(tried.some.size(), ACCEPTED);
     const bool judges = judges_motion(e) && e.config.estimates_velocity;
     const double gate = e.config.gate;
     if (!std::isfinite(gate) && !judges) return verdict;
     const Rows& rows = tried.projection.rows;
+    const Matrix left_by_all = solution.residual();
     Slots doubtful;
     if (judges) {
         doubtful = where(Flags(verdict.size(), true));
@@ -106,7 +110,7 @@ Verdicts gate_by_others(Estimate& e, const Solution& solution, const Matrix& lef
     Flags moves(doubtful.size(), false);
     if (judges) {
         // Noisy velocities would accuse all tracks of a frame alike: only what others leave counts.
-        const Evidence evidence = evidence_given_others(left, variance, C, along_step(e, seen, tried.some));
+        const Evidence evidence = evidence_given_others(left, variance, C, along(step, seen, tried.some));
         moves = moves_along(e.table, rows.slot, evidence, found.squares, gate, e.config);
     }
     for (std::size_t i = 0; i < doubtful.size(); ++i) {
@@ -117,11 +121,9 @@ Verdicts gate_by_others(Estimate& e, const Solution& solution, const Matrix& lef
 }
 
 // Solve eq. (6) for tried rows, and remove those that others reject.
-void gate_jointly(Estimate& e, Tried& tried, const Observed& seen, Correction& found) {
+void gate_jointly(Estimate& e, const Tried& tried, const Observed& seen, const Vector3& step, Correction& found) {
     Solution solution = e.gaussian.solve(tried.projection);
-    found.change = e.gaussian.correction(solution);
-    Matrix left = left_by(tried.projection.rows, parts(e, found.change));
-    const Verdicts verdict = gate_by_others(e, solution, left, tried, seen);
+    const Verdicts verdict = gate_by_others(e, solution, tried, seen, step);
     Flags out(verdict.size());
     for (std::size_t i = 0; i < verdict.size(); ++i) {
         out[i] = verdict[i] != ACCEPTED;
@@ -129,16 +131,15 @@ void gate_jointly(Estimate& e, Tried& tried, const Observed& seen, Correction& f
         found.outside += verdict[i] == GATE;
     }
     const Slots inside = where(out, false);
-    Rows accepted = tried.projection.rows;
-    Blocks S = tried.S;
+    const Rows& rows = tried.projection.rows;
     if (inside.size() < out.size()) {
         solution = e.gaussian.without(std::move(solution), out);
-        found.change = e.gaussian.correction(solution);
-        accepted = accepted.only(inside);
-        S = picked(S, inside);
-        left = left_by(accepted, parts(e, found.change));
+        const Matrix left = columns(solution.residual(), inside);
+        found.innovations = innovations_of(e, e.gaussian, solution, rows.only(inside), picked(tried.S, inside), left);
+    } else {
+        found.innovations = innovations_of(e, e.gaussian, solution, rows, tried.S, solution.residual());
     }
-    found.innovations = innovations_of(e, e.gaussian, solution, accepted, S, left);
+    found.change = e.gaussian.correction(solution);
     found.nis = solution.nis;
     found.log_det = solution.log_det;
     found.solution = std::move(solution);
@@ -181,45 +182,50 @@ Vector focal_lengths(const Matrix& by_pose, Index dimension) {
     return squares.reshaped(dimension, squares.size() / dimension).colwise().maxCoeff().cwiseSqrt();
 }
 
+void look_at(Estimate& e, const Vector6& imu_twist) {
+    e.imu_twist = imu_twist;
+    open_views(e);
+}
+
 Correction correct_plainly(Estimate& e, const Slots& slots, const Matrix& measured) {
     Correction found;
-    found.linear = e.mean();
-    found.coordinates = e.coordinates;
     found.verdict.assign(slots.size(), ACCEPTED);
     found.innovations.alone = found.innovations.apart = Matrix(measured.rows(), 0);
-    Observed seen = observe(e, found.linear, slots, measured);
+    Observed seen = observe(e, e.mean(), slots, measured);
     for (Index i = 0; i < seen.q.cols(); ++i) {
         if (!e.sensor.in_view(seen.q.col(i), e.config.min_depth_m)) found.verdict[i] = BEHIND_CAMERA;
     }
+    const Vector3 step = last_step(e);
     Tried tried = gate_alone(e, seen, found.verdict);
     found.outside = tried.outside;
     if (!tried.some.empty()) {
         if (e.has_time_offset() && e.motion.tau_s) {
-            found.linear.imu_twist = corrected_twist(e, tried);
-            seen.rows = observe(e, found.linear, slots, measured).rows;
+            look_at(e, corrected_twist(e, tried));
+            seen.rows = observe(e, e.mean(), slots, measured).rows;
             tried.projection = e.gaussian.project(seen.rows.only(tried.some));
             tried.S = own_covariances(tried.projection);
         }
-        gate_jointly(e, tried, seen, found);
+        gate_jointly(e, tried, seen, step, found);
     } else {
         found.change = Vector::Zero(e.gaussian.considered() + e.columns.body + 3 * e.gaussian.landmarks());
     }
-    Flags taken(slots.size());
-    for (std::size_t i = 0; i < taken.size(); ++i) taken[i] = found.verdict[i] == ACCEPTED;
-    const Slots which = where(taken);
-    found.slot = picked(slots, which);
-    found.measured = columns(measured, which);
-    found.variance = columns(seen.rows.variance, which);
+    Slots taken;
+    for (std::size_t i = 0; i < slots.size(); ++i) {
+        if (found.verdict[i] == ACCEPTED) taken.push_back(static_cast<Index>(i));
+    }
+    found.slot = picked(slots, taken);
+    found.measured = columns(measured, taken);
+    found.variance = columns(seen.rows.variance, taken);
     found.dof = found.variance.size();
+    found.linear = e.mean();
+    found.coordinates = e.coordinates;
     found.is_wide = is_wide(e, tried);
     return found;
 }
 
-Relinearised relinearised(const Estimate& e, const Vector6& imu_twist, const Vector& change, const Slots& slots,
-                          const Matrix& measured) {
+Relinearised relinearised(const Estimate& e, const Vector& change, const Slots& slots, const Matrix& measured) {
     const Moved moved = retracted(e, change);
     Relinearised found{moved.mean, e.coordinates + change.head(e.coordinates.size()), {}};
-    found.linear.imu_twist = imu_twist;
     found.seen = observe(e, found.linear, slots, measured);
     found.seen.rows = carried_back(e, std::move(found.seen.rows), moved);
     Parts back = parts(e, change);

@@ -16,24 +16,23 @@ struct Correction {
     Vector change;                     // (body + considered + 3n) of the mean
     double nis = 0, log_det = 0;
     Index dof = 0;
-    Verdicts verdict;                  // (k) ACCEPTED or a reason
-    Slots slot;                        // (j) of the accepted landmarks
-    Matrix measured, variance;         // (d, j)
-    Mean linear;                       // at which the accepted rows were linearised
-    Vector coordinates;                // (body) there
-    FrameInnovations innovations;      // of the first linearisation
-    Index outside = 0;                 // landmarks outside of the gate, whether or not they seem to move, too
-    bool is_wide = false;              // whether the prediction is too uncertain to linearise at
-    std::optional<Gaussian> gaussian;  // that the solution belongs to, if it is not that of the prediction
-    double doubt = 1;                  // factor of the noise of the inputs in it
+    Verdicts verdict;               // (k) ACCEPTED or a reason
+    Slots slot;                     // (j) of the accepted landmarks
+    Matrix measured, variance;      // (d, j)
+    Mean linear;                    // at which the accepted rows were linearised
+    Vector coordinates;             // (body) there
+    FrameInnovations innovations;   // of the first linearisation
+    Index outside = 0;              // landmarks outside of the gate, whether or not they seem to move, too
+    bool is_wide = false;           // whether the prediction is too uncertain to linearise at
+    std::optional<Estimate> prior;  // that the solution belongs to, if it is another one; its table is of no use
 };
 
 // Numbers (rows, columns) that are uniform in [0, 1), drawn row by row from a generator seeded by the frame.
 using Uniform = std::function<Matrix(Index frame, Index rows, Index columns)>;
 
 // Solve eq. (6) behind its gates, for landmarks at slots (k) with rows (d, k). A landmark must agree with the
-// prediction, and with the prediction as corrected by all other landmarks of the frame. Of the estimate, only the
-// evidence of motion in its table changes. The caller applies the correction.
+// prediction, and with the prediction as corrected by all other landmarks of the frame. Of the estimate, the evidence
+// of motion in its table changes, and with a time offset its velocity and view. The caller applies the correction.
 Correction correct_plainly(Estimate& e, const Slots& slots, const Matrix& measured);
 
 // The same, and doubtful frames are decided by consensus, see filters/consensus.py.
@@ -42,13 +41,15 @@ Correction correct(Estimate& e, Index frame, const Slots& slots, const Matrix& m
 // Largest derivative (k) of each landmark's rows by a rotation, px/rad, from `by_pose` (k d, 6).
 Vector focal_lengths(const Matrix& by_pose, Index dimension);
 
+// Take another velocity at the image, before its update: the view of this frame becomes that with it, eq. (9).
+void look_at(Estimate& e, const Vector6& imu_twist);
+
 // Rows at the mean after a correction, in the coordinates of the prior.
 struct Relinearised {
     Mean linear;
     Vector coordinates;
     Observed seen;
 };
-Relinearised relinearised(const Estimate& e, const Vector6& imu_twist, const Vector& change, const Slots& slots,
-                          const Matrix& measured);
+Relinearised relinearised(const Estimate& e, const Vector& change, const Slots& slots, const Matrix& measured);
 
 }  // namespace ekfslam

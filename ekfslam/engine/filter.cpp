@@ -93,10 +93,9 @@ Report Filter::take(Index frame, const Ids& ids, const Matrix& measured) {
 }
 
 void Filter::take_in(Correction& found, Index frame, Report& report) {
-    if (found.gaussian) {
-        e.gaussian = std::move(*found.gaussian);
-        e.motion.doubt = found.doubt;
-        e.motion.Q *= found.doubt * found.doubt;
+    if (found.prior) {
+        found.prior->table = std::move(e.table);
+        e = std::move(*found.prior);
     }
     report.taken = taken_by(e, found);
     observed(e.table, found.slot, e.step, found.measured, next_observation);
@@ -167,6 +166,7 @@ void Filter::adopt(const Vector& values, const Vector& coordinates, const Matrix
     whole.bottomLeftCorner(landmarks, body) = P.bottomLeftCorner(landmarks, body);
     whole.topRightCorner(body, landmarks) = P.topRightCorner(body, landmarks);
     e.gaussian.replace(whole);
+    open_views(e);
 }
 
 }  // namespace ekfslam

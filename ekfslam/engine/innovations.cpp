@@ -2,8 +2,6 @@
 
 #include <limits>
 
-#include "model.hpp"
-
 namespace ekfslam {
 namespace {
 
@@ -22,12 +20,8 @@ Matrix6 inverse(const Matrix6& information) {
 Matrix by_pose(const Estimate& e, const Rows& rows) {
     const Lead lead = e.gaussian.lead();
     const Index pose = e.block("pose")->at;
-    const View now = camera(e, e.mean(), false);
-    Matrix J = rows.H_x.middleRows(lead.view, 6).transpose() * now.Y.middleCols(pose, 6);
-    if (lead.drifted >= 0) {
-        const View drifted = camera(e, e.mean(), true);
-        J += rows.H_x.middleRows(lead.drifted, 6).transpose() * drifted.Y.middleCols(pose, 6);
-    }
+    Matrix J = rows.H_x.middleRows(lead.view, 6).transpose() * e.opened.Y.middleCols(pose, 6);
+    if (lead.drifted >= 0) J += rows.H_x.middleRows(lead.drifted, 6).transpose() * e.drifted->Y.middleCols(pose, 6);
     return J;
 }
 

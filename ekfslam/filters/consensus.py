@@ -251,7 +251,7 @@ def agreeing(S: Array, rows: Rows, gate: float, generator: np.random.Generator) 
         generator: Source of samples, if there are too many to try them all.
     """
     (k, d), r = rows.residual.shape, rows.residual
-    sample = _samples(k, generator)
+    sample = samples_of(k, generator)
     n, size = sample.shape
     S = S.reshape(k, d, k, d)
     S_ka = S[:, :, sample].transpose(2, 0, 1, 3, 4).reshape(n, k * d, size * d)
@@ -270,7 +270,7 @@ def agreeing(S: Array, rows: Rows, gate: float, generator: np.random.Generator) 
     return squares[best] <= gate
 
 
-def _samples(k: int, generator: np.random.Generator) -> IntArray:
+def samples_of(k: int, generator: np.random.Generator) -> IntArray:
     """Return samples (n, size) of k landmarks: three each, or one less than there are."""
     size = max(min(3, k - 1), 1)
     if comb(k, size) <= _SAMPLES:
