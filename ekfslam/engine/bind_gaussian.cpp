@@ -7,6 +7,10 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
+
 #include "gaussian.hpp"
 
 namespace nb = nanobind;
@@ -32,12 +36,14 @@ NumPy stacked(const std::vector<Some>& blocks, Index rows, Index columns) {
         const RowMajor rowwise = block;
         numbers.insert(numbers.end(), rowwise.data(), rowwise.data() + rowwise.size());
     }
-    return array(std::move(numbers), {blocks.size(), static_cast<std::size_t>(rows), static_cast<std::size_t>(columns)});
+    return array(std::move(numbers),
+                 {blocks.size(), static_cast<std::size_t>(rows), static_cast<std::size_t>(columns)});
 }
 
 // One column for each row of the blocks: (c, k r) of (k, r, c).
 Matrix columns_of(const Stack& blocks) {
-    const Index rows = static_cast<Index>(blocks.shape(0) * blocks.shape(1)), columns = static_cast<Index>(blocks.shape(2));
+    const Index rows = static_cast<Index>(blocks.shape(0) * blocks.shape(1)),
+                columns = static_cast<Index>(blocks.shape(2));
     return Eigen::Map<const Matrix>(blocks.data(), columns, rows);
 }
 
@@ -48,12 +54,15 @@ std::vector<Block> blocks_of(const Stack& stack) {
         throw Error("a stack of blocks of another shape");
     std::vector<Block> blocks;
     for (std::size_t i = 0; i < stack.shape(0); ++i)
-        blocks.push_back(Eigen::Map<const Eigen::Matrix<double, Block::RowsAtCompileTime, Block::ColsAtCompileTime,
-                                                        Eigen::RowMajor>>(stack.data() + i * stack.shape(1) * stack.shape(2)));
+        blocks.push_back(
+            Eigen::Map<
+                const Eigen::Matrix<double, Block::RowsAtCompileTime, Block::ColsAtCompileTime, Eigen::RowMajor>>(
+                stack.data() + i * stack.shape(1) * stack.shape(2)));
     return blocks;
 }
 
-Rows rows_of(const Slots& slot, const Stack& H_x, const Stack& H_m, const RowMajor& residual, const RowMajor& variance) {
+Rows rows_of(const Slots& slot, const Stack& H_x, const Stack& H_m, const RowMajor& residual,
+             const RowMajor& variance) {
     Rows rows{slot, columns_of(H_x), columns_of(H_m), residual.transpose(), variance.transpose()};
     const Index k = static_cast<Index>(slot.size()), d = residual.cols();
     if (residual.rows() != k || variance.rows() != k || variance.cols() != d || rows.H_x.cols() != k * d ||
@@ -80,9 +89,19 @@ void bind_projection(nb::module_& m) {
         .def_ro("left", &Solution::left)
         .def_prop_ro("residual", [](const Solution& self) -> RowMajor { return self.residual().transpose(); });
 }
+
+// Matrices of a frame come and go. What glibc may return to the system at once costs a fifth of the frame in page
+// faults.
+void keep_memory() {
+#if defined(__GLIBC__)
+    mallopt(M_MMAP_THRESHOLD, 32 << 20);
+    mallopt(M_TRIM_THRESHOLD, 64 << 20);
+#endif
+}
 }  // namespace
 
 void bind_gaussian(nb::module_& m) {
+    keep_memory();
     bind_projection(m);
     nb::class_<Gaussian>(m, "Gaussian")
         .def(
@@ -111,10 +130,9 @@ void bind_gaussian(nb::module_& m) {
         .def("open_view", &Gaussian::open_view, nb::arg("Y"), nb::arg("Yd") = nb::none())
         .def("hold_anchor", &Gaussian::hold_anchor)
         .def("add_noise", &Gaussian::add_noise)
-        .def("project", [](const Gaussian& self, const Slots& slot, const Stack& H_x, const Stack& H_m,
-                           const RowMajor& residual, const RowMajor& variance) {
-            return self.project(rows_of(slot, H_x, H_m, residual, variance));
-        })
+        .def("project",
+             [](const Gaussian& self, const Slots& slot, const Stack& H_x, const Stack& H_m, const RowMajor& residual,
+                const RowMajor& variance) { return self.project(rows_of(slot, H_x, H_m, residual, variance)); })
         .def("solve", &Gaussian::solve)
         .def("without", &Gaussian::without)
         .def("solve_body", &Gaussian::solve_body)

@@ -24,8 +24,10 @@ inline void multiply(char a, char b, double alpha, const Given& A, const Given& 
 inline void square(char a, double alpha, const Given& A, double beta, Part C) {
     char lower = 'L';
     int n = size(C.rows()), k = size(a == 'N' ? A.cols() : A.rows()), lda = stride(A), ldc = stride(C);
-    if (n && k) lapack::dsyrk(&lower, &a, &n, &k, &alpha, data(A), &lda, &beta, C.data(), &ldc);
-    else if (n && beta != 1.0) C *= beta;
+    if (n && k)
+        lapack::dsyrk(&lower, &a, &n, &k, &alpha, data(A), &lda, &beta, C.data(), &ldc);
+    else if (n && beta != 1.0)
+        C *= beta;
 }
 
 // B <- op(A)^-1 B (side 'L') or B op(A)^-1 ('R') for triangular A.
@@ -50,6 +52,16 @@ inline bool factorise(Part A) {
     int n = size(A.rows()), lda = stride(A), failed = 0;
     if (n) lapack::dpotrf(&lower, &n, A.data(), &lda, &failed);
     return failed == 0 && A.diagonal().allFinite();
+}
+
+// op(A) x.
+inline Vector multiply(char a, const Given& A, const Vector& x) {
+    int m = size(A.rows()), n = size(A.cols()), lda = stride(A), step = 1;
+    double one = 1.0, zero = 0.0;
+    Vector y = Vector::Zero(a == 'N' ? A.rows() : A.cols());
+    if (m && n)
+        lapack::dgemv(&a, &m, &n, &one, data(A), &lda, const_cast<double*>(x.data()), &step, &zero, y.data(), &step);
+    return y;
 }
 
 // Copies the lower triangle to the upper one.

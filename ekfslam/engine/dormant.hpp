@@ -1,8 +1,8 @@
 // Landmarks out of view in the conditional form: exact, and next to free until they are seen again.
 //
-// Dormant landmarks are d_B = K_B x_A + eps_B, eps_B independent of x_A with a joint covariance S, and with a covariance
-// `cross` with the other columns e. Correcting A changes none of these. If columns o leave A, and k stay, with
-// x_o = C x_k + eps_o, eps_o of covariance D:
+// Dormant landmarks are d_B = K_B x_A + eps_B, eps_B independent of x_A with a joint covariance S, and with a
+// covariance `cross` with the other columns e. Correcting A changes none of these. If columns o leave A, and k stay,
+// with x_o = C x_k + eps_o, eps_o of covariance D:
 //
 //     K_B <- K_B,k + K_B,o C      S <- S + K_B,o D K_B,o^T      cross <- cross + (P_eo - P_ek C^T) K_B,o^T
 //

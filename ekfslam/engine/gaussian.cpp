@@ -111,8 +111,10 @@ Matrix Gaussian::dependence(const Slots& slots) const {
             continue;
         }
         const Awake& landmark = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slots[i])])];
-        if (landmark.own >= 0) own.middleRows(landmark.own, 3).setIdentity();
-        else own.bottomRows(P_AA_.rows() - landmark.begin) = tail(const_cast<Awake&>(landmark));
+        if (landmark.own >= 0)
+            own.middleRows(landmark.own, 3).setIdentity();
+        else
+            own.bottomRows(P_AA_.rows() - landmark.begin) = tail(landmark);
     }
     return K;
 }
@@ -142,7 +144,8 @@ Matrix Gaussian::covariance_of(const Slots& slots) const {
     blas::multiply('N', 'N', 1.0, P_AA_, K, 0.0, P_Ad);
     blas::multiply('N', 'N', 1.0, P_eA_, K, 0.0, P_ed);
     for (std::size_t i = 0; i < slots.size(); ++i)
-        if (dormant[i] >= 0) P_ed.middleCols(static_cast<Index>(3 * i), 3) += dormant_.cross.middleCols(3 * dormant[i], 3);
+        if (dormant[i] >= 0)
+            P_ed.middleCols(static_cast<Index>(3 * i), 3) += dormant_.cross.middleCols(3 * dormant[i], 3);
     Matrix P(b + m, b + m);
     P.topLeftCorner(b, b) = gathered(places, places);
     for (Index j = 0; j < b; ++j) {
@@ -158,25 +161,38 @@ Matrix Gaussian::covariance_of(const Slots& slots) const {
 }
 
 std::vector<Matrix3> Gaussian::landmark_blocks(const Slots& slots) const {
-    const std::vector<Index> dormant = dormant_of(slots);
-    const Matrix K = dependence(slots);
-    Matrix PK(K.rows(), K.cols());
-    blas::multiply('N', 'N', 1.0, P_AA_, K, 0.0, PK);
-    std::vector<Matrix3> blocks;
+    std::vector<Matrix3> blocks(slots.size());
+    Slots others;
+    std::vector<std::size_t> at;
+    Index begin = P_AA_.rows();
     for (std::size_t i = 0; i < slots.size(); ++i) {
-        const Index at = static_cast<Index>(3 * i);
-        const Matrix3 given = dormant[i] >= 0
-                                  ? dormant_.block(dormant[i])
-                                  : awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slots[i])])].S;
-        const Matrix3 P = K.middleCols(at, 3).transpose() * PK.middleCols(at, 3) + given;
-        blocks.push_back(0.5 * (P + P.transpose()));
+        const Index row = row_[static_cast<std::size_t>(slots[i])];
+        const Awake* landmark = row < 0 ? nullptr : &awake_[static_cast<std::size_t>(row)];
+        if (landmark && landmark->own >= 0) {
+            blocks[i] = P_AA_.block<3, 3>(landmark->own, landmark->own);
+            continue;
+        }
+        begin = landmark ? std::min(begin, landmark->begin) : 0;
+        others.push_back(slots[i]);
+        at.push_back(i);
+    }
+    const std::vector<Index> dormant = dormant_of(others);
+    const Matrix K = dependence(others).bottomRows(P_AA_.rows() - begin);
+    Matrix PK(K.rows(), K.cols());
+    blas::multiply('N', 'N', 1.0, P_AA_.bottomRightCorner(K.rows(), K.rows()), K, 0.0, PK);
+    for (std::size_t i = 0; i < others.size(); ++i) {
+        const Index own = static_cast<Index>(3 * i), row = row_[static_cast<std::size_t>(others[i])];
+        const Matrix3 P = K.middleCols(own, 3).transpose() * PK.middleCols(own, 3);
+        blocks[at[i]] = 0.5 * (P + P.transpose());
+        blocks[at[i]] += row < 0 ? dormant_.block(dormant[i]) : awake_[static_cast<std::size_t>(row)].S;
     }
     return blocks;
 }
 
 Gaussian::Over Gaussian::over(const Matrix& H) const {
     Over rows{Matrix::Zero(H.rows(), P_AA_.rows()), Matrix::Zero(H.rows(), P_eA_.rows())};
-    for (Index i = 0; i < static_cast<Index>(rest_.size()); ++i) rows.e.col(i) = H.col(rest_[static_cast<std::size_t>(i)]);
+    for (Index i = 0; i < static_cast<Index>(rest_.size()); ++i)
+        rows.e.col(i) = H.col(rest_[static_cast<std::size_t>(i)]);
     for (Index i = 0; i < front_size(); ++i)
         rows.A.col(front_at() + i) = H.col(columns_.front[static_cast<std::size_t>(i)]);
     for (Index at : {columns_.view, columns_.previous, columns_.anchor})

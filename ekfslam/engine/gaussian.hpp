@@ -13,10 +13,11 @@
 //     x_A = F y     x_e = F_e y               d_i = K_i x_A + G_i (w_i - T_i y),    G_i = S_i H_m^T L_i^-T
 //     K_i+ = K_i - G_i B_i                    S_i+ = S_i - G_i G_i^T
 //
-// and S^-1 = L^-T (I - T M^-1 T^T) L^-1. Columns of A are in this order, so that B_i and T_i (F is upper triangular) are
-// zero before the first view of landmark i: promoted landmarks, views from the oldest to z', z, zd, front, anchor.
+// and S^-1 = L^-T (I - T M^-1 T^T) L^-1. Columns of A are in this order, so that B_i and T_i (F is upper triangular)
+// are zero before the first view of landmark i: promoted landmarks, views from the oldest to z', z, zd, front, anchor.
 #pragma once
 
+#include <algorithm>
 #include <optional>
 
 #include "dormant.hpp"
@@ -28,21 +29,24 @@ namespace ekfslam {
 // Columns of the body in the layout of the model. All body matrices and vectors of the interface have this layout.
 // A model without a block `view` has a view inside of the covariance all the same; its `at` is -1.
 struct Columns {
-    Index body = 0;             // all blocks, views included
-    Index view = -1;            // first column of the block `view`
-    Index previous = -1;        // of `previous_view`
-    Index anchor = -1;          // of `anchor`
-    std::vector<Index> front;   // columns of the body (no view) on which rows depend directly
+    Index body = 0;            // all blocks, views included
+    Index view = -1;           // first column of the block `view`
+    Index previous = -1;       // of `previous_view`
+    Index anchor = -1;         // of `anchor`
+    std::vector<Index> front;  // columns of the body (no view) on which rows depend directly
 };
 
-// Whitened rows of k landmarks over A, one column a row, with what both gates need.
+// Whitened rows of k landmarks over A, one column a row, with what both gates need. The columns of T^T are sorted by
+// the first of their rows that is not zero: T^T is a staircase.
 struct Projection {
     Rows rows;
-    std::vector<double> L;      // (k) lower (d, d), column-major
-    Matrix B, T, G;             // B^T (n_A, k d), T^T (f, k d), G (3, k d)
-    std::vector<Index> begin;   // (k) first row of B^T that is not zero
+    std::vector<double> L;     // (k) lower (d, d), column-major
+    Matrix T, G;               // T^T (f, k d), G (3, k d)
+    std::vector<Index> begin;  // (k) first row of a landmark's columns of T^T that is not zero
+    std::vector<Index> place;  // (k) of each landmark in T^T
 
     Projection only(const Slots& which) const;
+    Eigen::Block<const Matrix> of(Index i) const;  // (f - begin, d) columns of T^T of landmark i
     Eigen::Map<const Matrix> root(Index i) const;  // L_i
     Matrix own_variance(Index i) const;            // (d, d) of H P H^T for landmark i
     Matrix S() const;                              // (k d, k d) joint covariance of the innovations, V included
@@ -51,11 +55,11 @@ struct Projection {
 // Eq. (6) solved for projected rows, all or some of them; or for rows of the body alone.
 struct Solution {
     Projection at;
-    std::vector<bool> left;     // which landmarks are in it
-    Matrix C;                   // (f, f) in the lower triangle
-    Matrix w;                   // (d, k)
-    Vector y;                   // (f)
-    Matrix V_A, V_e, H_e;       // of rows of the body, whitened by their S: P_A: H^T, P_e: H^T (e, k), and H_e (k, e)
+    std::vector<bool> left;  // which landmarks are in it
+    Matrix M, C;             // (f, f) in their lower triangles
+    Matrix w, v;             // (d, k) L^-1 r, and w - T y of the rows that are left
+    Vector y;                // (f)
+    Matrix V_A, V_e, H_e;    // of rows of the body, whitened by their S: P_A: H^T, P_e: H^T (e, k), and H_e (k, e)
     double nis = 0.0, log_det = 0.0;
 
     // (d, k) residuals that the correction leaves in the rows that are left, V S^-1 r; 0 in others.
@@ -67,7 +71,7 @@ class Gaussian {
     Gaussian(const Matrix& P_body, Columns columns);
 
     const Columns& columns() const { return columns_; }
-    Lead lead() const;          // of rows in the present frame
+    Lead lead() const;                                                   // of rows in the present frame
     Index landmarks() const { return static_cast<Index>(row_.size()); }  // in the table's order, dormant ones included
     Index considered() const { return considered_; }
     Index width() const { return P_AA_.rows() + static_cast<Index>(rest_.size()); }  // n_X
@@ -103,7 +107,8 @@ class Gaussian {
     // z <- A z for the view in layout columns `at` (view, previous or anchor), or another part of the body.
     void transform_body(Index at, const Matrix& A);
     // d_i <- M_i d_i + B_i z for the view in layout columns `at`; M empty: identity.
-    void transform_landmarks(const Slots& slots, const std::vector<Matrix3>& M, const std::vector<Matrix36>& B, Index at);
+    void transform_landmarks(const Slots& slots, const std::vector<Matrix3>& M, const std::vector<Matrix36>& B,
+                             Index at);
     void rest(const std::vector<bool>& asleep);
     void marginalise(const std::vector<bool>& stay);
     void replace(const Matrix& P);  // (body + considered + 3n): all landmarks promoted, none asleep
@@ -112,7 +117,8 @@ class Gaussian {
     void clone(Index source, Index size, Index to);  // body columns into considered ones
 
    private:
-    // A view of the layout is E x at columns of A: two layouts may share columns, and none of them has to be re-expressed.
+    // A view of the layout is E x at columns of A: two layouts may share columns, and none of them has to be
+    // re-expressed.
     struct View {
         Index column = -1;
         Matrix6 E = Matrix6::Identity();
@@ -123,29 +129,34 @@ class Gaussian {
         Index begin = 0;        // first column of A on which it depends
         std::vector<double> K;  // K_i^T (n_A - begin, 3) of a landmark that is not promoted
         Matrix3 S = Matrix3::Zero();
+        Matrix3 A = Matrix3::Identity();  // K_i is A K in so many first columns, which have not been multiplied yet
+        Index waiting = 0;
     };
-    struct Over {               // the same rows over A and over e
+    struct Over {  // the same rows over A and over e
         Matrix A, e;
     };
     using Tail = Eigen::Map<Eigen::Matrix<double, Eigen::Dynamic, 3>>;
 
     // gaussian.cpp
-    Over over(const Matrix& H) const;                   // rows H (k, body) over the columns of A and e
-    std::vector<Index> body_places() const;             // places of body and considered columns in [A, e]
-    double entry(Index i, Index j) const;               // of P over [A, e]
+    Over over(const Matrix& H) const;        // rows H (k, body) over the columns of A and e
+    std::vector<Index> body_places() const;  // places of body and considered columns in [A, e]
+    double entry(Index i, Index j) const;    // of P over [A, e]
     Matrix gathered(const std::vector<Index>& rows, const std::vector<Index>& columns) const;
     const View* view_at(Index at) const;
     View* view_at(Index at);
-    void turn_views(Matrix& P) const;                   // E of each view to rows and columns of a body covariance
-    Matrix dependence(const Slots& slots) const;        // K^T (n_A, 3k)
-    Matrix own_covariance(const Slots& slots) const;    // (3k, 3k) of d given A
+    void turn_views(Matrix& P) const;                 // E of each view to rows and columns of a body covariance
+    Matrix dependence(const Slots& slots) const;      // K^T (n_A, 3k)
+    Matrix own_covariance(const Slots& slots) const;  // (3k, 3k) of d given A
     std::vector<Index> dormant_of(const Slots& slots) const;
     void transform_columns(const std::vector<Index>& at, const Matrix& A);
 
     // window.cpp
-    Matrix lead_over(const Matrix& H_x) const;          // rows (lead, m) over A, (n_A, m)
-    Tail tail(Awake& landmark) const;
+    Matrix lead_over(const Matrix& H_x) const;  // rows (lead, m) over A, (n_A, m)
+    Tail tail(const Awake& landmark) const;     // K_i^T
+    Tail recent(const Awake& landmark) const;   // its rows from the view of the frame before on, K_i^T or shorter
+    void turn(Awake& landmark, const Matrix3& A) const;  // K_i <- A K_i
     void extend(Awake& landmark, Index begin) const;
+    void move(Awake& landmark, const std::vector<Index>& first) const;
     bool is_used(Index column, Index size) const;
     void rearrange(const std::vector<Index>& from);
     Matrix release(const std::vector<Index>& leaving);  // covariance (o, 3n) of the columns with what K_B leaves
@@ -161,30 +172,42 @@ class Gaussian {
     Index front_at() const { return P_AA_.rows() - (has_anchor_ ? 6 : 0) - front_size(); }
     Index front_size() const { return static_cast<Index>(columns_.front.size()); }
     Index view_column() const { return front_at() - (has_drifted_ ? 12 : 6); }
+    // Columns of this frame and the frame before begin here.
+    Index recent_column() const {
+        return previous_.column >= promoted_ ? std::min(view_column(), previous_.column) : view_column();
+    }
 
     // landmarks.cpp
     void wake(const std::vector<bool>& wakes);
     void forget(const std::vector<bool>& gone);
-    void transform_promoted(Index own, const Matrix3& M, const Matrix36& B, Index view);
+    struct Change {  // x_own <- M x_own + B z for a promoted landmark
+        Index own;
+        Matrix3 M;
+        Matrix36 B;
+    };
+    void transform_promoted(const std::vector<Change>& changes, Index view);
     void transform_dormant(Index which, const Matrix3& M, const Matrix36& B, Index view);
     void number();
 
-    // solve.cpp
+    // project.cpp, solve.cpp
     const Root& root() const;
+    Matrix by_columns(Matrix H_x) const;  // rows (lead, m) by the columns of A
+    bool whiten(Projection& at, Index i, const Matrix& H_x) const;
     void solve_left(Solution& solution) const;
+    void apply_rows(const Solution& solution, Index i, const Matrix& H_x);
     void apply_body(const Solution& solution);
 
     Columns columns_;
-    std::vector<Index> rest_;                           // layout columns of e, considered ones not included
+    std::vector<Index> rest_;  // layout columns of e, considered ones not included
     Index considered_ = 0;
     Matrix P_AA_, P_eA_, P_ee_;
     View view_, previous_, anchor_;
-    std::vector<Index> groups_;                         // widths of views in the window, from the oldest
-    Index promoted_ = 0;                                // columns of promoted landmarks
-    bool has_drifted_ = false, has_anchor_ = false;     // whether A has columns of zd, and of an anchor of its own
+    std::vector<Index> groups_;                      // widths of views in the window, from the oldest
+    Index promoted_ = 0;                             // columns of promoted landmarks
+    bool has_drifted_ = false, has_anchor_ = false;  // whether A has columns of zd, and of an anchor of its own
     Matrix Y_, Yd_;
     std::vector<Awake> awake_;
-    std::vector<Index> row_;                            // of each slot, in `awake_`; -1: dormant
+    std::vector<Index> row_;  // of each slot, in `awake_`; -1: dormant
     Dormant dormant_;
     mutable std::optional<Root> root_;
     mutable Matrix F_e_;

@@ -16,13 +16,18 @@ void Gaussian::number() {
 
 void Gaussian::augment(const Matrix& G, const std::vector<Matrix3>& covariance) {
     const Matrix K = lead_over(G);
+    const Lead lead = this->lead();
     for (std::size_t i = 0; i < covariance.size(); ++i) {
-        const auto own = K.middleCols(static_cast<Index>(3 * i), 3);
-        Index begin = 0;
-        while (begin < view_column() && own.row(begin).isZero(0.0)) ++begin;
-        Awake landmark{landmarks(), -1, begin, {}, covariance[i]};
-        landmark.K.resize(static_cast<std::size_t>(3 * (K.rows() - begin)));
-        tail(landmark) = own.bottomRows(K.rows() - begin);
+        const Index at = static_cast<Index>(3 * i);
+        Index begin = view_column();
+        const auto depends = [&](Index row, const View& view) {
+            if (row >= 0 && !G.block(row, at, 6, 3).isZero(0.0)) begin = std::min(begin, view.column);
+        };
+        depends(lead.previous, previous_);
+        depends(columns_.anchor >= 0 ? front_size() : -1, anchor_);
+        Awake landmark{landmarks(), -1, begin, std::vector<double>(static_cast<std::size_t>(3 * (K.rows() - begin))),
+                       covariance[i]};
+        tail(landmark) = K.middleCols(at, 3).bottomRows(K.rows() - begin);
         row_.push_back(static_cast<Index>(awake_.size()));
         awake_.push_back(std::move(landmark));
     }
@@ -33,6 +38,7 @@ void Gaussian::transform_landmarks(const Slots& slots, const std::vector<Matrix3
     const View* view = view_at(at);
     if (!view) throw Error("landmarks depend on views alone");
     const std::vector<Index> dormant = dormant_.size() ? dormant_of(slots) : std::vector<Index>(slots.size(), -1);
+    std::vector<Change> promoted;
     for (std::size_t i = 0; i < slots.size(); ++i) {
         const Matrix3 M_i = M.empty() ? Matrix3::Identity() : M[i];
         const Matrix36 B_i = B[i] * view->E;
@@ -42,34 +48,49 @@ void Gaussian::transform_landmarks(const Slots& slots, const std::vector<Matrix3
         }
         Awake& landmark = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slots[i])])];
         if (landmark.own >= 0) {
-            transform_promoted(landmark.own, M_i, B_i, view->column);
+            promoted.push_back({landmark.own, M_i, B_i});
             continue;
         }
         extend(landmark, view->column);
-        Tail K = tail(landmark);
         if (!M.empty()) {
-            K = (K.lazyProduct(M_i.transpose())).eval();
+            turn(landmark, M_i);
             const Matrix3 S = M_i * landmark.S * M_i.transpose();
             landmark.S = 0.5 * (S + S.transpose());
         }
+        Tail K = view->column >= recent_column() ? recent(landmark) : tail(landmark);
         K.middleRows(view->column - landmark.begin, 6) += B_i.transpose();
     }
+    if (!promoted.empty()) transform_promoted(promoted, view->column);
 }
 
-void Gaussian::transform_promoted(Index own, const Matrix3& M, const Matrix36& B, Index view) {
-    P_AA_.middleRows(own, 3) = (M * P_AA_.middleRows(own, 3)).eval();
-    P_AA_.middleRows(own, 3) += B * P_AA_.middleRows(view, 6);
-    P_AA_.middleCols(own, 3) = (P_AA_.middleCols(own, 3) * M.transpose()).eval();
-    P_AA_.middleCols(own, 3) += P_AA_.middleCols(view, 6) * B.transpose();
-    const Matrix3 block = P_AA_.block<3, 3>(own, own);
-    P_AA_.block<3, 3>(own, own) = 0.5 * (block + block.transpose());
-    P_eA_.middleCols(own, 3) = (P_eA_.middleCols(own, 3) * M.transpose()).eval();
-    P_eA_.middleCols(own, 3) += P_eA_.middleCols(view, 6) * B.transpose();
+// Multiplies P_AA from the right, then the promoted rows from the left; the others follow by symmetry.
+void Gaussian::transform_promoted(const std::vector<Change>& changes, Index view) {
+    const Index n = P_AA_.rows(), p = promoted_;
+    Matrix B = Matrix::Zero(p, 6), P_Ap(n, p), P_ep(P_eA_.rows(), p), own(p, p);
+    for (const Change& change : changes) B.middleRows(change.own, 3) = change.B;
+    blas::multiply('N', 'T', 1.0, P_AA_.middleCols(view, 6), B, 0.0, P_Ap);
+    blas::multiply('N', 'T', 1.0, P_eA_.middleCols(view, 6), B, 0.0, P_ep);
+    for (const Change& change : changes) {
+        auto columns = P_AA_.middleCols(change.own, 3), columns_e = P_eA_.middleCols(change.own, 3);
+        columns = (columns.lazyProduct(change.M.transpose()) + P_Ap.middleCols(change.own, 3)).eval();
+        columns_e = (columns_e.lazyProduct(change.M.transpose()) + P_ep.middleCols(change.own, 3)).eval();
+    }
+    blas::multiply('N', 'N', 1.0, B, P_AA_.block(view, 0, 6, p), 0.0, own);
+    for (const Change& change : changes)
+        for (Index j = 0; j < p; ++j) {
+            const Vector3 column = P_AA_.block<3, 1>(change.own, j);
+            P_AA_.block<3, 1>(change.own, j) = change.M * column + own.block<3, 1>(change.own, j);
+        }
+    own = P_AA_.topLeftCorner(p, p);
+    P_AA_.topLeftCorner(p, p) = 0.5 * (own + own.transpose());
+    P_AA_.topRightCorner(p, n - p) = P_AA_.bottomLeftCorner(n - p, p).transpose();
     root_.reset();
-    // Dormant landmarks stay: x_own = M^-1 (x_own+ - B z).
     if (!dormant_.size()) return;
-    dormant_.K.middleRows(own, 3) = (M.inverse().transpose() * dormant_.K.middleRows(own, 3)).eval();
-    dormant_.K.middleRows(view, 6) -= B.transpose() * dormant_.K.middleRows(own, 3);
+    for (const Change& change : changes) {  // dormant landmarks stay: x_own = M^-1 (x_own+ - B z)
+        auto K = dormant_.K.middleRows(change.own, 3);
+        K = (change.M.inverse().transpose() * K).eval();
+        dormant_.K.middleRows(view, 6) -= change.B.transpose() * K;
+    }
 }
 
 void Gaussian::transform_dormant(Index which, const Matrix3& M, const Matrix36& B, Index view) {

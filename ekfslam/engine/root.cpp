@@ -7,6 +7,8 @@ namespace ekfslam {
 namespace {
 // Smallest pivot of a Cholesky factorisation, in the variance of its column, that is more than rounding.
 constexpr double LEAST_PIVOT = 1e-14;
+// Triangles of this size are not divided further.
+constexpr Index SMALL = 48;
 }  // namespace
 
 Root::Root(const Matrix& P, const Vector& of) {
@@ -15,8 +17,7 @@ Root::Root(const Matrix& P, const Vector& of) {
     Matrix reversed(n, n);
     for (Index j = 0; j < n; ++j) reversed.col(j).tail(n - j) = P.col(n - 1 - j).head(n - j).reverse();
     regular = blas::factorise(reversed);
-    for (Index j = 0; regular && j < n; ++j)
-        regular = std::pow(reversed(j, j), 2) > LEAST_PIVOT * of(n - 1 - j);
+    for (Index j = 0; regular && j < n; ++j) regular = std::pow(reversed(j, j), 2) > LEAST_PIVOT * of(n - 1 - j);
     if (!regular) {
         pivot(P, of);
         return;
@@ -53,8 +54,10 @@ void Root::pivot(const Matrix& P, const Vector& of) {
 
 Matrix Root::coefficients(const Matrix& P_oA) const {
     Matrix F_o = regular ? P_oA : Matrix(P_oA(Eigen::all, pivots_));
-    if (regular) blas::solve('R', 'U', 'T', F, F_o);
-    else blas::solve('R', 'L', 'T', L_, F_o);
+    if (regular)
+        blas::solve('R', 'U', 'T', F, F_o);
+    else
+        blas::solve('R', 'L', 'T', L_, F_o);
     return F_o;
 }
 
@@ -68,6 +71,27 @@ Matrix Root::regression(const Matrix& F_o) const {
     Matrix wide = Matrix::Zero(F_o.rows(), F.rows());
     wide(Eigen::all, pivots_) = C;
     return wide;
+}
+
+void divide_upper(Eigen::Ref<Matrix> F, const Eigen::Ref<const Matrix>& C) {
+    const Index n = F.rows(), a = n / 2, b = n - a;
+    if (n <= SMALL) return blas::solve('R', 'L', 'T', C, F);
+    divide_upper(F.topLeftCorner(a, a), C.topLeftCorner(a, a));
+    divide_upper(F.bottomRightCorner(b, b), C.bottomRightCorner(b, b));
+    Matrix known = C.bottomLeftCorner(b, a).transpose();
+    blas::multiply_triangle('L', 'U', 'N', F.topLeftCorner(a, a), known);
+    F.topRightCorner(a, b) -= known;
+    blas::solve('R', 'L', 'T', C.bottomRightCorner(b, b), F.topRightCorner(a, b));
+}
+
+void square_upper(const Eigen::Ref<const Matrix>& W, Eigen::Ref<Matrix> P) {
+    const Index n = W.rows(), a = n / 2, b = n - a;
+    if (n <= SMALL) return blas::square('N', 1.0, W, 0.0, P);
+    square_upper(W.topLeftCorner(a, a), P.topLeftCorner(a, a));
+    square_upper(W.bottomRightCorner(b, b), P.bottomRightCorner(b, b));
+    blas::square('N', 1.0, W.topRightCorner(a, b), 1.0, P.topLeftCorner(a, a));
+    P.bottomLeftCorner(b, a) = W.topRightCorner(a, b).transpose();
+    blas::multiply_triangle('L', 'U', 'N', W.bottomRightCorner(b, b), P.bottomLeftCorner(b, a));
 }
 
 }  // namespace ekfslam

@@ -26,4 +26,9 @@ class Root {
     Matrix L_;                   // those rows
 };
 
+// For upper triangular F and W, which stay so: W <- F C^-T with lower triangular C, and the lower triangle of W W^T.
+// Recursion spares two thirds of the arithmetic of BLAS, which knows one of the two triangles alone.
+void divide_upper(Eigen::Ref<Matrix> F, const Eigen::Ref<const Matrix>& C);
+void square_upper(const Eigen::Ref<const Matrix>& W, Eigen::Ref<Matrix> P);
+
 }  // namespace ekfslam

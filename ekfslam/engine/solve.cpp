@@ -1,168 +1,95 @@
-// Eq. (6): rows projected on A, solved, and applied.
+// Eq. (6): projected rows solved, and applied.
 #include <cmath>
 
 #include "blas.hpp"
 #include "gaussian.hpp"
+#include "stairs.hpp"
 
 namespace ekfslam {
 
 namespace {
-using Block = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMajor, 8, 8>;  // d is small
-
-Matrix columns_of(const Matrix& M, const Slots& which, Index d) {
-    Matrix some(M.rows(), static_cast<Index>(which.size()) * d);
-    for (std::size_t i = 0; i < which.size(); ++i)
-        some.middleCols(static_cast<Index>(i) * d, d) = M.middleCols(which[i] * d, d);
-    return some;
-}
-
-Slots places(const std::vector<bool>& flags) {
-    Slots some;
-    for (std::size_t i = 0; i < flags.size(); ++i)
-        if (flags[i]) some.push_back(static_cast<Index>(i));
-    return some;
-}
+using Gain = Eigen::Matrix<double, 3, Eigen::Dynamic, Eigen::ColMajor, 3, 8>;  // (3, d)
 }  // namespace
-
-Rows Rows::only(const Slots& which) const {
-    const Index d = dimension();
-    Rows some{{}, columns_of(H_x, which, d), columns_of(H_m, which, d), columns_of(residual, which, 1),
-              columns_of(variance, which, 1)};
-    for (Index i : which) some.slot.push_back(slot[static_cast<std::size_t>(i)]);
-    return some;
-}
-
-Projection Projection::only(const Slots& which) const {
-    const Index d = rows.dimension();
-    Projection some{rows.only(which), {}, columns_of(B, which, d), columns_of(T, which, d), columns_of(G, which, d), {}};
-    for (Index i : which) {
-        const double* own = L.data() + i * d * d;
-        some.L.insert(some.L.end(), own, own + d * d);
-        some.begin.push_back(begin[static_cast<std::size_t>(i)]);
-    }
-    return some;
-}
-
-Eigen::Map<const Matrix> Projection::root(Index i) const {
-    const Index d = rows.dimension();
-    return Eigen::Map<const Matrix>(L.data() + i * d * d, d, d);
-}
-
-Matrix Projection::own_variance(Index i) const {
-    const Index d = rows.dimension();
-    const auto T_i = T.middleCols(i * d, d);
-    Matrix S = root(i) * (Matrix::Identity(d, d) + T_i.transpose() * T_i) * root(i).transpose();
-    S.diagonal() -= rows.variance.col(i);
-    return S;
-}
-
-Matrix Projection::S() const {
-    const Index d = rows.dimension(), k = rows.count();
-    Matrix LT = T, S = Matrix::Zero(k * d, k * d);
-    for (Index i = 0; i < k; ++i) {
-        LT.middleCols(i * d, d) = (T.middleCols(i * d, d) * root(i).transpose()).eval();
-        S.block(i * d, i * d, d, d) = root(i) * root(i).transpose();
-    }
-    blas::square('T', 1.0, LT, 1.0, S);
-    blas::mirror(S);
-    return S;
-}
 
 Matrix Solution::residual() const {
     const Index d = at.rows.dimension();
     Matrix e = Matrix::Zero(d, at.rows.count());
-    for (Index i : places(left)) {
-        const Vector white = w.col(i) - at.T.middleCols(i * d, d).transpose() * y;
-        e.col(i) = at.rows.variance.col(i).cwiseProduct(
-            at.root(i).transpose().triangularView<Eigen::Upper>().solve(white));
+    for (Index i : places_of(left)) {
+        const auto L = at.root(i);
+        for (Index j = d - 1; j >= 0; --j) {
+            e(j, i) = v(j, i);
+            for (Index l = j + 1; l < d; ++l) e(j, i) -= L(l, j) * e(l, i);
+            e(j, i) /= L(j, j);
+        }
+        e.col(i).array() *= at.rows.variance.col(i).array();
     }
     return e;
-}
-
-const Root& Gaussian::root() const {
-    if (!root_) {
-        root_.emplace(P_AA_);
-        F_e_ = root_->coefficients(P_eA_);
-    }
-    return *root_;
-}
-
-Projection Gaussian::project(Rows rows) const {
-    const Index d = rows.dimension(), k = rows.count(), n = P_AA_.rows();
-    Projection at{std::move(rows), std::vector<double>(static_cast<std::size_t>(k * d * d)), lead_over(at.rows.H_x), {},
-                  Matrix(3, k * d), {}};
-    Slots failed;
-    for (Index i = 0; i < k; ++i) {
-        const Index row = row_[static_cast<std::size_t>(at.rows.slot[static_cast<std::size_t>(i)])];
-        if (row < 0) throw Error("a dormant landmark must wake before it is observed", {at.rows.slot[static_cast<std::size_t>(i)]});
-        const Awake& landmark = awake_[static_cast<std::size_t>(row)];
-        const auto H_m = at.rows.H_m.middleCols(i * d, d);
-        Block R = H_m.transpose() * landmark.S * H_m;
-        R.diagonal() += at.rows.variance.col(i);
-        const Eigen::LLT<Block> factor(R);
-        if (factor.info() != Eigen::Success || !R.allFinite()) {
-            failed.push_back(at.rows.slot[static_cast<std::size_t>(i)]);
-            continue;
-        }
-        const Block L = factor.matrixL();
-        Eigen::Map<Matrix>(at.L.data() + i * d * d, d, d) = L;
-        const auto whitened = L.triangularView<Eigen::Lower>();
-        at.G.middleCols(i * d, d) = whitened.solve<Eigen::OnTheLeft>((landmark.S * H_m).transpose()).transpose();
-        auto B = at.B.middleCols(i * d, d);
-        Index begin = 0;
-        while (begin < view_column() && B.row(begin).isZero(0.0)) ++begin;
-        begin = std::min(begin, landmark.begin);
-        if (landmark.own >= 0) B.middleRows(landmark.own, 3) += H_m;
-        else B.bottomRows(n - landmark.begin) += tail(const_cast<Awake&>(landmark)).lazyProduct(H_m);
-        B.bottomRows(n - begin) = whitened.solve(B.bottomRows(n - begin).transpose()).transpose().eval();
-        at.begin.push_back(begin);
-    }
-    if (!failed.empty()) throw Error("the innovation covariance is not positive definite", failed);
-    if (root().regular) {
-        at.T = at.B;
-        blas::multiply_triangle('L', 'U', 'T', root().F, at.T);
-    } else {
-        at.T.resize(root().F.cols(), k * d);
-        blas::multiply('T', 'N', 1.0, root().F, at.B, 0.0, at.T);
-    }
-    return at;
 }
 
 Solution Gaussian::solve(Projection at) const {
     Solution solution;
     const Index d = at.rows.dimension(), k = at.rows.count();
     solution.left.assign(static_cast<std::size_t>(k), true);
-    solution.w.resize(d, k);
-    for (Index i = 0; i < k; ++i)
-        solution.w.col(i) = at.root(i).triangularView<Eigen::Lower>().solve(at.rows.residual.col(i));
+    solution.w = at.rows.residual;
+    for (Index i = 0; i < k; ++i) {
+        const auto L = at.root(i);
+        for (Index j = 0; j < d; ++j) {
+            for (Index l = 0; l < j; ++l) solution.w(j, i) -= L(j, l) * solution.w(l, i);
+            solution.w(j, i) /= L(j, j);
+        }
+    }
     solution.at = std::move(at);
     solve_left(solution);
     return solution;
 }
 
-Solution Gaussian::without(Solution solution, const std::vector<bool>& out) const {
-    for (std::size_t i = 0; i < out.size(); ++i) solution.left[i] = solution.left[i] && !out[i];
-    solve_left(solution);
-    return solution;
+Solution Gaussian::without(Solution s, const std::vector<bool>& out) const {
+    // Removal from M is exact to rounding of what is removed.
+    constexpr double most = 1e4;
+    const Index d = s.at.rows.dimension();
+    double removed = 0.0;
+    Slots some;
+    for (Index i : places_of(out)) {
+        if (!s.left[static_cast<std::size_t>(i)]) continue;
+        s.left[static_cast<std::size_t>(i)] = false;
+        removed += s.at.of(i).squaredNorm();
+        some.push_back(s.at.place[static_cast<std::size_t>(i)]);
+    }
+    if (some.empty()) return s;
+    if (removed < most)
+        blas::square('N', -1.0, columns_of(s.at.T, some, d), 1.0, s.M);
+    else
+        s.M.resize(0, 0);
+    for (Index place : some) s.at.T.middleCols(place * d, d).setZero();
+    for (Index i : places_of(out)) s.w.col(i).setZero();
+    solve_left(s);
+    return s;
 }
 
-// Factorises M for the rows that are left.
+// Factorises M for the rows that are left; those of others are zero.
 void Gaussian::solve_left(Solution& s) const {
-    const Slots some = places(s.left);
-    const Index d = s.at.rows.dimension(), f = s.at.T.rows();
-    const bool is_all = some.size() == s.left.size();
-    const Matrix T_left = is_all ? Matrix() : columns_of(s.at.T, some, d), w = columns_of(s.w, some, 1);
-    const Matrix& T = is_all ? s.at.T : T_left;
-    s.C.setIdentity(f, f);
-    blas::square('N', 1.0, T, 1.0, s.C);
+    const Index d = s.at.rows.dimension(), f = s.at.T.rows(), k = s.at.rows.count();
+    if (s.M.rows() != f || !f) {
+        s.M.setIdentity(f, f);
+        for (const Stair& stair : stairs(s.at))
+            blas::square('N', 1.0, s.at.T.block(stair.begin, stair.column, f - stair.begin, stair.width), 1.0,
+                         s.M.bottomRightCorner(f - stair.begin, f - stair.begin));
+    }
+    s.C = s.M;
     if (!blas::factorise(s.C)) throw Error("the innovation covariance is not positive definite", s.at.rows.slot);
-    const Eigen::Map<const Vector> white(w.data(), w.size());
-    const Vector along = T * white;
-    const Vector u = s.C.triangularView<Eigen::Lower>().solve(along);
+    Vector white(k * d);
+    for (Index i = 0; i < k; ++i) white.segment(s.at.place[static_cast<std::size_t>(i)] * d, d) = s.w.col(i);
+    Vector u = blas::multiply('N', s.at.T, white);
+    s.C.triangularView<Eigen::Lower>().solveInPlace(u);
     s.y = s.C.transpose().triangularView<Eigen::Upper>().solve(u);
-    s.nis = white.squaredNorm() - u.squaredNorm();
+    white -= blas::multiply('T', s.at.T, s.y);
+    s.v.setZero(d, k);
+    s.nis = s.w.squaredNorm() - u.squaredNorm();
     s.log_det = 2.0 * s.C.diagonal().array().log().sum();
-    for (Index i : some) s.log_det += 2.0 * s.at.root(i).diagonal().array().log().sum();
+    for (Index i : places_of(s.left)) {
+        s.v.col(i) = white.segment(s.at.place[static_cast<std::size_t>(i)] * d, d);
+        for (Index j = 0; j < d; ++j) s.log_det += 2.0 * std::log(s.at.root(i)(j, j));
+    }
 }
 
 Solution Gaussian::solve_body(const Matrix& H, const Vector& residual, const Vector& variance) const {
@@ -172,7 +99,8 @@ Solution Gaussian::solve_body(const Matrix& H, const Vector& residual, const Vec
     S = (0.5 * (S + S.transpose())).eval();
     S.diagonal() += variance;
     const Eigen::LLT<Matrix> factor(S);
-    if (factor.info() != Eigen::Success || !S.allFinite()) throw Error("the innovation covariance is not positive definite");
+    if (factor.info() != Eigen::Success || !S.allFinite())
+        throw Error("the innovation covariance is not positive definite");
     Solution solution;
     const auto L = factor.matrixL();
     solution.V_A = L.solve(A).transpose();
@@ -186,8 +114,8 @@ Solution Gaussian::solve_body(const Matrix& H, const Vector& residual, const Vec
 
 Vector Gaussian::correction(const Solution& s) const {
     const bool of_body = s.V_A.size() > 0;
-    const Vector x_A = of_body ? Vector(s.V_A * s.w) : Vector(root().F * s.y);
-    const Vector x_e = of_body ? Vector(s.V_e * s.w) : Vector(F_e_ * s.y);
+    const Vector x_A = of_body ? Vector(s.V_A * s.w) : blas::multiply('N', root().F, s.y);
+    const Vector x_e = of_body ? Vector(s.V_e * s.w) : blas::multiply('N', F_e_, s.y);
     const Index b = columns_.body, n = x_A.size();
     Vector x = Vector::Zero(b + considered_ + 3 * landmarks());
     for (Index i = 0; i < static_cast<Index>(rest_.size()); ++i) x(rest_[static_cast<std::size_t>(i)]) = x_e(i);
@@ -196,8 +124,10 @@ Vector Gaussian::correction(const Solution& s) const {
         if (at >= 0) x.segment<6>(at) = view_at(at)->E * x_A.segment<6>(view_at(at)->column);
     const auto own = [&](Index slot) { return x.segment<3>(b + considered_ + 3 * slot); };
     for (const Awake& landmark : awake_) {
-        if (landmark.own >= 0) own(landmark.slot) = x_A.segment<3>(landmark.own);
-        else own(landmark.slot) = tail(const_cast<Awake&>(landmark)).transpose() * x_A.tail(n - landmark.begin);
+        if (landmark.own >= 0)
+            own(landmark.slot) = x_A.segment<3>(landmark.own);
+        else
+            own(landmark.slot) = tail(landmark).transpose() * x_A.tail(n - landmark.begin);
     }
     for (Index i = 0; i < dormant_.size(); ++i) {
         const Index slot = dormant_.slot[static_cast<std::size_t>(i)];
@@ -205,17 +135,21 @@ Vector Gaussian::correction(const Solution& s) const {
         if (of_body) own(slot) += (s.H_e * dormant_.cross.middleCols(3 * i, 3)).transpose() * s.w;
     }
     const Index d = s.at.rows.dimension();
-    for (Index i : places(s.left)) {
-        const Vector white = s.w.col(i) - s.at.T.middleCols(i * d, d).transpose() * s.y;
-        own(s.at.rows.slot[static_cast<std::size_t>(i)]) += s.at.G.middleCols(i * d, d) * white;
-    }
+    for (Index i : places_of(s.left))
+        own(s.at.rows.slot[static_cast<std::size_t>(i)]) += s.at.G.middleCols(i * d, d).lazyProduct(s.v.col(i));
     return x;
 }
 
 std::vector<Matrix> Gaussian::given_others(const Solution& s, const Slots& which) const {
-    const Index d = s.at.rows.dimension();
-    Matrix Z = columns_of(s.at.T, which, d);
-    blas::solve('L', 'L', 'N', s.C, Z);
+    const Index d = s.at.rows.dimension(), f = s.at.T.rows();
+    Slots columns;
+    Index begin = f;
+    for (Index i : which) {
+        columns.push_back(s.at.place[static_cast<std::size_t>(i)]);
+        begin = std::min(begin, s.at.begin[static_cast<std::size_t>(i)]);
+    }
+    Matrix Z = columns_of(s.at.T, columns, d).bottomRows(f - begin);
+    blas::solve('L', 'L', 'N', s.C.bottomRightCorner(f - begin, f - begin), Z);
     std::vector<Matrix> blocks;
     for (std::size_t i = 0; i < which.size(); ++i) {
         const auto Z_i = Z.middleCols(static_cast<Index>(i) * d, d);
@@ -227,14 +161,16 @@ std::vector<Matrix> Gaussian::given_others(const Solution& s, const Slots& which
 }
 
 Matrix Gaussian::information(const Solution& s, const Matrix& J) const {
-    const Slots some = places(s.left);
+    const Slots some = places_of(s.left);
     const Index d = s.at.rows.dimension();
     Matrix A = J;
     for (std::size_t i = 0; i < some.size(); ++i) {
         auto rows = A.middleRows(static_cast<Index>(i) * d, d);
         s.at.root(some[i]).triangularView<Eigen::Lower>().solveInPlace(rows);
     }
-    const Matrix T = columns_of(s.at.T, some, d);
+    Slots columns;
+    for (Index i : some) columns.push_back(s.at.place[static_cast<std::size_t>(i)]);
+    const Matrix T = columns_of(s.at.T, columns, d);
     Matrix along(T.rows(), J.cols());
     blas::multiply('N', 'N', 1.0, T, A, 0.0, along);
     blas::solve('L', 'L', 'N', s.C, along);
@@ -243,34 +179,68 @@ Matrix Gaussian::information(const Solution& s, const Matrix& J) const {
 
 void Gaussian::apply(const Solution& s) {
     if (s.V_A.size() > 0) return apply_body(s);
+    const bool regular = root().regular;
     Matrix W = root().F, G_e = F_e_;
-    blas::solve('R', 'L', 'T', s.C, W);
     blas::solve('R', 'L', 'T', s.C, G_e);
-    blas::square('N', 1.0, W, 0.0, P_AA_);
+    if (regular) {
+        divide_upper(W, s.C);
+        square_upper(W, P_AA_);
+        P_eA_ = G_e;
+        blas::multiply_triangle('R', 'U', 'T', W, P_eA_);
+    } else {
+        blas::solve('R', 'L', 'T', s.C, W);
+        blas::square('N', 1.0, W, 0.0, P_AA_);
+        blas::multiply('N', 'T', 1.0, G_e, W, 0.0, P_eA_);
+    }
     blas::mirror(P_AA_);
-    blas::multiply('N', 'T', 1.0, G_e, W, 0.0, P_eA_);
     const Matrix P_cc = P_ee_.bottomRightCorner(considered_, considered_);
     blas::square('N', -1.0, F_e_, 1.0, P_ee_);
     blas::square('N', 1.0, G_e, 1.0, P_ee_);
     blas::mirror(P_ee_);
     P_ee_.bottomRightCorner(considered_, considered_) = P_cc;
     root_.reset();
-    const Index d = s.at.rows.dimension(), n = P_AA_.rows();
-    for (Index i : places(s.left)) {
-        Awake& landmark = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(s.at.rows.slot[static_cast<std::size_t>(i)])])];
-        if (landmark.own >= 0) continue;
-        const Index begin = s.at.begin[static_cast<std::size_t>(i)];
-        extend(landmark, begin);
-        const auto G = s.at.G.middleCols(i * d, d);
-        tail(landmark).bottomRows(n - begin) -= s.at.B.block(begin, i * d, n - begin, d).lazyProduct(G.transpose());
-        landmark.S -= G * G.transpose();
-        landmark.S = (0.5 * (landmark.S + landmark.S.transpose())).eval();
+    const Matrix H_x = by_columns(s.at.rows.H_x);
+    for (Index i : places_of(s.left)) apply_rows(s, i, H_x);
+}
+
+// K_i <- (I - G L^-1 H_m) K_i - G L^-1 H_x, S_i <- S_i - G G^T.
+void Gaussian::apply_rows(const Solution& s, Index i, const Matrix& H_x) {
+    const Index d = s.at.rows.dimension();
+    const Index slot = s.at.rows.slot[static_cast<std::size_t>(i)];
+    Awake& landmark = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slot)])];
+    if (landmark.own >= 0) return;
+    const auto G = s.at.G.middleCols(i * d, d);
+    Gain gain = G;  // G L^-1
+    const auto L = s.at.root(i);
+    for (Index j = d - 1; j >= 0; --j) {
+        for (Index l = j + 1; l < d; ++l) gain.col(j) -= L(l, j) * gain.col(l);
+        gain.col(j) /= L(j, j);
     }
+    turn(landmark, Matrix3::Identity() - gain.lazyProduct(s.at.rows.H_m.middleCols(i * d, d).transpose()));
+    const auto subtract = [&](Index column, Index row, Index size) {
+        if (row < 0) return;
+        const auto H = H_x.block(row, i * d, size, d);
+        if (column < landmark.begin) {
+            if (H.isZero(0.0)) return;
+            extend(landmark, column);
+        }
+        Tail K = column >= recent_column() ? recent(landmark) : tail(landmark);
+        K.middleRows(column - landmark.begin, size) -= H.lazyProduct(gain.transpose());
+    };
+    const Lead lead = this->lead();
+    subtract(front_at(), 0, front_size());
+    subtract(anchor_.column, columns_.anchor >= 0 ? front_size() : -1, 6);
+    subtract(view_column() + 6, lead.drifted, 6);
+    subtract(view_.column, lead.view, 6);
+    subtract(previous_.column, lead.previous, 6);
+    landmark.S -= G.lazyProduct(G.transpose());
+    landmark.S = (0.5 * (landmark.S + landmark.S.transpose())).eval();
 }
 
 void Gaussian::apply_body(const Solution& s) {
     if (dormant_.size()) {
-        // Given A afterwards: with v = F^-1 V_A and N = (I - v^T v)^-1, eps_B depends on it by - F^-T v N cov(rows, eps_B).
+        // Given A afterwards: with v = F^-1 V_A and N = (I - v^T v)^-1, eps_B depends on it by - F^-T v N cov(rows,
+        // eps_B).
         const Matrix v = root().coefficients(s.V_A.transpose()).transpose(), E = s.H_e * dormant_.cross;
         const Index k = v.cols();
         const Eigen::LLT<Matrix> left(Matrix::Identity(k, k) - v.transpose() * v);

@@ -22,17 +22,37 @@ std::vector<Index> complement(const std::vector<Index>& some, Index size) {
     return others;
 }
 
-// Rows, and columns if `both`, of a matrix in a new order; -1: zeros.
-Matrix picked(const Matrix& P, const std::vector<Index>& rows, const std::vector<Index>& columns) {
-    Matrix new_P(static_cast<Index>(rows.size()), static_cast<Index>(columns.size()));
-    for (Index j = 0; j < new_P.cols(); ++j) {
-        const Index from = columns[static_cast<std::size_t>(j)];
-        for (Index i = 0; i < new_P.rows(); ++i) {
-            const Index row = rows[static_cast<std::size_t>(i)];
-            new_P(i, j) = from < 0 || row < 0 ? 0.0 : P(row, from);
-        }
+// Neighbours that stay neighbours in a new order.
+struct Run {
+    Index to, from, size;
+};
+
+std::vector<Run> runs(const std::vector<Index>& from) {
+    std::vector<Run> found;
+    for (Index j = 0; j < static_cast<Index>(from.size()); ++j) {
+        const Index old = from[static_cast<std::size_t>(j)];
+        if (old < 0) continue;
+        if (!found.empty() && found.back().to + found.back().size == j && found.back().from + found.back().size == old)
+            ++found.back().size;
+        else
+            found.push_back({j, old, 1});
     }
-    return new_P;
+    return found;
+}
+
+// Blocks of a matrix in a new order (n); zero elsewhere.
+Matrix picked(const Matrix& P, const std::vector<Run>& rows, Index height, const std::vector<Run>& columns,
+              Index width) {
+    Matrix moved(height, width);
+    Index kept_rows = 0, kept_columns = 0;
+    for (const Run& run : rows) kept_rows += run.size;
+    for (const Run& run : columns) kept_columns += run.size;
+    if (kept_rows < height || kept_columns < width) moved.setZero();
+    for (const Run& column : columns)
+        for (const Run& row : rows)
+            moved.block(row.to, column.to, row.size, column.size) =
+                P.block(row.from, column.from, row.size, column.size);
+    return moved;
 }
 
 std::vector<Index> all(Index size) {
@@ -42,8 +62,36 @@ std::vector<Index> all(Index size) {
 }
 }  // namespace
 
-Gaussian::Tail Gaussian::tail(Awake& landmark) const {
-    return Tail(landmark.K.data(), P_AA_.rows() - landmark.begin, 3);
+Gaussian::Tail Gaussian::tail(const Awake& constant) const {
+    Awake& landmark = const_cast<Awake&>(constant);  // its K does not change, the form of it does
+    const Index rows = P_AA_.rows() - landmark.begin;
+    const Matrix3 A = landmark.A;
+    double *x = landmark.K.data(), *y = x + rows, *z = y + rows;
+    for (Index i = 0; i < landmark.waiting; ++i) {
+        const double a = x[i], b = y[i], c = z[i];
+        x[i] = A(0, 0) * a + A(0, 1) * b + A(0, 2) * c;
+        y[i] = A(1, 0) * a + A(1, 1) * b + A(1, 2) * c;
+        z[i] = A(2, 0) * a + A(2, 1) * b + A(2, 2) * c;
+    }
+    landmark.waiting = 0;
+    return Tail(x, rows, 3);
+}
+
+// As a map of all rows, of which those before the last `n_A - recent_column()` may be waiting.
+Gaussian::Tail Gaussian::recent(const Awake& landmark) const {
+    const Index begin = std::max(recent_column(), landmark.begin);
+    if (landmark.waiting > begin - landmark.begin) return tail(landmark);
+    return Tail(const_cast<double*>(landmark.K.data()), P_AA_.rows() - landmark.begin, 3);
+}
+
+void Gaussian::turn(Awake& landmark, const Matrix3& A) const {
+    const Index waiting = std::max<Index>(0, recent_column() - landmark.begin);
+    if (landmark.waiting && landmark.waiting != waiting) tail(landmark);
+    landmark.A = landmark.waiting ? Matrix3(A * landmark.A) : A;
+    landmark.waiting = waiting;
+    const Index rows = P_AA_.rows() - landmark.begin;
+    auto K = Tail(landmark.K.data(), rows, 3).bottomRows(rows - waiting);
+    K = (K.lazyProduct(A.transpose())).eval();
 }
 
 // Lets a landmark depend on columns from `begin` on.
@@ -62,7 +110,7 @@ bool Gaussian::is_used(Index column, Index size) const {
         if (landmark.own >= 0) continue;
         const Index begin = std::max(column, landmark.begin);
         if (begin >= column + size) continue;
-        const Tail K = tail(const_cast<Awake&>(landmark));
+        const Tail K = column >= recent_column() ? recent(landmark) : tail(landmark);
         if (!K.middleRows(begin - landmark.begin, column + size - begin).isZero(0.0)) return true;
     }
     return false;
@@ -76,33 +124,49 @@ void Gaussian::rearrange(const std::vector<Index>& from) {
     for (Index j = 0; j < n; ++j) {
         const Index old = from[static_cast<std::size_t>(j)];
         if (old < 0) continue;
-        if (to[static_cast<std::size_t>(old)] >= 0) first[static_cast<std::size_t>(j)] = -1;
-        else to[static_cast<std::size_t>(old)] = j;
+        if (to[static_cast<std::size_t>(old)] >= 0)
+            first[static_cast<std::size_t>(j)] = -1;
+        else
+            to[static_cast<std::size_t>(old)] = j;
     }
     for (Awake& landmark : awake_) {
-        if (landmark.own >= 0) {
+        if (landmark.own >= 0)
             landmark.own = landmark.begin = to[static_cast<std::size_t>(landmark.own)];
-            continue;
-        }
-        Index begin = 0;
-        while (begin < n && first[static_cast<std::size_t>(begin)] < landmark.begin) ++begin;
-        std::vector<double> K(static_cast<std::size_t>(3 * (n - begin)), 0.0);
-        for (Index axis = 0; axis < 3; ++axis)
-            for (Index j = begin; j < n; ++j) {
-                const Index row = first[static_cast<std::size_t>(j)] - landmark.begin;
-                if (row < 0) continue;
-                K[static_cast<std::size_t>(axis * (n - begin) + j - begin)] =
-                    landmark.K[static_cast<std::size_t>(axis * (before - landmark.begin) + row)];
-            }
-        landmark.K.swap(K);
-        landmark.begin = begin;
+        else
+            move(landmark, first);
     }
     for (View* view : {&view_, &previous_, &anchor_})
         if (view->column >= 0) view->column = to[static_cast<std::size_t>(view->column)];
-    P_AA_ = picked(P_AA_, from, from);
-    P_eA_ = picked(P_eA_, all(P_eA_.rows()), from);
-    dormant_.K = picked(dormant_.K, first, all(dormant_.K.cols()));
+    const std::vector<Run> order = runs(from), e = runs(all(P_eA_.rows()));
+    P_AA_ = picked(P_AA_, order, n, order, n);
+    P_eA_ = picked(P_eA_, e, P_eA_.rows(), order, n);
+    dormant_.K = picked(dormant_.K, runs(first), n, runs(all(dormant_.K.cols())), dormant_.K.cols());
     root_.reset();
+}
+
+// Gives K of a landmark the new order of A, see `rearrange`.
+void Gaussian::move(Awake& landmark, const std::vector<Index>& first) const {
+    const Index before = P_AA_.rows(), n = static_cast<Index>(first.size()), begin = landmark.begin;
+    Index after = n;
+    while (after > 0 && first[static_cast<std::size_t>(after - 1)] == before - (n - after) - 1 &&
+           before - (n - after) > begin)
+        --after;
+    if (before - (n - after) == begin) {  // all of its columns stay together
+        landmark.begin = after;
+        return;
+    }
+    after = 0;
+    while (after < n && first[static_cast<std::size_t>(after)] < begin) ++after;
+    const Tail old = tail(landmark);
+    std::vector<double> K(static_cast<std::size_t>(3 * (n - after)), 0.0);
+    Tail moved(K.data(), n - after, 3);
+    for (Index j = after; j < n; ++j) {
+        const Index row = first[static_cast<std::size_t>(j)] - begin;
+        if (row < 0) continue;
+        for (Index axis = 0; axis < 3; ++axis) moved(j - after, axis) = old(row, axis);
+    }
+    landmark.K.swap(K);
+    landmark.begin = after;
 }
 
 // Makes dormant landmarks independent of columns that leave A, see dormant.hpp.
@@ -182,25 +246,24 @@ void Gaussian::promote(const std::vector<Index>& rows) {
 
 // Promotes landmarks so that A becomes smallest without the views that only they depend on; returns these columns.
 std::vector<Index> Gaussian::cut() {
-    Index best = 0, end = promoted_, dropped = 0;
-    std::size_t groups = 0;
-    Index width = 0, cost_of_best = 0;
     std::vector<Index> begins;
     for (const Awake& landmark : awake_)
         if (landmark.own < 0) begins.push_back(landmark.begin);
     std::sort(begins.begin(), begins.end());
+    Index end = promoted_, best = promoted_, least = 0;
+    std::size_t groups = 0;
     for (std::size_t c = 0; c < groups_.size(); ++c) {
         end += groups_[c];
-        width += groups_[c];
         if (previous_.column >= promoted_ && previous_.column < end) break;
-        const auto needed = std::lower_bound(begins.begin(), begins.end(), end) - begins.begin();
-        if (3 * needed - width >= cost_of_best) continue;
-        cost_of_best = 3 * needed - width;
+        const auto joined = std::lower_bound(begins.begin(), begins.end(), end) - begins.begin();
+        const Index grows = 3 * joined - (end - promoted_);
+        if (grows >= least) continue;
+        least = grows;
         groups = c + 1;
         best = end;
-        dropped = width;
     }
     if (!groups) return {};
+    const Index dropped = best - promoted_;
     std::vector<Index> joined, leaving;
     for (std::size_t i = 0; i < awake_.size(); ++i)
         if (awake_[i].own < 0 && awake_[i].begin < best) joined.push_back(static_cast<Index>(i));
@@ -220,8 +283,10 @@ void Gaussian::open_view(const Matrix& Y, const std::optional<Matrix>& Yd) {
     const Index groups = promoted_ + static_cast<Index>(leaving.size());
     const bool is_anchor = columns_.anchor >= 0 && anchor_.column == z;
     if (is_anchor) {
-    } else if (is_used(z, 6) || (columns_.previous >= 0 && previous_.column == z)) append_range(group, z, z + 6);
-    else append_range(leaving, z, z + 6);
+    } else if (is_used(z, 6) || (columns_.previous >= 0 && previous_.column == z))
+        append_range(group, z, z + 6);
+    else
+        append_range(leaving, z, z + 6);
     if (has_drifted_) append_range(is_used(z + 6, 6) ? group : leaving, z + 6, z + 12);
     release(leaving);
     append_range(from, 0, promoted_);

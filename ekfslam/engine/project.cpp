@@ -1,0 +1,188 @@
+// Rows projected on A: whitened, multiplied with the root of P_AA, and the covariances of innovations that follow.
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+#include "blas.hpp"
+#include "gaussian.hpp"
+#include "stairs.hpp"
+
+namespace ekfslam {
+
+namespace {
+using Small = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMajor, 8, 8>;  // (d, d)
+using Narrow = Eigen::Matrix<double, 3, Eigen::Dynamic, Eigen::ColMajor, 3, 8>;              // (3, d)
+
+// H <- H L^-T in place for a few columns of H and lower triangular L.
+template <class Columns>
+void divide(Columns&& H, const Small& L) {
+    for (Index j = 0; j < L.cols(); ++j) {
+        for (Index l = 0; l < j; ++l) H.col(j) -= L(j, l) * H.col(l);
+        H.col(j) *= 1.0 / L(j, j);
+    }
+}
+}  // namespace
+
+Rows Rows::only(const Slots& which) const {
+    const Index d = dimension();
+    Rows some{{},
+              columns_of(H_x, which, d),
+              columns_of(H_m, which, d),
+              columns_of(residual, which, 1),
+              columns_of(variance, which, 1)};
+    for (Index i : which) some.slot.push_back(slot[static_cast<std::size_t>(i)]);
+    return some;
+}
+
+Projection Projection::only(const Slots& which) const {
+    const Index d = rows.dimension(), k = static_cast<Index>(which.size());
+    Slots sorted(which.size()), columns;
+    std::iota(sorted.begin(), sorted.end(), 0);
+    const auto place_of = [&](Index i) { return place[static_cast<std::size_t>(which[static_cast<std::size_t>(i)])]; };
+    std::sort(sorted.begin(), sorted.end(), [&](Index i, Index j) { return place_of(i) < place_of(j); });
+    Projection some{rows.only(which), {}, {}, columns_of(G, which, d), {}, Slots(which.size())};
+    for (Index p = 0; p < k; ++p) {
+        columns.push_back(place_of(sorted[static_cast<std::size_t>(p)]));
+        some.place[static_cast<std::size_t>(sorted[static_cast<std::size_t>(p)])] = p;
+    }
+    some.T = columns_of(T, columns, d);
+    for (Index i : which) {
+        const double* own = L.data() + i * d * d;
+        some.L.insert(some.L.end(), own, own + d * d);
+        some.begin.push_back(begin[static_cast<std::size_t>(i)]);
+    }
+    return some;
+}
+
+Eigen::Map<const Matrix> Projection::root(Index i) const {
+    const Index d = rows.dimension();
+    return Eigen::Map<const Matrix>(L.data() + i * d * d, d, d);
+}
+
+Eigen::Block<const Matrix> Projection::of(Index i) const {
+    const Index d = rows.dimension(), first = begin[static_cast<std::size_t>(i)];
+    return T.block(first, place[static_cast<std::size_t>(i)] * d, T.rows() - first, d);
+}
+
+Matrix Projection::own_variance(Index i) const {
+    const Index d = rows.dimension();
+    const auto T_i = of(i);
+    Small square = Small::Identity(d, d);
+    for (Index a = 0; a < d; ++a)
+        for (Index b = 0; b <= a; ++b) square(a, b) += T_i.col(a).dot(T_i.col(b));
+    for (Index a = 0; a < d; ++a)
+        for (Index b = 0; b < a; ++b) square(b, a) = square(a, b);
+    Matrix S = root(i).lazyProduct(square.lazyProduct(root(i).transpose()).eval());
+    S.diagonal() -= rows.variance.col(i);
+    return S;
+}
+
+Matrix Projection::S() const {
+    const Index d = rows.dimension(), k = rows.count();
+    Matrix LT(T.rows(), k * d), S = Matrix::Zero(k * d, k * d);
+    for (Index i = 0; i < k; ++i) {
+        LT.middleCols(i * d, d).topRows(begin[static_cast<std::size_t>(i)]).setZero();
+        LT.middleCols(i * d, d).bottomRows(of(i).rows()) = of(i).lazyProduct(root(i).transpose());
+        S.block(i * d, i * d, d, d) = root(i) * root(i).transpose();
+    }
+    blas::square('T', 1.0, LT, 1.0, S);
+    blas::mirror(S);
+    return S;
+}
+
+const Root& Gaussian::root() const {
+    if (!root_) {
+        root_.emplace(P_AA_);
+        F_e_ = root_->coefficients(P_eA_);
+    }
+    return *root_;
+}
+
+Matrix Gaussian::by_columns(Matrix H_x) const {
+    const Lead at = lead();
+    const auto turned = [&H_x](const View& view, Index row) {
+        if (row >= 0 && !view.E.isIdentity(0.0))
+            H_x.middleRows(row, 6) = (view.E.transpose() * H_x.middleRows(row, 6)).eval();
+    };
+    turned(anchor_, columns_.anchor >= 0 ? front_size() : -1);
+    turned(view_, at.view);
+    turned(previous_, at.previous);
+    return H_x;
+}
+
+// Fills the whitened rows B^T of landmark i in T; false: their variance is not positive definite.
+bool Gaussian::whiten(Projection& at, Index i, const Matrix& H_x) const {
+    const Index d = at.rows.dimension(), n = P_AA_.rows();
+    const auto u = static_cast<std::size_t>(i);
+    const Awake& landmark = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(at.rows.slot[u])])];
+    Narrow H_m = at.rows.H_m.middleCols(i * d, d), SH = landmark.S.lazyProduct(H_m);
+    Small R = H_m.transpose().lazyProduct(SH);
+    R.diagonal() += at.rows.variance.col(i);
+    const Eigen::LLT<Small> factor(R);
+    if (factor.info() != Eigen::Success || !R.allFinite()) return false;
+    const Small L = factor.matrixL();
+    Eigen::Map<Matrix>(at.L.data() + i * d * d, d, d) = L;
+    divide(SH, L);
+    divide(H_m, L);
+    at.G.middleCols(i * d, d) = SH;
+    auto B = at.T.middleCols(at.place[u] * d, d);
+    B.topRows(landmark.own >= 0 ? n : landmark.begin).setZero();
+    if (landmark.own >= 0)
+        B.middleRows(landmark.own, 3) = H_m;
+    else {
+        const Tail K = tail(landmark);
+        for (Index j = 0; j < d; ++j)
+            B.col(j).tail(n - landmark.begin) = H_m(0, j) * K.col(0) + H_m(1, j) * K.col(1) + H_m(2, j) * K.col(2);
+    }
+    Matrix H = H_x.middleCols(i * d, d);
+    divide(H, L);
+    const Lead lead = this->lead();
+    B.middleRows(front_at(), front_size()) += H.topRows(front_size());
+    if (columns_.anchor >= 0) B.middleRows(anchor_.column, 6) += H.middleRows(front_size(), 6);
+    if (lead.drifted >= 0) B.middleRows(view_column() + 6, 6) += H.middleRows(lead.drifted, 6);
+    B.middleRows(view_.column, 6) += H.middleRows(lead.view, 6);
+    if (lead.previous >= 0) B.middleRows(previous_.column, 6) += H.middleRows(lead.previous, 6);
+    return true;
+}
+
+Projection Gaussian::project(Rows rows) const {
+    const Index d = rows.dimension(), k = rows.count(), n = P_AA_.rows();
+    const Matrix H_x = by_columns(rows.H_x);
+    const Lead lead = this->lead();
+    Projection at{std::move(rows),
+                  std::vector<double>(static_cast<std::size_t>(k * d * d)),
+                  Matrix(n, k * d),
+                  Matrix(3, k * d),
+                  {},
+                  Slots(static_cast<std::size_t>(k))};
+    for (Index i = 0; i < k; ++i) {
+        const Index slot = at.rows.slot[static_cast<std::size_t>(i)], row = row_[static_cast<std::size_t>(slot)];
+        if (row < 0) throw Error("a dormant landmark must wake before it is observed", {slot});
+        Index begin = std::min(view_column(), awake_[static_cast<std::size_t>(row)].begin);
+        const auto depends = [&](Index at_row, const View& view) {
+            if (at_row >= 0 && view.column < begin && !H_x.block(at_row, i * d, 6, d).isZero(0.0)) begin = view.column;
+        };
+        depends(lead.previous, previous_);
+        depends(columns_.anchor >= 0 ? front_size() : -1, anchor_);
+        at.begin.push_back(begin);
+    }
+    const Slots order = ascending(at.begin);
+    for (std::size_t p = 0; p < order.size(); ++p) at.place[static_cast<std::size_t>(order[p])] = static_cast<Index>(p);
+    Slots failed;
+    for (Index i = 0; i < k; ++i)
+        if (!whiten(at, i, H_x)) failed.push_back(at.rows.slot[static_cast<std::size_t>(i)]);
+    if (!failed.empty()) throw Error("the innovation covariance is not positive definite", failed);
+    if (root().regular) {
+        for (const Stair& s : stairs(at))
+            blas::multiply_triangle('L', 'U', 'T', root().F.bottomRightCorner(n - s.begin, n - s.begin),
+                                    at.T.block(s.begin, s.column, n - s.begin, s.width));
+        return at;
+    }
+    Matrix T(root().F.cols(), k * d);
+    blas::multiply('T', 'N', 1.0, root().F, at.T, 0.0, T);
+    at.T = T;
+    std::fill(at.begin.begin(), at.begin.end(), 0);
+    return at;
+}
+
+}  // namespace ekfslam
