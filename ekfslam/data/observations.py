@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.arrays import Array, IntArray
 from ekfslam.data.checks import (
+    LARGEST,
     LARGEST_DISTANCE_M,
     LARGEST_PX,
     LARGEST_VELOCITY,
@@ -145,34 +146,34 @@ def flat_observations(dense: Array, frame_axis: int, field: str) -> tuple[Observ
     The index of a track is its landmark id. A track is unseen if all four pixels are -1 or NaN. If only the right two
     are, there is no depth: the observation is left out. Any other missing pixel is an error.
     """
-    missing = (dense == UNSEEN) | np.isnan(dense)
-    seen = ~missing.any(axis=0)
-    only_left = missing[2:].all(axis=0) & ~missing[:2].any(axis=0)
-    _require_whole(dense, missing, seen | only_left | missing.all(axis=0), field)
-    require_finite(np.where(missing, 0.0, dense), field)
-    never = np.flatnonzero(~(seen | only_left).any(axis=frame_axis - 1))
-    if dense.shape[3 - frame_axis] and not seen.any():
-        raise EmptyTracksError(f"{len(never)} tracks are never seen, which is all of them", field=field, index=0)
-    notes = []
-    if len(never):
-        notes.append(f"{len(never)} of {dense.shape[3 - frame_axis]} tracks are never seen and are left out.")
-    if only_left.any():
-        notes.append(f"{int(only_left.sum())} observations have no right pixels and are left out.")
-    first, second = np.nonzero(seen)
-    frame, landmark = (first, second) if frame_axis == 1 else (second, first)
-    return Observations(frame, landmark, dense[:, first, second].T), tuple(notes)
-
-
-def _require_whole(dense: Array, missing: BoolArray, is_known: BoolArray, field: str) -> None:
-    partly = np.argwhere(~is_known)
+    missing = np.isnan(dense)
+    missing |= dense == UNSEEN
+    # Most entries are of tracks out of view: only the others are looked at more closely.
+    first, second = np.nonzero(~missing.all(axis=0))
+    pixels, unknown = dense[:, first, second], missing[:, first, second]
+    seen, only_left = ~unknown.any(axis=0), unknown[2:].all(axis=0) & ~unknown[:2].any(axis=0)
+    partly = np.flatnonzero(~(seen | only_left))
     if len(partly):
-        i, j = partly[0].tolist()
-        row = int(np.argmax(missing[:, i, j]))
+        k = int(partly[0])
+        row = int(np.argmax(unknown[:, k]))
         error: type[DataError] = ShapeError
         kind = "have some but not all of their four pixels equal to -1 (unseen)"
-        if np.isnan(dense[row, i, j]):
+        if np.isnan(pixels[row, k]):
             error, kind = NonFiniteError, "are NaN in some of their pixels"
-        raise error(f"{len(partly)} observations {kind}", field=field, index=(row, i, j))
+        raise error(f"{len(partly)} observations {kind}", field=field, index=(row, int(first[k]), int(second[k])))
+    if not (unknown | (np.abs(pixels) <= LARGEST)).all():
+        require_finite(np.where(missing, 0.0, dense), field)
+    frame, landmark = (first, second) if frame_axis == 1 else (second, first)
+    tracks = dense.shape[3 - frame_axis]
+    never = tracks - np.count_nonzero(np.bincount(landmark, minlength=tracks))
+    if tracks and not seen.any():
+        raise EmptyTracksError(f"{never} tracks are never seen, which is all of them", field=field, index=0)
+    notes = []
+    if never:
+        notes.append(f"{never} of {tracks} tracks are never seen and are left out.")
+    if only_left.any():
+        notes.append(f"{int(only_left.sum())} observations have no right pixels and are left out.")
+    return Observations(frame[seen], landmark[seen], pixels[:, seen].T), tuple(notes)
 
 
 def numbers(value: ArrayLike, name: str) -> Array:

@@ -46,13 +46,11 @@ def parse_mat(content: bytes, budget: Budget) -> dict[str, NDArray]:
 
 def _inflated(data: memoryview, order: str, budget: Budget) -> memoryview:
     """Decompress an element to the size that its tag claims, if that is allowed."""
-    stream = zlib.decompressobj()
-    tag = stream.decompress(data, 8)
-    _, size = struct.unpack_from(order + "II", tag)
+    _, size = struct.unpack_from(order + "II", zlib.decompressobj().decompress(data, 8))
     budget.take(size, "a compressed variable")
     if size > _MOST_DEFLATED * (len(data) + 1):
         raise ValueError(f"a variable claims {size} bytes, which {len(data)} compressed ones cannot hold")
-    return memoryview(tag + stream.decompress(stream.unconsumed_tail, size))
+    return memoryview(zlib.decompressobj().decompress(data, 8 + size))
 
 
 def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
