@@ -138,6 +138,62 @@ def test_information_equals_dense_least_squares(size, up_to, state):
     assert_equals_dense(system, found, rng)
 
 
+def system_of_views(rng, views, w, seen):
+    """A random system whose landmarks are seen through views of the frames, and the same one without views."""
+    system = random_system(rng, 9, 14, 0.5, aux=4, drive=3, chained=True, w=w, coupled=True)
+    by_frame = rng.normal(size=(9, 6 * views, w))
+    through, plain = [], []
+    for factor in system.factors:
+        if all(term.group != "landmarks" for term in factor.terms):
+            through.append(factor)
+            plain.append(factor)
+            continue
+        terms, expanded = [], []
+        for number, term in enumerate(factor.terms):
+            if term.group == "frames":
+                view = rng.integers(views, size=len(term.index)) if number else np.full(len(term.index), views - 1)
+                J = rng.normal(size=(*term.J.shape[:2], 6))
+                terms.append(Term("views", views * term.index + view, J))
+                J_frame = J @ by_frame.reshape(9, views, 6, w)[term.index, view]
+                expanded.append(Term("frames", term.index, J_frame))
+            else:
+                terms.append(term)
+                expanded.append(term)
+        through.append(dataclasses.replace(factor, terms=tuple(terms)))
+        plain.append(dataclasses.replace(factor, terms=tuple(expanded)))
+    seen = np.array(seen) if seen else np.arange(w)
+    return dataclasses.replace(system, factors=tuple(through), views=by_frame, seen=seen), dataclasses.replace(
+        system, factors=tuple(plain)
+    )
+
+
+@pytest.mark.parametrize("singular", [False, True])
+@pytest.mark.parametrize(
+    ("views", "w", "seen"),
+    [(1, 6, None), (1, 11, range(6)), (2, 18, [*range(6), *range(12, 18)]), (2, 15, None)],
+    ids=["pose", "jitter hidden", "drift seen, jitter hidden", "nothing hidden"],
+)
+def test_landmarks_seen_through_views_are_those_of_the_frames(views, w, seen, singular):
+    rng = np.random.default_rng(w)
+    system, plain = system_of_views(rng, views, w, seen)
+    if singular:  # a first pose that is known for certain in part
+        B = system.first.B.copy()
+        B[[0, 3, w - 1]] = 0.0
+        first = dataclasses.replace(system.first, B=B)
+        system, plain = (dataclasses.replace(one, first=first) for one in (system, plain))
+    found = JointInformation(system)
+    assert found.structure.sizes["hidden"] == (w - len(seen) if seen else 0) + 4
+    if not singular:
+        assert_equals_dense(plain, found, rng)
+    expected = JointInformation(plain)
+    for name in ("zeta", "eps", "aux", "drive", "d", "gain", "cost", "log_determinant"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(found.landmark_covariances(), expected.landmark_covariances(), rtol=1e-6, atol=1e-9)
+    for one, other in zip(system.rows(), plain.rows(), strict=True):
+        dense_of = [part.toarray() if hasattr(part, "toarray") else part for part in (one, other)]
+        np.testing.assert_allclose(*dense_of, atol=1e-12)
+
+
 def test_a_stranger_adds_kinds_of_factors_from_outside():
     """A loop closure, the offset between two landmarks, and a landmark that a bias of a frame displaces."""
     rng = np.random.default_rng(2)

@@ -23,6 +23,7 @@ from ekfslam.smoother.sparse.information import JointInformation
 MOST_ITERATIONS = 50
 # Landmarks settle until a step lowers their cost by less than this share of what ends the iterations.
 _SETTLED = 0.01
+_LEAST_DAMPING = 1e-8
 
 
 def robust(config: PosteriorConfig, s: Array) -> tuple[Array, Array]:
@@ -51,6 +52,23 @@ class Evaluation:
     system: LinearSystem
 
 
+@dataclass(frozen=True)
+class Maximum:
+    """The maximum a posteriori.
+
+    Args:
+        state: All unknowns there.
+        costs: Costs at the start and after each step.
+        linearised: The state and the weights of ``information``, at most one last step away.
+        information: The factorised system.
+    """
+
+    state: State
+    costs: tuple[float, ...]
+    linearised: Evaluation
+    information: JointInformation
+
+
 def evaluate(problem: BatchProblem, state: State, config: PosteriorConfig, min_depth_m: float) -> Evaluation | None:
     """Return cost and system at a state; None if a landmark is behind a camera that saw it."""
     sight = problem.observations.at(state)
@@ -68,14 +86,11 @@ def maximise(
     config: PosteriorConfig,
     min_depth_m: float,
     iterations: Iterable[int],
-) -> tuple[Evaluation, tuple[float, ...], JointInformation]:
+) -> Maximum:
     """Find the maximum a posteriori of all factors, by Levenberg-Marquardt with iteratively reweighted factors.
 
     A landmark that fits better at its first triangulation starts from there. Source: Triggs, McLauchlan, Hartley,
     Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000, section 4.
-
-    Returns:
-        The maximum; the costs at the start and after each step; the factorised system there.
 
     Raises:
         IllPosedError: Something is undetermined, or a landmark is behind a camera that saw it; names the ids.
@@ -95,18 +110,21 @@ def maximise(
         there = evaluate(problem, moved, config, min_depth_m)
         gain = here.cost - there.cost if there else -np.inf
         if there is None or not gain >= 0:
-            damping, growth = damping * growth, 2.0 * growth
+            damping, growth = max(damping, _LEAST_DAMPING) * growth, 2.0 * growth
             if step.gain <= config.tolerance * here.cost:
                 break
             continue
         # Nielsen, "Damping parameter in Marquardt's method", 1999: by how much of what was promised has come.
         share = gain / max(step.gain, np.finfo(float).tiny)
-        damping, growth = damping * max(1 / 3, 1 - (2 * min(share, 1.0) - 1) ** 3), 2.0
+        costs.append(there.cost)
+        if gain <= config.tolerance * there.cost and not damping:
+            return Maximum(there.state, tuple(costs), here, step)
         here = there
-        costs.append(here.cost)
         if gain <= config.tolerance * here.cost:
             break
-    return here, tuple(costs), JointInformation(here.system, like=step)
+        damping, growth = damping * max(1 / 3, 1 - (2 * min(share, 1.0) - 1) ** 3), 2.0
+        damping = damping if damping > _LEAST_DAMPING else 0.0
+    return Maximum(here.state, tuple(costs), here, JointInformation(here.system, like=step))
 
 
 def better_start(problem: BatchProblem, state: State, config: PosteriorConfig, min_depth_m: float) -> State:

@@ -338,12 +338,13 @@ def posterior_of_log(
     if config.linearisation == "filtered":
         information = JointInformation(problem.as_filtered())
         state = problem.solved_as_filtered(information)
-        weight, costs = np.ones(log.observations), (information.cost,)
+        weight, costs, linearised = np.ones(log.observations), (information.cost,), state
     else:
         iterations = progress(range(MOST_ITERATIONS), f"{name}: smoothing")
         start = problem.filtered_state(positions_m)
-        found, costs, information = maximise(problem, start, config, min_depth_m, iterations)
-        state, weight = found.state, found.weight
+        found = maximise(problem, start, config, min_depth_m, iterations)
+        state, costs, information = found.state, found.costs, found.information
+        weight, linearised = found.linearised.weight, found.linearised.state
     return Posterior(
         config.linearisation,
         log.id,
@@ -354,7 +355,7 @@ def posterior_of_log(
         information,
         problem.unknowns.values(state),
         problem,
-        state,
+        linearised,
     )
 
 

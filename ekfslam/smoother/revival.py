@@ -83,9 +83,9 @@ class MapRevival:
         start = problem.filtered_state(positions_m)
         if self._last is not None:
             start = continued(self._last, start, log)
-        found, _, information = maximise(problem, start, _MAXIMUM, self._config.min_depth_m, range(MOST_ITERATIONS))
+        found = maximise(problem, start, _MAXIMUM, self._config.min_depth_m, range(MOST_ITERATIONS))
         self._last = found.state
-        return marginal_of(problem, found.state, information, landmarks)
+        return marginal_of(problem, found.state, found.information, landmarks)
 
 
 def marginal_of(

@@ -38,7 +38,7 @@ class BlockPattern:
     Args:
         sizes: (b,) columns of each block of A, positive.
         places: Sets of blocks in the lower triangle: (n, 2) row and column of each, and the shape of all blocks of the
-            set. A place may occur in several sets, but once in each. Every diagonal block occurs.
+            set. A place may occur several times. Every diagonal block occurs.
 
     Attributes:
         order: (b,) blocks in that order.
@@ -68,19 +68,19 @@ class BlockPattern:
         # CHOLMOD works with 32 bit indices if they suffice; converted once, they need not be at every factorisation.
         index_type = np.int32 if len(indices) <= np.iinfo(np.int32).max else np.int64
         self._indices, self._indptr = indices.astype(index_type), indptr.astype(index_type)
-        self._targets, start = [], 0
+        targets, start = [], 0
         for blocks, (high, wide) in places:
             own = slice(start, start := start + len(blocks))
             at, turned = place[own, None, None], is_turned[own, None, None]
             down, right = np.where(turned, stride[at], 1), np.where(turned, 1, stride[at])
             target = origin[at] + down * np.arange(high)[:, None] + right * np.arange(wide)
-            self._targets.append(target.astype(index_type))
+            targets.append(target.ravel())
+        self._targets = np.concatenate(targets)
 
     def assemble(self, values: Iterable[Array]) -> sp.csc_matrix:
         """Return the permuted lower triangle from blocks (n, high, wide) of each set; blocks of a place add up."""
-        data = np.zeros(len(self._indices))
-        for target, blocks in zip(self._targets, values, strict=True):
-            data[target] += blocks
+        blocks = np.concatenate([np.ravel(blocks) for blocks in values])
+        data = np.bincount(self._targets, weights=blocks, minlength=len(self._indices))
         return sp.csc_matrix((data, self._indices, self._indptr), shape=(len(self.permutation),) * 2)
 
     def not_positive_definite(self, column: int) -> NotPositiveDefiniteError:

@@ -45,20 +45,26 @@ def normal_equations(structure: Structure, factors: Sequence[Factor], coordinate
         gram, columns = _unfolded(batch, _gram(of_sides, batch.start), factor, C)
         by_batch[number] = gram, columns
         for side, own_columns in zip(batch.sides, columns, strict=True):
-            gradient[side.group] += sum_by(side.index, s.counts[side.group], gram[:, own_columns, -1])
+            if side.once:
+                gradient[side.group][side.index] += gram[:, own_columns, -1]
+            else:
+                gradient[side.group] += sum_by(side.index, s.counts[side.group], gram[:, own_columns, -1])
         for term in batch.landmarks:
             _add_landmarks(factor, batch, term, of_sides, own, pairs, of_views, gradient["landmarks"])
     if s.views:
         by_pair = of_views.reshape(-1, s.views, 3, 6).swapaxes(1, 2).reshape(len(pairs["seen"]), 3, -1)
-        pairs["seen"] += by_pair @ C[s.pairs["seen"][:, 1]]
+        ends = np.searchsorted(s.pairs["seen"][:, 1], np.arange(len(C) + 1)).tolist()
+        for k, (a, b) in enumerate(pairwise(ends)):  # one product a frame, far fewer than pairs
+            pairs["seen"][a:b] += (by_pair[a:b].reshape(-1, C.shape[1]) @ C[k]).reshape(-1, 3, C.shape[2])
     for product in s.products:
         if product.of_landmarks:
             row, column = (factors[product.batch].terms[i].J[product.which] for i in (product.row, product.column))
             blocks = row.swapaxes(1, 2) @ column
         else:
             gram, columns = by_batch[product.batch]
-            blocks = gram[product.which, columns[product.row], columns[product.column]]
-        products.append(sum_by(product.index, len(product.places), blocks))
+            blocks = gram[:, columns[product.row], columns[product.column]]
+            blocks = blocks if len(product.which) == len(gram) else blocks[product.which]
+        products.append(blocks if product.index is None else sum_by(product.index, len(product.places), blocks))
     return NormalEquations(own, pairs, products, gradient)
 
 
@@ -132,5 +138,7 @@ def sum_by(index: IntArray, groups: int, values: Array) -> Array:
     n = len(index)
     if not values.size:
         return np.zeros((groups, *values.shape[1:]))
+    if groups == 1:
+        return np.asarray(values.sum(axis=0)[None])
     summation = sp.csc_array((np.ones(n), index, np.arange(n + 1)), shape=(groups, n))
     return (summation @ values.reshape(n, -1)).reshape(groups, *values.shape[1:])

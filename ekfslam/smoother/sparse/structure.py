@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,11 @@ class Side:
     term: int
     view: IntArray | None
 
+    @cached_property
+    def once(self) -> bool:
+        """Whether no two stretches touch the same unknown."""
+        return len(np.unique(self.index)) == len(self.index)
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -70,7 +76,7 @@ class Product:
         batch: Number of the factor.
         row, column: Numbers of sides, or of the terms over landmarks.
         which: Stretches (m,), or constraints of two landmarks, that take part.
-        index: (m,) place of each among the `places`.
+        index: (m,) place of each among the `places`; None: they are in order.
         places: (p, 2) blocks of the reduced matrix.
         of_landmarks: Whether both are landmarks.
     """
@@ -79,7 +85,7 @@ class Product:
     row: int
     column: int
     which: IntArray
-    index: IntArray
+    index: IntArray | None
     places: IntArray
     of_landmarks: bool = False
 
@@ -124,7 +130,7 @@ class Structure:
         eliminate_up_to: Landmarks observed from at most so many frames are eliminated.
 
     Attributes:
-        pairs: For each reduced group, landmark and unknown (p, 2) of the pairs that factors couple.
+        pairs: For each reduced group, landmark and unknown (p, 2) of the pairs that factors couple, by unknown.
         is_kept, kept: Whether (M,) a landmark is kept for CHOLMOD, and the numbers of kept ones.
         first: First reduced block of each group.
         block_sizes, start: Columns of each reduced block; the first of them, and the number of all.
@@ -204,8 +210,8 @@ class Structure:
                     touched.append((batch, (term, i), side.group, keys, view))
         self._numbers, self.pairs, by_key = {}, {}, {}
         for group, parts in found.items():
-            by_key[group], first = np.unique(np.concatenate(parts), return_index=True)
-            order = np.argsort(first)
+            by_key[group] = np.unique(np.concatenate(parts))
+            order = np.argsort(by_key[group] % max(self.counts[group], 1), kind="stable")  # by unknown
             self._numbers[group] = np.empty_like(order)
             self._numbers[group][order] = np.arange(len(order))
             self.pairs[group] = np.stack(np.divmod(by_key[group][order], max(self.counts[group], 1)), axis=-1)
@@ -234,6 +240,7 @@ class Structure:
             which = np.flatnonzero(high >= low)
             if len(which):
                 keys, index = np.unique(high[which] * n + low[which], return_inverse=True)
+                index = None if np.array_equal(index, np.arange(len(keys))) else index
                 places = np.stack(np.divmod(keys, n), axis=-1)
                 yield Product(number, row, column, which, index, places, of_landmarks)
 
