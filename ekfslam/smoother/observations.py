@@ -75,6 +75,10 @@ class ObservationFactors:
         """Take a sight as that of a state."""
         self._seen = state, sight
 
+    def forget(self) -> None:
+        """Forget the last sight, which takes more memory than all else kept."""
+        self._seen = None
+
     def factors(self, state: State) -> list[Factor]:
         """Return the factors linearised at a state."""
         sight, factors = self.at(state), []

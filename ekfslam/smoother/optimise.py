@@ -75,6 +75,7 @@ def evaluate(problem: BatchProblem, state: State, config: PosteriorConfig, min_d
     if not sight.in_view(min_depth_m).all():
         return None
     system, s = problem.relinearised(state), sight.norms()
+    problem.observations.forget()
     costs, weight = robust(config, s)
     cost = float(costs.sum() + system.half_square - 0.5 * (s**2).sum())
     return Evaluation(state, cost, weight, system if config.kernel == "none" else system.weighted(weight))

@@ -20,9 +20,8 @@ from ekfslam.smoother.sparse.cholmod import BlockPattern, concatenated_ranges
 from ekfslam.smoother.sparse.coordinates import REDUCED, SOLVED, Coordinates
 from ekfslam.smoother.sparse.factors import Factor, LinearSystem
 
-# Landmarks observed from more frames than this are kept for CHOLMOD: eliminating one couples all frames that observed
-# it, pair by pair, and their number grows with the square.
-ELIMINATE_UP_TO = 25
+# Landmarks whose elimination would couple more columns of frames are kept for CHOLMOD: the work grows with the square.
+MOST_COUPLED = 300
 AT_ONCE = 20_000  # constraints or pairs of them, so that temporary arrays stay in the cache
 
 
@@ -127,7 +126,7 @@ class Structure:
 
     Args:
         system: Any linearisation.
-        eliminate_up_to: Landmarks observed from at most so many frames are eliminated.
+        eliminate_up_to: Landmarks observed from at most so many frames are eliminated; None: see `MOST_COUPLED`.
 
     Attributes:
         pairs: For each reduced group, landmark and unknown (p, 2) of the pairs that factors couple, by unknown.
@@ -144,7 +143,7 @@ class Structure:
         IllPosedError: Landmarks without an observation; names them.
     """
 
-    def __init__(self, system: LinearSystem, eliminate_up_to: int = ELIMINATE_UP_TO) -> None:
+    def __init__(self, system: LinearSystem, eliminate_up_to: int | None = None) -> None:
         coordinates = Coordinates.of(system)
         factors, seen = coordinates.factors(system), coordinates.seen
         frames, landmarks = system.counts["frames"], system.counts["landmarks"]
@@ -163,7 +162,7 @@ class Structure:
         observed = np.bincount(self.pairs["seen"][:, 0], minlength=landmarks)
         if (observed == 0).any():
             raise IllPosedError("landmarks without an observation", self.ids[observed == 0])
-        self.is_kept = observed > eliminate_up_to
+        self.is_kept = observed > (MOST_COUPLED // seen if eliminate_up_to is None else eliminate_up_to)
         for factor, batch in zip(factors, self.batches, strict=True):
             for term in batch.landmarks[1:] and batch.landmarks:
                 self.is_kept[factor.terms[term].index] = True
