@@ -1,5 +1,8 @@
 #include "dormant.hpp"
 
+#include <algorithm>
+#include <utility>
+
 #include "blas.hpp"
 
 namespace ekfslam {
@@ -16,15 +19,24 @@ std::vector<Index> triples(const std::vector<Index>& which) {
     return columns;
 }
 
-void Dormant::append(Index at, const Matrix& K_i, const Matrix3& S_i) {
-    const Index before = S_.rows(), after = before + 3;
-    slot.push_back(at);
-    K.conservativeResize(K_i.rows(), after);
-    K.rightCols(3) = K_i;
+void Dormant::append(const std::vector<Index>& at, const Matrix& K_new, const std::vector<Matrix3>& S_new) {
+    const Index before = K.cols(), after = before + K_new.cols(), room = S_.rows();
+    slot.insert(slot.end(), at.begin(), at.end());
+    K.conservativeResize(K_new.rows(), after);
+    K.rightCols(after - before) = K_new;
     cross.conservativeResize(cross.rows(), after);
-    cross.rightCols(3).setZero();
-    S_.conservativeResizeLike(Matrix::Zero(after, after));
-    S_.bottomRightCorner(3, 3) = S_i;
+    cross.rightCols(after - before).setZero();
+    if (after > room) {
+        Matrix larger(std::max(after, 2 * room), std::max(after, 2 * room));
+        larger.topLeftCorner(before, before) = S_.topLeftCorner(before, before);
+        S_ = std::move(larger);
+    }
+    S_.block(0, before, after, after - before).setZero();
+    S_.block(before, 0, after - before, before).setZero();
+    for (std::size_t i = 0; i < S_new.size(); ++i) {
+        const Index own = before + static_cast<Index>(3 * i);
+        S_.block<3, 3>(own, own) = S_new[i];
+    }
     squares_.conservativeResizeLike(Matrix::Zero(after, squares_.cols()));
 }
 
@@ -35,7 +47,9 @@ void Dormant::keep(const std::vector<Index>& which) {
     slot = kept;
     K = Matrix(K(Eigen::all, own));
     cross = Matrix(cross(Eigen::all, own));
-    S_ = Matrix(S_(own, own));
+    const Index n = static_cast<Index>(own.size());
+    for (Index j = 0; j < n; ++j)  // in place: they ascend
+        for (Index i = 0; i < n; ++i) S_(i, j) = S_(own[static_cast<std::size_t>(i)], own[static_cast<std::size_t>(j)]);
     squares_ = Matrix(squares_(own, Eigen::all));
 }
 
@@ -50,14 +64,15 @@ void Dormant::add(const Matrix& A, double sign) {
 
 void Dormant::turn(Index which, const Matrix3& M) {
     const Index own = 3 * which;
-    S_.middleRows(own, 3) = (M * S_.middleRows(own, 3)).eval();
-    S_.middleCols(own, 3) = (S_.middleCols(own, 3) * M.transpose()).eval();
+    auto S = S_.topLeftCorner(K.cols(), K.cols());
+    S.middleRows(own, 3) = (M * S.middleRows(own, 3)).eval();
+    S.middleCols(own, 3) = (S.middleCols(own, 3) * M.transpose()).eval();
     squares_.middleRows(own, 3) = (M * squares_.middleRows(own, 3)).eval();
     cross.middleCols(own, 3) = (cross.middleCols(own, 3) * M.transpose()).eval();
 }
 
 Matrix Dormant::rows(const std::vector<Index>& own) const {
-    Matrix S = S_(own, Eigen::all);
+    Matrix S = S_.leftCols(K.cols())(own, Eigen::all);
     const Matrix left = squares_(own, Eigen::all) * sign_.asDiagonal();
     blas::multiply('N', 'T', 1.0, left, squares_, 1.0, S);
     return S;
@@ -69,14 +84,15 @@ Matrix3 Dormant::block(Index which) const {
 }
 
 void Dormant::fold() {
+    auto S = S_.topLeftCorner(K.cols(), K.cols());
     for (double sign : {1.0, -1.0}) {
         std::vector<Index> which;
         for (Index j = 0; j < sign_.size(); ++j)
             if (sign_(j) == sign) which.push_back(j);
-        if (!which.empty()) blas::square('N', sign, squares_(Eigen::all, which), 1.0, S_);
+        if (!which.empty()) blas::square('N', sign, squares_(Eigen::all, which), 1.0, S);
     }
-    blas::mirror(S_);
-    squares_.resize(S_.rows(), 0);
+    blas::mirror(S);
+    squares_.resize(K.cols(), 0);
     sign_.resize(0);
 }
 

@@ -23,9 +23,9 @@ class Dormant {
     Matrix cross;             // (e, 3n)
 
     Index size() const { return static_cast<Index>(slot.size()); }
-    // Adds a landmark, independent of the others given A.
-    void append(Index at, const Matrix& K_i, const Matrix3& S_i);
-    // Keeps some of the landmarks.
+    // Adds landmarks, independent of the others given A.
+    void append(const std::vector<Index>& at, const Matrix& K_new, const std::vector<Matrix3>& S_new);
+    // Keeps some of the landmarks, ascending.
     void keep(const std::vector<Index>& which);
     // Adds sign A A^T to S, A (3n, c).
     void add(const Matrix& A, double sign);
@@ -36,7 +36,7 @@ class Dormant {
 
    private:
     void fold();
-    Matrix S_{0, 0};
+    Matrix S_{0, 0};        // with room for more
     Matrix squares_{0, 0};  // S is this much more, or less, than S_: U diag(sign) U^T
     Vector sign_;
 };

@@ -115,11 +115,14 @@ void Gaussian::rest(const std::vector<bool>& asleep) {
     if (some_wake) wake(wakes);
     if (!some_tire) return;
     tires.resize(awake_.size(), false);
+    Slots slots;
+    std::vector<Matrix3> S;
     for (std::size_t i = 0; i < tires.size(); ++i) {
         if (!tires[i]) continue;
-        const Matrix K = dependence({awake_[i].slot});
-        dormant_.append(awake_[i].slot, K, awake_[i].S);
+        slots.push_back(awake_[i].slot);
+        S.push_back(awake_[i].S);
     }
+    dormant_.append(slots, dependence(slots), S);
     forget(tires);
 }
 

@@ -55,6 +55,13 @@ Matrix picked(const Matrix& P, const std::vector<Run>& rows, Index height, const
     return moved;
 }
 
+// Columns of C at some places among more, which are zero.
+Matrix widened(const Matrix& C, const std::vector<Index>& columns, Index width) {
+    Matrix wide = Matrix::Zero(C.rows(), width);
+    wide(Eigen::all, columns) = C;
+    return wide;
+}
+
 std::vector<Index> all(Index size) {
     std::vector<Index> places;
     append_range(places, 0, size);
@@ -179,10 +186,11 @@ Matrix Gaussian::release(const std::vector<Index>& leaving) {
     const Root root(P_AA_(kept, kept));
     const Matrix F_o = root.coefficients(P_AA_(leaving, kept)), C = root.regression(F_o);
     const Matrix D = P_AA_(leaving, leaving) - F_o * F_o.transpose();
-    dormant_.K(kept, Eigen::all) += C.transpose() * K_o;
+    blas::multiply('T', 'N', 1.0, widened(C, kept, P_AA_.rows()), K_o, 1.0, dormant_.K);
     dormant_.K(leaving, Eigen::all).setZero();
     dormant_.add(K_o.transpose() * Root(D).F, 1.0);
-    dormant_.cross += (P_eA_(Eigen::all, leaving) - P_eA_(Eigen::all, kept) * C.transpose()) * K_o;
+    const Matrix P_eo = P_eA_(Eigen::all, leaving) - P_eA_(Eigen::all, kept) * C.transpose();
+    blas::multiply('N', 'N', 1.0, P_eo, K_o, 1.0, dormant_.cross);
     return D * K_o;
 }
 
@@ -202,10 +210,10 @@ void Gaussian::absorb(const std::vector<Index>& entered, const Matrix& cross) {
     const Matrix P_nn = P_AA_(entered, entered);
     const Root given(P_nn - F_n * F_n.transpose(), P_nn.diagonal());
     const Matrix white = given.coefficients(cross.transpose()), gain = given.regression(white).transpose();
-    dormant_.K(others, Eigen::all) -= C.transpose() * gain;
+    blas::multiply('T', 'N', -1.0, widened(C, others, P_AA_.rows()), gain, 1.0, dormant_.K);
     dormant_.K(entered, Eigen::all) += gain;
     dormant_.add(white, -1.0);
-    dormant_.cross -= (P_eA_(Eigen::all, entered) - F_e * F_n.transpose()) * gain;
+    blas::multiply('N', 'N', -1.0, P_eA_(Eigen::all, entered) - F_e * F_n.transpose(), gain, 1.0, dormant_.cross);
 }
 
 // Appends columns K x_A + eps, K^T (n_A, m), to the promoted ones, with S (m, m) of eps and its covariance (e, m) with
