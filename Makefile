@@ -5,20 +5,20 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-whole check lint docs archive-page lower-bounds sanitize wheel results setup clean
+.PHONY: demo test test-whole check lint docs archive-page lower-bounds sanitize wheel results setup engine clean
 
-demo: $(READY)
+demo: engine
 	$(BIN)/ekfslam compare builtin:city --out results/local
 
-test: $(READY)
+test: engine
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
 
 # The slow tests at their full length, about an hour on two cores.
-test-whole: $(READY)
+test-whole: engine
 	OPENBLAS_NUM_THREADS=1 EKFSLAM_TESTS=whole $(BIN)/python -m pytest
 
 # Form, types and the fast tests: before every commit.
-check: lint
+check: engine lint
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow and not data"
 
 lint: $(READY)
@@ -45,7 +45,7 @@ wheel: $(READY)
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheel .
 
 # What is committed under results/, where it needs recordings only if they are present. About half an hour on two cores.
-results: $(READY)
+results: engine
 	$(BIN)/python experiments/compare_modes.py
 	$(BIN)/python experiments/reproduce_report.py
 	$(BIN)/python experiments/monte_carlo.py
@@ -63,9 +63,15 @@ results: $(READY)
 archive-page: $(READY)
 	$(BIN)/python docs/make_archive.py
 
-setup: $(READY)
+setup: engine
 
-$(READY): pyproject.toml .ci/setup ekfslam/engine/CMakeLists.txt $(wildcard ekfslam/engine/*.?pp ekfslam/kernels/*.c)
+# What has changed in C++ is compiled; the first time takes a minute on two cores.
+engine: $(READY)
+	@[ -f build/engine/build.ninja ] || $(BIN)/cmake -G Ninja -S ekfslam/engine -B build/engine --log-level=WARNING \
+	    -DCMAKE_MAKE_PROGRAM="$(CURDIR)/$(BIN)/ninja" -DPython_EXECUTABLE="$(CURDIR)/$(BIN)/python" >/dev/null
+	@$(BIN)/cmake --build build/engine -- --quiet
+
+$(READY): pyproject.toml .ci/setup
 	PYTHON="$(PYTHON)" VENV="$(VENV)" sh .ci/setup
 	@touch $@
 
