@@ -66,6 +66,18 @@ def test_errors_that_walk_are_not_white():
 def test_walks_whose_steps_persist_have_negative_white_errors():
     found = track_noise(seen(CAMERA, 0.0, 0.1, persists=0.6))
     assert (found.white < 0).all() and not found.is_white
+    assert found.persists
+
+
+def test_errors_that_persist_are_told_by_every_second_stretch_and_white_ones_by_all():
+    persisting, white = (seen(CAMERA, *std, frames=121, persists=0.6) for std in ((0.0, 0.1), (0.3, 0.0)))
+    asked = {}
+    for name, sequence in (("persisting", persisting), ("white", white)):
+        frames = asked[name] = set()
+        at = sequence.observations.at
+        object.__setattr__(sequence.observations, "at", lambda k, at=at, frames=frames: (frames.add(k), at(k))[1])
+        track_noise(sequence)
+    assert len(asked["persisting"]) <= 0.6 * len(asked["white"])
 
 
 def test_both_parts_of_a_mixture_are_found_and_the_walk_decides():

@@ -10,12 +10,14 @@ Successive residuals share ``n_k``. Steps of a walk share nothing, and steps tha
     Sigma = -E r_k (B_(k+1)^-1 r_(k+1))^T,    W = E r_k r_k^T - Sigma - B_k Sigma B_k^T.
 
 Each motion is fitted to the same tracks and takes a part of each row, its leverage p, with it. Hence residuals are
-divided by ``sqrt(1 - p)``. The errors are those of a jackknife over parts of the recording.
+divided by ``sqrt(1 - p)``. The errors are those of a jackknife over parts of the recording. Every second stretch is
+enough if errors clearly persist there.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +63,11 @@ class TrackNoise:
         """Whether white errors are seen in each row, and no walk that exceeds them half a track later."""
         walk = self.step - _SURE * self.step_error
         return bool(((self.white > _SURE * self.white_error) & (0.5 * self.length * walk < self.white)).all())
+
+    @property
+    def persists(self) -> bool:
+        """Whether steps of errors clearly persist, so that errors are not white, however many more are seen."""
+        return bool((self.white < -_SURE * self.white_error).any())
 
     @property
     def sigma_px(self) -> float:
@@ -110,15 +117,23 @@ def track_noise(sequence: Sequence) -> TrackNoise | None:
     """Return the noise of tracks from stretches of a recording; None: too few tracks."""
     intervals = len(sequence) - 1
     count = min(max(1, intervals // _STRETCH), _MOST_STRETCHES)
+    begins = (np.arange(count) * (intervals / count)).astype(int)
     moments: list[_Moments] = []
-    for begin in (np.arange(count) * (intervals / count)).astype(int).tolist():
-        last, before = _Fit(), None
-        for k in range(begin + 1, min(begin + _STRETCH, intervals) + 1):
-            now = _residuals(sequence, k, last)
-            if before is not None and now is not None:
-                moments.append(_moments(before, now))
-            before = now
-    return None if sum(len(some.B) for some in moments) < _LEAST_PAIRS else _noise(moments, _length(sequence))
+    found = None
+    for part in (begins[::2], begins[1::2]):
+        moments += [some for begin in part.tolist() for some in _stretch(sequence, begin, intervals)]
+        found = None if sum(len(some.B) for some in moments) < _LEAST_PAIRS else _noise(moments, _length(sequence))
+        if found is not None and found.persists:
+            break
+    return found
+
+
+def _stretch(sequence: Sequence, begin: int, intervals: int) -> list[_Moments]:
+    """Return the moments of the intervals of a stretch, each with the next."""
+    last = _Fit()
+    frames = range(begin + 1, min(begin + _STRETCH, intervals) + 1)
+    residuals = [_residuals(sequence, k, last) for k in frames]
+    return [_moments(before, now) for before, now in pairwise(residuals) if before is not None and now is not None]
 
 
 def _noise(moments: list[_Moments], length: int) -> TrackNoise:
