@@ -31,6 +31,10 @@ Matrix cholesky(Matrix P) {
 
 }  // namespace
 
+namespace ekfslam {
+void bind_model(nb::module_& module);
+}
+
 NB_MODULE(_engine, module) {
     module.doc() = "The filter in C++; `ekfslam.engine` is its face.";
     try {
@@ -41,4 +45,5 @@ NB_MODULE(_engine, module) {
     bind_gaussian(module);
     bind_gates(module);
     module.def("cholesky", &cholesky, nb::arg("P"), "Return the lower Cholesky factor of a covariance.");
+    bind_model(module);
 }
