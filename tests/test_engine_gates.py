@@ -107,6 +107,16 @@ def test_the_landmarks_that_agree_are_those_of_the_reference(rng, k, wrong):
         assert not np.isin(wrong, np.flatnonzero(found)).any() and found.sum() > k // 2
 
 
+def test_landmarks_that_a_sample_moves_far_are_judged_less_strictly(rng):
+    """The term of second order of a rotation is large where the focal length is small."""
+    S, rows = frame_of(rng, 12, (2, 7))
+    samples, focal = consensus.samples_of(12, np.random.default_rng(5)).tolist(), focal_lengths(rows)
+    strict, lenient = (engine.agreeing(S, rows.residual, factor * focal, GATE, samples) for factor in (1.0, 1e-3))
+    bent = Rows(rows.slot, 1e-3 * rows.H_x, rows.H_m, rows.residual, rows.variance)
+    np.testing.assert_array_equal(lenient, consensus.agreeing(S, bent, GATE, np.random.default_rng(5)))
+    assert sum(lenient) > sum(strict)
+
+
 @pytest.mark.parametrize("inside", ["all", "some", "none"])
 @pytest.mark.parametrize("d", [2, 3])
 def test_refined_landmarks_are_those_of_the_reference(rng, inside, d):
