@@ -26,7 +26,9 @@ from ekfslam.models.build import model_of
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
 
-OPEN = FilterConfig(landmark_coordinates="image", gate_probability=1.0, split_after=0, retire="never")
+OPEN = FilterConfig(
+    landmark_coordinates="image", gate_probability=1.0, split_after=0, retire="never", engine="reference"
+)
 P0 = np.diag([0.2, 0.1, 0.3, 0.05, 0.04, 0.08]) ** 2
 NOISE = Noise.isotropic(0.3, 0.02, 1.0)
 CAMERAS = {

@@ -19,6 +19,7 @@ from ekfslam.resolve import noise_of
 from ekfslam.runner import run
 
 OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0)
+REFERENCE = dataclasses.replace(OPEN, engine="reference")  # its covariance can be written to
 P0 = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
 
 
@@ -279,7 +280,7 @@ def test_a_frame_without_observations_is_a_prediction():
 
 def test_non_positive_innovation_covariance_names_frame_and_landmarks(world):
     rig = Rig(world.camera, world.T_cam_imu, world.noise)
-    ekf = JointEKF(rig, OPEN, world.initial_T_world_imu)
+    ekf = JointEKF(rig, REFERENCE, world.initial_T_world_imu)
     ids, pixels = world.observations.at(0)
     ekf.update(0, ids, pixels)
     ekf.P[9:12, 9:12] = -np.eye(3)
@@ -291,7 +292,7 @@ def test_non_positive_innovation_covariance_names_frame_and_landmarks(world):
 
 def test_indefinite_as_a_whole_is_an_error_too(world):
     rig = Rig(world.camera, world.T_cam_imu, world.noise)
-    ekf = JointEKF(rig, OPEN, world.initial_T_world_imu)
+    ekf = JointEKF(rig, REFERENCE, world.initial_T_world_imu)
     ids, pixels = world.observations.at(0)
     ekf.update(0, ids, pixels)
     ekf.P[6:9, 9:12] = ekf.P[9:12, 6:9] = 50 * np.eye(3)

@@ -26,7 +26,6 @@ ROOMS: tuple[tuple[str, ...], ...] = (
     ("models",),
     ("engine",),
     ("filters",),
-    ("engine",),
     ("smoother",),
     ("storage",),
     ("evaluation",),

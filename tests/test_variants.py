@@ -15,7 +15,7 @@ from ekfslam.errors import ConfigError
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
 
-OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0, retire="never")
+OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0, retire="never", engine="reference")
 
 
 def gauge_ratio(ekf, T_start, P0):

@@ -4,6 +4,7 @@
 
 #include "bind_gaussian.hpp"
 #include "bind_gates.hpp"
+#include "binding.hpp"
 #include "lapack.hpp"
 #include "types.hpp"
 
@@ -44,6 +45,7 @@ NB_MODULE(_engine, module) {
     }
     bind_gaussian(module);
     bind_gates(module);
+    binding::bind_filter(module);
     module.def("cholesky", &cholesky, nb::arg("P"), "Return the lower Cholesky factor of a covariance.");
     bind_model(module);
 }

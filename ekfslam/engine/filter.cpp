@@ -29,6 +29,12 @@ Taken taken_by(const Estimate& e, const Correction& found) {
     return taken;
 }
 
+// Whether a view without a block has another derivative after a correction: by a calibration, or blocks that move it.
+bool has_blocks_of_camera(const Estimate& e) {
+    const auto is_of_camera = [](const Block& block) { return block.moves_camera || block.kind == Kind::calibration; };
+    return std::any_of(e.blocks.begin(), e.blocks.end(), is_of_camera);
+}
+
 }  // namespace
 
 Filter::Filter(Estimate estimate, std::int64_t landmark, std::int64_t observation)
@@ -103,6 +109,7 @@ void Filter::take_in(Correction& found, Index frame, Report& report) {
     if (found.solution) e.gaussian.apply(*found.solution);
     e.imu_twist = found.linear.imu_twist;
     retract(e, found.change);
+    if (e.columns.view < 0 && has_blocks_of_camera(e)) open_views(e);
     if (found.dof) e.updated = Updated::view;
     accepted(e.table, found.slot, frame);
     report.nis = found.nis;

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
 from ekfslam.data.interval import Interval
+from ekfslam.engine.choice import uses_engine
+from ekfslam.engine.face import Engine
 from ekfslam.errors import ConfigError
 from ekfslam.filters.conditional import ConditionalGaussian
 from ekfslam.filters.coordinates import CameraCoordinates
@@ -86,6 +89,7 @@ class Estimate:
     Args:
         model: Blocks, sensor and noise.
         config: Settings of the filter; the form ``auto`` of the covariance means ``dense``.
+        is_joint: Whether landmarks will come; blocks alone need no engine.
 
     Raises:
         ConfigError: Landmarks in image coordinates, but no view in the model.
@@ -94,21 +98,25 @@ class Estimate:
         values: Estimate of every state block by name.
         coordinates: (body,) coordinates of the blocks, as in the log.
         imu_twist: (6,) velocity of the IMU at the last frame, for a time offset, eq. (9).
-        table: The active landmarks, in the order of their blocks in P.
+        engine: Mean and covariance in C++; None in the reference filter.
         step: Number of predictions so far.
         updated_view: Block of the last updated view: ``view`` between an update and the next prediction, then
             ``previous_view``. None: the observations of the frame before have not updated it.
         images: Image coordinates, eq. (7'); None with ``xyz``.
     """
 
-    def __init__(self, model: Model, config: FilterConfig) -> None:
+    def __init__(self, model: Model, config: FilterConfig, is_joint: bool = True) -> None:
         self.model, self.config = model, config
         self.variant = VARIANTS[config.variant]
         self.values = model.initial_values()
         self.coordinates, self.imu_twist = model.initial_coordinates, np.zeros(6)
-        self.table = LandmarkTable(model.sensor.dimension)
-        form = ConditionalGaussian if config.covariance_form == "conditional" else DenseGaussian
-        self.gaussian: Gaussian = form(model.prior_covariance, model.layout.seen)
+        self._table: LandmarkTable | None = LandmarkTable(model.sensor.dimension)
+        self.engine = Engine(model, config) if is_joint and uses_engine(model, config) else None
+        if self.engine is not None:
+            self.gaussian = cast(Gaussian, self.engine)  # it has the verbs that are used outside of a frame
+        else:
+            form = ConditionalGaussian if config.covariance_form == "conditional" else DenseGaussian
+            self.gaussian = form(model.prior_covariance, model.layout.seen)
         self.motion, self.step = Motion.none(self.values["pose"]), 0
         self.updated_view: str | None = View.name
         self.images: CameraCoordinates | None = None
@@ -118,13 +126,26 @@ class Estimate:
             self.images = CameraCoordinates(model.sensor, config.min_depth_m)
 
     @property
+    def table(self) -> LandmarkTable:
+        """The active landmarks, in the order of their blocks in P; a copy of the engine's."""
+        if self._table is None:
+            assert self.engine is not None
+            self._table = LandmarkTable(self.sensor.dimension)
+            self._table.append(**self.engine.table())
+        return self._table
+
+    def forget_table(self) -> None:
+        """Forget the copy of the engine's table, which changes."""
+        self._table = None
+
+    @property
     def mean(self) -> Mean:
         """The present mean."""
         return Mean(self.values, self.table.position_m, self.imu_twist)
 
     def without_landmarks(self) -> Estimate:
         """Return an estimate of the blocks alone, to look ahead with `ekfslam.filters.prediction.predict`."""
-        alone, body = Estimate(self.model, self.config), self.model.layout.body
+        alone, body = Estimate(self.model, self.config, False), self.model.layout.body
         alone.values, alone.coordinates, alone.imu_twist = self.values, self.coordinates, self.imu_twist
         alone.motion, alone.step, alone.updated_view = self.motion, self.step, self.updated_view
         alone.gaussian = DenseGaussian(self.gaussian.body_covariance[:body, :body], self.model.layout.seen)

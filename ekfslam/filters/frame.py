@@ -12,7 +12,7 @@ from ekfslam.filters.correction import Correction
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.innovations import FrameInnovations
 from ekfslam.filters.lifecycle import Retired
-from ekfslam.filters.logbook import LogBook
+from ekfslam.filters.logbook import Accepted, LogBook
 from ekfslam.filters.observing import look_again
 from ekfslam.filters.reports import missed
 from ekfslam.filters.retraction import retract
@@ -100,7 +100,11 @@ def _take(e: Estimate, log: LogBook, found: Correction, frame: int) -> None:
     if found.gaussian is not None:
         e.gaussian = found.gaussian
         e.motion = e.motion.doubted(found.doubt)
-    log.corrected(e, found)
+    slot, linear = found.slot, found.linear
+    follows = (e.table.last_step[slot] == e.step - 1) & (e.model.track_error is not None)
+    previous = np.where(follows, e.table.last_observation[slot], -1)
+    accepted = Accepted(e.table.log_row[slot], previous, found.measured, found.variance, linear.position_m[slot])
+    log.corrected(e, accepted, linear.values, linear.imu_twist, found.coordinates)
     e.table.observed(found.slot, e.step, found.measured, log.last(len(found.slot)))
     correction = found.done.correction
     if found.solution is not None:

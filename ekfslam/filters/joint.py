@@ -16,8 +16,9 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.config import CalibrationConfig, FilterConfig
 from ekfslam.data.interval import Interval
 from ekfslam.errors import ConfigError
+from ekfslam.filters import compiled
+from ekfslam.filters import frame as frames
 from ekfslam.filters.estimate import Estimate
-from ekfslam.filters.frame import rest, update
 from ekfslam.filters.lifecycle import Marginal, Relinearised, Retired, Revival
 from ekfslam.filters.log import Log
 from ekfslam.filters.logbook import LogBook
@@ -79,7 +80,7 @@ class JointEKF(Estimate):
             model = model_of(sensor, sensor.noise, se3.inverse(T_world_imu), P_pose, calibration, blocks, coordinates)
         super().__init__(model, config)
         self.window = window(model, config) if config.lag and window is not None else None
-        look_again(self)
+        self._look_again()
         self.revival, self.retired, self._revived = revival, Retired(), False
         self._log = LogBook(self)
         self._reported: list[Array] = []  # estimates and standard deviations (2, p) after each frame
@@ -90,7 +91,7 @@ class JointEKF(Estimate):
     def begin(self, inputs: Array) -> None:
         """Take the inputs (c,) at the first frame, for a time offset, eq. (9); no prediction leads to this frame."""
         self.imu_twist = self.model.process.begin(self.values, np.asarray(inputs, dtype=float))
-        look_again(self)
+        self._look_again()
         self._log.amend(seen_twist=self.imu_twist)
 
     def predict(
@@ -127,13 +128,18 @@ class JointEKF(Estimate):
         Raises:
             InnovationError: The innovation covariance is not positive definite.
         """
-        # 1. Retire landmarks out of view, revive those that come back.
-        rest(self, self.retired, frame, ids)
-        if self.revival is not None and (returning := self.retired.among(ids)):
+        # 1. Retire landmarks out of view, revive those that come back; correct with known landmarks, start new ones.
+        returning = [] if self.revival is None else self.retired.among(ids)
+        if (engine := self.engine) is None:
+            frames.rest(self, self.retired, frame, ids)
             self._revive(frame, returning)
-        # 2. Correct with known landmarks, start new ones.
-        found = update(self, self._log, self.retired, self._waiting, frame, ids, measured)
-        # 3. Linearise the last frames again.
+            found = frames.update(self, self._log, self.retired, self._waiting, frame, ids, measured)
+        else:
+            if returning:
+                compiled.rest(self, engine, self.retired, frame, ids)
+                self._revive(frame, returning)
+            found = compiled.update(self, engine, self._log, self.retired, frame, ids, measured, bool(returning))
+        # 2. Linearise the last frames again.
         if self.window is not None and self.step:
             self._relinearise(self.window)
         self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
@@ -146,9 +152,13 @@ class JointEKF(Estimate):
 
     def _revive(self, frame: int, ids: list[int]) -> None:
         """Bring retired landmarks and their neighbours back: the state becomes the marginal of the batch problem."""
-        assert self.revival is not None
+        if self.revival is None or not ids:
+            return
         log, known = self._log.log(), self.landmarks()
+        count = len(self.table)
         self.retired.fetch(self.table, known, log, ids, self.revival, frame)
+        if self.engine is not None:
+            self.engine.revive(self.table.columns(count))
         self._adopt(self.revival.marginal(log, known.position_m, self.table.log_row))
         self._revived = True
         if self.variant.first_estimates and not is_frozen_exactly(self.config):
@@ -173,10 +183,20 @@ class JointEKF(Estimate):
     def _adopt(self, found: Marginal) -> None:
         """Replace mean and covariance of blocks and active landmarks."""
         self.values, self.table.position_m = {**self.values, **found.values}, found.position_m
-        self.gaussian.start_over(found.P)
         self.coordinates = self.coordinates.copy()  # the log has those before
         self.coordinates[found.columns] = found.coordinates
-        look_again(self)
+        if self.engine is None:
+            self.gaussian.start_over(found.P)
+            look_again(self)
+        else:
+            self.values, self.coordinates = self.engine.adopt(self.values, self.coordinates, found.position_m, found.P)
+
+    def _look_again(self) -> None:
+        """Set the view of the first frame, in the covariance, too."""
+        if self.engine is None:
+            look_again(self)
+        else:
+            self.values, self.coordinates = self.engine.look_again(self.imu_twist)
 
     def landmarks(self) -> Landmarks:
         """Return every landmark so far, in the order of landmark initialisation."""

@@ -65,6 +65,10 @@ class LandmarkTable:
             new[name] = value
         self._rows = np.concatenate([self._rows, new])
 
+    def columns(self, first: int) -> dict[str, Array | IntArray]:
+        """Return all columns but ``extra`` by name, from a row on."""
+        return {name: np.ascontiguousarray(self._rows[name][first:]) for name in (*_WHOLE, *_STEPS, *_REAL[:-1])}
+
     def keep(self, stay: BoolArray) -> None:
         """Drop the rows that do not stay (n,)."""
         self._rows = self._rows[stay]

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.interval import Interval
-from ekfslam.filters.correction import Correction
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.log import Log
 from ekfslam.filters.prediction import Prediction
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import PreviousView
+from ekfslam.models.blocks import PreviousView, Values
 from ekfslam.models.process import Measured
 
 # Arrays over observations, pieces of inputs and measurements, by the one that holds their frames.
@@ -24,6 +23,23 @@ _OF_FRAMES = {
     "input_frame": ("input_frame", "input_dt_s", "inputs"),
     "measured_frame": ("measured_frame", *(f"measured_{field.name}" for field in fields(Measured))),
 }
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """Accepted observations (k) of known landmarks.
+
+    Args:
+        landmark, previous: (k,) rows of the log; places of the observations in the frame before, or -1.
+        rows, variance: (k, d) measured rows; variances of these or of their differences.
+        position_m: (k, 3) landmarks at the linearisation.
+    """
+
+    landmark: IntArray
+    previous: IntArray
+    rows: Array
+    variance: Array
+    position_m: Array
 
 
 class LogBook:
@@ -88,21 +104,21 @@ class LogBook:
         self._add(measured_frame=np.full(len(rows.axis), len(self._frames)))
         self._add(**{f"measured_{field.name}": getattr(rows, field.name) for field in fields(rows)})
 
-    def corrected(self, now: Estimate, found: Correction) -> None:
-        """Add the correction of this frame, before the estimate takes it."""
-        table, slot = now.table, found.slot
-        follows = (table.last_step[slot] == now.step - 1) & (now.model.track_error is not None)
-        previous = np.where(follows, table.last_observation[slot], -1)
-        linear, T_before = found.linear, now.motion.T_departed
-        if (view := linear.values.get(PreviousView.name)) is not None and now.step:
+    def corrected(
+        self, now: Estimate, accepted: Accepted, values: Values, imu_twist: Array, coordinates: Array
+    ) -> None:
+        """Add the correction of this frame, with the values at which it was linearised."""
+        T_before = now.motion.T_departed
+        if (view := values.get(PreviousView.name)) is not None and now.step:
             T_before = se3.inverse(now.motion.T_cam_imu_before) @ view
-        position_m = linear.position_m[slot]
-        self._observed(now.step, table.log_row[slot], found.measured, found.variance, position_m, previous)
+        self._observed(
+            now.step, accepted.landmark, accepted.rows, accepted.variance, accepted.position_m, accepted.previous
+        )
         self.amend(
             doubt=now.motion.interval.doubt,
-            seen_twist=linear.imu_twist,
-            linear=found.coordinates.copy(),
-            T_linear=linear.values["pose"],
+            seen_twist=imu_twist,
+            linear=coordinates.copy(),
+            T_linear=values["pose"],
             T_linear_before=T_before,
         )
 

@@ -72,6 +72,10 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     e.motion = Motion(T_departed, e.T_imu_world, W_before, W_before, interval, way_m, T_cam_imu, step.Q, last)
     e.imu_twist, e.step = step.imu_twist, e.step + 1
     # The view of this frame is where its camera is now.
+    if e.engine is not None:
+        e.forget_table()
+        e.values, e.coordinates = e.engine.arrive(e.values, e.coordinates, e.imu_twist, whole.Phi, whole.Q, e.motion)
+        return Prediction(departed, measured, log_likelihood, doubt)
     if (E := look(e)) is not None:
         whole = replace(whole, Phi=E @ whole.Phi, Q=E @ whole.Q @ E.T)
         e.motion = replace(e.motion, Q=E @ step.Q @ E.T)
@@ -106,10 +110,15 @@ def _measure(
     used = Measured.concatenate(parts)
     H = process.jacobian(used)
     residual = used.value - H @ e.coordinates
-    solution = e.gaussian.solve_body(H, residual, used.std**2, e.step + 1)
-    e.gaussian.apply(solution)
-    retract(e, solution.done.correction)
-    log_likelihood = log_density(solution.done.nis, solution.done.log_det, len(residual))
+    if e.engine is not None:
+        e.forget_table()
+        e.values, e.coordinates, nis, log_det = e.engine.measure(e.values, e.coordinates, H, residual, used.std**2)
+    else:
+        solution = e.gaussian.solve_body(H, residual, used.std**2, e.step + 1)
+        e.gaussian.apply(solution)
+        retract(e, solution.done.correction)
+        nis, log_det = solution.done.nis, solution.done.log_det
+    log_likelihood = log_density(nis, log_det, len(residual))
     return None, Measured.concatenate([*begin, *parts]), log_likelihood, max(doubts)
 
 
