@@ -61,8 +61,9 @@ def update(
     views = [(e.step, begun["rows"], begun["variance"])]
     if begun["step_before"] >= 0:
         views.insert(0, (begun["step_before"], begun["rows_before"], begun["variance"]))
-    log.started(begun["ids"], begun["position_m"], *views)
-    retired.start_again(begun["ids"])
+    if len(begun["ids"]):
+        log.started(begun["ids"], begun["position_m"], *views)
+        retired.start_again(begun["ids"])
     e.values, e.coordinates, e.imu_twist = engine.named(found["values"]), found["coordinates"], found["imu_twist"]
     return Outcome(
         found["reason"],

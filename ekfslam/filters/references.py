@@ -40,7 +40,7 @@ class References:
         for i in np.flatnonzero(self._second == frame):
             at, own = self._clones[int(self._first[i])]
             # A map revival replaces the covariance of the filter by one without the clones.
-            if np.array_equal(P[at, at], own):
+            if np.allclose(P[at, at], own, rtol=1e-6, atol=0.0) or np.array_equal(P[at, at], own):
                 self._cross[i] = P[at, _POSE]
         needed = set(self._first[self._second > frame].tolist())
         for j in self._clones.keys() - needed:
