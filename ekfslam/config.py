@@ -24,7 +24,6 @@ Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
 Variant = Literal["invariant", "fej", "standard"]
 LandmarkCoordinates = Literal["image", "xyz"]
 Retire = Literal["auto", "unseen", "never"]
-CovarianceForm = Literal["auto", "dense", "conditional"]
 Engine = Literal["auto", "engine", "reference"]
 Linearisation = Literal["map", "filtered"]
 NoiseModel = Literal["auto", "tuned", "white"]
@@ -106,6 +105,7 @@ _CONSTANTS_OF_THE_FRONT_END = (
 )
 # Settings of earlier versions: files that name them are read, with a note.
 RETIRED = {
+    "filter.covariance_form": "the engine has one form of the covariance, which is linear in the number of landmarks",
     "blocks.stereo_rotation": "the block is gone: it improved nothing. Pitch and roll of the right camera are the mean "
     "of vL - vR over the tracks of a recording",
     "hygiene.restart_above_px": "it changed no accuracy; every track is cut at a repeated frame",
@@ -185,8 +185,6 @@ class FilterConfig:
         landmark_coordinates: Coordinates in which a correction acts on landmarks. ``image``: their images in the last
             updated camera, see `ekfslam.filters.coordinates`; sensors that are not cameras use ``xyz``. ``xyz``:
             positions in world, the textbook's form.
-        covariance_form: Form of the joint covariance; estimates are the same. ``dense``: one matrix. ``conditional``:
-            linear in the number of landmarks, see `ekfslam.filters.conditional`. ``auto`` takes the cheaper one.
         iterations: Gauss-Newton iterations of an update; 1 is the plain EKF. ``fej`` and ``xyz`` allow no more.
         lag: Number of frames n of the relinearised window: after each update, the factors of the last n frames are
             linearised again at their maximum a posteriori, see `ekfslam.smoother.fixed_lag`. 0 linearises each once. By
@@ -217,7 +215,6 @@ class FilterConfig:
 
     variant: Variant = field(default="invariant", metadata=_one_of(Variant))
     landmark_coordinates: LandmarkCoordinates = field(default="image", metadata=_one_of(LandmarkCoordinates))
-    covariance_form: CovarianceForm = field(default="auto", metadata=_one_of(CovarianceForm))
     iterations: int = field(default=1, metadata=_whole(1, 100))
     lag: int | None = field(default=None, metadata=_whole(0, 1000))
     retire: Retire = field(default="auto", metadata=_one_of(Retire))

@@ -8,8 +8,7 @@
    residuals along tracks show them (`ekfslam.models.track_noise`), else errors that walk.
 4. Automatic model: blocks of shared errors, calibration, least disparity (`settings_of`).
 5. Tracks: cleaned by `ekfslam.data.hygiene`.
-6. Form of the covariance: the cheaper one.
-7. Scale of the walk of track errors, from innovations of short stretches of the recording.
+6. Scale of the walk of track errors, from innovations of short stretches of the recording.
 
 `ekfslam info` prints the outcome. A resolved configuration resolves to itself.
 
@@ -42,7 +41,6 @@ from ekfslam.filters.stretches import run_stretches, stretches_of, thinned
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import OPTIONAL_BLOCKS, StateBlock, TwistBias
 from ekfslam.models.build import blocks_and_process, model_of
-from ekfslam.models.form import is_conditional_cheaper
 from ekfslam.models.model import Model
 from ekfslam.models.noise import (
     CAMERA_ROTATION_DEG,
@@ -119,7 +117,7 @@ class Problem:
         config = self.config
         chosen = {
             "noise": ("sigma_px", "drift", "track_scale", *_SAMPLING),
-            "filter": ("lag", "retire", "retire_after", "dormant", "covariance_form"),
+            "filter": ("lag", "retire", "retire_after", "dormant"),
             "hygiene": ("min_disparity_sigma",),
             "calibration": ("rotation_deg", "disparity_px"),
         }
@@ -166,7 +164,6 @@ def resolve(
         attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
         sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
     model = _model(sequence, config, noise, blocks)
-    config = _with_form(config, sequence, model)
     if mode in ("full", "smoothed"):
         account["engine"] = in_words(model, config.filter)
         if (sampling := _sampling(sequence, config)) is not None:
@@ -207,7 +204,7 @@ def noise_of_velocities(sequence: Sequence, config: Config | None = None) -> Vel
 def settings_of(sequence: Sequence, config: Config) -> Config:
     """Return a configuration with every automatic setting resolved that depends on the recording alone.
 
-    Explicit settings take precedence. `noise_of` gives the noise; `resolve` adds track scale and covariance form.
+    Explicit settings take precedence. `noise_of` gives the noise; `resolve` adds the track scale.
     """
     config = _with_retirement(sequence, config)
     if sequence.has_checked_tracks and config.filter.split_after is None:
@@ -458,18 +455,3 @@ def _settings(table: Mapping[str, BlockSetting | None]) -> str:
         for key, value in table.items()
         if value is not None
     )
-
-
-def _with_form(config: Config, sequence: Sequence, model: Model) -> Config:
-    """Return a configuration with the form of the covariance."""
-    settings, layout = config.filter, model.layout
-    if settings.covariance_form != "auto":
-        return config
-    if settings.lag:  # the window writes all of the covariance in each frame
-        return config.with_overrides({"filter": {"covariance_form": "dense"}})
-    # The view stays in the state for one more frame, as the previous one.
-    group = sum(block.size for block in layout.blocks if block.is_seen and (block.per_frame or block.clones))
-    kept = len(sequence.observations.ids) if settings.retire == "never" else settings.dormant or 0
-    stay = settings.retire_after or 1
-    cheaper = is_conditional_cheaper(sequence.observations, len(sequence), layout.body, group, stay, kept)
-    return config.with_overrides({"filter": {"covariance_form": "conditional" if cheaper else "dense"}})

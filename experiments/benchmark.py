@@ -1,8 +1,8 @@
-"""Measure the time of a frame: both forms of the covariance, and the joint filter against GTSAM's iSAM2.
+"""Measure the time of a frame: engine and reference filter, and the joint filter against GTSAM's iSAM2.
 
 Three tables, on one BLAS thread. Runs take turns (A B A B ...), so other work on the machine affects all alike:
 
-- *Observations per frame*: `builtin:city` with 30 to 1000; dense and conditional form, the same filter to rounding.
+- *Observations per frame*: `builtin:city` with 30 to 1000; engine and reference filter, the same to rounding.
 - *Laps*: a ring of 40 m radius, driven three times. Landmarks out of view are dormant, and return exactly.
 - *The race*: total seconds of the joint filter on the UTIAS drives, with white noise as in GTSAM's factors, and with
   the automatic model. iSAM2 (relinearizeSkip 10, Cauchy) runs on the observations that the filter accepted, without
@@ -36,8 +36,8 @@ from ekfslam.evaluation.tables import document, markdown_table, number
 from ekfslam.figures.style import BAND_ALPHA, VARIANTS, styled
 
 OBSERVATIONS = (30, 60, 120, 250, 500, 1000)
-FORMS = ("dense", "conditional")
-DENSE_LIMIT = 500  # beyond it the dense form runs once, and over fewer frames
+FILTERS = ("engine", "reference")
+REFERENCE_LIMIT = 500  # beyond it fewer frames
 WHITE: dict[str, dict[str, Any]] = {"noise": {"model": "white"}, "filter": {"relative_frames": 0}}
 XYZ: dict[str, dict[str, Any]] = {**WHITE, "filter": {"relative_frames": 0, "landmark_coordinates": "xyz"}}
 AUTOMATIC: dict[str, dict[str, Any]] = {"filter": {"relative_frames": 0}}
@@ -59,9 +59,9 @@ def city(observations: int, frames: int) -> Sequence:
     return builtin(f"city?frames={frames}&max_tracks={tracks}&landmarks_per_m={density}")
 
 
-def of_form(form: str) -> dict[str, Any]:
-    """Return the settings of one form of the covariance."""
-    return {"filter": {"covariance_form": form, "relative_frames": 0}}
+def of_filter(name: str) -> dict[str, Any]:
+    """Return the settings of one implementation of the filter."""
+    return {"filter": {"engine": name, "relative_frames": 0}}
 
 
 def milliseconds(sequence: Sequence, settings: dict[str, Any]) -> np.ndarray:
@@ -73,12 +73,12 @@ def by_observations(repeat: int, sizes: tuple[int, ...]) -> list[dict[str, Any]]
     """Measure milliseconds per frame against observations per frame."""
     rows = []
     for size in sizes:
-        sequence = city(size, 60 if size <= DENSE_LIMIT else 30)
-        tasks = {form: partial(milliseconds, sequence, of_form(form)) for form in ("auto", *FORMS)}
-        found = {form: np.concatenate([ms[10:] for ms in all_ms]) for form, all_ms in in_turn(tasks, repeat).items()}
+        sequence = city(size, 60 if size <= REFERENCE_LIMIT else 30)
+        tasks = {name: partial(milliseconds, sequence, of_filter(name)) for name in FILTERS}
+        found = {name: np.concatenate([ms[10:] for ms in all_ms]) for name, all_ms in in_turn(tasks, repeat).items()}
         row: dict[str, Any] = {"observations": float(np.bincount(sequence.observations.frame)[10:].mean())}
-        for form, ms in found.items():
-            row[form] = {"median": float(np.median(ms)), "p95": float(np.percentile(ms, 95)), "max": float(ms.max())}
+        for name, ms in found.items():
+            row[name] = {"median": float(np.median(ms)), "p95": float(np.percentile(ms, 95)), "max": float(ms.max())}
         rows.append(row)
         print(row, flush=True)
     return rows
@@ -89,8 +89,8 @@ def by_laps(laps: int = 3) -> list[dict[str, Any]]:
     frames = int(laps * 2 * np.pi * 40.0 / 8.0 / 0.1)
     sequence = builtin(f"loop?radius_m=40&landmarks=394&landmark_offset_m=16&frames={frames}")
     settings: dict[str, dict[str, Any]] = {
-        "never retired, dense": {"retire": "never", "covariance_form": "dense"},
-        "asleep out of view": {"retire": "never", "covariance_form": "conditional"},
+        "never retired, reference filter": {"retire": "never", "engine": "reference"},
+        "asleep out of view": {"retire": "never"},
         "retired, from the batch problem": {"retire": "unseen", "retire_after": 10},
     }
     rows = []
@@ -159,10 +159,10 @@ def figure(rows: list[dict[str, Any]]) -> Figure:
     """Draw milliseconds per frame against observations per frame."""
     drawn = Figure(figsize=(5.0, 3.6))
     axes = drawn.add_subplot()
-    for form, style in (("dense", VARIANTS["standard"]), ("conditional", VARIANTS["invariant"])):
+    for name, style in (("reference", VARIANTS["standard"]), ("engine", VARIANTS["invariant"])):
         x = [row["observations"] for row in rows]
-        axes.plot(x, [row[form]["median"] for row in rows], **style, label=f"{form} form")
-        lower, upper = ([row[form][key] for row in rows] for key in ("median", "p95"))
+        axes.plot(x, [row[name]["median"] for row in rows], **style, label=f"{name} name")
+        lower, upper = ([row[name][key] for row in rows] for key in ("median", "p95"))
         axes.fill_between(x, lower, upper, color=style["color"], alpha=BAND_ALPHA, linewidth=0)
     axes.set(xscale="log", yscale="log", xlabel="observations a frame", ylabel="time a frame (ms), median to 95 %")
     axes.set_xticks(OBSERVATIONS[: len(rows)], [str(size) for size in OBSERVATIONS[: len(rows)]])
@@ -177,9 +177,8 @@ def tables(found: dict[str, Any]) -> str:
     sizes = [
         [
             number(row["observations"], ".0f"),
-            *(f"{row[form]['median']:.1f} ({row[form]['p95']:.1f})" for form in FORMS),
-            f"{row['dense']['median'] / row['conditional']['median']:.2f}",
-            f"{row['dense']['median'] / row['auto']['median']:.2f}",
+            *(f"{row[name]['median']:.1f} ({row[name]['p95']:.1f})" for name in FILTERS),
+            f"{row['reference']['median'] / row['engine']['median']:.2f}",
         ]
         for row in found["observations"]
     ]
@@ -195,7 +194,7 @@ def tables(found: dict[str, Any]) -> str:
     parts = [
         f"One BLAS thread of {found['machine']}, {found['dgemm_gflops']:.0f} Gflop/s at 500 x 500; runs take turns.",
         "Milliseconds a frame on `builtin:city`, median (95 %):",
-        markdown_table(["observations", *FORMS, "dense / conditional", "dense / auto"], sizes),
+        markdown_table(["observations", *FILTERS, "reference / engine"], sizes),
         "A ring of 40 m radius with 394 landmarks, seconds a lap:",
         markdown_table(["landmarks out of view", "lap 1", "lap 2", "lap 3", "3 / 2", "longest / median frame"], laps),
     ]

@@ -30,7 +30,7 @@ from ekfslam.models.model import Model
 from ekfslam.models.process.inertial import inertial
 from ekfslam.models.sensors.stereo import Rig
 
-FILTER = FilterConfig(covariance_form="dense", retire="unseen", retire_after=1, revive=-1)
+FILTER = FilterConfig(retire="unseen", retire_after=1, revive=-1)
 PARTS = {"rotation": slice(3, 6), "position": slice(0, 3), "velocity": slice(6, 9)}
 PARTS |= {"gyro bias": slice(9, 12), "accel bias": slice(12, 15), "pose": slice(0, 6), "all": slice(0, 15)}
 

@@ -197,7 +197,7 @@ def position_error_m(sequence: Sequence, T_world_imu: Array) -> float:
 
 def steps(sequence: Sequence, retire: str, variant: str = "invariant") -> Iterator[tuple[JointEKF, float]]:
     """Yield the joint filter after each frame, with the CPU milliseconds of the frame."""
-    config = Config().with_overrides({"filter": {"retire": retire, "variant": variant, "covariance_form": "dense"}})
+    config = Config().with_overrides({"filter": {"retire": retire, "variant": variant}})
     problem = resolve(sequence, config, "dead-reckoning")
     model, settings = problem.model, problem.config.filter
     ekf = JointEKF(model, settings, revival=MapRevival(model, settings))

@@ -14,13 +14,12 @@ from ekfslam.config import CalibrationConfig, FilterConfig
 from ekfslam.data.sequence import Noise
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError
-from ekfslam.filters.coordinates import CameraCoordinates, change_in_view, points_in
+from ekfslam.filters.coordinates import CameraCoordinates, change_in_view, image, image_jacobian, points_in
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.observing import look, observe
 from ekfslam.filters.retraction import carried_back, retracted
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import se3
-from ekfslam.kernels.plain import image, image_jacobian
 from ekfslam.models.blocks import CameraJitter, VisionDrift
 from ekfslam.models.build import model_of
 from ekfslam.models.sensors.monocular import Monocular

@@ -94,12 +94,11 @@ def test_pixel_noise_of_zero_is_refused_by_name():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["dense", "conditional"])
 @pytest.mark.parametrize("world", ["city", "loop"])
 @pytest.mark.parametrize("px", [0.001, 0.003])
-def test_covariances_keep_their_digits_where_pixels_are_almost_exact(world, px, form):
+def test_covariances_keep_their_digits_where_pixels_are_almost_exact(world, px):
     sequence = builtin(f"{world}?frames=40&sigma_px={px}&outlier_fraction=0")
-    found = run(sequence, "full", Config().with_overrides({"filter": {"covariance_form": form}}))
+    found = run(sequence, "full")
     assert COVARIANCES.holds(found.covariance, {}).all()
     assert COVARIANCES.holds(found.landmarks.covariance, {}).all()
     assert "is less than the errors of linearisation" in found.remarks[0]

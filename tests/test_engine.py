@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(bool(choice.MISSING), reason=f"engine: {choice.M
 
 def filter_of(problem, engine):
     """Return a new filter of a problem, by one of both implementations."""
-    config = dataclasses.replace(problem.config.filter, engine=engine, covariance_form="dense")
+    config = dataclasses.replace(problem.config.filter, engine=engine)
     revival = MapRevival(problem.model, config) if config.revive >= 0 else None
     return JointEKF(problem.model, config, revival=revival, window=FixedLag)
 

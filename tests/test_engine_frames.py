@@ -100,7 +100,7 @@ def reports_of_both(world, settings=None):
     """Return the reports of the engine, after a comparison of each frame with the reference filter."""
     problem = resolve(world, Config().with_overrides({"filter": {"revive": -1}, **(settings or {})}))
     filters = [
-        JointEKF(problem.model, dataclasses.replace(problem.config.filter, engine=engine, covariance_form="dense"))
+        JointEKF(problem.model, dataclasses.replace(problem.config.filter, engine=engine))
         for engine in ("engine", "reference")
     ]
     reports = []

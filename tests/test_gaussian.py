@@ -1,18 +1,14 @@
-"""Every verb of the covariance, in both forms, against its naive dense form; the table of landmarks stays aligned."""
+"""Every verb of the covariance against its naive form; the table of landmarks stays aligned."""
 
 import numpy as np
 import pytest
 
 from ekfslam.config import FilterConfig
 from ekfslam.errors import InnovationError
-from ekfslam.filters import dormant
-from ekfslam.filters.conditional import ConditionalGaussian
-from ekfslam.filters.dense import DenseGaussian, add_square
 from ekfslam.filters.gates import agrees_with_others, most_given_others, moves_along
-from ekfslam.filters.gaussian import Rows
+from ekfslam.filters.gaussian import Gaussian, Rows, add_square
 from ekfslam.filters.landmarks import LandmarkTable
 
-FORMS = [DenseGaussian, ConditionalGaussian]
 BODY, SEEN, POSE, CLONE, WALK = 14, 12, slice(0, 6), slice(6, 12), slice(12, 14)
 
 
@@ -171,13 +167,11 @@ def step(rng):
 @pytest.mark.parametrize("certain", [False, True], ids=["uncertain", "certain"])
 @pytest.mark.parametrize("considered", [0, 12])
 @pytest.mark.parametrize("naps", [False, True], ids=["awake", "naps"])
-@pytest.mark.parametrize("form", FORMS)
-def test_all_verbs_over_many_frames(form, considered, certain, naps, monkeypatch):
+def test_all_verbs_over_many_frames(considered, certain, naps):
     """Landmarks come, are seen in part and shuffled, and leave; coordinates change; all is compared in every frame."""
-    monkeypatch.setattr(dormant, "WAITING", 20)
     rng = np.random.default_rng(considered + certain)
     body = np.diag(rng.uniform(0.01, 0.1, BODY)) * (not certain)
-    gaussian, naive = form(body, SEEN), Naive(body)
+    gaussian, naive = Gaussian(body, SEEN), Naive(body)
     if considered:
         assert gaussian.consider(considered) == BODY
         naive.consider(considered)
@@ -227,11 +221,10 @@ def test_all_verbs_over_many_frames(form, considered, certain, naps, monkeypatch
     assert naive.n > 3
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_nothing_but_landmarks_is_uncertain(form):
+def test_nothing_but_landmarks_is_uncertain():
     rng = np.random.default_rng(10)
     nothing, C = np.zeros((BODY, BODY)), np.stack([(1 + i) * 0.1 * (np.eye(3) + 0.4) for i in range(5)])
-    gaussian, naive = form(nothing, SEEN), Naive(nothing)
+    gaussian, naive = Gaussian(nothing, SEEN), Naive(nothing)
     G = rng.normal(size=(5, 3, SEEN))
     gaussian.augment(G, C), naive.augment(G, C)
     gaussian.propagate(np.eye(BODY), nothing)
@@ -240,11 +233,10 @@ def test_nothing_but_landmarks_is_uncertain(form):
         same(gaussian, naive)
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_another_covariance_takes_its_place(form):
+def test_another_covariance_takes_its_place():
     rng = np.random.default_rng(7)
     root = rng.normal(size=(BODY + 15,) * 2)
-    gaussian, naive = form(np.eye(BODY), SEEN), Naive(np.eye(BODY))
+    gaussian, naive = Gaussian(np.eye(BODY), SEEN), Naive(np.eye(BODY))
     gaussian.consider(6)
     naive.P = root @ root.T
     gaussian.start_over(naive.P)
@@ -260,11 +252,10 @@ def test_another_covariance_takes_its_place(form):
     same(gaussian, naive)
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_all_rows_taken_out_leave_what_was(form):
+def test_all_rows_taken_out_leave_what_was():
     rng = np.random.default_rng(8)
     root = rng.normal(size=(BODY + 9,) * 2)
-    gaussian = form(np.eye(BODY), SEEN)
+    gaussian = Gaussian(np.eye(BODY), SEEN)
     gaussian.replace(root @ root.T)
     projection = gaussian.project(rows_of(rng, [1, 2]), 0, np.arange(2))
     solution = gaussian.solve(projection, 0, np.arange(2)).without(np.ones(2, dtype=bool))
@@ -274,10 +265,9 @@ def test_all_rows_taken_out_leave_what_was(form):
     np.testing.assert_allclose(gaussian.P, root @ root.T, atol=1e-11)
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_an_innovation_covariance_that_is_not_positive_definite_is_named(form):
+def test_an_innovation_covariance_that_is_not_positive_definite_is_named():
     rng = np.random.default_rng(9)
-    gaussian = form(np.eye(BODY), SEEN)
+    gaussian = Gaussian(np.eye(BODY), SEEN)
     gaussian.replace(np.eye(BODY + 9))
     rows = rows_of(rng, [1, 2])
     rows.variance[1] = -100.0

@@ -58,15 +58,6 @@ def test_the_standard_variant_gains_information_about_the_heading():
     assert gauge_ratio("standard", "xyz").max() > 10.0
 
 
-def test_dense_and_conditional_form_agree():
-    forms = [dataclasses.replace(FILTER, covariance_form=form) for form in ("dense", "conditional")]
-    ekfs = [JointEKF(model_from_prior(room(), Prior(), np.random.default_rng(0)), config) for config in forms]
-    for _ in zip(*(run_filter(ekf, room(), range(30)) for ekf in ekfs), strict=True):
-        pass
-    for name, value in ekfs[0].values.items():
-        np.testing.assert_allclose(ekfs[1].values[name], value, atol=1e-8, err_msg=name)
-
-
 def test_a_recording_with_samples_alone_runs_by_them():
     sequence = room()
     result = ekfslam.run(sequence, "full")

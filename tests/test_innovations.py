@@ -5,11 +5,9 @@ import pytest
 
 from ekfslam.config import Config
 from ekfslam.data.simulate import builtin
-from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.gates import diagonal
-from ekfslam.filters.gaussian import Rows
-from ekfslam.filters.innovations import innovations_of
-from ekfslam.kernels import whitened
+from ekfslam.filters.gaussian import Gaussian, Rows
+from ekfslam.filters.innovations import innovations_of, whitened
 from ekfslam.runner import run
 
 LANDMARKS, SEEN, BODY, D = 7, 12, 15, 3
@@ -21,7 +19,7 @@ def prior(request):
     rng = np.random.default_rng(request.param)
     size = BODY + 3 * LANDMARKS
     A = rng.normal(size=(size, size))
-    gaussian = DenseGaussian(np.zeros((BODY, BODY)), SEEN)
+    gaussian = Gaussian(np.zeros((BODY, BODY)), SEEN)
     gaussian.replace(A @ A.T)
     slot = rng.permutation(LANDMARKS)[:6]
     rows = Rows(

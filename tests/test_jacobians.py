@@ -11,7 +11,7 @@ from support.reference import CAMERA, T_CAM_IMU, jacobian_of_pi, small_world, st
 from ekfslam.config import FilterConfig
 from ekfslam.data.interval import Interval
 from ekfslam.data.sequence import Noise
-from ekfslam.filters.dense import DenseGaussian
+from ekfslam.filters.gaussian import Gaussian
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import camera as cam
@@ -35,7 +35,7 @@ def retract_invariant(T, m, xi, d):
 def transport_invariant(P, T, T_after, moved):
     """P (b+3n, b+3n) carried along by a correction that moves landmarks by ``moved`` (n, 3)."""
     model = model_of(RIG, RIG.noise, T, np.eye(6), coordinates="xyz")
-    gaussian = DenseGaussian(np.eye(6), 6)
+    gaussian = Gaussian(np.eye(6), 6)
     gaussian.replace(P.copy())
     variant, before = VARIANTS["invariant"], {"pose": T}
     change = variant.change(T, np.eye(6), np.arange(len(moved)), moved)

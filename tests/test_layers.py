@@ -18,7 +18,6 @@ from ekfslam.models.blocks import StateBlock
 # Rooms from the lowest to the highest: folders, and the modules that lie in ekfslam/ itself. A new one gets its place.
 ROOMS: tuple[tuple[str, ...], ...] = (
     ("arrays", "errors", "names", "limits", "progress", "shown", "files", "stored", "hdf5", "timings"),
-    ("kernels",),
     ("geometry",),
     ("config",),
     ("data",),

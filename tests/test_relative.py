@@ -22,8 +22,7 @@ from ekfslam.evaluation.relative import (
     relative_pose_nees,
 )
 from ekfslam.evaluation.summary import summarise
-from ekfslam.filters.dense import DenseGaussian
-from ekfslam.filters.gaussian import Rows
+from ekfslam.filters.gaussian import Gaussian, Rows
 from ekfslam.filters.result import PosePairs
 from ekfslam.geometry import motion
 from ekfslam.runner import run
@@ -35,7 +34,7 @@ BODY, CONSIDERED, LANDMARKS, SEEN = 8, 12, 3, 6
 
 def considered_gaussian(rng):
     """A covariance of body, considered columns and landmarks, and which columns are estimated."""
-    gaussian = DenseGaussian(np.eye(BODY), SEEN)
+    gaussian = Gaussian(np.eye(BODY), SEEN)
     assert gaussian.consider(CONSIDERED) == BODY
     size = BODY + CONSIDERED + 3 * LANDMARKS
     root = rng.normal(size=(size, size))
@@ -96,7 +95,7 @@ def test_rows_of_the_body_alone():
 def test_what_is_estimated_does_not_notice(verb):
     rng = np.random.default_rng(2)
     gaussian, P, estimated = considered_gaussian(rng)
-    plain = DenseGaussian(np.eye(BODY), SEEN)
+    plain = Gaussian(np.eye(BODY), SEEN)
     plain.replace(P[np.ix_(estimated, estimated)].copy())
     rows, Phi = some_rows(rng), rng.normal(size=(BODY, BODY))
     for one in (gaussian, plain):

@@ -20,7 +20,7 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError, EmptyTracksError
 from ekfslam.filters import consensus
 from ekfslam.filters.dead_reckoning import dead_reckon
-from ekfslam.filters.dense import DenseGaussian, DenseSolution
+from ekfslam.filters.gaussian import Gaussian, Solution
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.filters.mapping import IndependentLandmarks
@@ -88,13 +88,13 @@ def test_log_likelihood_equals_the_dense_one_also_where_rows_are_taken_out_again
     world = with_outliers(small_world(sigma_v=1.0, sigma_w=0.03), 0.0 if gate == 1.0 else 0.08, 12.0)
     config = FilterConfig(gate_probability=gate, split_after=0, retire="never")
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu)
-    taken_out, without = [], DenseSolution.without
+    taken_out, without = [], Solution.without
 
     def spy(solution, out):
         taken_out.append(out)
         return without(solution, out)
 
-    monkeypatch.setattr(DenseSolution, "without", spy)
+    monkeypatch.setattr(Solution, "without", spy)
     for k in range(len(world)):
         if k:
             ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
@@ -112,7 +112,7 @@ def test_log_likelihood_of_a_wide_frame_is_that_of_its_accepted_rows_as_linearis
     world = with_outliers(small_world(sigma_v=1.0, sigma_w=0.1), 0.08, 12.0)
     config = FilterConfig(gate_probability=0.99, split_after=0, retire="never")
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu)
-    solve, correct, solved, found = DenseGaussian.solve, consensus.correct, [], []
+    solve, correct, solved, found = Gaussian.solve, consensus.correct, [], []
 
     def spy(gaussian, projection, *arguments):
         solution = solve(gaussian, projection, *arguments)
@@ -123,7 +123,7 @@ def test_log_likelihood_of_a_wide_frame_is_that_of_its_accepted_rows_as_linearis
         found.append(correct(*arguments))
         return found[-1]
 
-    monkeypatch.setattr(DenseGaussian, "solve", spy)
+    monkeypatch.setattr(Gaussian, "solve", spy)
     monkeypatch.setattr(consensus, "correct", kept)
     again = 0
     for k in range(len(world)):

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekfslam import kernels
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.geometry import se3
 from ekfslam.models.sensors.base import Sensor
@@ -23,6 +22,8 @@ from ekfslam.models.sensors.stereo import Rig
 _MOST_OBLIQUE = 3.0
 # Largest factor by which a correction may change a disparity.
 LARGEST_FACTOR = 4.0
+# Stands for points whose image is not wanted.
+_AHEAD = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class CameraCoordinates:
         q = before.q
         step = z[:3] + q @ se3.skew(z[3:]).T + d @ before.R_linear.T
         in_image = is_in_image(self.sensor, q, self.min_depth_m)
-        q_after, in_image = kernels.moved_by_image(q, step, in_image, LARGEST_FACTOR)
+        q_after, in_image = moved_by_image(q, step, in_image, LARGEST_FACTOR)
         return se3.apply(se3.inverse(T_after), q_after), in_image
 
 
@@ -111,12 +112,16 @@ def change_in_view(
         in_image: (n,) whether they count by their images.
         turned: (6, 6) D of eq. (7').
     """
-    B, M = kernels.change_by_image(
-        (before.q, before.q_linear, before.R_linear, np.eye(6)),
-        (after.q, after.q_linear, after.R_linear, turned),
-        in_image,
-    )
-    return Change(slot, columns, B, M)
+    # The image is its own inverse: its derivative at an image is the inverse of that at the point.
+    J = image_jacobian(np.where(in_image[:, None], before.q, _AHEAD))
+    J_inverse_after = image_jacobian(image(np.where(in_image[:, None], after.q, _AHEAD)))
+    J = np.where(in_image[:, None, None], J_inverse_after @ J, np.eye(3))
+    # Rows a of A q^ are a x q.
+    by_turn, by_turn_after = np.cross(J, before.q_linear[:, None]), np.cross(np.eye(3), after.q_linear[:, None])
+    by_after = np.concatenate([np.broadcast_to(np.eye(3), J.shape), -by_turn_after], axis=-1) @ turned
+    B = np.concatenate([J, -by_turn], axis=-1) - by_after
+    R, R_after = before.R_linear, after.R_linear
+    return Change(slot, columns, R_after.T @ B, R_after.T @ J @ R)
 
 
 def is_in_image(sensor: Sensor, q: Array, min_depth_m: float) -> BoolArray:
@@ -125,3 +130,35 @@ def is_in_image(sensor: Sensor, q: Array, min_depth_m: float) -> BoolArray:
     furthest_m = sensor.camera.furthest_m if isinstance(sensor, Rig) else np.inf
     is_ahead = np.abs(q[:, :2]).max(axis=1, initial=0.0) < _MOST_OBLIQUE * z
     return is_ahead & (z > min_depth_m) & (z < furthest_m)
+
+
+def moved_by_image(q: Array, step: Array, in_image: BoolArray, factor: float) -> tuple[Array, BoolArray]:
+    """Return points that a correction moves linearly in the image, ``y+ = y + J dq``, and the others by dq itself.
+
+    Args:
+        q, step: (n, 3) points in the camera frame, and dq.
+        in_image: (n,) which points have an image.
+        factor: Points whose disparity changes by a larger one count by themselves, too.
+
+    Returns:
+        The points after it, and which of them (n,) moved in the image.
+    """
+    front = np.where(in_image[:, None], q, _AHEAD)
+    y = image(front)
+    y_after = y + (image_jacobian(front) @ step[..., None])[..., 0]
+    in_image = in_image & (y_after[:, 2] > y[:, 2] / factor) & (y_after[:, 2] < y[:, 2] * factor)
+    return np.where(in_image[:, None], image(np.where(in_image[:, None], y_after, _AHEAD)), q + step), in_image
+
+
+def image(q: Array) -> Array:
+    """Return ``(x/z, y/z, 1/z)`` of points (..., 3); its own inverse."""
+    return np.concatenate([q[..., :2], np.ones_like(q[..., 2:])], axis=-1) / q[..., 2:]
+
+
+def image_jacobian(q: Array) -> Array:
+    """Return the derivative (..., 3, 3) of `image` by the points."""
+    y = image(q)
+    J = np.zeros((*q.shape, 3))
+    J[..., 0, 0] = J[..., 1, 1] = y[..., 2]
+    J[..., 2] = -y * y[..., 2:]
+    return J

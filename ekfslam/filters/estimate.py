@@ -13,9 +13,7 @@ from ekfslam.data.interval import Interval
 from ekfslam.engine.choice import uses_engine
 from ekfslam.engine.face import Engine
 from ekfslam.errors import ConfigError
-from ekfslam.filters.conditional import ConditionalGaussian
 from ekfslam.filters.coordinates import CameraCoordinates
-from ekfslam.filters.dense import DenseGaussian
 from ekfslam.filters.gaussian import Gaussian
 from ekfslam.filters.landmarks import LandmarkTable
 from ekfslam.filters.variants import VARIANTS
@@ -88,7 +86,7 @@ class Estimate:
 
     Args:
         model: Blocks, sensor and noise.
-        config: Settings of the filter; the form ``auto`` of the covariance means ``dense``.
+        config: Settings of the filter.
         is_joint: Whether landmarks will come; blocks alone need no engine.
 
     Raises:
@@ -115,8 +113,7 @@ class Estimate:
         if self.engine is not None:
             self.gaussian = cast(Gaussian, self.engine)  # it has the verbs that are used outside of a frame
         else:
-            form = ConditionalGaussian if config.covariance_form == "conditional" else DenseGaussian
-            self.gaussian = form(model.prior_covariance, model.layout.seen)
+            self.gaussian = Gaussian(model.prior_covariance, model.layout.seen)
         self.motion, self.step = Motion.none(self.values["pose"]), 0
         self.updated_view: str | None = View.name
         self.images: CameraCoordinates | None = None
@@ -148,7 +145,7 @@ class Estimate:
         alone, body = Estimate(self.model, self.config, False), self.model.layout.body
         alone.values, alone.coordinates, alone.imu_twist = self.values, self.coordinates, self.imu_twist
         alone.motion, alone.step, alone.updated_view = self.motion, self.step, self.updated_view
-        alone.gaussian = DenseGaussian(self.gaussian.body_covariance[:body, :body], self.model.layout.seen)
+        alone.gaussian = Gaussian(self.gaussian.body_covariance[:body, :body], self.model.layout.seen)
         return alone
 
     @property

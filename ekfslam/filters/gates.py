@@ -7,13 +7,14 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import gammaincinv
 
-from ekfslam import kernels
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.config import FilterConfig
 from ekfslam.errors import InnovationError
 from ekfslam.filters.gaussian import Rows
 from ekfslam.filters.landmarks import LandmarkTable
 
+# Smallest share of its variance that an innovation must have besides what all others of the frame say of it.
+LEAST_SHARE = 1e-6
 # Observations of a landmark after which it may be found to move.
 SEEN_TO_MOVE = 3
 
@@ -41,7 +42,8 @@ def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> 
         InnovationError: A block of S is not positive definite; names the frame and the landmarks.
     """
     try:
-        return kernels.normalised_squares(S, residual)
+        whitened = np.linalg.solve(np.linalg.cholesky(S), residual[..., None])[..., 0]
+        return np.einsum("ni,ni->n", whitened, whitened)
     except np.linalg.LinAlgError:
         finite = np.isfinite(S).all(axis=(1, 2), keepdims=True)
         smallest = np.linalg.eigvalsh(np.where(finite, S, 0.0))[:, 0]
@@ -77,7 +79,12 @@ def agrees_with_others(left: Rows, C: Array) -> tuple[Array, BoolArray]:
         The squares, and whether (k,) a landmark can be judged. If C is only rounding, the others say nothing about the
         landmark, and its square is 0.
     """
-    return kernels.squares_given_others(C, left.residual, left.variance)
+    share, axes = np.linalg.eigh(C)
+    judged = share[:, 0] > LEAST_SHARE
+    along = np.einsum("nji,nj->ni", axes, left.residual / np.sqrt(left.variance))
+    with np.errstate(over="ignore"):
+        squares = np.divide(along**2, share, out=np.zeros_like(along), where=judged[:, None]).sum(axis=1)
+    return squares, judged
 
 
 def moves_along(

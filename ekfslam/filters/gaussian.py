@@ -1,18 +1,23 @@
 """The joint Gaussian of body and landmarks, and the verbs that change it: nothing else writes the covariance.
 
-Two forms have these verbs, and equal each other to rounding: `ekfslam.filters.dense` keeps P as one matrix and is the
-readable one, `ekfslam.filters.conditional` is linear in the number of landmarks. Body columns come first (see
-`ekfslam.models.blocks.Layout`), then three columns a landmark. ``frame`` and ``ids`` serve error messages alone.
+Here it is one matrix P; the engine has the verbs that are used outside of a frame. Body columns come first (see
+`ekfslam.models.blocks.Layout`), then three a landmark. ``frame`` and ``ids`` serve error messages alone.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.linalg import blas, lapack
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.errors import InnovationError
+
+# Rows that are mirrored at once.
+_BLOCK = 128
+_ABOVE = ~np.tri(_BLOCK, dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -50,51 +55,108 @@ class Conditioned:
     log_det: float = 0.0
 
 
-class Projection(ABC):
-    """Rows of k landmarks, projected through the covariance: ``H P H^T``, in the form of the Gaussian."""
+@dataclass(frozen=True)
+class Projection:
+    """``H P`` (k d, body+3n) and ``H P H^T`` (k d, k d) of rows."""
 
     rows: Rows
+    HP: Array
+    HPH: Array
 
     @property
-    @abstractmethod
     def variances(self) -> Array:
         """``H_i P H_i^T`` (k, d, d) of each landmark's own rows."""
+        k, d = self.rows.residual.shape
+        own = np.arange(k)
+        return self.HPH.reshape(k, d, k, d)[own, :, own, :]
 
     @property
-    @abstractmethod
     def S(self) -> Array:
         """``H P H^T + V`` (k d, k d), the joint covariance of all innovations."""
+        return self.HPH + np.diag(self.rows.variance.ravel())
 
-    @abstractmethod
     def only(self, which: IntArray) -> Projection:
         """Return the projection of some of the landmarks."""
+        row = _columns(which, self.rows.residual.shape[1])
+        return Projection(self.rows.only(which), self.HP[row], self.HPH[np.ix_(row, row)])
 
 
-class Solution(ABC):
-    """Eq. (6) solved for some rows: what conditioning on them would do. The covariance has not changed yet."""
+@dataclass(frozen=True)
+class Solution:
+    """Eq. (6) with ``S = L L^T``.
 
-    @property
-    @abstractmethod
-    def done(self) -> Conditioned: ...
+    Rows E are removed by projection of the whitened rows to those orthogonal to ``A = L^-1 E``, because
+    ``S_kk^-1 = L^-T (I - A (A^T A)^-1 A^T) L^-1``.
 
-    @abstractmethod
+    Args:
+        Y: (body+3n, m) ``(L^-1 H P)^T``, with ``P - Y Y^T`` the covariance afterwards.
+        L: (m, m) in the lower triangle; the upper one is not used.
+        white: (m,) ``L^-1 r``.
+        log_det: ``log det S``.
+        shape: (k, d) of the rows; d is 1 for rows of the body alone.
+        variance: (m,).
+        considered: Columns of the mean that stay.
+        left: (k,) which landmarks are left; None: all.
+        Q: (m, r) orthonormal basis of the removed rows.
+    """
+
+    Y: Array
+    L: Array
+    white: Array
+    log_det: float
+    shape: tuple[int, int]
+    variance: Array
+    considered: slice
+    left: BoolArray | None = None
+    Q: Array | None = None
+
+    @cached_property
+    def done(self) -> Conditioned:
+        """The effect on the mean, NIS and ``log det S``."""
+        correction = self.Y @ self.white
+        correction[self.considered] = 0.0
+        return Conditioned(correction, float(self.white @ self.white), self.log_det)
+
     def given_others(self, which: IntArray) -> Array:
         """Return ``V^1/2 (S^-1)_ii V^1/2`` (j, d, d) for some landmarks (j,).
 
         The innovation of landmark i given those of all *others* has covariance ``((S^-1)_ii)^-1``.
         """
+        k, d = self.shape
+        columns = self._whitened(which).T.reshape(len(which), d, k * d)
+        std = np.sqrt(self.variance.reshape(k, d)[which])
+        return (columns @ columns.swapaxes(1, 2)) * (std[:, :, None] * std[:, None, :])
 
-    @abstractmethod
+    def _whitened(self, which: IntArray) -> Array:
+        """Return ``L^-1 E`` (m, j d) for unit vectors E of the rows of landmarks (j,)."""
+        rows = _columns(which, self.shape[1])
+        E = np.zeros((len(self.L), len(rows)))
+        E[rows, np.arange(len(rows))] = 1.0
+        return blas.dtrsm(1.0, self.L, E, lower=1)
+
     def without(self, out: BoolArray) -> Solution:
         """Return the solution without the rows of the landmarks ``out`` (k,)."""
+        assert self.Q is None
+        Q, R = np.linalg.qr(self._whitened(np.flatnonzero(out)))
+        white = self.white - Q @ (Q.T @ self.white)
+        log_det = self.log_det + 2.0 * float(np.log(np.abs(R.diagonal())).sum())
+        if out.all():  # so that rounding is not left over
+            white, log_det = np.zeros_like(white), 0.0
+        return replace(self, Y=self.Y - (self.Y @ Q) @ Q.T, white=white, log_det=log_det, left=~out, Q=Q)
 
-    @abstractmethod
     def information(self, J: Array) -> Array:
         """Return ``J^T S^-1 J`` (c, c) for J (j, d, c) of the j landmarks that are left."""
+        k, d = self.shape
+        wide = np.zeros((k, d, J.shape[-1]))
+        wide[slice(None) if self.left is None else self.left] = J
+        A = blas.dtrsm(1.0, self.L, wide.reshape(k * d, -1), lower=1)
+        if self.Q is not None:
+            A -= self.Q @ (self.Q.T @ A)
+        return A.T @ A
 
 
-class Gaussian(ABC):
-    """Covariance of body columns and landmarks.
+class Gaussian:
+    """Covariance of body columns and landmarks, before there are landmarks that of the ``body`` (body, body).
 
     Attributes:
         body: Number of body columns.
@@ -102,19 +164,19 @@ class Gaussian(ABC):
         considered: Number of *considered* columns at the end of the body, see `consider`.
     """
 
-    body: int
-    seen: int
-    considered: int
+    def __init__(self, body: Array, seen: int) -> None:
+        self._P, self.body, self.seen = np.array(body, dtype=float), len(body), seen
+        self.considered = 0
 
     @property
-    @abstractmethod
     def P(self) -> Array:
         """(body+3n, body+3n), read only."""
+        return self._P
 
     @property
-    @abstractmethod
     def landmarks(self) -> int:
         """Number n of landmarks."""
+        return (len(self._P) - self.body) // 3
 
     @property
     def is_finite(self) -> bool:
@@ -122,84 +184,146 @@ class Gaussian(ABC):
         return bool(np.isfinite(self.body_covariance).all() and np.isfinite(self.landmark_blocks()).all())
 
     @property
-    @abstractmethod
     def body_covariance(self) -> Array:
         """(body, body), a copy."""
+        return self._P[: self.body, : self.body].copy()
 
-    @abstractmethod
+    @property
+    def _considered(self) -> slice:
+        return slice(self.body - self.considered, self.body)
+
     def landmark_blocks(self, slot: IntArray | None = None) -> Array:
         """Return the landmarks' own covariances (k, 3, 3), of all or at slots (k,). Read only."""
+        b, (row, column) = self.body, self._P.strides
+        blocks = np.lib.stride_tricks.as_strided(
+            self._P[b:, b:], (self.landmarks, 3, 3), (3 * (row + column), row, column), writeable=False
+        )
+        return blocks if slot is None else blocks[slot]
 
-    @abstractmethod
     def covariance_of(self, slot: IntArray) -> Array:
         """Return the covariance (body+3k, body+3k) of the body and of the landmarks at the slots (k,)."""
+        columns = np.concatenate([np.arange(self.body), self._columns(slot)])
+        return self._P[np.ix_(columns, columns)]
 
-    @abstractmethod
+    def _columns(self, slot: IntArray) -> IntArray:
+        return self.body + _columns(slot, 3)
+
     def consider(self, columns: int) -> int:
         """Add columns to the end of the body that are considered but not estimated, zero at first; return the first.
 
         Conditioning changes only their cross-covariances, not their own covariance and mean (Schmidt, "Application of
         state-space methods to navigation problems", 1966).
         """
+        start = self.body
+        self._P = np.insert(np.insert(self._P, [start] * columns, 0.0, axis=0), [start] * columns, 0.0, axis=1)
+        self.body, self.considered = start + columns, self.considered + columns
+        return start
 
-    @abstractmethod
     def clone(self, source: slice, to: slice) -> None:
         """Copy body columns into considered ones."""
+        P = self._P
+        P[to] = P[source]
+        P[:, to] = P[to].T
+        P[to, to] = P[source, source]
 
-    @abstractmethod
     def propagate(self, Phi: Array, Q: Array) -> None:
         """Propagate, eq. (2): ``P <- F P F^T + Q``, F = Phi (b, b) on estimated body columns and I on all others."""
+        b, P = len(Phi), self._P
+        P_b = Phi @ P[:b]
+        P_bb = P_b[:, :b] @ Phi.T + Q
+        P[:b, b:] = P_b[:, b:]
+        P[b:, :b] = P_b[:, b:].T
+        P[:b, :b] = 0.5 * (P_bb + P_bb.T)
 
-    @abstractmethod
     def project(self, rows: Rows, frame: int, ids: IntArray) -> Projection:
         """Return the rows projected through P.
 
         Raises:
             InnovationError: The variance of some landmark's rows is not positive definite.
         """
+        k, d, size = *rows.residual.shape, len(self._P)
+        H_x, seen = rows.H_x.reshape(k * d, self.seen), self.seen
+        HP = (H_x @ self._P[:seen]).reshape(k, d, size)
+        HP += rows.H_m @ self._P[self.body :].reshape(self.landmarks, 3, size)[rows.slot]
+        HP = HP.reshape(k * d, size)
+        HPH = (rows.H_m @ HP.T[self._columns(rows.slot)].reshape(k, 3, k * d)).reshape(k * d, k * d)
+        HPH += H_x @ HP[:, :seen].T
+        return Projection(rows, HP, HPH)
 
-    @abstractmethod
     def solve(self, projection: Projection, frame: int, ids: IntArray) -> Solution:
         """Solve eq. (6) for projected rows.
 
         Raises:
             InnovationError: The innovation covariance is not positive definite.
         """
+        rows = projection.rows
+        return self._solve(projection.HP, projection.HPH, rows.residual, rows.variance, frame, ids)
 
-    @abstractmethod
     def solve_body(self, H: Array, residual: Array, variance: Array, frame: int) -> Solution:
         """Solve eq. (6) for rows H (k, b) of the body alone, with residuals and variances (k,)."""
+        HP = H @ self._P[: H.shape[1]]
+        HPH, nobody = HP[:, : H.shape[1]] @ H.T, np.empty(0, dtype=np.int64)
+        return self._solve(HP, HPH, residual[:, None], variance[:, None], frame, nobody)
 
-    @abstractmethod
+    def _solve(self, HP: Array, HPH: Array, residual: Array, variance: Array, frame: int, ids: IntArray) -> Solution:
+        S = HPH.copy()
+        S.ravel()[:: len(S) + 1] += variance.ravel()
+        # LAPACK sees row-major arrays as their transposes: S is symmetric, and (H P)^T is what dtrsm wants.
+        L, failed = lapack.dpotrf(S.T, lower=1, clean=0, overwrite_a=1)
+        if failed or not np.isfinite(L.diagonal()).all():
+            raise InnovationError(frame, ids)
+        Y = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1)
+        white = blas.dtrsm(1.0, L, residual.reshape(-1, 1), lower=1)[:, 0]
+        log_det = 2.0 * float(np.log(L.diagonal()).sum())
+        k, d = residual.shape
+        return Solution(Y, L, white, log_det, (k, d), variance.ravel(), self._considered)
+
     def apply(self, solution: Solution) -> None:
         """Condition on the rows of a solution of the present covariance."""
+        at = self._considered
+        own = self._P[at, at].copy()
+        add_square(self._P, solution.Y, -1.0)
+        self._P[at, at] = own
 
-    @abstractmethod
     def augment(self, G: Array, covariance: Array) -> None:
         """Append landmarks with ``d = G x + w``, eq. (5): G (n, 3, seen), covariance (n, 3, 3) of w."""
+        n = len(G)
+        G = G.reshape(3 * n, self.seen)
+        size, grown = len(self._P), len(self._P) + 3 * n
+        P = np.empty((grown, grown))
+        P[:size, :size] = self._P
+        P[size:, :size] = G @ self._P[: self.seen]
+        P[:size, size:] = P[size:, :size].T
+        P_new = P[size:, : self.seen] @ G.T
+        P[size:, size:] = 0.5 * (P_new + P_new.T)
+        block = np.arange(n)
+        P[size:, size:].reshape(n, 3, n, 3)[block, :, block, :] += covariance
+        self._P = P
 
-    @abstractmethod
     def transform_landmarks(self, slot: IntArray, M: Array | None, B: Array, columns: IntArray) -> None:
         """Re-express errors of landmarks at slots (n,), ascending: ``d_i <- M_i d_i + B_i x``.
 
         M is (n, 3, 3), None is the identity; B is (n, 3, c) for the body columns (c,) of x.
         """
+        own = slice(self.body, None) if len(slot) == self.landmarks else self._columns(slot)
+        transform_part(self._P, own, M, B, columns)
 
-    @abstractmethod
     def transform_body(self, at: slice, A: Array) -> None:
         """Re-express some body columns, ``x_at <- A x_at`` with invertible A."""
+        transform(self._P, at, A)
 
-    @abstractmethod
     def rest(self, asleep: BoolArray) -> None:
         """Set which landmarks (n,) are dormant, that is not observed before they wake; P stays unchanged."""
+        # here it would save nothing
 
-    @abstractmethod
     def marginalise(self, stay: BoolArray) -> None:
         """Drop the rows and columns of landmarks that do not stay (n,): exact marginalisation."""
+        kept = np.flatnonzero(np.concatenate([np.ones(self.body, dtype=bool), np.repeat(stay, 3)]))
+        self._P = self._P[kept].take(kept, axis=1)
 
-    @abstractmethod
     def replace(self, P: Array) -> None:
         """Replace P by one of the same body and of other landmarks."""
+        self._P = np.ascontiguousarray(P, dtype=float)
 
     def start_over(self, P: Array) -> None:
         """Replace P, at a map revival, by one without considered columns: these become zero."""
@@ -207,3 +331,67 @@ class Gaussian(ABC):
         self.considered = 0
         self.replace(P)
         self.consider(columns)
+
+
+def _columns(which: IntArray, size: int) -> IntArray:
+    """Return the columns (n size,) of blocks (n,) of one size."""
+    return (size * which[:, None] + np.arange(size)).ravel()
+
+
+def transform(P: Array, at: slice, A: Array) -> None:
+    """Re-express columns of symmetric P in place: ``x_at <- A x_at``."""
+    P[at] = A @ P[at]
+    P[:, at] = P[at].T
+    P_xx = A @ P[at, at]
+    P[at, at] = 0.5 * (P_xx + P_xx.T)
+
+
+def transform_part(P: Array, own: IntArray | slice, M: Array | None, B: Array, columns: IntArray) -> None:
+    """Re-express the columns ``own`` (3n,) of symmetric P in place: ``d_i <- M_i d_i + B_i x``."""
+    n, B = len(B), B.reshape(-1, len(columns))
+    if M is None and isinstance(own, slice):
+        # d+ = d + B a, hence P+ = P + B Z^T + Z B^T with Z = P_a + B P_aa / 2.
+        wide = np.zeros((len(P), len(columns)))
+        wide[own] = B
+        add_product(P, wide, P[:, columns] + 0.5 * wide @ P[np.ix_(columns, columns)])
+        return
+    rows = B @ P[columns]
+    rows += P[own] if M is None else (M @ P[own].reshape(n, 3, len(P))).reshape(3 * n, len(P))
+    right = rows[:, own] if M is None else (M @ rows[:, own].T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
+    right = right + (B @ rows[:, columns].T if M is not None else rows[:, columns] @ B.T)
+    P[own] = rows
+    P[:, own] = rows.T
+    block = np.ix_(own, own) if not isinstance(own, slice) else (own, own)
+    P[block] = 0.5 * (right + right.T)
+
+
+def add_square(P: Array, A: Array, sign: float) -> None:
+    """Add ``sign A A^T`` to symmetric C-ordered P in place, which stays symmetric to the last bit; A is (n, k).
+
+    Raises:
+        ValueError: P is not C-contiguous: BLAS would update a copy of it.
+    """
+    _require_order(P)
+    # NumPy's row-major P is LAPACK's column-major P^T: the upper triangle there is the lower one here.
+    blas.dsyrk(sign, A, beta=1.0, c=P.T, lower=0, overwrite_c=1)
+    _mirror(P)
+
+
+def add_product(P: Array, A: Array, B: Array) -> None:
+    """Add ``A B^T + B A^T`` to P, see `add_square`; A and B are (n, k)."""
+    _require_order(P)
+    blas.dsyr2k(1.0, A, B, beta=1.0, c=P.T, lower=0, overwrite_c=1)
+    _mirror(P)
+
+
+def _require_order(P: Array) -> None:
+    if not P.flags.c_contiguous:
+        raise ValueError("P must be C-contiguous, or BLAS would update a copy of it")
+
+
+def _mirror(P: Array) -> None:
+    for begin in range(0, len(P), _BLOCK):
+        end = begin + _BLOCK
+        P[begin:end, end:] = P[end:, begin:end].T
+        own = P[begin:end, begin:end]
+        np.copyto(own, own.T, where=_ABOVE[: len(own), : len(own)])

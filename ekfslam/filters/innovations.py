@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekfslam import kernels
 from ekfslam.arrays import Array, IntArray
+from ekfslam.filters.gates import LEAST_SHARE
 from ekfslam.filters.gaussian import Rows, Solution
 from ekfslam.filters.result import WhitenedInnovations
 
@@ -57,8 +57,25 @@ def innovations_of(solution: Solution, landmark: IntArray, rows: Rows, S: Array,
     score = J.reshape(k * d, 6).T @ (left / rows.variance).ravel()
     shared = _inverse(information)
     S_apart, apart = S - J @ shared @ J.swapaxes(1, 2), rows.residual - J @ (shared @ score)
-    both = kernels.whitened(np.concatenate([S, S_apart]), np.concatenate([rows.residual, apart]))
+    both = whitened(np.concatenate([S, S_apart]), np.concatenate([rows.residual, apart]))
     return FrameInnovations(landmark, both[:k], both[k:], score, information)
+
+
+def whitened(S: Array, residual: Array) -> Array:
+    """Return ``L_i^-1 r_i`` with ``S_i = L_i L_i^T``: (k, d, d) and (k, d) to (k, d); NaN where S_i is singular.
+
+    Rows of S that are (uL, v, uR) and those that are (u, v, disparity) come out alike: u, v, and what the last row adds
+    to u, which is the disparity.
+    """
+    std = np.sqrt(np.maximum(np.diagonal(S, axis1=1, axis2=2), np.finfo(float).tiny))
+    with np.errstate(over="ignore"):
+        correlation = S / (std[:, :, None] * std[:, None, :])
+    finite = np.isfinite(correlation).all(axis=(1, 2))
+    correlation = np.where(finite[:, None, None], correlation, 0.0)
+    definite = np.linalg.eigvalsh(correlation)[:, 0] > LEAST_SHARE
+    L = np.linalg.cholesky(np.where(definite[:, None, None], correlation, np.eye(S.shape[1])))
+    solved = np.linalg.solve(L, (residual / std)[..., None])[..., 0]
+    return np.where(definite[:, None], solved, np.nan)
 
 
 def _inverse(information: Array) -> Array:

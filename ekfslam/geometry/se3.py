@@ -1,10 +1,9 @@
 """Rotations and rigid transforms on arrays: exponential, logarithm, adjoint and left Jacobian.
 
-Leading dimensions are free; single poses go through C if that is built (`ekfslam.kernels.pose`). Tangent vectors of
-SE(3) are ``xi = [rho; theta]`` (metres, radians). All is accurate to rounding from angle 0 to pi; the logarithm of a
-half turn returns one of its two axes. Formulas: Barfoot, *State Estimation for Robotics*, chapter 7, in the functions
-``phi_k = sum_n (-1)^n theta^(2n) / (2n + k)!``, which are smooth at zero: phi_1 = sin(theta)/theta, phi_2 =
-(1 - cos(theta))/theta^2, and so on.
+Leading dimensions are free. Tangent vectors of SE(3) are ``xi = [rho; theta]`` (metres, radians). All is accurate to
+rounding from angle 0 to pi; the logarithm of a half turn returns one of its two axes. Formulas: Barfoot, *State
+Estimation for Robotics*, chapter 7, in the functions ``phi_k = sum_n (-1)^n theta^(2n) / (2n + k)!``, which are smooth
+at zero: phi_1 = sin(theta)/theta, phi_2 = (1 - cos(theta))/theta^2, and so on.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.kernels import pose
 
 _SERIES_LIMIT = 2.0  # below this theta^2 the power series is both accurate and cheap
 _SERIES_TERMS = 10  # the first one left out is 2^10 / 24! < 1e-20
@@ -92,8 +90,6 @@ def so3_left_jacobian(theta: Array) -> Array:
 def so3_exp_and_left_jacobian(theta: Array) -> tuple[Array, Array]:
     """Return `so3_exp` and `so3_left_jacobian` at the price of one: (..., 3) to (..., 3, 3) twice."""
     theta = np.asarray(theta, dtype=float)
-    if pose.is_one(theta, 3):
-        return pose.so3_exp_and_left_jacobian(theta)
     _, phi_1, phi_2, phi_3, _, _ = phis(_angle_squared(theta))
     w = skew(theta)
     ww = w @ w
@@ -153,8 +149,6 @@ def nearest_rigid(T: Array) -> Array:
 
 def inverse(T: Array) -> Array:
     """Inverse of a rigid transform, ``T_a_b`` to ``T_b_a``: (..., 4, 4) to (..., 4, 4)."""
-    if pose.is_one(T, 4, 4):
-        return pose.inverse(T)
     R_transposed = np.swapaxes(T[..., :3, :3], -1, -2)
     return transform(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
 
@@ -167,8 +161,6 @@ def apply(T: Array, points: Array) -> Array:
 def exp(xi: Array) -> Array:
     """Exponential of a tangent vector ``[rho; theta]``: (..., 6) to (..., 4, 4)."""
     xi = np.asarray(xi, dtype=float)
-    if pose.is_one(xi, 6):
-        return pose.exp(xi)
     R, J = so3_exp_and_left_jacobian(xi[..., 3:])
     return transform(R, (J @ xi[..., :3, None])[..., 0])
 
@@ -190,8 +182,6 @@ def _blocks(top_left: Array, top_right: Array) -> Array:
 
 def adjoint(T: Array) -> Array:
     """``Ad_T`` with ``T exp(xi^) T^-1 = exp((Ad_T xi)^)``: (..., 4, 4) to (..., 6, 6)."""
-    if pose.is_one(T, 4, 4):
-        return pose.adjoint(T)
     R = T[..., :3, :3]
     return _blocks(R, skew(T[..., :3, 3]) @ R)
 
@@ -213,8 +203,6 @@ def _left_jacobian_corner(xi: Array) -> Array:
 def left_jacobian(xi: Array) -> Array:
     """``J_l`` with ``exp((xi + d)^) ~ exp((J_l d)^) exp(xi^)``: (..., 6) to (..., 6, 6)."""
     xi = np.asarray(xi, dtype=float)
-    if pose.is_one(xi, 6):
-        return pose.left_jacobian(xi)
     return _blocks(so3_left_jacobian(xi[..., 3:]), _left_jacobian_corner(xi))
 
 

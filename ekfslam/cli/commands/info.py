@@ -7,7 +7,7 @@ import dataclasses
 
 from threadpoolctl import threadpool_info
 
-from ekfslam import hdf5, kernels
+from ekfslam import hdf5
 from ekfslam.cli.options import DATA, declare, open_data, table
 from ekfslam.config import Config
 from ekfslam.data.interpolation import stretches
@@ -31,7 +31,7 @@ EXAMPLES = ("info 0027.npz", "info results/local/city/archive.h5")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "data", *DATA)
     parser.add_argument(
-        "--build", action="store_true", help="show engine, kernels, libraries and threads of this installation instead"
+        "--build", action="store_true", help="show engine, libraries and threads of this installation instead"
     )
 
 
@@ -130,9 +130,7 @@ def _is_archive(data: str) -> bool:
 
 
 def _print_build() -> None:
-    how = "compiled, C" if kernels.FORM == "compiled" else "plain, NumPy: not compiled, or EKFSLAM_KERNELS=plain is set"
     print(f"engine        {MISSING or 'compiled, C++'}")
-    print(f"kernels       {how}")
     print(f"smoother      {solvers.describe()}")
     for name, version in versions().items():
         print(f"{name.removeprefix('version_'):13s} {version}")
