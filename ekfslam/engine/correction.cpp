@@ -92,7 +92,7 @@ Verdicts gate_by_others(Estimate& e, const Solution& solution, const Tried& trie
     const bool judges = judges_motion(e) && e.config.estimates_velocity;
     const double gate = e.config.gate;
     if (!std::isfinite(gate) && !judges) return verdict;
-    const Rows& rows = tried.projection.rows;
+    const Rows& rows = solution.at.rows;
     const Matrix left_by_all = solution.residual();
     Slots doubtful;
     if (judges) {
@@ -120,9 +120,9 @@ Verdicts gate_by_others(Estimate& e, const Solution& solution, const Tried& trie
     return verdict;
 }
 
-// Solve eq. (6) for tried rows, and remove those that others reject.
-void gate_jointly(Estimate& e, const Tried& tried, const Observed& seen, const Vector3& step, Correction& found) {
-    Solution solution = e.gaussian.solve(tried.projection);
+// Solve eq. (6) for tried rows, and remove those that others reject. The projection of the rows moves to the solution.
+void gate_jointly(Estimate& e, Tried& tried, const Observed& seen, const Vector3& step, Correction& found) {
+    Solution solution = e.gaussian.solve(std::move(tried.projection));
     const Verdicts verdict = gate_by_others(e, solution, tried, seen, step);
     Flags out(verdict.size());
     for (std::size_t i = 0; i < verdict.size(); ++i) {
@@ -131,7 +131,7 @@ void gate_jointly(Estimate& e, const Tried& tried, const Observed& seen, const V
         found.outside += verdict[i] == GATE;
     }
     const Slots inside = where(out, false);
-    const Rows& rows = tried.projection.rows;
+    const Rows& rows = solution.at.rows;
     if (inside.size() < out.size()) {
         solution = e.gaussian.without(std::move(solution), out);
         const Matrix left = columns(solution.residual(), inside);
@@ -156,13 +156,11 @@ double median(std::vector<double> values) {
 // row by s px has a term of second order of s^2 / (2 f) there, f being the row's derivative by the rotation. All
 // landmarks share most of it, and their noise averages out: wide means that in the median it exceeds half of
 // sigma / sqrt(k).
-bool is_wide(const Estimate& e, const Tried& tried) {
-    const Rows& rows = tried.projection.rows;
-    if (!rows.count()) return false;
+bool is_wide(const Estimate& e, const Rows& rows, const Blocks& S) {
     const Vector focal = focal_lengths(by_pose(e, rows), rows.dimension());
     std::vector<double> spread;
     for (Index i = 0; i < rows.count(); ++i) {
-        const double most = (tried.S[i].diagonal() - rows.variance.col(i)).maxCoeff();
+        const double most = (S[i].diagonal() - rows.variance.col(i)).maxCoeff();
         spread.push_back(most / (focal[i] * std::sqrt(rows.variance.col(i).minCoeff())));
     }
     return median(spread) > 1.0 / std::sqrt(static_cast<double>(rows.count()));
@@ -219,7 +217,7 @@ Correction correct_plainly(Estimate& e, const Slots& slots, const Matrix& measur
     found.dof = found.variance.size();
     found.linear = e.mean();
     found.coordinates = e.coordinates;
-    found.is_wide = is_wide(e, tried);
+    found.is_wide = found.solution && is_wide(e, found.solution->at.rows, tried.S);
     return found;
 }
 

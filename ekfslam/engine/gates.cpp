@@ -14,6 +14,15 @@ double smallest_eigenvalue(const Block3& S) {
     return S.allFinite() ? Eigenvalues(S, Eigen::EigenvaluesOnly).eigenvalues()[0] : 0.0;
 }
 
+// Whether the smallest eigenvalue exceeds a number, given the root of S. The product of n eigenvalues and their sum
+// bound the smallest one from below, and decide nearly always.
+bool exceeds(const Block3& S, const Eigen::LLT<Block3>& root, double least) {
+    const auto others = static_cast<int>(S.rows()) - 1;
+    double bound = root.matrixLLT().diagonal().cwiseAbs2().prod();
+    for (int i = 0; i < others; ++i) bound *= others / S.trace();
+    return bound > 2.0 * least || smallest_eigenvalue(S) > least;
+}
+
 // L^-1 r, or nothing where S is not positive definite.
 bool whiten_by(const Block3& S, Small& r) {
     if (!S.allFinite()) return false;
@@ -114,10 +123,11 @@ Matrix whitened(const Blocks& S, const Matrix& residual) {
         const Small std = S[i].diagonal().cwiseMax(std::numeric_limits<double>::min()).cwiseSqrt();
         const Block3 scale = std.cwiseInverse().asDiagonal();
         const Block3 correlation = scale * S[i] * scale;
-        Small r = residual.col(i).cwiseQuotient(std);
-        const bool definite = smallest_eigenvalue(correlation) > LEAST_SHARE && whiten_by(correlation, r);
-        if (definite) {
-            white.col(i) = r;
+        const Small r = residual.col(i).cwiseQuotient(std);
+        const Eigen::LLT<Block3> root(correlation);
+        const bool definite = correlation.allFinite() && root.info() == Eigen::Success;
+        if (definite && exceeds(correlation, root, LEAST_SHARE)) {
+            white.col(i) = root.matrixL().solve(r);
         } else {
             white.col(i).setConstant(std::numeric_limits<double>::quiet_NaN());
         }

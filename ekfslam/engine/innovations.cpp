@@ -5,6 +5,8 @@
 namespace ekfslam {
 namespace {
 
+using Few = Eigen::Matrix<double, Eigen::Dynamic, 6, 0, 3, 6>;  // (d, 6), without allocation
+
 // The inverse of an information matrix; NaN if it leaves a direction undetermined.
 Matrix6 inverse(const Matrix6& information) {
     const Vector6 std = information.diagonal().cwiseMax(std::numeric_limits<double>::min()).cwiseSqrt();
@@ -41,8 +43,8 @@ FrameInnovations innovations_of(const Estimate& e, const Gaussian& gaussian, con
     const Vector moved = J * (shared * found.score);
     Blocks S_apart(S);
     for (Index i = 0; i < k; ++i) {
-        const auto J_i = J.middleRows(i * d, d);
-        S_apart[i] -= J_i * shared * J_i.transpose();
+        const Few J_i = J.middleRows(i * d, d), J_shared = J_i.lazyProduct(shared);
+        S_apart[i] -= J_shared.lazyProduct(J_i.transpose());
     }
     found.alone = whitened(S, rows.residual);
     found.apart = whitened(S_apart, rows.residual - moved.reshaped(d, k));

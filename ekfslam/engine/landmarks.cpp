@@ -71,13 +71,15 @@ void Gaussian::transform_promoted(const std::vector<Change>& changes, Index view
     blas::multiply('N', 'T', 1.0, P_AA_.middleCols(view, 6), B, 0.0, P_Ap);
     blas::multiply('N', 'T', 1.0, P_eA_.middleCols(view, 6), B, 0.0, P_ep);
     for (const Change& change : changes) {
-        auto columns = P_AA_.middleCols(change.own, 3), columns_e = P_eA_.middleCols(change.own, 3);
-        columns = (columns.lazyProduct(change.M.transpose()) + P_Ap.middleCols(change.own, 3)).eval();
-        columns_e = (columns_e.lazyProduct(change.M.transpose()) + P_ep.middleCols(change.own, 3)).eval();
+        auto columns = P_AA_.middleCols<3>(change.own), columns_e = P_eA_.middleCols<3>(change.own);
+        P_Ap.middleCols<3>(change.own) += columns.lazyProduct(change.M.transpose());
+        P_ep.middleCols<3>(change.own) += columns_e.lazyProduct(change.M.transpose());
+        columns = P_Ap.middleCols<3>(change.own);
+        columns_e = P_ep.middleCols<3>(change.own);
     }
     blas::multiply('N', 'N', 1.0, B, P_AA_.block(view, 0, 6, p), 0.0, own);
-    for (const Change& change : changes)
-        for (Index j = 0; j < p; ++j) {
+    for (Index j = 0; j < p; ++j)
+        for (const Change& change : changes) {
             const Vector3 column = P_AA_.block<3, 1>(change.own, j);
             P_AA_.block<3, 1>(change.own, j) = change.M * column + own.block<3, 1>(change.own, j);
         }

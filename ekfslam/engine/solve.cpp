@@ -28,16 +28,10 @@ Matrix Solution::residual() const {
 
 Solution Gaussian::solve(Projection at) const {
     Solution solution;
-    const Index d = at.rows.dimension(), k = at.rows.count();
+    const Index k = at.rows.count();
     solution.left.assign(static_cast<std::size_t>(k), true);
     solution.w = at.rows.residual;
-    for (Index i = 0; i < k; ++i) {
-        const auto L = at.root(i);
-        for (Index j = 0; j < d; ++j) {
-            for (Index l = 0; l < j; ++l) solution.w(j, i) -= L(j, l) * solution.w(l, i);
-            solution.w(j, i) /= L(j, j);
-        }
-    }
+    for (Index i = 0; i < k; ++i) divide_rows(at.root(i), solution.w.col(i));
     solution.at = std::move(at);
     solve_left(solution);
     return solution;
@@ -153,8 +147,8 @@ std::vector<Matrix> Gaussian::given_others(const Solution& s, const Slots& which
     std::vector<Matrix> blocks;
     for (std::size_t i = 0; i < which.size(); ++i) {
         const auto Z_i = Z.middleCols(static_cast<Index>(i) * d, d);
-        const Matrix std = s.at.rows.variance.col(which[i]).cwiseSqrt().asDiagonal();
-        const Matrix white = s.at.root(which[i]).triangularView<Eigen::Lower>().solve(std);
+        Matrix white = s.at.rows.variance.col(which[i]).cwiseSqrt().asDiagonal();
+        divide_rows(s.at.root(which[i]), white);
         blocks.push_back(white.transpose() * (Matrix::Identity(d, d) - Z_i.transpose() * Z_i) * white);
     }
     return blocks;
@@ -163,16 +157,13 @@ std::vector<Matrix> Gaussian::given_others(const Solution& s, const Slots& which
 Matrix Gaussian::information(const Solution& s, const Matrix& J) const {
     const Slots some = places_of(s.left);
     const Index d = s.at.rows.dimension();
-    Matrix A = J;
+    Matrix A = Matrix::Zero(s.at.T.cols(), J.cols()), along(s.at.T.rows(), J.cols());
     for (std::size_t i = 0; i < some.size(); ++i) {
-        auto rows = A.middleRows(static_cast<Index>(i) * d, d);
-        s.at.root(some[i]).triangularView<Eigen::Lower>().solveInPlace(rows);
+        auto rows = A.middleRows(s.at.place[static_cast<std::size_t>(some[i])] * d, d);
+        rows = J.middleRows(static_cast<Index>(i) * d, d);
+        divide_rows(s.at.root(some[i]), rows);
     }
-    Slots columns;
-    for (Index i : some) columns.push_back(s.at.place[static_cast<std::size_t>(i)]);
-    const Matrix T = columns_of(s.at.T, columns, d);
-    Matrix along(T.rows(), J.cols());
-    blas::multiply('N', 'N', 1.0, T, A, 0.0, along);
+    blas::multiply('N', 'N', 1.0, s.at.T, A, 0.0, along);
     blas::solve('L', 'L', 'N', s.C, along);
     return A.transpose() * A - along.transpose() * along;
 }

@@ -37,6 +37,15 @@ inline std::vector<Stair> stairs(const Projection& at) {
     return found;
 }
 
+// X <- L^-1 X for a lower triangle of a few rows.
+template <class Rows>
+void divide_rows(const Eigen::Map<const Matrix>& L, Rows&& X) {
+    for (Index j = 0; j < L.rows(); ++j) {
+        for (Index l = 0; l < j; ++l) X.row(j) -= L(j, l) * X.row(l);
+        X.row(j) /= L(j, j);
+    }
+}
+
 inline Matrix columns_of(const Matrix& M, const Slots& which, Index d) {
     Matrix some(M.rows(), static_cast<Index>(which.size()) * d);
     for (std::size_t i = 0; i < which.size(); ++i)
