@@ -221,9 +221,9 @@ void Gaussian::propagate(const Matrix& Phi, const Matrix& Q) {
     P_eA_.topRows(r) = rows.topRows(r).leftCols(n);
     P_eA_.middleCols(front_at(), front_size()) = P_fe.transpose();
     P_ee_.topRows(r) = rows.topRows(r).rightCols(P_eA_.rows());
-    P_ee_.leftCols(r) = P_ee_.topRows(r).transpose();
+    P_ee_.leftCols(r) = P_ee_.topRows(r).transpose().eval();
     P_AA_.middleRows(front_at(), front_size()) = rows.bottomRows(front_size()).leftCols(n);
-    P_AA_.middleCols(front_at(), front_size()) = P_AA_.middleRows(front_at(), front_size()).transpose();
+    P_AA_.middleCols(front_at(), front_size()) = P_AA_.middleRows(front_at(), front_size()).transpose().eval();
     root_.reset();
     if (!dormant_.size()) return;
     const Matrix cross = Phi_b.leftCols(r) * dormant_.cross.topRows(r);

@@ -232,7 +232,7 @@ Index Gaussian::join(const Matrix& K, const Matrix& S, const Matrix& cross) {
     P_AA_.block(0, at, at, m) = P_Am.topRows(at);
     P_AA_.block(at + m, at, n - at, m) = P_Am.bottomRows(n - at);
     P_AA_.block(at, at, m, m) = 0.5 * (P_mm + P_mm.transpose());
-    P_AA_.middleRows(at, m) = P_AA_.middleCols(at, m).transpose();
+    P_AA_.middleRows(at, m) = P_AA_.middleCols(at, m).transpose().eval();
     P_eA_.middleCols(at, m) = P_em;
     promoted_ += m;
     return at;
