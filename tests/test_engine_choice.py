@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from ekfslam.cli import main
-from ekfslam.config import FilterConfig
+from ekfslam.config import CalibrationConfig, FilterConfig
 from ekfslam.data.noise import Noise
 from ekfslam.engine import choice
 from ekfslam.errors import ConfigError
 from ekfslam.geometry.camera import StereoCamera
-from ekfslam.models.blocks import StateBlock
+from ekfslam.models.blocks import CameraJitter, StateBlock
 from ekfslam.models.build import model_of
 from ekfslam.models.model import Model
 from ekfslam.models.sensors.stereo import Rig
@@ -45,8 +45,8 @@ class OwnRig(Rig):
     """A sensor of the user's own."""
 
 
-def model(sensor=RIG, *blocks: StateBlock) -> Model:
-    return model_of(sensor, sensor.noise, np.eye(4), np.zeros((6, 6)), blocks=blocks)
+def model(sensor=RIG, *blocks: StateBlock, **settings) -> Model:
+    return model_of(sensor, sensor.noise, np.eye(4), np.zeros((6, 6)), blocks=blocks, **settings)
 
 
 @pytest.fixture(autouse=True)
@@ -64,6 +64,16 @@ def test_the_engine_runs_a_block_of_data_alone():
     [
         (model(RIG, Angle()), {}, "block angle has its own retract"),
         (model(OwnRig(CAMERA, np.eye(4), RIG.noise)), {}, "own sensor OwnRig"),
+        (
+            model(calibration=CalibrationConfig(time_s=0.01), coordinates="xyz"),
+            {},
+            "block calibration with landmarks in xyz, without track errors",
+        ),
+        (
+            model(RIG, CameraJitter(), coordinates="xyz"),
+            {},
+            "block camera_jitter with landmarks in xyz, without track errors",
+        ),
         (model(), {"variant": "fej"}, "variant fej"),
         (model(), {"iterations": 2}, "iterations > 1"),
         (model(), {"engine": "reference"}, "as requested"),

@@ -23,12 +23,18 @@ except ImportError as error:
 def obstacle(model: Model, config: FilterConfig) -> str:
     """Return why the engine cannot run a model with some settings; an empty text if it can."""
     own = [block.name for block in model.blocks if block.retraction == "own"]
+    has_view = "view" in model.layout
+    camera = [*model.layout.coupled("camera"), *model.layout.coupled("sensor")]
     if MISSING:
         return MISSING
     if type(model.sensor) not in (Rig, Monocular):
         return f"own sensor {type(model.sensor).__name__}"
     if own:
         return f"block {own[0]} has its own retract"
+    if isinstance(model.sensor, Monocular) and not has_view:
+        return "one camera with landmarks in xyz"
+    if camera and not has_view:
+        return f"block {camera[0].name} with landmarks in xyz, without track errors"
     if config.variant == "fej":
         return "variant fej"
     return "iterations > 1" if config.iterations > 1 else ""
