@@ -258,7 +258,7 @@ Slots all(const Filter& filter) {
 }  // namespace
 
 void bind_filter(nb::module_& module) {
-    nb::class_<Filter>(module, "Filter", "The joint filter; predictions come from Python.")
+    bind_process(nb::class_<Filter>(module, "Filter", "The joint filter; predictions may come from Python."))
         .def("__init__",
              [](Filter* self, const nb::list& blocks, const nb::dict& sensor, const nb::object& track_error,
                 const nb::dict& config, const Vector& values, const Vector& coordinates, const Matrix& P,

@@ -32,8 +32,9 @@ std::vector<T> listed(const Eigen::Matrix<T, Eigen::Dynamic, 1>& values) {
 inline Ids ids_of(const Integers& values) { return listed<std::int64_t>(values); }
 Slots slots_of(const Integers& values, Index count);  // checked: from 0 to count - 1
 
-// Adds `Filter` to the module.
+// Adds `Filter` to the module, and its predictions.
 void bind_filter(nb::module_& module);
+nb::class_<Filter> bind_process(nb::class_<Filter> filter);
 
 // Throws ValueError that names the array.
 void require_shape(const char* name, const Eigen::Ref<const Matrix>& found, Index rows, Index columns);

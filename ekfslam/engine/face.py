@@ -14,10 +14,12 @@ from scipy.special import gammaincinv
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
+from ekfslam.data.interval import Interval
 from ekfslam.geometry.camera import DEPTH_FROM_PX
 from ekfslam.models.blocks import StateBlock, Values
 from ekfslam.models.build import has_image_coordinates
 from ekfslam.models.model import Model
+from ekfslam.models.process.velocities import VelocityInputs
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
 
@@ -53,6 +55,13 @@ class Engine:
             np.asarray(model.prior_covariance, dtype=float),
             self._shares(0.0),
         )
+        laws = [law for block in model.layout.blocks if (law := block.as_data()) is not None]
+        self._predicts = type(model.process) is VelocityInputs and len(laws) == len(model.layout.blocks)
+        if self._predicts:
+            noise = model.noise.process
+            self._filter.set_process(
+                laws, np.asarray(noise.pose_std, dtype=float), np.asarray(noise.gap_std, dtype=float)
+            )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Engine:
         copy = object.__new__(Engine)
@@ -78,6 +87,20 @@ class Engine:
         return self.named(self._filter.values())
 
     # --- predictions --------------------------------------------------------------------------------------------------
+
+    def predict(self, interval: Interval) -> dict[str, Any] | None:
+        """Predict by velocities that are inputs, eq. (1) and (2); None: the model needs the prediction in Python.
+
+        Returns:
+            Flat ``values``, ``coordinates`` and ``departed`` coordinates, ``imu_twist``, ``way_m``, and the extrinsics
+            ``T_cam_imu`` of the frame before.
+        """
+        if not self._predicts:
+            return None
+        found: dict[str, Any] = self._filter.predict(
+            interval.tau_s, interval.dt_s, interval.inputs, interval.is_gap, interval.doubt
+        )
+        return found
 
     def propagate(self, Phi: Array, Q: Array) -> None:
         """Propagate the blocks, eq. (2)."""

@@ -1,10 +1,12 @@
-// The joint filter from its observation side; predictions come from Python. A frame on one page: `Filter::update`.
+// The joint filter; predictions by processes other than `Process` come from Python. A frame on one page:
+// `Filter::update`.
 #pragma once
 
 #include <unordered_set>
 
 #include "correction.hpp"
 #include "lifecycle.hpp"
+#include "process.hpp"
 #include "starting.hpp"
 
 namespace ekfslam {
@@ -57,6 +59,7 @@ class Filter {
     void adopt(const Vector& values, const Vector& coordinates, const Matrix& position_m, const Matrix& P);
 
     Estimate e;
+    std::optional<Process> process;           // none: predictions come from Python
     Uniform uniform;                          // of Python: `numpy.random.default_rng(frame).random`
     Waiting waiting;                          // of one camera
     std::unordered_set<std::int64_t> moving;  // ids of tracks that were found to move; they are not used again

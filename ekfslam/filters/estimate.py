@@ -50,7 +50,7 @@ class Motion:
         interval: Inputs.
         way_m: Length of the way.
         T_cam_imu_before: (4, 4) extrinsics of the frame before, after its update: the view's for the pose.
-        Q: (body, body) covariance of the noise that the process added, to the view, too.
+        Q: (body, body) covariance of the noise that the process added, to the view, too; empty if the engine predicts.
         last: (4, 4) motion over the interval before, ``T_departed = last T``, and its duration in s, if there was one.
     """
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.data.interval import Interval
+from ekfslam.engine.face import Engine
 from ekfslam.errors import ConfigError
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate, Motion
@@ -51,6 +53,8 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     model, process = e.model, e.model.process
     if also is not None and not process.estimates_velocity:
         raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
+    if e.engine is not None and (arrived := e.engine.predict(interval)) is not None:
+        return _arrived(e, e.engine, interval, arrived)
     way_m, T_cam_imu = process.way_m(e.values, interval), np.eye(4)
     if View.name in model.layout:
         T_cam_imu = e.values[View.name] @ se3.inverse(e.T_imu_world)
@@ -81,6 +85,18 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
         e.motion = replace(e.motion, Q=E @ step.Q @ E.T)
     e.gaussian.propagate(whole.Phi, whole.Q)
     return Prediction(departed, measured, log_likelihood, doubt)
+
+
+def _arrived(e: Estimate, engine: Engine, interval: Interval, found: dict[str, Any]) -> Prediction:
+    """Take in a prediction of the engine, which keeps what it needs of the motion."""
+    e.forget_table()
+    T_departed, W = e.T_imu_world, e.motion.W_predicted
+    e.updated_view = PreviousView.name if e.updated_view == View.name else None
+    e.values, e.coordinates = engine.named(found["values"]), found["coordinates"]
+    T_cam_imu = found["T_cam_imu"].reshape(4, 4)
+    e.motion = Motion(T_departed, e.T_imu_world, W, W, interval, found["way_m"], T_cam_imu, np.zeros((0, 0)))
+    e.imu_twist, e.step = found["imu_twist"], e.step + 1
+    return Prediction(found["departed"], None, 0.0)
 
 
 def _measure(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 
@@ -33,6 +33,8 @@ class StateBlock:
     Attributes:
         coupling: Role in the model; set by the method that a subclass overrides.
         retraction: Kind of its error.
+        laws: Names of the laws by which the engine computes a method without Python, by method. A class that overrides
+            the method has none for it, unless it says otherwise.
         name: Key of its value, and of its columns in the `Layout`.
         size: Number of columns of its error.
         per_frame: Whether it has a value for each frame, or one for the whole drive.
@@ -46,6 +48,7 @@ class StateBlock:
 
     coupling: ClassVar[Coupling] = "none"
     retraction: ClassVar[Retraction] = "vector"
+    laws: ClassVar[Mapping[str, str]] = {}
     per_frame: ClassVar[bool] = False
     is_seen: ClassVar[bool] = False
     is_curved: ClassVar[bool] = False
@@ -59,6 +62,23 @@ class StateBlock:
                 cls.coupling = coupling
         if "retract" in vars(cls) and "retraction" not in vars(cls):
             cls.retraction = "own"
+        inherited: Mapping[str, str] = next(vars(base)["laws"] for base in cls.__mro__[1:] if "laws" in vars(base))
+        kept = {method: law for method, law in inherited.items() if method not in vars(cls)}
+        cls.laws = {**kept, **vars(cls).get("laws", {})}
+
+    @classmethod
+    def law(cls, method: str) -> str:
+        """Return the law of a method: ``none`` if it is that of `StateBlock`, ``own`` if it is Python alone."""
+        is_base = getattr(cls, method) is getattr(StateBlock, method, None)
+        return "none" if is_base else cls.laws.get(method, "own")
+
+    def as_data(self) -> dict[str, Any] | None:
+        """Return what a prediction in C++ has to know of the block; None: it depends on Python."""
+        laws = {method: self.law(method) for method in ("transition", "turn_velocities", "camera_share")}
+        if "own" in laws.values() or (self.clones and not self.is_view):
+            return None
+        offset = self.velocity_offset()
+        return {**laws, "offset": np.zeros((6, 0)) if offset is None else np.asarray(offset, dtype=float)}
 
     @property
     def name(self) -> str:

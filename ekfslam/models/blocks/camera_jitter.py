@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,13 +31,15 @@ class CameraJitter(GaussMarkov):
 
     name = "camera_jitter"
     is_seen = True
+    laws: ClassVar = {"camera_share": "one"}
 
     @property
     def stationary_std(self) -> Array:
         return np.repeat([self.translation_m, np.deg2rad(self.rotation_deg)], 3)
 
-    def lengths(self, tau_s: Array | float, way_m: Array | float) -> Array:
-        return np.asarray(tau_s)[..., None] / self.time_s
+    @property
+    def scales(self) -> tuple[Array | float, Array | float]:
+        return self.time_s, np.inf
 
     @classmethod
     def automatic(cls, white_std: Array | None, is_clean: bool, has_checked_tracks: bool) -> dict[str, float] | None:

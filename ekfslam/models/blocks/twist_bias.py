@@ -46,8 +46,9 @@ class TwistBias(GaussMarkov):
         linear = [self.sigma_v_m_s if std is None else std for std in slip]
         return np.array([*linear, *[self.sigma_w_rad_s] * 3])
 
-    def lengths(self, tau_s: Array | float, way_m: Array | float) -> Array:
-        return np.asarray(tau_s)[..., None] / np.repeat([self.time_v_s, self.time_w_s], 3)
+    @property
+    def scales(self) -> tuple[Array | float, Array | float]:
+        return np.repeat([self.time_v_s, self.time_w_s], 3), np.inf
 
     @classmethod
     def automatic(cls, white_std: Array | None, is_clean: bool, has_checked_tracks: bool) -> dict[str, float] | None:

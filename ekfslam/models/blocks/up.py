@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -33,6 +34,7 @@ class Up(StateBlock):
     size = 3
     is_curved = True
     retraction = "direction"
+    laws: ClassVar = {"turn_velocities": "up"}
     labels = ("roll", "pitch")
     units = ("rad", "rad")
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.models.blocks.base import optional_block
 from ekfslam.models.blocks.gauss_markov import GaussMarkov
-
-# Way a frame that counts at least: a tracker drifts a little where the rig stands, too.
-_LEAST_WAY_M = 0.1
 
 
 @optional_block
@@ -39,13 +37,16 @@ class VisionDrift(GaussMarkov):
 
     name = "vision_drift"
     is_seen = True
+    laws: ClassVar = {"camera_share": "way"}
+    least_way_m = 0.1  # a tracker drifts a little where the rig stands, too
 
     @property
     def stationary_std(self) -> Array:
         return np.repeat([self.translation_percent / 100.0, np.deg2rad(self.rotation_deg_m)], 3)
 
-    def lengths(self, tau_s: Array | float, way_m: Array | float) -> Array:
-        return np.maximum(way_m, _LEAST_WAY_M)[..., None] / self.length_m
+    @property
+    def scales(self) -> tuple[Array | float, Array | float]:
+        return np.inf, self.length_m
 
     @classmethod
     def automatic(cls, white_std: Array | None, is_clean: bool, has_checked_tracks: bool) -> dict[str, float] | None:
@@ -53,4 +54,4 @@ class VisionDrift(GaussMarkov):
         return None if has_checked_tracks else {}
 
     def camera_share(self, way_m: Array, is_difference: BoolArray) -> Array | None:
-        return np.where(is_difference, np.maximum(way_m, _LEAST_WAY_M), 0.0)
+        return np.where(is_difference, np.maximum(way_m, self.least_way_m), 0.0)

@@ -1,0 +1,147 @@
+"""Predictions by velocities: those of the engine in C++ are those of Python."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from support.compiled import CALIBRATION, CAMERA, EXTRINSICS, NOISE, TRACKS
+
+from ekfslam.config import FilterConfig
+from ekfslam.data.interval import Interval
+from ekfslam.engine import choice
+from ekfslam.filters.joint import JointEKF
+from ekfslam.geometry import se3
+from ekfslam.models.blocks import CameraJitter, TwistBias, Up, VisionDrift
+from ekfslam.models.build import model_of
+from ekfslam.models.process.velocities import VelocityInputs
+from ekfslam.models.sensors.stereo import Rig
+
+pytestmark = pytest.mark.skipif(bool(choice.MISSING), reason=f"engine: {choice.MISSING}")
+
+
+class OwnInputs(VelocityInputs):
+    """The same process as a class of the user's, which the engine does not know."""
+
+
+@dataclass(frozen=True)
+class OwnBias(TwistBias):
+    """The same block with lengths of the user's."""
+
+    name = "twist_bias"
+
+    def lengths(self, tau_s, way_m):
+        return super().lengths(tau_s, way_m)
+
+
+def up_of(rng):
+    tilt = np.array([0.7, -0.5, 0.0]) + 0.1 * rng.normal(size=3)
+    return Up(se3.so3_exp(tilt)[:, 2], np.full(3, 0.05), np.eye(3))
+
+
+BLOCKS = {
+    "bias": lambda rng: (TwistBias(),),
+    "up": lambda rng: (up_of(rng),),
+    "camera": lambda rng: (CameraJitter(), VisionDrift()),
+    "all": lambda rng: (TwistBias(slip_y_m_s=0.3), up_of(rng), CameraJitter(), VisionDrift()),
+    "none": lambda rng: (),
+}
+POSES = {
+    "identity": 1e-9 * np.ones(6),
+    "pi": np.array([3.0, -1.0, 2.0, 0.1, np.pi - 1e-7, 0.0]),
+    "far": np.array([30.0, -10.0, 2.0, 0.4, -0.9, 1.1]),
+}
+
+
+def filters_of(blocks, pose, noise=TRACKS, calibration=None):
+    """Return filters that predict in C++ and in Python, with a random joint covariance, biases and jitter."""
+    rng = np.random.default_rng(7)
+    noise = dataclasses.replace(noise, motion_std=np.repeat([0.03, 0.004], 3), gap_std=np.repeat([0.5, 0.1], 3))
+    model = model_of(Rig(CAMERA, EXTRINSICS, noise), noise, se3.exp(POSES[pose]), 0.01 * np.eye(6), calibration, blocks)
+    root = 0.05 * rng.normal(size=(model.layout.body, model.layout.body))
+    model = dataclasses.replace(model, joint_prior=root @ root.T + model.prior_covariance)
+    config = FilterConfig(engine="engine", retire="unseen")
+    own = dataclasses.replace(model, make_process=lambda layout, noise: OwnInputs(layout, noise.process))
+    return [JointEKF(one, config) for one in (model, own)]
+
+
+def intervals(rng):
+    """Return intervals with one and with several pieces, across gaps, doubted, long, and while the rig stands."""
+    kinds = [(1, 0, 1, 1), (4, 0, 1, 1), (1, 1, 1, 0), (3, 0, 5, 2), (1, 1, 2, 1), (2, 0, 1, 20)]
+    for pieces, is_gap, doubt, size in kinds:
+        dt_s = rng.uniform(0.02, 0.1, pieces)
+        yield Interval(float(dt_s.sum()), dt_s, size * rng.normal(size=(pieces, 6)), bool(is_gap), float(doubt))
+
+
+def see(ekf, frame, rng):
+    """Update by four landmarks of which two were known."""
+    pixels = np.column_stack([rng.uniform(100, 500, 4), rng.uniform(100, 400, 4)])
+    measured = np.column_stack([pixels, pixels[:, 0] - rng.uniform(20, 60, 4), pixels[:, 1]])
+    ekf.update(frame, np.array([7, 3, 9, 5])[: 2 + frame], measured[: 2 + frame])
+
+
+def assert_close(one, other, what):
+    size = np.abs(other).max(initial=1.0)
+    np.testing.assert_allclose(one, other, atol=1e-13 * size, rtol=1e-13, err_msg=what)
+
+
+def assert_same(one, other):
+    for name, value in other.values.items():
+        assert_close(one.values[name], value, name)
+    for name in ("coordinates", "imu_twist", "P", "step"):
+        assert_close(getattr(one, name), getattr(other, name), name)
+    for name in ("T_departed", "T_predicted", "way_m", "T_cam_imu_before"):
+        assert_close(getattr(one.motion, name), getattr(other.motion, name), name)
+    logs = one.log(), other.log()
+    for field in dataclasses.fields(logs[0]):
+        assert_close(*(np.asarray(getattr(log, field.name), dtype=float) for log in logs), field.name)
+
+
+@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize("blocks", BLOCKS)
+def test_predictions_are_those_of_python(blocks, pose):
+    both = filters_of(BLOCKS[blocks](np.random.default_rng(1)), pose)
+    for ekf in both:
+        ekf.begin(np.ones(6))
+    for interval in intervals(np.random.default_rng(2)):
+        for ekf in both:
+            ekf.predict(interval)
+        assert_same(*both)
+
+
+@pytest.mark.parametrize("noise", [NOISE, TRACKS], ids=["white", "tracks"])
+def test_predictions_between_updates_are_those_of_python(noise):
+    both = filters_of(BLOCKS["all"](np.random.default_rng(1)), "far", noise, CALIBRATION)
+    for ekf in both:
+        rng = np.random.default_rng(3)
+        ekf.begin(np.ones(6))
+        see(ekf, 0, rng)
+    for interval in list(intervals(np.random.default_rng(2)))[:2]:
+        for ekf in both:
+            ekf.predict(interval)
+        assert_same(*both)
+        for ekf in both:
+            see(ekf, ekf.step, np.random.default_rng(4 + ekf.step))
+
+
+def test_a_block_with_a_method_of_the_user_is_no_data():
+    assert TwistBias().as_data() is not None
+    assert OwnBias().as_data() is None
+
+
+def test_a_block_of_the_user_gives_its_scales_as_data():
+    @dataclass(frozen=True)
+    class Slow(TwistBias):
+        name = "twist_bias"
+
+        @property
+        def scales(self):
+            return 3.0, 50.0
+
+    both = filters_of((Slow(),), "far")
+    for ekf in both:
+        ekf.predict(Interval.of_one(np.arange(6) / 3.0, 0.1))
+    assert_same(*both)
+    assert Slow().as_data()["length_m"].tolist() == [50.0] * 6
