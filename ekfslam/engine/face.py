@@ -6,7 +6,7 @@ predictions, references and reports need.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -77,9 +77,10 @@ class Engine:
         shares = [[block.camera_share(way, is_difference) for block in self._camera] for is_difference in _KINDS]
         return np.array(shares, dtype=float).reshape(2, -1)
 
-    def named(self, flat: Array) -> dict[str, Array]:
-        """Return the values of blocks by name."""
-        return {name: flat[at].reshape(shape) for name, (at, shape) in self._places.items()}
+    def named(self, flat: Array, names: Iterable[str] | None = None) -> dict[str, Array]:
+        """Return the values of blocks by name, of all or of some."""
+        places = ((name, *self._places[name]) for name in (self._places if names is None else names))
+        return {name: flat[at].reshape(shape) for name, at, shape in places}
 
     @property
     def values(self) -> dict[str, Array]:

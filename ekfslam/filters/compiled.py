@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from ekfslam.arrays import Array, IntArray
 from ekfslam.engine.face import Engine
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.frame import Outcome
 from ekfslam.filters.innovations import FrameInnovations
-from ekfslam.filters.landmarks import LandmarkTable
+from ekfslam.filters.landmarks import landmarks_of
 from ekfslam.filters.lifecycle import Retired
 from ekfslam.filters.logbook import Accepted, LogBook
 from ekfslam.models.blocks import Values
@@ -21,7 +19,7 @@ def rest(e: Estimate, engine: Engine, retired: Retired, frame: int, ids: IntArra
     """Let landmarks out of view sleep or retire; arguments as of `ekfslam.filters.frame.rest`."""
     e.forget_table()
     if (gone := engine.rest(frame, ids)) is not None:
-        _keep(e, retired, gone)
+        _keep(retired, gone)
 
 
 def update(
@@ -49,20 +47,21 @@ def update(
     e.forget_table()
     found = engine.update(frame, ids, measured, is_rested, twist_after if needs_twist else None)
     for gone in found["retired"]:
-        _keep(e, retired, gone)
+        _keep(retired, gone)
     retired.moving.update(found["moving"].tolist())
     if (doubt := found["doubt"]) != e.motion.interval.doubt:
         e.motion = e.motion.doubted(doubt)
+    views = ("pose", *e.model.layout.views)
     # The log has the rows at their linearisation, then those of new landmarks.
     taken, begun = found["taken"], found["begun"]
     accepted = Accepted(*(taken[name] for name in ("landmark", "previous", "rows", "variance", "position_m")))
-    log.corrected(e, accepted, engine.named(taken["values"]), taken["imu_twist"], taken["coordinates"])
-    log.amend(T_updated=engine.named(found["updated_values"])["pose"], updated=found["updated_coordinates"])
-    views = [(e.step, begun["rows"], begun["variance"])]
+    log.corrected(e, accepted, engine.named(taken["values"], views), taken["imu_twist"], taken["coordinates"])
+    log.amend(T_updated=engine.named(found["updated_values"], views)["pose"], updated=found["updated_coordinates"])
+    seen = [(e.step, begun["rows"], begun["variance"])]
     if begun["step_before"] >= 0:
-        views.insert(0, (begun["step_before"], begun["rows_before"], begun["variance"]))
+        seen.insert(0, (begun["step_before"], begun["rows_before"], begun["variance"]))
     if len(begun["ids"]):
-        log.started(begun["ids"], begun["position_m"], *views)
+        log.started(begun["ids"], begun["position_m"], *seen)
         retired.start_again(begun["ids"])
     e.values, e.coordinates, e.imu_twist = engine.named(found["values"]), found["coordinates"], found["imu_twist"]
     return Outcome(
@@ -75,8 +74,6 @@ def update(
     )
 
 
-def _keep(e: Estimate, retired: Retired, gone: dict[str, Any]) -> None:
+def _keep(retired: Retired, gone: dict[str, Any]) -> None:
     """Keep the last estimates of landmarks that left the state."""
-    table = LandmarkTable(e.sensor.dimension)
-    table.append(**gone["table"])
-    retired.add(table, gone["covariance"], np.ones(len(table), dtype=bool), gone["may_return"])
+    retired.take(landmarks_of(gone["table"], gone["covariance"]), gone["table"], gone["may_return"])

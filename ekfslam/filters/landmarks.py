@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from ekfslam.filters.result import Landmarks
 
 _WHOLE = ("id", "first_frame", "last_frame", "observations", "misses")  # with `_STEPS` the columns of whole numbers
 _STEPS = ("log_row", "stay_until", "first_step", "last_step", "last_observation", "asleep")
+_RECORDED = ("id", "position_m", "initial_m", "first_frame", "last_frame", "observations")
 _REAL = ("position_m", "initial_m", "evidence", "seen_rows", "extra")
 
 
@@ -91,8 +93,13 @@ class LandmarkTable:
 
     def snapshot(self, slot: IntArray, covariance: Array) -> Landmarks:
         """Return some landmarks as records of a result, with their covariances (k, 3, 3)."""
-        names = ("initial_m", "first_frame", "last_frame", "observations")
-        return Landmarks(self.id[slot], self.position_m[slot], covariance, *(self._rows[name][slot] for name in names))
+        return landmarks_of({name: self._rows[name][slot] for name in _RECORDED}, covariance)
+
+
+def landmarks_of(columns: Mapping[str, Any], covariance: Array) -> Landmarks:
+    """Return landmarks (k) as records of a result, given columns of a table and covariances (k, 3, 3)."""
+    id, position_m, *others = (columns[name] for name in _RECORDED)
+    return Landmarks(id, position_m, covariance, *others)
 
 
 def lookup(sorted_ids: IntArray, ids: IntArray) -> tuple[IntArray, BoolArray]:

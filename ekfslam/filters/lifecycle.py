@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -94,12 +95,17 @@ class Retired:
     def add(self, table: LandmarkTable, covariance: Array, gone: BoolArray, may_return: bool) -> None:
         """Add landmarks (n,) of a table that are gone, with their covariances (k, 3, 3)."""
         slot = np.flatnonzero(gone)
-        ids, rows = table.id[slot].tolist(), table.log_row[slot]
-        self._parts.append(table.snapshot(slot, covariance))
+        columns = {name: getattr(table, name)[slot] for name in ("log_row", "misses", "evidence")}
+        self.take(table.snapshot(slot, covariance), columns, may_return)
+
+    def take(self, gone: Landmarks, columns: Mapping[str, Any], may_return: bool) -> None:
+        """Add landmarks (k) that are gone, with the columns ``log_row``, ``misses`` and ``evidence`` of their table."""
+        rows = columns["log_row"]
+        self._parts.append(gone)
         self._rows.append(rows)
         if may_return:
-            self.row_of.update(zip(ids, rows.tolist(), strict=True))
-            verdicts = zip(table.misses[slot].tolist(), table.evidence[slot], strict=True)
+            self.row_of.update(zip(gone.id.tolist(), rows.tolist(), strict=True))
+            verdicts = zip(columns["misses"].tolist(), columns["evidence"], strict=True)
             self._verdicts.update(zip(rows.tolist(), verdicts, strict=True))
 
     def among(self, ids: IntArray) -> list[int]:

@@ -124,8 +124,8 @@ class Model:
     def reported(self, values: Values, covariance: Array) -> Array:
         """Return estimates and standard deviations (2, p) by labels; the covariance begins with the body."""
         covariance = covariance[: self.layout.body, : self.layout.body]
-        found = (block.reported(values, covariance, self.layout) for block in self.layout.blocks if block.labels)
-        return np.hstack([np.empty((2, 0)), *(np.array(pair) for pair in found)])
+        found = [block.reported(values, covariance, self.layout) for block in self.layout.blocks if block.labels]
+        return np.array([np.concatenate(part) for part in zip(*found, strict=True)]) if found else np.empty((2, 0))
 
     # --- from one frame to the next -----------------------------------------------------------------------------------
 

@@ -163,7 +163,7 @@ class StateBlock:
     def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
         """Return estimates and standard deviations (p,) by `labels`, given all blocks and their covariance."""
         at = layout[self.name]
-        return values[self.name], np.sqrt(np.diag(covariance)[at])
+        return values[self.name], np.sqrt(covariance.diagonal()[at])
 
     @property
     def reported_prior_std(self) -> Array:

@@ -77,7 +77,7 @@ class Calibration(StateBlock):
         return moved
 
     def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
-        return values[self.name][self.free], np.sqrt(np.diag(covariance)[layout[self.name]])
+        return values[self.name][self.free], np.sqrt(covariance.diagonal()[layout[self.name]])
 
     def camera_by(self, parameters: Array, T_cam_imu: Array, twist: Array) -> Array:
         """Return the derivative (..., 6, size) of the error of the camera in world, eq. (9), by the free parameters.

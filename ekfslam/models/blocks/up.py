@@ -73,10 +73,9 @@ class Up(StateBlock):
     def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
         """Return roll and pitch of the IMU and their standard deviations, rad."""
         up = self.in_imu(values)
-        by = np.zeros((3, layout.body))
-        by[:, layout["pose"].start + 3 : layout["pose"].stop] = np.eye(3)
-        by[:, layout[self.name]] = values["pose"][:3, :3]
-        variance = ((by @ covariance) * by).sum(axis=1)
+        theta, psi, R = slice(layout["pose"].start + 3, layout["pose"].stop), layout[self.name], values["pose"][:3, :3]
+        cross = R @ covariance[psi, theta]
+        variance = (covariance[theta, theta] + cross + cross.T + R @ covariance[psi, psi] @ R.T).diagonal()
         return np.array([np.arctan2(up[1], up[2]), -np.arcsin(up[0])]), np.sqrt(variance[:2])
 
     @property
