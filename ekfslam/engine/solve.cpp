@@ -8,7 +8,8 @@
 namespace ekfslam {
 
 namespace {
-using Gain = Eigen::Matrix<double, 3, Eigen::Dynamic, Eigen::ColMajor, 3, 8>;  // (3, d)
+using Gain = Eigen::Matrix<double, 3, Eigen::Dynamic, Eigen::ColMajor, 3, 8>;                // (3, d)
+using Small = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMajor, 8, 8>;  // (d, d)
 }  // namespace
 
 Matrix Solution::residual() const {
@@ -147,9 +148,10 @@ std::vector<Matrix> Gaussian::given_others(const Solution& s, const Slots& which
     std::vector<Matrix> blocks;
     for (std::size_t i = 0; i < which.size(); ++i) {
         const auto Z_i = Z.middleCols(static_cast<Index>(i) * d, d);
-        Matrix white = s.at.rows.variance.col(which[i]).cwiseSqrt().asDiagonal();
+        Small white = s.at.rows.variance.col(which[i]).cwiseSqrt().asDiagonal(), left = Small::Identity(d, d);
+        left -= Z_i.transpose().lazyProduct(Z_i);
         divide_rows(s.at.root(which[i]), white);
-        blocks.push_back(white.transpose() * (Matrix::Identity(d, d) - Z_i.transpose() * Z_i) * white);
+        blocks.push_back(white.transpose().lazyProduct(left.lazyProduct(white).eval()));
     }
     return blocks;
 }
@@ -171,7 +173,7 @@ Matrix Gaussian::information(const Solution& s, const Matrix& J) const {
 void Gaussian::apply(const Solution& s) {
     if (s.V_A.size() > 0) return apply_body(s);
     const bool regular = root().regular;
-    Matrix W = root().F, G_e = F_e_;
+    Matrix W = std::move(root_->F), G_e = F_e_;  // the root is not that of P afterwards
     blas::solve('R', 'L', 'T', s.C, G_e);
     if (regular) {
         divide_upper(W, s.C);

@@ -65,7 +65,7 @@ class LandmarkTable:
         new = np.zeros(len(np.asarray(values["id"])), dtype=self._rows.dtype)
         for name, value in values.items():
             new[name] = value
-        self._rows = np.concatenate([self._rows, new])
+        self._rows = np.concatenate([self._rows, new]) if len(self) else new
 
     def columns(self, first: int) -> dict[str, Array | IntArray]:
         """Return all columns but ``extra`` by name, from a row on."""
