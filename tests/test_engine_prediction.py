@@ -36,16 +36,25 @@ class OwnBias(TwistBias):
         return super().lengths(tau_s, way_m)
 
 
+class Begun(TwistBias):
+    """The same block with a first value."""
+
+    name = "twist_bias"
+
+    def initial(self):
+        return np.array([0.2, -0.1, 0.3, 0.02, -0.01, 0.03])
+
+
 def up_of(rng):
     tilt = np.array([0.7, -0.5, 0.0]) + 0.1 * rng.normal(size=3)
     return Up(se3.so3_exp(tilt)[:, 2], np.full(3, 0.05), np.eye(3))
 
 
 BLOCKS = {
-    "bias": lambda rng: (TwistBias(),),
+    "bias": lambda rng: (Begun(),),
     "up": lambda rng: (up_of(rng),),
     "camera": lambda rng: (CameraJitter(), VisionDrift()),
-    "all": lambda rng: (TwistBias(slip_y_m_s=0.3), up_of(rng), CameraJitter(), VisionDrift()),
+    "all": lambda rng: (Begun(slip_y_m_s=0.3), up_of(rng), CameraJitter(), VisionDrift()),
     "none": lambda rng: (),
 }
 POSES = {
@@ -62,7 +71,7 @@ def filters_of(blocks, pose, noise=TRACKS, calibration=None):
     model = model_of(Rig(CAMERA, EXTRINSICS, noise), noise, se3.exp(POSES[pose]), 0.01 * np.eye(6), calibration, blocks)
     root = 0.05 * rng.normal(size=(model.layout.body, model.layout.body))
     model = dataclasses.replace(model, joint_prior=root @ root.T + model.prior_covariance)
-    config = FilterConfig(engine="engine", retire="unseen")
+    config = FilterConfig(engine="engine", retire="unseen", gate_probability=1.0)
     own = dataclasses.replace(model, make_process=lambda layout, noise: OwnInputs(layout, noise.process))
     return [JointEKF(one, config) for one in (model, own)]
 
@@ -75,28 +84,30 @@ def intervals(rng):
         yield Interval(float(dt_s.sum()), dt_s, size * rng.normal(size=(pieces, 6)), bool(is_gap), float(doubt))
 
 
-def see(ekf, frame, rng):
-    """Update by four landmarks of which two were known."""
+def see(ekf, frame):
+    """Update by four landmarks, in another order each time, whose images stay where they are."""
+    rng = np.random.default_rng(3)
     pixels = np.column_stack([rng.uniform(100, 500, 4), rng.uniform(100, 400, 4)])
     measured = np.column_stack([pixels, pixels[:, 0] - rng.uniform(20, 60, 4), pixels[:, 1]])
-    ekf.update(frame, np.array([7, 3, 9, 5])[: 2 + frame], measured[: 2 + frame])
+    order = np.roll(np.arange(4), frame)[: 3 + frame % 2]
+    return ekf.update(frame, np.array([7, 3, 9, 5])[order], measured[order])
 
 
-def assert_close(one, other, what):
+def assert_close(one, other, what, tolerance):
     size = np.abs(other).max(initial=1.0)
-    np.testing.assert_allclose(one, other, atol=1e-13 * size, rtol=1e-13, err_msg=what)
+    np.testing.assert_allclose(one, other, atol=tolerance * size, rtol=tolerance, err_msg=what)
 
 
-def assert_same(one, other):
+def assert_same(one, other, tolerance=1e-13):
     for name, value in other.values.items():
-        assert_close(one.values[name], value, name)
+        assert_close(one.values[name], value, name, tolerance)
     for name in ("coordinates", "imu_twist", "P", "step"):
-        assert_close(getattr(one, name), getattr(other, name), name)
+        assert_close(getattr(one, name), getattr(other, name), name, tolerance)
     for name in ("T_departed", "T_predicted", "way_m", "T_cam_imu_before"):
-        assert_close(getattr(one.motion, name), getattr(other.motion, name), name)
+        assert_close(getattr(one.motion, name), getattr(other.motion, name), name, tolerance)
     logs = one.log(), other.log()
     for field in dataclasses.fields(logs[0]):
-        assert_close(*(np.asarray(getattr(log, field.name), dtype=float) for log in logs), field.name)
+        assert_close(*(np.asarray(getattr(log, field.name), dtype=float) for log in logs), field.name, tolerance)
 
 
 @pytest.mark.parametrize("pose", POSES)
@@ -115,15 +126,15 @@ def test_predictions_are_those_of_python(blocks, pose):
 def test_predictions_between_updates_are_those_of_python(noise):
     both = filters_of(BLOCKS["all"](np.random.default_rng(1)), "far", noise, CALIBRATION)
     for ekf in both:
-        rng = np.random.default_rng(3)
         ekf.begin(np.ones(6))
-        see(ekf, 0, rng)
-    for interval in list(intervals(np.random.default_rng(2)))[:2]:
+        see(ekf, 0)
+    for k in range(1, 4):
         for ekf in both:
-            ekf.predict(interval)
-        assert_same(*both)
-        for ekf in both:
-            see(ekf, ekf.step, np.random.default_rng(4 + ekf.step))
+            ekf.predict(Interval.of_one(0.05 * np.arange(1, 7), 0.1))
+        assert_same(*both, 1e-9)  # an update enlarges what rounding leaves
+        reports = [see(ekf, k) for ekf in both]
+        assert reports[0].dof == reports[1].dof > 0
+    assert all(np.abs(both[0].values[name]).min() > 0 for name in ("twist_bias", "camera_jitter"))
 
 
 def test_a_block_with_a_method_of_the_user_is_no_data():
