@@ -15,7 +15,6 @@ from ekfslam.filters.retraction import carried_back, retract, retracted
 from ekfslam.geometry import se3
 
 engine = pytest.importorskip("ekfslam.engine._engine", reason="the engine is not built")
-pytestmark = pytest.mark.skipif(not hasattr(engine, "observe"), reason="the engine is built without `Filter`")
 
 CASES = {
     "all": Case(),

@@ -62,3 +62,32 @@ def test_a_function_of_51_lines_is_too_long(tmp_path: Path) -> None:
         "class A:\n    def f(self):\n" + "        pass\n" * 50 + "    def g(self):\n" + "        pass\n" * 49
     )
     assert too_long(package) == {"some.part.A.f": 51}
+
+
+def functions_in_cpp(text: str) -> Iterator[tuple[int, int]]:
+    """Yield first line and number of lines of each function of a file in C++, formatted as the project's are."""
+    first = 0
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line and not line.startswith((" ", "}", "#", "//", "namespace", "struct", "class", "template")):
+            first = first or number
+        if line.endswith(";") and not line.startswith((" ", "}")):
+            first = 0
+        if line.startswith("}"):
+            if first:
+                yield first, number - first + 1
+            first = 0
+
+
+def test_functions_in_cpp_are_short():
+    found = {
+        f"{path.name}:{first}": length
+        for path in sorted(Path(ekfslam.__file__).parent.joinpath("engine").glob("*.[ch]pp"))
+        for first, length in functions_in_cpp(path.read_text(encoding="utf-8"))
+    }
+    assert len(found) > 100
+    assert not {name: length for name, length in found.items() if length > LONGEST["function"]}
+
+
+def test_a_long_function_in_cpp_is_found():
+    text = "int before();\nint f(int a,\n      int b) {\n" + "    ++a;\n" * 60 + "}\n"
+    assert list(functions_in_cpp(text)) == [(2, 63)]

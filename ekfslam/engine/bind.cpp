@@ -2,8 +2,8 @@
 #include <nanobind/eigen/dense.h>
 #include <nanobind/nanobind.h>
 
-#include "bind_gaussian.hpp"
 #include "bind_gates.hpp"
+#include "bind_gaussian.hpp"
 #include "binding.hpp"
 #include "lapack.hpp"
 #include "types.hpp"
@@ -31,10 +31,6 @@ Matrix cholesky(Matrix P) {
 }
 
 }  // namespace
-
-namespace ekfslam {
-void bind_model(nb::module_& module);
-}
 
 NB_MODULE(_engine, module) {
     module.doc() = "The filter in C++; `ekfslam.engine` is its face.";

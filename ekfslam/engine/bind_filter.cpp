@@ -39,6 +39,22 @@ std::vector<Block> blocks_of(const nb::list& given) {
     return blocks;
 }
 
+constexpr Index MOST_CONSIDERED = 10000;
+
+void require_range(const std::string& name, Index first, Index size, Index count) {
+    if (first >= 0 && size >= 0 && first <= count && size <= count - first) return;
+    throw nb::value_error((name + " must be among " + std::to_string(count)).c_str());
+}
+
+// Blocks whose columns and values are those of a state.
+void require_places(const std::vector<Block>& blocks, Index body, Index values) {
+    for (const Block& block : blocks) {
+        require_range("columns of block " + block.name, block.at, block.size, body);
+        require_range("values of block " + block.name, block.value_at, block.value_size, values);
+        for (const Index parameter : block.free) require_range("free parameters", parameter, 1, block.value_size);
+    }
+}
+
 Sensor sensor_of(const nb::dict& from) {
     Sensor sensor;
     sensor.type = get<bool>(from, "is_monocular") ? Sensor::monocular : Sensor::rig;
@@ -136,13 +152,14 @@ Filter make(const nb::list& blocks, const nb::dict& sensor, const nb::object& tr
         body += block.size;
         size += block.value_size;
     }
+    require_places(parts, body, size);
     require_shape("values", values, size, 1);
     require_shape("coordinates", coordinates, body, 1);
     require_shape("P", P, body, body);
     require_finite("values", values);
     require_covariance(P);
-    Filter filter(Estimate(config_of(config), sensor_of(sensor), track_error_of(track_error), parts, values,
-                           coordinates, P));
+    Filter filter(
+        Estimate(config_of(config), sensor_of(sensor), track_error_of(track_error), parts, values, coordinates, P));
     filter.uniform = &uniform;
     set_shares(filter.e, shares);
     open_views(filter.e);
@@ -181,7 +198,9 @@ nb::tuple measure(Filter& filter, const Vector& values, const Vector& coordinate
     });
 }
 
-nb::tuple mean_of(const Filter& filter) { return nb::make_tuple(array(filter.e.values.flat), array(filter.e.coordinates)); }
+nb::tuple mean_of(const Filter& filter) {
+    return nb::make_tuple(array(filter.e.values.flat), array(filter.e.coordinates));
+}
 
 // Arrive at the next frame: the covariance follows Phi and Q, the mean is that of Python, and the view opens.
 // `numbers` are tau_s, way_m and doubt; `last` is the motion of the interval before and its duration, or None.
@@ -218,13 +237,14 @@ nb::dict update(Filter& filter, Index frame, const Integers& ids, const Matrix& 
     const Matrix columns = measured.transpose();
     if (std::unordered_set<std::int64_t>(seen.begin(), seen.end()).size() != seen.size())
         throw nb::value_error("ids must be distinct");
-    if (columns.cols() != static_cast<Index>(seen.size()) || columns.rows() < (filter.e.sensor.type == Sensor::rig ? 4 : 2))
+    if (columns.cols() != static_cast<Index>(seen.size()) ||
+        columns.rows() < (filter.e.sensor.type == Sensor::rig ? 4 : 2))
         throw nb::value_error("measured must have one row of pixels for each id");
-    if (!twist_after.is_none())
-        filter.e.twist_after = [&](const Values& after) {
-            const nb::gil_scoped_acquire held;
-            return nb::cast<Vector6>(twist_after(array(after.flat)));
-        };
+    filter.e.twist_after = [&](const Values& after) {
+        const nb::gil_scoped_acquire held;
+        if (twist_after.is_none()) throw nb::value_error("twist_after must be a function for a time offset");
+        return nb::cast<Vector6>(twist_after(array(after.flat)));
+    };
     struct Reset {
         Estimate& e;
         ~Reset() { e.twist_after = nullptr; }
@@ -238,7 +258,8 @@ nb::dict update(Filter& filter, Index frame, const Integers& ids, const Matrix& 
                      filter);
 }
 
-nb::tuple adopt(Filter& filter, const Vector& values, const Vector& coordinates, const Matrix& position_m, const Matrix& P) {
+nb::tuple adopt(Filter& filter, const Vector& values, const Vector& coordinates, const Matrix& position_m,
+                const Matrix& P) {
     const Index body = filter.e.columns.body, count = filter.e.table.size();
     require_shape("values", values, filter.e.values.flat.size(), 1);
     require_shape("coordinates", coordinates, body, 1);
@@ -255,68 +276,88 @@ Slots all(const Filter& filter) {
     return slots;
 }
 
-}  // namespace
-
-void bind_filter(nb::module_& module) {
-    bind_process(nb::class_<Filter>(module, "Filter", "The joint filter; predictions may come from Python."))
-        .def("__init__",
-             [](Filter* self, const nb::list& blocks, const nb::dict& sensor, const nb::object& track_error,
-                const nb::dict& config, const Vector& values, const Vector& coordinates, const Matrix& P,
-                const Matrix& shares) {
-                 new (self) Filter(make(blocks, sensor, track_error, config, values, coordinates, P, shares));
-             },
-             arg("blocks"), arg("sensor"), arg("track_error").none(), arg("config"), arg("values"),
-             arg("coordinates"), arg("P"), arg("shares"))
-        .def("copy", [](const Filter& filter) { return Filter(filter); })
-        .def("propagate", &propagate, arg("Phi"), arg("Q"))
-        .def("measure", &measure, arg("values"), arg("coordinates"), arg("H"), arg("residual"), arg("variance"))
-        .def("arrive", &arrive, arg("values"), arg("coordinates"), arg("imu_twist"), arg("Phi"), arg("Q"),
-             arg("T_departed"), arg("T_predicted"), arg("noise"), arg("numbers"), arg("last").none(), arg("shares"))
-        .def("rest",
-             [](Filter& filter, Index frame, const Integers& ids) {
-                 return retired_of(filter.rest(frame, ids_of(ids)));
-             },
-             arg("frame"), arg("ids"))
-        .def("update", &update, arg("frame"), arg("ids"), arg("measured"), arg("is_rested"),
-             arg("twist_after").none())
-        .def("revive",
-             [](Filter& filter, const nb::dict& more) {
-                 filter.revive(table_from(more, filter.e.sensor.dimension()));
-             },
-             arg("more"))
-        .def("adopt", &adopt, arg("values"), arg("coordinates"), arg("position_m"), arg("P"))
-        .def("look_again", &look_again, arg("imu_twist"))
-        .def("replace",
-             [](Filter& filter, const Matrix& P) {
-                 const Index size = filter.e.columns.body + filter.e.gaussian.considered() + 3 * filter.e.table.size();
-                 require_shape("P", P, size, size);
-                 require_covariance(P);
-                 filter.e.gaussian.replace(P);
-             },
-             arg("P"))
-        .def("values", [](const Filter& filter) { return array(filter.e.values.flat); })
+void bind_reading(nb::class_<Filter>& bound) {
+    bound.def("values", [](const Filter& filter) { return array(filter.e.values.flat); })
         .def("table", [](const Filter& filter) { return table_of(filter.e.table); })
         .def("landmarks", [](const Filter& filter) { return filter.e.table.size(); })
         .def("considered", [](const Filter& filter) { return filter.e.gaussian.considered(); })
         .def("body_covariance", [](const Filter& filter) { return rows(filter.e.gaussian.body_covariance()); })
         .def("covariance", [](const Filter& filter) { return rows(filter.e.gaussian.covariance_of(all(filter))); })
-        .def("covariance_of",
-             [](const Filter& filter, const Integers& slots) {
-                 return rows(filter.e.gaussian.covariance_of(slots_of(slots, filter.e.table.size())));
-             },
-             arg("slots"))
+        .def(
+            "covariance_of",
+            [](const Filter& filter, const Integers& slots) {
+                return rows(filter.e.gaussian.covariance_of(slots_of(slots, filter.e.table.size())));
+            },
+            arg("slots"))
         .def("landmark_blocks",
              [](const Filter& filter) { return blocks(filter.e.gaussian.landmark_blocks(all(filter))); })
-        .def("landmark_blocks_of",
-             [](const Filter& filter, const Integers& slots) {
-                 return blocks(filter.e.gaussian.landmark_blocks(slots_of(slots, filter.e.table.size())));
-             },
-             arg("slots"))
-        .def("consider", [](Filter& filter, Index columns) { return filter.e.gaussian.consider(columns); },
-             arg("columns"))
-        .def("clone",
-             [](Filter& filter, Index source, Index size, Index to) { filter.e.gaussian.clone(source, size, to); },
-             arg("source"), arg("size"), arg("to"));
+        .def(
+            "landmark_blocks_of",
+            [](const Filter& filter, const Integers& slots) {
+                return blocks(filter.e.gaussian.landmark_blocks(slots_of(slots, filter.e.table.size())));
+            },
+            arg("slots"))
+        .def(
+            "consider",
+            [](Filter& filter, Index columns) {
+                require_range("considered columns", 0, columns, MOST_CONSIDERED);
+                return filter.e.gaussian.consider(columns);
+            },
+            arg("columns"))
+        .def(
+            "clone",
+            [](Filter& filter, Index source, Index size, Index to) {
+                const Index body = filter.e.columns.body;
+                require_range("columns of blocks", source, size, body);
+                require_range("considered columns", to - body, size, filter.e.gaussian.considered());
+                filter.e.gaussian.clone(source, size, to);
+            },
+            arg("source"), arg("size"), arg("to"));
+}
+
+}  // namespace
+
+void bind_filter(nb::module_& module) {
+    nb::class_<Filter> bound(module, "Filter", "The joint filter; predictions may come from Python.");
+    bound
+        .def(
+            "__init__",
+            [](Filter* self, const nb::list& blocks, const nb::dict& sensor, const nb::object& track_error,
+               const nb::dict& config, const Vector& values, const Vector& coordinates, const Matrix& P,
+               const Matrix& shares) {
+                new (self) Filter(make(blocks, sensor, track_error, config, values, coordinates, P, shares));
+            },
+            arg("blocks"), arg("sensor"), arg("track_error").none(), arg("config"), arg("values"), arg("coordinates"),
+            arg("P"), arg("shares"))
+        .def("copy", [](const Filter& filter) { return Filter(filter); })
+        .def("propagate", &propagate, arg("Phi"), arg("Q"))
+        .def("measure", &measure, arg("values"), arg("coordinates"), arg("H"), arg("residual"), arg("variance"))
+        .def("arrive", &arrive, arg("values"), arg("coordinates"), arg("imu_twist"), arg("Phi"), arg("Q"),
+             arg("T_departed"), arg("T_predicted"), arg("noise"), arg("numbers"), arg("last").none(), arg("shares"))
+        .def(
+            "rest",
+            [](Filter& filter, Index frame, const Integers& ids) {
+                return retired_of(filter.rest(frame, ids_of(ids)));
+            },
+            arg("frame"), arg("ids"))
+        .def("update", &update, arg("frame"), arg("ids"), arg("measured"), arg("is_rested"), arg("twist_after").none())
+        .def(
+            "revive",
+            [](Filter& filter, const nb::dict& more) { filter.revive(table_from(more, filter.e.sensor.dimension())); },
+            arg("more"))
+        .def("adopt", &adopt, arg("values"), arg("coordinates"), arg("position_m"), arg("P"))
+        .def("look_again", &look_again, arg("imu_twist"))
+        .def(
+            "replace",
+            [](Filter& filter, const Matrix& P) {
+                const Index size = filter.e.columns.body + filter.e.gaussian.considered() + 3 * filter.e.table.size();
+                require_shape("P", P, size, size);
+                require_covariance(P);
+                filter.e.gaussian.replace(P);
+            },
+            arg("P"));
+    bind_process(bound);
+    bind_reading(bound);
 }
 
 }  // namespace ekfslam::binding

@@ -98,12 +98,51 @@ void keep_memory() {
     mallopt(M_TRIM_THRESHOLD, 64 << 20);
 #endif
 }
+void bind_updates(nb::class_<Gaussian>& bound) {
+    bound
+        .def("project",
+             [](const Gaussian& self, const Slots& slot, const Stack& H_x, const Stack& H_m, const RowMajor& residual,
+                const RowMajor& variance) { return self.project(rows_of(slot, H_x, H_m, residual, variance)); })
+        .def("solve", &Gaussian::solve)
+        .def("without", &Gaussian::without)
+        .def("solve_body", &Gaussian::solve_body)
+        .def("correction", &Gaussian::correction)
+        .def("given_others",
+             [](const Gaussian& self, const Solution& solution, const Slots& which) {
+                 const Index d = solution.at.rows.dimension();
+                 return stacked(self.given_others(solution, which), d, d);
+             })
+        .def("information", &Gaussian::information)
+        .def("apply", &Gaussian::apply);
+}
+
+void bind_changes(nb::class_<Gaussian>& bound) {
+    bound.def("propagate", &Gaussian::propagate)
+        .def("close_view", &Gaussian::close_view)
+        .def("open_view", &Gaussian::open_view, nb::arg("Y"), nb::arg("Yd") = nb::none())
+        .def("hold_anchor", &Gaussian::hold_anchor)
+        .def("add_noise", &Gaussian::add_noise)
+        .def("augment", [](Gaussian& self, const Stack& G,
+                           const Stack& covariance) { self.augment(columns_of(G), blocks_of<Matrix3>(covariance)); })
+        .def("transform_body", &Gaussian::transform_body)
+        .def("transform_landmarks",
+             [](Gaussian& self, const Slots& slots, const std::optional<Stack>& M, const Stack& B, Index at) {
+                 self.transform_landmarks(slots, M ? blocks_of<Matrix3>(*M) : std::vector<Matrix3>(),
+                                          blocks_of<Matrix36>(B), at);
+             })
+        .def("rest", &Gaussian::rest)
+        .def("marginalise", &Gaussian::marginalise)
+        .def("replace", &Gaussian::replace)
+        .def("consider", &Gaussian::consider)
+        .def("clone", &Gaussian::clone);
+}
 }  // namespace
 
 void bind_gaussian(nb::module_& m) {
     keep_memory();
     bind_projection(m);
-    nb::class_<Gaussian>(m, "Gaussian")
+    nb::class_<Gaussian> bound(m, "Gaussian");
+    bound
         .def(
             "__init__",
             [](Gaussian* self, const Matrix& P, Index view, Index previous, Index anchor, std::vector<Index> front) {
@@ -124,39 +163,9 @@ void bind_gaussian(nb::module_& m) {
         .def_prop_ro("body_covariance", &Gaussian::body_covariance)
         .def("covariance_of", &Gaussian::covariance_of)
         .def("landmark_blocks",
-             [](const Gaussian& self, const Slots& slots) { return stacked(self.landmark_blocks(slots), 3, 3); })
-        .def("propagate", &Gaussian::propagate)
-        .def("close_view", &Gaussian::close_view)
-        .def("open_view", &Gaussian::open_view, nb::arg("Y"), nb::arg("Yd") = nb::none())
-        .def("hold_anchor", &Gaussian::hold_anchor)
-        .def("add_noise", &Gaussian::add_noise)
-        .def("project",
-             [](const Gaussian& self, const Slots& slot, const Stack& H_x, const Stack& H_m, const RowMajor& residual,
-                const RowMajor& variance) { return self.project(rows_of(slot, H_x, H_m, residual, variance)); })
-        .def("solve", &Gaussian::solve)
-        .def("without", &Gaussian::without)
-        .def("solve_body", &Gaussian::solve_body)
-        .def("correction", &Gaussian::correction)
-        .def("given_others",
-             [](const Gaussian& self, const Solution& solution, const Slots& which) {
-                 const Index d = solution.at.rows.dimension();
-                 return stacked(self.given_others(solution, which), d, d);
-             })
-        .def("information", &Gaussian::information)
-        .def("apply", &Gaussian::apply)
-        .def("augment", [](Gaussian& self, const Stack& G,
-                           const Stack& covariance) { self.augment(columns_of(G), blocks_of<Matrix3>(covariance)); })
-        .def("transform_body", &Gaussian::transform_body)
-        .def("transform_landmarks",
-             [](Gaussian& self, const Slots& slots, const std::optional<Stack>& M, const Stack& B, Index at) {
-                 self.transform_landmarks(slots, M ? blocks_of<Matrix3>(*M) : std::vector<Matrix3>(),
-                                          blocks_of<Matrix36>(B), at);
-             })
-        .def("rest", &Gaussian::rest)
-        .def("marginalise", &Gaussian::marginalise)
-        .def("replace", &Gaussian::replace)
-        .def("consider", &Gaussian::consider)
-        .def("clone", &Gaussian::clone);
+             [](const Gaussian& self, const Slots& slots) { return stacked(self.landmark_blocks(slots), 3, 3); });
+    bind_updates(bound);
+    bind_changes(bound);
 }
 
 }  // namespace ekfslam

@@ -1,6 +1,4 @@
 // The observation side for the tests of Python: functions of SE(3), cameras, rows, corrections.
-#if __has_include("binding.hpp")
-
 #include "binding.hpp"
 #include "model.hpp"
 #include "retraction.hpp"
@@ -87,13 +85,3 @@ void bind_model(nb::module_& module) {
 }
 
 }  // namespace ekfslam
-
-#else  // without the class `Filter` of Python there is nothing to look at
-
-#include <nanobind/nanobind.h>
-
-namespace ekfslam {
-void bind_model(nanobind::module_&) {}
-}  // namespace ekfslam
-
-#endif

@@ -15,11 +15,11 @@ nb::object owned(T values, std::initializer_list<std::size_t> shape) {
 
 struct Column {
     const char* name;
-    Ids Table::*values;
+    Ids Table::* values;
 };
 struct Block {
     const char* name;
-    Matrix Table::*values;
+    Matrix Table::* values;
 };
 constexpr Column COLUMNS[] = {
     {"id", &Table::id},

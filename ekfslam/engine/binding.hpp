@@ -12,6 +12,13 @@
 
 #include "filter.hpp"
 
+namespace ekfslam {
+
+// Adds what tests compare: SE(3), cameras, rows, corrections.
+void bind_model(nanobind::module_& module);
+
+}  // namespace ekfslam
+
 namespace ekfslam::binding {
 
 namespace nb = nanobind;

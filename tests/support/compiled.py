@@ -64,7 +64,8 @@ class Case:
         blocks = (CameraJitter(), Sway(), VisionDrift()) if self.blocks else ()
         calibration = CALIBRATION if self.calibration else None
         model = model_of(sensor, noise, T_imu_world, np.eye(6) * 1e-4, calibration, blocks, self.coordinates)
-        e = Estimate(model, FilterConfig(variant=self.variant, landmark_coordinates=self.coordinates))
+        settings = {"variant": self.variant, "landmark_coordinates": self.coordinates, "engine": "reference"}
+        e = Estimate(model, FilterConfig(**settings))
         values = {**e.values, **{block.name: rng.normal(size=6) * 0.05 for block in blocks}}
         if self.calibration:
             values["calibration"] = rng.normal(size=9) * [0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.02, 1.0, 0.05]
