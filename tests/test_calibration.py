@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from support.helpers import run_joint
-from support.jacobians import POSES, TWISTS, visible_points
+from support.jacobians import POSES, TWISTS, see, visible_points
 from support.literal import OPEN, recorded, seen_rows, sighted, stencil
 from support.reference import CAMERA, T_CAM_IMU, small_world
 from support.same import assert_same
@@ -45,7 +45,7 @@ def seen(T, c, m):
 
 def linearised(T, c, m, linear):
     """Points, rows by pose and parameters (n, 3, 15), rows by landmarks."""
-    seen = observer_of(T, ALL).see(Moment(T, T, c, TWIST), m, linear)
+    seen = see(observer_of(T, ALL), Moment(T, T, c, TWIST), m, linear)
     return seen.q, seen.H_x, seen.H_m
 
 
@@ -279,7 +279,7 @@ def test_parameters_that_are_not_free_stay_as_given(calibrated):
     assert block.size == len(free)
     np.testing.assert_allclose(block.retract(C, np.ones(len(free))) - C, np.isin(np.arange(9), free), atol=1e-15)
     moment = Moment(np.eye(4), np.eye(4), C, TWIST)
-    ours, theirs = (observer_of(np.eye(4), own).see(moment, m, m).H_x for own in (block, ALL))
+    ours, theirs = (see(observer_of(np.eye(4), own), moment, m, m).H_x for own in (block, ALL))
     np.testing.assert_array_equal(ours, theirs[..., np.concatenate([np.arange(6), 6 + free])])
 
 

@@ -10,7 +10,7 @@ from support.helpers import tracked, truth_error
 from support.running import WHOLE
 
 from ekfslam import open_sequence
-from ekfslam.config import Config
+from ekfslam.config import Config, PosteriorConfig
 from ekfslam.data.noise import TrackError
 from ekfslam.data.sequence import Truth
 from ekfslam.data.simulate import builtin
@@ -18,9 +18,10 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.resolve import resolve
 from ekfslam.runner import run
-from ekfslam.smoother.posterior import posterior, smooth
+from ekfslam.smoother.posterior import in_layout, posterior, posterior_of_log, smooth
 from ekfslam.smoother.revival import MapRevival
 
+FILTERED = PosteriorConfig(linearisation="filtered")
 SHARED = ["camera_jitter", "vision_drift"]
 ALL_BLOCKS = ["pose", "view", "previous_view", "calibration", *SHARED, "twist", "up", "twist_bias"]
 TRACK_ERROR = TrackError(np.array([0.3, 0.4, 0.8]), np.array([0.2, 0.25, 0.3]), 40.0, 0.05)
@@ -153,3 +154,29 @@ def test_as_filtered_of_a_run_with_every_block_is_the_filter():
     np.testing.assert_allclose(np.sqrt(np.diag(bias[-1])[[0, 5]]), result.parameters.std[-1, at], rtol=1e-6)
     assert found.block_covariance("up").shape == (3, 3)
     assert smooth(result).mode == "as filtered"
+
+
+def test_a_log_of_an_older_release_gets_the_columns_of_views():
+    """It has clones of pose and jitter in place of views, behind the pose and behind all seen blocks."""
+    settings = {"filter": {"variant": "standard", **PRIOR}, "calibration": CALIBRATION, "blocks": BLOCKS}
+    ekf = drive(with_everything(builtin("city?frames=6")), settings)
+    log, layout = ekf.log(), ekf.model.layout
+    parts = [["pose"], None, ["calibration", "camera_jitter", "vision_drift"], None, ["twist", "up", "twist_bias"]]
+    columns = np.concatenate([np.full(6, -1) if names is None else layout.columns(names) for names in parts])
+
+    def old(array):
+        return np.where(columns < 0, 7.0, array[:, columns])
+
+    former = dataclasses.replace(
+        log,
+        has_views=False,
+        initial_covariance=old(old(log.initial_covariance).T),
+        **{name: old(getattr(log, name)) for name in ("departed", "linear", "updated")},
+    )
+    found, own = in_layout(former, ekf.model), np.sort(columns[columns >= 0])
+    for name in ("departed", "linear", "updated"):
+        np.testing.assert_array_equal(getattr(found, name)[:, own], getattr(log, name)[:, own])
+    np.testing.assert_array_equal(found.initial_covariance[np.ix_(own, own)], log.initial_covariance[np.ix_(own, own)])
+    new, again = (posterior_of_log(some, ekf.model, ekf.landmarks().position_m, FILTERED) for some in (log, found))
+    # Corrections of jitter and calibration between two frames are in the pose of the frame before: of second order.
+    np.testing.assert_allclose(again.T_world_imu, new.T_world_imu, atol=2e-3)

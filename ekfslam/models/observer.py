@@ -80,19 +80,6 @@ class Projected:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Landmarks as the sensor sees them: points ``q`` (n, 3), rows ``z`` (n, d), and Jacobians of the rows.
-
-    ``H_x`` (n, d, seen) is by the leading columns of the layout, ``H_m`` (n, d, 3) by the landmark positions.
-    """
-
-    q: Array
-    z: Array
-    H_x: Array
-    H_m: Array
-
-
-@dataclass(frozen=True)
 class Observer:
     """A sensor of landmarks, and the blocks that its observations depend on."""
 
@@ -179,12 +166,6 @@ class Observer:
         parts = [s[..., None] * moment.shared[block.name] for s, block in zip(shares, self.moves_camera, strict=True)]
         return C, CD, sum(parts[1:], parts[0]), shares
 
-    def points(self, moment: Moment, positions_m: Array, is_difference: BoolArray | bool = False) -> Array:
-        """Return landmarks (n, 3) in the frame of the sensor; moments are of one frame or of each landmark's."""
-        _, CD, offset, _ = self._parts(moment, is_difference)
-        T = moment.T_imu_world if offset is None else se3.exp(offset) @ moment.T_imu_world
-        return se3.apply(CD @ T, positions_m)
-
     @cached_property
     def has_drift(self) -> bool:
         """Whether a difference of observations sees the present frame otherwise than a single one does."""
@@ -227,29 +208,6 @@ class Observer:
         H_x = seen.H_z @ by
         H_x[..., self.intrinsic] += seen.H_i
         return H_x
-
-    def see(
-        self,
-        moment: Moment,
-        positions_m: Array,
-        linear_positions_m: Array,
-        is_difference: BoolArray | bool = False,
-    ) -> Seen:
-        """Return landmarks (n, 3) as the sensor sees them, by the blocks of their frame: eq. (3), (4), (9) and (11).
-
-        Args:
-            moment: Moment of their frame, or moments (n) of the frame of each.
-            positions_m, linear_positions_m: As of `project`.
-            is_difference: (n,) whether observations are differences from the frame before.
-        """
-        camera = self.camera(moment, is_difference)
-        W, W_linear = camera.T_cam_imu @ moment.T_imu_world, camera.T_cam_imu @ moment.T_linear
-        found = self.project(moment.calibration, W, positions_m, W_linear, linear_positions_m)
-        return Seen(found.q, found.z, self.by_body(found, camera.by), found.H_m)
-
-    def predicted(self, moment: Moment, q: Array) -> Array:
-        """Return the rows (n, d) of points (n, 3) in the frame of the sensor."""
-        return self.sensor_at(moment.calibration).predict(q)
 
     def inverted(self, parameters: Array, rows: Array) -> tuple[Array, BoolArray]:
         """Return the points (n, 3) in the sensor's frame that rows (n, 3) see, and whether (n,) they have a depth.

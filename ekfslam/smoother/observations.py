@@ -195,10 +195,10 @@ class ObservationFactors:
         W, W_updated = (updated.T_cam_imu @ T for T in (log.T_linear_before[k], log.T_updated[k - 1]))
         z_updated = (predicted.by @ log.updated[k - 1, : layout.seen, None])[..., 0]
         if log.has_views:
-            z, z_predicted = x[:, view], log.departed[k, view]
+            z, W_predicted = x[:, view], se3.exp(log.departed[k, view] - z_updated) @ W_updated
         else:
-            z, z_predicted = z_updated + se3.log(W @ se3.inverse(W_updated)), z_updated
-        D = _carried_back(W, se3.exp(z_predicted - z_updated) @ W_updated)
+            z, W_predicted = z_updated + se3.log(W @ se3.inverse(W_updated)), updated.T_cam_imu @ log.T_departed[k]
+        D = _carried_back(W, W_predicted)
         W_linear = predicted.T_cam_imu @ log.T_predicted[k - 1] if log.first_estimates else W
         before = self._projected(k, x, W, log.position_m[follows], W_linear, linear_position)
         z -= (predicted.by @ start[: layout.seen, None])[..., 0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy.sparse as sp
 
@@ -41,10 +43,28 @@ def transition_jacobian(e, interval):
     return sp.csr_array(full)
 
 
+@dataclass(frozen=True)
+class Seen:
+    """Points q (n, 3), rows z (n, d), and derivatives H_x (n, d, seen) by blocks and H_m (n, d, 3) by landmarks."""
+
+    q: np.ndarray
+    z: np.ndarray
+    H_x: np.ndarray
+    H_m: np.ndarray
+
+
+def see(observer, moment, positions, linear, is_difference=False):
+    """Landmarks as the sensor sees them at a moment, by the blocks of its frame."""
+    camera = observer.cameras(moment).at(np.broadcast_to(np.asarray(is_difference, dtype=int), len(positions)))
+    W, W_linear = camera.T_cam_imu @ moment.T_imu_world, camera.T_cam_imu @ moment.T_linear
+    found = observer.project(moment.calibration, W, positions, W_linear, linear)
+    return Seen(found.q, found.z, observer.by_body(found, camera.by), found.H_m)
+
+
 def measurement_jacobian(e, ids):
     """Return the full-width H (3k, b+3n) of the sensor's rows of active landmarks ``ids`` (k,)."""
     slot = e.slots(ids)
-    seen = e.model.observer.see(moment(e, e.mean), e.positions_m[slot], e.linear_positions_m[slot])
+    seen = see(e.model.observer, moment(e, e.mean), e.positions_m[slot], e.linear_positions_m[slot])
     k, d, width = seen.H_x.shape
     row = np.broadcast_to(np.arange(k * d).reshape(k, d, 1), (k, d, width + 3))
     body = np.broadcast_to(np.arange(width), (k, d, width))
