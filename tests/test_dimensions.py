@@ -18,6 +18,7 @@ from ekfslam.data.readers import read_sequence, write_sequence
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError
 from ekfslam.filters.result import Result
+from ekfslam.geometry import se3
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import smooth
 from ekfslam.storage.archive import open_result, read_archive, write_archive
@@ -153,8 +154,11 @@ def test_a_frozen_archive_of_inertial_samples_is_smoothed_as_it_was(tmp_path):
     archive = read_archive(unpacked("inertial_6", tmp_path))
     found, frozen = smooth(archive.results["full"]), archive.results["smoothed"]
     assert archive.twist is None
-    np.testing.assert_allclose(found.T_world_imu, frozen.T_world_imu, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.covariance, frozen.covariance, rtol=1e-6, atol=1e-12)
+    # The maximum is found by other steps than then, which end at another place within the tolerance on the cost.
+    off = se3.log(se3.inverse(found.T_world_imu) @ frozen.T_world_imu)
+    std = np.sqrt(np.diagonal(frozen.covariance, axis1=1, axis2=2))
+    assert (np.abs(off) <= 1e-3 * std + 1e-9).all()
+    np.testing.assert_allclose(found.covariance, frozen.covariance, rtol=1e-4, atol=1e-9)
 
 
 def test_an_earlier_sequence_and_study_are_read(tmp_path):

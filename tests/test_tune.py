@@ -86,7 +86,7 @@ def test_log_likelihood_equals_the_dense_one_also_where_rows_are_taken_out_again
     # Where the pose is uncertain the first gate passes outliers that the second then finds, and takes out. It is
     # certain enough that no frame is linearised again.
     world = with_outliers(small_world(sigma_v=1.0, sigma_w=0.03), 0.0 if gate == 1.0 else 0.08, 12.0)
-    config = FilterConfig(gate_probability=gate, split_after=0, retire="never")
+    config = FilterConfig(gate_probability=gate, split_after=0, retire="never", engine="reference")
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu)
     taken_out, without = [], Solution.without
 
@@ -110,7 +110,7 @@ def test_log_likelihood_equals_the_dense_one_also_where_rows_are_taken_out_again
 @pytest.mark.slow
 def test_log_likelihood_of_a_wide_frame_is_that_of_its_accepted_rows_as_linearised_last(monkeypatch):
     world = with_outliers(small_world(sigma_v=1.0, sigma_w=0.1), 0.08, 12.0)
-    config = FilterConfig(gate_probability=0.99, split_after=0, retire="never")
+    config = FilterConfig(gate_probability=0.99, split_after=0, retire="never", engine="reference")
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu)
     solve, correct, solved, found = Gaussian.solve, consensus.correct, [], []
 

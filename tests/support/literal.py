@@ -433,6 +433,8 @@ def recorded(world, c, rng):
 def filter_of(world, config, calibration=None, P=P0, up=None, blocks=()):
     """The filter of a world, where ``up`` (3,) is what it takes as up in the first frame of the IMU."""
     rig = Rig(world.camera, world.T_cam_imu, world.noise)
+    if up is not None:  # the engine takes no values from outside
+        config = dataclasses.replace(config, engine="reference")
     ekf = JointEKF(rig, config, world.initial_T_world_imu, P, calibration, blocks=blocks)
     if up is not None:
         ekf.values["up"] = ekf.T_world_imu[:3, :3] @ up

@@ -52,7 +52,8 @@ def normal_equations(structure: Structure, factors: Sequence[Factor], coordinate
         for term in batch.landmarks:
             _add_landmarks(factor, batch, term, of_sides, own, pairs, of_views, gradient["landmarks"])
     if s.views:
-        by_pair = of_views.reshape(-1, s.views, 3, 6).swapaxes(1, 2).reshape(len(pairs["seen"]), 3, -1)
+        n = len(pairs["seen"])
+        by_pair = of_views.reshape(n, s.views, 3, 6).swapaxes(1, 2).reshape(n, 3, 6 * s.views)
         ends = np.searchsorted(s.pairs["seen"][:, 1], np.arange(len(C) + 1)).tolist()
         for k, (a, b) in enumerate(pairwise(ends)):  # one product a frame, far fewer than pairs
             pairs["seen"][a:b] += (by_pair[a:b].reshape(-1, C.shape[1]) @ C[k]).reshape(-1, 3, C.shape[2])
