@@ -216,7 +216,7 @@ def test_rows_after_a_correction_equal_those_of_the_reference(case, T):
 def test_new_landmarks_equal_those_of_the_reference(name, T):
     e, made, rng = both(CASES[name], T)
     q = rng.normal(size=(5, 3)) * [3, 2, 6] + [0, 0, 16]
-    rows, ids = e.model.observer.predicted(moment(e, e.mean), q), np.array([40, 99, 31, 77, 60])
+    rows, ids = e.model.observer.sensor_at(moment(e, e.mean).calibration).predict(q), np.array([40, 99, 31, 77, 60])
     if e.model.observer.calibration is not None:
         rows[2, 2] = -2.0 if CASES[name].tracks else rows[2, 0] + 2.0  # beyond infinity
     started = starting.start(e, NoLog(), 9, ids, rows)

@@ -109,7 +109,14 @@ def test_intervals_with_several_pieces_have_the_mean_velocity_of_each():
 def test_a_prior_that_couples_blocks_is_that_of_filter_log_and_smoother():
     world = builtin("city?frames=10&outlier_fraction=0")
     rig = Rig(world.camera, world.T_cam_imu, world.noise)
-    model = model_of(rig, world.noise, se3.inverse(world.initial_T_world_imu), 1e-4 * np.eye(6), blocks=[TwistBias()], coordinates="xyz")
+    model = model_of(
+        rig,
+        world.noise,
+        se3.inverse(world.initial_T_world_imu),
+        1e-4 * np.eye(6),
+        blocks=[TwistBias()],
+        coordinates="xyz",
+    )
     at, prior = model.layout["twist_bias"], model.prior_covariance.copy()
     prior[:6, at] = 0.5 * np.sqrt(np.outer(np.diag(prior)[:6], np.diag(prior)[at])) * np.eye(6)
     prior[at, :6] = prior[:6, at].T
