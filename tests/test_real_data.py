@@ -107,7 +107,7 @@ def test_dense_tracks_with_noisy_and_with_clean_velocities(opened):
     clean = dataclasses.replace(noisy, twist=opened("0027").twist)
     noisy, bounds_m = (noisy, (7.0, 3.5)) if WHOLE else (noisy[:FRAMES], (1.5, 0.8))
     assert np.all(errors(noisy, "full") <= bounds_m)
-    # Vision drifts by one prior, whatever the velocities are: aligned, it is worse than clean ones here (docs/limits.md).
+    # Vision drifts by one prior, whatever the velocities are: aligned, it is worse than clean ones (docs/limits.md).
     assert np.all(errors(clean, "full") <= np.array([0.65, 1.25]) * errors(clean, "dead-reckoning"))
 
 
