@@ -76,7 +76,7 @@ $(READY): pyproject.toml .ci/setup
 	@touch $@
 
 $(VENV)/.docs: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	EKFSLAM_WITHOUT_ENGINE=1 $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	@touch $@
 
 clean:
