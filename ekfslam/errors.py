@@ -101,6 +101,10 @@ class NoVelocitiesError(FilterError):
     """Dead reckoning was requested for a recording without measured velocities."""
 
 
+class NoInertialError(FilterError):
+    """Velocity or biases were requested of a result without inertial samples."""
+
+
 class InnovationError(FilterError):
     """The innovation covariance S is not positive definite.
 

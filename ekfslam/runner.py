@@ -20,6 +20,7 @@ from ekfslam.evaluation.relative import dead_reckoned_pairs, relative_pairs
 from ekfslam.evaluation.sanity import inspect_result, inspect_sequence, sanity_attributes
 from ekfslam.evaluation.sources import compare_sources, doubt_in_truth, in_words
 from ekfslam.filters.dead_reckoning import dead_reckon
+from ekfslam.filters.inertial_states import InertialStates
 from ekfslam.filters.innovations import collect_innovations
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.log import Log
@@ -29,6 +30,7 @@ from ekfslam.filters.references import References
 from ekfslam.filters.reports import FrameReport, collect
 from ekfslam.filters.result import Innovation, Landmarks, Parameters, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
+from ekfslam.models.process.inertial import Inertial
 from ekfslam.models.sensors.velocities import VelocitySource
 from ekfslam.progress import progress
 from ekfslam.resolve import Problem, resolve
@@ -100,6 +102,7 @@ class _Estimate:
     counts: Mapping[str, int] = dataclasses.field(default_factory=dict)
     log: Log | None = None
     parameters: Parameters | None = None
+    inertial: InertialStates | None = None
 
 
 def _judged(problem: Problem) -> tuple[IntArray, IntArray] | None:
@@ -117,16 +120,22 @@ def _joint(problem: Problem, further: VelocitySource | None) -> _Estimate:
     references = None if judged is None else References(ekf, *judged)
     T_imu_world, covariance, ms = np.zeros((count, 4, 4)), np.zeros((count, 6, 6)), np.zeros(count)
     reports: list[FrameReport] = []
+    own, columns = problem.model.process.own[1:], np.ix_(*[problem.model.process.columns] * 2)
+    states, joint = list[list[Array]](), list[Array]()
     frames = progress(range(count), f"{sequence.name}: full")
     for k, report, ms[k] in run_filter(ekf, sequence, frames, further):
-        T_imu_world[k], covariance[k] = ekf.T_imu_world, ekf.gaussian.body_covariance[:6, :6]
+        P = ekf.gaussian.body_covariance
+        T_imu_world[k], covariance[k] = ekf.T_imu_world, P[:6, :6]
+        if isinstance(problem.model.process, Inertial):
+            states.append([ekf.values[name] for name in own])
+            joint.append(P[columns])
         reports.append(report)
         if references is not None:
             references.record(k)
     pairs = None if references is None else references.pairs()
-    return _Estimate(
-        T_imu_world, covariance, ms, pairs, reports, ekf.landmarks(), ekf.counts, ekf.log(), ekf.parameters()
-    )
+    inertial = InertialStates.of_frames(states, joint)
+    known, log = ekf.landmarks(), ekf.log()
+    return _Estimate(T_imu_world, covariance, ms, pairs, reports, known, ekf.counts, log, ekf.parameters(), inertial)
 
 
 def _dead_reckoned(problem: Problem, mode: Mode) -> _Estimate:
@@ -178,6 +187,7 @@ def _result(problem: Problem, mode: Mode, estimate: _Estimate) -> Result:
         log=estimate.log,
         hygiene=problem.hygiene,
         parameters=estimate.parameters,
+        inertial=estimate.inertial,
         pairs=estimate.pairs,
         whitened=whitened,
         attributes={**sequence.attributes, **account, **versions()},

@@ -148,6 +148,11 @@ AXES: Mapping[str, Axis] = MappingProxyType(
         "xi": Axis("xi", "pose error, translation first", (*(f"rho_{a}" for a in _XYZ), *(f"theta_{a}" for a in _XYZ))),
         "u": Axis("component", "velocity", (*(f"v_{a}" for a in _XYZ), *(f"w_{a}" for a in _XYZ))),
         "xyz": Axis("axis", "axes of a vector", _XYZ),
+        "inertial": Axis(
+            "inertial_error",
+            "errors of pose, velocity, gyroscope and accelerometer bias",
+            tuple(f"{part}_{a}" for part in ("rho", "theta", "velocity", "gyro_bias", "accel_bias") for a in _XYZ),
+        ),
         "error": Axis("world_error", "position, then rotation", (*_XYZ, *(f"rotation_{a}" for a in _XYZ))),
         "row": Axis("row", "rows of a transform", (*_XYZ, "one")),
         "column": Axis("column", "columns of a transform", (*(f"{a}_axis" for a in _XYZ), "translation")),

@@ -54,7 +54,7 @@ def offered(results: Mapping[str, Result], truth: Truth | None, interpolated: Bo
     """Return the values that a figure may take or need, None if missing.
 
     ``results`` by mode, ``result`` (the first), each mode by its name, ``truth``, ``interpolated`` (T,) intervals;
-    and as needs alone ``updates``, ``landmarks``, and ``parameters`` of the full run.
+    and as needs alone ``updates``, ``landmarks``, ``inertial``, and ``parameters`` of the full run.
     """
     runs = list(results.values())
     return {
@@ -64,6 +64,7 @@ def offered(results: Mapping[str, Result], truth: Truth | None, interpolated: Bo
         "interpolated": interpolated,
         "updates": any(run.innovation.dof.any() for run in runs) or None,
         "landmarks": any(len(run.landmarks) for run in runs) or None,
+        "inertial": runs[0].inertial,
         "parameters": results["full"].parameters if "full" in results else None,
         **results,
     }

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from ekfslam.arrays import BoolArray
+from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.tables import significant
 from ekfslam.evaluation.trajectory import absolute_trajectory_error
@@ -16,7 +16,7 @@ from ekfslam.figures import maps as maps  # registers figures, as the next one d
 from ekfslam.figures import posterior as posterior
 from ekfslam.figures import registry, series
 from ekfslam.figures.series import BAND_SIGMAS, draw_series
-from ekfslam.figures.style import PRIOR, ZERO, Format, arrange, legend_of, save_all, share_x, style_of
+from ekfslam.figures.style import PRIOR, TRUTH, ZERO, Format, arrange, legend_of, line_of, save_all, share_x, style_of
 from ekfslam.filters.result import Result
 
 
@@ -109,13 +109,49 @@ def plot_parameters(full: Result) -> Figure:
     return figure
 
 
+def _range_of(*values: Array) -> tuple[float, float]:
+    """Return limits with a margin about all values."""
+    low, high = (float(pick([pick(part) for part in values])) for pick in (np.min, np.max))
+    margin = 0.08 * (high - low) or 1.0
+    return low - margin, high + margin
+
+
+@registry.figure("inertial_{mode}", needs={"inertial"})
+def plot_inertial(result: Result, truth: Truth | None = None) -> Figure:
+    """Draw velocity, biases and tilt of an inertial unit over time with 3-sigma bands, and their true values.
+
+    The velocity, and its error if the truth has one, are along the axes of world, the biases along those of the IMU.
+    The first tenth, in which wide priors shrink, may leave the picture.
+    """
+    drawn, color = series.inertial(result, truth), style_of(result.mode)["color"]
+    if not drawn:
+        raise ValueError("no inertial samples moved the poses")
+    rows = len(drawn) // 3
+    figure = Figure(figsize=(10.6, 0.8 + 1.75 * rows))
+    axes = figure.subplots(rows, 3)
+    for ax, (one, true) in zip(axes.ravel(), drawn, strict=True):
+        if true is not None:
+            draw_series(ax, true, color, TRUTH, label="truth")
+        line = {"color": "black", "linewidth": 1.0} if one.levels else line_of(result.mode)
+        label = "error" if one.levels else f"{result.mode}, band: {BAND_SIGMAS:g} sigma"
+        draw_series(ax, one, color, line, levels=ZERO, label=label)
+        later = slice(len(one.y) // 10, None)
+        ax.set_ylim(_range_of(*(part[later] for part in (one.y, one.low, one.high) if part is not None)))
+    for column in axes.T:
+        share_x(*column)
+    figure.suptitle(f"{result.sequence_name}, {result.mode}: velocity (world), biases (IMU) and tilt (world)")
+    arrange(figure, left=0.95, bottom=0.5 + legend_of(figure, axes[:, 0], 3), top=0.5, gaps=(1.0, 0.15))
+    return figure
+
+
 def draw_figures(
     results: Mapping[str, Result], truth: Truth | None = None, interpolated: BoolArray | None = None
 ) -> dict[str, Figure]:
     """Draw the registered figures that the results allow, by name.
 
     ``map`` and ``side`` always, ``errors`` with true poses, ``nis`` with updates, ``parameters`` if ``full`` estimated
-    any, ``landmarks_<mode>`` for every mode with a map, ``map_before_and_after`` with ``full`` and ``smoothed``.
+    any, ``landmarks_<mode>`` for every mode with a map, ``inertial_<mode>`` for every mode with an inertial unit,
+    ``map_before_and_after`` with ``full`` and ``smoothed``.
     """
     figures = {}
     for name, entry in registry.FIGURES.items():

@@ -17,6 +17,7 @@ from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_nees, world_axes_errors, world_axes_std
 from ekfslam.evaluation.trajectory import align_se3, distance_along
 from ekfslam.figures.style import BAND_ALPHA, BOUNDS, EXPECTED, Style, log_axis
+from ekfslam.filters.inertial_states import FIELDS, UNITS
 from ekfslam.filters.result import Result
 from ekfslam.geometry import se3
 
@@ -115,6 +116,54 @@ def errors(result: Result, truth: Truth) -> list[Series]:
         Series(name, unit, x, error[:, i], -bound[:, i], bound[:, i], levels=(0.0,))
         for i, (name, unit) in enumerate(zip(_AXES, _UNITS, strict=True))
     ]
+
+
+def inertial(result: Result, truth: Truth | None = None) -> list[tuple[Series, Series | None]]:
+    """Return velocity, biases and tilt of an inertial unit with 3-sigma bounds, three axes each, with true series.
+
+    The velocity is along the axes of world, biases are along those of the IMU. With true motion its error comes next,
+    and the tilt is that of the error. Without truth, tilt and heading are standard deviations.
+    """
+    states, known = result.inertial, None if truth is None else truth.motion
+    if states is None:
+        return []
+    x, frame = _time(result), np.arange(0) if truth is None else truth.frame
+    velocity, std = result.velocity_world_m_s, result.velocity_std_world_m_s
+    found = _with_bounds("velocity", "m/s", x, velocity, std, frame, None if known is None else known.velocity_m_s)
+    if known is not None:
+        off = velocity[frame] - known.velocity_m_s
+        found += _with_bounds("velocity error", "m/s", x[frame], off, std[frame], around_zero=True)
+    for part, words in (("gyro_bias", "gyro bias"), ("accel_bias", "accel bias")):
+        true = None if known is None else getattr(known, FIELDS[part])
+        found += _with_bounds(words, UNITS[part], x, states.value(part), states.std(part), frame, true)
+    names = ("tilt x", "tilt y", "heading")
+    if truth is not None and len(frame):
+        return found + [
+            (dataclasses.replace(e, name=f"{n} error"), None)
+            for n, e in zip(names, errors(result, truth)[3:], strict=True)
+        ]
+    of_rotation = np.degrees(world_axes_std(result.T_world_imu, result.covariance)[:, 3:])
+    return found + [(Series(f"{n}, std", "deg", x, of_rotation[:, i]), None) for i, n in enumerate(names)]
+
+
+def _with_bounds(
+    name: str,
+    unit: str,
+    x: Array,
+    y: Array,
+    std: Array,
+    frame: IntArray | None = None,
+    true: Array | None = None,
+    around_zero: bool = False,
+) -> list[tuple[Series, Series | None]]:
+    """Return the components of vectors (n, 3) with 3-sigma bounds, and of their true values at some frames."""
+    found: list[tuple[Series, Series | None]] = []
+    bound, centre = BAND_SIGMAS * std, 0.0 * y if around_zero else y
+    for i, axis in enumerate("xyz"):
+        one = Series(f"{name} {axis}", unit, x, y[:, i], (centre - bound)[:, i], (centre + bound)[:, i])
+        truth = None if true is None else Series(one.name, unit, x[frame], true[:, i])
+        found.append((dataclasses.replace(one, levels=(0.0,)) if around_zero else one, truth))
+    return found
 
 
 def share_inside(series: Iterable[Series]) -> float:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.hygiene import HygieneReport
 from ekfslam.data.noise import Noise
-from ekfslam.errors import NonFiniteResultError, ShapeError
+from ekfslam.errors import NoInertialError, NonFiniteResultError, ShapeError
+from ekfslam.filters.inertial_states import InertialStates, in_words, velocity_world
 from ekfslam.filters.log import Log
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.geometry.motion import world_axes_covariance
@@ -247,6 +248,7 @@ class Result(Shown):
         log: Everything that the joint filter conditioned on, with the landmarks in the same order (mode full only).
         hygiene: Report on the cleaning of the tracks (None: they were not cleaned, as in dead reckoning).
         parameters: Estimates of calibration, roll and pitch (None: none were estimated).
+        inertial: Velocity and biases of an inertial unit (None: other inputs moved the poses, or an older archive).
         pairs: Cross-covariances of some of the poses (None: there is no truth to compare with).
         whitened: Whitened innovations (mode full only; older archives have none).
         attributes: Sequence attributes, versions, seed, input checksum, ``log_likelihood`` of the accepted innovations.
@@ -273,6 +275,7 @@ class Result(Shown):
     log: Log | None = field(default=None, metadata=group(Log))
     hygiene: HygieneReport | None = field(default=None, metadata=group(HygieneReport))
     parameters: Parameters | None = field(default=None, metadata=group(Parameters))
+    inertial: InertialStates | None = field(default=None, metadata=group(InertialStates))
     pairs: PosePairs | None = field(default=None, metadata=group(PosePairs))
     whitened: WhitenedInnovations | None = field(default=None, metadata=group(WhitenedInnovations))
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
@@ -302,6 +305,9 @@ class Result(Shown):
             + " m (1 sigma)",
             "landmarks": str(len(self.landmarks)),
         }
+        if self.inertial is not None:
+            velocity = in_words(self.velocity_world_m_s, self.velocity_std_world_m_s, "m/s along world")
+            facts |= {"last velocity": velocity, **dict(line.split(": ") for line in self.inertial.lines[1:])}
         if dof:
             facts["observations"] = f"{innovation.accepted.sum()} accepted, {innovation.rejected.sum()} rejected"
             facts["NIS / dof"] = f"{figure(float(innovation.nis.sum()) / dof)} (1 expected)"
@@ -330,6 +336,34 @@ class Result(Shown):
     def position_std_world_m(self) -> Array:
         """(T, 3) standard deviations of the position along x, y, z of world."""
         return np.sqrt(np.maximum(np.diagonal(self.position_covariance_world, axis1=1, axis2=2), 0.0))
+
+    @property
+    def tilt_std_rad(self) -> Array:
+        """(T, 2) standard deviations of the tilt: of the rotation about the level axes x and y of world."""
+        variance = np.diagonal(self.rotation_covariance_world, axis1=1, axis2=2)[:, :2]
+        return np.sqrt(np.maximum(variance, 0.0))
+
+    @property
+    def gravity_imu(self) -> Array:
+        """(T, 3) unit vectors along gravity (-z of world) in the IMU frame; `tilt_std_rad` is their uncertainty."""
+        return -self.T_world_imu[:, 2, :3]
+
+    @property
+    def velocity_world_m_s(self) -> Array:
+        """(T, 3) velocity of an inertial unit along the axes of world; raises `NoInertialError` without one."""
+        return velocity_world(self.T_world_imu, self._moved)[0]
+
+    @property
+    def velocity_std_world_m_s(self) -> Array:
+        """(T, 3) standard deviations of `velocity_world_m_s`."""
+        variance = np.diagonal(velocity_world(self.T_world_imu, self._moved)[1], axis1=1, axis2=2)
+        return np.sqrt(np.maximum(variance, 0.0))
+
+    @property
+    def _moved(self) -> InertialStates:
+        if self.inertial is None:
+            raise NoInertialError(f"{self.sequence_name}: no velocity and biases: the result is of no inertial samples")
+        return self.inertial
 
     def frame_at(self, time_s: float) -> int:
         """Return the frame whose stamp is nearest to a time on the clock of the recording, s.
@@ -371,6 +405,7 @@ class Result(Shown):
             landmarks=replace(known, first_frame=first, last_frame=last),
             rejections=replace(rejections, frame=rejections.frame - begin),
             parameters=None if parameters is None else replace(parameters, **along(parameters, "T", frames)),
+            inertial=self.inertial and replace(self.inertial, **along(self.inertial, "T", frames)),
             pairs=pairs,
             log=None,
             hygiene=None,

@@ -191,8 +191,17 @@ def _plotted_run(section: Section, j: int, kept: IntArray) -> dict[str, Any]:
         "landmarks": _landmarks(result.landmarks),
         "words": words,
         "errors": [_plot(one.name, one.unit, [(one, "error", "thin", None, j)]) for one in errors],
+        "inertial": list(_inertial(run, j)),
         "consistency": list(_consistency(run, j)),
     }
+
+
+def _inertial(run: Run, j: int) -> Iterator[dict[str, Any]]:
+    """Yield the plots of velocity and biases of an inertial unit; the errors of its pose are shown with all others."""
+    for one, true in series.inertial(run.result, run.truth):
+        if one.low is not None and not one.name.startswith(("tilt", "heading")):
+            of_truth: list[Curve] = [] if true is None else [(true, "truth", "truth", None, None)]
+            yield _plot(one.name, one.unit, [*of_truth, (one, run.label, "thin", None if one.levels else j, j)])
 
 
 def _consistency(run: Run, j: int) -> Iterator[dict[str, Any]]:

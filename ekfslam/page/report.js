@@ -464,7 +464,7 @@ function ofRun(room, run, g, dashes, onTime) {
   room.replaceChildren();
   element("p", { class: "hint" }, room, run.words);
   const six = element("div", { class: "grid3" }, room), two = element("div", { class: "grid2" }, room);
-  for (const spec of run.errors) plot(six, { height: 150, ...spec }, g, dashes, onTime);
+  for (const spec of [...run.errors, ...run.inertial]) plot(six, { height: 150, ...spec }, g, dashes, onTime);
   for (const spec of run.consistency) plot(two, spec, g, dashes, onTime);
   if (!run.consistency.length) element("p", { class: "hint" }, two, "This run has no innovations.");
 }

@@ -207,6 +207,7 @@ def _detail(run: Run) -> str:
         ("Counts", _pairs(result.counts)),
         ("Track hygiene", _list(hygiene)),
         ("Estimated parameters", _list(() if result.parameters is None else result.parameters.lines)),
+        ("Velocity and biases at the end", _list(() if result.inertial is None else result.inertial.lines)),
         ("Configuration", _configuration(result.config)),
         ("Assumed noise", _pairs({key: value for key, value in vars(result.noise).items() if value is not None})),
         ("Attributes", _pairs(result.attributes)),

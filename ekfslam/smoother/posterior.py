@@ -22,12 +22,14 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.config import Config, FilterConfig, PosteriorConfig
 from ekfslam.data.inputs import InertialNoise
 from ekfslam.errors import PosteriorError
+from ekfslam.filters.inertial_states import InertialStates
 from ekfslam.filters.log import Log
 from ekfslam.filters.loop import solvable
 from ekfslam.filters.result import Innovation, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
 from ekfslam.models.build import blocks_and_process, model_of
 from ekfslam.models.model import Model
+from ekfslam.models.process.inertial import Inertial
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
 from ekfslam.shown import Card, Shown, count, figure
@@ -113,6 +115,18 @@ class Posterior(Shown):
                 at = first + np.flatnonzero(np.array(owners) == name)
                 return find()[..., at[:, None], at]
         raise PosteriorError(f"there is no state block {name!r}; there are {', '.join(self.values) or 'none'}")
+
+    @cached_property
+    def inertial(self) -> InertialStates | None:
+        """Smoothed velocities and biases of an inertial unit, with their joint marginals; None without one."""
+        process, u = self.problem.model.process, self.problem.unknowns
+        if not isinstance(process, Inertial):
+            return None
+        place = {column: i for i, column in enumerate((*u.frame_columns, *u.aux_columns))}
+        own = [place[column] for column in process.columns]
+        covariance = self.information.state_covariances[:, own][:, :, own]
+        velocity, gyro_bias, accel_bias = (self.values[name] for name in process.own[1:])
+        return InertialStates(velocity, gyro_bias, accel_bias, covariance)
 
     def rows_of(self, ids: ArrayLike) -> IntArray:
         """Return the rows (n,) of landmarks given by their ids; a track that was split has the row of its last piece.
@@ -391,6 +405,7 @@ def smooth(result: Result, config: PosteriorConfig | None = None, found: Posteri
         },
         config=settings,
         log=None,
+        inertial=found.inertial,
         pairs=pairs,
         whitened=None,
     )

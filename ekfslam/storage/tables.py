@@ -68,6 +68,21 @@ def _innovation(result: Result) -> Columns:
     return {"time_s": result.time_s, **vars(result.innovation)}
 
 
+def _inertial(result: Result) -> Columns:
+    found = result.inertial
+    if found is None:
+        raise ArchiveError(f"{result.sequence_name}: no table 'inertial': no inertial samples moved the poses")
+    columns: Columns = {"time_s": result.time_s}
+    for name, values, std, unit in (
+        ("v_world", result.velocity_world_m_s, result.velocity_std_world_m_s, "m_s"),
+        ("gyro_bias", found.gyro_bias_rad_s, found.std("gyro_bias"), "rad_s"),
+        ("accel_bias", found.accel_bias_m_s2, found.std("accel_bias"), "m_s2"),
+    ):
+        columns |= _named(tuple(f"{name}_{axis}_{unit}" for axis in _XYZ), values)
+        columns |= _named(tuple(f"{name}_{axis}_std_{unit}" for axis in _XYZ), std)
+    return {**columns, **_named(("tilt_x_std_rad", "tilt_y_std_rad"), result.tilt_std_rad)}
+
+
 def _rejections(result: Result) -> Columns:
     found = result.rejections
     reason = np.array(REASONS)[found.reason]
@@ -75,7 +90,13 @@ def _rejections(result: Result) -> Columns:
 
 
 TABLES: Mapping[str, Callable[[Result], Columns]] = MappingProxyType(
-    {"trajectory": _trajectory, "landmarks": _landmarks, "innovation": _innovation, "rejections": _rejections}
+    {
+        "trajectory": _trajectory,
+        "landmarks": _landmarks,
+        "innovation": _innovation,
+        "rejections": _rejections,
+        "inertial": _inertial,
+    }
 )
 
 
@@ -87,7 +108,7 @@ def columns(result: Result, table: str) -> Columns:
 
 
 def dataframe(result: Result, table: str = "trajectory") -> pandas.DataFrame:
-    """Return a table for pandas: ``trajectory``, ``landmarks``, ``innovation`` or ``rejections``.
+    """Return a table for pandas: ``trajectory``, ``landmarks``, ``innovation``, ``rejections`` or ``inertial``.
 
     Units stand in the names of its columns.
 

@@ -42,8 +42,6 @@ class Velocity(_Vector):
     first_m_s: Array = field(default_factory=lambda: np.zeros(3))
 
     name = "velocity"
-    labels = ("v_x", "v_y", "v_z")
-    units = ("m/s",) * 3
 
     def begun_by(self, sequence: Sequence) -> Velocity:
         return replace(self, first_m_s=sequence.initial_velocity_m_s)
@@ -57,8 +55,6 @@ class GyroBias(_Vector):
     first_rad_s: Array = field(default_factory=lambda: np.zeros(3))
 
     name = "gyro_bias"
-    labels = ("bias of w_x", "bias of w_y", "bias of w_z")
-    units = ("rad/s",) * 3
 
 
 @dataclass(frozen=True)
@@ -69,5 +65,3 @@ class AccelBias(_Vector):
     first_m_s2: Array = field(default_factory=lambda: np.zeros(3))
 
     name = "accel_bias"
-    labels = ("bias of f_x", "bias of f_y", "bias of f_z")
-    units = ("m/s^2",) * 3

@@ -155,14 +155,17 @@ class JointInformation:
         return SelectedInverse(self.factor)
 
     def frame_covariances(self) -> Array:
-        """Return the marginal covariances (T, w, w) of all frames, by selected inversion."""
-        by_u = self._coordinates.rows_of("frames")
-        return by_u @ self._frame_covariances @ by_u.swapaxes(1, 2)
+        """Return the marginal covariances (T, w, w) of all frames."""
+        return self.state_covariances[:, : self._first.width, : self._first.width]
 
     def aux_covariances(self) -> Array:
-        """Return the marginal covariances (T, a, a) of the further blocks of the frames, by selected inversion."""
-        by_u = self._coordinates.rows_of("aux")
-        return by_u @ self._frame_covariances @ by_u.swapaxes(1, 2)
+        """Return the marginal covariances (T, a, a) of the further blocks of the frames."""
+        return self.state_covariances[:, self._first.width :, self._first.width :]
+
+    @cached_property
+    def state_covariances(self) -> Array:
+        """(T, w+a, w+a) marginal covariances of frames and their further blocks, by selected inversion."""
+        return self._coordinates.N @ self._frame_covariances @ self._coordinates.N.swapaxes(1, 2)
 
     @cached_property
     def _frame_covariances(self) -> Array:
