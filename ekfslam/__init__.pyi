@@ -17,7 +17,9 @@ from .data.opening import attach_truth, open_images
 from .data.readers.hdf5 import write_sequence
 from .data.readers.kitti_raw import open_kitti_raw
 from .data.readers.registry import Reader, Source
+from .data.readers.tum import read_trajectory
 from .data.sequence import Observations, Sequence, Truth
+from .data.trajectory import Trajectory
 from .data.velocities import attach_velocities
 from .errors import EkfslamError
 from .filters.live import LiveEKF
@@ -62,6 +64,7 @@ __all__ = [
     "StereoCamera",
     "Study",
     "TrackReport",
+    "Trajectory",
     "Truth",
     "TruthConfig",
     "TunedNoise",
@@ -76,6 +79,7 @@ __all__ = [
     "open_sequence",
     "posterior",
     "read_archive",
+    "read_trajectory",
     "run",
     "smooth",
     "track",

@@ -291,7 +291,7 @@ def test_tum_export_holds_stamps_positions_and_quaternions(results, tmp_path):
 
 def test_kitti_export_holds_the_upper_rows_exactly(results, tmp_path):
     result = results["full"]
-    export(result, tmp_path / "poses.txt", "kitti")
+    export(result, tmp_path / "poses.txt", "kitti", frame="body")
     rows = np.loadtxt(tmp_path / "poses.txt")
     np.testing.assert_array_equal(rows.reshape(-1, 3, 4), result.T_world_imu[:, :3])
 

@@ -71,7 +71,7 @@ def test_simulate_run_info_plot_export_go_hand_in_hand(tmp_path, capsys):
     assert main(["export", str(archive), "--format", "tum"]) == 0
     tum = np.loadtxt(tmp_path / "deep" / "run.full.tum.txt")
     assert tum.shape == (20, 8)
-    assert main(["export", str(archive), "--format", "kitti", "--out", str(tmp_path / "k.txt")]) == 0
+    assert main(["export", str(archive), "--format", "kitti", "--frame", "body", "--out", str(tmp_path / "k.txt")]) == 0
     np.testing.assert_allclose(np.loadtxt(tmp_path / "k.txt")[:, 3::4], tum[:, 1:4], atol=1e-12)
 
 

@@ -22,6 +22,8 @@ from ekfslam.data.sequence import Truth
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.summary import summarise
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import T_CAM_BODY
 from ekfslam.runner import run
 from ekfslam.storage.archive import read_archive, write_archive
 from ekfslam.storage.exports import truth_text
@@ -63,15 +65,32 @@ def with_gaps(world, result, tmp_path_factory) -> Path:
 def evo(tmp_path):
     """A function from a tool with its options, a format and an archive to the root mean square error that evo finds."""
 
-    def evaluate(command: tuple[str, ...], format: str, archive: Path) -> float:
+    def evaluate(command: tuple[str, ...], format: str, archive: Path, *how: str) -> float:
         tool, *options = command
         program = Path(sysconfig.get_path("scripts")) / tool
         if not program.exists():
             pytest.skip(f"{tool} is not installed beside this Python; pip install 'ekfslam[dev]'")
         files = [tmp_path / f"{mode}.txt" for mode in ("truth", "full")]
         for path in files:
-            assert main(["export", str(archive), "--format", format, "--mode", path.stem, "--out", str(path)]) == 0
+            assert (
+                main(
+                    [
+                        "export",
+                        str(archive),
+                        "--format",
+                        format,
+                        "--mode",
+                        path.stem,
+                        "--out",
+                        str(path),
+                        *how,
+                        "--force",
+                    ]
+                )
+                == 0
+            )
         saved = tmp_path / "evo.zip"
+        saved.unlink(missing_ok=True)  # evo would ask
         subprocess.run(
             [program, format, *files, *options, "--save_results", saved],
             env={**os.environ, "HOME": str(tmp_path)},  # evo writes its settings there
@@ -102,7 +121,52 @@ def evo(tmp_path):
 def test_evo_finds_the_errors_of_the_summary(evo, world, result, archive, format, command, key):
     stated = summarise(world, result)[key]
     assert stated > 0.01
-    assert evo(command, format, archive) == pytest.approx(stated, rel=0, abs=1e-9)
+    assert evo(command, format, archive, "--frame", "body") == pytest.approx(stated, rel=0, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_evo_finds_the_errors_of_the_summary_in_the_left_camera_relative_to_its_first_pose(
+    evo, world, result, tmp_path
+):
+    path, T_imu_body = tmp_path / "camera.h5", se3.inverse(world.T_cam_imu) @ T_CAM_BODY
+    truth = Truth(world.truth.frame, world.truth.T_world_imu @ T_imu_body)
+    moved = dataclasses.replace(world, T_cam_imu=T_CAM_BODY, truth=truth)
+    of_camera = dataclasses.replace(result, T_cam_imu=T_CAM_BODY, T_world_imu=result.T_world_imu @ T_imu_body)
+    write_archive(path, moved, {"full": of_camera})
+    stated = summarise(moved, of_camera)
+    # The first pose is known, so it turns nothing: both trajectories start at the same place.
+    assert evo(ATE, "kitti", path) == pytest.approx(stated["ate_m"], rel=0, abs=1e-9)
+    assert evo((*RPE, *PATH, *DEGREES), "kitti", path) == pytest.approx(stated["rpe_10_m_deg"], rel=0, abs=1e-6)
+    assert evo(ATE, "tum", path, "--frame", "camera") == pytest.approx(stated["ate_m"], rel=0, abs=1e-9)
+
+
+def test_poses_of_kitti_are_of_the_left_camera_in_its_first_frame(archive, result, tmp_path):
+    assert main(["export", str(archive), "--format", "kitti", "--out", str(tmp_path / "k.txt")]) == 0
+    T = result.T_world_imu @ se3.inverse(result.T_cam_imu)
+    rows = np.loadtxt(tmp_path / "k.txt").reshape(-1, 3, 4)
+    np.testing.assert_allclose(rows, (np.linalg.inv(T[0]) @ T)[:, :3], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rows[0], np.eye(4)[:3], atol=1e-12)
+    # The camera looks along its third axis, which is the way of the vehicle.
+    assert np.abs(rows[5, 2, 3]) > 5 * np.abs(rows[5, :2, 3]).max()
+
+
+@pytest.mark.slow
+def test_evo_reads_the_bag_of_a_result_exactly(evo, result, archive, tmp_path):
+    bag = tmp_path / "full.mcap"
+    assert main(["export", str(archive), "--format", "bag", "--out", str(bag)]) == 0
+    program = Path(sysconfig.get_path("scripts")) / "evo_traj"
+    if not program.exists():
+        pytest.skip("evo_traj is not installed beside this Python; pip install 'ekfslam[dev]'")
+    subprocess.run(
+        [program, "bag2", bag, "/ekfslam/odometry", "--save_as_tum"],
+        env={**os.environ, "HOME": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        check=True,
+    )
+    rows = np.loadtxt(next(tmp_path.glob("*.tum")))
+    np.testing.assert_array_equal(rows[:, 1:4], result.T_world_imu[:, :3, 3])
+    np.testing.assert_allclose(rows[:, 0], result.time_s, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -112,10 +176,10 @@ def test_evo_finds_the_errors_where_truth_has_gaps(evo, result, with_gaps):
 
 
 def test_exported_truth_is_that_of_the_recording(world, archive, tmp_path):
-    count, text = truth_text(read_archive(archive), "", "kitti")
+    count, text = truth_text(read_archive(archive), "", "tum")
     rows = np.loadtxt(io.StringIO(text))
     assert count == 80
-    np.testing.assert_array_equal(rows.reshape(-1, 3, 4), world.truth.T_world_imu[:, :3])
+    np.testing.assert_array_equal(rows[:, 1:4], world.truth.T_world_imu[:, :3, 3])
 
 
 def test_exported_truth_with_gaps_has_its_own_stamps(world, with_gaps, tmp_path, capsys):

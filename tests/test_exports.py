@@ -11,13 +11,16 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from scipy.spatial.transform import Rotation
+from support.bags import stereo, write
 from support.same import assert_same
 
+import ekfslam
 from ekfslam.cli import main
 from ekfslam.config import Config
 from ekfslam.data.readers import read_sequence, write_sequence
+from ekfslam.data.readers.messages import message_types
 from ekfslam.data.simulate import builtin
-from ekfslam.errors import ArchiveError, MissingPackageError, PosteriorError
+from ekfslam.errors import ArchiveError, MissingPackageError, PosteriorError, ShapeError
 from ekfslam.geometry import se3
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
@@ -206,7 +209,77 @@ def test_what_has_no_log_has_no_graph(world, archive, capsys):
     with pytest.raises(PosteriorError, match="has no log"):
         information_bytes(dead)
     assert main(["export", str(archive), "--format", "ply", "--mode", "truth"]) == 2
-    assert "the truth is written as tum or kitti" in capsys.readouterr().err
+    assert "the truth is written as tum, kitti or bag" in capsys.readouterr().err
+
+
+def test_covariances_of_poses_are_beside_them_with_the_same_stamps_and_21_columns(full, tmp_path):
+    full.export(tmp_path / "poses.txt", "tum")
+    rows, beside = np.loadtxt(tmp_path / "poses.txt"), np.loadtxt(tmp_path / "poses.cov.txt")
+    assert rows.shape == (30, 8) and beside.shape == (30, 22)
+    np.testing.assert_array_equal(rows[:, 0], beside[:, 0])
+    read = ekfslam.read_trajectory(tmp_path / "poses.txt")
+    np.testing.assert_array_equal(read.time_s, full.time_s)
+    np.testing.assert_allclose(read.covariance[:, :3, :3], full.position_covariance_world, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(read.covariance[:, 3:, 3:], full.rotation_covariance_world, rtol=1e-9, atol=1e-18)
+    np.testing.assert_array_equal(read.covariance, np.swapaxes(read.covariance, 1, 2))
+
+
+def test_covariance_of_the_camera_is_that_of_its_errors_drawn_from_those_of_the_body(full, tmp_path):
+    rng, k = np.random.default_rng(3), 20
+    full.export(tmp_path / "camera.txt", "tum", frame="camera")
+    read = ekfslam.read_trajectory(tmp_path / "camera.txt", frame="camera")
+    T_imu_cam, small = se3.inverse(full.T_cam_imu), 1e-3
+    xi = small * rng.multivariate_normal(np.zeros(6), full.covariance[k], 20_000)
+    true = se3.inverse(se3.exp(xi) @ se3.inverse(full.T_world_imu[k])) @ T_imu_cam
+    T = read.T_world[k]
+    turned = Rotation.from_matrix(true[:, :3, :3] @ T[:3, :3].T).as_rotvec()
+    drawn = np.cov(np.hstack([true[:, :3, 3] - T[:3, 3], turned]).T) / small**2
+    std = np.sqrt(np.diag(read.covariance[k]))
+    np.testing.assert_allclose(drawn / np.outer(std, std), read.covariance[k] / np.outer(std, std), atol=0.05)
+
+
+def test_covariances_with_other_stamps_are_a_named_error(full, tmp_path):
+    full.export(tmp_path / "poses.txt", "tum")
+    beside = tmp_path / "poses.cov.txt"
+    beside.write_text("".join(beside.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.raises(ShapeError, match=r"poses\.cov\.txt: time: the stamps are not those of poses\.txt"):
+        ekfslam.read_trajectory(tmp_path / "poses.txt")
+
+
+def test_the_truth_leaves_no_covariances_of_an_earlier_export_beside_it(archive, tmp_path):
+    call = ["export", str(archive), "--format", "tum", "--out", str(tmp_path / "poses.txt")]
+    assert main(call) == 0 and ekfslam.read_trajectory(tmp_path / "poses.txt").covariance is not None
+    assert main([*call, "--mode", "truth"]) == 0
+    assert ekfslam.read_trajectory(tmp_path / "poses.txt").covariance is None
+
+
+def test_a_bag_of_a_result_holds_poses_and_covariances_as_ros_means_them(full, tmp_path):
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    path = tmp_path / "full.mcap"
+    full.export(path, "bag")
+    with rosbag2.Reader(path) as reader:
+        (connection,) = reader.connections
+        types = message_types(is_ros1=False)
+        read = [types.deserialize_cdr(raw, connection.msgtype) for _, _, raw in reader.messages()]
+    assert (connection.topic, connection.msgtype) == ("/ekfslam/odometry", "nav_msgs/msg/Odometry")
+    assert len(read) == len(full.time_s) and read[7].child_frame_id == "base_link"
+    position = read[7].pose.pose.position
+    np.testing.assert_array_equal([position.x, position.y, position.z], full.T_world_imu[7, :3, 3])
+    P = read[7].pose.covariance.reshape(6, 6)
+    np.testing.assert_allclose(P[:3, :3], full.position_covariance_world[7], rtol=1e-9)
+    np.testing.assert_allclose(P[3:, 3:], full.rotation_covariance_world[7], rtol=1e-9)
+    assert (np.diag(read[7].twist.covariance.reshape(6, 6)) == 1e6).all()
+
+
+def test_a_recorded_bag_is_not_replaced_by_an_export(archive, tmp_path, capsys):
+    path = write(tmp_path, stereo(), "mcap")
+    assert main(["export", str(archive), "--format", "bag", "--out", str(path)]) == 2
+    assert "not an earlier result of this command" in capsys.readouterr().err
+
+
+def test_a_format_without_poses_refuses_a_frame(archive, full, tmp_path, capsys):
+    assert main(["export", str(archive), "--format", "ply", "--frame", "camera"]) == 2
+    assert "the format ply has no frame" in capsys.readouterr().err
 
 
 # Runs on inertial samples

@@ -1,6 +1,7 @@
 """Files for other programs: trajectories, tables, point clouds, graphs and the information matrix.
 
-All poses are of the IMU in world. `EXPORTS` has every format by name. A file that adds one needs nothing else::
+Poses are of the IMU in world unless a format says otherwise. `EXPORTS` has every format by name. A file that adds one
+needs nothing else::
 
     EXPORTS["mine"] = Export("mine.txt", "last position: x y z", lambda result: str(result.T_world_imu[-1, :3, 3]))
 """
@@ -21,7 +22,9 @@ from numpy.typing import NDArray
 from ekfslam import files
 from ekfslam.arrays import Array
 from ekfslam.data.readers.text import first_row
-from ekfslam.errors import ArchiveError
+from ekfslam.data.readers.tum import COVARIANCE, COVARIANCE_ENDING, covariance_path
+from ekfslam.data.trajectory import Moving, Trajectory, from_left_error
+from ekfslam.errors import ArchiveError, ConfigError
 from ekfslam.filters.log import Log
 from ekfslam.filters.result import Result
 from ekfslam.geometry import motion, se3
@@ -29,53 +32,110 @@ from ekfslam.models.sensors.stereo import Rig
 from ekfslam.smoother.posterior import Posterior, is_inertial, posterior
 from ekfslam.storage.archive import Archive
 from ekfslam.storage.tables import columns, covariance_columns
+from ekfslam.storage.trajectories import (
+    bag_bytes,
+    covariance_text,
+    is_our_bag,
+    kitti_text,
+    numbers,
+    position_and_quaternion,
+    tum_text,
+)
 
 MADE_BY = "ekfslam"  # in files that have room for a remark
 _PLY = f"ply\nformat binary_little_endian 1.0\ncomment {MADE_BY}: landmarks in world, m and m^2\n"
 _G2O = f"# {MADE_BY}: "
 
 
-def export(result: Result, path: str | Path, format: str) -> None:
+def export(result: Result, path: str | Path, format: str, *, frame: Moving | None = None) -> None:
     """Write a result for other programs in a format of `EXPORTS`, such as ``tum``, ``ply`` or ``csv-landmarks``.
+
+    Args:
+        result: The result.
+        path: File; ``tum`` also writes the covariances of the poses beside it, see `contents`.
+        format: Name of the format.
+        frame: Moving frame of the poses of ``tum``, ``kitti`` and ``bag``; by default that of the left camera for
+            ``kitti``, of the body for the others.
 
     Raises:
         ArchiveError: There is no such format, it cannot hold this result, or the file cannot be written.
         PosteriorError: The format is ``information``, and the result has no log.
+        MissingPackageError: The format is ``bag``, and rosbags is not installed.
     """
     if format not in EXPORTS:
         raise ArchiveError(f"there is no format {format!r}; known: {', '.join(EXPORTS)}")
-    files.write(path, EXPORTS[format].write(result))
+    written = contents(result if EXPORTS[format].poses is None else trajectory_of(result), path, format, frame)
+    files.write_all(written, make_folders=False)
 
 
-def truth_text(archive: Archive, place: str, format: Literal["tum", "kitti"]) -> tuple[int, str]:
-    """Return number and text of the true poses of an archive, one line a frame of known pose.
+def contents(
+    data: Result | Poses, path: str | Path, format: str, frame: Moving | None = None
+) -> dict[Path, str | bytes]:
+    """Return the contents of the files of an export by path, see `export`.
+
+    The covariances of ``poses.txt`` in the format ``tum`` are in ``poses.cov.txt``: a stamp, and the 21 columns of
+    `ekfslam.data.readers.tum.read_trajectory`.
+    """
+    path, made = Path(path), EXPORTS[format]
+    if not isinstance(data, Poses):
+        if frame is not None:
+            raise ConfigError(f"the format {format} has no frame; those of poses have: tum, kitti, bag")
+        return {path: made.write(data)}
+    assert made.poses is not None
+    moving = data.of(frame or made.frame)
+    found = {path: made.poses(moving)}
+    beside = covariance_text(moving) if format == "tum" else None
+    if beside is None and format == "tum" and covariance_path(path).exists():
+        beside = f"# the poses of {path.name} have no covariances\n"  # in place of those of an earlier export
+    return found if beside is None else {**found, covariance_path(path): beside}
+
+
+class Poses(NamedTuple):
+    """A trajectory of the body, and the extrinsics (4, 4) of the left camera."""
+
+    trajectory: Trajectory
+    T_cam_imu: Array
+
+    def of(self, moving: Moving) -> Trajectory:
+        """Return the trajectory of the body or of the left camera."""
+        return self.trajectory if moving == "body" else self.trajectory.of_camera(self.T_cam_imu)
+
+
+def trajectory_of(result: Result) -> Poses:
+    """Return the poses of a result with their covariances."""
+    return Poses(from_left_error(result.time_s, result.T_world_imu, result.covariance), result.T_cam_imu)
+
+
+def true_trajectory(archive: Archive, place: str, format: str) -> Poses:
+    """Return the true poses of an archive, one a frame of known pose.
 
     Args:
         archive: The archive.
         place: Its path, for messages.
-        format: Format of the text.
+        format: Format to be written.
 
     Raises:
-        ArchiveError: There is no true pose; or frames lack one and the format is ``kitti``, which has no stamps.
+        ArchiveError: There is no true pose, or the format has none; or frames lack one and the format is ``kitti``,
+            which has no stamps.
     """
     truth, frames = archive.truth, len(archive.time_s)
+    if EXPORTS[format].poses is None:
+        raise ArchiveError(f"{place}: the truth is written as tum, kitti or bag, not as {format}")
     if truth is None or not len(truth.frame):
         raise ArchiveError(f"{place}: holds no true pose")
     if format == "kitti" and len(truth.frame) < frames:
         raise ArchiveError(
             f"{place}: holds the true pose of {len(truth.frame)} of {frames} frames; kitti has no stamps, take tum"
         )
-    return len(truth.frame), _pose_text(archive.time_s[truth.frame], truth.T_world_imu, format)
+    return Poses(Trajectory(archive.time_s[truth.frame], truth.T_world_imu), archive.T_cam_imu)
 
 
-def _pose_text(time_s: Array, T: Array, format: Literal["tum", "kitti"]) -> str:
-    """Return poses of the IMU in world, one line each, in 17 digits, which is every number exactly.
-
-    A line of ``tum`` is ``time tx ty tz qx qy qz qw``, one of ``kitti`` the upper 3x4 part of the pose by rows. Files
-    of KITTI itself hold the left camera in its first frame.
-    """
-    rows = np.column_stack([time_s, _position_and_quaternion(T)]) if format == "tum" else T[:, :3].reshape(-1, 12)
-    return "".join(f"{_numbers(row)}\n" for row in rows)
+def truth_text(archive: Archive, place: str, format: Literal["tum", "kitti"]) -> tuple[int, str]:
+    """Return number and text of the true poses of an archive, see `true_trajectory`."""
+    poses = true_trajectory(archive, place, format)
+    write = EXPORTS[format].poses
+    assert write is not None
+    return len(poses.trajectory.time_s), str(write(poses.of(EXPORTS[format].frame)))
 
 
 def csv_text(result: Result, table: str = "trajectory") -> str:
@@ -141,25 +201,25 @@ def g2o_text(result: Result) -> str:
 def _graph(result: Result, log: Log) -> Iterator[str]:
     frames = len(result.time_s)
     yield f"{_G2O}{' '.join(result.sequence_name.split())}, vertices 0 to {frames - 1} are poses of the IMU"
-    yield f"PARAMS_SE3OFFSET 0 {_numbers(_position_and_quaternion(np.eye(4)))}"
-    for k, row in enumerate(_position_and_quaternion(result.T_world_imu)):
-        yield f"VERTEX_SE3:QUAT {k} {_numbers(row)}"
+    yield f"PARAMS_SE3OFFSET 0 {numbers(position_and_quaternion(np.eye(4)))}"
+    for k, row in enumerate(position_and_quaternion(result.T_world_imu)):
+        yield f"VERTEX_SE3:QUAT {k} {numbers(row)}"
     yield "FIX 0"
     for i, row in enumerate(result.landmarks.position_m):
-        yield f"VERTEX_TRACKXYZ {frames + i} {_numbers(row)}"
+        yield f"VERTEX_TRACKXYZ {frames + i} {numbers(row)}"
     # The velocities that moved the pose, as they were after biases and tilt.
     moved, noise = log.T_departed[1:] @ se3.inverse(log.T_predicted[1:]), result.noise
-    step, twist = _position_and_quaternion(moved), se3.log(moved) / log.tau_s[1:, None]
+    step, twist = position_and_quaternion(moved), se3.log(moved) / log.tau_s[1:, None]
     std = np.where(log.is_gap[1:, None], np.hypot(noise.velocity_std, noise.gap_std), noise.velocity_std)
     std = std * log.doubt[1:, None]
     Q = motion.process_noise(twist, log.tau_s[1:], std)
     # The vector part of a quaternion is half the rotation.
     twice = np.repeat([1.0, 2.0], 3)
     for k, (row, information) in enumerate(zip(step, twice[:, None] * np.linalg.inv(Q) * twice, strict=True)):
-        yield f"EDGE_SE3:QUAT {k} {k + 1} {_numbers(row)} {_numbers(information[np.triu_indices(6)])}"
+        yield f"EDGE_SE3:QUAT {k} {k + 1} {numbers(row)} {numbers(information[np.triu_indices(6)])}"
     q, information = _triangulated(result, log)
     for k, i, row, block in zip(log.frame.tolist(), log.landmark.tolist(), q, information, strict=True):
-        yield f"EDGE_SE3_TRACKXYZ {k} {frames + i} 0 {_numbers(row)} {_numbers(block[np.triu_indices(3)])}"
+        yield f"EDGE_SE3_TRACKXYZ {k} {frames + i} 0 {numbers(row)} {numbers(block[np.triu_indices(3)])}"
 
 
 def _triangulated(result: Result, log: Log) -> tuple[Array, Array]:
@@ -171,17 +231,6 @@ def _triangulated(result: Result, log: Log) -> tuple[Array, Array]:
     variance = np.where((log.previous >= 0)[:, None], log.variance[first[log.landmark]], log.variance)
     A = rig.jacobian(q) @ result.T_cam_imu[:3, :3]
     return se3.apply(se3.inverse(result.T_cam_imu), q), np.swapaxes(A, 1, 2) @ (A / variance[:, :, None])
-
-
-def _position_and_quaternion(T: Array) -> Array:
-    """Return ``x y z qx qy qz qw`` (..., 7) of transforms (..., 4, 4)."""
-    from scipy.spatial.transform import Rotation
-
-    return np.concatenate([T[..., :3, 3], Rotation.from_matrix(T[..., :3, :3]).as_quat()], axis=-1)
-
-
-def _numbers(values: Array) -> str:
-    return " ".join(f"{value:.17g}" for value in values.tolist())
 
 
 def information_bytes(result: Result, found: Posterior | None = None) -> bytes:
@@ -214,6 +263,8 @@ class Export(NamedTuple):
         write: Function that returns the contents for a result.
         begins: First bytes of a file, if they tell it from other formats.
         columns: Number of columns of a table of numbers, which tells its files from other formats.
+        poses: Function that returns the contents for a trajectory, if the format is of poses alone.
+        frame: Moving frame of these poses by default.
     """
 
     ending: str
@@ -221,13 +272,19 @@ class Export(NamedTuple):
     write: Callable[[Result], str | bytes]
     begins: bytes = b""
     columns: int = 0
+    poses: Callable[[Trajectory], str | bytes] | None = None
+    frame: Moving = "body"
 
 
 def is_export(path: Path, format: str) -> bool:
     """Return whether a file is an earlier export in a format of `EXPORTS`."""
     export = EXPORTS[format]
     if export.columns:
-        return len(first_row(path, comment=None).split()) == export.columns
+        is_covariance = format == "tum" and path.name.endswith(COVARIANCE_ENDING)
+        allowed = (0, 1 + len(COVARIANCE)) if is_covariance else (export.columns,)
+        return len(first_row(path).split()) in allowed
+    if format == "bag":
+        return is_our_bag(path)
     try:
         with path.open("rb") as file:
             is_similar = file.read(len(export.begins)) == export.begins
@@ -239,9 +296,11 @@ def is_export(path: Path, format: str) -> bool:
     return is_similar
 
 
-def _poses(format: Literal["tum", "kitti"], words: str, columns: int) -> Export:
-    write = partial(_pose_text, format=format)
-    return Export(f"{format}.txt", words, lambda result: write(result.time_s, result.T_world_imu), columns=columns)
+def _poses(
+    ending: str, words: str, columns: int, write: Callable[[Trajectory], str | bytes], frame: Moving = "body"
+) -> Export:
+    of_result = lambda result: write(trajectory_of(result).of(frame))  # noqa: E731
+    return Export(ending, words, of_result, b"", columns, write, frame)
 
 
 def _csv(table: str, begins: bytes) -> Export:
@@ -249,8 +308,11 @@ def _csv(table: str, begins: bytes) -> Export:
 
 
 EXPORTS: dict[str, Export] = {
-    "tum": _poses("tum", "poses: time tx ty tz qx qy qz qw", 8),
-    "kitti": _poses("kitti", "poses: twelve entries", 12),
+    "tum": _poses("tum.txt", "poses: time tx ty tz qx qy qz qw", 8, tum_text),
+    "kitti": _poses(
+        "kitti.txt", "poses of the left camera in its first frame: twelve entries", 12, kitti_text, "camera"
+    ),
+    "bag": _poses("mcap", "poses: ROS 2 bag of nav_msgs/Odometry with covariances", 0, bag_bytes),
     "csv": _csv("trajectory", b"time_s,x_m,"),
     "csv-landmarks": _csv("landmarks", b"id,x_m,"),
     "csv-innovation": _csv("innovation", b"time_s,nis,"),

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import get_args
 
 from ekfslam import files
 from ekfslam.cli.options import declare, require_ours
-from ekfslam.errors import ArchiveError
+from ekfslam.data.trajectory import Moving
+from ekfslam.filters.result import Result
 from ekfslam.names import components
 from ekfslam.storage.archive import open_result, read_archive
-from ekfslam.storage.exports import EXPORTS, is_export, truth_text
+from ekfslam.storage.exports import EXPORTS, Poses, contents, is_export, trajectory_of, true_trajectory
 
 TRUTH = "truth"  # in place of a mode
 EXAMPLES = (
     "export city.h5 --format tum",
     "export city.h5 --format tum --mode truth",
     "export city.h5 --format kitti --mode dead-reckoning --out poses.txt",
+    "export city.h5 --format tum --frame camera",
+    "export city.h5 --format bag",
     "export city.h5 --format ply",
     "export city.h5 --format csv-landmarks",
     "export city.h5 --format information",
@@ -29,6 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", choices=tuple(EXPORTS), required=True, help=formats)
     parser.add_argument(
         "--mode", help=f"any in the archive (default: full, or else its first), or {TRUTH} for the true poses"
+    )
+    parser.add_argument(
+        "--frame",
+        choices=get_args(Moving),
+        help="moving frame of poses: the body (IMU), or the left camera (default: camera for kitti, otherwise body)",
     )
     parser.add_argument(
         "--out",
@@ -45,15 +54,16 @@ def command(options: argparse.Namespace) -> None:
     export = EXPORTS[options.format]
     path = options.out or options.archive.with_suffix(f".{components([mode])[0]}.{export.ending}")
     files.require_writable(path)
-    require_ours(options, path, lambda path: is_export(path, options.format))
-    content: str | bytes
+    data: Result | Poses
     if mode == TRUTH:
-        if options.format not in ("tum", "kitti"):
-            raise ArchiveError(f"{options.archive}: the truth is written as tum or kitti, not as {options.format}")
-        poses, text = truth_text(archive, str(options.archive), options.format)
-        found, content = f"{poses} poses", text
+        data = true_trajectory(archive, str(options.archive), options.format)
     else:
-        content = export.write(open_result(options.archive, mode))
-        found = f"{len(archive.time_s)} poses" if export.words.startswith("poses:") else export.words
-    files.write_all({path: content})
-    print(f"{found} written to {path}")
+        data = open_result(options.archive, mode)
+        data = data if export.poses is None else trajectory_of(data)
+    written = contents(data, path, options.format, options.frame)
+    for place in written:
+        require_ours(options, place, lambda path: is_export(path, options.format))
+    files.write_all(written)
+    found = f"{len(data.trajectory.time_s)} poses" if isinstance(data, Poses) else export.words
+    beside = "".join(f", their covariances to {place}" for place in written if place != path)
+    print(f"{found} written to {path}{beside}")

@@ -67,6 +67,12 @@ class Bag:
                 text = "an entry is of a wrong type"  # their words are about Python's objects, not the file
             raise UnknownFormatError(f"{self.path}: damaged or unknown bag ({text})") from None
 
+    @property
+    def topics(self) -> dict[str, str]:
+        """Types of messages by topic."""
+        found = {connection.topic: connection.msgtype for connection in self._reader.connections}
+        return dict(sorted(found.items()))
+
     def connections(self, *kinds: str) -> list[Any]:
         """Return the streams of messages of some types, by topic."""
         found = [connection for connection in self._reader.connections if connection.msgtype in kinds]

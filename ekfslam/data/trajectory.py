@@ -1,0 +1,61 @@
+"""Trajectories with covariances: poses of the body or of the left camera in world, as other programs exchange them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.data.checks import frozen, require_shape
+from ekfslam.geometry import se3
+
+Moving = Literal["body", "camera"]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Stamped poses of a moving frame, the body (IMU) or the left camera, in world.
+
+    Args:
+        time_s: (F,) stamps.
+        T_world: (F, 4, 4) poses of the moving frame in world.
+        covariance: (F, 6, 6) of the errors of the position (m) and of the rotation (rad), both along the axes of
+            world: ``p = p_hat + d``, ``R = exp(w^) R_hat``, the error is ``[d; w]`` as in ROS. None if unknown.
+        moving: The moving frame.
+    """
+
+    time_s: Array
+    T_world: Array
+    covariance: Array | None = None
+    moving: Moving = "body"
+
+    def __post_init__(self) -> None:
+        shapes = {"time_s": (None,), "T_world": (len(self.time_s), 4, 4), "covariance": (len(self.time_s), 6, 6)}
+        for name, shape in shapes.items():
+            if getattr(self, name) is not None:
+                value = np.asarray(getattr(self, name), dtype=float)
+                require_shape(value, shape, name)
+                object.__setattr__(self, name, frozen(value))
+
+    def of_camera(self, T_cam_imu: Array) -> Trajectory:
+        """Return the trajectory of the left camera on a body; the extrinsics count as known."""
+        T_imu_cam = se3.inverse(T_cam_imu)
+        covariance = None
+        if self.covariance is not None:
+            # d of the camera = d + w x (R lever)
+            J = np.broadcast_to(np.eye(6), self.covariance.shape).copy()
+            J[:, :3, 3:] = -se3.skew(self.T_world[:, :3, :3] @ T_imu_cam[:3, 3])
+            covariance = J @ self.covariance @ np.swapaxes(J, 1, 2)
+        return Trajectory(self.time_s, self.T_world @ T_imu_cam, covariance, "camera")
+
+
+def from_left_error(time_s: Array, T_world_imu: Array, covariance: Array) -> Trajectory:
+    """Return a trajectory with covariances (F, 6, 6) of ``xi`` in ``T_imu_world = exp(xi^) T_hat``.
+
+    To first order ``[d; w] = -diag(R, R) xi`` with the rotation R of ``T_world_imu``.
+    """
+    R = np.zeros_like(covariance)
+    R[:, :3, :3] = R[:, 3:, 3:] = T_world_imu[:, :3, :3]
+    return Trajectory(time_s, T_world_imu, R @ covariance @ np.swapaxes(R, 1, 2))
