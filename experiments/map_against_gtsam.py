@@ -180,12 +180,63 @@ def batch(graph: Any, start: Any, tolerance: float) -> tuple[Any, int, float]:
     return values, optimiser.iterations(), perf_counter() - begin
 
 
-def new_isam2(threshold: float, skip: int) -> Any:
-    """Return an iSAM2 that relinearises beyond a threshold at every ``skip``-th update."""
+def new_isam2(threshold: float) -> Any:
+    """Return an iSAM2 that relinearises beyond a threshold at every update."""
     parameters = gtsam.ISAM2Params()
     parameters.setRelinearizeThreshold(threshold)
-    parameters.relinearizeSkip = skip
+    parameters.relinearizeSkip = RELINEARISE_SKIP
     return gtsam.ISAM2(parameters)
+
+
+class Frames:
+    """New factors and first guesses of each frame, for solvers that get one frame at a time.
+
+    Args:
+        result: A run of the joint filter.
+        factors: Its `factors_of`.
+        landmark_std_m: Standard deviation of a prior on every landmark about its first guess; None for no prior.
+    """
+
+    def __init__(self, result: Result, factors: Factors, landmark_std_m: float | None = None) -> None:
+        self.log, self._camera, self._factors, self._std_m = log_of(result), result.camera, factors, landmark_std_m
+        inputs = np.concatenate([np.zeros((1, 6)), self.log.inputs])
+        self._measured = se3.inverse(motion.increment(inputs, self.log.tau_s))
+        self._T_imu_cam = se3.inverse(result.T_cam_imu)
+        self._T_world_imu = se3.inverse(self.log.T_predicted[0])
+        self._begin = np.searchsorted(self.log.frame, np.arange(self.log.frames + 1))
+        self._is_known = np.zeros(self.log.landmarks, dtype=bool)
+
+    def seen(self, k: int) -> Array:
+        """Return the indices of the observations of a frame."""
+        return np.arange(self._begin[k], self._begin[k + 1])
+
+    def graph(self, k: int, seen: Array) -> tuple[Any, Any, Array]:
+        """Return the factors of some observations of a frame, the first guesses, and the landmarks seen."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        if k == 0:
+            graph.push_back(self._factors.first)
+        else:
+            self._T_world_imu = self._T_world_imu @ self._measured[k]
+            graph.push_back(self._factors.motion[k - 1])
+        values.insert(X(k), gtsam.Pose3(self._T_world_imu))
+        landmark = self.log.landmark[seen]
+        new = seen[~self._is_known[landmark]]
+        in_camera = camera.triangulate(self._camera, self.log.rows[new])
+        points = se3.apply(self._T_world_imu @ self._T_imu_cam, in_camera)
+        for j, point in zip(self.log.landmark[new].tolist(), points, strict=True):
+            values.insert(L(j), point)
+            if self._std_m is not None:
+                weak = gtsam.noiseModel.Isotropic.Sigma(3, self._std_m)
+                graph.push_back(gtsam.PriorFactorPoint3(L(j), point, weak))
+        self._is_known[landmark] = True
+        for i in seen.tolist():
+            graph.push_back(self._factors.observation[i])
+        return graph, values, landmark
+
+    def continued_from(self, pose: Any) -> Array:
+        """Take the solver's pose of the frame, from which the next one starts, and return it (4, 4)."""
+        self._T_world_imu = np.asarray(pose.matrix())
+        return self._T_world_imu
 
 
 def incremental(
@@ -193,9 +244,6 @@ def incremental(
     factors: Factors,
     threshold: float,
     landmark_std_m: float | None = None,
-    *,
-    skip: int = RELINEARISE_SKIP,
-    pose_covariance: bool = False,
 ) -> tuple[Any, Array]:
     """Run iSAM2 frame by frame: its values after the last frame, and the seconds (T,) of each update.
 
@@ -204,43 +252,17 @@ def incremental(
         factors: Its `factors_of`.
         threshold: Change of a variable (metres and radians alike) beyond which it is linearised again.
         landmark_std_m: Standard deviation of a prior on every landmark about its first guess; none by default.
-        skip: Number of updates between two searches for such variables.
-        pose_covariance: Whether to compute the covariance of the last pose in every frame.
 
     Raises:
         RuntimeError: iSAM2 met a system that it could not solve.
     """
-    log, isam = log_of(result), new_isam2(threshold, skip)
-    measured = se3.inverse(motion.increment(np.concatenate([np.zeros((1, 6)), log.inputs]), log.tau_s))
-    T_imu_cam = se3.inverse(result.T_cam_imu)
-    T_world_imu = se3.inverse(log.T_predicted[0])
-    start_of_frame = np.searchsorted(log.frame, np.arange(log.frames + 1))
-    is_known = np.zeros(log.landmarks, dtype=bool)
-    seconds = np.empty(log.frames)
-    for k in range(log.frames):
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        if k == 0:
-            graph.push_back(factors.first)
-        else:
-            T_world_imu = T_world_imu @ measured[k]
-            graph.push_back(factors.motion[k - 1])
-        values.insert(X(k), gtsam.Pose3(T_world_imu))
-        seen = np.arange(start_of_frame[k], start_of_frame[k + 1])
-        new = seen[~is_known[log.landmark[seen]]]
-        points = se3.apply(T_world_imu @ T_imu_cam, camera.triangulate(result.camera, log.rows[new]))
-        for j, point in zip(log.landmark[new].tolist(), points, strict=True):
-            values.insert(L(j), point)
-            if landmark_std_m is not None:
-                weak = gtsam.noiseModel.Isotropic.Sigma(3, landmark_std_m)
-                graph.push_back(gtsam.PriorFactorPoint3(L(j), point, weak))
-        is_known[log.landmark[new]] = True
-        for i in seen:
-            graph.push_back(factors.observation[i])
+    isam, frames = new_isam2(threshold), Frames(result, factors, landmark_std_m)
+    seconds = np.empty(frames.log.frames)
+    for k in range(frames.log.frames):
+        graph, values, _ = frames.graph(k, frames.seen(k))
         begin = perf_counter()
         isam.update(graph, values)
-        T_world_imu = isam.calculateEstimatePose3(X(k)).matrix()
-        if pose_covariance:
-            isam.marginalCovariance(X(k))
+        frames.continued_from(isam.calculateEstimatePose3(X(k)))
         seconds[k] = perf_counter() - begin
     return isam.calculateEstimate(), seconds
 

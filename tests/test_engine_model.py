@@ -13,6 +13,8 @@ from ekfslam.filters import starting
 from ekfslam.filters.observing import look, moment, observe
 from ekfslam.filters.retraction import carried_back, retract, retracted
 from ekfslam.geometry import se3
+from ekfslam.geometry import stereo_motion as stereo
+from ekfslam.geometry.camera import StereoCamera, project
 
 engine = pytest.importorskip("ekfslam.engine._engine", reason="the engine is not built")
 
@@ -263,3 +265,21 @@ def test_tracks_wait_for_a_second_view_as_in_the_reference(variant):
         drive(e, made, rng.normal(size=6) * ([0.5] * 3 + [0.02] * 3))  # sideways
     assert 0 in count
     assert max(count) >= 3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_alignment_of_two_frames_is_that_of_numpy(seed):
+    rng = np.random.default_rng(seed)
+    camera, n = StereoCamera(500.0, 510.0, 320.0, 240.0, 0.3), 40
+    points = rng.uniform((-4, -2, 2), (4, 2, 20), (n, 3))
+    T = se3.exp(np.r_[rng.normal(0, 0.3, 3), rng.normal(0, 0.05, 3)])
+    before, now = (project(camera, q)[:, :3] + rng.normal(0, 0.2, (n, 3)) for q in (points, se3.apply(T, points)))
+    now[:5] += rng.normal(0, 20, (5, 3))
+    start = np.eye(4)
+    start[2, 3] = -2.2  # the nearest points are behind the camera there
+    for first in (np.eye(4), start):
+        found, expected = (
+            align(camera, before, now, first, 0.2, 2.0) for align in (stereo.align, stereo.align_in_numpy)
+        )
+        for name, value in vars(expected).items():
+            np.testing.assert_allclose(getattr(found, name), value, rtol=1e-8, atol=1e-9, err_msg=name)

@@ -2,9 +2,11 @@
 #include <nanobind/eigen/dense.h>
 #include <nanobind/nanobind.h>
 
+#include "alignment.hpp"
 #include "bind_gates.hpp"
 #include "bind_gaussian.hpp"
 #include "binding.hpp"
+#include "blas.hpp"
 #include "lapack.hpp"
 #include "types.hpp"
 
@@ -30,6 +32,15 @@ Matrix cholesky(Matrix P) {
     return P.triangularView<Eigen::Lower>();
 }
 
+// Arrays of `geometry.stereo_motion.Alignment`, matrices flat; camera (fu, fv, cu, cv, b).
+nb::tuple aligned(const Eigen::Matrix<double, 5, 1>& camera, const Alignment::Points& before,
+                  const Alignment::Points& now, const Matrix4& first, double std_px, double scale) {
+    if (before.rows() != now.rows()) throw nb::value_error("rows before and now must be those of the same points");
+    const Alignment found =
+        align({camera[0], camera[1], camera[2], camera[3], camera[4]}, before, now, first, std_px, scale);
+    return nb::make_tuple(found.T, found.true_px, found.residual_px, found.H, found.B, found.W);
+}
+
 }  // namespace
 
 NB_MODULE(_engine, module) {
@@ -43,5 +54,10 @@ NB_MODULE(_engine, module) {
     bind_gates(module);
     binding::bind_filter(module);
     module.def("cholesky", &cholesky, nb::arg("P"), "Return the lower Cholesky factor of a covariance.");
+    module.def("align", &aligned, nb::arg("camera"), nb::arg("before_px"), nb::arg("now_px"), nb::arg("T_now_before"),
+               nb::arg("std_px"), nb::arg("scale"), "Align two frames of a stereo rig.");
+    module.def(
+        "flops", [] { return blas::flops(); },
+        "Return the number of floating point operations of BLAS and LAPACK in this thread so far.");
     bind_model(module);
 }

@@ -246,6 +246,13 @@ class Engine:
         self._filter.clone(source.start, source.stop - source.start, to.start)
 
 
+def flops() -> float:
+    """Return the floating point operations of BLAS and LAPACK calls of the engine in this thread so far."""
+    from ekfslam.engine._engine import flops as counted
+
+    return float(counted())
+
+
 def _places(blocks: tuple[StateBlock, ...], values: Values) -> dict[str, tuple[slice, tuple[int, ...]]]:
     """Return the place and the shape of each block's value in the flat vector."""
     end, places = 0, {}

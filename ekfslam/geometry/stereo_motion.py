@@ -13,12 +13,19 @@ standard deviation s at both ends, and an error c of the disparity that a track 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera, project, triangulate
+
+try:
+    _engine: Any = import_module("ekfslam.engine._engine")
+except ImportError:  # not built: the same in NumPy
+    _engine = None
 
 _ITERATIONS = 12
 _CONVERGED = 1e-4  # m and rad of a step, after which the next would be far smaller
@@ -129,6 +136,17 @@ def align(
     camera: StereoCamera, before_px: Array, now_px: Array, T_now_before: Array, std_px: float = 0.2, scale: float = 2.0
 ) -> Alignment:
     """Align two frames by robust Gauss-Newton from a first guess of the motion; arguments as in `linearise`."""
+    if _engine is not None:
+        intrinsics = np.array([camera.fu_px, camera.fv_px, camera.cu_px, camera.cv_px, camera.baseline_m])
+        T, true_px, r, H, B, W = _engine.align(intrinsics, before_px, now_px, T_now_before, std_px, scale)
+        return Alignment(T, true_px, r, H.reshape(-1, 3, 6), B.reshape(-1, 3, 3), W.reshape(-1, 3, 3))
+    return align_in_numpy(camera, before_px, now_px, T_now_before, std_px, scale)
+
+
+def align_in_numpy(
+    camera: StereoCamera, before_px: Array, now_px: Array, T_now_before: Array, std_px: float, scale: float
+) -> Alignment:
+    """Align two frames as `align` does, without the compiled engine."""
     found = linearise(camera, before_px, now_px, T_now_before, before_px, std_px, scale)
     for _ in range(_ITERATIONS):
         # A weak prior keeps the step finite if too few points are left.
