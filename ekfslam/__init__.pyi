@@ -11,6 +11,7 @@ from .config import (
     TruthConfig,
 )
 from .data.images import ImageRecording
+from .data.imu import attach_inertial
 from .data.inputs import InertialNoise, InertialSamples, Velocities
 from .data.noise import Noise
 from .data.opening import attach_truth, open_images
@@ -69,6 +70,7 @@ __all__ = [
     "TruthConfig",
     "TunedNoise",
     "Velocities",
+    "attach_inertial",
     "attach_truth",
     "attach_velocities",
     "check",

@@ -67,6 +67,17 @@ _SHARED: dict[str, dict[str, Any]] = {
         "choices": ("imu", "level"),
         "help": "frame of --velocities (default: as the file says, otherwise imu)",
     },
+    "--imu": {
+        "type": Path,
+        "metavar": "FILE",
+        "help": "inertial samples from elsewhere: csv of timestamp w_x w_y w_z a_x a_y a_z (ns, rad/s, m/s^2), imu0 "
+        "of EuRoC, or a bag",
+    },
+    "--imu-noise": {
+        "type": Path,
+        "metavar": "FILE",
+        "help": "sensor.yaml or imu.yaml with the noise densities of --imu (default: the one beside it)",
+    },
     "--lateral": {
         "choices": ("corrected", "as-stored"),
         "default": "corrected",
@@ -94,7 +105,14 @@ _SHARED: dict[str, dict[str, Any]] = {
     **{flag: {"action": _Retired, "nargs": 0, "help": argparse.SUPPRESS} for flag in RETIRED},
 }
 EXECUTOR = ("--workers", "--executor")
-PLACES = ("--truth", "--velocities", "--velocity-frame", "--lateral")  # parts of a recording in other files
+PLACES = (
+    "--truth",
+    "--velocities",
+    "--velocity-frame",
+    "--imu",
+    "--imu-noise",
+    "--lateral",
+)  # parts of a recording in other files
 DATA = (*PLACES, "--frames", "--extrinsics", "--truth-noise")
 
 # Flags that override a setting, the table and key of it, and how argparse declares the flag.
@@ -159,6 +177,8 @@ def open_data(options: argparse.Namespace, data: str) -> Sequence:
         truth=options.truth,
         velocities=options.velocities,
         velocity_frame=options.velocity_frame,
+        imu=options.imu,
+        imu_noise=options.imu_noise,
         front_end=config_file(options).front_end,
     )
     return sequence if options.frames is None else sequence[options.frames]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
 from ekfslam.data.checks import checked_pose, frozen, require_finite, require_shape, spelled_as_in, validate_stamps
-from ekfslam.data.inputs import Velocities, VelocityFrame
+from ekfslam.data.inputs import InertialSamples, Velocities, VelocityFrame
 from ekfslam.data.noise import Noise
 from ekfslam.data.observations import Truth, validate_truth
 from ekfslam.errors import CalibrationError
@@ -104,7 +104,7 @@ def side_by_side(baseline_m: float) -> Array:
 
 @dataclass(frozen=True)
 class ImageRecording:
-    """One recording of stereo images, with or without body velocities.
+    """One recording of stereo images, with or without body velocities and inertial samples.
 
     Args:
         name, source, time_s, velocity_frame, truth, noise, notes, attributes: See `ekfslam.Sequence`.
@@ -113,6 +113,7 @@ class ImageRecording:
             raises `UnknownFormatError` or `DataError`.
         T_cam_imu: (4, 4) IMU to the optical frame of the left camera before rectification.
         twist: (T, 6) measured velocities ``[v; w]``, ``twist[k]`` drives ``(t[k-1], t[k]]``; None if there are none.
+        inertial: Samples of a gyroscope and an accelerometer; None if there are none.
     """
 
     name: str
@@ -127,6 +128,7 @@ class ImageRecording:
     noise: Noise | None = None
     notes: tuple[str, ...] = ()
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    inertial: InertialSamples | None = None
 
     def __post_init__(self) -> None:
         for name in ("time_s",) if self.twist is None else ("time_s", "twist"):
@@ -142,3 +144,25 @@ class ImageRecording:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def __getitem__(self, frames: slice) -> ImageRecording:
+        """Return a stretch of successive frames, as a recording whose frames count from 0."""
+        begin, end, _ = frames.indices(len(self))
+        return replace(
+            self,
+            time_s=self.time_s[begin:end],
+            load=_Later(self.load, begin),
+            twist=None if self.twist is None else self.twist[begin:end],
+            truth=None if self.truth is None else self.truth.stretch(begin, end),
+        )
+
+
+@dataclass(frozen=True)
+class _Later:
+    """Load images that begin at a later frame."""
+
+    load: Callable[[int], tuple[Image, Image]]
+    begin: int
+
+    def __call__(self, frame: int) -> tuple[Image, Image]:
+        return self.load(self.begin + frame)

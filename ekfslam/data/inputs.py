@@ -180,7 +180,9 @@ class InertialSamples:
         n, stated = self.noise, "densities of noise not stated"
         if n is not None:
             stated = f"gyroscope {n.gyro:.3g} rad/s/sqrt(Hz), accelerometer {n.accel:.3g} m/s^2/sqrt(Hz)"
-        return f"{len(self.time_s)} inertial samples, {_rate(self.time_s)}; {stated}"
+        gaps, longest_s = self.gaps
+        pauses = f"; {gaps} gaps, the longest {longest_s:.3g} s" if gaps else ""
+        return f"{len(self.time_s)} inertial samples, {_rate(self.time_s)}{pauses}; {stated}"
 
     def between(self, begin_s: float, end_s: float) -> InertialSamples:
         """Return the samples from ``begin_s`` to ``end_s``, with one more on each side to interpolate to both ends."""
@@ -192,6 +194,13 @@ class InertialSamples:
     def step_s(self) -> float:
         """Median time between samples."""
         return _median_step(self.time_s)
+
+    @cached_property
+    def gaps(self) -> tuple[int, float]:
+        """Number of gaps, which are steps of more than three times the median, and the longest of them in s."""
+        steps = np.diff(self.time_s)
+        steps = steps[steps > _GAP_STEPS * self.step_s]
+        return len(steps), float(steps.max(initial=0.0))
 
     def at(self, time_s: Array | float) -> Array:
         """Return the samples ``[w; f]`` (..., 6) at some time, linear between stamps."""

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.checks import LARGEST_PX, checked_pose, frozen, require_finite, spelled_as_in, validate_stamps
+from ekfslam.data.inertial import inertial_notes
 from ekfslam.data.inputs import InertialSamples, Input, Velocities, VelocityFrame, validate_inputs
 from ekfslam.data.interpolation import INTERPOLATED, attributes_of_part, known_intervals
 from ekfslam.data.interval import Interval
@@ -215,7 +216,7 @@ class Sequence(Once, Shown):
             truth=None if T_world_imu is None else truth_of(numbers(T_world_imu, "T_world_imu"), len(stamps)),
             noise=noise,
             velocity_frame=velocity_frame,
-            notes=notes,
+            notes=(*notes, *(() if imu is None else inertial_notes(imu, "arrays"))),
             attributes=WITHOUT_VELOCITIES if twist is None else {},
         )
 

@@ -20,7 +20,7 @@ from ekfslam.geometry import se3
 Recording = TypeVar("Recording", Sequence, ImageRecording)
 
 MAX_GAP_S = 1.0  # over longer, a velocity is not linear in time
-_NO_VELOCITIES = "There are no velocities"  # beginning of a note of a recording without any
+NO_VELOCITIES = "There are no velocities"  # beginning of a note of a recording without any
 _SAME = 1e-3  # of a step, by which stamps of the same instants may differ
 _DENSE = 2.0  # samples an interval from which their mean over it is taken
 
@@ -64,7 +64,7 @@ def attach_velocities(
     others = (*WITHOUT_VELOCITIES, TWIST_STD, "lateral")
     own = {name: value for name, value in recording.attributes.items() if name not in others}
     gaps = _interpolated_attributes(found, recording.time_s, twist)
-    notes = [note for note in recording.notes if not note.startswith(_NO_VELOCITIES)]
+    notes = [note for note in recording.notes if not note.startswith(NO_VELOCITIES)]
     notes += [*found.notes, f"Velocities ({found.velocity_frame} frame) from {path}: {how}."]
     changes: dict[str, Any] = {"twist": twist, "velocity_frame": found.velocity_frame}
     if found.T_cam_imu is not None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from ekfslam.config import FrontEndConfig
-from ekfslam.data.images import ImageRecording
+from ekfslam.data.imu import attach_inertial
 from ekfslam.data.opening import attach_truth, open_recording
 from ekfslam.data.readers.registry import Extrinsics, Lateral
 from ekfslam.data.sequence import Sequence, VelocityFrame
-from ekfslam.data.velocities import attach_velocities
+from ekfslam.data.velocities import Recording, attach_velocities
 from ekfslam.errors import ConfigError
 
 
@@ -21,6 +21,8 @@ def open_sequence(
     truth: str | Path | None = None,
     velocities: str | Path | None = None,
     velocity_frame: VelocityFrame | None = None,
+    imu: str | Path | None = None,
+    imu_noise: str | Path | None = None,
     front_end: FrontEndConfig | None = None,
 ) -> Sequence:
     """Open the recording in a file or folder, or the built-in world ``builtin:NAME``.
@@ -34,27 +36,36 @@ def open_sequence(
         truth: File or folder of true poses to use in place of the recording's own, see `attach_truth`.
         velocities: File or recording with velocities to use in place of the recording's own, see `attach_velocities`.
         velocity_frame: Frame of these velocities.
+        imu: File with inertial samples to use in place of the recording's own, see `attach_inertial`.
+        imu_noise: File with the densities of their noise.
         front_end: Settings of tracking; None for the defaults.
 
     Raises:
         UnknownFormatError: The file is missing, empty, damaged or of unknown content, or there is no such world.
         ConfigError: The recording's format does not know ``extrinsics`` or ``lateral``; or ``velocity_frame`` is given
-            without ``velocities``.
+            without ``velocities``, or ``imu_noise`` without ``imu``.
         ArchiveError: A newer release wrote the file.
         MissingPackageError: There are images, but OpenCV is not installed.
         DataError: A field is missing or malformed; the subclass says how.
     """
-    if velocity_frame is not None and velocities is None:
-        raise ConfigError("velocity_frame (--velocity-frame) is given without velocities (--velocities)")
+    _require("velocity_frame", velocity_frame, "velocities", velocities)
+    _require("imu_noise", imu_noise, "imu", imu)
     recording = open_recording(source, extrinsics=extrinsics, lateral=lateral)
-    if isinstance(recording, ImageRecording):
-        from ekfslam.frontend.track import track
 
+    def with_inputs(one: Recording) -> Recording:
         if velocities is not None:
-            recording = attach_velocities(recording, velocities, velocity_frame=velocity_frame, lateral=lateral)
-        recording, velocities = track(recording, front_end)[0], None
-    if truth is not None:
-        recording = attach_truth(recording, Path(truth))
-    if velocities is None:
-        return recording
-    return attach_velocities(recording, velocities, velocity_frame=velocity_frame, lateral=lateral)
+            one = attach_velocities(one, velocities, velocity_frame=velocity_frame, lateral=lateral)
+        return one if imu is None else attach_inertial(one, imu, imu_noise)
+
+    if isinstance(recording, Sequence):
+        return with_inputs(recording if truth is None else attach_truth(recording, Path(truth)))
+    from ekfslam.frontend.track import track
+
+    tracked = track(with_inputs(recording), front_end)[0]
+    return tracked if truth is None else attach_truth(tracked, Path(truth))
+
+
+def _require(name: str, value: object, needed: str, other: object) -> None:
+    if value is not None and other is None:
+        flag = f"--{name.replace('_', '-')}"
+        raise ConfigError(f"{name} ({flag}) is given without {needed} (--{needed})")

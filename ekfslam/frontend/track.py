@@ -126,6 +126,7 @@ def _tracked(
         name=recording.name,
         source=recording.source,
         time_s=recording.time_s,
+        inputs=() if recording.inertial is None else (recording.inertial,),
         twist=recording.twist,
         camera=camera,
         T_cam_imu=T_cam_imu,

@@ -1,21 +1,29 @@
-"""EuRoC MAV and TUM-VI: stereo images and true poses in a folder with ``mav0``, or in the folder ``mav0`` itself.
+"""EuRoC MAV and TUM-VI: stereo images, inertial samples and true poses in a folder with ``mav0``, or in that folder.
 
-Images are in ``mav0/cam0 cam1`` with ``data.csv`` and ``sensor.yaml``, true poses in
-``mav0/state_groundtruth_estimate0/data.csv``. Burri et al., *The EuRoC micro aerial vehicle datasets* (IJRR 2016).
+Images are in ``mav0/cam0 cam1`` with ``data.csv`` and ``sensor.yaml``, samples in ``mav0/imu0`` likewise, true poses
+with velocities and biases in ``mav0/state_groundtruth_estimate0/data.csv``. Burri et al., *The EuRoC micro aerial
+vehicle datasets* (IJRR 2016).
 Schubert et al., *The TUM VI Benchmark* (IROS 2018): a folder may have the calibration of Kalibr, ``dso/camchain.yaml``,
-in place of ``sensor.yaml``.
+in place of ``sensor.yaml``, and densities in ``imu_config.yaml`` or ``imu.yaml``.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
-from ekfslam.data.checks import require_rigid, spelled_as_in
+from ekfslam.data.checks import spelled_as_in
 from ekfslam.data.images import Distortion, DistortionModel, ImageRecording, PairCalibration
+from ekfslam.data.imu import with_rows
+from ekfslam.data.inertial import InertialRows
+from ekfslam.data.observations import TrueMotion
 from ekfslam.data.readers.fields import checksum
+from ekfslam.data.readers.imu_text import read_imu
+from ekfslam.data.readers.imu_yaml import CHAINS, beside, chain_of, late_s, pose_of, read_imu_yaml
 from ekfslam.data.readers.pictures import PairFiles, pair_stamps
 from ekfslam.data.readers.poses import Poses, stamped_poses, truth_of_frames
 from ekfslam.data.readers.registry import Reader, Source
@@ -23,7 +31,6 @@ from ekfslam.data.readers.text import Table, first_row, line_of, parse_table, re
 from ekfslam.data.readers.yaml import Calibration, read_yaml
 from ekfslam.errors import (
     CalibrationError,
-    ExtrinsicsError,
     LineError,
     LostDataError,
     StampError,
@@ -34,10 +41,14 @@ from ekfslam.geometry import se3
 
 CAMERAS = ("cam0", "cam1")
 COLUMNS = ("timestamp", "p_RS_R_x", "p_RS_R_y", "p_RS_R_z", "q_RS_w", "q_RS_x", "q_RS_y", "q_RS_z")
+MOTION = (
+    *(f"v_RS_R_{axis}" for axis in "xyz"),
+    *(f"b_w_RS_S_{axis}" for axis in "xyz"),
+    *(f"b_a_RS_S_{axis}" for axis in "xyz"),
+)
 _AS_TUM = [0, 1, 2, 3, 5, 6, 7, 4]  # the quaternion with w last
 _FOLDERS = ("state_groundtruth_estimate0", "mocap0")  # mocap0: TUM-VI
 _PLACES = ("data.csv", *(f"{above}{folder}/data.csv" for above in ("", "mav0/") for folder in _FOLDERS))
-_KALIBR = ("dso/camchain.yaml", "camchain.yaml")
 _MODELS: dict[str, DistortionModel] = {
     "radial-tangential": "radtan",
     "radtan": "radtan",
@@ -47,31 +58,57 @@ _MODELS: dict[str, DistortionModel] = {
 
 
 def open_euroc(folder: Path) -> ImageRecording:
-    """Open the images of a recording, its calibration, and its truth if there is any; the body is the IMU."""
+    """Open images, calibration, inertial samples and truth of a recording, as far as there are any.
+
+    The body is the inertial unit. Frames that its samples do not cover are left out.
+    """
     mav = _mav(folder) or folder
-    (left_ns, left), (right_ns, right) = (_images(mav / name) for name in CAMERAS)
-    in_left, in_right, notes = pair_stamps(left_ns, right_ns, str(mav))
-    calibration, T_cam_imu, read = _calibration(mav)
-    time_s = left_ns[in_left] / 1e9
+    left, right = (_images(mav / name) for name in CAMERAS)
+    # An image whose partner is known to be missing is no sign of another clock.
+    left, right = left.without(right.missing_ns), right.without(left.missing_ns)
+    in_left, in_right, notes = pair_stamps(left.time_ns, right.time_ns, str(mav))
+    rig, imu = _calibration(mav), _inertial(mav)
+    time_s = left.time_ns[in_left] / 1e9
+    notes = (*left.notes, *right.notes, *notes, *rig.notes)
     truth, found = None, find_euroc_truth(mav)
     if found is not None:
         truth = truth_of_frames(time_s, read_euroc(found))
         notes = (*notes, f"Truth of {len(truth.frame)} of {len(time_s)} frames from {found.relative_to(mav)}.")
     place = folder.resolve()
-    return ImageRecording(
+    recording = ImageRecording(
         name=place.name if place.name != "mav0" else place.parent.name,
         source=str(folder),
         time_s=time_s,
-        calibration=calibration,
-        load=PairFiles([left[i] for i in in_left], [right[i] for i in in_right], calibration.size),
-        T_cam_imu=T_cam_imu,
+        calibration=rig.calibration,
+        load=PairFiles([left.files[i] for i in in_left], [right.files[i] for i in in_right], rig.calibration.size),
+        T_cam_imu=rig.T_cam_body,
         truth=truth if truth is not None and len(truth.frame) else None,
-        notes=("There are no velocities: the IMU gives angular rates and accelerations only.", *notes),
+        notes=("There are no velocities and no inertial samples.", *notes),
         attributes={
             "reader": IMAGES.name,
-            "checksum_sha256": checksum(*(mav / name / "data.csv" for name in CAMERAS), *read),
+            "checksum_sha256": checksum(*(mav / name / "data.csv" for name in CAMERAS), *rig.files),
         },
     )
+    if imu is None:
+        return recording
+    rows, T_body_imu = imu
+    T_cam_imu = None if T_body_imu is None else rig.T_cam_body @ T_body_imu
+    return with_rows(recording, replace(rows, late_s=rig.late_s, T_cam_imu=T_cam_imu))
+
+
+def _inertial(mav: Path) -> tuple[InertialRows, Array | None] | None:
+    """Return the samples of a recording with their densities, and ``T_BS`` of the unit; None: there are none."""
+    path = mav / "imu0/data.csv"
+    if not path.is_file():
+        return None
+    places = (path.parent, mav, mav.parent, mav / "dso", mav.parent / "dso")
+    file = next((file for place in places if (file := beside(place)) is not None), None)
+    rows = read_imu(path)
+    if file is None:
+        return rows, None
+    read = read_imu_yaml(file)
+    notes = rows.notes if file.parent == path.parent else (*rows.notes, *read.notes)
+    return replace(rows, noise=read.noise, notes=notes), read.T_body_imu
 
 
 def _mav(folder: Path) -> Path | None:
@@ -79,49 +116,95 @@ def _mav(folder: Path) -> Path | None:
     return next((place for place in (folder / "mav0", folder) if (place / CAMERAS[0] / "data.csv").is_file()), None)
 
 
-def _images(camera: Path) -> tuple[IntArray, list[Path]]:
-    """Return increasing stamps (ns) and files of a camera."""
+class _Images(NamedTuple):
+    """Increasing stamps (T,) and files of a camera, stamps of missing files, and a note on these."""
+
+    time_ns: IntArray
+    files: list[Path]
+    missing_ns: IntArray
+    notes: tuple[str, ...]
+
+    def without(self, time_ns: IntArray) -> _Images:
+        """Return the images whose stamps are not among some."""
+        kept = np.flatnonzero(~np.isin(self.time_ns, time_ns))
+        return self._replace(time_ns=self.time_ns[kept], files=[self.files[i] for i in kept])
+
+
+def _images(camera: Path) -> _Images:
+    """Return the images of a camera; missing files are left out with a note."""
     path = camera / "data.csv"
     stamps: list[int] = []
     files: list[Path] = []
+    missing: list[int] = []
     there = {entry.name for entry in (camera / "data").iterdir()} if (camera / "data").is_dir() else set()
+    last = -1
     for number, content in rows_of(read_lines(path, "expected stamps and names of images")):
         words = [word.strip() for word in content.split(",")]
         if len(words) < 2 or not words[0].isdigit() or int(words[0]) >= 1 << 63:
-            if not stamps and not any(word.isdigit() for word in words):
+            if last < 0 and not any(word.isdigit() for word in words):
                 continue  # a header without the mark of a comment
             raise LineError(f"{content!r} is no stamp in ns and a name", **line_of(path, number))
-        if words[1] not in there:
-            raise LostDataError(f"the image {words[1]} is missing in {camera / 'data'}", **line_of(path, number))
-        stamp = int(words[0])
-        if stamps and stamp <= stamps[-1]:
+        stamp, name = int(words[0]), words[1]
+        if stamp <= last:
             raise StampError("the stamp does not increase", **line_of(path, number))
+        last = stamp
+        if name not in there:
+            if Path(name).name != name or not there:
+                raise LostDataError(f"the image {name} is missing in {camera / 'data'}", **line_of(path, number))
+            missing.append(stamp)
+            continue
         stamps.append(stamp)
-        files.append(camera / "data" / words[1])
+        files.append(camera / "data" / name)
+    if missing and not stamps:
+        message = f"none of its {len(missing)} images is in {camera / 'data'}"
+        raise LostDataError(message, source=str(path), field="line")
     if not stamps:
         raise LineError("there are no images", source=str(path), field="line")
-    return np.array(stamps, dtype=np.int64), files
+    note = (
+        f"{camera.name}: {len(missing)} images of data.csv are missing, the first at {missing[0]} ns."
+        if missing
+        else ""
+    )
+    missing_ns = np.array(missing, dtype=np.int64)
+    return _Images(np.array(stamps, dtype=np.int64), files, missing_ns, (note,) if note else ())
 
 
-def _calibration(mav: Path) -> tuple[PairCalibration, Array, tuple[Path, ...]]:
-    """Return the calibration of the pair, ``T_cam_imu`` of its left camera, and the files read."""
-    kalibr = next((place / name for place in (mav, mav.parent) for name in _KALIBR if (place / name).is_file()), None)
+class _Rig(NamedTuple):
+    """Calibration of the pair, pose of the body in the left camera, and what else the files say.
+
+    Args:
+        late_s: Stamp of an inertial sample less that of an image of the same instant.
+    """
+
+    calibration: PairCalibration
+    T_cam_body: Array
+    late_s: float
+    files: tuple[Path, ...]
+    notes: tuple[str, ...]
+
+
+def _calibration(mav: Path) -> _Rig:
+    """Return the calibration of the pair and of the body."""
+    places = [place / sub for place in (mav, mav.parent) for sub in ("dso", ".")]
+    kalibr = next((file for place in places if (file := beside(place, CHAINS)) is not None), None)
     paths = [mav / name / "sensor.yaml" for name in CAMERAS]
+    late, notes = 0.0, tuple[str, ...]()
     if not paths[0].is_file() and kalibr is not None:
         read = read_yaml(kalibr)
         cameras = [_camera(read, f"{name}.", "distortion_coeffs") for name in CAMERAS]
-        poses = [_kalibr_pose(read, name) for name in CAMERAS]
-        paths = [kalibr]
+        (T_left, notes), (T_right, _) = (_kalibr_pose(read, name) for name in CAMERAS)
+        paths, late = [kalibr], late_s(read, CAMERAS[0])
     else:
         reads = [read_yaml(path) for path in paths]
         cameras = [_camera(read, "", "distortion_coefficients") for read in reads]
-        poses = [se3.inverse(_pose(read, "T_BS.data" if "T_BS.data" in read else "T_BS")) for read in reads]
+        T_left, T_right = (se3.inverse(pose_of(read, "T_BS.data" if "T_BS.data" in read else "T_BS")) for read in reads)
     (K_left, size, lens_left), (K_right, size_right, lens_right) = cameras
     with spelled_as_in(str(paths[-1])):
         if size_right != size:
             raise CalibrationError(f"{size_right} differs from {size} of the left camera", field="resolution")
-        T_right_left = poses[1] @ se3.inverse(poses[0])
-        return PairCalibration(K_left, K_right, size, T_right_left, lens_left, lens_right), poses[0], tuple(paths)
+        T_right_left = T_right @ se3.inverse(T_left)
+        calibration = PairCalibration(K_left, K_right, size, T_right_left, lens_left, lens_right)
+        return _Rig(calibration, T_left, late, tuple(paths), notes)
 
 
 def _camera(read: Calibration, prefix: str, coefficients: str) -> tuple[Array, tuple[int, int], Distortion]:
@@ -141,19 +224,14 @@ def _camera(read: Calibration, prefix: str, coefficients: str) -> tuple[Array, t
     return np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]]), (int(width), int(height)), lens
 
 
-def _pose(read: Calibration, key: str) -> Array:
-    pose = read.numbers(key, 16).reshape(4, 4)
-    with spelled_as_in(str(read.path)):
-        require_rigid(pose, key, ExtrinsicsError)
-    return se3.nearest_rigid(pose)
-
-
-def _kalibr_pose(read: Calibration, name: str) -> Array:
-    """Return ``T_cam_imu`` of a camera; Kalibr may state that of the second relative to the first."""
-    key = f"{name}.T_cam_imu"
-    if key not in read and f"{name}.T_cn_cnm1" in read:
-        return _pose(read, f"{name}.T_cn_cnm1") @ _kalibr_pose(read, CAMERAS[0])
-    return _pose(read, key)
+def _kalibr_pose(read: Calibration, name: str) -> tuple[Array, tuple[str, ...]]:
+    """Return ``T_cam_imu`` of a camera, and notes; Kalibr may state that of the second relative to the first."""
+    if (found := chain_of(read, name)) is not None:
+        return found
+    if name != CAMERAS[0] and (key := f"{name}.T_cn_cnm1") in read:
+        T_left, notes = _kalibr_pose(read, CAMERAS[0])
+        return pose_of(read, key) @ T_left, notes
+    return pose_of(read, f"{name}.T_cam_imu"), ()
 
 
 def find_euroc_truth(folder: Path) -> Path | None:
@@ -164,7 +242,8 @@ def find_euroc_truth(folder: Path) -> Path | None:
 def read_euroc(path: Path) -> Poses:
     """Read the poses ``T_R_S`` of the body (the IMU) in the reference frame, from a csv or the csv of a folder.
 
-    They are stamped in ns, with quaternions w first. The header must name these eight columns; others are not read.
+    They are stamped in ns, with quaternions w first. The header must name these eight columns. Velocities and biases
+    are read if the next nine columns hold them; others are not.
     """
     path = find_euroc_truth(path) or path
     lines = read_lines(path, f"expected {TRUTH.expected}")
@@ -173,11 +252,12 @@ def read_euroc(path: Path) -> Poses:
     if not line.startswith("#") or tuple(header[: len(COLUMNS)]) != COLUMNS:
         expected = f"expected #{', '.join(COLUMNS)}, ..."
         raise TruthError(f"the header is missing or differs; {expected}", **line_of(path, number))
+    has_motion = tuple(header[len(COLUMNS) : len(COLUMNS) + len(MOTION)]) == MOTION
     table = parse_table(
         lines,
         path,
         columns=len(header),
-        used=len(COLUMNS),
+        used=len(COLUMNS) + has_motion * len(MOTION),
         separator=",",
         # Nanoseconds since 1970 have more digits than a float; as integers they lose none.
         converters={0: lambda word: int(word) / 1e9},
@@ -185,7 +265,8 @@ def read_euroc(path: Path) -> Poses:
     )
     if not len(table.values):
         raise UnknownFormatError(f"{path}: holds no poses; expected lines of {', '.join(COLUMNS)}, ...")
-    return stamped_poses(Table(path, table.values[:, _AS_TUM], table.line))
+    poses = stamped_poses(Table(path, table.values[:, _AS_TUM], table.line))
+    return replace(poses, motion=TrueMotion(*np.split(table.values[:, 8:17], 3, axis=1))) if has_motion else poses
 
 
 def _has_truth(source: Source) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
+from ekfslam.data.observations import TrueMotion
 from ekfslam.data.readers.text import Table
 from ekfslam.data.sequence import Truth
 from ekfslam.data.truth_noise import TruthNoise
@@ -26,12 +27,14 @@ class Poses:
         time_s: (F,) increasing stamps; None if row i is the pose of frame i.
         files: Files that were read.
         noise: Accuracy of the poses; None if the format does not state it.
+        motion: Velocities and biases of the same rows; None if the file has none.
     """
 
     T_world_imu: Array
     time_s: Array | None
     files: tuple[Path, ...]
     noise: TruthNoise | None = None
+    motion: TrueMotion | None = None
 
 
 def stamped_poses(table: Table) -> Poses:
@@ -57,7 +60,9 @@ def truth_of_frames(time_s: Array, poses: Poses) -> Truth:
     # Nearest in both directions, so that no pose serves two frames.
     mutual = nearest(time_s, poses.time_s)[row] == np.arange(len(time_s))
     frame = np.flatnonzero(mutual & (np.abs(poses.time_s[row] - time_s) <= tolerance_s))
-    return Truth(frame, poses.T_world_imu[row[frame]], noise=poses.noise)
+    found, of_frames = poses.motion, row[frame]
+    motion = None if found is None else TrueMotion(*(value[of_frames] for value in vars(found).values()))
+    return Truth(frame, poses.T_world_imu[of_frames], noise=poses.noise, motion=motion)
 
 
 def nearest(ascending: Array | IntArray, wanted: Array | IntArray) -> IntArray:

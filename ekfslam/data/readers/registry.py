@@ -19,13 +19,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ekfslam.data.images import ImageRecording
+from ekfslam.data.inertial import InertialRows
 from ekfslam.data.inputs import VelocitySamples
 from ekfslam.data.readers.poses import Poses
 from ekfslam.data.sequence import Sequence
 
 Extrinsics = Literal["corrected", "as-stored"]
 Lateral = Literal["corrected", "as-stored"]
-Kind = Literal["tracks", "images", "truth", "inputs"]
+Kind = Literal["tracks", "images", "truth", "inputs", "inertial"]
 
 _HEAD_BYTES = 128
 
@@ -81,6 +82,7 @@ class Reader:
         images: Reader of stereo images.
         truth: Reader of true poses, for a sequence whose extrinsics it may need.
         inputs: Reader of velocities for another recording.
+        inertial: Reader of inertial samples for another recording.
     """
 
     name: str
@@ -90,6 +92,7 @@ class Reader:
     images: Callable[[Source], ImageRecording | None] | None = None
     truth: Callable[[Source, Sequence], Poses | None] | None = None
     inputs: Callable[[Source], VelocitySamples | None] | None = None
+    inertial: Callable[[Source], InertialRows | None] | None = None
 
 
 def readers(*kinds: Kind) -> tuple[Reader, ...]:

@@ -1,0 +1,82 @@
+"""Inertial samples from elsewhere: of a file, a folder or a bag, for a recording of tracks or of images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ekfslam.data.images import ImageRecording
+from ekfslam.data.inertial import InertialRows, covered_frames, samples_of
+from ekfslam.data.inputs import Velocities
+from ekfslam.data.readers.imu_yaml import read_imu_yaml
+from ekfslam.data.readers.registry import Source, expected, read_as
+from ekfslam.data.velocities import NO_VELOCITIES, Recording
+from ekfslam.errors import CalibrationError, UnknownFormatError
+from ekfslam.geometry import se3
+from ekfslam.geometry.camera import T_CAM_BODY
+
+
+def attach_inertial(recording: Recording, path: str | Path, noise: str | Path | None = None) -> Recording:
+    """Return a recording, of tracks or of images, with the inertial samples of a file in place of its own.
+
+    The body of the recording has to be the inertial unit, unless the source of the samples states ``T_cam_imu``.
+
+    Args:
+        recording: Recording, with velocities or without.
+        path: Text file (see `readers.imu_text`), folder ``imu0`` of EuRoC, bag, or .npz with arrays of samples.
+        noise: ``sensor.yaml`` or ``imu.yaml`` with the densities; by default such a file beside the samples.
+
+    Raises:
+        UnknownFormatError: A file is missing or of unknown content.
+        CalibrationError: The file of densities does not state all four.
+        StampError: Stamps go back, or have an impossible rate.
+        LostDataError: The samples do not cover two frames.
+        DataError: A line is malformed, or units cannot be right; the error says what to do.
+    """
+    source = Source.at(path)
+    rows: InertialRows | None = read_as(source, "inertial")
+    if rows is None:
+        raise UnknownFormatError(
+            f"{path}: no inertial samples ({source.problem or 'unknown content'}); {expected('inertial')}"
+        )
+    if noise is not None:
+        read = read_imu_yaml(Path(noise))
+        if read.noise is None:
+            raise CalibrationError(" ".join(read.notes), source=str(noise))
+        rows = replace(rows, noise=read.noise)
+    return with_rows(recording, rows)
+
+
+def with_rows(recording: Recording, rows: InertialRows) -> Recording:
+    """Return a recording with samples on its clock; frames that they do not cover are left out. See `samples_of`."""
+    found: tuple[str, ...]
+    samples, found = samples_of(rows)
+    begin, end = covered_frames(samples, recording.time_s, rows.source)
+    notes: list[str] = [note for note in recording.notes if not note.startswith(NO_VELOCITIES)]
+    notes += [f"Inertial samples from {rows.source}.", *found]
+    if (left_out := len(recording.time_s) - (end - begin)) > 0:
+        recording = recording[begin:end]
+        notes.append(f"{left_out} frames before or after all inertial samples are left out.")
+    changes: dict[str, Any] = {} if rows.T_cam_imu is None else _of_body(recording, rows)
+    if np.array_equal(changes.get("T_cam_imu", recording.T_cam_imu), T_CAM_BODY):
+        notes.append("No file states T_cam_imu: the inertial unit is taken to be the left camera, x forward.")
+    attributes = {**recording.attributes, **rows.attributes}
+    if isinstance(recording, ImageRecording):
+        changes["inertial"] = samples
+    else:
+        changes["inputs"] = (*(each for each in recording.inputs if isinstance(each, Velocities)), samples)
+    return replace(recording, notes=tuple(notes), attributes=attributes, **changes)
+
+
+def _of_body(recording: Recording, rows: InertialRows) -> dict[str, Any]:
+    """Return the extrinsics of the inertial unit, and the truth of the recording for it."""
+    assert rows.T_cam_imu is not None
+    changes: dict[str, Any] = {"T_cam_imu": rows.T_cam_imu}
+    moved = se3.inverse(recording.T_cam_imu) @ rows.T_cam_imu
+    if recording.truth is not None and np.abs(moved - np.eye(4)).max() > 1e-6:
+        T_world_imu = recording.truth.T_world_imu @ moved
+        changes["truth"] = replace(recording.truth, T_world_imu=T_world_imu, motion=None)
+    return changes
