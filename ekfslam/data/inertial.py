@@ -72,7 +72,7 @@ def samples_of(rows: InertialRows) -> tuple[InertialSamples, tuple[str, ...]]:
         ShapeError: There are less than two samples.
         DataError: The units cannot be right.
     """
-    rows, notes = _in_order(rows)
+    rows, notes = in_order(rows)
     if len(rows.time_ns) < 2:
         raise ShapeError(f"there are {len(rows.time_ns)} inertial samples, two are needed", source=rows.source)
     noise = rows.noise
@@ -87,8 +87,8 @@ def samples_of(rows: InertialRows) -> tuple[InertialSamples, tuple[str, ...]]:
     return samples, (*rows.notes, *notes, *inertial_notes(samples, rows.source))
 
 
-def _in_order(rows: InertialRows) -> tuple[InertialRows, list[str]]:
-    """Return the rows with increasing stamps, and notes."""
+def in_order(rows: InertialRows) -> tuple[InertialRows, list[str]]:
+    """Return the rows with increasing stamps, and notes; raise `StampError` for stamps that go back unless sorted."""
     notes, steps = [], np.diff(rows.time_ns)
     back = np.flatnonzero(steps < 0)
     if len(back):

@@ -191,3 +191,24 @@ def write(folder: Path, bag: Written, kind: str = "ros2") -> Path:
             data = store.serialize_ros1(content, name) if is_ros1 else store.serialize_cdr(content, name)
             writer.write(streams[topic], stamp + 7_000_000, data)  # written later than stamped
     return next(path.glob("*.mcap")) if kind == "mcap" else path
+
+
+def imu(
+    stamp_ns: int, rate: Any, force: Any, frame: str = "imu", is_known: tuple[bool, bool] = (True, True)
+) -> Callable[[Any], Any]:
+    """A message of an inertial unit; what it does not know is 0, with -1 for its first covariance."""
+
+    def make(types: Any) -> Any:
+        covariances = [np.zeros(9) if known else np.array([-1.0, *[0.0] * 8]) for known in is_known]
+        turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+        return types["sensor_msgs/msg/Imu"](
+            header=header(types, stamp_ns, frame),
+            orientation=turn,
+            orientation_covariance=np.array([-1.0, *[0.0] * 8]),
+            angular_velocity=vector(types, np.asarray(rate) * is_known[0]),
+            angular_velocity_covariance=covariances[0],
+            linear_acceleration=vector(types, np.asarray(force) * is_known[1]),
+            linear_acceleration_covariance=covariances[1],
+        )
+
+    return make

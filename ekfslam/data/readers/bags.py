@@ -6,7 +6,7 @@ The package rosbags reads them; it is an extra: ``pip install 'ekfslam[bags]'``.
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,27 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.checks import spelled_as_in
 from ekfslam.data.images import Distortion, DistortionModel, Image, ImageRecording, PairCalibration, side_by_side
+from ekfslam.data.imu import with_rows
+from ekfslam.data.inertial import InertialRows
 from ekfslam.data.inputs import VelocitySamples
 from ekfslam.data.readers import messages
+from ekfslam.data.readers.bag_imu import imu_of_bag, inertial_of, velocities_of_unit
 from ekfslam.data.readers.fields import BODY_IS_CAMERA
-from ekfslam.data.readers.messages import CAMERA_INFO, COMPRESSED, IMAGE, ODOMETRY, TRANSFORMS, VELOCITIES, Bag
+from ekfslam.data.readers.imu_yaml import CHAINS, beside, chain_of, late_s
+from ekfslam.data.readers.messages import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    ODOMETRY,
+    TRANSFORMS,
+    VELOCITIES,
+    Bag,
+    frame_of,
+)
 from ekfslam.data.readers.pictures import pair_stamps
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row
+from ekfslam.data.readers.yaml import read_yaml
 from ekfslam.data.sequence import TWIST_STD
 from ekfslam.data.velocities import is_covered, resample, stated_at
 from ekfslam.errors import CalibrationError, LostDataError, StampError, UnknownFormatError
@@ -52,7 +66,7 @@ class Camera:
     @property
     def frame(self) -> str:
         """Name of the optical frame."""
-        return _frame(self.info.header.frame_id)
+        return frame_of(self.info.header.frame_id)
 
     @property
     def is_rectified(self) -> bool:
@@ -69,10 +83,6 @@ def _parts(topic: str) -> tuple[str, str]:
     """Return space and last part: ``/left`` and ``image_raw`` of ``/left/image_raw/compressed``."""
     space, _, last = topic.removesuffix("/compressed").rpartition("/")
     return space, last
-
-
-def _frame(name: object) -> str:
-    return str(name).lstrip("/")
 
 
 class BagPairs:
@@ -110,11 +120,12 @@ class BagPairs:
 
 
 def open_bag(path: Path) -> ImageRecording:
-    """Open the images of the stereo pair of a bag, its calibration, and its velocities if it has any.
+    """Open the images of the stereo pair of a bag, its calibration, inertial samples and velocities if it has any.
 
     The CameraInfo of the right camera has a baseline in P. Topics with ``rect`` in their last part are rectified
-    images with the camera P; others are as the lens sees them, with K, D and R. The body is the frame of the
-    velocities. If ``/tf_static`` does not connect it to the camera, the body is the left camera.
+    images with the camera P; others are as the lens sees them, with K, D and R. The body is the inertial unit if
+    ``/tf_static``, or a chain of Kalibr beside the bag, connects it to the camera; else the frame of the velocities.
+    If nothing connects that to the camera either, the body is the left camera.
 
     Raises:
         MissingPackageError: rosbags is not installed.
@@ -125,19 +136,18 @@ def open_bag(path: Path) -> ImageRecording:
         in_left, in_right, notes = pair_stamps(places[0][:, 1], places[1][:, 1], str(path))
         calibration, R_cam_optical = _calibration(left, right)
         time_s = places[0][in_left, 1] / 1e9
-        velocities, frame, found = _velocities(bag)
-        T_optical_body, note = _body(bag, left, frame)
-        notes = (*notes, *found, note)
+        velocities, T_optical_body, rows, found = _inputs(bag, left)
+        notes = (*notes, *found)
         twist, used, stated = None, np.ones(len(time_s), dtype=bool), {}
         if velocities is not None:
             used = is_covered(velocities.time_s, time_s)
             if not used.all():
                 notes = (*notes, f"{int((~used).sum())} frames before or after all velocities are left out.")
             twist, how = resample(velocities, time_s[used])
-            notes = (*notes, f"Velocities ({printable(frame)}): {how}.")
+            notes = (*notes, f"Velocities: {how}.")
             stated = stated_at(velocities, time_s[used])
         chosen = (places[0][in_left[used]], places[1][in_right[used]])
-        return ImageRecording(
+        recording = ImageRecording(
             name=path.resolve().stem,
             source=str(path),
             time_s=time_s[used],
@@ -148,6 +158,42 @@ def open_bag(path: Path) -> ImageRecording:
             notes=notes,
             attributes={"reader": READER.name, "topics": printable(f"{left.topic} {right.topic}"), **stated},
         )
+        return recording if rows is None else with_rows(recording, rows)
+
+
+def _inputs(bag: Bag, left: Camera) -> tuple[VelocitySamples | None, Array, InertialRows | None, tuple[str, ...]]:
+    """Return velocities of the body, ``T_optical_body`` (4, 4), inertial samples, and notes."""
+    rows, imu_frame, said = inertial_of(bag, near=left.topic)
+    velocities, frame, found = _velocities(bag)
+    if rows is not None:
+        T_optical_imu, late_s, where = _unit(bag, left, imu_frame)
+        said = (*said, *where)
+        if T_optical_imu is not None:
+            rows = replace(rows, late_s=late_s)
+            if velocities is not None and frame != imu_frame:
+                T_imu_base = _transform(bag, imu_frame, frame)
+                velocities, note = velocities_of_unit(velocities, T_imu_base, imu_frame)
+                said = (*said, note)
+            return velocities, T_optical_imu, rows, (*found, *said)
+    T_optical_body, note = _body(bag, left, frame)
+    return velocities, T_optical_body, None, (*found, *said, note)
+
+
+def _unit(bag: Bag, left: Camera, frame: str) -> tuple[Array | None, float, tuple[str, ...]]:
+    """Return ``T_optical_imu`` (4, 4), None if nothing states it, the lateness of samples in s, and notes."""
+    T = np.eye(4) if frame and frame == left.frame else _transform(bag, left.frame, frame) if frame else None
+    late, notes = 0.0, tuple[str, ...]()
+    chain = beside(bag.path.parent, CHAINS)
+    if chain is not None:
+        read = read_yaml(chain)
+        late = late_s(read, "cam0")
+        if T is None and (found := chain_of(read, "cam0")) is not None:
+            T, notes = found[0], (f"T_cam_imu is that of cam0 in {chain.name}.", *found[1])
+            return T, late, notes
+    if T is not None:
+        return T, late, (f"T_cam_imu is that of {printable(frame)} to {printable(left.frame)} in /tf_static.",)
+    where = f"/tf_static does not connect {printable(frame) or 'it'} and {printable(left.frame)}"
+    return None, late, (f"Inertial samples are not used: {where}; put camchain-imucam.yaml of Kalibr beside the bag.",)
 
 
 def _pair(bag: Bag) -> tuple[Camera, Camera]:
@@ -258,7 +304,7 @@ def _velocities(bag: Bag) -> tuple[VelocitySamples | None, str, tuple[str, ...]]
         twist = message.twist if hasattr(message.twist, "linear") else message.twist.twist
         covariances.append(getattr(message.twist, "covariance", np.zeros(36)))
         name = message.child_frame_id if chosen.msgtype == ODOMETRY else message.header.frame_id
-        frame = frame or _frame(name)
+        frame = frame or frame_of(name)
         linear, angular = twist.linear, twist.angular
         rows.append([messages.stamp_of(message), linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
     table = np.array(rows, dtype=float).reshape(-1, 7)
@@ -291,7 +337,7 @@ def _transform(bag: Bag, target: str, source: str) -> Array | None:
     edges: dict[str, list[tuple[str, Array]]] = {}
     static = [stream for stream in bag.connections(TRANSFORMS) if stream.topic.lstrip("/") == "tf_static"]
     for entry in (entry for stream in static for message in bag.messages(stream) for entry in message.transforms):
-        parent, child = _frame(entry.header.frame_id), _frame(entry.child_frame_id)
+        parent, child = frame_of(entry.header.frame_id), frame_of(entry.child_frame_id)
         T_parent_child = messages.transform_of(entry.transform)
         edges.setdefault(parent, []).append((child, T_parent_child))
         edges.setdefault(child, []).append((parent, se3.inverse(T_parent_child)))
@@ -314,4 +360,10 @@ def _recognises(source: Source) -> bool:
     )
 
 
-READER = Reader("bag", "a bag of ROS 1 or ROS 2, or MCAP", _recognises, images=lambda source: open_bag(source.path))
+READER = Reader(
+    "bag",
+    "a bag of ROS 1 or ROS 2, or MCAP",
+    _recognises,
+    images=lambda source: open_bag(source.path),
+    inertial=lambda source: imu_of_bag(source.path),
+)

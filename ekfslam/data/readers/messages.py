@@ -24,7 +24,7 @@ from ekfslam.names import printable
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, TRANSFORMS = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
-ODOMETRY = "nav_msgs/msg/Odometry"
+ODOMETRY, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
 VELOCITIES = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped", ODOMETRY)
 
 ROS1_MAGIC = b"#ROSBAG V2.0"
@@ -125,6 +125,11 @@ def stamp_of(message: Any) -> float:
     """Return the stamp in the header of a message, s."""
     stamp = message.header.stamp
     return float(stamp.sec) + float(stamp.nanosec) / 1e9
+
+
+def frame_of(name: object) -> str:
+    """Return the name of a frame without the leading slash of ROS 1."""
+    return str(name).lstrip("/")
 
 
 def matrix_of(info: Any, name: str, rows: int) -> Array:
