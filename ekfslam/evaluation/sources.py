@@ -19,7 +19,7 @@ from ekfslam.data.tracks import adjacent
 from ekfslam.data.truth_noise import Doubt, doubt_attributes
 from ekfslam.evaluation.evidence import AXES
 from ekfslam.geometry import motion, se3
-from ekfslam.geometry.camera import MOTION_FROM_PX, rectified_rows
+from ekfslam.geometry.camera import MOTION_FROM_PX, StereoCamera, rectified_rows
 from ekfslam.geometry.stereo_motion import agrees, linearise
 
 STRETCH_S = 2.0
@@ -33,6 +33,7 @@ _TAIL = 1e-5  # probability of naming a correct source in one axis of one stretc
 _SURE_OF_DRIFT = 2.0  # standard errors of its variance
 _SURE = 12.0  # twice the log likelihood ratio to the next source
 _LEAST_POINTS, _POINTS = 6, 50  # of a frame
+_AT_ONCE = 5000  # points
 _STD_PX, _AGREE_PX, _AGREE_SHARE = 0.2, 2.0, 0.5
 _SCALES = (50.0, 15.0, 5.0, 2.0, 2.0)  # of the robust kernel, from errors of the velocities down to `align`'s
 
@@ -78,24 +79,38 @@ def visual_motion(sequence: Sequence) -> tuple[Array, BoolArray]:
     order = np.argsort(o.frame[later], kind="stable")
     earlier, later = earlier[order], later[order]
     at, starts = np.unique(o.frame[later], return_index=True)
-    which = np.repeat(np.arange(len(at)), np.diff(starts, append=len(later)))
     tau_s = np.diff(sequence.time_s, prepend=sequence.time_s[0])
     T = C @ motion.increment(sequence.twist, tau_s) @ se3.inverse(C)
-    true_px, known = rows[earlier], np.zeros(frames, dtype=bool)
-    known[at] = np.bincount(which, minlength=len(at)) >= _LEAST_POINTS
-    for scale in _SCALES if len(at) else ():
-        found = linearise(sequence.camera, rows[earlier], rows[later], T[at][which], true_px, _STD_PX, scale)
+    known = np.zeros(frames, dtype=bool)
+    known[at] = np.diff(starts, append=len(later)) >= _LEAST_POINTS
+    bounds = np.append(starts, len(later))
+    # Some thousand points at once: all of a long drive would take gigabytes.
+    for part in np.array_split(np.arange(len(at)), max(1, len(later) // _AT_ONCE)):
+        points = slice(bounds[part[0]], bounds[part[-1] + 1]) if len(part) else slice(0)
+        own, frame = bounds[part] - bounds[part[:1]], at[part]
+        before, now = rows[earlier[points]], rows[later[points]]
+        T[frame], agree = _aligned(sequence.camera, before, now, T[frame], own)
+        known[frame] &= agree
+    twist = sequence.twist.copy()
+    twist[1:][known[1:]] = -se3.log(se3.inverse(C) @ T[1:] @ C)[known[1:]] / tau_s[1:, None][known[1:]]
+    return twist, known
+
+
+def _aligned(
+    camera: StereoCamera, before_px: Array, now_px: Array, T: Array, starts: IntArray
+) -> tuple[Array, BoolArray]:
+    """Return the motions (k, 4, 4) of points (n, 3) of frames that begin at ``starts`` (k,), and if enough agree."""
+    true_px, counts = before_px, np.diff(starts, append=len(now_px))
+    which = np.repeat(np.arange(len(T)), counts)
+    for scale in _SCALES if len(T) else ():
+        found = linearise(camera, before_px, now_px, T[which], true_px, _STD_PX, scale)
         true_px, HW = found.true_px, np.swapaxes(found.H, 1, 2) @ found.W
         r = np.where(np.isfinite(found.residual_px), found.residual_px, 0.0)
         information, gradient = (np.add.reduceat(sums, starts) for sums in (HW @ found.H, HW @ r[..., None]))
         step: Array = np.linalg.solve(information + 1e-6 * np.eye(6), gradient)[..., 0].astype(float)
-        T[at] = se3.exp(step) @ T[at]
-    if len(at):
-        counts = np.diff(starts, append=len(later))
-        known[at] &= np.add.reduceat(agrees(found, _AGREE_PX), starts, dtype=np.int64) >= _AGREE_SHARE * counts
-    twist = sequence.twist.copy()
-    twist[1:][known[1:]] = -se3.log(se3.inverse(C) @ T[1:] @ C)[known[1:]] / tau_s[1:, None][known[1:]]
-    return twist, known
+        T = se3.exp(step) @ T
+    agree = np.add.reduceat(agrees(found, _AGREE_PX), starts, dtype=np.int64) if len(T) else counts
+    return T, agree >= _AGREE_SHARE * counts
 
 
 def compare_sources(sequence: Sequence) -> Comparison | None:

@@ -17,12 +17,13 @@ from ekfslam.models.blocks import PreviousView, View
 from ekfslam.models.model import Model
 from ekfslam.models.observation import landmark_by_pose
 from ekfslam.models.observer import GIVEN, Camera, Moment, Projected
-from ekfslam.smoother.sparse.factors import Factor, Term
+from ekfslam.smoother.sparse.factors import Factor, Term, concatenated
 from ekfslam.smoother.unknowns import State, Unknowns, split
 from ekfslam.smoother.views import Observed, Sight, Views, views_of_frame
 
 # Prior of a landmark about its initialisation: too weak to matter to a landmark with a depth.
 LANDMARK_PRIOR_M = 1e4
+_AT_ONCE = 20_000  # observations that are linearised as filtered: those of a long drive would take gigabytes
 
 
 class ObservationFactors:
@@ -125,50 +126,37 @@ class ObservationFactors:
         r = self.prior_weight * (self.first_position_m - state.positions_m)
         return [Factor(r, (Term("landmarks", landmarks, J),))]
 
-    def _whitened(self, H_x: Array, H_before: Array, H_m: Array, r: Array) -> list[Factor]:
-        """Return the factors of single observations and of differences.
-
-        Args:
-            H_x: (K, d, seen) Jacobians by the blocks of the frame of each observation.
-            H_before: (j, d, seen) those of differences by the blocks of the frame before.
-            H_m, r: (K, d, 3), (K, d).
-        """
-        log, u, scale = self._log, self._unknowns, 1.0 / np.sqrt(self._log.variance)
-        observed, factors = u.drive_columns < H_x.shape[-1], []
-        drive = u.drive_columns[observed]
-        for is_difference in (False, True):
-            which = np.flatnonzero(self._is_difference == is_difference)
-            if not len(which):
-                continue
-            H, wide, n = H_x[which], scale[which][..., None], len(which)
-            J_drive = np.zeros((*H.shape[:2], len(observed)))
-            J_drive[..., observed] = wide * (H[..., drive] - H_before[..., drive] if is_difference else H[..., drive])
-            terms = [
-                Term("frames", log.frame[which], wide * H[..., u.frame_columns]),
-                Term("drive", np.zeros(n, dtype=np.int64), J_drive),
-                Term("landmarks", log.landmark[which], wide * H_m[which]),
-            ]
-            if is_difference:
-                terms.append(Term("frames", log.frame[which] - 1, -wide * H_before[..., u.frame_columns]))
-            factors.append(Factor(scale[which] * r[which], tuple(terms), which))
-        return factors
-
     # --- as filtered --------------------------------------------------------------------------------------------------
 
     @cached_property
+    def _by_coordinates(self) -> dict[str, Camera]:
+        """The cameras (2, T) of single observations and of differences at coordinates of the log, by their name."""
+        return {name: self._cameras(getattr(self._log, name)) for name in ("departed", "linear", "updated")}
+
+    @property
     def frozen_views(self) -> Camera:
         """The cameras (T) of single observations where the filter predicted them."""
-        return self._cameras(self._log.departed).at(0)
+        return self._by_coordinates["departed"].at(0)
 
     def frozen(self) -> list[Factor]:
         """Return the factors where the filter linearised them; residuals count from the coordinates of the log."""
-        log, first, layout = self._log, self._is_first, self._model.layout
-        k, position, first_position = log.frame, log.position_m, log.first_position_m[log.landmark]
+        parts: tuple[list[Factor], list[Factor]] = [], []
+        for begin in range(0, self._log.observations, _AT_ONCE):
+            some = np.arange(begin, min(begin + _AT_ONCE, self._log.observations))
+            for part, factor in zip(parts, self._frozen(some), strict=True):
+                part += factor
+        return [concatenated(part) for part in parts if part]
+
+    def _frozen(self, some: IntArray) -> tuple[list[Factor], list[Factor]]:
+        """Return the factors of some successive observations (n,): single ones, and differences, if there are any."""
+        log, layout, first = self._log, self._model.layout, self._is_first[some]
+        k, position, first_position = log.frame[some], log.position_m[some], log.first_position_m[log.landmark[some]]
         linear_position = first_position if log.first_estimates else position
         # A new landmark is initialised after the update of its frame; all others are linearised before it.
-        at = self._is_difference.astype(np.int64), k
-        updated, predicted = self._cameras(log.updated).at(0).at(k), self._cameras(log.departed).at(*at)
-        T_cam_imu = np.where(first[:, None, None], updated.T_cam_imu, self._cameras(log.linear).at(*at).T_cam_imu)
+        at = self._is_difference[some].astype(np.int64), k
+        of = self._by_coordinates
+        updated, predicted = of["updated"].at(0).at(k), of["departed"].at(*at)
+        T_cam_imu = np.where(first[:, None, None], updated.T_cam_imu, of["linear"].at(*at).T_cam_imu)
         W = T_cam_imu @ np.where(first[:, None, None], log.T_updated[k], log.T_linear[k])
         W_first, by = predicted.T_cam_imu @ log.T_predicted[k], predicted.by
         by = _carried_back(W, W_first, ~first) @ by
@@ -180,18 +168,50 @@ class ObservationFactors:
         if log.first_estimates:  # a new landmark follows the predicted camera
             seen.H_z[first] = -seen.H_m[first] @ landmark_by_pose(W_first[first], first_position[first])
         H_x, H_m = self._model.observer.by_body(seen, by), seen.H_m
-        r = log.rows - seen.z + (H_x @ (x - log.departed[0])[:, : layout.seen, None])[..., 0]
-        H_before = H_x[:0]
-        if len(self._follows):
-            H_before = self._subtract_frozen_before(H_m, r, x[self._follows], linear_position[self._follows])
-        r += (H_m @ (position - first_position)[..., None])[..., 0]
-        return self._whitened(H_x, H_before, H_m, r)
+        r = log.rows[some] - seen.z + (H_x @ (x - log.departed[0])[:, : layout.seen, None])[..., 0]
+        shift = (position - first_position)[..., None]
+        found: tuple[list[Factor], list[Factor]] = [], []
+        single, follows = np.flatnonzero(at[0] == 0), np.flatnonzero(at[0])
+        if len(follows):
+            H_before, H_m_before, r_before = self._frozen_before(some[follows], x[follows], linear_position[follows])
+            H_m[follows] -= H_m_before
+            r[follows] -= r_before
+        r += (H_m @ shift)[..., 0]
+        for kind, which, H in ((0, single, None), (1, follows, H_before if len(follows) else None)):
+            if len(which):
+                found[kind].append(self._whitened(some[which], H_x[which], H, H_m[which], r[which]))
+        return found
 
-    def _subtract_frozen_before(self, H_m: Array, r: Array, x: Array, linear_position: Array) -> Array:
-        """Turn observations into differences, in place; return their H (j, d, seen) by the frame before."""
-        log, follows, layout, observer = self._log, self._follows, self._model.layout, self._model.observer
+    def _whitened(self, which: IntArray, H_x: Array, H_before: Array | None, H_m: Array, r: Array) -> Factor:
+        """Return the factor of single observations (n,), or of differences.
+
+        Args:
+            which: (n,) numbers in the log.
+            H_x: (n, d, seen) Jacobians by the blocks of the frame of each observation.
+            H_before: (n, d, seen) those of differences by the blocks of the frame before.
+            H_m, r: (n, d, 3), (n, d).
+        """
+        log, u, scale = self._log, self._unknowns, 1.0 / np.sqrt(self._log.variance[which])
+        observed, wide = u.drive_columns < H_x.shape[-1], scale[..., None]
+        drive = u.drive_columns[observed]
+        J_drive = np.zeros((*H_x.shape[:2], len(observed)))
+        J_drive[..., observed] = wide * (
+            H_x[..., drive] if H_before is None else H_x[..., drive] - H_before[..., drive]
+        )
+        terms = [
+            Term("frames", log.frame[which], wide * H_x[..., u.frame_columns]),
+            Term("drive", np.zeros(len(which), dtype=np.int64), J_drive),
+            Term("landmarks", log.landmark[which], wide * H_m),
+        ]
+        if H_before is not None:
+            terms.append(Term("frames", log.frame[which] - 1, -wide * H_before[..., u.frame_columns]))
+        return Factor(scale * r, tuple(terms), which)
+
+    def _frozen_before(self, follows: IntArray, x: Array, linear_position: Array) -> tuple[Array, Array, Array]:
+        """Return ``H_x`` (j, d, seen), ``H_m`` (j, d, 3) and r (j, d) of the observations before differences (j,)."""
+        log, layout, observer = self._log, self._model.layout, self._model.observer
         k, view, start = log.frame[follows], layout[PreviousView.name], log.departed[0]
-        predicted, updated = self.frozen_views.at(k - 1), self._cameras(log.updated).at(0).at(k - 1)
+        predicted, updated = self.frozen_views.at(k - 1), self._by_coordinates["updated"].at(0).at(k - 1)
         W, W_updated = (updated.T_cam_imu @ T for T in (log.T_linear_before[k], log.T_updated[k - 1]))
         z_updated = (predicted.by @ log.updated[k - 1, : layout.seen, None])[..., 0]
         if log.has_views:
@@ -204,9 +224,8 @@ class ObservationFactors:
         z -= (predicted.by @ start[: layout.seen, None])[..., 0]
         shifted = (before.H_z @ D @ z[..., None])[..., 0]
         shifted += (before.H_i @ (x - start)[:, observer.intrinsic, None])[..., 0]
-        r[follows] -= log.rows[log.previous[follows]] - before.z + shifted
-        H_m[follows] -= before.H_m
-        return observer.by_body(before, D @ predicted.by)
+        r = log.rows[log.previous[follows]] - before.z + shifted
+        return observer.by_body(before, D @ predicted.by), before.H_m, r
 
     def _cameras(self, coordinates: Array) -> Camera:
         """Return the cameras (2, T) of single observations and of differences, given the coordinates (T, body)."""

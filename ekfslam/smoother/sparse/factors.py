@@ -14,7 +14,7 @@ To add a new kind of factor, build it from the state at which the system is line
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -69,6 +69,16 @@ class Factor:
         """Return some of the constraints (n,)."""
         terms = tuple(Term(term.group, term.index[which], term.J[which]) for term in self.terms)
         return Factor(self.r[which], terms, None if self.observation is None else self.observation[which])
+
+
+def concatenated(factors: Sequence[Factor]) -> Factor:
+    """Return one factor with the constraints of several, which come from observations and touch the same groups."""
+    terms = [
+        Term(some[0].group, np.concatenate([term.index for term in some]), np.concatenate([term.J for term in some]))
+        for some in zip(*(factor.terms for factor in factors), strict=True)
+    ]
+    numbers = [factor.observation for factor in factors if factor.observation is not None]
+    return Factor(np.concatenate([factor.r for factor in factors]), tuple(terms), np.concatenate(numbers))
 
 
 @dataclass(frozen=True)
