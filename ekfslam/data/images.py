@@ -23,6 +23,7 @@ DistortionModel = Literal["none", "radtan", "equidistant"]
 
 # Allowed numbers of coefficients of a model.
 _COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
+LEAST_BASELINE_M, LARGEST_BASELINE_M = 0.005, 5.0  # others are named: their unit is probably another one
 _LARGEST_SIDE_PX = 1 << 15  # limit of OpenCV's remap
 
 
@@ -97,6 +98,17 @@ class PairCalibration:
         )
 
 
+def baseline_doubt(baseline_m: float) -> str:
+    """Return a warning about a baseline that is hardly in metres; empty without one."""
+    if baseline_m > LARGEST_BASELINE_M:
+        return (
+            f"the baseline is {baseline_m:.6g} m: the calibration looks as if it were in mm ({baseline_m / 1e3:.4g} m)"
+        )
+    if 0 < baseline_m < LEAST_BASELINE_M:
+        return f"the baseline is {1e3 * baseline_m:.4g} mm: the calibration looks as if it were not in metres"
+    return ""
+
+
 def side_by_side(baseline_m: float) -> Array:
     """Return ``T_right_left`` (4, 4) of a rectified pair."""
     return se3.transform(np.eye(3), np.array([-baseline_m, 0.0, 0.0]))
@@ -141,6 +153,9 @@ class ImageRecording:
             if self.truth is not None:
                 validate_truth(self.truth, len(self.time_s))
         object.__setattr__(self, "name", printable(self.name))
+        doubt = baseline_doubt(float(np.linalg.norm(self.calibration.T_right_left[:3, 3])))
+        if doubt and doubt not in self.notes:
+            object.__setattr__(self, "notes", (doubt, *self.notes))
 
     def __len__(self) -> int:
         return len(self.time_s)

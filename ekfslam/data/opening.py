@@ -9,7 +9,7 @@ from typing import get_args
 from ekfslam.arrays import Array
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.readers.fields import checksum
-from ekfslam.data.readers.poses import Poses, truth_of_frames
+from ekfslam.data.readers.poses import FIRST_IMAGE, Poses, truth_of_frames
 from ekfslam.data.readers.registry import Extrinsics, Lateral, Source, expected, read_as
 from ekfslam.data.readers.text import read_lines, rows_of
 from ekfslam.data.sequence import Sequence
@@ -63,7 +63,8 @@ def attach_truth(sequence: Sequence, path: Path) -> Sequence:
 
     The content decides the format: KITTI odometry, TUM, the csv of EuRoC or a folder with it, or a drive folder of
     KITTI raw. A pose with a stamp is given to the frame with the nearest stamp, if that is within half the median time
-    step. Without stamps, row i is the pose of frame i.
+    step. Without stamps, row i is the pose of frame i. If a recording begins at a later image n of a drive (KITTI), row
+    n is that of its first frame, unless the file of poses was cut there, too (see `truth_of_frames`).
 
     Stamps are compared in seconds as they are stored. If both clocks have different origins, the error names both
     spans. Text after ``#`` is a comment. Extra rows are cut, and missing ones leave frames without truth, with a note.
@@ -83,7 +84,7 @@ def attach_truth(sequence: Sequence, path: Path) -> Sequence:
         number, content = next(iter(rows_of(read_lines(path, formats))), (0, ""))
         found = f"line {number} has {len(content.split())} columns" if content else "holds no poses"
         raise UnknownFormatError(f"{path}: {found}; {formats}")
-    truth = truth_of_frames(sequence.time_s, poses)
+    truth = truth_of_frames(sequence.time_s, poses, int(sequence.attributes.get(FIRST_IMAGE, 0)))
     frames, known, count = len(sequence), len(truth.frame), len(poses.T_world_imu)
     if known < MIN_COVERAGE * frames:
         spans = ""

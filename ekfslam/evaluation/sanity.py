@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, IntArray
+from ekfslam.data.images import baseline_doubt
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import MOVING_M_S, successive
 from ekfslam.evaluation.trajectory import absolute_trajectory_error, distance_along
@@ -97,6 +98,8 @@ def inspect_sequence(sequence: Sequence) -> Sanity:
     """Return figures of a recording, and warnings about likely mistakes in it, before it is run."""
     figures, warnings = _tracks_in_front(sequence)
     unfilled = _unfilled(sequence)
+    if doubt := baseline_doubt(sequence.camera.baseline_m):
+        warnings.append(doubt)
     tau = np.diff(sequence.time_s, prepend=sequence.time_s[:1])
     if len(sequence) > 1:
         figures.insert(0, f"median step {np.median(tau[1:]):.4g} s, longest {tau[1:].max():.4g} s")

@@ -24,7 +24,7 @@ from ekfslam.data.observations import TrueMotion
 from ekfslam.data.readers.fields import checksum
 from ekfslam.data.readers.imu_text import read_imu
 from ekfslam.data.readers.imu_yaml import CHAINS, beside, chain_of, late_s, pose_of, read_imu_yaml
-from ekfslam.data.readers.pictures import PairFiles, pair_stamps
+from ekfslam.data.readers.pictures import SUFFIXES, pair_files, pair_stamps
 from ekfslam.data.readers.poses import Poses, stamped_poses, truth_of_frames
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import Table, first_row, line_of, parse_table, read_lines, rows_of
@@ -33,7 +33,6 @@ from ekfslam.errors import (
     CalibrationError,
     LineError,
     LostDataError,
-    StampError,
     TruthError,
     UnknownFormatError,
 )
@@ -66,10 +65,12 @@ def open_euroc(folder: Path) -> ImageRecording:
     left, right = (_images(mav / name) for name in CAMERAS)
     # An image whose partner is known to be missing is no sign of another clock.
     left, right = left.without(right.missing_ns), right.without(left.missing_ns)
-    in_left, in_right, notes = pair_stamps(left.time_ns, right.time_ns, str(mav))
+    in_left, in_right, alone = pair_stamps(left.time_ns, right.time_ns, str(mav))
     rig, imu = _calibration(mav), _inertial(mav)
     time_s = left.time_ns[in_left] / 1e9
-    notes = (*left.notes, *right.notes, *notes, *rig.notes)
+    files = ([left.files[i] for i in in_left], [right.files[i] for i in in_right])
+    load, deep = pair_files(*files, rig.calibration.size)
+    notes = (*left.notes, *right.notes, *alone, *deep, *rig.notes)
     truth, found = None, find_euroc_truth(mav)
     if found is not None:
         truth = truth_of_frames(time_s, read_euroc(found))
@@ -80,7 +81,7 @@ def open_euroc(folder: Path) -> ImageRecording:
         source=str(folder),
         time_s=time_s,
         calibration=rig.calibration,
-        load=PairFiles([left.files[i] for i in in_left], [right.files[i] for i in in_right], rig.calibration.size),
+        load=load,
         T_cam_imu=rig.T_cam_body,
         truth=truth if truth is not None and len(truth.frame) else None,
         notes=("There are no velocities and no inertial samples.", *notes),
@@ -131,42 +132,37 @@ class _Images(NamedTuple):
 
 
 def _images(camera: Path) -> _Images:
-    """Return the images of a camera; missing files are left out with a note."""
-    path = camera / "data.csv"
-    stamps: list[int] = []
-    files: list[Path] = []
-    missing: list[int] = []
+    """Return the images of a camera; missing files and repeated lines are left out with a note."""
+    path, found, missing, lines = camera / "data.csv", dict[int, Path](), list[int](), list[int]()
     there = {entry.name for entry in (camera / "data").iterdir()} if (camera / "data").is_dir() else set()
-    last = -1
     for number, content in rows_of(read_lines(path, "expected stamps and names of images")):
         words = [word.strip() for word in content.split(",")]
-        if len(words) < 2 or not words[0].isdigit() or int(words[0]) >= 1 << 63:
-            if last < 0 and not any(word.isdigit() for word in words):
+        if len(words) < 2 or not words[0].isdecimal() or int(words[0]) >= 1 << 63:
+            if not lines and not any(word.isdecimal() for word in words):
                 continue  # a header without the mark of a comment
             raise LineError(f"{content!r} is no stamp in ns and a name", **line_of(path, number))
-        stamp, name = int(words[0]), words[1]
-        if stamp <= last:
-            raise StampError("the stamp does not increase", **line_of(path, number))
-        last = stamp
-        if name not in there:
-            if Path(name).name != name or not there:
-                raise LostDataError(f"the image {name} is missing in {camera / 'data'}", **line_of(path, number))
-            missing.append(stamp)
-            continue
-        stamps.append(stamp)
-        files.append(camera / "data" / name)
-    if missing and not stamps:
-        message = f"none of its {len(missing)} images is in {camera / 'data'}"
-        raise LostDataError(message, source=str(path), field="line")
-    if not stamps:
+        lines.append(int(words[0]))
+        if words[1] in there:
+            found.setdefault(lines[-1], camera / "data" / words[1])
+        elif Path(words[1]).name != words[1]:
+            raise LostDataError(f"the image {words[1]} is missing in {camera / 'data'}", **line_of(path, number))
+        else:
+            missing.append(lines[-1])
+    if not lines:
         raise LineError("there are no images", source=str(path), field="line")
-    note = (
-        f"{camera.name}: {len(missing)} images of data.csv are missing, the first at {missing[0]} ns."
-        if missing
-        else ""
-    )
-    missing_ns = np.array(missing, dtype=np.int64)
-    return _Images(np.array(stamps, dtype=np.int64), files, missing_ns, (note,) if note else ())
+    if not found:
+        raise LostDataError(f"none of its {len(lines)} images is in {camera / 'data'}", source=str(path), field="line")
+    extra = {name for name in there if Path(name).suffix.lower() in SUFFIXES} - {file.name for file in found.values()}
+    counts = {
+        f"images of data.csv are missing, the first at {min(missing, default=0)} ns": len(missing),
+        "lines of data.csv repeat a stamp and are left out": len(lines) - len(missing) - len(found),
+        "images have no line in data.csv and are left out": len(extra),
+        "lines of data.csv are before their predecessors; all are sorted": int((np.diff(lines) < 0).sum()),
+    }
+    notes = tuple(f"{camera.name}: {count} {words}." for words, count in counts.items() if count)
+    stamps = sorted(found)
+    as_ns = (np.array(each, dtype=np.int64) for each in (stamps, missing))
+    return _Images(next(as_ns), [found[stamp] for stamp in stamps], next(as_ns), notes)
 
 
 class _Rig(NamedTuple):

@@ -2,12 +2,14 @@
 
 ::
 
-    left = "left"                       # folders of images next to this file; equal names belong together
-    right = "right"
+    left = "left"                       # folders of images next to this file; equal names belong together, in natural
+    right = "right"                     # order. Both may be one folder with left_0001 and right_0001. Optional if
+                                        # the folders have usual names: left right, image_l image_r, cam0 cam1, ...
     times = "times.txt"                 # a stamp a line, s; or rate_hz = 10.0
     T_right_left = [[1, 0, 0, -0.54], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
                                         # left optical frame to right optical frame; or baseline_m = 0.54
     T_cam_imu = [...]                   # optional: IMU to left optical frame
+    bit_depth = 12                      # optional: used bits of 16-bit images; default: by the largest value
     velocities = "velocities.csv"       # optional, see `ekfslam.data.velocities`
 
     [left_camera]
@@ -30,7 +32,7 @@ from ekfslam.arrays import Array
 from ekfslam.data.checks import require_finite, require_shape, spelled_as_in
 from ekfslam.data.images import Distortion, ImageRecording, PairCalibration, side_by_side
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
-from ekfslam.data.readers.pictures import PairFiles, images_in, size_of
+from ekfslam.data.readers.pictures import find_pair, images_of_sides, pair_files
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
 from ekfslam.data.velocities import attach_velocities
@@ -38,7 +40,7 @@ from ekfslam.errors import CalibrationError, DataError, LostDataError, UnknownFo
 from ekfslam.geometry.camera import T_CAM_BODY
 
 FILE = "calibration.toml"
-_KEYS = {"left", "right", "times", "rate_hz", "T_right_left", "baseline_m", "T_cam_imu", "velocities"}
+_KEYS = {"left", "right", "times", "rate_hz", "T_right_left", "baseline_m", "T_cam_imu", "velocities", "bit_depth"}
 _TABLES = {"left_camera", "right_camera"}
 _CAMERA_KEYS = {"intrinsics", "distortion_model", "distortion"}
 
@@ -50,20 +52,22 @@ def open_folder(path: Path) -> ImageRecording:
     """
     file = _file_of(path)
     folder, values = file.parent, _parsed(file)
-    left, right = (images_in(folder / _text(values, key, file)) for key in ("left", "right"))
-    alone = sorted({image.stem for image in left} ^ {image.stem for image in right})
+    left, right = images_of_sides(*(folder / name for name in _folders(values, folder, file)))
+    alone = [
+        image.stem for side, other in ((left, right), (right, left)) for key, image in side.items() if key not in other
+    ]
     if alone:
         raise LostDataError(f"{len(alone)} images have no partner, the first is {alone[0]}", source=str(folder))
-    size = size_of(left[0])
-    notes: tuple[str, ...] = () if "velocities" in values else ("There are no velocities.",)
+    load, notes = pair_files(list(left.values()), [right[key] for key in left], bits=_bits(values, file))
+    notes += () if "velocities" in values else ("There are no velocities.",)
     notes += () if "T_cam_imu" in values else (f"There is no T_cam_imu. {BODY_IS_CAMERA}",)
     with spelled_as_in(str(file)):
         recording = ImageRecording(
             name=folder.resolve().name,
             source=str(path),
             time_s=_stamps(values, folder, file, len(left)),
-            calibration=_pair(values, size),
-            load=PairFiles(left, right, size),
+            calibration=_pair(values, load.size),
+            load=load,
             T_cam_imu=_numbers(values["T_cam_imu"], (4, 4), "T_cam_imu") if "T_cam_imu" in values else T_CAM_BODY,
             notes=notes,
             attributes={"reader": READER.name, "checksum_sha256": checksum(file)},
@@ -90,6 +94,23 @@ def _parsed(file: Path) -> dict[str, Any]:
             message = f"unknown key; known: {', '.join(sorted(known))}"
             raise CalibrationError(message, source=str(file), field=prefix + key)
     return values
+
+
+def _folders(values: dict[str, Any], folder: Path, file: Path) -> tuple[str, str]:
+    """Return the names of the folders of images; by default those with usual names."""
+    if "left" in values or "right" in values:
+        return _text(values, "left", file), _text(values, "right", file)
+    if (found := find_pair(folder)) is None:
+        message = "expected the names of the folders of images; there are none with usual names, such as left and right"
+        raise CalibrationError(message, source=str(file), field="left")
+    return found
+
+
+def _bits(values: dict[str, Any], file: Path) -> int | None:
+    bits = values.get("bit_depth")
+    if bits is not None and not (isinstance(bits, int) and 8 <= bits <= 16):
+        raise CalibrationError(f"expected 8 to 16, found {bits!r}", source=str(file), field="bit_depth")
+    return bits
 
 
 def _text(values: dict[str, Any], key: str, file: Path) -> str:

@@ -10,58 +10,96 @@ from pathlib import Path
 
 import numpy as np
 
+from ekfslam.arrays import Array
 from ekfslam.data.checks import require_rigid
 from ekfslam.data.images import ImageRecording, PairCalibration, side_by_side
 from ekfslam.data.readers.fields import BODY_IS_CAMERA
-from ekfslam.data.readers.pictures import PairFiles, in_order, numbered_images, size_of
-from ekfslam.data.readers.poses import Poses
+from ekfslam.data.readers.pictures import PAIRS, find_pair, in_order, numbered_images, pair_files
+from ekfslam.data.readers.poses import FIRST_IMAGE, Poses
 from ekfslam.data.readers.registry import Reader
-from ekfslam.data.readers.text import first_row, parse_table, read_keys, read_lines
+from ekfslam.data.readers.text import first_row, parse_table, read_keys, read_lines, rows_of
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import CalibrationError, LostDataError, ShapeError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import T_CAM_BODY
 
-_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
 _COLUMNS = 12
+_LABELS = ("P0", "P1")
 
 
 def open_kitti_odometry(folder: Path) -> ImageRecording:
-    """Open a sequence of the benchmark: rectified pairs and stamps, without velocities.
+    """Open a sequence of the benchmark, or a run of its images: rectified pairs and stamps, without velocities.
 
-    The body is the left camera. The gray pair is preferred.
+    Image n has line n of ``times.txt``, counted from 0; or the file begins at the first image, see `_first_line`. The
+    body is the left camera. The gray pair is preferred.
     """
-    names = next((pair for pair in _PAIRS if all((folder / name).is_dir() for name in pair)), None)
-    if names is None:
-        raise UnknownFormatError(
-            f"{folder}: no pair of image folders; expected image_0 and image_1, or image_2 and image_3"
-        )
-    times = parse_table(read_lines(folder / "times.txt", "expected a stamp a line"), folder / "times.txt", columns=1)
-    found = [numbered_images(folder / name) for name in names]
-    frames, stamps = max(max(images) for images in found) + 1, len(times.values)
-    left, right = (in_order(images, range(frames)) for images in found)
-    if frames > stamps:
-        raise LostDataError(f"{frames} images, but {stamps} stamps in times.txt", source=str(folder), field="times.txt")
-    size = size_of(left[0])
-    notes = ["There are no velocities.", BODY_IS_CAMERA]
-    if frames < stamps:
-        notes.append(f"The folder has the first {frames} of {stamps} images.")
+    names = find_pair(folder)
+    lacking = _lacking(folder, names)
+    if lacking or names is None:
+        raise UnknownFormatError(f"{folder}: looks like a folder of KITTI odometry, but lacks {', and '.join(lacking)}")
+    path = folder / "times.txt"
+    times = parse_table(read_lines(path, "expected a stamp a line"), path, columns=1).values[:, 0]
+    sides = (0, 1) if names[0] == names[1] else (None, None)
+    found = [numbered_images(folder / name, side) for name, side in zip(names, sides, strict=True)]
+    first, last = min(map(min, found)), max(map(max, found))
+    frames, stamps = last - first + 1, len(times)
+    left, right = (in_order(images, range(first, last + 1)) for images in found)
+    begin = _first_line(times, first, frames)
+    if begin + frames > stamps:
+        message = f"{frames} images, but {stamps} stamps in times.txt"
+        message = message if first == 0 else f"images {first} to {last}, but {stamps} stamps in times.txt"
+        raise LostDataError(message, source=str(folder), field="times.txt")
+    load, notes = pair_files(left, right)
+    notes += ("There are no velocities.", BODY_IS_CAMERA)
+    if first:
+        notes += (f"The folder has images {first} to {last}; times.txt has {stamps} stamps.",)
+    elif frames < stamps:
+        notes += (f"The folder has the first {frames} of {stamps} images.",)
     if names[0] == "image_2":
-        notes.append("True poses of the benchmark are of the left gray camera, 6 cm from the left colour camera.")
+        notes += ("True poses of the benchmark are of the left gray camera, 6 cm from the left colour camera.",)
+    keys = tuple(f"P{name[-1]}" for name in names) if names in (PAIRS[0], PAIRS[1]) else _LABELS
     return ImageRecording(
         name=folder.resolve().name,
         source=str(folder),
-        time_s=times.values[:frames, 0],
-        calibration=_calibration(folder / "calib.txt", [f"P{name[-1]}" for name in names], size),
-        load=PairFiles(left, right, size),
+        time_s=times[begin : begin + frames],
+        calibration=_calibration(folder / "calib.txt", keys, load.size),
+        load=load,
         T_cam_imu=T_CAM_BODY,
-        notes=tuple(notes),
-        attributes={"reader": IMAGES.name, "images": " ".join(names)},
+        notes=notes,
+        attributes={"reader": IMAGES.name, "images": " ".join(names), **({FIRST_IMAGE: first} if first else {})},
     )
 
 
-def _calibration(path: Path, keys: list[str], size: tuple[int, int]) -> PairCalibration:
+def _first_line(times_s: Array, first: int, frames: int) -> int:
+    """Return the line of the first image, which has a number: that number, or 0 if the file was cut there, too.
+
+    It was if it has as many lines as there are images, or if its first stamp is that of the image: whole files of the
+    benchmark begin at 0 s.
+    """
+    if first and len(times_s) > 1:
+        step_s = float(np.median(np.diff(times_s)))
+        if step_s > 0 and times_s[0] > 0.5 * step_s and abs(times_s[0] / step_s - first) < 0.05 * first + 0.5:
+            return 0
+    return 0 if len(times_s) == frames else first
+
+
+def _lacking(folder: Path, names: tuple[str, str] | None) -> list[str]:
+    """Return the parts of a sequence that a folder lacks, in words."""
+    lacking = []
+    if names is None:
+        lacking.append("a pair of folders of images (image_0 and image_1, image_2 and image_3, or image_l and image_r)")
+    if not (folder / "times.txt").is_file():
+        lacking.append("times.txt (a stamp in seconds a line)")
+    lines = [line for _, line in rows_of(read_lines(folder / "calib.txt", "expected P0: and 12 numbers"))]
+    if not any(":" in line for line in lines):
+        lacking.append(
+            f"labels in calib.txt (P0: and P1: before the 12 numbers of the cameras; {len(lines)} lines have none)"
+        )
+    return lacking
+
+
+def _calibration(path: Path, keys: tuple[str, ...], size: tuple[int, int]) -> PairCalibration:
     """Return the calibration of two cameras of ``calib.txt``, whose images are rectified."""
     values = read_keys(path, dict.fromkeys(keys, _COLUMNS), "expected P0: and 12 numbers")
     left, right = (values[key].reshape(3, 4) for key in keys)
@@ -94,10 +132,17 @@ def read_kitti_odometry(path: Path, sequence: Sequence) -> Poses:
     return Poses(T_world_imu, None, (path,), KITTI_TRUTH_NOISE)
 
 
+def _recognises(folder: Path) -> bool:
+    if not (folder / "calib.txt").is_file():
+        return False
+    words = first_row(folder / "calib.txt").split()
+    return find_pair(folder) is not None or len([word for word in words if not word.endswith(":")]) == _COLUMNS
+
+
 IMAGES = Reader(
     "kitti_odometry_images",
     "a folder of KITTI odometry (image_0 image_1 calib.txt times.txt)",
-    lambda source: (source.path / "calib.txt").is_file() and any((source.path / left).is_dir() for left, _ in _PAIRS),
+    lambda source: _recognises(source.path),
     images=lambda source: open_kitti_odometry(source.path),
 )
 POSES = Reader(

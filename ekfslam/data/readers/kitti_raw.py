@@ -21,7 +21,7 @@ from ekfslam.data.checks import require_rigid, spelled_as_in
 from ekfslam.data.images import ImageRecording, PairCalibration, side_by_side
 from ekfslam.data.readers.fields import checksum
 from ekfslam.data.readers.oxts import EXPECTED, Oxts, image_stamp_notes, read_oxts
-from ekfslam.data.readers.pictures import PairFiles, in_order, numbered_images, size_of
+from ekfslam.data.readers.pictures import in_order, numbered_images, pair_files
 from ekfslam.data.readers.poses import Poses
 from ekfslam.data.readers.registry import Lateral, Reader, Source
 from ekfslam.data.readers.text import read_keys
@@ -129,7 +129,8 @@ def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> Image
         message = f"image {last:010d} has no packet, there are {len(drive)}"
         raise LostDataError(message, source=str(folder), field="oxts")
     left, right = (in_order(images, range(first, last + 1)) for images in found)
-    part, size = drive[first : last + 1], size_of(left[0])
+    part = drive[first : last + 1]
+    load, deep = pair_files(left, right)
     K = np.vstack([part.camera.matrix[:2, :3], [0.0, 0.0, 1.0]])
     notes = tuple(note for note in part.notes if note != _NO_TRACKS)
     if len(part) < len(drive):
@@ -139,13 +140,13 @@ def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> Image
         name=part.name,
         source=part.source,
         time_s=part.time_s,
-        calibration=PairCalibration(K, K, size, side_by_side(part.camera.baseline_m)),
-        load=PairFiles(left, right, size),
+        calibration=PairCalibration(K, K, load.size, side_by_side(part.camera.baseline_m)),
+        load=load,
         T_cam_imu=part.T_cam_imu,
         twist=part.twist,
         velocity_frame=part.velocity_frame,
         truth=part.truth,
-        notes=notes,
+        notes=(*notes, *deep),
         attributes={**attributes, "reader": "kitti_raw_images"},
     )
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ekfslam.arrays import IntArray
 from ekfslam.data.images import Image
@@ -22,20 +25,38 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp")
 LEAST_PAIRED = 0.9  # of the images, that must have a partner
+# Folders of the left and the right images, by their usual names.
+PAIRS = (
+    ("image_0", "image_1"),
+    ("image_2", "image_3"),
+    ("left", "right"),
+    ("image_l", "image_r"),
+    ("image_left", "image_right"),
+    ("image_00", "image_01"),
+    ("image_02", "image_03"),
+    ("cam0", "cam1"),
+    ("infra1", "infra2"),
+)
+# Words for the sides in names of images.
+_SIDES = tuple(
+    re.compile(rf"{word}|(?<![a-z]){letter}(?![a-z])|(?<![a-z])(?:cam|camera)_?{number}(?!\d)|infra{number + 1}", re.I)
+    for word, letter, number in (("left", "l", 0), ("right", "r", 1))
+)
 _TOLERANCE_NS = 5_000_000  # cameras that are not triggered together are no stereo pair
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM")  # PPM includes pgm
 
 
-def read_gray(path: Path, size: tuple[int, int] | None = None) -> Image:
-    """Read an image file as (height, width) uint8. Colours become luma, 16 bits their upper eight.
+def read_gray(path: Path, size: tuple[int, int] | None = None, bits: int = 16) -> Image:
+    """Read an image file as (height, width) uint8. Colours become luma.
 
-    ``size`` is the required width and height; any by default.
+    ``size`` is the required width and height; any by default. Of values of 16 bits, ``bits`` are used: the upper eight
+    of these remain.
     """
     require_file(path)
-    return decode_gray(path.read_bytes(), str(path), size)
+    return decode_gray(path.read_bytes(), str(path), size, bits)
 
 
-def decode_gray(content: bytes, source: str, size: tuple[int, int] | None = None) -> Image:
+def decode_gray(content: bytes, source: str, size: tuple[int, int] | None = None, bits: int = 16) -> Image:
     """Return `read_gray` of the bytes of an image file; ``source`` names it in messages."""
     with _opened(io.BytesIO(content), source) as image:
         width, height = image.size
@@ -43,16 +64,18 @@ def decode_gray(content: bytes, source: str, size: tuple[int, int] | None = None
         if size is not None and image.size != size:
             message = f"the image has {width} x {height} pixels, the calibration {size[0]} x {size[1]}"
             raise CalibrationError(message, source=source)
-        if image.mode.startswith("I"):
-            return np.ascontiguousarray(np.asarray(image, dtype=np.uint32) >> 8, dtype=np.uint8)
+        if _is_deep(image):
+            return upper_eight(np.asarray(image, dtype=np.uint32), bits)
         return np.asarray(image if image.mode == "L" else image.convert("L"))
 
 
-def size_of(path: Path) -> tuple[int, int]:
-    """Read width and height of an image file from its header alone."""
-    require_file(path)
-    with _opened(path, str(path)) as image:
-        return image.size
+def upper_eight(values: NDArray[np.integer], bits: int) -> Image:
+    """Return the upper eight of the used bits of pixels."""
+    return np.ascontiguousarray(np.minimum(values >> max(bits - 8, 0), 255), dtype=np.uint8)
+
+
+def _is_deep(image: Pillow.Image) -> bool:
+    return image.mode.startswith("I")
 
 
 @contextmanager
@@ -68,33 +91,131 @@ def _opened(file: Path | io.BytesIO, source: str) -> Iterator[Pillow.Image]:
 
 @dataclass(frozen=True)
 class PairFiles:
-    """Load pairs of images of one width and height from the files of each frame."""
+    """Load pairs of images of one width and height from the files of each frame; see `read_gray` for ``bits``."""
 
     left: Sequence[Path]
     right: Sequence[Path]
     size: tuple[int, int]
+    bits: int = 16
 
     def __call__(self, frame: int) -> tuple[Image, Image]:
-        return read_gray(self.left[frame], self.size), read_gray(self.right[frame], self.size)
+        left, right = (read_gray(files[frame], self.size, self.bits) for files in (self.left, self.right))
+        return left, right
+
+
+def pair_files(
+    left: Sequence[Path], right: Sequence[Path], size: tuple[int, int] | None = None, bits: int | None = None
+) -> tuple[PairFiles, tuple[str, ...]]:
+    """Return the loader of pairs of images, and notes on them. Sizes are read from the headers of all files.
+
+    Args:
+        left, right: Files of each frame.
+        size: Width and height as calibrated; by default those of the first image.
+        bits: Used bits of images of 16 bits; by default those of the largest value in all files.
+
+    Raises:
+        CalibrationError: An image has another size.
+        UnknownFormatError: A file is no readable image.
+    """
+    whose, deep = ("the calibration" if size else str(left[0])), []
+    for path in (*left, *right):
+        require_file(path)
+        with _opened(path, str(path)) as image:
+            size = size or image.size
+            if image.size != size:
+                found = f"the image has {image.size[0]} x {image.size[1]} pixels, {whose} {size[0]} x {size[1]}"
+                raise CalibrationError(found, source=str(path))
+            if _is_deep(image):
+                deep.append(path)
+    if size is None:
+        raise UnknownFormatError("there are no images")
+    used = bits or (_bits_of(deep) if deep else 16)
+    how = "as stated" if bits else "by the largest value in all images"
+    note = f"Images of 16 bits use {used}, {how}: the upper eight of these are kept."
+    return PairFiles(left, right, size, used), (note,) if deep else ()
+
+
+def _bits_of(paths: Sequence[Path]) -> int:
+    """Return the number of bits of the largest value in images of 16 bits, at least 8."""
+    largest = 0
+    for path in paths:
+        with _opened(io.BytesIO(path.read_bytes()), str(path)) as image:
+            Budget(str(path)).take(4 * image.size[0] * image.size[1], "the image")
+            largest = max(largest, int(np.asarray(image, dtype=np.uint32).max()))
+        if largest >> 15:
+            break
+    return max(largest.bit_length(), 8)
 
 
 def images_in(folder: Path) -> tuple[Path, ...]:
-    """Return the image files of a folder in the order of their names."""
+    """Return the image files of a folder in the natural order of their names: 2 before 10."""
     if not folder.is_dir():
         raise UnknownFormatError(f"{folder}: this folder of images is missing")
-    found = tuple(sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES))
+    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
     if not found:
         raise UnknownFormatError(f"{folder}: there are no images")
-    return found
+    is_decimal = all(re.fullmatch(r"\d+\.\d+", path.stem, re.ASCII) for path in found)
+    return tuple(sorted(found, key=lambda path: (Decimal(path.stem),) if is_decimal else _natural(path.name)))
 
 
-def numbered_images(folder: Path) -> dict[int, Path]:
-    """Return the image files of a folder by the number that is their name."""
-    found = {}
+def _natural(name: str) -> tuple[Any, ...]:
+    """Return a key by which numbers in names count as numbers."""
+    parts = re.split(r"(\d+)", name)
+    return (*((int(part), "") if part.isdecimal() else (-1, part) for part in parts), (-1, name))
+
+
+def find_pair(folder: Path) -> tuple[str, str] | None:
+    """Return the folders of left and right images in a folder, by their usual names; None if there are none.
+
+    Both are ``.`` if the images themselves are in the folder, with sides in their names: ``left_0001 right_0001``.
+    """
+    for pair in PAIRS:
+        if all((folder / name).is_dir() for name in pair):
+            return pair
+    names = [path.stem for path in folder.iterdir() if path.suffix.lower() in SUFFIXES] if folder.is_dir() else []
+    return (".", ".") if all(any(side.search(name) for name in names) for side in _SIDES) else None
+
+
+def images_of_sides(left: Path, right: Path) -> tuple[dict[str, Path], dict[str, Path]]:
+    """Return the images of two folders, which may be one, by the part of their names that is the same on both sides.
+
+    ``left_0001`` and ``right_0001``, ``0001_l`` and ``0001_r`` are pairs, as are equal names in two folders.
+    """
+    found = [images_in(folder) for folder in (left, right)]
+    if left.resolve() == right.resolve():
+        found = [tuple(p for p in images if _side_of(p.stem) == side) for side, images in enumerate(found)]
+        for side, images in zip(("left", "right"), found, strict=True):
+            if not images:
+                raise UnknownFormatError(f"{left}: no name of an image says that it is of the {side} camera")
+    if {path.stem for path in found[0]} == {path.stem for path in found[1]}:
+        in_left, in_right = ({path.stem: path for path in images} for images in found)
+    else:
+        in_left, in_right = (
+            {_SIDES[side].sub("*", path.stem, count=1): path for path in images} for side, images in enumerate(found)
+        )
+    return in_left, in_right
+
+
+def _side_of(name: str) -> int | None:
+    """Return the side that a name states; None unless it is one."""
+    sides = [side for side, pattern in enumerate(_SIDES) if pattern.search(name)]
+    return sides[0] if len(sides) == 1 else None
+
+
+def numbered_images(folder: Path, side: int | None = None) -> dict[int, Path]:
+    """Return the image files of a folder, those of a side (0, 1) if it holds both, by the number in their names."""
+    found: dict[int, Path] = {}
     for path in images_in(folder):
-        if not path.stem.isdigit():
+        if side is not None and _side_of(path.stem) != side:
+            continue
+        # Some names have the side, too: left_000001
+        numbers = re.findall(r"\d+", re.sub(f"{_SIDES[0].pattern}|{_SIDES[1].pattern}", "", path.stem, flags=re.I))
+        if len(numbers) != 1:
             raise UnknownFormatError(f"{path}: expected a number for a name, such as 000000.png")
-        found[int(path.stem)] = path
+        if int(numbers[0]) in found:
+            other = found[int(numbers[0])].name
+            raise LostDataError(f"it has the number of {other}", source=str(path), field="images")
+        found[int(numbers[0])] = path
     return found
 
 

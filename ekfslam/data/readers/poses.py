@@ -15,7 +15,9 @@ from ekfslam.data.truth_noise import TruthNoise
 from ekfslam.errors import TruthError
 from ekfslam.geometry import se3
 
+FIRST_IMAGE = "first_image"  # attribute of a recording that begins at a later image of its drive
 _QUATERNION_TOLERANCE = 1e-3
+_SAME_POSE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -50,11 +52,17 @@ def stamped_poses(table: Table) -> Poses:
     return Poses(se3.transform(Rotation.from_quat(quaternion).as_matrix(), position_m), time_s, (table.path,))
 
 
-def truth_of_frames(time_s: Array, poses: Poses) -> Truth:
-    """Return the poses of frames with stamps (T,), matched as `ekfslam.attach_truth` says."""
+def truth_of_frames(time_s: Array, poses: Poses, first: int = 0) -> Truth:
+    """Return the poses of frames with stamps (T,), matched as `ekfslam.attach_truth` says.
+
+    Without stamps, row ``first`` is the pose of the first frame, unless the file was cut there, too: it has as many
+    rows as there are frames, or does not begin with the identity, as whole files do.
+    """
     if poses.time_s is None:
-        used = min(len(time_s), len(poses.T_world_imu))
-        return Truth(np.arange(used), poses.T_world_imu[:used], noise=poses.noise)
+        is_whole = not len(poses.T_world_imu) or bool(np.abs(poses.T_world_imu[0] - np.eye(4)).max() < _SAME_POSE)
+        begin = first if is_whole and len(poses.T_world_imu) != len(time_s) else 0
+        T_world_imu = poses.T_world_imu[begin : begin + len(time_s)]
+        return Truth(np.arange(len(T_world_imu)), T_world_imu, noise=poses.noise)
     tolerance_s = 0.5 * np.median(np.diff(time_s)) if len(time_s) > 1 else 0.0
     row = nearest(poses.time_s, time_s)
     # Nearest in both directions, so that no pose serves two frames.
