@@ -156,6 +156,14 @@ class LateError(EkfslamError):
         super().__init__(f"{what} at {stamp_s:.6f} s comes too late: {known}")
 
 
+class ClockError(StampError):
+    """A stamp is so far from all others that a clock must have jumped."""
+
+
+class BacklogError(EkfslamError):
+    """More messages wait in a live filter than it may keep."""
+
+
 class MissingVelocityError(EkfslamError):
     """No velocity has arrived that reaches to a stamp."""
 

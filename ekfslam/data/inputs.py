@@ -17,7 +17,7 @@ from ekfslam.errors import DataError, LostDataError, ShapeError
 from ekfslam.stored import FLAGS, attribute, stored
 
 VelocityFrame = Literal["imu", "level"]
-_GAP_STEPS = 3.0
+GAP_STEPS = 3.0
 _ZERO = 1e-9  # m/s and rad/s, below which a velocity is a rounded 0
 
 
@@ -216,7 +216,7 @@ class InertialSamples:
         inside = part.time_s[(part.time_s > begin_s) & (part.time_s < end_s)]
         stamps = np.concatenate([[begin_s], inside, [end_s]])
         values = part.at(stamps)
-        is_gap = len(part.time_s) > 1 and bool(np.diff(part.time_s).max() > _GAP_STEPS * self.step_s)
+        is_gap = len(part.time_s) > 1 and bool(np.diff(part.time_s).max() > GAP_STEPS * self.step_s)
         return Interval(end_s - begin_s, np.diff(stamps), 0.5 * (values[1:] + values[:-1]), is_gap)
 
 

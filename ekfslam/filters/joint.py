@@ -203,8 +203,21 @@ class JointEKF(Estimate):
         return self.retired.all_landmarks(self.table, self.gaussian.landmark_blocks())
 
     def log(self) -> Log:
-        """Return the log so far, for the posterior over all poses and landmarks."""
+        """Return the log so far, for the posterior over all poses and landmarks; `PosteriorError` if it was dropped."""
         return self._log.log()
+
+    @property
+    def needs_log(self) -> bool:
+        """Whether the filter reads its own log: for a map revival or a relinearised window."""
+        return self.revival is not None or self.window is not None
+
+    def drop_log(self) -> None:
+        """Drop the log, landmarks that have left, and parameters of past frames, so that memory stays bounded."""
+        if self.needs_log:
+            raise ConfigError("a filter with map revival or a relinearised window needs its log")
+        self._log.drop()
+        self.retired.drop()
+        del self._reported[:]
 
     def parameters(self) -> Parameters | None:
         """Return the estimates of blocks with labels after each frame; None: there are none."""

@@ -85,12 +85,13 @@ class Retired:
         self.revived: list[int] = []
         self.reappeared: list[int] = []
         self.moving: set[int] = set()
+        self._dropped = 0
 
     @property
     def counts(self) -> dict[str, int]:
         """Totals by name."""
         again = {name: len(getattr(self, name)) for name in ("revived", "reappeared", "moving")}
-        return {"retired": sum(len(part) for part in self._parts), **again}
+        return {"retired": self._dropped + sum(len(part) for part in self._parts), **again}
 
     def add(self, table: LandmarkTable, covariance: Array, gone: BoolArray, may_return: bool) -> None:
         """Add landmarks (n,) of a table that are gone, with their covariances (k, 3, 3)."""
@@ -118,6 +119,12 @@ class Retired:
         self.reappeared.extend(again)
         for i in again:
             del self.row_of[i]
+
+    def drop(self) -> None:
+        """Drop all landmarks that have left; they cannot come back. Tracks that move stay known."""
+        self._dropped += sum(len(part) for part in self._parts)
+        for kept in (self._parts, self._rows, self.row_of, self._verdicts):
+            kept.clear()
 
     def all_landmarks(self, table: LandmarkTable, covariance: Array) -> Landmarks:
         """Return every landmark so far, in the order of the log; covariances (n, 3, 3) are for the table."""

@@ -1,16 +1,19 @@
-"""Live use: velocities and images as they come, at any rates, in any order within a stated delay.
+"""Live use: velocities or inertial samples, and images, as they come: at any rates, in any order within a stated delay.
 
 See docs/live.md. An image is processed once a message stamped ``delay_s`` later has arrived; older messages are then
-rejected. So the filter, ``live.ekf``, is that of the recording in order. Later poses follow from it by the velocities.
+rejected. So the filter, ``live.ekf``, is that of the recording in order. Later poses follow from it by the inputs.
 
 A velocity at stamp s holds since the one before, as in a recording. Those between two images act as one: the constant
-velocity that leads to the same pose. Its noise is that of the model at any rate of velocities.
+velocity that leads to the same pose. Its noise is that of the model at any rate of velocities. Inertial samples are
+linear between stamps; an image waits for the first sample at its stamp or later.
+
+Every public call takes one lock. Arguments are checked before anything changes.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from bisect import bisect_left, bisect_right
+import threading
+from bisect import bisect_left
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -18,22 +21,29 @@ from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
-from ekfslam.data.checks import require_finite, require_shape
-from ekfslam.data.interval import Interval
+from ekfslam.data.inputs import InertialNoise, InertialSamples
 from ekfslam.data.noise import Noise
-from ekfslam.errors import ConfigError, DuplicateObservationError, LateError, MissingVelocityError, StampError
+from ekfslam.errors import ClockError, ConfigError, MissingVelocityError
+from ekfslam.filters.admission import Admission, Dropped, Kind
+from ekfslam.filters.door import checked_inputs, checked_observations, checked_stamp
+from ekfslam.filters.driven import Driven, copied
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.prediction import predict
 from ekfslam.filters.reports import FrameReport
+from ekfslam.filters.streams import Samples, Velocities
+from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
+from ekfslam.models.build import blocks_and_process, model_of
+from ekfslam.models.model import Model
 from ekfslam.models.sensors.stereo import Rig
+
+MOST_IMAGES = 10_000  # that wait
 
 
 class Pose(NamedTuple):
     """A pose (4, 4) at a stamp, with the covariance (6, 6) of its error ``xi``.
 
-    ``is_held`` says that the last velocity was extrapolated because none had arrived for the stamp.
+    ``is_held`` says that the last inputs were extrapolated because none had arrived for the stamp.
     """
 
     time_s: float
@@ -42,86 +52,27 @@ class Pose(NamedTuple):
     is_held: bool
 
 
-@dataclasses.dataclass
-class LiveCounts:
-    """Counts of all messages: none is dropped without being counted.
-
-    Args:
-        velocities, images: Messages in time.
-        taken_in: Images that the filter has processed.
-        late_velocities, late_images: Rejected messages, older than the last processed image.
-        out_of_order: Messages in time that came after a later one of their kind.
-        held: Images processed with an extrapolated velocity, since none had arrived in time.
-        gaps: Images after velocities more than ``gap_s`` apart.
-    """
-
-    velocities: int = 0
-    images: int = 0
-    taken_in: int = 0
-    late_velocities: int = 0
-    late_images: int = 0
-    out_of_order: int = 0
-    held: int = 0
-    gaps: int = 0
-
-
-class _Velocities:
-    """Velocities in the order of their stamps."""
-
-    def __init__(self) -> None:
-        self.stamps: list[float] = []
-        self._twists: list[Array] = []
-
-    def add(self, twist: Array, t: float) -> None:
-        at = bisect_left(self.stamps, t)
-        if at < len(self.stamps) and self.stamps[at] == t:
-            raise StampError(f"there are two velocities at {t:.6f} s", field="t")
-        self.stamps.insert(at, t)
-        self._twists.insert(at, twist)
-
-    def at(self, t: float) -> tuple[Array, bool]:
-        """Return the velocity (6,) at a stamp, and whether it is the last one, extrapolated."""
-        at = min(bisect_left(self.stamps, t), len(self.stamps) - 1)
-        return self._twists[at], self.stamps[-1] < t
-
-    def during(self, begin: float, end: float, gap_s: float) -> tuple[Interval, bool]:
-        """Return the velocities between two stamps, and whether the last one is extrapolated.
-
-        The interval is a gap if velocities in it are more than ``gap_s`` apart.
-        """
-        if not self.stamps:
-            raise MissingVelocityError(end)
-        stamps, last = self.stamps, len(self.stamps) - 1
-        first, stop = bisect_right(stamps, begin), min(bisect_left(stamps, end), last)
-        pieces, is_held = range(min(first, stop), stop + 1), stamps[last] < end
-        is_gap = any(i > 0 and stamps[i] - stamps[i - 1] > gap_s for i in pieces)
-        bounds = np.array([begin, *(stamps[i] for i in pieces[:-1]), end])
-        twists = np.array([self._twists[i] for i in pieces])
-        return Interval(end - begin, np.diff(bounds), twists, is_gap), is_held
-
-    def forget(self, before: float) -> None:
-        """Drop velocities older than a stamp, but keep the newest of them: it marks where the next interval begins."""
-        keep = max(bisect_right(self.stamps, before) - 1, 0)
-        del self.stamps[:keep], self._twists[:keep]
-
-
 class LiveEKF:
-    """The joint filter behind a window of messages, see the module.
+    """The joint filter behind a window of messages, see the module. Threads may share it.
 
     Args:
         ekf: New filter; with a `MapRevival` if landmarks shall come back.
         delay_s: Time for which an image waits for older messages.
-        gap_s: Spacing of velocities above which the noise of a gap applies.
+        gap_s: Spacing of inputs above which the noise of a gap applies; for samples at most three times their step.
         history_s: Time before the last processed image for which `pose` answers.
-        late: ``raise`` an error at a late message, or only ``count`` it.
+        late: ``raise`` an error at a late, repeated, jumping or surplus message, or only ``count`` it.
+        jump_s: Time by which a stamp may be after the newest one.
+        backlog: Number of velocities or samples since the last image that may wait.
+        log_frames: Frames after which the log and landmarks that have left are dropped; ``inf``: never. A filter with
+            map revival or a relinearised window needs its log and always keeps it.
 
     Raises:
-        ConfigError: A time is negative.
+        ConfigError: A time is negative, or a number is not positive.
 
     Attributes:
-        ekf: Filter after the last processed image: its ``P``, ``ids``, ``positions_m``, ``covariance_of``.
         counts: `LiveCounts`.
-        time_s: Stamp of that image; None before the first.
+        dropped: The last messages that were not used, `Dropped`.
+        lock: Lock of every call; hold it to read several attributes of one moment.
     """
 
     def __init__(
@@ -131,16 +82,33 @@ class LiveEKF:
         gap_s: float = np.inf,
         history_s: float = 1.0,
         late: Literal["raise", "count"] = "raise",
+        *,
+        jump_s: float = 10.0,
+        backlog: int = 100_000,
+        log_frames: float = 10_000,
     ) -> None:
         if not (delay_s >= 0 and gap_s > 0 and history_s >= 0):
             raise ConfigError("delay_s and history_s must not be negative, and gap_s must be positive")
-        self.ekf, self.counts = ekf, LiveCounts()
-        self.delay_s, self.gap_s, self.history_s, self.late = delay_s, gap_s, history_s, late
-        self.time_s: float | None = None
-        self._velocities = _Velocities()
+        if not (jump_s > 0 and backlog >= 1 and log_frames >= 1):
+            raise ConfigError("jump_s must be positive, and backlog and log_frames must be at least 1")
+        if late not in ("raise", "count"):
+            raise ConfigError(f"late: expected 'raise' or 'count', found {late!r}")
+        self.delay_s, self.gap_s, self.history_s = delay_s, gap_s, history_s
+        self.jump_s, self.backlog, self.log_frames = jump_s, backlog, log_frames
+        self.lock = threading.RLock()
+        self._admission = Admission(late, jump_s)
+        self.counts, self.dropped = self._admission.counts, self._admission.dropped
+        self.is_inertial = ekf.model.process.takes is InertialSamples
+        self._new = copied(ekf)
+        self._start(ekf)
+
+    def _start(self, ekf: JointEKF) -> None:
+        """Begin with a new filter, without messages."""
+        self._inputs = (Samples if self.is_inertial else Velocities)(self.gap_s)
+        self._driven = Driven(ekf, self._inputs, self.history_s, self.log_frames, self.counts)
         self._waiting: list[tuple[float, IntArray, Array]] = []
-        self._newest = {"velocity": -np.inf, "image": -np.inf}
-        self._past: list[tuple[float, Estimate]] = []
+        self._admission.start()
+        self._reports: list[FrameReport] = []
 
     @classmethod
     def from_rig(
@@ -150,26 +118,39 @@ class LiveEKF:
         noise: Noise,
         T_world_imu: Array | None = None,
         config: FilterConfig | None = None,
+        *,
+        imu: InertialNoise | None = None,
         **window: Any,
     ) -> LiveEKF:
-        """Return the live filter of a stereo rig with measured velocities.
+        """Return the live filter of a stereo rig with measured velocities or an inertial unit.
 
         Args:
-            camera: Rectified pair.
-            T_cam_imu: (4, 4) IMU to left optical frame.
+            camera, T_cam_imu: Rectified pair; (4, 4) IMU to left optical frame.
             noise: White noise of velocities and pixels.
-            T_world_imu: (4, 4) first pose; by default the origin of world.
+            T_world_imu: (4, 4) first pose, by default the origin; with an inertial unit, gravity is along -z of world.
             config: Settings of the filter; by default landmarks out of view are retired.
-            window: ``delay_s``, ``gap_s``, ``history_s`` and ``late`` of `LiveEKF`.
+            imu: Densities of an inertial unit that gives samples instead of velocities.
+            window: Further arguments of `LiveEKF`.
         """
-        settings = FilterConfig(retire="unseen") if config is None else config
-        start = np.eye(4) if T_world_imu is None else T_world_imu
-        return cls(JointEKF(Rig(camera, T_cam_imu, noise), settings, start), **window)
+        settings = config or FilterConfig(retire="unseen")
+        start, rig = np.eye(4) if T_world_imu is None else T_world_imu, Rig(camera, T_cam_imu, noise)
+        return cls(JointEKF(rig if imu is None else _inertial(rig, imu, start, settings), settings, start), **window)
+
+    @property
+    def ekf(self) -> JointEKF:
+        """Filter after the last processed image: its ``P``, ``ids``, ``positions_m``, ``covariance_of``."""
+        return self._driven.ekf
+
+    @property
+    def time_s(self) -> float | None:
+        """Stamp of the last processed image; None before the first."""
+        return self._driven.time_s
 
     @property
     def newest_s(self) -> float:
         """The newest stamp of all messages; minus infinity before the first."""
-        return max(self._newest.values())
+        with self.lock:
+            return self._admission.newest_s
 
     def predict(self, velocities: ArrayLike, t: float) -> list[FrameReport]:
         """Take a measured velocity, and return reports on the images that could be processed then.
@@ -179,18 +160,31 @@ class LiveEKF:
             t: Stamp in s.
 
         Raises:
+            ConfigError: The filter takes inertial samples.
             DataError: No six finite numbers, or a stamp that another velocity has.
             LateError: The filter has had a later image already.
-            FilterError: The filter cannot go on.
+            ClockError: The stamp is too far from all others, see docs/live.md.
+            BacklogError: No image has come for too long.
+            FilterError: The filter cannot process an image; it goes on without it.
         """
-        twist = np.array(velocities, dtype=float)
-        require_shape(twist, (6,), "velocities")
-        require_finite(twist, "velocities")
-        if not self._in_time("velocity", t):
-            return []
-        self._velocities.add(twist, t)
-        self.counts.velocities += 1
-        return self._arrived("velocity", t)
+        if self.is_inertial:
+            raise ConfigError("this filter takes inertial samples: call imu(gyro, accel, t)")
+        return self._take_inputs("velocity", checked_inputs(velocities, 6, "velocities"), checked_stamp(t))
+
+    def imu(self, gyro: ArrayLike, accel: ArrayLike, t: float) -> list[FrameReport]:
+        """Take an inertial sample, and return reports on the images that could be processed then.
+
+        Args:
+            gyro, accel: (3,) angular rates, rad/s, and specific forces, m/s^2, in the IMU frame.
+            t: Stamp in s.
+
+        Raises:
+            EkfslamError: As `predict`.
+        """
+        if not self.is_inertial:
+            raise ConfigError("this filter takes velocities: call predict(velocities, t)")
+        rows = checked_inputs(gyro, 3, "gyro"), checked_inputs(accel, 3, "accel")
+        return self._take_inputs("sample", np.concatenate(rows), checked_stamp(t))
 
     def update(self, ids: ArrayLike, pixels: ArrayLike, t: float) -> list[FrameReport]:
         """Take the tracks of an image, and return reports on the images that could be processed then.
@@ -202,96 +196,116 @@ class LiveEKF:
 
         Raises:
             DataError: Shapes disagree, a number is not finite, an id occurs twice, or another image has the stamp.
-            LateError: The filter has had a later image already.
-            FilterError: The filter cannot go on.
+            EkfslamError: As `predict`.
         """
-        landmark, measured = np.array(ids, dtype=np.int64).ravel(), np.array(pixels, dtype=float)
-        measured = measured.reshape(0, 4) if not measured.size else measured
-        require_shape(measured, (len(landmark), None), "pixels")
-        require_finite(measured, "pixels")
-        order = np.argsort(landmark, kind="stable")
-        landmark, measured = landmark[order], measured[order]
-        twice = np.flatnonzero(np.diff(landmark) == 0)
-        if len(twice):
-            raise DuplicateObservationError(f"landmark {landmark[twice[0]]} is observed twice", field="ids")
-        if not self._in_time("image", t):
-            return []
-        at = bisect_left(self._waiting, t, key=lambda image: image[0])
-        if at < len(self._waiting) and self._waiting[at][0] == t:
-            raise StampError(f"there are two images at {t:.6f} s", field="t")
-        self._waiting.insert(at, (t, landmark, measured))
-        self.counts.images += 1
-        return self._arrived("image", t)
+        landmark, measured = checked_observations(self.ekf.sensor, ids, pixels)
+        t = checked_stamp(t)
+        with self.lock:
+            self._watch_clock("image", t)
+            at = bisect_left(self._waiting, t, key=lambda image: image[0])
+            is_repeated, is_full = any(image[0] == t for image in self._waiting[at : at + 1]), at >= MOST_IMAGES
+            if not self._admission.accepts("image", t, self.time_s, is_repeated, is_full):
+                return []
+            self._waiting.insert(at, (t, landmark, measured))
+            return self._take_in(self.newest_s - self.delay_s)
+
+    def _take_inputs(self, kind: Kind, row: Array, t: float) -> list[FrameReport]:
+        with self.lock:
+            self._watch_clock(kind, t)
+            inputs, most = self._inputs, self.backlog
+            if self.time_s is None and not self._waiting and len(inputs.stamps) >= most:
+                self.counts.unused += most // 2 + 1
+                inputs.drop(most // 2 + 1)
+            is_full = len(inputs.stamps) >= most
+            if not self._admission.accepts(kind, t, self._driven.used_s, inputs.has(t), is_full):
+                return []
+            inputs.add(row, t)
+            self._driven.history.arrived(t)
+            return self._take_in(self.newest_s - self.delay_s)
+
+    def _watch_clock(self, kind: Kind, t: float) -> None:
+        """Start again if a clock jumped before the first image; raise `ClockError` if it did later."""
+        if self._admission.has_jumped(kind, t, self.time_s):
+            if self.time_s is not None:
+                self.counts.jumps += 1
+                self.dropped.append(Dropped(kind, t, "jump"))
+                raise ClockError(f"a clock has jumped to {t:.6f} s from {self.newest_s:.6f} s: call reset()", field="t")
+            self.reset()
 
     def flush(self) -> list[FrameReport]:
         """Process all images that wait, since nothing more will come, and return reports on them.
 
         Raises:
-            MissingVelocityError: No velocity has come at all.
-            FilterError: The filter cannot go on.
+            MissingVelocityError: No velocity or sample has come at all.
+            FilterError: The filter cannot process an image; it goes on without it.
         """
-        if self._waiting and not self._velocities.stamps:
-            raise MissingVelocityError(self._waiting[0][0])
-        return self._take_in(np.inf)
+        with self.lock:
+            if self._waiting and not self._inputs.stamps:
+                raise MissingVelocityError(self._waiting[0][0])
+            return self._take_in(np.inf, is_last=True)
+
+    def reset(self) -> None:
+        """Start again with a filter as new as the first one; messages that wait are dropped. Counts go on."""
+        with self.lock:
+            self.dropped.extend(Dropped("image", t, "reset") for t, *_ in self._waiting)
+            self.counts.unused += len(self._waiting)
+            self.counts.resets += 1
+            self._start(copied(self._new))
 
     def pose(self, t: float | None = None) -> Pose:
         """Return the pose at a stamp, by default the newest one, given the images processed until then.
 
         Raises:
             LateError: The stamp is over ``history_s`` before the last processed image, or there is none.
-            MissingVelocityError: No velocity has come.
+            ClockError: The stamp is more than ``jump_s`` after the newest one.
+            MissingVelocityError: No velocity or sample has come.
         """
-        t = self.newest_s if t is None else t
-        at = bisect_right(self._past, t, key=lambda past: past[0]) - 1
-        if at < 0:
-            raise LateError("pose", t, self._past[0][0] if self._past else None)
-        begin, then = self._past[at]
-        is_held = False
-        if t > begin:
-            interval, is_held = self._velocities.during(begin, t, self.gap_s)
-            then = then.without_landmarks()
-            predict(then, _distrusted(interval, is_held), None)
-        return Pose(t, then.T_world_imu, then.gaussian.body_covariance[:6, :6].copy(), is_held)
+        with self.lock:
+            t, then, is_held = self._at(t)
+            return Pose(t, then.T_world_imu, then.gaussian.body_covariance[:6, :6].copy(), is_held)
 
-    def _in_time(self, kind: Literal["velocity", "image"], t: float) -> bool:
-        """Return whether a message is in time; count it or raise if it is late."""
-        require_finite(np.array(t, dtype=float), "t")
-        if self.time_s is None or t > self.time_s:
-            return True
-        self.counts.late_velocities += kind == "velocity"
-        self.counts.late_images += kind == "image"
-        if self.late == "raise":
-            raise LateError(kind, t, self.time_s)
-        return False
+    def block(self, name: str, t: float | None = None) -> tuple[Array, Array]:
+        """Return the value and the covariance of a state block at a stamp, such as ``velocity`` or ``gyro_bias``.
 
-    def _arrived(self, kind: str, t: float) -> list[FrameReport]:
-        self.counts.out_of_order += t < self._newest[kind]
-        self._newest[kind] = max(self._newest[kind], t)
-        return self._take_in(self.newest_s - self.delay_s)
+        Raises:
+            ConfigError: ``live.ekf.model.layout`` has no such block.
+            EkfslamError: As `pose`.
+        """
+        with self.lock:
+            layout = self.ekf.model.layout
+            if name not in layout:
+                raise ConfigError(f"no state block {name!r}; known: {', '.join(layout)}")
+            _, then, _ = self._at(t)
+            at = layout[name]
+            return np.array(then.values[name]), then.gaussian.body_covariance[at, at].copy()
 
-    def _take_in(self, until: float) -> list[FrameReport]:
-        """Process the images up to a stamp, in their order; none before the first velocity."""
-        reports = []
-        while self._waiting and self._waiting[0][0] <= until and self._velocities.stamps:
-            (t, ids, measured), begin = self._waiting[0], self.time_s
-            if begin is None:
-                twist, is_held = self._velocities.at(t)
-                self.ekf.begin(twist)
-            else:
-                interval, is_held = self._velocities.during(begin, t, self.gap_s)
-                self.ekf.predict(_distrusted(interval, is_held))
-                self.counts.gaps += interval.is_gap
-            self.counts.held += is_held
-            del self._waiting[0]
-            reports.append(self.ekf.update(self.counts.taken_in, ids, measured))
-            self.counts.taken_in += 1
-            self.time_s = t
-            self._past.append((t, self.ekf.without_landmarks()))
-            self._past = [past for past in self._past if past[0] >= t - self.history_s]
-            self._velocities.forget(self._past[0][0])
+    def _at(self, t: float | None) -> tuple[float, Estimate, bool]:
+        """Return a stamp, the estimate without landmarks there, and whether its inputs were extrapolated."""
+        t = self.newest_s if t is None else checked_stamp(t)
+        if t > self.newest_s + self.jump_s:
+            raise ClockError(f"{t:.6f} s is {t - self.newest_s:.3g} s after the newest message", field="t")
+        return t, *self._driven.history.at(t)
+
+    def _take_in(self, until: float, is_last: bool = False) -> list[FrameReport]:
+        """Process the images up to a stamp, in their order; none before its inputs."""
+        while self._waiting and (t := self._waiting[0][0]) <= until and (is_last or self._inputs.serves(t, until)):
+            image = self._waiting.pop(0)
+            if self.time_s is None and self._inputs.begin_after(t):
+                self.counts.unused += 1
+                self.dropped.append(Dropped("image", t, "before the first sample"))
+                continue
+            try:
+                self._reports.append(self._driven.process(*image))
+            except Exception:
+                self.counts.failed += 1
+                self.dropped.append(Dropped("image", t, "failed"))
+                raise
+        reports, self._reports = self._reports, []
         return reports
 
 
-def _distrusted(interval: Interval, is_held: bool) -> Interval:
-    """Return an interval with the noise of a gap if its velocity is extrapolated."""
-    return dataclasses.replace(interval, is_gap=True) if is_held else interval
+def _inertial(rig: Rig, imu: InertialNoise, T_world_imu: Array, settings: FilterConfig) -> Model:
+    """Return the model of a rig with an inertial unit."""
+    blocks, process = blocks_and_process({}, imu)
+    P, coordinates = settings.initial_covariance, settings.landmark_coordinates
+    return model_of(rig, rig.noise, se3.inverse(T_world_imu), P, None, blocks, coordinates, False, process)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.interval import Interval
+from ekfslam.errors import PosteriorError
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.log import Log
 from ekfslam.filters.prediction import Prediction
@@ -55,6 +56,7 @@ class LogBook:
         self._frames: list[dict] = []
         self._parts: defaultdict[str, list] = defaultdict(list)
         self._landmarks = self._observations = 0
+        self._is_dropped = False
         # Empty parts, for a log to which nothing is added.
         none, no_index, no_rows = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, start.sensor.dimension))
         self.started(no_index, np.empty((0, 3)), (0, no_rows, no_rows))
@@ -146,8 +148,17 @@ class LogBook:
         self._add(rows=rows, variance=variance, position_m=position_m)
         self._observations += len(landmark)
 
+    def drop(self) -> None:
+        """Drop all but the present frame; there is no log from then on."""
+        self._is_dropped = True
+        del self._frames[:-1]
+        for parts in self._parts.values():
+            del parts[1:]
+
     def log(self) -> Log:
-        """Return the log so far."""
+        """Return the log so far; raise `PosteriorError` if a part was dropped."""
+        if self._is_dropped:
+            raise PosteriorError("the log of a long live run was dropped: see log_frames of LiveEKF")
         return self._log(0, {name: np.concatenate(parts) for name, parts in self._parts.items()})
 
     def _log(self, first: int, arrays: dict[str, NDArray]) -> Log:

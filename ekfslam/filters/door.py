@@ -1,0 +1,117 @@
+"""Checks of the arguments of a filter, before it changes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.checks import LARGEST, LARGEST_PX, LARGEST_VELOCITY, require_finite, require_shape, validate_stamps
+from ekfslam.data.observations import LARGEST_ID
+from ekfslam.errors import DataError, DuplicateObservationError, ShapeError
+from ekfslam.models.sensors.base import Sensor
+from ekfslam.models.sensors.monocular import Monocular
+from ekfslam.models.sensors.stereo import Rig
+
+# Numbers of an observation, by its sensor; others are judged by their rows.
+_WIDTHS: dict[type, tuple[int, ...]] = {Rig: (4,), Monocular: (2, 4)}
+
+
+def checked_numbers(value: Any, name: str, largest: float = LARGEST) -> Array:
+    """Return real, finite numbers of any shape as a new array.
+
+    Raises:
+        DataError: Booleans, text, complex numbers or other objects; a ragged list; or a number is NaN or too large.
+    """
+    found = _plain(value, name)
+    if found.dtype.kind not in "iuf":
+        raise DataError(f"expected real numbers, found {found.dtype}", field=name)
+    numbers = found.astype(float)
+    require_finite(numbers, name, largest)
+    return numbers
+
+
+def checked_stamp(t: Any) -> float:
+    """Return a stamp in s.
+
+    Raises:
+        DataError: It is no finite number, or no time in s.
+    """
+    if type(t) is float and -LARGEST <= t <= LARGEST:
+        return t
+    found = _plain(t, "t")
+    if found.dtype.kind not in "iuf":
+        raise DataError(f"expected a number of seconds, found {found.dtype}", field="t")
+    require_shape(found, (), "t")
+    if np.isfinite(found):
+        validate_stamps(found.astype(float)[None])
+    require_finite(found.astype(float), "t")
+    return float(found)
+
+
+def checked_inputs(value: Any, size: int, name: str) -> Array:
+    """Return velocities or samples (size,).
+
+    Raises:
+        DataError: See `checked_numbers`; or another shape.
+    """
+    found = checked_numbers(value, name, LARGEST_VELOCITY)
+    require_shape(found, (size,), name)
+    return found
+
+
+def checked_observations(sensor: Sensor, ids: Any, measured: Any) -> tuple[IntArray, Array]:
+    """Return ids (n,), ascending, and measurements (n, m) of a sensor's landmarks, such as pixels.
+
+    Raises:
+        DuplicateObservationError: An id occurs twice.
+        DataError: Shapes disagree with each other or with the sensor, an id is no whole number that is not negative, or
+            a measurement is no finite real number.
+    """
+    landmark, numbers = _checked_ids(ids), checked_numbers(measured, "pixels", LARGEST_PX)
+    widths = _WIDTHS.get(type(sensor))
+    if not numbers.size and not len(landmark):
+        return landmark, np.empty((0, 4))
+    require_shape(numbers, (len(landmark), None), "pixels")
+    if widths is not None and numbers.shape[1] not in widths:
+        wanted = " or ".join(map(str, widths))
+        raise ShapeError(f"expected {wanted} numbers an observation, found {numbers.shape[1]}", field="pixels")
+    order = np.argsort(landmark, kind="stable")
+    landmark, numbers = landmark[order], numbers[order]
+    twice = np.flatnonzero(np.diff(landmark) == 0)
+    if len(twice):
+        raise DuplicateObservationError(f"landmark {landmark[twice[0]]} is observed twice", field="ids")
+    if widths is None:
+        rows = np.asarray(sensor.rows(numbers), dtype=float)
+        require_shape(rows, (len(landmark), sensor.dimension), "pixels (as rows)")
+        require_finite(rows, "pixels (as rows)")
+    return landmark, numbers
+
+
+def _checked_ids(ids: Any) -> IntArray:
+    found = _plain(ids, "ids")
+    require_shape(found, (None,), "ids")
+    if found.dtype.kind not in "iuf" or (found.dtype.kind == "f" and not (found == np.floor(found)).all()):
+        raise DataError(f"expected whole numbers, found {found.dtype}", field="ids")
+    bad = np.flatnonzero((found < 0) | (found > LARGEST_ID))
+    if len(bad):
+        at = int(bad[0])
+        raise DataError(f"{found[at]} is negative or larger than {LARGEST_ID}", field="ids", index=at)
+    return found.astype(np.int64)
+
+
+def _plain(value: Any, name: str) -> np.ndarray:
+    """Return an array of anything but booleans and ragged lists."""
+    if _has_booleans(value):
+        raise DataError("expected numbers, found a truth value", field=name)
+    try:
+        return np.asarray(value)
+    except (ValueError, OverflowError, TypeError) as error:
+        raise ShapeError(f"expected numbers of a regular shape: {error}", field=name) from None
+
+
+def _has_booleans(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return any(map(_has_booleans, value))
+    return isinstance(value, bool | np.bool_) or getattr(getattr(value, "dtype", None), "kind", "") == "b"
