@@ -94,9 +94,13 @@ class History:
         self._inputs.forget(self._past[0][0])
 
     def arrived(self, t: float) -> None:
-        """Forget predictions that inputs with this stamp change."""
+        """Forget predictions that inputs with this stamp change; predict further if many have arrived."""
         while len(self._kept) > 1 and self._kept[-1][0] > t:
             del self._kept[-1]
+        if self._kept and isinstance(self._inputs, Samples):
+            self._advanced(self._inputs.stamps[-1])
+        elif self._kept:
+            self._inputs.join(self._kept[0][0])
 
     def at(self, t: float) -> tuple[Estimate, bool]:
         """Return the estimate without landmarks at a stamp, and whether its inputs were extrapolated.

@@ -15,6 +15,7 @@ from ekfslam.errors import MissingVelocityError
 from ekfslam.geometry import motion, se3
 
 _STEPS = 201  # steps between samples, whose median tells a gap
+_MANY = 64  # velocities that are joined at once
 
 
 class Velocities:
@@ -28,8 +29,9 @@ class Velocities:
         self.gap_s = gap_s
         self.stamps: list[float] = []
         self._rows: list[Array] = []
-        # Motions (4, 4) from `_begin` to the end of each velocity since, and whether there is a gap until then.
+        # Motions (4, 4) from `_begin` to the end of each velocity since, from index `_first` on; and gaps until then.
         self._begin: float | None = None
+        self._first = 0
         self._joined: list[tuple[Array, bool]] = []
 
     def has(self, t: float) -> bool:
@@ -42,8 +44,7 @@ class Velocities:
         at = bisect_left(self.stamps, t)
         self.stamps.insert(at, t)
         self._rows.insert(at, row)
-        if at < len(self.stamps) - 1:
-            self._begin = None
+        del self._joined[max(at - self._first, 0) :]
 
     def driving(self, t: float) -> float | None:
         """Return the stamp of the inputs that lead to a stamp; None: they have not arrived."""
@@ -87,19 +88,29 @@ class Velocities:
     def joined(self, begin: float, end: float) -> tuple[Interval, bool]:
         """Return `during` as one velocity that leads to the same pose; the cost is amortised over calls."""
         first, stop = self._pieces(begin, end)
-        if begin != self._begin:
-            self._begin, self._joined = begin, []
-        E, is_gap = self._joined[-1] if self._joined else (np.eye(4), False)
-        for i in range(first + len(self._joined), stop):
-            since, ends_gap = self._step(i, begin)
-            E, is_gap = motion.increment(self._rows[i], self.stamps[i] - since) @ E, is_gap or ends_gap
-            self._joined.append((E, is_gap))
+        self.join(begin, stop)
         E, is_gap = self._joined[stop - first - 1] if stop > first else (np.eye(4), False)
         since, ends_gap = self._step(stop, begin)
         twist = self._rows[stop]
         if stop > first:
             twist = -se3.log(motion.increment(twist, end - since) @ E) / (end - begin)
         return Interval.of_one(twist, end - begin, is_gap or ends_gap), self.stamps[-1] < end
+
+    def join(self, begin: float, stop: int | None = None) -> None:
+        """Join velocities since a stamp up to an index; None: if many of the complete ones are not joined yet."""
+        if begin != self._begin:
+            self._begin, self._first, self._joined = begin, bisect_right(self.stamps, begin), []
+        known = self._first + len(self._joined)
+        if stop is None and (stop := len(self.stamps) - 1) < known + _MANY:
+            return
+        if stop <= known:
+            return
+        E, is_gap = self._joined[-1] if self._joined else (np.eye(4), False)
+        since, ends_gap = zip(*(self._step(i, begin) for i in range(known, stop)), strict=True)
+        steps = motion.increment(np.array(self._rows[known:stop]), np.array(self.stamps[known:stop]) - since)
+        for step, ends in zip(steps, ends_gap, strict=True):
+            E, is_gap = step @ E, is_gap or ends
+            self._joined.append((E, is_gap))
 
     def forget(self, before: float) -> None:
         """Drop inputs older than a stamp, but keep the newest of them: it marks where the next interval begins."""
