@@ -199,7 +199,7 @@ class InertialSamples:
     def gaps(self) -> tuple[int, float]:
         """Number of gaps, which are steps of more than three times the median, and the longest of them in s."""
         steps = np.diff(self.time_s)
-        steps = steps[steps > _GAP_STEPS * self.step_s]
+        steps = steps[steps > GAP_STEPS * self.step_s]
         return len(steps), float(steps.max(initial=0.0))
 
     def at(self, time_s: Array | float) -> Array:
