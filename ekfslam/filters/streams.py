@@ -101,9 +101,10 @@ class Velocities:
         if begin != self._begin:
             self._begin, self._first, self._joined = begin, bisect_right(self.stamps, begin), []
         known = self._first + len(self._joined)
-        if stop is None and (stop := len(self.stamps) - 1) < known + _MANY:
-            return
-        if stop <= known:
+        least = 1
+        if stop is None:
+            stop, least = len(self.stamps) - 1, _MANY
+        if stop < known + least:
             return
         E, is_gap = self._joined[-1] if self._joined else (np.eye(4), False)
         since, ends_gap = zip(*(self._step(i, begin) for i in range(known, stop)), strict=True)
