@@ -2,7 +2,8 @@
 
 `resolve` decides in one order, and no module below it decides anything:
 
-1. Velocities: stereo odometry if the recording has none, also for linear or angular ones that were never filled in.
+1. Velocities: beside inertial samples, they measure the velocity in the state (`Problem.beside`). Stereo odometry if
+   the recording has none, also for linear or angular ones that were never filled in.
 2. Landmarks: when they leave the state, and how many dormant ones stay (`settings_of`).
 3. Noise: the configuration, else the recording, else what the data show (`noise_of`): white errors of tracks where
    residuals along tracks show them (`ekfslam.models.track_noise`), else errors that walk.
@@ -32,9 +33,10 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import LEAST_PX, BlockSetting, Config, Mode
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
-from ekfslam.data.inputs import InertialNoise
+from ekfslam.data.inputs import InertialNoise, InertialSamples, Velocities
+from ekfslam.data.interpolation import INTERPOLATED
 from ekfslam.data.noise import Noise
-from ekfslam.data.sequence import MEASURED_KINDS, WITHOUT_TRACKS, WITHOUT_VELOCITIES, YAW_STD_PX, Sequence
+from ekfslam.data.sequence import MEASURED_KINDS, TWIST_STD, WITHOUT_TRACKS, WITHOUT_VELOCITIES, YAW_STD_PX, Sequence
 from ekfslam.engine.choice import in_words
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.stretches import run_stretches, stretches_of, thinned
@@ -54,6 +56,7 @@ from ekfslam.models.noise import (
 )
 from ekfslam.models.odometry import missing_velocities, stereo_odometry, vision_noise, with_vision
 from ekfslam.models.sensors.stereo import Rig
+from ekfslam.models.sensors.velocities import AXES, VelocitySource
 from ekfslam.models.tilt import first_tilt
 from ekfslam.models.track_noise import track_noise
 from ekfslam.models.vehicle import odometry_text, slow_slip, with_vehicle
@@ -87,6 +90,7 @@ class Problem:
         sequence: Recording with cleaned tracks.
         hygiene: Report of cleaning; None: tracks were not cleaned.
         account: Attributes of a result that say where the noise comes from.
+        beside: Velocities that are measured beside inertial samples, such as those of wheels; None if there are none.
     """
 
     sequence: Sequence
@@ -94,6 +98,7 @@ class Problem:
     model: Model
     hygiene: HygieneReport | None
     account: Mapping[str, str | int | float]
+    beside: VelocitySource | None = None
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -138,8 +143,10 @@ def resolve(
     Raises:
         ConfigError: An unknown block, an unknown setting of a block, or pixel noise that is too small.
     """
-    sequence = recording = sequence.once(with_odometry)
     config = config or Config()
+    if mode in ("full", "smoothed") and (apart := _apart(sequence, config)) is not None:
+        return apart.added_to(resolve(apart.sequence, apart.config, mode, blocks))
+    sequence = recording = sequence.once(with_odometry)
     account: dict[str, str | int | float] = {f"tuned_{key}": value for key, value in config.tuning.items()}
     if mode != "dead-reckoning" and _has_open_scale(sequence, config) and (tracks := sequence.once(track_noise)):
         account["found_tracks"] = tracks.text
@@ -155,11 +162,7 @@ def resolve(
     if is_inertial(sequence):
         account |= {f"inertial_{name}": value for name, value in vars(_densities(sequence)).items()}
     if mode != "dead-reckoning":
-        if (least := float(np.min(noise.pixel_std_px))) < LEAST_PX:
-            raise ConfigError(
-                f"{sequence.name}: the recording states a pixel noise of {least:g} px, with which innovation "
-                f"covariances are singular; give noise.sigma_px, at least {LEAST_PX:g}"
-            )
+        _require_pixel_noise(sequence, noise)
         observations, hygiene = sequence.once(clean_tracks, _in_the_long_run(sequence, config, noise), config.hygiene)
         attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
         sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
@@ -175,6 +178,65 @@ def resolve(
             config = config.with_overrides({"noise": {"track_scale": scale}})
             model = _model(sequence, config, noise_of(sequence, config), blocks)
     return Problem(sequence, config, model, hygiene, account)
+
+
+def _require_pixel_noise(sequence: Sequence, noise: Noise) -> None:
+    if (least := float(np.min(noise.pixel_std_px))) < LEAST_PX:
+        raise ConfigError(
+            f"{sequence.name}: the recording states a pixel noise of {least:g} px, with which innovation covariances "
+            f"are singular; give noise.sigma_px, at least {LEAST_PX:g}"
+        )
+
+
+@dataclass(frozen=True)
+class _Apart:
+    """A recording without its velocities, and these as a source that measures the velocity in the state."""
+
+    sequence: Sequence
+    config: Config
+    source: VelocitySource
+
+    def added_to(self, problem: Problem) -> Problem:
+        """Return the problem of the recording alone with the source, and its noise in words."""
+        std = ", ".join(f"{axis} {std:.3g}" for axis, std in zip(self.source.axes, self.source.std, strict=True))
+        account = {**problem.account, "beside": f"velocities are measured beside inertial samples: {std} m/s"}
+        return dataclasses.replace(problem, beside=self.source, account=account)
+
+
+def _apart(sequence: Sequence, config: Config) -> _Apart | None:
+    """Return a recording of inertial samples and velocities apart; None if it has not both.
+
+    Only linear velocities in the IMU frame are used: the gyroscope knows the angular ones better. They have the noise
+    that they have without samples, and their slow bias as a block. Interpolated ones are left out.
+    """
+    axes = np.flatnonzero(sequence.measured_axes[:3])
+    if sequence.inertial is None or not len(axes) or sequence.velocity_frame != "imu":
+        return None
+    wheels = sequence.once(_without_samples)
+    std, found = noise_of(wheels, config).velocity_std[axes], noise_of_velocities(wheels, config)
+    std = np.where(std > 0, std, automatic_noise(found).velocity_std[axes])
+    if is_automatic(wheels, config) and config.noise.shared:
+        bias = TwistBias.automatic(found.sigma, found.is_clean, False) or {}
+        tables = {TwistBias.name: {**bias, **config.blocks.get(TwistBias.name, {})}}
+        config = dataclasses.replace(config, blocks={**config.blocks, **tables})
+    known = 1 + np.flatnonzero(~wheels.interpolated[1:])
+    source = VelocitySource(
+        wheels.time_s[known], tuple(AXES[axis] for axis in axes), wheels.twist[np.ix_(known, axes)], std, True
+    )
+    return _Apart(sequence.once(_without_velocities), config, source)
+
+
+def _without_samples(sequence: Sequence) -> Sequence:
+    inputs = tuple(each for each in sequence.inputs if isinstance(each, Velocities))
+    return dataclasses.replace(sequence, inputs=inputs)
+
+
+def _without_velocities(sequence: Sequence) -> Sequence:
+    inputs = tuple(each for each in sequence.inputs if isinstance(each, InertialSamples))
+    attributes = {**sequence.attributes, **WITHOUT_VELOCITIES}
+    attributes.pop(TWIST_STD, None)
+    attributes.pop(INTERPOLATED, None)
+    return dataclasses.replace(sequence, inputs=inputs, attributes=attributes)
 
 
 def with_odometry(sequence: Sequence) -> Sequence:
@@ -281,7 +343,7 @@ def with_unmeasured(sequence: Sequence, noise: Noise) -> Noise:
 
 
 def is_inertial(sequence: Sequence) -> bool:
-    """Return whether inertial samples move the state: the recording has some, and no measured velocities."""
+    """Return whether inertial samples move the state: the recording has some, and no velocities, see `_apart`."""
     return sequence.inertial is not None and not sequence.has_velocities
 
 

@@ -31,7 +31,7 @@ from ekfslam.filters.reports import FrameReport, collect
 from ekfslam.filters.result import Innovation, Landmarks, Parameters, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
 from ekfslam.models.process.inertial import Inertial
-from ekfslam.models.sensors.velocities import VelocitySource
+from ekfslam.models.sensors.velocities import Both, VelocitySource
 from ekfslam.progress import progress
 from ekfslam.resolve import Problem, resolve
 from ekfslam.smoother.fixed_lag import FixedLag
@@ -79,7 +79,7 @@ def run(
         suspicions = sequence.once(inspect_sequence).warnings
         problem = resolve(sequence, config, mode)
     with timings.part(mode), one_thread():
-        estimate = _joint(problem, further) if mode == "full" else _dead_reckoned(problem, mode)
+        estimate = _joint(problem, _sources(problem, further)) if mode == "full" else _dead_reckoned(problem, mode)
     with timings.part("evaluation"):
         result = _result(problem, mode, estimate)
         compared = compare_sources(sequence) if mode == "full" and not suspicions else None
@@ -111,7 +111,12 @@ def _judged(problem: Problem) -> tuple[IntArray, IntArray] | None:
     return relative_pairs(truth, reach) if truth is not None and reach else None
 
 
-def _joint(problem: Problem, further: VelocitySource | None) -> _Estimate:
+def _sources(problem: Problem, further: VelocitySource | None) -> VelocitySource | Both | None:
+    """Return the velocities that are measured beside the inputs of the process."""
+    return further if problem.beside is None else problem.beside.along(further)
+
+
+def _joint(problem: Problem, further: VelocitySource | Both | None) -> _Estimate:
     """Run the joint filter."""
     sequence, settings, judged = problem.sequence, problem.config.filter, _judged(problem)
     count = len(sequence)

@@ -182,6 +182,7 @@ def test_samples_may_end_one_step_before_a_frame_but_not_two():
         samples.interval(0.9, 1.005)
 
 
-def test_measured_velocities_take_precedence_over_samples():
+def test_samples_move_the_state_beside_measured_velocities_but_not_in_dead_reckoning():
     sequence = world(inputs=(synthetic_sequence(frames=20).velocities, inertial()))
-    assert resolve(sequence).model.process.takes is Velocities
+    assert resolve(sequence).model.process.takes is InertialSamples
+    assert resolve(sequence, mode="dead-reckoning").model.process.takes is Velocities

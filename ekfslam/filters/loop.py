@@ -15,7 +15,7 @@ from ekfslam.errors import FilterError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.mapping import IndependentLandmarks
 from ekfslam.filters.reports import FrameReport
-from ekfslam.models.sensors.velocities import VelocitySource
+from ekfslam.models.sensors.velocities import Both, VelocitySource
 
 
 class Frame(NamedTuple):
@@ -49,7 +49,7 @@ def run_filter(
     estimator: JointEKF | IndependentLandmarks,
     sequence: Sequence,
     frames: Iterable[int] | None = None,
-    further: VelocitySource | None = None,
+    further: VelocitySource | Both | None = None,
     clock: Callable[[], float] = perf_counter,
 ) -> Iterator[Frame]:
     """Feed a recording to an estimator frame by frame; its state can be read in between.

@@ -51,9 +51,11 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
         ConfigError: Measurements by further sensors of a velocity that is not in the state.
     """
     model, process = e.model, e.model.process
-    if also is not None and not process.estimates_velocity:
-        raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
-    if e.engine is not None and (arrived := e.engine.predict(interval)) is not None:
+    if also is not None:
+        if not process.has_velocity:
+            raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
+        also = process.referred(also, e.values, interval)
+    if e.engine is not None and also is None and (arrived := e.engine.predict(interval)) is not None:
         return _arrived(e, e.engine, interval, arrived)
     way_m, T_cam_imu = process.way_m(e.values, interval), np.eye(4)
     if View.name in model.layout:

@@ -139,6 +139,7 @@ class ProcessFactors:
         measured, frame = self._log.measured, self._log.measured_frame
         if not len(frame):
             return []
+        frame = frame - int(self._model.process.measures_departure)
         J = self._model.process.jacobian(measured)[:, self._unknowns.aux_columns] / measured.std[:, None]
         r = measured.value / measured.std - (J * aux[frame]).sum(axis=1)
         return [Factor(r[:, None], (Term("aux", frame, J[:, None]),))]

@@ -114,8 +114,9 @@ def _print_findings(sequence: Sequence) -> None:
     assert problem.hygiene is not None
     if (found := problem.account.get("found_tracks")) is not None:
         print(f"tracks        noise not stated; from the data: {found}")
-    if "odometry" in problem.account:
-        print(f"odometry      {problem.account['odometry']}")
+    for name in ("odometry", "beside"):
+        if name in problem.account:
+            print(f"{name:13s} {problem.account[name]}")
     print(f"filter        {problem.account['engine']}")
     for line in problem.lines:
         print(f"state         {line}")

@@ -88,7 +88,9 @@ class Process(ABC):
         layout: Columns of all blocks.
         takes: Kind of the inputs.
         started: Names of the walking blocks that the first inputs start, see `start`.
-        estimates_velocity: Whether velocities are in the state, so that further sensors can measure them.
+        estimates_velocity: Whether the inputs measure velocities in the state.
+        has_velocity: Whether a velocity is in the state, so that further sensors can measure it.
+        measures_departure: Whether these measure the state before the step, see `referred`; else that of the interval.
     """
 
     own: tuple[str, ...] = ("pose",)
@@ -96,6 +98,8 @@ class Process(ABC):
     takes: type[Velocities] | type[InertialSamples] = Velocities
     started: tuple[str, ...] = ()
     estimates_velocity: bool = False
+    has_velocity: bool = False
+    measures_departure: bool = False
 
     @abstractmethod
     def step(self, values: Values, interval: Interval | Intervals, T_linear: Array, first_estimates: bool) -> Step:
@@ -137,6 +141,10 @@ class Process(ABC):
         In the first interval `start` uses them.
         """
         return None
+
+    def referred(self, measured: Measured, values: Values, interval: Interval) -> Measured:
+        """Return measurements by further sensors during an interval as those of the state that `jacobian` is of."""
+        return measured
 
     def jacobian(self, measured: Measured) -> Array:
         """Return H (n, body) of measurements by all blocks, which are vectors: ``value = H x + noise``."""

@@ -8,7 +8,7 @@ estimation", IJRR 2020) with the velocity in the body.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,11 +17,12 @@ from ekfslam.arrays import Array
 from ekfslam.data.inputs import InertialNoise, InertialSamples
 from ekfslam.data.interval import Interval, Intervals
 from ekfslam.data.noise import Noise
+from ekfslam.errors import ConfigError
 from ekfslam.geometry import se3
 from ekfslam.geometry.preintegration import LONGEST_S, NU, PHI, Increment, R, increments
 from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
 from ekfslam.models.blocks.base import Layout, StateBlock, Values
-from ekfslam.models.process.base import MakeProcess, Process, Residual, Step
+from ekfslam.models.process.base import MakeProcess, Measured, Process, Residual, Step
 
 GRAVITY_M_S2 = 9.81
 _GAP_FACTOR = 10.0  # by which densities of white noise grow in an interval with a gap between its samples
@@ -49,6 +50,7 @@ class Inertial(Process):
 
     own = ("pose", Velocity.name, GyroBias.name, AccelBias.name)
     takes = InertialSamples
+    has_velocity = measures_departure = True
 
     @cached_property
     def _g(self) -> Array:
@@ -117,6 +119,32 @@ class Inertial(Process):
         else:
             ends = _rate_at_end(interval)
         return np.concatenate([after[Velocity.name], ends - after[GyroBias.name]], axis=-1)
+
+    def referred(self, measured: Measured, values: Values, interval: Interval) -> Measured:
+        """Return means of linear velocities over an interval as velocities before it: less the change by the samples.
+
+        That change depends on the state by the length of the interval only, which is left out.
+
+        Raises:
+            ConfigError: Something else than linear velocities is measured.
+        """
+        if (measured.axis > 2).any():
+            raise ConfigError("beside inertial samples, only linear velocities can be measured: v_x, v_y, v_z")
+        T, first, gyro_bias, accel_bias = (values[name] for name in self.own)
+        u, g, change = first, T[:3, :3] @ self._g, np.zeros(3)
+        for dt, sample in zip(interval.dt_s, interval.inputs, strict=True):
+            back = se3.so3_exp(-dt * (sample[:3] - gyro_bias))
+            after, g = back @ (u + dt * (sample[3:] - accel_bias + g)), back @ g
+            change, u = change + 0.5 * dt * (u + after - 2.0 * first), after
+        return replace(measured, value=measured.value - (change / interval.tau_s)[measured.axis])
+
+    def jacobian(self, measured: Measured) -> Array:
+        H = np.zeros((len(measured.axis), self.layout.body))
+        H[np.arange(len(H)), self.layout[Velocity.name].start + measured.axis] = 1.0
+        for block in self.layout.coupled("velocity"):
+            if (J := block.velocity_offset()) is not None:
+                H[:, self.layout[block.name]] = np.where(measured.is_biased[:, None], J[measured.axis], 0.0)
+        return H
 
     def way_m(self, values: Values, interval: Interval | Intervals) -> Array:
         """Return the way at the speed before the interval."""

@@ -126,7 +126,7 @@ class VelocityWalk(VelocityInputs):
     """The velocity is the block `Twist`, which walks; the inputs measure it, or only start it."""
 
     started = (Twist.name,)
-    estimates_velocity = True
+    estimates_velocity = has_velocity = True
 
     @property
     def _depends_on_blocks(self) -> bool:

@@ -15,16 +15,17 @@ AXES = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
 
 @dataclass(frozen=True)
 class VelocitySource:
-    """Measurements of the block `Twist`: ``z = twist[axes] + noise``, at stamps of their own.
+    """Measurements of a velocity in the state: ``z = twist[axes] + noise``, at stamps of their own.
 
-    Each measures the velocities of the interval between frames that its stamp lies in, ``(t[k-1], t[k]]``. Biases of
-    the IMU's velocities are not in it.
+    Each measures the mean velocity of the interval between frames that its stamp lies in, ``(t[k-1], t[k]]``. The state
+    holds it in the block `Twist`, or in the block `Velocity` of inertial samples, which takes linear axes only.
 
     Args:
         time_s: (n,) ascending stamps, on the clock of the recording.
         axes: Which of `AXES` are measured, a of them.
         value: (n, a) measurements, m/s or rad/s, in the frame of the recording's velocities.
         std: (a,) their standard deviations.
+        is_biased: Whether blocks of biases, such as `TwistBias`, are in them.
 
     Raises:
         ConfigError: An unknown axis, stamps that do not ascend, or sizes that do not fit.
@@ -34,6 +35,7 @@ class VelocitySource:
     axes: tuple[str, ...]
     value: Array
     std: Array
+    is_biased: bool = False
 
     def __post_init__(self) -> None:
         unknown = [axis for axis in self.axes if axis not in AXES]
@@ -56,4 +58,22 @@ class VelocitySource:
             return None
         axis = np.tile([AXES.index(name) for name in self.axes], last - first)
         std = np.tile(np.asarray(self.std, dtype=float), last - first)
-        return Measured(axis, np.ravel(self.value[first:last]), std, np.zeros(len(axis), dtype=bool))
+        return Measured(axis, np.ravel(self.value[first:last]), std, np.full(len(axis), self.is_biased))
+
+    def along(self, other: VelocitySource | None) -> VelocitySource | Both:
+        """Return both sources as one."""
+        return self if other is None else Both(self, other)
+
+
+@dataclass(frozen=True)
+class Both:
+    """Two sources of velocities as one."""
+
+    first: VelocitySource
+    second: VelocitySource
+
+    def during(self, begin_s: float, end_s: float) -> Measured | None:
+        """Return the measurements of both, see `VelocitySource.during`."""
+        found = (source.during(begin_s, end_s) for source in (self.first, self.second))
+        parts = [part for part in found if part is not None]
+        return Measured.concatenate(parts) if parts else None
