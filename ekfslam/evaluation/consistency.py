@@ -16,6 +16,7 @@ from scipy.special import chdtri, gammaincinv
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.interpolation import interpolated_poses, stretches
+from ekfslam.data.observations import TrueMotion
 from ekfslam.data.sequence import Truth
 from ekfslam.data.truth_noise import TruthNoise, doubts_of
 from ekfslam.filters.result import Result
@@ -69,13 +70,14 @@ def measured_truth(truth: Truth, interpolated: BoolArray, time_s: Array) -> Trut
     position is uncertain by the speed over that gap, and all other positions are relative to it.
     """
     interpolated = interpolated | interpolated_frames(truth, len(time_s))
-    kept, noise = ~interpolated[truth.frame], truth.noise
+    kept, noise, motion = ~interpolated[truth.frame], truth.noise, truth.motion
     if noise is not None and interpolated[1:2].any():
         invented_s = float(time_s[stretches(interpolated)[0][1]] - time_s[0])
         first_m = float(np.hypot(noise.first_position_m, GAP_STD[0] * invented_s))
         noise = dataclasses.replace(noise, first_position_m=first_m)
+    motion = None if motion is None else TrueMotion(*(value[kept] for value in vars(motion).values()))
     return dataclasses.replace(
-        truth, frame=truth.frame[kept], T_world_imu=truth.T_world_imu[kept], noise=noise, motion=None
+        truth, frame=truth.frame[kept], T_world_imu=truth.T_world_imu[kept], noise=noise, motion=motion
     )
 
 

@@ -22,7 +22,9 @@ from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation import trajectory
 from ekfslam.evaluation.consistency import measured_truth, pose_nees, pose_nees_apart, pose_nees_by_axis
+from ekfslam.evaluation.inertial import inertial_nees
 from ekfslam.evaluation.relative import FRAMES, PATHS_M, over_frames, over_path, relative_pose_nees
+from ekfslam.filters.inertial_states import InertialStates
 from ekfslam.filters.result import Innovation, Result
 
 RPE_PATH_M = 10.0
@@ -41,32 +43,35 @@ class Metric:
         heading, fmt: Heading in tables, with unit or expected value, and format of the value.
         compute: Function that returns the value, or the values of several metrics.
         place: Place of the value among several; None if it is alone.
+        definition: The definition in one line, if the heading does not say all.
     """
 
     heading: str
     fmt: str
     compute: Function
     place: int | None = None
+    definition: str = ""
 
 
 METRICS: dict[str, Metric] = {}  # by key, in the order of tables
 
 
-def metric(key: str, heading: str, fmt: str) -> Callable[[Function], Function]:
+def metric(key: str, heading: str, fmt: str, definition: str = "") -> Callable[[Function], Function]:
     """Register a function that returns a figure of merit: its key in summaries, its heading and format in tables."""
 
     def register(compute: Function) -> Function:
-        METRICS[key] = Metric(heading, fmt, compute)
+        METRICS[key] = Metric(heading, fmt, compute, None, definition)
         return compute
 
     return register
 
 
-def metrics(*rows: tuple[str, str, str]) -> Callable[[Function], Function]:
-    """Register a function that returns several figures of merit, or None: key, heading and format of each."""
+def metrics(*rows: tuple[str, ...]) -> Callable[[Function], Function]:
+    """Register a function that returns several figures of merit, or None: key, heading, format, definition of each."""
 
     def register(compute: Function) -> Function:
-        METRICS.update({key: Metric(heading, fmt, compute, i) for i, (key, heading, fmt) in enumerate(rows)})
+        for i, (key, heading, fmt, *definition) in enumerate(rows):
+            METRICS[key] = Metric(heading, fmt, compute, i, *definition)
         return compute
 
     return register
@@ -75,9 +80,9 @@ def metrics(*rows: tuple[str, str, str]) -> Callable[[Function], Function]:
 def offered(result: Result, truth: Truth | None, interpolated: BoolArray) -> dict[str, Any]:
     """Return the values that metrics may take by name, None if missing.
 
-    ``result``, its ``landmarks`` and ``innovation`` (None without an update), ``truth``, the ``interpolated`` intervals
-    (T,) of the recording; with true poses ``T_est`` and ``T_true`` (n, 4, 4) at their frames, and ``measured``, the
-    truth of frames that no interpolated interval leads to.
+    ``result``, its ``landmarks``, ``innovation`` (None without an update) and states of an ``inertial`` unit,
+    ``truth``, the ``interpolated`` intervals (T,) of the recording; with true poses ``T_est`` and ``T_true``
+    (n, 4, 4) at their frames, and ``measured``, the truth of frames that no interpolated interval leads to.
     """
     known = truth if truth is not None and len(truth.frame) else None
     return {
@@ -85,6 +90,7 @@ def offered(result: Result, truth: Truth | None, interpolated: BoolArray) -> dic
         "landmarks": result.landmarks,
         "innovation": result.innovation if result.innovation.dof.any() else None,
         "interpolated": interpolated,
+        "inertial": result.inertial,
         "truth": truth,
         "measured": known and measured_truth(known, interpolated, result.time_s),
         "T_est": known and result.T_world_imu[known.frame],
@@ -109,6 +115,20 @@ def computed(found: dict[str, Any]) -> dict[str, Value]:
 
 metric("ate_m", "ATE [m], unaligned", ".3f")(partial(trajectory.absolute_trajectory_error, align=False))
 metric("ate_aligned_m", "ATE [m], SE(3)-aligned", ".3f")(partial(trajectory.absolute_trajectory_error, align=True))
+
+
+@metric(
+    "ate_aligned_4dof_m",
+    "ATE [m], aligned in yaw and position",
+    ".3f",
+    "Root mean square of position errors after the turn about the vertical and the shift of least squares; an inertial "
+    "unit knows the vertical.",
+)
+def ate_aligned_4dof(T_est: Array, T_true: Array, inertial: InertialStates) -> float:
+    """Return the ATE after `align_yaw`, four degrees of freedom."""
+    return trajectory.absolute_trajectory_error(T_est, T_true, align=True, by=trajectory.align_yaw)
+
+
 metric("final_error_m", "final error [m]", ".3f")(trajectory.final_position_error)
 metrics(("rpe_1_frame_m", "RPE [m], 1 frame", ".4f"), ("rpe_1_frame_deg", "RPE [deg], 1 frame", ".4f"))(
     trajectory.relative_pose_error_over_frames
@@ -158,6 +178,32 @@ def relative_nees(result: Result, truth: Truth, interpolated: BoolArray) -> list
     return [_mean(values[which]) for which in chosen]
 
 
+def _error_squared(of: str) -> str:
+    return f"Mean of e^T P^-1 e, with e the error of {of} and P its covariance"
+
+
+_FIRST = "position and yaw of the first true pose are those of the estimate"
+
+
+@metrics(
+    ("pose_nees_free_mean", "pose NEES (6), yaw and position free", ".2f", f"{_error_squared('the pose')}: {_FIRST}."),
+    ("velocity_nees_mean", "velocity NEES (3)", ".2f", f"{_error_squared('the velocity in the IMU frame')}."),
+    ("gyro_bias_nees_mean", "gyroscope bias NEES (3)", ".2f", f"{_error_squared('the bias of the gyroscope')}."),
+    ("accel_bias_nees_mean", "accelerometer bias NEES (3)", ".2f", f"{_error_squared('that of the accelerometer')}."),
+    (
+        "inertial_nees_mean",
+        "pose, velocity and biases NEES (15)",
+        ".2f",
+        f"{_error_squared('pose, velocity and biases together')}: {_FIRST}.",
+    ),
+)
+def nees_of_inertial_states(result: Result, measured: Truth, inertial: InertialStates) -> list[float | None] | None:
+    """Return the mean NEES of the pose with free yaw and position, of velocity and biases, and of all together."""
+    found = inertial_nees(result, measured)
+    parts = ("pose", "velocity", "gyro_bias", "accel_bias", "all")
+    return None if found is None else [_mean(found[part]) if part in found else None for part in parts]
+
+
 @metric("nis_per_dof", "NIS / dof (1)", ".3f")
 def nis_per_dof(innovation: Innovation) -> float:
     """Return the sum of NIS divided by the sum of degrees of freedom."""
@@ -168,8 +214,10 @@ metric("landmark_rmse_m", "landmark RMSE [m]", ".3f")(trajectory.landmark_rmse)
 
 
 @metrics(("accepted", "accepted", "d"), ("rejected", "rejected", "d"))
-def observations(result: Result) -> tuple[int, int]:
-    """Return the numbers of accepted and rejected observations."""
+def observations(result: Result) -> tuple[int, int] | None:
+    """Return the numbers of accepted and rejected observations; None of a posterior, which rejects none."""
+    if "observations" in result.counts:
+        return None
     return int(result.innovation.accepted.sum()), int(result.innovation.rejected.sum())
 
 

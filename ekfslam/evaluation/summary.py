@@ -67,7 +67,8 @@ def compare_table(summary: Mapping[str, Any]) -> str:
     landmarks = "" if summary["landmarks"] is None else f", {summary['landmarks']} landmarks"
     title = f"**{summary['sequence']}**: {summary['frames']} frames{landmarks}"
     table = markdown_table(["", *modes], merit_rows(modes.values()), padded=True)
-    return document(title, table, *(f"{mode}: {words}." for mode, words in summary.get("errors", {}).items()))
+    errors = (f"{mode}: {words}." for mode, words in summary.get("errors", {}).items())
+    return document(title, table, *errors, *(f"{heading}: {words}" for heading, words in definitions(modes.values())))
 
 
 def merit_rows(summaries: Iterable[Mapping[str, Any]]) -> list[list[str]]:
@@ -78,3 +79,11 @@ def merit_rows(summaries: Iterable[Mapping[str, Any]]) -> list[list[str]]:
         if any(value is not None for value in values):
             rows.append([metric.heading, *(number(value, metric.fmt) for value in values)])
     return rows
+
+
+def definitions(summaries: Iterable[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Return heading and definition of the rows of `merit_rows` whose heading does not say all."""
+    found = {key for summary in summaries for key, value in summary.items() if value is not None}
+    return [
+        (metric.heading, metric.definition) for key, metric in METRICS.items() if key in found and metric.definition
+    ]

@@ -5,6 +5,7 @@ Trajectories are stacks of poses ``T_world_imu`` (n, 4, 4), estimate and truth a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -34,14 +35,26 @@ def align_se3(points: Array, reference: Array) -> Array:
     return se3.transform(R, reference_centre - R @ centre)
 
 
-def absolute_trajectory_error(T_est: Array, T_true: Array, align: bool) -> float:
-    """Return the ATE, the root mean square of the position errors in metres, without or after `align_se3`.
+def align_yaw(points: Array, reference: Array) -> Array:
+    """Return the transform (4, 4) of least squared distances that turns about z alone: the vertical is known.
+
+    Four degrees of freedom, as an inertial unit leaves them; points are (n, 3). Points on one vertical are not turned.
+    """
+    centre, reference_centre = points.mean(axis=0), reference.mean(axis=0)
+    p, q = (points - centre)[:, :2], (reference - reference_centre)[:, :2]
+    yaw = np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum())
+    R = se3.so3_exp(np.array([0.0, 0.0, yaw]))
+    return se3.transform(R, reference_centre - R @ centre)
+
+
+def absolute_trajectory_error(T_est: Array, T_true: Array, align: bool, by: Callable[..., Array] = align_se3) -> float:
+    """Return the ATE, the root mean square of the position errors in metres, without or after an alignment.
 
     Sturm et al., *A Benchmark for the Evaluation of RGB-D SLAM Systems*, IROS 2012. Scale is never aligned.
     """
     estimate, truth = T_est[:, :3, 3], T_true[:, :3, 3]
     if align:
-        estimate = se3.apply(align_se3(estimate, truth), estimate)
+        estimate = se3.apply(by(estimate, truth), estimate)
     return float(np.sqrt(np.mean(np.sum((estimate - truth) ** 2, axis=1))))
 
 

@@ -20,7 +20,7 @@ from ekfslam import files
 from ekfslam.config import Config
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.evidence import BLIND
-from ekfslam.evaluation.summary import error_in_words, merit_rows
+from ekfslam.evaluation.summary import definitions, error_in_words, merit_rows
 from ekfslam.evaluation.tables import MISSING
 from ekfslam.names import components, printable
 from ekfslam.page.content import PART, Run, Section, plotted, remarks_of, sections_of, told_apart
@@ -147,6 +147,7 @@ def _section(number: int, section: Section, is_alone: bool) -> str:
 {_evidence(section)}
 <h3>Figures of merit</h3>
 {_runs_table(section, merit_rows(run.summary for run in section.runs))}
+{_list((f"{heading}: {words}" for heading, words in definitions(run.summary for run in section.runs)), "notes")}
 <h3>Runs in detail</h3>
 {"".join(_detail(run) for run in section.runs)}
 </section>"""

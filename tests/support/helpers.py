@@ -156,7 +156,15 @@ def truth_error(sequence, result):
     return np.linalg.norm(result.T_world_imu[truth.frame, :3, 3] - truth.T_world_imu[:, :3, 3], axis=1)
 
 
-SUMMARY_KEYS = {
+INERTIAL_KEYS = {
+    "ate_aligned_4dof_m",
+    "pose_nees_free_mean",
+    "velocity_nees_mean",
+    "gyro_bias_nees_mean",
+    "accel_bias_nees_mean",
+    "inertial_nees_mean",
+}
+SUMMARY_KEYS = INERTIAL_KEYS | {
     "ate_m",
     "ate_aligned_m",
     "final_error_m",
