@@ -18,6 +18,7 @@ from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import EkfslamError, FilterError, IllPosedError, PosteriorError
+from ekfslam.evaluation.brief import ATE, brief, brief_rows
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations, verdict_on
 from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.evaluation.truth import with_truth_noise
@@ -32,15 +33,6 @@ from ekfslam.timings import Timings
 
 if TYPE_CHECKING:
     from ekfslam.studies.study import Study, StudyArchive
-
-# Key figures of a summary on the card of a `Comparison`.
-_KEY_FIGURES = {
-    "ate_m": "ATE [m]",
-    "ate_aligned_m": "aligned [m]",
-    "pose_nees_mean": "pose NEES (6)",
-    "nis_per_dof": "NIS / dof (1)",
-    "total_s": "s",
-}
 
 
 @dataclass(frozen=True, repr=False)
@@ -62,15 +54,22 @@ class Comparison(Shown):
     def card(self) -> Card:
         """Return the card that ``repr`` and a notebook show."""
         facts = dict(self.skipped)
-        for mode, found in self.summary["modes"].items():
-            said = [(key, words) for key, words in _KEY_FIGURES.items() if found.get(key) is not None]
-            facts[mode] = ", ".join(f"{words} {found[key]:.3g}" for key, words in said) or "no truth to compare with"
+        for mode, result in self.results.items():
+            said = brief_rows(result, self.sequence.truth)
+            facts[mode] = ", ".join(
+                f"{name} {said[name]}" for name in (ATE, "observations used", "time") if name in said
+            )
         of = f"{self.sequence.name}, {count(len(self.sequence), 'frame')}"
-        return Card(of, facts, ("print(comparison.table)", 'comparison.results["full"]', 'comparison.save("out")'))
+        return Card(of, facts, ("print(comparison.brief)", "print(comparison.table)", 'comparison.save("out")'))
+
+    @cached_property
+    def brief(self) -> str:
+        """A few rows a mode, the verdict on the full run with its next step, and remarks."""
+        return brief(self.sequence, self.results, self.skipped, "ARCHIVE")
 
     @cached_property
     def table(self) -> str:
-        """The summary as a Markdown table, with reasons for missing modes and remarks."""
+        """All figures of merit as a Markdown table, with reasons for missing modes, the verdict and remarks."""
         lines = [f"No {mode}: {reason}" for mode, reason in self.skipped.items()]
         if "full" in self.results:
             lines.append(f"Verdict on full: {verdict_on(self.sequence, self.results['full'])}")
@@ -137,10 +136,23 @@ def compare(
     return Comparison(sequence, results, summary, skipped)
 
 
+def run_modes(
+    sequence: Sequence, modes: Iterable[Mode], config: Config | None = None, timings: Timings | None = None
+) -> dict[str, Result]:
+    """Return the results of several modes; the filter runs once for ``full`` and ``smoothed``.
+
+    Raises:
+        FilterError, IllPosedError: A mode has no result.
+    """
+    results, skipped = _run_all(sequence, list(modes), config, timings or Timings(), is_strict=True)
+    assert not skipped
+    return results
+
+
 def _run_all(
-    sequence: Sequence, modes: list[Mode], config: Config | None, timings: Timings
+    sequence: Sequence, modes: list[Mode], config: Config | None, timings: Timings, is_strict: bool = False
 ) -> tuple[dict[str, Result], dict[str, str]]:
-    """Return the result of each mode, and the reason for each mode without one."""
+    """Return the result of each mode, and the reason for each mode without one; ``is_strict`` raises it instead."""
     results: dict[str, Result] = {}
     skipped: dict[str, str] = {}
     for mode in dict.fromkeys(modes):
@@ -154,6 +166,8 @@ def _run_all(
             else:
                 results[mode] = run(sequence, mode, config, timings=timings)
         except (IllPosedError, FilterError) as error:
+            if is_strict:
+                raise
             skipped[mode] = str(error)
     return results, skipped
 
@@ -166,9 +180,12 @@ def compare_into(
     *,
     force: bool = False,
     figures: bool = True,
+    verbose: bool = False,
     timings: Timings | None = None,
 ) -> str:
-    """Save `compare` into a folder, and return the text for a terminal: notes of the reader, table and files written.
+    """Save `compare` into a folder, and return the text for a terminal: notes of the reader, `brief`, folder written.
+
+    ``verbose`` adds all figures of merit, counts and parameters, and lists the files.
 
     Raises:
         ArchiveError: The folder holds results of another recording, or cannot be written.
@@ -179,8 +196,24 @@ def compare_into(
     paths = comparison.save(folder, force, figures, timings)
     notes = "".join(f"{sequence.name}: {note}\n" for note in sequence.notes)
     with timings.part("evaluation"):
-        table = comparison.table
-    return f"{notes}\n{table}\nwritten to {folder}: {', '.join(path.name for path in paths)}"
+        said = brief(sequence, comparison.results, comparison.skipped, folder / "archive.h5")
+        if verbose:
+            said += f"\n{comparison.table}\n{details(comparison.results)}"
+    listed = f": {', '.join(path.name for path in paths)}" if verbose else f" ({count(len(paths), 'file')})"
+    return f"{notes}\n{said}\nwritten to {folder}{listed}"
+
+
+def details(results: Mapping[str, Result]) -> str:
+    """Return counts, estimated parameters and cleaned tracks of runs, one line each."""
+    found = []
+    for mode, result in results.items():
+        lines = [", ".join(f"{name} {number}" for name, number in result.counts.items() if number)]
+        lines += () if result.parameters is None else result.parameters.lines
+        lines += () if result.inertial is None else result.inertial.lines
+        cleaned = result.hygiene
+        lines += () if cleaned is None else [f"hygiene: {line}" for line in cleaned.lines(result.config["hygiene"])]
+        found += [f"{mode}: {line}" for line in lines if line]
+    return "\n".join(found)
 
 
 def compare_all(

@@ -35,7 +35,7 @@ def failure(capsys, *arguments):
 def test_compare_writes_archive_summaries_and_figures(tmp_path, capsys, undrawn):
     assert main(["compare", CITY, "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    assert "| ATE [m]" in printed
+    assert "| ATE (aligned)" in printed and "verdict: " in printed and "\nnext: " in printed
     folder = tmp_path / "city"
     names = {path.name for path in folder.iterdir()}
     assert {"archive.h5", "summary.json", "summary.md", "map.png", "errors.png", "nis.png"} <= names
@@ -163,7 +163,7 @@ def test_mistakes_in_the_call(tmp_path, capsys):
     assert "atlantis" in failure(capsys, "compare", "builtin:atlantis", "--out", tmp_path)
     assert "no.toml" in failure(capsys, "run", CITY, "--config", tmp_path / "no.toml", "--out", tmp_path / "o.h5")
     assert "sigma_px" in failure(capsys, "run", CITY, "--sigma-px", "0", "--out", tmp_path / "o.h5")
-    assert "invalid choice" in failure(capsys, "run", CITY, "--mode", "best", "--out", tmp_path / "o.h5")
+    assert "unknown mode 'best'" in failure(capsys, "run", CITY, "--mode", "best", "--out", tmp_path / "o.h5")
     assert "one by one" in failure(capsys, "compare", CITY, CITY, "--truth", tmp_path / "t.txt", "--out", tmp_path)
     (tmp_path / "file").touch()
     assert "file" in failure(capsys, "run", CITY, "--out", tmp_path / "file" / "o.h5")

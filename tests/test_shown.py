@@ -48,8 +48,8 @@ def test_everything_shows_itself_in_a_few_lines(world, compared, full, tmp_path)
     study = Study(runs=3)
     records = {
         "Sequence": (world, ["city", "60, 5.9 s", "stated", "ekfslam.run(sequence)"]),
-        "Result": (full, ["full on city", "60, 5.9 s", "+-", f"{len(full.landmarks)}", "NIS / dof", ".map()"]),
-        "Comparison": (compared, ["dead-reckoning", "full", "ATE [m]", "print(comparison.table)"]),
+        "Result": (full, ["full on city", "60 in 5.9 s", "+-", f"{len(full.landmarks)}", "NIS / dof", ".map()"]),
+        "Comparison": (compared, ["dead-reckoning", "full", "ATE (aligned)", "print(comparison.table)"]),
         "Posterior": (posterior(full), ["maximum a posteriori", "60 poses", ".joint_covariance("]),
         "Archive": (read_archive(tmp_path / "a.h5"), ["city", "60 frames", "archive.results["]),
         "Study": (study, ["3 runs", "large-heading", "invariant", "ekfslam.check_consistency(study"]),

@@ -30,6 +30,10 @@ from ekfslam.names import printable
 def main(arguments: SequenceType[str] | None = None) -> int:
     """Run ``ekfslam`` and return the exit code: 0, 130 after Ctrl-C, or 2 after one line for a user's error."""
     given = sys.argv[1:] if arguments is None else list(arguments)
+    if {"--mode", "--modes"} & {*given}:
+        from ekfslam.cli.modes import joined_modes
+
+        given = joined_modes(given)
     options = _parser(given[:1]).parse_args(given)
     _prepare_output()
     try:

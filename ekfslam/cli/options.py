@@ -48,6 +48,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     "--out": {"type": Path, "metavar": "DIR", "help": "default: the folder of the archive"},
     "--timings": {"action": "store_true", "help": "print the CPU and wall-clock time of each part"},
     "--force": {"action": "store_true", "help": "overwrite the output even if it holds something else"},
+    "--verbose": {"action": "store_true", "help": "print all figures of merit, counts and estimated parameters"},
     "--no-figures": {"action": "store_true", "help": "draw no figures, which saves time"},
     "--workers": {"type": int, "metavar": "N", "help": "processes (default: one per core)"},
     "--executor": {

@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.sequence import Truth
-from ekfslam.evaluation.tables import significant
-from ekfslam.evaluation.trajectory import absolute_trajectory_error
+from ekfslam.evaluation.brief import ATE, brief_rows
 from ekfslam.figures import maps as maps  # registers figures, as the next one does
 from ekfslam.figures import posterior as posterior
 from ekfslam.figures import registry, series
@@ -41,19 +40,17 @@ def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolA
         for ax, error in zip(column, errors, strict=True):
             draw_series(ax, error, color, {"color": "black", "linewidth": 1.0}, levels=ZERO)
         inside = f"{100 * series.share_inside(errors):.1f} % inside {BAND_SIGMAS:g} sigma"
-        nees = _nees_words(result, truth, interpolated)
         share_x(*column)
-        column[0].set_title(f"{title}\n{_ate_words(result, truth)}, {inside}{nees}")
+        said = [title, _ate_words(result, truth), inside, _nees_words(result, truth, interpolated)]
+        column[0].set_title("\n".join(said), fontsize=9.0)
     name, break_ = next(iter(results.values())).sequence_name, "\n" if len(columns) == 1 else " "
     figure.suptitle(f"{name}:{break_}estimate minus truth, world axes")
-    arrange(figure, left=0.8, top=1.2 if len(columns) == 1 else 1.0, gaps=(0.8, 0.13))
+    arrange(figure, left=0.8, top=1.25 if len(columns) == 1 else 1.05, gaps=(0.8, 0.13))
     return figure
 
 
 def _ate_words(result: Result, truth: Truth) -> str:
-    T = result.T_world_imu[truth.frame]
-    ate_m, aligned_m = (absolute_trajectory_error(T, truth.T_world_imu, align) for align in (False, True))
-    return f"ATE {significant(ate_m)} m, aligned {significant(aligned_m)} m"
+    return f"ATE (aligned) {brief_rows(result, truth)[ATE]}"
 
 
 def _nees_words(result: Result, truth: Truth, interpolated: BoolArray | None) -> str:
@@ -61,7 +58,7 @@ def _nees_words(result: Result, truth: Truth, interpolated: BoolArray | None) ->
     exact, noisy = (series.nees(result, truth, interpolated, noise).mean for noise in (False, True))
     if exact is None:
         return ""
-    words = f"\nmean NEES {exact:.3g} (6 expected)"
+    words = f"mean NEES (6) {exact:.3g}"
     return words if truth.noise is None else f"{words}, {noisy:.3g} with truth noise"
 
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array
+from ekfslam.evaluation.metrics import METRICS
 from ekfslam.figures.series import LOG_RATIO
 from ekfslam.figures.style import BAND_ALPHA, SERIES, legend_of, log_axis, styled
 from ekfslam.studies.sweep_table import SweepTable
@@ -17,6 +18,9 @@ from ekfslam.studies.sweep_table import SweepTable
 _MARKERS = "os^Dv<>P"
 _MOST_LINES, _MOST_PANELS = 24, 24
 _PANELS_A_ROW = 3
+# Units by the endings of settings, longer ones first.
+_UNITS = {"rad_s": "rad/s", "m_s2": "m/s^2", "m_s": "m/s", "px": "px", "deg": "deg", "rad": "rad", "hz": "Hz"}
+_UNITS |= {"ms": "ms", "m": "m", "s": "s"}
 
 
 @styled
@@ -48,11 +52,11 @@ def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
     names = [] if x.dtype.kind == "f" else list(dict.fromkeys(x.tolist()))
     for ax, (name, panel) in zip(axes, panels.items(), strict=False):
         _draw_panel(ax, panel, figure, setting, others, choices, names)
-        ax.set(title=", ".join(name), xlabel=setting, ylabel=figure)
+        ax.set(title=", ".join(name), xlabel=words_of(setting), ylabel=words_of(figure))
     for ax in axes[len(panels) :]:
         ax.remove()
     missing = int((~np.isfinite(y)).sum())
-    drawn.suptitle(f"{figure}, {len(y) - missing} runs" + (f", {missing} without it" if missing else ""))
+    drawn.suptitle(f"{words_of(figure)}, {len(y) - missing} runs" + (f", {missing} without it" if missing else ""))
     if others:
         legend_of(drawn, axes[:1], min(columns + 1, 3), ", ".join(others))
     return drawn
@@ -85,6 +89,15 @@ def _draw_panel(
     shown = table.column(figure)[np.isfinite(table.column(figure))]
     if len(shown) and shown.min() > 0 and shown.max() > LOG_RATIO * shown.min():
         log_axis(ax, (1.0, 2.0, 5.0))
+
+
+def words_of(column: str) -> str:
+    """Return a column in words with its unit: the heading of a metric, or a setting whose name ends with its unit."""
+    if column in METRICS:
+        return METRICS[column].heading
+    unit = next((ending for ending in _UNITS if column.endswith(f"_{ending}")), None)
+    name = column if unit is None else f"{column.removesuffix(f'_{unit}')} [{_UNITS[unit]}]"
+    return name.replace("_", " ").replace(".", " ")
 
 
 def _over_seeds(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:

@@ -295,27 +295,51 @@ class Result(Shown):
 
     def card(self) -> Card:
         """Return the card that ``repr`` and a notebook show."""
-        way_m = float(np.linalg.norm(np.diff(self.T_world_imu[:, :3, 3], axis=0), axis=1).sum())
-        seconds = float(self.time_s[-1] - self.time_s[0])
         last = zip("xyz", self.T_world_imu[-1, :3, 3], self.position_std_world_m[-1], strict=True)
         innovation, dof = self.innovation, int(self.innovation.dof.sum())
-        facts = {
-            "frames": f"{len(self.time_s)}, {figure(seconds)} s, {figure(way_m)} m",
-            "last position": ", ".join(f"{axis} {value:.2f} +- {std:.2g}" for axis, value, std in last)
-            + " m (1 sigma)",
-            "landmarks": str(len(self.landmarks)),
-        }
+        facts = self.brief
+        facts["last position"] = ", ".join(f"{a} {value:.2f} +- {std:.2g}" for a, value, std in last) + " m (1 sigma)"
+        tracks, count = len(np.unique(self.landmarks.id)), len(self.landmarks)
+        again = f" of {tracks} tracks: one that comes back or is cut starts another" if count > tracks else ""
+        facts["landmarks"] = f"{count}{again}"
         if self.inertial is not None:
             velocity = in_words(self.velocity_world_m_s, self.velocity_std_world_m_s, "m/s along world")
             facts |= {"last velocity": velocity, **dict(line.split(": ") for line in self.inertial.lines[1:])}
         if dof:
-            facts["observations"] = f"{innovation.accepted.sum()} accepted, {innovation.rejected.sum()} rejected"
             facts["NIS / dof"] = f"{figure(float(innovation.nis.sum()) / dof)} (1 expected)"
-        facts["time"] = f"{figure(float(np.median(self.ms_per_frame)))} ms a frame"
         facts |= {f"remark {i}": remark for i, remark in enumerate(self.remarks, 1)}
         further: tuple[str, ...] = (".map()", ".plot()", ".errors(sequence)", '.to_dataframe("landmarks")')
         further += ("ekfslam.posterior(result)",) if self.log is not None else ()
         return Card(f"{self.mode} on {self.sequence_name}", facts, further)
+
+    @property
+    def brief(self) -> dict[str, str]:
+        """Size, last standard deviations, share of the observations used, and time, in words by heading.
+
+        The standard deviation of the position is the root of the sum over its axes; the heading turns about z of world.
+        """
+        way_m = float(np.linalg.norm(np.diff(self.T_world_imu[:, :3, 3], axis=0), axis=1).sum())
+        seconds, total_s = float(self.time_s[-1] - self.time_s[0]), float(self.ms_per_frame.sum()) / 1e3
+        position_m = np.sqrt(max(float(np.trace(self.position_covariance_world[-1])), 0.0))
+        heading_deg = np.degrees(np.sqrt(max(float(self.rotation_covariance_world[-1, 2, 2]), 0.0)))
+        each_ms = float(np.median(self.ms_per_frame))
+        return {
+            "frames, way": f"{len(self.time_s)} in {figure(seconds)} s, {figure(way_m)} m",
+            "std of last position, heading": f"{figure(position_m)} m, {figure(float(heading_deg))} deg",
+            "observations used": self._used,
+            "time": f"{figure(total_s)} s, {figure(each_ms)} ms a frame",
+        }
+
+    @property
+    def _used(self) -> str:
+        """The share of the observations that the estimate is conditioned on."""
+        counts, accepted = self.counts, int(self.innovation.accepted.sum())
+        if "observations" in counts:  # a posterior
+            weak = counts.get("observations weighted below one half", 0)
+            return f"all {counts['observations']} of full, {weak} with less than half their weight"
+        if (total := accepted + int(self.innovation.rejected.sum()) + counts.get("dropped by hygiene", 0)) == 0:
+            return "none"
+        return f"{100 * accepted / total:.1f} % of {total}"
 
     # --- in the frame that a reader expects ---------------------------------------------------------------------------
 

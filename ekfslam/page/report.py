@@ -19,6 +19,7 @@ from typing import Any
 from ekfslam import files
 from ekfslam.config import Config
 from ekfslam.errors import ArchiveError
+from ekfslam.evaluation.brief import brief_rows
 from ekfslam.evaluation.evidence import BLIND
 from ekfslam.evaluation.summary import definitions, error_in_words, merit_rows
 from ekfslam.evaluation.tables import MISSING
@@ -42,7 +43,6 @@ _KEY_FIGURES = (
     "nis_per_dof",
     "landmark_rmse_m",
 )
-_ERRORS = ("ate_m", "ate_aligned_m", "t_rel_percent", "landmark_rmse_m")  # on cards, whose verdict has the others
 _MOST_CARDS = 4  # of more runs, only those judged by innovations have a card
 
 
@@ -165,14 +165,13 @@ def _carded(section: Section) -> list[Run]:
 
 
 def _card(run: Run) -> str:
-    """Return the verdicts of a run, their evidence, and its errors."""
+    """Return the verdicts of a run, their evidence, and the rows that a terminal shows."""
     head, *items = run.said
-    figures = dict(merit_rows([{key: run.summary[key] for key in _ERRORS}]))
     return f"""<article class="card {run.honesty.grade}">
 <h3>{escape(run.label)}</h3>
 <p class="verdict">{escape(head[:1].upper() + head[1:])}</p>
 {_list([*items, *run.result.remarks, *filter(None, [error_in_words(run.result, run.truth)])], "causes")}
-{_pairs(figures, "")}
+{_pairs(brief_rows(run.result, run.truth), "")}
 </article>"""
 
 

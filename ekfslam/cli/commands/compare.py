@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from ekfslam import files
+from ekfslam.cli.modes import declare_modes
 from ekfslam.cli.options import DEFAULT_DATA, EXECUTOR, configured, declare, declare_run, open_data, print_warnings
 from ekfslam.config import MODES
 from ekfslam.errors import ConfigError
@@ -26,9 +27,9 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "data", nargs="*", default=[DEFAULT_DATA])
-    parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), metavar="MODE", help=", ".join(MODES))
+    declare_modes(parser, MODES)
     declare(parser, "--out", default=Path("results/local"), help="default: %(default)s")
-    declare(parser, "--no-figures", "--timings", *EXECUTOR)
+    declare(parser, "--no-figures", "--verbose", "--timings", *EXECUTOR)
     declare_run(parser)
 
 
@@ -52,7 +53,7 @@ def command(options: argparse.Namespace) -> None:
     recordings = dict(zip(folders, sequences, strict=True))
     where = "serial" if len(recordings) == 1 and options.executor == "processes" else options.executor
     workers = options.workers or min(len(recordings), os.cpu_count() or 1)
-    chosen = {"force": options.force, "figures": not options.no_figures}
+    chosen = {"force": options.force, "figures": not options.no_figures, "verbose": options.verbose}
     if where == "serial":  # the clock is that of this process
         chosen["timings"] = timings
     with open_executor(where, workers) as executor:

@@ -19,6 +19,7 @@ from ekfslam.evaluation.consistency import interpolated_frames
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.sources import compare_sources, in_words
 from ekfslam.evaluation.truth import with_truth_noise
+from ekfslam.reports import details
 from ekfslam.resolve import noise_of_velocities, resolve
 from ekfslam.runner import versions
 from ekfslam.smoother.sparse import solvers
@@ -51,15 +52,10 @@ def _print_archive(path: str) -> None:
     archive = read_archive(path)
     print(f"{path}: archive of {archive.name}, {len(archive.time_s)} frames, from {archive.source}")
     print(table(archive, None, archive.results))
+    print(details(archive.results))
     for mode, result in archive.results.items():
-        counts = [f"{name} {count}" for name, count in result.counts.items() if count]
-        lines = [", ".join(counts)] if counts else []
-        lines += result.parameters.lines if result.parameters is not None else ()
-        lines += [f"note: {remark}" for remark in result.remarks]
-        if result.hygiene is not None:
-            lines += [f"hygiene: {line}" for line in result.hygiene.lines(result.config["hygiene"])]
-        for line in lines:
-            print(f"{mode}: {line}")
+        for remark in result.remarks:
+            print(f"{mode}: note: {remark}")
 
 
 def _print_recording(sequence: Sequence) -> None:

@@ -1,4 +1,4 @@
-"""Run one mode and write its result archive."""
+"""Run a mode, or several, and write the result archive."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ import argparse
 from pathlib import Path
 
 from ekfslam import files
+from ekfslam.cli.modes import declare_modes
 from ekfslam.cli.options import configured, declare, declare_run, open_data, print_warnings, table
-from ekfslam.config import MODES
-from ekfslam.data.sequence import Sequence
-from ekfslam.evaluation.honesty import verdict_on
+from ekfslam.evaluation.brief import brief
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.older import older_figures, remove_figures
-from ekfslam.filters.result import Result
-from ekfslam.runner import run
+from ekfslam.reports import details, run_modes
 from ekfslam.storage.archive import archive_image, require_same_origin
 from ekfslam.timings import Timings
 
@@ -25,9 +23,9 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "data")
-    parser.add_argument("--mode", choices=MODES, default="full", help="default: %(default)s")
+    declare_modes(parser, ["full"])
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="archive to write")
-    declare(parser, "--timings")
+    declare(parser, "--verbose", "--timings")
     declare_run(parser)
 
 
@@ -40,28 +38,19 @@ def command(options: argparse.Namespace) -> None:
         require_same_origin(options.out, sequence)
     with timings.part("automatic model"):
         print_warnings(sequence)
-    result = run(sequence, options.mode, config, timings=timings)
+    results = run_modes(sequence, options.modes, config, timings)
     with timings.part("archive"):
         older = [] if _is_shared(options.out) else older_figures(options.out.parent)
-        files.write_all({options.out: archive_image(sequence, {result.mode: result})})
+        files.write_all({options.out: archive_image(sequence, results)})
         remove_figures(older, ())
     with timings.part("evaluation"):
-        _print(sequence, result)
+        print(brief(sequence, results, {}, options.out))
+        if options.verbose:
+            print(table(sequence, len(sequence.observations.ids), results))
+            print(details(results))
     print(f"written to {options.out}")
     if options.timings:
         print(timings.table)
-
-
-def _print(sequence: Sequence, result: Result) -> None:
-    """Print figures of merit, counts, parameters, the verdict and remarks."""
-    print(table(sequence, len(sequence.observations.ids), {result.mode: result}))
-    print(", ".join(f"{name} {count}" for name, count in result.counts.items()))
-    if result.parameters is not None:
-        print("\n".join(result.parameters.lines))
-    if result.whitened is not None:
-        print(f"verdict: {verdict_on(sequence, result)}")
-    for remark in result.remarks:
-        print(f"note: {remark}")
 
 
 def _is_shared(archive: Path) -> bool:
