@@ -267,6 +267,23 @@ class CalibrationConfig:
 
 
 @dataclass(frozen=True)
+class InertialConfig:
+    """Gyroscope and accelerometer, for recordings whose inertial samples move the state.
+
+    Args:
+        gyro, accel, gyro_walk, accel_walk: Densities of noise as in `ekfslam.InertialNoise`; None takes those that the
+            recording states, or finds them from it if it states none or its samples are noisier by far.
+        gravity_m_s2: Magnitude of gravity.
+    """
+
+    gyro: float | None = field(default=None, metadata=_FINITE)
+    accel: float | None = field(default=None, metadata=_FINITE)
+    gyro_walk: float | None = field(default=None, metadata=_FINITE)
+    accel_walk: float | None = field(default=None, metadata=_FINITE)
+    gravity_m_s2: float = field(default=9.81, metadata=_POSITIVE)
+
+
+@dataclass(frozen=True)
 class FrontEndConfig:
     """Settings of the front end, which tracks images, see `ekfslam.frontend`. Lengths are in rectified pixels.
 
@@ -341,7 +358,7 @@ class Config:
     """All settings of a run, and the record of tuning.
 
     Args:
-        noise, filter, posterior, calibration, hygiene, front_end, truth: Tables of a file.
+        noise, filter, posterior, calibration, inertial, hygiene, front_end, truth: Tables of a file.
         tuning: Record of `ekfslam tune`, texts and numbers by name; results have it as attributes ``tuned_*``.
         blocks: Settings of optional state blocks by name, ``[blocks.<name>]`` in a file; `ekfslam.models.build` checks
             them.
@@ -354,6 +371,7 @@ class Config:
     filter: FilterConfig = field(default_factory=FilterConfig)
     posterior: PosteriorConfig = field(default_factory=PosteriorConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    inertial: InertialConfig = field(default_factory=InertialConfig)
     hygiene: HygieneConfig = field(default_factory=HygieneConfig)
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
     truth: TruthConfig = field(default_factory=TruthConfig)

@@ -9,7 +9,8 @@
    residuals along tracks show them (`ekfslam.models.track_noise`), else errors that walk.
 4. Automatic model: blocks of shared errors, calibration, least disparity (`settings_of`).
 5. Tracks: cleaned by `ekfslam.data.hygiene`.
-6. Scale of the walk of track errors, from innovations of short stretches of the recording.
+6. First state of an inertial unit, see `first_state`.
+7. Scale of the walk of track errors, from innovations of short stretches of the recording.
 
 `ekfslam info` prints the outcome. A resolved configuration resolves to itself.
 
@@ -43,6 +44,7 @@ from ekfslam.filters.stretches import run_stretches, stretches_of, thinned
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import OPTIONAL_BLOCKS, StateBlock, TwistBias
 from ekfslam.models.build import blocks_and_process, model_of
+from ekfslam.models.inertial_start import FirstPrior, InertialStart, at_rest, rest_of, unknown
 from ekfslam.models.model import Model
 from ekfslam.models.noise import (
     CAMERA_ROTATION_DEG,
@@ -80,6 +82,9 @@ _STRETCH, _EVERY, _MOST_STRETCHES = 8, 60, 25  # frames, frames, count
 _SAMPLING = ("sampling_v", "sampling_w")
 _FACTORS, _SAMPLING_STRETCHES, _SAMPLING_TRACKS = (0.0, 1.0, 2.0, 4.0), (10, 5), 25
 _SURE, _LEAST_GAIN = 3.0, 20.0  # standard errors
+
+
+_DENSITIES = tuple(field.name for field in dataclasses.fields(InertialNoise))
 
 
 @dataclass(frozen=True)
@@ -125,6 +130,7 @@ class Problem:
             "filter": ("lag", "retire", "retire_after", "dormant"),
             "hygiene": ("min_disparity_sigma",),
             "calibration": ("rotation_deg", "disparity_px"),
+            "inertial": _DENSITIES,
         }
         tables = {name: {key: getattr(getattr(config, name), key) for key in keys} for name, keys in chosen.items()}
         tables |= {f"blocks.{name}": dict(settings) for name, settings in config.blocks.items()}
@@ -160,13 +166,14 @@ def resolve(
     if is_automatic(sequence, config):
         account |= found_attributes(noise_of_velocities(sequence))
     if is_inertial(sequence):
-        account |= {f"inertial_{name}": value for name, value in vars(_densities(sequence)).items()}
+        config = with_densities(sequence, config)
+        account |= {f"inertial_{name}": value for name, value in vars(densities_of(config)).items()}
     if mode != "dead-reckoning":
-        _require_pixel_noise(sequence, noise)
-        observations, hygiene = sequence.once(clean_tracks, _in_the_long_run(sequence, config, noise), config.hygiene)
-        attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
-        sequence = dataclasses.replace(sequence, observations=observations, attributes=attributes)
+        sequence, hygiene = _cleaned(sequence, config, noise)
     model = _model(sequence, config, noise, blocks)
+    start = first_state(sequence, config, model) if is_inertial(sequence) else None
+    if start is not None:
+        model, account["inertial_start"] = start.begun(model), start.text
     if mode in ("full", "smoothed"):
         account["engine"] = in_words(model, config.filter)
         if (sampling := _sampling(sequence, config)) is not None:
@@ -176,16 +183,21 @@ def resolve(
         if _has_open_scale(sequence, config):
             scale = _track_scale(sequence, config, model)
             config = config.with_overrides({"noise": {"track_scale": scale}})
-            model = _model(sequence, config, noise_of(sequence, config), blocks)
+            scaled = _model(sequence, config, noise_of(sequence, config), blocks)
+            model = scaled if start is None else start.begun(scaled)
     return Problem(sequence, config, model, hygiene, account)
 
 
-def _require_pixel_noise(sequence: Sequence, noise: Noise) -> None:
+def _cleaned(sequence: Sequence, config: Config, noise: Noise) -> tuple[Sequence, HygieneReport]:
+    """Return the recording with clean tracks."""
     if (least := float(np.min(noise.pixel_std_px))) < LEAST_PX:
         raise ConfigError(
             f"{sequence.name}: the recording states a pixel noise of {least:g} px, with which innovation covariances "
             f"are singular; give noise.sigma_px, at least {LEAST_PX:g}"
         )
+    observations, hygiene = sequence.once(clean_tracks, _in_the_long_run(sequence, config, noise), config.hygiene)
+    attributes = sequence.attributes if len(observations) else {**sequence.attributes, **WITHOUT_TRACKS}
+    return dataclasses.replace(sequence, observations=observations, attributes=attributes), hygiene
 
 
 @dataclass(frozen=True)
@@ -414,7 +426,8 @@ def _returns(sequence: Sequence, after: int = 1) -> IntArray:
 
 
 def _model(sequence: Sequence, config: Config, noise: Noise, blocks: SequenceType[StateBlock]) -> Model:
-    chosen, process = blocks_and_process(config.blocks, _densities(sequence) if is_inertial(sequence) else None)
+    densities = densities_of(config) if is_inertial(sequence) else None
+    chosen, process = blocks_and_process(config.blocks, densities, config.inertial.gravity_m_s2)
     return model_of(
         Rig(sequence.camera, sequence.T_cam_imu, noise),
         noise,
@@ -428,10 +441,31 @@ def _model(sequence: Sequence, config: Config, noise: Noise, blocks: SequenceTyp
     )
 
 
-def _densities(sequence: Sequence) -> InertialNoise:
-    if sequence.inertial is None or sequence.inertial.noise is None:
+def with_densities(sequence: Sequence, config: Config) -> Config:
+    """Return a configuration with the densities of an inertial unit: its own, else those that the recording states."""
+    assert sequence.inertial is not None
+    given, stated = vars(config.inertial), sequence.inertial.noise
+    missing = [name for name in _DENSITIES if given[name] is None]
+    if not missing:
+        return config
+    if stated is None:
         raise ConfigError(f"{sequence.name}: the inertial samples state no densities of their noise (InertialNoise)")
-    return sequence.inertial.noise
+    return config.with_overrides({"inertial": {name: getattr(stated, name) for name in missing}})
+
+
+def first_state(sequence: Sequence, config: Config, model: Model) -> InertialStart:
+    """Return the first state of an inertial process and how it was found: at rest, or not at all."""
+    samples = sequence.inertial
+    assert samples is not None
+    prior = FirstPrior.of(sequence, model, config.inertial.gravity_m_s2)
+    if (rest := rest_of(sequence)) is not None:
+        return at_rest(samples, *rest, prior, densities_of(config))
+    return unknown(samples, float(sequence.time_s[0]), prior, "in motion")
+
+
+def densities_of(config: Config) -> InertialNoise:
+    """Return the densities of a resolved configuration."""
+    return InertialNoise(*(float(getattr(config.inertial, name)) for name in _DENSITIES))
 
 
 def _has_open_scale(sequence: Sequence, config: Config) -> bool:

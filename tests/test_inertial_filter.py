@@ -66,10 +66,14 @@ def test_a_recording_with_samples_alone_runs_by_them():
     assert 0.9 < result.innovation.nis.sum() / result.innovation.dof.sum() < 1.1
 
 
-def test_priors_of_the_inertial_blocks_are_settings():
-    config = ekfslam.Config(blocks={"gyro_bias": {"std_rad_s": 0.02}})
-    model = resolve(room(8), config).model
-    assert model.prior_covariance[model.layout["gyro_bias"], model.layout["gyro_bias"]][0, 0] == pytest.approx(4e-4)
+def test_the_prior_of_the_accelerometer_bias_is_a_setting_and_bounds_the_first_tilt():
+    tilt = []
+    for std in (0.1, 0.2):
+        model = resolve(room(8), ekfslam.Config(blocks={"accel_bias": {"std_m_s2": std}})).model
+        level = model.initial_values()["pose"][:3, 0]
+        P = model.prior_covariance[model.layout["pose"], model.layout["pose"]][3:, 3:]
+        tilt.append(np.sqrt(level @ P @ level))
+    np.testing.assert_allclose(tilt, [0.1 / 9.81, 0.2 / 9.81], rtol=0.01)
 
 
 def test_samples_without_densities_are_refused():

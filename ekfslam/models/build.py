@@ -26,7 +26,7 @@ from ekfslam.models.blocks import (
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.model import Model
 from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess
-from ekfslam.models.process.inertial import inertial
+from ekfslam.models.process.inertial import GRAVITY_M_S2, inertial
 from ekfslam.models.process.velocities import velocities
 from ekfslam.models.sensors.base import DelayedSensor, Sensor
 from ekfslam.models.sensors.monocular import Monocular
@@ -116,10 +116,10 @@ def optional_blocks(
 
 
 def blocks_and_process(
-    tables: Mapping[str, Mapping[str, Any]], densities: InertialNoise | None
+    tables: Mapping[str, Mapping[str, Any]], densities: InertialNoise | None, gravity_m_s2: float = GRAVITY_M_S2
 ) -> tuple[tuple[StateBlock, ...], MakeProcess]:
     """Return the blocks of the tables ``[blocks.<name>]``, and the process: inertial if densities are given."""
     if densities is None:
         return optional_blocks(tables), velocities
     tables = {name: {} for name in INERTIAL_BLOCKS} | dict(tables)
-    return optional_blocks(tables, OPTIONAL_BLOCKS | INERTIAL_BLOCKS), inertial(densities)
+    return optional_blocks(tables, OPTIONAL_BLOCKS | INERTIAL_BLOCKS), inertial(densities, gravity_m_s2)

@@ -267,7 +267,7 @@ def model_of_result(result: Result) -> Model:
     if is_inertial(result):
         names = (f"inertial_{field.name}" for field in dataclasses.fields(InertialNoise))
         densities = InertialNoise(*(float(result.attributes[name]) for name in names))
-    blocks, process = blocks_and_process(stored.blocks, densities)
+    blocks, process = blocks_and_process(stored.blocks, densities, stored.inertial.gravity_m_s2)
     coordinates = stored.filter.landmark_coordinates
     model = model_of(rig, result.noise, *start, stored.calibration, blocks, coordinates, make_process=process)
     if (body := len(_columns_of(log, model))) == log.departed.shape[1] and len(log.initial_covariance) in (6, body):

@@ -113,6 +113,8 @@ def _print_findings(sequence: Sequence) -> None:
     for name in ("odometry", "beside"):
         if name in problem.account:
             print(f"{name:13s} {problem.account[name]}")
+    if "inertial_start" in problem.account:
+        print(f"start         {problem.account['inertial_start']}")
     print(f"filter        {problem.account['engine']}")
     for line in problem.lines:
         print(f"state         {line}")
