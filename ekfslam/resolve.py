@@ -9,7 +9,7 @@
    residuals along tracks show them (`ekfslam.models.track_noise`), else errors that walk.
 4. Automatic model: blocks of shared errors, calibration, least disparity (`settings_of`).
 5. Tracks: cleaned by `ekfslam.data.hygiene`.
-6. First state of an inertial unit, see `first_state`.
+6. Noise and first state of an inertial unit, see `with_densities` and `first_state`.
 7. Scale of the walk of track errors, from innovations of short stretches of the recording.
 
 `ekfslam info` prints the outcome. A resolved configuration resolves to itself.
@@ -25,7 +25,7 @@ ten recordings, in an eighth of the filter's time.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as SequenceType
 from dataclasses import dataclass
 
@@ -42,6 +42,8 @@ from ekfslam.engine.choice import in_words
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.stretches import run_stretches, stretches_of, thinned
 from ekfslam.geometry import se3
+from ekfslam.inertial.motion import in_motion
+from ekfslam.inertial.noise import Densities, from_differences, is_refuted, likeliest_densities
 from ekfslam.models.blocks import OPTIONAL_BLOCKS, StateBlock, TwistBias
 from ekfslam.models.build import blocks_and_process, model_of
 from ekfslam.models.inertial_start import FirstPrior, InertialStart, at_rest, rest_of, unknown
@@ -165,11 +167,11 @@ def resolve(
         account["odometry"] = text
     if is_automatic(sequence, config):
         account |= found_attributes(noise_of_velocities(sequence))
-    if is_inertial(sequence):
-        config = with_densities(sequence, config)
-        account |= {f"inertial_{name}": value for name, value in vars(densities_of(config)).items()}
     if mode != "dead-reckoning":
         sequence, hygiene = _cleaned(sequence, config, noise)
+    if is_inertial(sequence):
+        config, account["inertial_noise"] = with_densities(sequence, config, mode in ("full", "smoothed"))
+        account |= {f"inertial_{name}": value for name, value in vars(densities_of(config)).items()}
     model = _model(sequence, config, noise, blocks)
     start = first_state(sequence, config, model) if is_inertial(sequence) else None
     if start is not None:
@@ -441,26 +443,52 @@ def _model(sequence: Sequence, config: Config, noise: Noise, blocks: SequenceTyp
     )
 
 
-def with_densities(sequence: Sequence, config: Config) -> Config:
-    """Return a configuration with the densities of an inertial unit: its own, else those that the recording states."""
-    assert sequence.inertial is not None
-    given, stated = vars(config.inertial), sequence.inertial.noise
+def with_densities(sequence: Sequence, config: Config, is_searched: bool = True) -> tuple[Config, str]:
+    """Return a configuration with the densities of an inertial unit, and where they come from.
+
+    They are the configuration's, else those that the recording states. If it states none, or its samples are noisier by
+    far, those are searched by which innovations are likeliest (`ekfslam.inertial.noise`).
+    """
+    samples, given = sequence.inertial, vars(config.inertial)
+    assert samples is not None
     missing = [name for name in _DENSITIES if given[name] is None]
     if not missing:
-        return config
-    if stated is None:
-        raise ConfigError(f"{sequence.name}: the inertial samples state no densities of their noise (InertialNoise)")
-    return config.with_overrides({"inertial": {name: getattr(stated, name) for name in missing}})
+        return config, "as given"
+    found = None
+    if samples.noise is not None and not is_refuted(samples):
+        found = Densities(samples.noise, "as stated")
+    elif is_searched:
+        found = _likeliest_densities(sequence, config)
+    if found is None:
+        found = Densities(from_differences(samples), "from differences of samples: no stretch shows them otherwise")
+    return config.with_overrides({"inertial": {name: getattr(found.noise, name) for name in missing}}), found.text
+
+
+def _likeliest_densities(sequence: Sequence, config: Config) -> Densities | None:
+    """Return the densities by which innovations are likeliest; None: they are not found."""
+
+    def begun(part: Sequence, noise: InertialNoise) -> Callable[[InertialNoise], Model]:
+        def model(noise: InertialNoise) -> Model:
+            densities = config.with_overrides({"inertial": vars(noise)})
+            return _model(part, densities, noise_of(part, densities), ())
+
+        start = first_state(part, config.with_overrides({"inertial": vars(noise)}), model(noise))
+        return lambda noise: start.begun(model(noise))
+
+    return likeliest_densities(sequence, config.filter, begun)
 
 
 def first_state(sequence: Sequence, config: Config, model: Model) -> InertialStart:
-    """Return the first state of an inertial process and how it was found: at rest, or not at all."""
+    """Return the first state of an inertial process and how it was found: at rest, in motion, or not at all."""
     samples = sequence.inertial
     assert samples is not None
     prior = FirstPrior.of(sequence, model, config.inertial.gravity_m_s2)
     if (rest := rest_of(sequence)) is not None:
         return at_rest(samples, *rest, prior, densities_of(config))
-    return unknown(samples, float(sequence.time_s[0]), prior, "in motion")
+    if not isinstance(model.sensor, Rig):
+        return unknown(samples, float(sequence.time_s[0]), prior, "one camera in motion")
+    start, refused = in_motion(sequence, model, prior, config.filter)
+    return start or unknown(samples, float(sequence.time_s[0]), prior, refused or "in motion")
 
 
 def densities_of(config: Config) -> InertialNoise:

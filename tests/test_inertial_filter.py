@@ -11,7 +11,6 @@ from support.gauge import gauge_directions
 
 import ekfslam
 from ekfslam.data.room import Room, simulate_room
-from ekfslam.errors import ConfigError
 from ekfslam.evaluation.consistency import nees, pose_error
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
@@ -74,12 +73,6 @@ def test_the_prior_of_the_accelerometer_bias_is_a_setting_and_bounds_the_first_t
         P = model.prior_covariance[model.layout["pose"], model.layout["pose"]][3:, 3:]
         tilt.append(np.sqrt(level @ P @ level))
     np.testing.assert_allclose(tilt, [0.1 / 9.81, 0.2 / 9.81], rtol=0.01)
-
-
-def test_samples_without_densities_are_refused():
-    samples = dataclasses.replace(room(8).inertial, noise=None)
-    with pytest.raises(ConfigError, match="no densities"):
-        ekfslam.run(dataclasses.replace(room(8), inputs=(samples,)), "full")
 
 
 @pytest.mark.parametrize("variant", ["standard", "fej"])

@@ -4,10 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+from inertial import nees as inertial_nees
+from inertial import true_values
 
 import ekfslam
 from ekfslam.data.inputs import InertialNoise, InertialSamples
 from ekfslam.data.room import GRAVITY_M_S2, Room, simulate_room
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
+from ekfslam.filters.stretches import thinned
 from ekfslam.geometry import se3
 from ekfslam.models.inertial_start import FirstPrior, at_rest, image_motion, rest_of
 from ekfslam.resolve import resolve
@@ -86,3 +91,71 @@ def test_a_start_from_the_truth_does_not_make_the_tilt_certain():
     problem = resolve(sequence, ekfslam.Config())
     P = problem.model.prior_covariance[3:6, 3:6]
     assert np.sqrt(np.linalg.eigvalsh(P)[1:]).min() > 0.005
+
+
+def moving(seed, begin=30, frames=20):
+    """A stretch of the room in motion."""
+    return simulate_room(Room(frames=begin + frames, seed=seed))[begin:]
+
+
+def first_errors(sequence, model):
+    """Errors (15,) of the first state, and their covariance."""
+    values, own, P = model.initial_values(), model.process.own, model.prior_covariance
+    truth = true_values(sequence, 0)
+    error = [true - values[name] for true, name in zip(truth[1:], own[1:], strict=True)]
+    columns = model.process.columns
+    return np.concatenate([se3.log(truth[0] @ se3.inverse(values["pose"])), *error]), P[np.ix_(columns, columns)]
+
+
+@pytest.mark.slow
+def test_a_start_in_motion_finds_tilt_velocity_and_gyroscope_bias():
+    for seed in range(3):
+        sequence = moving(seed)
+        problem = resolve(sequence)
+        assert str(problem.account["inertial_start"]).startswith("in motion, from stereo over 0.0 to 1.0 s")
+        error, P = first_errors(sequence, problem.model)
+        assert np.linalg.norm(error[3:6]) < np.deg2rad(2.5)
+        assert np.linalg.norm(error[6:9]) < 0.05 and np.linalg.norm(error[9:12]) < 0.01
+        assert error[3:] @ np.linalg.solve(P[3:, 3:], error[3:]) < 25.0
+
+
+@pytest.mark.slow
+def test_a_filter_that_starts_in_motion_is_honest_from_the_first_frames_on():
+    squared = []
+    for seed in range(5):
+        sequence = moving(seed, frames=40)
+        problem, found = resolve(sequence), []
+        ekf = JointEKF(problem.model, problem.config.filter)
+        for frame in run_filter(ekf, sequence):
+            if frame.number:
+                found.append(inertial_nees(ekf, true_values(sequence, frame.number))["all"])
+        squared.append(found)
+    assert np.mean(squared, axis=0).max() < 28.0 and 8.0 < np.mean(squared) < 20.0
+
+
+def test_a_start_in_motion_without_enough_points_says_so():
+    sequence = moving(0)
+    few = thinned(sequence, [range(len(sequence))], 4)
+    problem = resolve(few)
+    assert "only 0 motions of at least 10 points" in problem.account["inertial_start"]
+    tilt = np.sqrt(np.linalg.eigvalsh(problem.model.prior_covariance[3:6, 3:6])[-1])
+    assert tilt == pytest.approx(0.3, rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_densities_of_flight_are_found_from_innovations(is_stated):
+    """Samples with 5 and 10 times the stated noise of gyroscope and accelerometer, or of no stated noise."""
+    sequence = simulate_room(Room(frames=160, seed=1, gyro=8.5e-4, accel=2e-2))
+    noise = NOISE if is_stated else None
+    sequence = dataclasses.replace(sequence, inputs=(dataclasses.replace(sequence.inertial, noise=noise),))
+    problem = resolve(sequence)
+    found = problem.config.inertial
+    assert 0.5 < found.gyro / 8.5e-4 < 2.0 and 0.5 < found.accel / 2e-2 < 2.0
+    assert str(problem.account["inertial_noise"]).startswith("found from ")
+
+
+def test_right_densities_stay_as_stated():
+    problem = resolve(simulate_room(Room(frames=30, seed=1)))
+    assert problem.account["inertial_noise"] == "as stated"
+    assert problem.config.inertial.accel == 2e-3

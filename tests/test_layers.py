@@ -26,6 +26,7 @@ ROOMS: tuple[tuple[str, ...], ...] = (
     ("engine",),
     ("filters",),
     ("smoother",),
+    ("inertial",),
     ("storage",),
     ("evaluation",),
     ("resolve",),

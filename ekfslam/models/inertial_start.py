@@ -119,7 +119,7 @@ def at_rest(
 ) -> InertialStart:
     """Return the state of a unit that rests from one time to another, by the rows of its mean samples.
 
-    Their noise is the density's, or that of the means of ten batches where these scatter more by far.
+    Their noise is the density's, or that of the means over 0.1 s if these scatter more by far.
     """
     part = samples.between(begin_s, end_s)
     mean, variance = _mean(part, noise)
@@ -227,7 +227,7 @@ def _mean(part: InertialSamples, noise: InertialNoise) -> tuple[Array, Array]:
     duration = len(values) * max(part.step_s, 1e-6)
     white, walk = np.array([noise.gyro, noise.accel]), np.array([noise.gyro_walk, noise.accel_walk])
     stated = white**2 / duration + walk**2 * duration / 3.0
-    batches = [batch.mean(axis=0) for batch in np.array_split(values, 10) if len(batch)]
+    batches = [batch.mean(axis=0) for batch in np.array_split(values, max(2, round(duration / _BATCH_S))) if len(batch)]
     scatter = np.var(batches, axis=0, ddof=1).reshape(2, 3).mean(axis=1) / len(batches) if len(batches) > 1 else stated
     return values.mean(axis=0), np.where(scatter > _NOISY * stated, scatter, stated)
 

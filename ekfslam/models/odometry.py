@@ -7,6 +7,7 @@ and stand in where poses are needed before there is a filter (hygiene, mapping-o
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import MEASURED_KINDS, Sequence
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import MOTION_FROM_PX, rectified_rows
-from ekfslam.geometry.stereo_motion import agrees, align, sampled_motion
+from ekfslam.geometry.stereo_motion import Alignment, agrees, align, sampled_motion
 
 _LEAST_POINTS, _AGREE_SHARE, _AGREE_PX = 6, 0.5, 2.0
 _SAMPLES = 200
@@ -29,16 +30,26 @@ _START_FACTOR = 10.0
 
 
 def stereo_odometry(sequence: Sequence) -> Array:
-    """Return velocities (T, 6) between successive frames from common tracks; the last ones if there are too few.
+    """Return velocities (T, 6) between successive frames from common tracks; the last ones if there are too few."""
+    C, twist, is_known = sequence.T_cam_imu, np.zeros((len(sequence), 6)), np.zeros(len(sequence), dtype=bool)
+    for k, found in stereo_motions(sequence, len(sequence)):
+        tau_s = float(sequence.time_s[k] - sequence.time_s[k - 1])
+        twist[k], is_known[k] = -se3.log(se3.inverse(C) @ found.T_now_before @ C) / tau_s, True
+    if not is_known.any():
+        return twist
+    last = np.maximum.accumulate(np.where(is_known, np.arange(len(twist)), 0))
+    return _without_jumps(twist[np.where(last > 0, last, np.argmax(is_known))])
+
+
+def stereo_motions(sequence: Sequence, frames: int, std_px: float = 0.2) -> Iterator[tuple[int, Alignment]]:
+    """Yield frames before ``frames`` and their motions from the frame before, by common tracks if there are enough.
 
     Robust Gauss-Newton over the three rows of every point starts at the previous motion, or at the best of random
     three-point motions if most points disagree.
     """
-    camera, observations, C = sequence.camera, sequence.observations, sequence.T_cam_imu
-    generator = np.random.default_rng(0)
-    twist, is_known = np.zeros((len(sequence), 6)), np.zeros(len(sequence), dtype=bool)
-    guess: Array | None = None
-    for k in range(1, len(sequence)):
+    camera, observations = sequence.camera, sequence.observations
+    generator, guess = np.random.default_rng(0), None
+    for k in range(1, frames):
         (ids, before), (ids_now, now) = observations.at(k - 1), observations.at(k)
         _, i, j = np.intersect1d(ids, ids_now, assume_unique=True, return_indices=True)
         rows, rows_now = (rectified_rows(pixels, np.ones(4))[0] for pixels in (before[i], now[j]))
@@ -46,17 +57,12 @@ def stereo_odometry(sequence: Sequence) -> Array:
         rows, rows_now = (some[disparity >= MOTION_FROM_PX] for some in (rows, rows_now))
         if len(rows) < _LEAST_POINTS:
             continue
-        found = None if guess is None else align(camera, rows, rows_now, guess)
+        found = None if guess is None else align(camera, rows, rows_now, guess, std_px)
         if found is None or agrees(found, _AGREE_PX).mean() < _AGREE_SHARE:
             start = sampled_motion(camera, rows, rows_now, generator, _SAMPLES, _AGREE_PX)
-            found = align(camera, rows, rows_now, start)
+            found = align(camera, rows, rows_now, start, std_px)
         guess = found.T_now_before
-        tau_s = float(sequence.time_s[k] - sequence.time_s[k - 1])
-        twist[k], is_known[k] = -se3.log(se3.inverse(C) @ guess @ C) / tau_s, True
-    if not is_known.any():
-        return twist
-    last = np.maximum.accumulate(np.where(is_known, np.arange(len(twist)), 0))
-    return _without_jumps(twist[np.where(last > 0, last, np.argmax(is_known))])
+        yield k, found
 
 
 def missing_velocities(sequence: Sequence, odometry: Array | None = None) -> tuple[str, ...]:

@@ -114,6 +114,7 @@ def _print_findings(sequence: Sequence) -> None:
         if name in problem.account:
             print(f"{name:13s} {problem.account[name]}")
     if "inertial_start" in problem.account:
+        print(f"densities     {problem.account['inertial_noise']}")
         print(f"start         {problem.account['inertial_start']}")
     print(f"filter        {problem.account['engine']}")
     for line in problem.lines:

@@ -1,0 +1,183 @@
+"""First state of the inertial process in motion, from a window of a stereo rig.
+
+1. Gyroscope bias: rotations of stereo motion against integrated samples.
+2. First velocity and gravity, which are linear in displacements, then with the magnitude of gravity known. They are the
+   displacements of stereo motion given the rotations of the gyroscope. Source: Mur-Artal and Tardos, "Visual-inertial
+   monocular SLAM with map reuse", RA-L 2017, without the scale.
+3. The joint maximum a posteriori of the window, by the factors of the smoother.
+
+The mean is that of the window. The covariance is the broad prior of the window: the filter processes the window itself,
+and would use it twice if it started with the marginal. So the covariance is too large in the first frames, and right
+after the window.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.config import FilterConfig, PosteriorConfig
+from ekfslam.data.inputs import InertialSamples
+from ekfslam.data.sequence import Sequence
+from ekfslam.errors import EkfslamError
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import one_thread, run_filter, solvable
+from ekfslam.geometry import se3
+from ekfslam.geometry.preintegration import BG, LONGEST_S, PHI, Increment, increments
+from ekfslam.geometry.stereo_motion import Alignment
+from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
+from ekfslam.models.inertial_start import FirstPrior, InertialStart
+from ekfslam.models.model import Model
+from ekfslam.models.odometry import stereo_motions
+from ekfslam.smoother.optimise import MOST_ITERATIONS, maximise
+from ekfslam.smoother.problem import BatchProblem
+
+# Ends of windows, s; standard deviation before the window of the velocity, and of the tilt over that which the bias of
+# the accelerometer leaves after it.
+_ENDS_S, _LONG_S, _SPEED_M_S, _TILT_FACTOR = (1.0, 1.5, 2.0, 3.0), 1.0, 0.5, 3.0
+_LEAST_MOTIONS, _LEAST_POINTS, _OFF_M_S2, _MOST_COST = 5, 10, 0.3, 3.0
+_PASSES = 4
+
+
+def in_motion(
+    sequence: Sequence, model: Model, prior: FirstPrior, config: FilterConfig
+) -> tuple[InertialStart | None, str]:
+    """Return the state at the first frame, from the first window that serves, and why earlier windows do not.
+
+    Args:
+        sequence: Recording with clean tracks.
+        model: Model with a stereo rig and the inertial process.
+    """
+    since = sequence.time_s - sequence.time_s[0]
+    last = int(np.searchsorted(since, _ENDS_S[-1], "right"))
+    motions = dict(stereo_motions(sequence, last, float(np.mean(model.noise.pixel_std_px))))
+    refused: list[str] = []
+    for end_s in _ENDS_S:
+        end = int(np.searchsorted(since, end_s, "right"))
+        if refused and since[end - 1] < end_s - 0.5:  # the recording ends before
+            break
+        inside = {k: motion for k, motion in motions.items() if end_s - _LONG_S - 1e-9 <= since[k - 1] and k < end}
+        name = f"{since[min(inside, default=1) - 1]:.1f} to {since[end - 1]:.1f} s"
+        try:
+            start = _smoothed(sequence, model, prior, config, _linear(sequence, prior, inside), end)
+            return dataclasses.replace(start, text=f"in motion, from stereo over {name}: {start.text}"), "; ".join(
+                refused
+            )
+        except _RefusedError as error:
+            refused.append(f"{name}: {error}")
+    return None, "; ".join(refused)
+
+
+class _RefusedError(Exception):
+    """A window does not serve."""
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """First velocity, direction up, gyroscope bias, in the first IMU frame; magnitude of gravity if it is free."""
+
+    velocity_m_s: Array
+    up: Array
+    gyro_bias_rad_s: Array
+    free_m_s2: float
+
+
+def _linear(sequence: Sequence, prior: FirstPrior, motions: dict[int, Alignment]) -> _Linear:
+    """Solve for the first velocity and gravity by the motions (by frame) of a window."""
+    motions = {k: motion for k, motion in motions.items() if len(motion.residual_px) >= _LEAST_POINTS}
+    if len(motions) < _LEAST_MOTIONS:
+        raise _RefusedError(f"only {len(motions)} motions of at least {_LEAST_POINTS} points")
+    C = sequence.T_cam_imu
+    bias: Array = np.zeros(3)
+    intervals = [sequence.interval(k, InertialSamples) for k in range(1, max(motions) + 1)]
+    Ad = se3.adjoint(C)
+    for _ in range(2):
+        parts = [_integrated(interval.dt_s, interval.inputs, bias) for interval in intervals]
+        A, b = 1e-12 * np.eye(3), np.zeros(3)
+        for k, motion in motions.items():
+            theta, by_theta = _against(motion, C, parts[k - 1])[3:], Ad.T @ motion.information @ Ad
+            W = by_theta[3:, 3:] - by_theta[3:, :3] @ np.linalg.solve(by_theta[:3, :3], by_theta[:3, 3:])
+            J = parts[k - 1].Phi[PHI, BG]
+            A, b = A + J.T @ W @ J, b + J.T @ W @ theta
+        bias = bias + np.linalg.solve(A, b).astype(float)
+    rows, values = _displacements(C, motions, [_integrated(i.dt_s, i.inputs, bias) for i in intervals])
+    free, *_ = np.linalg.lstsq(rows, values, rcond=None)
+    if abs(np.linalg.norm(free[3:]) - prior.gravity_m_s2) > _OFF_M_S2:
+        raise _RefusedError(f"gravity comes out as {np.linalg.norm(free[3:]):.2f} m/s^2")
+    v: Array = free[:3].astype(float)
+    g: Array = free[3:].astype(float)
+    for _ in range(_PASSES):
+        g = prior.gravity_m_s2 * g / np.linalg.norm(g)
+        tangent = np.linalg.svd(g[None])[2][1:].T
+        x, *_ = np.linalg.lstsq(np.hstack([rows[:, :3], rows[:, 3:] @ tangent]), values - rows[:, 3:] @ g, rcond=None)
+        v, g = x[:3].astype(float), g + tangent @ x[3:]
+    return _Linear(v, -g / np.linalg.norm(g), bias, float(np.linalg.norm(free[3:])))
+
+
+def _integrated(dt_s: Array, inputs: Array, gyro_bias: Array) -> Increment:
+    parts = np.ceil(dt_s / LONGEST_S).astype(int)
+    inputs, dt_s = np.repeat(inputs, parts, axis=0), np.repeat(dt_s / parts, parts)
+    return increments(dt_s, inputs[:, :3] - gyro_bias, inputs[:, 3:], np.zeros(15)).total()
+
+
+def _against(motion: Alignment, T_cam_imu: Array, part: Increment) -> Array:
+    """Return ``log`` (6,) of the motion of the IMU by samples, without translation, after the one of stereo."""
+    M = se3.inverse(T_cam_imu) @ motion.T_now_before @ T_cam_imu
+    return np.concatenate([np.zeros(3), se3.log(se3.transform(part.R.T @ M[:3, :3].T, np.zeros(3)))[3:]])
+
+
+def _displacements(T_cam_imu: Array, motions: dict[int, Alignment], parts: list[Increment]) -> tuple[Array, Array]:
+    """Return rows (3n, 6) and values (3n,) of displacements, linear in first velocity and gravity (first IMU frame)."""
+    Ad, rows, values = se3.adjoint(T_cam_imu), [], []
+    R, V, t = np.eye(3), np.zeros(3), 0.0
+    for k, part in enumerate(parts, 1):
+        tau = float(part.tau_s)
+        if k in motions:
+            # exp(xi^) M with the rotation of the samples, and the likeliest translation given it.
+            information = Ad.T @ motions[k].information @ Ad
+            theta = _against(motions[k], T_cam_imu, part)[3:]
+            rho = -np.linalg.solve(information[:3, :3], information[:3, 3:] @ theta)
+            M = se3.exp(np.concatenate([rho, theta])) @ se3.inverse(T_cam_imu) @ motions[k].T_now_before @ T_cam_imu
+            d = se3.inverse(M)[:3, 3]
+            W = np.linalg.cholesky(M[:3, :3].T @ information[:3, :3] @ M[:3, :3]).T
+            rows.append(W @ R.T @ np.hstack([tau * np.eye(3), (t * tau + 0.5 * tau**2) * np.eye(3)]))
+            values.append(W @ (d - R.T @ V * tau - part.p))
+        R, V, t = R @ part.R, V + R @ part.v, t + tau
+    return np.concatenate(rows), np.concatenate(values)
+
+
+def _smoothed(
+    sequence: Sequence, model: Model, prior: FirstPrior, config: FilterConfig, first: _Linear, end: int
+) -> InertialStart:
+    """Return the start at the maximum a posteriori of the frames before ``end``."""
+    T = prior.levelled(first.up)
+    tilt_rad = _TILT_FACTOR * prior.accel_bias_std_m_s2 / prior.gravity_m_s2
+    P = prior.covariance(T[:3, :3], tilt_rad, _SPEED_M_S)
+    start = InertialStart(T, first.velocity_m_s, first.gyro_bias_rad_s, np.zeros(3), P, "")
+    started = start.begun(model)
+    try:
+        with one_thread(), solvable():
+            ekf = JointEKF(started, dataclasses.replace(config, lag=0, revive=-1))
+            for _ in run_filter(ekf, sequence, range(end)):
+                pass
+            log = ekf.log()
+            problem = BatchProblem(log, started)
+            state = problem.filtered_state(ekf.landmarks().position_m)
+            found = maximise(problem, state, PosteriorConfig(), config.min_depth_m, range(MOST_ITERATIONS))
+    except EkfslamError as error:
+        raise _RefusedError(str(error)) from None
+    cost = 2.0 * found.costs[-1] / max(3 * log.observations - 3 * log.landmarks, 1)
+    if cost > _MOST_COST:
+        raise _RefusedError(f"observations err by {np.sqrt(cost):.1f} standard deviations")
+    values = problem.unknowns.values(found.state)
+    u, gyro_bias, accel_bias = (values[name][0] for name in (Velocity.name, GyroBias.name, AccelBias.name))
+    T = prior.levelled(found.state.T_imu_world[0, :3, 2])
+    text = (
+        f"{np.linalg.norm(u):.2f} m/s, |g| {first.free_m_s2:.2f} m/s^2 if free, gyroscope bias "
+        f"({', '.join(f'{x:.3g}' for x in gyro_bias)}) rad/s"
+    )
+    P = prior.covariance(T[:3, :3], tilt_rad, _SPEED_M_S)
+    return InertialStart(T, u, gyro_bias, accel_bias, P, text)

@@ -1,0 +1,187 @@
+"""Densities of an inertial unit, from its samples and from the innovations of the filter.
+
+Data sheets state the noise at rest. Vibration in flight is 5 to 15 times as large. Differences of successive samples
+show that: they are the noise, if it is white up to the rate of the samples, and more than it if rotors shake the unit
+above the bandwidth of a motion. So they tell whether stated densities can hold, and where to search. The densities are
+those with which the innovations of some stretches of the recording are likeliest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ekfslam.arrays import Array
+from ekfslam.config import FilterConfig
+from ekfslam.data.inputs import InertialNoise, InertialSamples
+from ekfslam.data.sequence import Sequence
+from ekfslam.errors import EkfslamError, FilterError
+from ekfslam.filters.stretches import run_stretches, stretches_of, thinned
+from ekfslam.models.model import Model
+
+# Ratio of differences over a density from which on it is refuted.
+_REFUTED = 1.5
+# Stretches: seconds, most of them, tracks in each.
+_STRETCH_S, _LEAST_S, _MOST, _TRACKS = 4.0, 1.5, 5, 25
+# Factors as powers of 2: their bound, and the standard deviation of their prior.
+_BOUND, _SPREAD = 6.0, 1.5
+# Walks of biases over white noise, of units that state both: per root of a second.
+_WALK = (0.1, 0.5)
+_SURE, _LEAST_GAIN = 3.0, 20.0  # standard errors; see `ekfslam.resolve`
+
+Begun = Callable[[Sequence, InertialNoise], Callable[[InertialNoise], Model]]
+
+
+@dataclass(frozen=True)
+class Densities:
+    """Densities, and where they come from."""
+
+    noise: InertialNoise
+    text: str
+
+
+def sampled_densities(samples: InertialSamples) -> tuple[float, float]:
+    """Return the densities of gyroscope and accelerometer if all that third differences of samples show is noise."""
+    dt = np.diff(samples.time_s)
+    even = np.abs(dt - samples.step_s) < 0.2 * samples.step_s
+    kept = even[2:] & even[1:-1] & even[:-2]
+    found = []
+    for values in (samples.gyro_rad_s, samples.accel_m_s2):
+        third = np.diff(values, n=3, axis=0)[kept]
+        found.append(float(np.sqrt(np.mean(third**2) / 20.0 * samples.step_s)) if len(third) else 0.0)
+    return found[0], found[1]
+
+
+def is_refuted(samples: InertialSamples) -> bool:
+    """Return whether samples are noisier by far than the densities that they state."""
+    stated = samples.noise
+    assert stated is not None
+    gyro, accel = sampled_densities(samples)
+    return gyro > _REFUTED * stated.gyro or accel > _REFUTED * stated.accel
+
+
+def from_differences(samples: InertialSamples) -> InertialNoise:
+    """Return densities by differences of samples alone, with walks of biases as units typically have."""
+    gyro, accel = (max(value, 1e-6) for value in sampled_densities(samples))
+    return InertialNoise(gyro, accel, _WALK[0] * gyro, _WALK[1] * accel)
+
+
+def likeliest_densities(sequence: Sequence, config: FilterConfig, begun: Begun) -> Densities | None:
+    """Return the densities by which innovations of stretches of a recording are likeliest; None: no stretch serves.
+
+    Args:
+        sequence: Recording with clean tracks.
+        config: Settings of the filter.
+        begun: Function that returns, for a stretch and densities to find its first state with, the models that start
+            there, as a function of densities. It raises an `EkfslamError` if there is no first state.
+    """
+    samples = sequence.inertial
+    assert samples is not None
+    upper, stated = from_differences(samples), samples.noise
+    base = stated or upper
+    search = _Search(config, base, list(_begun_stretches(sequence, upper, begun)))
+    if not search.stretches:
+        return None
+    # Half way between the stated densities and the differences.
+    middle = [
+        0.5 * math.log2(max(u, 1e-12) / max(b, 1e-12)) for u, b in ((upper.gyro, base.gyro), (upper.accel, base.accel))
+    ]
+    at = search.best((round(middle[0], 3), round(middle[1], 3), 0.0))
+    if stated is not None and not search.gains((0.0, 0.0, 0.0), at):
+        return Densities(stated, "as stated: no others are clearly likelier")
+    noise = search.noise(at)
+    of = f"{2.0 ** at[0]:.2g} and {2.0 ** at[1]:.2g} times the stated densities, " if stated else ""
+    text = f"found from {len(search.stretches)} stretches: {of}gyroscope {noise.gyro:.2g} rad/s/sqrt(Hz), "
+    return Densities(noise, f"{text}accelerometer {noise.accel:.2g} m/s^2/sqrt(Hz)")
+
+
+def _begun_stretches(
+    sequence: Sequence, noise: InertialNoise, begun: Begun
+) -> Iterator[tuple[Sequence, Callable[[InertialNoise], Model]]]:
+    """Yield stretches with few tracks that have a first state, and their models."""
+    time_s = sequence.time_s
+    count = int(np.clip((time_s[-1] - time_s[0]) / _STRETCH_S, 1, _MOST))
+    length = int(np.clip(np.searchsorted(time_s - time_s[0], _STRETCH_S, "right"), 2, len(sequence)))
+    for frames in stretches_of(len(sequence), length, count):
+        try:
+            part = sequence[frames.start : frames.stop]
+            if part.time_s[-1] - part.time_s[0] < _LEAST_S:
+                continue
+            yield thinned(part, [range(len(part))], _TRACKS), begun(part, noise)
+        except EkfslamError:  # nothing is seen there, or no state fits
+            continue
+
+
+Factors = tuple[float, float, float]  # powers of 2: gyroscope, accelerometer, and the walks of both
+
+
+class _Search:
+    """Log-likelihoods of stretches by factors on densities."""
+
+    def __init__(
+        self,
+        config: FilterConfig,
+        base: InertialNoise,
+        stretches: list[tuple[Sequence, Callable[[InertialNoise], Model]]],
+    ) -> None:
+        self.base, self.stretches, self._config = base, stretches, replace(config, lag=0, revive=-1)
+        self._scores: dict[Factors, Array] = {}
+
+    def noise(self, at: Factors) -> InertialNoise:
+        """Return the densities of some factors."""
+        (gyro, accel, walk), base = (2.0**power for power in at), self.base
+        return InertialNoise(base.gyro * gyro, base.accel * accel, base.gyro_walk * walk, base.accel_walk * walk)
+
+    def value(self, at: Factors) -> float:
+        """Return the log-likelihood with a weak prior of factors near 1, by which they stay if data say nothing."""
+        return float(self.score(at).sum()) - 0.5 * float(np.sum(np.square(at))) / _SPREAD**2
+
+    def score(self, at: Factors) -> Array:
+        """Return the log-likelihood of each stretch."""
+        if at not in self._scores:
+            noise, found = self.noise(at), []
+            for part, model in self.stretches:
+                try:
+                    (stretch,) = run_stretches(model(noise), self._config, part, [range(len(part))])
+                    found.append(stretch.log_likelihood)
+                except FilterError:
+                    found.append(-np.inf)
+            self._scores[at] = np.array(found)
+        return self._scores[at]
+
+    def gains(self, before: Factors, after: Factors) -> bool:
+        """Return whether some factors are clearly likelier than others."""
+        gain = self.score(after) - self.score(before)
+        error = np.sqrt(len(gain)) * float(gain.std()) if np.isfinite(gain).all() else 0.0
+        return bool(gain.sum() > max(_SURE * error, _LEAST_GAIN))
+
+    def best(self, at: Factors) -> Factors:
+        """Return the likeliest factors: by steps along one axis after the other, then by parabolas."""
+        at = self._climbed(at, 2.0, (0, 1))
+        at = self._climbed(at, 2.0, (2,))
+        at = self._climbed(at, 1.0, (0, 1))
+        return self._vertex(self._vertex(at, 0), 1)
+
+    def _climbed(self, at: Factors, step: float, axes: tuple[int, ...]) -> Factors:
+        before = None
+        while before != at:
+            before = at
+            for axis in axes:
+                at = max((_moved(at, axis, by) for by in (0.0, -step, step)), key=self.value)
+        return at
+
+    def _vertex(self, at: Factors, axis: int) -> Factors:
+        """Return the maximum, along an axis, of the parabola through the values at a maximum and a step away."""
+        low, here, high = (self.value(_moved(at, axis, by)) for by in (-1.0, 0.0, 1.0))
+        bend = low - 2.0 * here + high
+        by = 0.5 * (low - high) / bend if np.isfinite(bend) and bend < 0 else 0.0
+        return _moved(at, axis, float(np.clip(by, -0.5, 0.5)))
+
+
+def _moved(at: Factors, axis: int, by: float) -> Factors:
+    moved = list(at)
+    moved[axis] = round(float(np.clip(at[axis] + by, -_BOUND, _BOUND)), 3)
+    return moved[0], moved[1], moved[2]
