@@ -170,12 +170,14 @@ def resolve(
     if mode != "dead-reckoning":
         sequence, hygiene = _cleaned(sequence, config, noise)
     if is_inertial(sequence):
-        config, account["inertial_noise"] = with_densities(sequence, config, mode in ("full", "smoothed"))
-        account |= {f"inertial_{name}": value for name, value in vars(densities_of(config)).items()}
+        if mode in ("full", "smoothed") and _has_open_scale(sequence, config):
+            config = config.with_overrides({"noise": {"track_scale": PERSISTENCE}})
+            noise = noise_of(sequence, config)
+        config, text = with_densities(sequence, config, mode in ("full", "smoothed"))
+        account |= {"inertial_noise": text, **{f"inertial_{key}": x for key, x in vars(densities_of(config)).items()}}
     model = _model(sequence, config, noise, blocks)
-    start = first_state(sequence, config, model) if is_inertial(sequence) else None
-    if start is not None:
-        model, account["inertial_start"] = start.begun(model), start.text
+    if is_inertial(sequence):
+        model, account["inertial_start"] = (start := first_state(sequence, config, model)).begun(model), start.text
     if mode in ("full", "smoothed"):
         account["engine"] = in_words(model, config.filter)
         if (sampling := _sampling(sequence, config)) is not None:
@@ -185,8 +187,7 @@ def resolve(
         if _has_open_scale(sequence, config):
             scale = _track_scale(sequence, config, model)
             config = config.with_overrides({"noise": {"track_scale": scale}})
-            scaled = _model(sequence, config, noise_of(sequence, config), blocks)
-            model = scaled if start is None else start.begun(scaled)
+            model = _model(sequence, config, noise_of(sequence, config), blocks)
     return Problem(sequence, config, model, hygiene, account)
 
 

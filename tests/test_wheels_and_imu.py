@@ -92,7 +92,7 @@ def test_velocities_of_a_recording_measure_the_velocity_of_the_state():
         "velocities are measured beside inertial samples: v_x 0.03, v_y 0.03, v_z 0.03 m/s"
     )
     variances = [np.trace(run.inertial.covariance[-1, 6:9, 6:9]) for run in (alone, both)]
-    assert variances[1] < 0.95 * variances[0]
+    assert variances[1] < 0.97 * variances[0]
 
 
 def test_axes_that_are_not_measured_are_not_used():
