@@ -16,7 +16,9 @@ from ekfslam.figures import series
 from ekfslam.figures.run import draw_figures, plot_inertial
 from ekfslam.filters.inertial_states import velocity_world
 from ekfslam.geometry import se3
+from ekfslam.page.report import report_page
 from ekfslam.storage.archive import open_result
+from ekfslam.storage.exports import export
 
 
 @functools.cache
@@ -154,6 +156,23 @@ def test_a_figure_of_velocity_and_biases_is_registered_once_per_mode():
 def test_a_page_shows_velocity_and_biases():
     archive = ekfslam.storage.archive.Archive
     fields = {name: getattr(room(), name) for name in archive.__dataclass_fields__ if name not in ("results", "twist")}
-    page = ekfslam.page.report.report_page({"room": archive(**fields, twist=None, results={"full": full()})})
+    page = report_page({"room": archive(**fields, twist=None, results={"full": full()})})
     assert '"velocity error x"' in page and '"accel bias z"' in page
     assert "Velocity and biases at the end" in page and "gyro bias: x" in page
+
+
+def test_states_are_exported_as_the_truth_of_euroc_and_read_back(tmp_path):
+    result = full()
+    path = tmp_path / "states.csv"
+    export(result, path, "euroc")
+    truth = ekfslam.attach_truth(room(), path).truth
+    np.testing.assert_allclose(truth.T_world_imu, result.T_world_imu, atol=1e-9)
+    np.testing.assert_allclose(truth.motion.velocity_m_s, result.velocity_world_m_s, atol=1e-12)
+    np.testing.assert_allclose(truth.motion.gyro_bias_rad_s, result.inertial.gyro_bias_rad_s, atol=1e-12)
+    np.testing.assert_allclose(truth.motion.accel_bias_m_s2, result.inertial.accel_bias_m_s2, atol=1e-12)
+
+
+def test_states_of_a_result_without_samples_are_not_exported(tmp_path):
+    result = replace(full(), inertial=None)
+    with pytest.raises(NoInertialError):
+        export(result, tmp_path / "states.csv", "euroc")

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ekfslam import files
 from ekfslam.arrays import Array
+from ekfslam.data.readers.euroc import COLUMNS, MOTION
 from ekfslam.data.readers.text import first_row
 from ekfslam.data.readers.tum import COVARIANCE, COVARIANCE_ENDING, covariance_path
 from ekfslam.data.trajectory import Moving, Trajectory, from_left_error
@@ -43,6 +44,7 @@ from ekfslam.storage.trajectories import (
 )
 
 MADE_BY = "ekfslam"  # in files that have room for a remark
+_UNITS = ("ns", *["m"] * 3, *[""] * 4, *["m s^-1"] * 3, *["rad s^-1"] * 3, *["m s^-2"] * 3)
 _PLY = f"ply\nformat binary_little_endian 1.0\ncomment {MADE_BY}: landmarks in world, m and m^2\n"
 _G2O = f"# {MADE_BY}: "
 
@@ -145,6 +147,26 @@ def csv_text(result: Result, table: str = "trajectory") -> str:
     writer.writerow(found)
     writer.writerows(zip(*(values.tolist() for values in found.values()), strict=True))
     return out.getvalue()
+
+
+def euroc_text(result: Result) -> str:
+    """Return the states of an inertial result as the ground truth of EuRoC has them: a csv that `attach_truth` reads.
+
+    Stamps are ns; a float holds those since 1970 to 0.2 us. Velocities are along world.
+
+    Raises:
+        NoInertialError: Other inputs moved the poses.
+    """
+    velocity, states = result.velocity_world_m_s, result.inertial
+    assert states is not None
+    quaternion = position_and_quaternion(result.T_world_imu)[:, [6, 3, 4, 5]]
+    biases = states.gyro_bias_rad_s, states.accel_bias_m_s2
+    rows = np.hstack([result.T_world_imu[:, :3, 3], quaternion, velocity, *biases])
+    lines = [f"#{', '.join(f'{name} [{unit}]' for name, unit in zip((*COLUMNS, *MOTION), _UNITS, strict=True))}"]
+    for time_s, row in zip(result.time_s.tolist(), rows.tolist(), strict=True):
+        seconds, rest = divmod(time_s, 1.0)
+        lines.append(",".join([str(int(seconds) * 10**9 + round(rest * 1e9)), *(f"{value:.17g}" for value in row)]))
+    return "\n".join([*lines, ""])
 
 
 def ply_bytes(result: Result) -> bytes:
@@ -313,6 +335,7 @@ EXPORTS: dict[str, Export] = {
         "kitti.txt", "poses of the left camera in its first frame: twelve entries", 12, kitti_text, "camera"
     ),
     "bag": _poses("mcap", "poses: ROS 2 bag of nav_msgs/Odometry with covariances", 0, bag_bytes),
+    "euroc": Export("euroc.csv", "inertial states: ns, p, q, v, biases", euroc_text, b"#timestamp [ns], p_RS"),
     "csv": _csv("trajectory", b"time_s,x_m,"),
     "csv-landmarks": _csv("landmarks", b"id,x_m,"),
     "csv-innovation": _csv("innovation", b"time_s,nis,"),
