@@ -79,6 +79,18 @@ _SHARED: dict[str, dict[str, Any]] = {
         "metavar": "FILE",
         "help": "sensor.yaml or imu.yaml with the noise densities of --imu (default: the one beside it)",
     },
+    "--topics": {
+        "nargs": "+",
+        "default": [],
+        "metavar": "TOPIC",
+        "help": "topics of a bag: LEFT RIGHT [ODOMETRY] [IMU] (default: chosen by CameraInfo and names)",
+    },
+    "--calibration": {
+        "type": Path,
+        "metavar": "FILE",
+        "help": "calibration of the pair: chain of Kalibr or OpenVINS, left.yaml of ROS, OpenCV, ORB-SLAM, "
+        "calibration.toml (bags without CameraInfo need one)",
+    },
     "--lateral": {
         "choices": ("corrected", "as-stored"),
         "default": "corrected",
@@ -112,6 +124,8 @@ PLACES = (
     "--velocity-frame",
     "--imu",
     "--imu-noise",
+    "--topics",
+    "--calibration",
     "--lateral",
 )  # parts of a recording in other files
 DATA = (*PLACES, "--frames", "--extrinsics", "--truth-noise")
@@ -180,6 +194,8 @@ def open_data(options: argparse.Namespace, data: str) -> Sequence:
         velocity_frame=options.velocity_frame,
         imu=options.imu,
         imu_noise=options.imu_noise,
+        topics=options.topics,
+        calibration=options.calibration,
         front_end=config_file(options).front_end,
     )
     return sequence if options.frames is None else sequence[options.frames]

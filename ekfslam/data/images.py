@@ -24,6 +24,7 @@ DistortionModel = Literal["none", "radtan", "equidistant"]
 # Allowed numbers of coefficients of a model.
 _COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
 LEAST_BASELINE_M, LARGEST_BASELINE_M = 0.005, 5.0  # others are named: their unit is probably another one
+_LEAST_FOCAL_PX = 1e-3
 _LARGEST_SIDE_PX = 1 << 15  # limit of OpenCV's remap
 
 
@@ -74,7 +75,7 @@ class PairCalibration:
             K = np.asarray(getattr(self, name), dtype=float)
             require_shape(K, (3, 3), name)
             require_finite(K, name, 1e7)
-            if K[0, 0] <= 0 or K[1, 1] <= 0 or (K[2] != (0, 0, 1)).any() or K[1, 0] != 0:
+            if min(K[0, 0], K[1, 1]) < _LEAST_FOCAL_PX or (K[2] != (0, 0, 1)).any() or K[1, 0] != 0:
                 raise CalibrationError("not an intrinsic matrix: upper triangular, positive focal lengths", field=name)
             object.__setattr__(self, name, frozen(K))
         size = tuple(int(side) for side in self.size)

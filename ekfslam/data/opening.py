@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 from typing import get_args
 
@@ -10,7 +11,7 @@ from ekfslam.arrays import Array
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.readers.fields import checksum
 from ekfslam.data.readers.poses import FIRST_IMAGE, Poses, truth_of_frames
-from ekfslam.data.readers.registry import Extrinsics, Lateral, Source, expected, read_as
+from ekfslam.data.readers.registry import CALIBRATION, Extrinsics, Lateral, Source, expected, read_as
 from ekfslam.data.readers.text import read_lines, rows_of
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError, TruthError, UnknownFormatError
@@ -19,7 +20,12 @@ MIN_COVERAGE = 0.9  # a file that knows fewer of the frames belongs to another r
 
 
 def open_recording(
-    source: str | Path, *, extrinsics: Extrinsics = "corrected", lateral: Lateral = "corrected"
+    source: str | Path,
+    *,
+    extrinsics: Extrinsics = "corrected",
+    lateral: Lateral = "corrected",
+    topics: Iterable[str] = (),
+    calibration: str | Path | None = None,
 ) -> Sequence | ImageRecording:
     """Open a recording as it is stored: as images if it has any, otherwise as tracks.
 
@@ -29,8 +35,8 @@ def open_recording(
     for name, (choice, known) in choices.items():
         if choice not in get_args(known):
             raise ConfigError(f"{name} must be one of {', '.join(get_args(known))}, found {choice!r}")
-    place = Source.at(source, extrinsics, lateral)
-    images: ImageRecording | None = read_as(place, "images")
+    place = _placed(Source.at(source, extrinsics, lateral), topics, calibration)
+    images = _images(place)
     if images is not None:
         return images
     sequence: Sequence | None = read_as(place, "tracks")
@@ -45,16 +51,40 @@ def open_recording(
     return sequence
 
 
-def open_images(source: str | Path, *, lateral: Lateral = "corrected") -> ImageRecording | None:
+def open_images(
+    source: str | Path,
+    *,
+    lateral: Lateral = "corrected",
+    topics: Iterable[str] = (),
+    calibration: str | Path | None = None,
+) -> ImageRecording | None:
     """Open a recording of stereo images; return None if no reader finds images there.
 
-    ``lateral`` is the reading of the lateral velocity of KITTI, see `ekfslam.open_sequence`.
+    For arguments see `ekfslam.open_sequence`.
 
     Raises:
         UnknownFormatError: A file of the recording is missing or damaged.
         DataError: A field is missing or malformed; the subclass says how.
     """
-    images: ImageRecording | None = read_as(Source.at(source, lateral=lateral), "images")
+    return _images(_placed(Source.at(source, lateral=lateral), topics, calibration))
+
+
+def _placed(place: Source, topics: Iterable[str], calibration: str | Path | None) -> Source:
+    """Return a source with what its reader needs to know."""
+    if isinstance(topics, str):
+        raise ConfigError(f"topics must be a list of names, found {topics!r}")
+    given = None if calibration is None else str(calibration)
+    return dataclasses.replace(place, topics=tuple(map(str, topics)), calibration=given)
+
+
+def _images(place: Source) -> ImageRecording | None:
+    """Return the images of a source, None without any; refuse what is given in vain."""
+    images: ImageRecording | None = read_as(place, "images")
+    attributes = {} if images is None else images.attributes
+    if place.topics and "topics" not in attributes:
+        raise ConfigError(f"{place.place}: topics (--topics) mean nothing for this format; bags have topics")
+    if place.calibration is not None and CALIBRATION not in attributes:
+        raise ConfigError(f"{place.place}: calibration (--calibration) means nothing here; bags and folders take one")
     return images
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from ekfslam.config import FrontEndConfig
@@ -23,34 +24,34 @@ def open_sequence(
     velocity_frame: VelocityFrame | None = None,
     imu: str | Path | None = None,
     imu_noise: str | Path | None = None,
+    topics: Iterable[str] = (),
+    calibration: str | Path | None = None,
     front_end: FrontEndConfig | None = None,
 ) -> Sequence:
     """Open the recording in a file or folder, or the built-in world ``builtin:NAME``.
 
     Args:
         source: Path of a recording, or ``builtin:NAME``. Stereo images are tracked.
-        extrinsics: Reading of ``cam_T_imu`` of an .npz recording, see `read_ece276a`. All other formats store
-            ``T_cam_imu`` unambiguously and accept only ``corrected``.
+        extrinsics: Reading of ``cam_T_imu`` of an .npz recording, see `read_ece276a`; else only ``corrected``.
         lateral: Reading of the lateral velocity of KITTI (.npz, .mat, drive folder), which is stored with the wrong
-            sign, see `with_lateral`. All other formats accept only ``corrected``.
+            sign, see `with_lateral`; else only ``corrected``.
         truth: File or folder of true poses to use in place of the recording's own, see `attach_truth`.
-        velocities: File or recording with velocities to use in place of the recording's own, see `attach_velocities`.
-        velocity_frame: Frame of these velocities.
-        imu: File with inertial samples to use in place of the recording's own, see `attach_inertial`.
-        imu_noise: File with the densities of their noise.
+        velocities, velocity_frame: File or recording with other velocities, their frame, see `attach_velocities`.
+        imu, imu_noise: Files of inertial samples and of their noise densities, see `attach_inertial`.
+        topics: Topics of a bag: left and right images, velocities, inertial samples. Others are chosen automatically.
+        calibration: Calibration of the pair in place of the recording's own, see `read_pair`.
         front_end: Settings of tracking; None for the defaults.
 
     Raises:
         UnknownFormatError: The file is missing, empty, damaged or of unknown content, or there is no such world.
-        ConfigError: The recording's format does not know ``extrinsics`` or ``lateral``; or ``velocity_frame`` is given
-            without ``velocities``, or ``imu_noise`` without ``imu``.
+        ConfigError: An argument means nothing for this format, or lacks the one that it belongs to.
         ArchiveError: A newer release wrote the file.
         MissingPackageError: There are images, but OpenCV is not installed.
         DataError: A field is missing or malformed; the subclass says how.
     """
     _require("velocity_frame", velocity_frame, "velocities", velocities)
     _require("imu_noise", imu_noise, "imu", imu)
-    recording = open_recording(source, extrinsics=extrinsics, lateral=lateral)
+    recording = open_recording(source, extrinsics=extrinsics, lateral=lateral, topics=topics, calibration=calibration)
 
     def with_inputs(one: Recording) -> Recording:
         if velocities is not None:

@@ -45,8 +45,9 @@ from ekfslam.studies.sweep_table import SweepTable, read_table, write_table
 MOST_RUNS = 100_000
 _ERROR_BYTES = 400
 _KEYS = {"recordings": list, "modes": list, "variants": list, "seeds": list, "settings": dict, "cases": dict}
-_FILES = ("data", "truth", "velocities")  # of a recording
-_READ_AS = ("truth", "extrinsics", "lateral", "velocities", "velocity_frame")  # arguments of `open_sequence`
+_FILES = ("data", "truth", "velocities", "calibration")  # of a recording
+# Arguments of `open_sequence`.
+_READ_AS = ("truth", "extrinsics", "lateral", "velocities", "velocity_frame", "topics", "calibration")
 _RECORDING_KEYS = ("data", "name", "frames", *_READ_AS)
 _TAKEN = ("key", "recording", "seed", "case", "mode", "error", "run", *KEYS)  # names of columns
 
@@ -60,7 +61,8 @@ class Recording:
     Args:
         data: Path, or ``builtin:NAME``.
         name: Name in the table.
-        truth, extrinsics, lateral, velocities, velocity_frame: Arguments of `ekfslam.open_sequence`.
+        truth, extrinsics, lateral, velocities, velocity_frame, topics, calibration: Arguments of
+            `ekfslam.open_sequence`; ``topics`` in a file is one text with blanks between names.
         frames: Stretch ``A:B`` of the recording, empty for all of it; applied before ``prepare``.
         prepare: Function from the sequence and the seed (None without seeds) to the sequence that is run. It must be a
             function of a module, or a `functools.partial` of one, and draw random numbers from the seed alone.
@@ -73,6 +75,8 @@ class Recording:
     lateral: str = "corrected"
     velocities: str | None = None
     velocity_frame: str | None = None
+    topics: tuple[str, ...] = ()
+    calibration: str | None = None
     frames: str = ""
     prepare: Callable[[Sequence, int | None], Sequence] | None = None
 
@@ -99,7 +103,8 @@ class Recording:
             UnknownFormatError: A file is missing.
         """
         further = {"velocities": self.velocities and _digest(Path(self.velocities)), "frames": self.frames}
-        further |= {"velocity_frame": self.velocity_frame}
+        further |= {"velocity_frame": self.velocity_frame, "topics": " ".join(self.topics)}
+        further |= {"calibration": self.calibration and _digest(Path(self.calibration))}
         facts = [self.data] if self.is_simulated else [self.extrinsics, self.lateral]
         if not self.is_simulated:
             facts += [_digest(Path(path)) for path in (self.data, self.truth) if path]
@@ -370,6 +375,8 @@ def _recording(entry: Any, folder: Path) -> Recording:
     name = Path(data).stem
     if data.startswith(BUILTIN):
         places["data"], name = data, data.removeprefix(BUILTIN)
+    if "topics" in given:
+        given = {**given, "topics": tuple(given["topics"].split())}
     return Recording(**{**given, **places, "name": printable(given.get("name", name))})
 
 

@@ -33,7 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def command(options: argparse.Namespace) -> None:
     config = config_file(options).with_overrides({"front_end": {"features": options.features}})
     files.require_writable(options.out)
-    recording = open_images(options.data, lateral=options.lateral)
+    recording = open_images(
+        options.data, lateral=options.lateral, topics=options.topics, calibration=options.calibration
+    )
     if recording is None:
         raise UnknownFormatError(f"{options.data}: there are no stereo images that a source knows")
     if options.velocities is not None:

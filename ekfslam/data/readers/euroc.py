@@ -16,19 +16,19 @@ from typing import NamedTuple
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
-from ekfslam.data.checks import spelled_as_in
-from ekfslam.data.images import Distortion, DistortionModel, ImageRecording, PairCalibration
+from ekfslam.data.images import ImageRecording
 from ekfslam.data.imu import with_rows
 from ekfslam.data.inertial import InertialRows
 from ekfslam.data.observations import TrueMotion
-from ekfslam.data.readers.fields import checksum
+from ekfslam.data.readers.calibrations import PairFile, find_chain, kalibr_camera, read_pair
+from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
 from ekfslam.data.readers.imu_text import read_imu
-from ekfslam.data.readers.imu_yaml import CHAINS, beside, chain_of, late_s, pose_of, read_imu_yaml
+from ekfslam.data.readers.imu_yaml import beside, pose_of, read_imu_yaml
 from ekfslam.data.readers.pictures import SUFFIXES, pair_files, pair_stamps
 from ekfslam.data.readers.poses import Poses, stamped_poses, truth_of_frames
-from ekfslam.data.readers.registry import Reader, Source
+from ekfslam.data.readers.registry import CALIBRATION, Reader, Source
 from ekfslam.data.readers.text import Table, first_row, line_of, parse_table, read_lines, rows_of
-from ekfslam.data.readers.yaml import Calibration, read_yaml
+from ekfslam.data.readers.yaml import read_yaml
 from ekfslam.errors import (
     CalibrationError,
     LineError,
@@ -37,6 +37,7 @@ from ekfslam.errors import (
     UnknownFormatError,
 )
 from ekfslam.geometry import se3
+from ekfslam.geometry.camera import T_CAM_BODY
 
 CAMERAS = ("cam0", "cam1")
 COLUMNS = ("timestamp", "p_RS_R_x", "p_RS_R_y", "p_RS_R_z", "q_RS_w", "q_RS_x", "q_RS_y", "q_RS_z")
@@ -48,15 +49,9 @@ MOTION = (
 _AS_TUM = [0, 1, 2, 3, 5, 6, 7, 4]  # the quaternion with w last
 _FOLDERS = ("state_groundtruth_estimate0", "mocap0")  # mocap0: TUM-VI
 _PLACES = ("data.csv", *(f"{above}{folder}/data.csv" for above in ("", "mav0/") for folder in _FOLDERS))
-_MODELS: dict[str, DistortionModel] = {
-    "radial-tangential": "radtan",
-    "radtan": "radtan",
-    "equidistant": "equidistant",
-    "none": "none",
-}
 
 
-def open_euroc(folder: Path) -> ImageRecording:
+def open_euroc(folder: Path, calibration: str | None = None) -> ImageRecording:
     """Open images, calibration, inertial samples and truth of a recording, as far as there are any.
 
     The body is the inertial unit. Frames that its samples do not cover are left out.
@@ -66,10 +61,10 @@ def open_euroc(folder: Path) -> ImageRecording:
     # An image whose partner is known to be missing is no sign of another clock.
     left, right = left.without(right.missing_ns), right.without(left.missing_ns)
     in_left, in_right, alone = pair_stamps(left.time_ns, right.time_ns, str(mav))
-    rig, imu = _calibration(mav), _inertial(mav)
+    rig, imu = _calibration(mav, calibration), _inertial(mav)
     time_s = left.time_ns[in_left] / 1e9
     files = ([left.files[i] for i in in_left], [right.files[i] for i in in_right])
-    load, deep = pair_files(*files, rig.calibration.size)
+    load, deep = pair_files(*files, rig.pair.left.size)
     notes = (*left.notes, *right.notes, *alone, *deep, *rig.notes)
     truth, found = None, find_euroc_truth(mav)
     if found is not None:
@@ -80,18 +75,22 @@ def open_euroc(folder: Path) -> ImageRecording:
         name=place.name if place.name != "mav0" else place.parent.name,
         source=str(folder),
         time_s=time_s,
-        calibration=rig.calibration,
+        calibration=rig.pair.pair(load.size),
         load=load,
-        T_cam_imu=rig.T_cam_body,
+        T_cam_imu=T_CAM_BODY if rig.T_cam_body is None else rig.T_cam_body,
         truth=truth if truth is not None and len(truth.frame) else None,
         notes=("There are no velocities and no inertial samples.", *notes),
         attributes={
             "reader": IMAGES.name,
             "checksum_sha256": checksum(*(mav / name / "data.csv" for name in CAMERAS), *rig.files),
+            **({CALIBRATION: checksum(*rig.files)} if calibration else {}),
         },
     )
     if imu is None:
         return recording
+    if rig.T_cam_body is None:
+        note = f"Inertial samples are not used: {rig.files[0].name} states no T_cam_imu."
+        return replace(recording, notes=(*recording.notes, note))
     rows, T_body_imu = imu
     T_cam_imu = None if T_body_imu is None else rig.T_cam_body @ T_body_imu
     return with_rows(recording, replace(rows, late_s=rig.late_s, T_cam_imu=T_cam_imu))
@@ -169,65 +168,36 @@ class _Rig(NamedTuple):
     """Calibration of the pair, pose of the body in the left camera, and what else the files say.
 
     Args:
+        T_cam_body: (4, 4); None if it is not stated, so that the body is the left camera.
         late_s: Stamp of an inertial sample less that of an image of the same instant.
     """
 
-    calibration: PairCalibration
-    T_cam_body: Array
+    pair: PairFile
+    T_cam_body: Array | None
     late_s: float
     files: tuple[Path, ...]
     notes: tuple[str, ...]
 
 
-def _calibration(mav: Path) -> _Rig:
-    """Return the calibration of the pair and of the body."""
+def _calibration(mav: Path, given: str | None) -> _Rig:
+    """Return the calibration of the pair and of the body: of a given file, ``sensor.yaml``, or a chain of Kalibr."""
     places = [place / sub for place in (mav, mav.parent) for sub in ("dso", ".")]
-    kalibr = next((file for place in places if (file := beside(place, CHAINS)) is not None), None)
     paths = [mav / name / "sensor.yaml" for name in CAMERAS]
-    late, notes = 0.0, tuple[str, ...]()
-    if not paths[0].is_file() and kalibr is not None:
-        read = read_yaml(kalibr)
-        cameras = [_camera(read, f"{name}.", "distortion_coeffs") for name in CAMERAS]
-        (T_left, notes), (T_right, _) = (_kalibr_pose(read, name) for name in CAMERAS)
-        paths, late = [kalibr], late_s(read, CAMERAS[0])
-    else:
-        reads = [read_yaml(path) for path in paths]
-        cameras = [_camera(read, "", "distortion_coefficients") for read in reads]
-        T_left, T_right = (se3.inverse(pose_of(read, "T_BS.data" if "T_BS.data" in read else "T_BS")) for read in reads)
-    (K_left, size, lens_left), (K_right, size_right, lens_right) = cameras
-    with spelled_as_in(str(paths[-1])):
-        if size_right != size:
-            raise CalibrationError(f"{size_right} differs from {size} of the left camera", field="resolution")
-        T_right_left = T_right @ se3.inverse(T_left)
-        calibration = PairCalibration(K_left, K_right, size, T_right_left, lens_left, lens_right)
-        return _Rig(calibration, T_left, late, tuple(paths), notes)
-
-
-def _camera(read: Calibration, prefix: str, coefficients: str) -> tuple[Array, tuple[int, int], Distortion]:
-    """Return intrinsic matrix, size and lens of a camera."""
-    with spelled_as_in(str(read.path), {"distortion": f"{prefix}{coefficients}"}):
-        if (kind := read.word(f"{prefix}camera_model")) != "pinhole":
-            raise CalibrationError(f"expected pinhole, found {kind!r}", field=f"{prefix}camera_model")
-        fu, fv, cu, cv = read.numbers(f"{prefix}intrinsics", 4)
-        width, height = read.numbers(f"{prefix}resolution", 2)
-        if not (float(width).is_integer() and float(height).is_integer()):
-            message = f"expected whole numbers of pixels, found {width:g} and {height:g}"
-            raise CalibrationError(message, field=f"{prefix}resolution")
-        if (name := read.word(f"{prefix}distortion_model")) not in _MODELS:
-            raise CalibrationError(f"expected {', '.join(_MODELS)}, found {name!r}", field=f"{prefix}distortion_model")
-        values = () if _MODELS[name] == "none" else tuple(read.numbers(f"{prefix}{coefficients}").tolist())
-        lens = Distortion(_MODELS[name], values)
-    return np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]]), (int(width), int(height)), lens
-
-
-def _kalibr_pose(read: Calibration, name: str) -> tuple[Array, tuple[str, ...]]:
-    """Return ``T_cam_imu`` of a camera, and notes; Kalibr may state that of the second relative to the first."""
-    if (found := chain_of(read, name)) is not None:
-        return found
-    if name != CAMERAS[0] and (key := f"{name}.T_cn_cnm1") in read:
-        T_left, notes = _kalibr_pose(read, CAMERAS[0])
-        return pose_of(read, key) @ T_left, notes
-    return pose_of(read, f"{name}.T_cam_imu"), ()
+    chain = given or (None if paths[0].is_file() else find_chain(*places))
+    if chain is not None:
+        found = read_pair(chain)
+        notes = (f"The calibration is that of {found.files[0].name}.", *found.notes) if given else found.notes
+        notes += (
+            () if found.T_cam_imu is not None else (f"{found.files[0].name} states no T_cam_imu. {BODY_IS_CAMERA}",)
+        )
+        return _Rig(found, found.T_cam_imu, found.late_s, found.files, notes)
+    reads = [read_yaml(path) for path in paths]
+    left, right = (kalibr_camera(read, "", "distortion_coefficients") for read in reads)
+    T_left, T_right = (se3.inverse(pose_of(read, "T_BS.data" if "T_BS.data" in read else "T_BS")) for read in reads)
+    if left.size != right.size:
+        message = f"{right.size} differs from {left.size} of the left camera"
+        raise CalibrationError(message, source=str(paths[1]), field="resolution")
+    return _Rig(PairFile(left, right, T_right @ se3.inverse(T_left), tuple(paths)), T_left, 0.0, tuple(paths), ())
 
 
 def find_euroc_truth(folder: Path) -> Path | None:
@@ -274,7 +244,7 @@ IMAGES = Reader(
     "euroc_images",
     "a folder of EuRoC or TUM-VI (mav0/cam0 cam1)",
     lambda source: _mav(source.path) is not None,
-    images=lambda source: open_euroc(source.path),
+    images=lambda source: open_euroc(source.path, source.calibration),
 )
 TRUTH = Reader(
     "EuRoC",

@@ -18,40 +18,48 @@
     distortion = [-0.28, 0.07, 0.0, 0.0]
 
     [right_camera]                      # optional: as the left one
+
+In place of the tables and the transforms, ``calibration = "camchain.yaml"`` names a file of another program, see
+`calibrations`.
 """
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ekfslam.arrays import Array
-from ekfslam.data.checks import require_finite, require_shape, spelled_as_in
-from ekfslam.data.images import Distortion, ImageRecording, PairCalibration, side_by_side
+from ekfslam.data.checks import spelled_as_in
+from ekfslam.data.images import ImageRecording
+from ekfslam.data.readers.calibrations import read_pair, read_toml
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
 from ekfslam.data.readers.pictures import find_pair, images_of_sides, pair_files
-from ekfslam.data.readers.registry import Reader, Source
+from ekfslam.data.readers.registry import CALIBRATION, Reader, Source
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
 from ekfslam.data.velocities import attach_velocities
-from ekfslam.errors import CalibrationError, DataError, LostDataError, UnknownFormatError
+from ekfslam.errors import CalibrationError, LostDataError
 from ekfslam.geometry.camera import T_CAM_BODY
 
 FILE = "calibration.toml"
-_KEYS = {"left", "right", "times", "rate_hz", "T_right_left", "baseline_m", "T_cam_imu", "velocities", "bit_depth"}
-_TABLES = {"left_camera", "right_camera"}
-_CAMERA_KEYS = {"intrinsics", "distortion_model", "distortion"}
+_BARE: dict[str, Any] = {"times": "times.txt"}  # of a folder without its own file
 
 
-def open_folder(path: Path) -> ImageRecording:
+def open_folder(path: Path, calibration: str | None = None) -> ImageRecording:
     """Open the images that a calibration describes, see this module.
 
     Without ``T_cam_imu`` the body is the left camera.
+
+    Args:
+        path: Folder, or its ``calibration.toml``.
+        calibration: File for `calibrations.read_pair`; it takes precedence, and the folder may lack its own.
     """
     file = _file_of(path)
-    folder, values = file.parent, _parsed(file)
+    folder, values = file.parent, (_BARE if calibration and not file.is_file() else read_toml(file))
+    if calibration is None and "calibration" in values:
+        calibration = str(folder / _text(values, "calibration", file))
+    described = read_pair(calibration or file)
     left, right = images_of_sides(*(folder / name for name in _folders(values, folder, file)))
     alone = [
         image.stem for side, other in ((left, right), (right, left)) for key, image in side.items() if key not in other
@@ -60,17 +68,21 @@ def open_folder(path: Path) -> ImageRecording:
         raise LostDataError(f"{len(alone)} images have no partner, the first is {alone[0]}", source=str(folder))
     load, notes = pair_files(list(left.values()), [right[key] for key in left], bits=_bits(values, file))
     notes += () if "velocities" in values else ("There are no velocities.",)
-    notes += () if "T_cam_imu" in values else (f"There is no T_cam_imu. {BODY_IS_CAMERA}",)
+    notes += () if described.T_cam_imu is not None else (f"There is no T_cam_imu. {BODY_IS_CAMERA}",)
+    attributes = {"checksum_sha256": checksum(file)} if file.is_file() else {}
+    if calibration is not None:
+        notes += (f"The calibration is that of {described.files[0].name}.", *described.notes)
+        attributes[CALIBRATION] = checksum(*described.files)
     with spelled_as_in(str(file)):
         recording = ImageRecording(
             name=folder.resolve().name,
             source=str(path),
             time_s=_stamps(values, folder, file, len(left)),
-            calibration=_pair(values, load.size),
+            calibration=described.pair(load.size),
             load=load,
-            T_cam_imu=_numbers(values["T_cam_imu"], (4, 4), "T_cam_imu") if "T_cam_imu" in values else T_CAM_BODY,
+            T_cam_imu=T_CAM_BODY if described.T_cam_imu is None else described.T_cam_imu,
             notes=notes,
-            attributes={"reader": READER.name, "checksum_sha256": checksum(file)},
+            attributes={"reader": READER.name, **attributes},
         )
     if "velocities" not in values:
         return recording
@@ -79,21 +91,6 @@ def open_folder(path: Path) -> ImageRecording:
 
 def _file_of(path: Path) -> Path:
     return path / FILE if path.is_dir() else path
-
-
-def _parsed(file: Path) -> dict[str, Any]:
-    text = "\n".join(read_lines(file, f"expected {FILE}"))
-    try:
-        values = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise UnknownFormatError(f"{file}: not a TOML file ({error})") from None
-    tables = [("", values, _KEYS | _TABLES)]
-    tables += [(f"{name}.", values[name], _CAMERA_KEYS) for name in _TABLES if isinstance(values.get(name), dict)]
-    for prefix, table, known in tables:
-        for key in table.keys() - known:
-            message = f"unknown key; known: {', '.join(sorted(known))}"
-            raise CalibrationError(message, source=str(file), field=prefix + key)
-    return values
 
 
 def _folders(values: dict[str, Any], folder: Path, file: Path) -> tuple[str, str]:
@@ -135,55 +132,21 @@ def _stamps(values: dict[str, Any], folder: Path, file: Path, count: int) -> Arr
     return times
 
 
-def _pair(values: dict[str, Any], size: tuple[int, int]) -> PairCalibration:
-    K_left, lens_left = _camera(values, "left_camera")
-    K_right, lens_right = _camera(values, "right_camera") if "right_camera" in values else (K_left, lens_left)
-    if ("T_right_left" in values) == ("baseline_m" in values):
-        raise CalibrationError("expected either T_right_left or baseline_m", field="T_right_left")
-    if "baseline_m" in values:
-        baseline = values["baseline_m"]
-        if not (isinstance(baseline, int | float) and 0 < baseline < 1e6):
-            raise CalibrationError(f"expected a positive length, found {baseline!r}", field="baseline_m")
-        T_right_left = side_by_side(baseline)
-    else:
-        T_right_left = _numbers(values["T_right_left"], (4, 4), "T_right_left")
-    return PairCalibration(K_left, K_right, size, T_right_left, lens_left, lens_right)
-
-
-def _camera(values: dict[str, Any], name: str) -> tuple[Array, Distortion]:
-    table = values.get(name)
-    if not isinstance(table, dict):
-        raise CalibrationError("this table is missing", field=name)
-    fu, fv, cu, cv = _numbers(table.get("intrinsics"), (4,), f"{name}.intrinsics")
-    model = table.get("distortion_model", "none")
-    coefficients = _numbers(table.get("distortion", []), (None,), f"{name}.distortion")
-    with spelled_as_in("", {"distortion": f"{name}.distortion"}):
-        lens = Distortion(model, tuple(coefficients.tolist()))
-    return np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]]), lens
-
-
-def _numbers(value: Any, shape: tuple[int | None, ...], name: str) -> Array:
-    """Return an array of finite numbers of a shape; None stands for any length."""
-    try:
-        found = np.asarray(value, dtype=float)
-        require_shape(found, shape, name)
-        require_finite(found, name)
-    except (TypeError, ValueError, OverflowError, DataError):
-        wanted = " x ".join("n" if n is None else str(n) for n in shape)
-        raise CalibrationError(f"expected {wanted} numbers", field=name) from None
-    return found
-
-
 def _recognises(source: Source) -> bool:
     file = _file_of(source.path)
     if source.path.is_dir():
-        return file.is_file()
+        return file.is_file() or (source.calibration is not None and _is_bare(source.path))
     return file.suffix == ".toml" and bool(first_row(file)) and b"\x00" not in source.head
+
+
+def _is_bare(folder: Path) -> bool:
+    """Return whether a folder has a pair of folders of images and stamps, but is no sequence of KITTI."""
+    return find_pair(folder) is not None and (folder / "times.txt").is_file() and not (folder / "calib.txt").is_file()
 
 
 READER = Reader(
     "image_folders",
     f"a folder with {FILE} of a pair of image folders",
     _recognises,
-    images=lambda source: open_folder(source.path),
+    images=lambda source: open_folder(source.path, source.calibration),
 )

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
 from ekfslam.data.images import Image
-from ekfslam.data.readers.pictures import decode_gray
+from ekfslam.data.readers.pictures import decode_gray, size_of_image, upper_eight
 from ekfslam.data.readers.registry import Source
-from ekfslam.errors import CalibrationError, EkfslamError, MissingPackageError, UnknownFormatError
+from ekfslam.errors import CalibrationError, EkfslamError, LostDataError, MissingPackageError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.names import printable
 
@@ -29,23 +30,34 @@ VELOCITIES = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCova
 
 ROS1_MAGIC = b"#ROSBAG V2.0"
 MAGICS = (ROS1_MAGIC, b"\x89MCAP0\r\n", b"SQLite format 3\x00")
-# Bytes of a pixel.
-_BYTES = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "mono16": 2, "16UC1": 2}
+# Bytes of a pixel. Of two chroma samples and two luma samples in four bytes (yuv), luma alone is read.
+_BYTES = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4}
+_BYTES |= {"mono16": 2, "16UC1": 2, "rgb16": 6, "bgr16": 6, "rgba16": 8, "bgra16": 8}
+_BYTES |= {"yuv422": 2, "uyvy": 2, "yuv422_yuy2": 2, "yuyv": 2, "nv21": 1, "nv24": 1}
+_BYTES |= {f"bayer_{pattern}{bits}": bits // 8 for pattern in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)}
+_LUMA_AT = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
+_FURTHER_ROWS = {"nv21": 0.5, "nv24": 2.0}  # of chroma, as a share of the height, below those of luma
+DEEP = tuple(name for name, size in _BYTES.items() if size in (2, 6, 8) and name not in _LUMA_AT)
 # Variances (m^2/s^2, rad^2/s^2) that drivers write for an axis without a value, and for one that is not measured.
 _UNSET, _UNKNOWN = 1e-10, 1e3
 _LUMA = np.array([0.299, 0.587, 0.114])
 
 
 class Bag:
-    """An open bag: a file, or a folder with ``metadata.yaml``; raises `MissingPackageError` without rosbags."""
+    """An open bag: a file, or a folder with ``metadata.yaml``; raises `MissingPackageError` without rosbags.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        path: Path of the bag.
+        named: Topics that take precedence over all others of their types, in this order.
+    """
+
+    def __init__(self, path: Path, named: tuple[str, ...] = ()) -> None:
         try:
             from rosbags import rosbag1, rosbag2
         except ImportError as error:
             raise MissingPackageError("rosbags", "bags", f"{path}: reading a bag ({error})") from None
         self.path = path
-        with self.named():
+        with self.named_errors():
             self.is_ros1 = Source.at(path).head.startswith(ROS1_MAGIC)
             self._reader: Any = rosbag1.Reader(path) if self.is_ros1 else rosbag2.Reader(path)
             self._reader.open()
@@ -53,9 +65,15 @@ class Bag:
             for connection in self._reader.connections:
                 if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
                     raise ValueError(f"a stream named {connection.topic!r} of the type {connection.msgtype!r}")
+        self.named = tuple(name if name in self.topics else f"/{name}" for name in named)
+        for name, full in zip(named, self.named, strict=True):
+            if full not in self.topics:
+                found = ", ".join(f"{topic} ({kind})" for topic, kind in self.topics.items())
+                message = f"{path}: there is no topic {printable(name)}; the bag has {printable(found)}"
+                raise LostDataError(message, field="topics")
 
     @contextlib.contextmanager
-    def named(self) -> Iterator[None]:
+    def named_errors(self) -> Iterator[None]:
         """Turn any exception of the package for a damaged bag into an error that names it."""
         try:
             yield
@@ -74,19 +92,24 @@ class Bag:
         return dict(sorted(found.items()))
 
     def connections(self, *kinds: str) -> list[Any]:
-        """Return the streams of messages of some types, by topic."""
-        found = [connection for connection in self._reader.connections if connection.msgtype in kinds]
-        return sorted(found, key=lambda connection: (connection.topic, connection.id))
+        """Return one stream a topic of messages of some types: the named ones, or else all by topic."""
+        found = sorted(self._of(*kinds), key=lambda connection: (connection.topic, connection.id))
+        by_topic = {connection.topic: connection for connection in reversed(found)}
+        return [by_topic[name] for name in self.named if name in by_topic] or list(by_topic.values())[::-1]
+
+    def _of(self, *kinds: str) -> list[Any]:
+        return [connection for connection in self._reader.connections if connection.msgtype in kinds]
 
     def raw(self, connection: Any, begin_ns: int | None = None, end_ns: int | None = None) -> Iterator[Any]:
-        """Yield the time of writing (ns) and the bytes of each message of a stream."""
-        with self.named():
-            for _, written_ns, content in self._reader.messages([connection], begin_ns, end_ns):
+        """Yield the time of writing (ns) and the bytes of each message of a topic, of all its publishers."""
+        same = [each for each in self._of(connection.msgtype) if each.topic == connection.topic]
+        with self.named_errors():
+            for _, written_ns, content in self._reader.messages(same, begin_ns, end_ns):
                 yield written_ns, content
 
     def message(self, connection: Any, content: bytes) -> Any:
         """Return the message that bytes encode."""
-        with self.named():
+        with self.named_errors():
             decode = self._types.deserialize_ros1 if self.is_ros1 else self._types.deserialize_cdr
             return decode(content, connection.msgtype)
 
@@ -97,7 +120,7 @@ class Bag:
 
     def stamp_ns(self, content: bytes) -> int:
         """Return the stamp of a message that begins with a header, without decoding the rest."""
-        with self.named():
+        with self.named_errors():
             if self.is_ros1:
                 seconds, nanoseconds = struct.unpack_from("<II", content, 4)
             else:
@@ -142,26 +165,71 @@ def field_of(info: Any, name: str) -> Any:
     return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
 
 
-def gray_of(message: Any, source: str, size: tuple[int, int]) -> Image:
-    """Return the gray pixels (height, width) of an Image or CompressedImage."""
+def gray_of(message: Any, source: str, size: tuple[int, int], bits: int = 16) -> Image:
+    """Return the gray pixels (height, width) of an Image or CompressedImage; see `read_gray` for ``bits``."""
     if hasattr(message, "format"):
-        return decode_gray(bytes(message.data), source, size)
+        return decode_gray(bytes(message.data), source, size, bits)
+    if (width_height := size_of(message, source)) != size:
+        width, height = width_height
+        text = f"the image has {width} x {height} pixels, its CameraInfo {size[0]} x {size[1]}"
+        raise CalibrationError(text, source=source)
+    values, encoding = _values(message, source), str(message.encoding)
+    values = values if values.dtype == np.uint8 else upper_eight(values, bits)
+    if encoding in _LUMA_AT:
+        return np.ascontiguousarray(values[..., _LUMA_AT[encoding]])
+    if encoding.startswith("bayer"):
+        return _debayered(values[..., 0], encoding[6:10])
+    if values.shape[-1] == 1:
+        return np.ascontiguousarray(values[..., 0])
+    luma = _LUMA if encoding.startswith("rgb") else _LUMA[::-1]
+    return np.round(values[..., :3] @ luma).astype(np.uint8)
+
+
+def size_of(message: Any, source: str) -> tuple[int, int]:
+    """Return width and height of an Image or CompressedImage."""
+    if hasattr(message, "format"):
+        return size_of_image(bytes(message.data), source)
+    return int(message.width), int(message.height)
+
+
+def largest_value(message: Any) -> int:
+    """Return the largest value in an Image."""
+    return int(_values(message, "").max(initial=0))
+
+
+def _values(message: Any, source: str) -> NDArray[Any]:
+    """Return the pixels (height, width, channels) of an Image as 8 or 16 bits; two channels of yuv."""
     height, width, encoding = int(message.height), int(message.width), printable(str(message.encoding))
-    if (width, height) != size:
-        message = f"the image has {width} x {height} pixels, its CameraInfo {size[0]} x {size[1]}"
-        raise CalibrationError(message, source=source)
     if encoding not in _BYTES:
         raise UnknownFormatError(f"{source}: images encoded as {encoding!r} are not read; known: {', '.join(_BYTES)}")
     size_of_pixel = _BYTES[encoding]
     step, data = int(message.step), np.asarray(message.data, dtype=np.uint8)
-    if step < width * size_of_pixel or len(data) != height * step:
+    rows = height + int(_FURTHER_ROWS.get(encoding, 0.0) * height)
+    if step < width * size_of_pixel or len(data) != rows * step:
         found = f"{len(data)} bytes and steps of {step}"
         raise UnknownFormatError(f"{source}: {found} are no {width} x {height} {encoding}")
-    rows = data.reshape(height, step)[:, : width * size_of_pixel].reshape(height, width, size_of_pixel)
-    if size_of_pixel <= 2:  # 16 bits: their upper eight
-        return np.ascontiguousarray(rows[..., 0 if size_of_pixel == 1 or message.is_bigendian else 1])
-    luma = _LUMA if encoding.startswith("rgb") else _LUMA[::-1]
-    return np.round(rows[..., :3] @ luma).astype(np.uint8)
+    pixels = np.ascontiguousarray(data.reshape(rows, step)[:height, : width * size_of_pixel])
+    if encoding in DEEP:
+        pixels = pixels.view(">u2" if message.is_bigendian else "<u2")
+    return pixels.reshape(height, width, -1)
+
+
+def _debayered(mosaic: Image, pattern: str) -> Image:
+    """Return the luma of a Bayer mosaic, whose colours are interpolated linearly."""
+    padded = np.pad(mosaic.astype(np.float32), 1, mode="reflect")
+    height, width = mosaic.shape
+    colour = np.array([["rgb".index(c) for c in pattern[:2]], ["rgb".index(c) for c in pattern[2:]]])
+    place = np.tile(colour, (height // 2 + 2, width // 2 + 2))[1 : height + 3, 1 : width + 3]  # padded by one
+    luma, weights = np.zeros(mosaic.shape, np.float32), np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], np.float32)
+    for channel, share in enumerate(_LUMA):
+        is_there = (place == channel).astype(np.float32)
+        total, known = np.zeros_like(luma), np.zeros_like(luma)
+        for (i, j), weight in np.ndenumerate(weights):
+            part = np.s_[i : i + height, j : j + width]
+            total += weight * (padded * is_there)[part]
+            known += weight * is_there[part]
+        luma += np.float32(share) * total / known
+    return np.round(luma).astype(np.uint8)
 
 
 def stated_std(covariances: Array) -> tuple[Array, str]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from PIL import Image as Pillow
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp")
-LEAST_PAIRED = 0.9  # of the images, that must have a partner
+LEAST_PAIRED, FEW = 0.9, 2  # share of the images that must have a partner, and number of images that need none
 # Folders of the left and the right images, by their usual names.
 PAIRS = (
     ("image_0", "image_1"),
@@ -43,6 +43,7 @@ _SIDES = tuple(
     for word, letter, number in (("left", "l", 0), ("right", "r", 1))
 )
 _TOLERANCE_NS = 5_000_000  # cameras that are not triggered together are no stereo pair
+_EXACT_NS = 1_000_000  # rounding of stamps that are the same
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM")  # PPM includes pgm
 
 
@@ -67,6 +68,12 @@ def decode_gray(content: bytes, source: str, size: tuple[int, int] | None = None
         if _is_deep(image):
             return upper_eight(np.asarray(image, dtype=np.uint32), bits)
         return np.asarray(image if image.mode == "L" else image.convert("L"))
+
+
+def size_of_image(content: bytes, source: str) -> tuple[int, int]:
+    """Return width and height of the bytes of an image file from its header alone."""
+    with _opened(io.BytesIO(content), source) as image:
+        return image.size
 
 
 def upper_eight(values: NDArray[np.integer], bits: int) -> Image:
@@ -183,7 +190,7 @@ def images_of_sides(left: Path, right: Path) -> tuple[dict[str, Path], dict[str,
     """
     found = [images_in(folder) for folder in (left, right)]
     if left.resolve() == right.resolve():
-        found = [tuple(p for p in images if _side_of(p.stem) == side) for side, images in enumerate(found)]
+        found = [tuple(p for p in images if side_of(p.stem) == side) for side, images in enumerate(found)]
         for side, images in zip(("left", "right"), found, strict=True):
             if not images:
                 raise UnknownFormatError(f"{left}: no name of an image says that it is of the {side} camera")
@@ -196,17 +203,32 @@ def images_of_sides(left: Path, right: Path) -> tuple[dict[str, Path], dict[str,
     return in_left, in_right
 
 
-def _side_of(name: str) -> int | None:
-    """Return the side that a name states; None unless it is one."""
+def side_of(name: str) -> int | None:
+    """Return the side that a name states, 0 for left, 1 for right; None unless it is one."""
     sides = [side for side, pattern in enumerate(_SIDES) if pattern.search(name)]
     return sides[0] if len(sides) == 1 else None
+
+
+def without_side(name: str, side: int) -> str | None:
+    """Return a name of a side without it, which is equal for both sides of a pair; None for other names."""
+    return _SIDES[side].sub("*", name) if side_of(name) == side else None
+
+
+def other_side(path: Path) -> Path | None:
+    """Return the file beside one of a side whose name differs in the side alone; None if there is none."""
+    side = side_of(path.stem)
+    if side is None:
+        return None
+    wanted = without_side(path.stem, side)
+    same = (other for other in sorted(path.parent.iterdir()) if other.suffix == path.suffix)
+    return next((other for other in same if without_side(other.stem, 1 - side) == wanted), None)
 
 
 def numbered_images(folder: Path, side: int | None = None) -> dict[int, Path]:
     """Return the image files of a folder, those of a side (0, 1) if it holds both, by the number in their names."""
     found: dict[int, Path] = {}
     for path in images_in(folder):
-        if side is not None and _side_of(path.stem) != side:
+        if side is not None and side_of(path.stem) != side:
             continue
         # Some names have the side, too: left_000001
         numbers = re.findall(r"\d+", re.sub(f"{_SIDES[0].pattern}|{_SIDES[1].pattern}", "", path.stem, flags=re.I))
@@ -235,8 +257,18 @@ def pair_stamps(left_ns: IntArray, right_ns: IntArray, source: str) -> tuple[Int
     left = np.flatnonzero(np.abs(right_ns[right] - left_ns) <= _TOLERANCE_NS)
     right, kept = np.unique(right[left], return_index=True)
     left = left[kept]
-    if len(left) < LEAST_PAIRED * max(len(left_ns), len(right_ns)):
-        message = f"only {len(left)} of {len(left_ns)} left and {len(right_ns)} right images have the same stamp"
+    most = max(len(left_ns), len(right_ns))
+    if len(left) < min(LEAST_PAIRED * most, most - FEW):
+        apart_ms = np.median(np.abs(right_ns[nearest(right_ns, left_ns)] - left_ns)) / 1e6
+        message = (
+            f"only {len(left)} of {len(left_ns)} left and {len(right_ns)} right images have the same stamp within "
+            f"{_TOLERANCE_NS / 1e6:g} ms; nearest stamps are {apart_ms:.3g} ms apart (median)"
+        )
         raise LostDataError(message, source=source)
     alone = len(left_ns) + len(right_ns) - 2 * len(left)
-    return left, right, (f"{alone} images without a partner are left out.",) if alone else ()
+    notes = [f"{alone} images without a partner are left out."] if alone else []
+    apart_ns = int(np.abs(right_ns[right] - left_ns[left]).max(initial=0))
+    if apart_ns > _EXACT_NS:
+        most = f"up to {apart_ns / 1e6:.3g} ms apart (tolerance {_TOLERANCE_NS / 1e6:g} ms)"
+        notes.append(f"Stamps of left and right images are {most}; those of the left camera count.")
+    return left, right, tuple(notes)

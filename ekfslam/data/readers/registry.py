@@ -29,6 +29,7 @@ Lateral = Literal["corrected", "as-stored"]
 Kind = Literal["tracks", "images", "truth", "inputs", "inertial"]
 
 _HEAD_BYTES = 128
+CALIBRATION = "calibration_sha256"  # attribute of recordings of images that were opened with `Source.calibration`
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class Source:
         lateral: Reading of the lateral velocity of KITTI.
         head: First 128 bytes of a file; empty otherwise.
         problem: Reason why there is no ``head``; empty if there is one.
+        topics: Topics of a bag to use, see `bags.open_bag`.
+        calibration: File with the calibration of the pair, in place of that of the recording.
     """
 
     place: str
@@ -48,6 +51,8 @@ class Source:
     lateral: Lateral
     head: bytes
     problem: str
+    topics: tuple[str, ...] = ()
+    calibration: str | None = None
 
     @property
     def path(self) -> Path:

@@ -16,8 +16,10 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.data.readers.text import read_lines
 from ekfslam.errors import CalibrationError
+from ekfslam.names import printable
 
-_KEY = re.compile(r"(\s*)(?:- )?([A-Za-z_][\w.]*)\s*:(?:\s+(.*)|)$")
+_KEY = re.compile(r"(\s*)(?:- )?([A-Za-z_][\w.]*)\s*:(?:\s+(.*)|(\[.*)|)$")
+_WORD = re.compile(r"[A-Za-z~.]+")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 
 
@@ -44,7 +46,11 @@ class Calibration:
 
     def numbers(self, key: str, count: int | None = None) -> Array:
         """Return the numbers (n,) of a key; raise `CalibrationError` if they are missing or not ``count``."""
-        found = np.array([float(text) for text in _NUMBER.findall(self.word(key))])
+        text = self.word(key)
+        found = np.array([float(number) for number in _NUMBER.findall(text)])
+        if (word := _WORD.search(_NUMBER.sub("", text))) is not None:
+            message = f"expected numbers, found {printable(word.group())!r}"
+            raise CalibrationError(message, source=str(self.path), field=key)
         if count is not None and len(found) != count:
             raise CalibrationError(f"expected {count} numbers, found {len(found)}", source=str(self.path), field=key)
         return found
@@ -52,7 +58,7 @@ class Calibration:
 
 def read_yaml(path: Path) -> Calibration:
     """Read the keys of a file."""
-    values: dict[str, str] = {}
+    parts: dict[str, list[str]] = {}
     above: list[tuple[int, str]] = []
     for raw in read_lines(path, "expected a calibration in YAML"):
         line = re.sub(r"(^|\s)#.*$", "", raw).rstrip()
@@ -62,7 +68,7 @@ def read_yaml(path: Path) -> Calibration:
         if match:
             depth = len(match.group(1))
             above = [entry for entry in above if entry[0] < depth] + [(depth, match.group(2))]
-            values[".".join(key for _, key in above)] = match.group(3) or ""
+            parts[".".join(key for _, key in above)] = [match.group(3) or match.group(4) or ""]
         elif above:
-            values[".".join(key for _, key in above)] += " " + line
-    return Calibration(path, values)
+            parts[".".join(key for _, key in above)].append(line)
+    return Calibration(path, {key: " ".join(lines) for key, lines in parts.items()})

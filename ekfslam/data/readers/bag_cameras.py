@@ -1,0 +1,295 @@
+"""Cameras of a bag: choice of the stereo pair among its topics, its calibration, and the stamps of its images."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ekfslam.arrays import Array, IntArray
+from ekfslam.data.checks import spelled_as_in
+from ekfslam.data.images import Distortion, PairCalibration, side_by_side
+from ekfslam.data.readers import messages
+from ekfslam.data.readers.calibrations import PairFile, find_chain, lens_of, read_pair, rectified_apart
+from ekfslam.data.readers.messages import CAMERA_INFO, COMPRESSED, IMAGE, Bag, frame_of
+from ekfslam.data.readers.pictures import without_side
+from ekfslam.errors import CalibrationError, LostDataError
+from ekfslam.names import printable
+
+_NO_PICTURES = re.compile(r"depth|disparity|confidence|point_?cloud|registered|mask", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Images of a camera of a bag (their connection), and its first CameraInfo, if it has one."""
+
+    bag: Bag
+    stream: Any
+    info: Any = None
+
+    @property
+    def topic(self) -> str:
+        return str(self.stream.topic)
+
+    @cached_property
+    def first(self) -> Any:
+        """First image."""
+        return first_of(self.bag, self.stream)
+
+    @property
+    def frame(self) -> str:
+        """Name of the optical frame."""
+        return frame_of((self.first if self.info is None else self.info).header.frame_id)
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether the images are rectified, by the last part of their topic, or a part that says so alone."""
+        space, last = parts_of(self.topic)
+        return "rect" in last or "rect" in space.split("/")
+
+    @property
+    def projection(self) -> Array:
+        """P (3, 4)."""
+        return messages.matrix_of(self.info, "p", 3)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return int(self.info.width), int(self.info.height)
+
+
+@dataclass(frozen=True)
+class BagPair:
+    """The stereo pair of a bag.
+
+    Args:
+        left, right: The cameras.
+        calibration: Calibration of their images.
+        R_cam_optical: (3, 3) rotation from the optical frame of the left camera to its images.
+        file: Calibration in a file, if it was taken in place of CameraInfo.
+        notes: Facts about the choice.
+    """
+
+    left: Camera
+    right: Camera
+    calibration: PairCalibration
+    R_cam_optical: Array
+    file: PairFile | None
+    notes: tuple[str, ...]
+
+
+def parts_of(topic: str) -> tuple[str, str]:
+    """Return space and last part: ``/left`` and ``image_raw`` of ``/left/image_raw/compressed``."""
+    space, _, last = topic.removesuffix("/compressed").rpartition("/")
+    return space, last
+
+
+def first_of(bag: Bag, connection: Any) -> Any:
+    """Return the first message of a stream; raise `LostDataError` if there is none."""
+    first = next(bag.messages(connection), None)
+    if first is None:
+        raise LostDataError("there is no message", field=printable(connection.topic))
+    return first
+
+
+def pair_of(bag: Bag, calibration: str | None = None) -> BagPair:
+    """Choose the stereo pair of a bag: named topics, otherwise by CameraInfo, a calibration file, or the topics' names.
+
+    Of several pairs a rectified one is preferred, then images that are not compressed. Depth and the like are no
+    candidates. Without CameraInfo, the chain of Kalibr beside the bag is taken if no file is given.
+
+    Args:
+        bag: The bag.
+        calibration: File for `read_pair`, which takes precedence over CameraInfo.
+
+    Raises:
+        CalibrationError: There is no such pair, or its calibration is impossible; the message lists all topics.
+    """
+    cameras = _cameras(bag)
+    if calibration is None and sum(camera.info is not None for camera in cameras) < 2:
+        beside = find_chain(bag.path if bag.path.is_dir() else bag.path.parent, bag.path.resolve().parent)
+        calibration = None if beside is None else str(beside)
+    file = None if calibration is None else read_pair(calibration)
+    if file is not None:
+        left, right, notes = _by_names(bag, cameras, file)
+        size = messages.size_of(left.first, f"{bag.path}: {printable(left.topic)}")
+        said = (f"The calibration is that of {file.files[0].name}.", *file.notes)
+        return BagPair(left, right, file.pair(size), np.eye(3), file, (*notes, *said))
+    left, right, notes = _by_info(bag, cameras)
+    found, R_cam_optical = _calibration(left, right)
+    return BagPair(left, right, found, R_cam_optical, None, notes)
+
+
+def _cameras(bag: Bag) -> list[Camera]:
+    """Return the cameras that may be of a pair: those named, in that order, or else all that take pictures."""
+    infos = {parts_of(connection.topic)[0]: connection for connection in bag.connections(CAMERA_INFO)}
+    streams = bag.connections(IMAGE, COMPRESSED)
+    named = [stream for stream in streams if stream.topic in bag.named]
+    if len(named) == 1:
+        raise CalibrationError(f"expected two topics of images, found {printable(named[0].topic)}", field="topics")
+    best: dict[str, Any] = {}
+    for stream in named or [stream for stream in streams if not _NO_PICTURES.search(stream.topic)]:
+        space = stream.topic if named else parts_of(stream.topic)[0]
+        if space not in best or _rank(Camera(bag, stream)) < _rank(Camera(bag, best[space])):
+            best[space] = stream
+    return [
+        Camera(bag, stream, first_of(bag, infos[space]) if (space := parts_of(stream.topic)[0]) in infos else None)
+        for stream in best.values()
+    ]
+
+
+def _rank(camera: Camera) -> tuple[bool, bool]:
+    return not camera.is_rectified, camera.stream.msgtype == COMPRESSED
+
+
+def _by_info(bag: Bag, cameras: list[Camera]) -> tuple[Camera, Camera, tuple[str, ...]]:
+    """Return left and right camera by the baseline in P, and a note on other pairs."""
+    known = [camera for camera in cameras if camera.info is not None]
+    if bag.named and len(known) < len(cameras):
+        lacking = ", ".join(printable(camera.topic) for camera in cameras if camera.info is None)
+        raise CalibrationError(f"no CameraInfo in the namespace of {lacking}; {_WAYS}", field="topics")
+    if len(known) == 2:
+        pairs = [_ordered(*known)]
+    else:
+        lefts = [camera for camera in known if camera.projection[0, 3] == 0 < camera.projection[0, 0]]
+        rights = [camera for camera in known if camera.projection[0, 3] < 0 < camera.projection[0, 0]]
+        pairs = [
+            (left, right)
+            for right in rights
+            for left in lefts
+            if left.size == right.size and left.is_rectified == right.is_rectified
+        ]
+    pairs = _best(pairs)
+    if not pairs:
+        found = printable(", ".join(camera.topic for camera in known)) or "none"
+        message = (
+            f"expected two cameras with images and CameraInfo, found {len(known)}: {found}; {_WAYS}; {listed(bag)}"
+        )
+        raise CalibrationError(message, field="topics")
+    return (*pairs[0], _others(pairs))
+
+
+_WAYS = "--topics LEFT RIGHT names the pair, --calibration FILE gives a calibration"
+
+
+def listed(bag: Bag) -> str:
+    """Return the topics of a bag in words."""
+    return f"the bag has {printable(', '.join(f'{topic} ({kind})' for topic, kind in bag.topics.items()))}"
+
+
+def _ordered(first: Camera, second: Camera) -> tuple[Camera, Camera]:
+    shifts = [camera.projection[0, 3] for camera in (first, second)]
+    rights = [i for i, shift in enumerate(shifts) if shift < 0]
+    if len(rights) != 1 or shifts[1 - rights[0]] != 0:
+        found = f"{shifts[0]:g} and {shifts[1]:g}"
+        message = f"expected P[0, 3] to be 0 for the left camera and negative for the right one, found {found}; {_WAYS}"
+        raise CalibrationError(message, field="CameraInfo")
+    return ((first, second), (second, first))[1 - rights[0]]
+
+
+def _best(pairs: list[tuple[Camera, Camera]]) -> list[tuple[Camera, Camera]]:
+    """Return the pairs, best first: names that differ in the side alone if there are any, rectified, not compressed."""
+    alike = [pair for pair in pairs if _are_sides(*pair)]
+    return sorted(alike or pairs, key=lambda pair: (_rank(pair[0]), _rank(pair[1]), pair[0].topic, pair[1].topic))
+
+
+def _are_sides(left: Camera, right: Camera) -> bool:
+    of_left, of_right = without_side(left.topic, 0), without_side(right.topic, 1)
+    return of_left is not None and of_left == of_right
+
+
+def _others(pairs: list[tuple[Camera, Camera]]) -> tuple[str, ...]:
+    names = [f"{left.topic} {right.topic}" for left, right in pairs[1:]]
+    return tuple(f"Not used: the pair {printable(name)}; --topics chooses it." for name in names)
+
+
+def _by_names(bag: Bag, cameras: list[Camera], file: PairFile) -> tuple[Camera, Camera, tuple[str, ...]]:
+    """Return the cameras of a calibration file: those named, its own topics, or those whose names are of two sides."""
+    if bag.named and len(cameras) == 2:
+        return cameras[0], cameras[1], ()
+    by_topic = {camera.topic: camera for camera in cameras}
+    if file.topics is not None and all(topic in by_topic for topic in file.topics):
+        return by_topic[file.topics[0]], by_topic[file.topics[1]], ()
+    pairs = [(left, right) for left in cameras for right in cameras if _are_sides(left, right)]
+    if not pairs and len(cameras) == 2:
+        pairs = [(cameras[0], cameras[1])]
+    is_distorted = file.left.lens.model != "none"
+    pairs.sort(key=lambda pair: (pair[0].is_rectified == is_distorted, _rank(pair[0]), pair[0].topic))
+    if not pairs:
+        raise CalibrationError(
+            f"no two topics are of a left and a right camera by name; {_WAYS}; {listed(bag)}", field="topics"
+        )
+    return (*pairs[0], _others(pairs))
+
+
+def places_of(camera: Camera) -> tuple[IntArray, int, tuple[str, ...]]:
+    """Return time of writing and stamp (T, 2) of each image in the order of stamps, ns; used bits; and notes.
+
+    Of images with one stamp the first is kept. Used bits are those of the largest value if images have 16 bits.
+    """
+    bag, topic = camera.bag, printable(camera.topic)
+    is_deep = getattr(camera.first, "encoding", "") in messages.DEEP
+    found, largest = [], 0
+    for written, content in bag.raw(camera.stream):
+        found.append((written, bag.stamp_ns(content)))
+        if is_deep and not largest >> 15:
+            largest = max(largest, messages.largest_value(bag.message(camera.stream, content)))
+    if not found:
+        raise LostDataError("there is no message", field=topic)
+    rows, notes = in_order_of_stamps(np.array(found, dtype=np.int64), 1, f"images of {topic}")
+    bits = max(largest.bit_length(), 8) if is_deep else 16
+    if is_deep:
+        note = f"Images of 16 bits of {topic} use {bits}, by the largest value: the upper eight of these are kept."
+        notes = (*notes, note)
+    return rows, bits, notes
+
+
+def in_order_of_stamps(rows: Any, column: int, what: str) -> tuple[Any, tuple[str, ...]]:
+    """Return rows sorted by their stamps without those of a repeated stamp, of which the first is kept, and notes."""
+    swapped = int((np.diff(rows[:, column]) < 0).sum())
+    _, kept = np.unique(rows[:, column], return_index=True)
+    counts = {
+        f"{what} have the stamp of an earlier one and are left out": len(rows) - len(kept),
+        f"{what} are before their predecessors; all are sorted by stamp": swapped,
+    }
+    return rows[kept], tuple(f"{count} {words}." for words, count in counts.items() if count)
+
+
+def _calibration(left: Camera, right: Camera) -> tuple[PairCalibration, Array]:
+    """Return the calibration by CameraInfo, and the rotation (3, 3) from the left optical frame to its images."""
+    if left.size != right.size:
+        raise CalibrationError("the cameras have different sizes", field="CameraInfo")
+    if left.is_rectified != right.is_rectified:
+        raise CalibrationError("images of one camera are rectified, of the other not", field="topics")
+    P_left, P_right = left.projection, right.projection
+    if not P_right[0, 0] > 0:
+        raise CalibrationError("P has no positive focal length", field="CameraInfo")
+    baseline_m = float(-P_right[0, 3] / P_right[0, 0])
+    R_left, R_right = (_rotation(camera) for camera in (left, right))
+    if left.is_rectified:
+        return PairCalibration(P_left[:, :3], P_right[:, :3], left.size, side_by_side(baseline_m)), R_left
+    T_right_left = rectified_apart(R_left, R_right, baseline_m)
+    K_left, K_right = (messages.matrix_of(camera.info, "k", 3) for camera in (left, right))
+    return PairCalibration(K_left, K_right, left.size, T_right_left, _lens(left), _lens(right)), np.eye(3)
+
+
+def _rotation(camera: Camera) -> Array:
+    """Return the rotation from the optical frame to rectified images; all zeros stand for the identity."""
+    from scipy.spatial.transform import Rotation
+
+    R = messages.matrix_of(camera.info, "r", 3)
+    if not R.any():
+        return np.eye(3)
+    if not np.abs(R @ R.T - np.eye(3)).max() < 1e-4 or np.linalg.det(R) < 0:
+        raise CalibrationError("R is no rotation", field=f"CameraInfo of {printable(camera.topic)}")
+    return Rotation.from_matrix(R).as_matrix()
+
+
+def _lens(camera: Camera) -> Distortion:
+    field = f"CameraInfo of {printable(camera.topic)}"
+    coefficients = np.array(messages.field_of(camera.info, "d"), dtype=float)
+    with spelled_as_in("", {"distortion": field}):
+        return lens_of(printable(str(camera.info.distortion_model)), coefficients, field)
