@@ -269,6 +269,6 @@ def pair_stamps(left_ns: IntArray, right_ns: IntArray, source: str) -> tuple[Int
     notes = [f"{alone} images without a partner are left out."] if alone else []
     apart_ns = int(np.abs(right_ns[right] - left_ns[left]).max(initial=0))
     if apart_ns > _EXACT_NS:
-        most = f"up to {apart_ns / 1e6:.3g} ms apart (tolerance {_TOLERANCE_NS / 1e6:g} ms)"
-        notes.append(f"Stamps of left and right images are {most}; those of the left camera count.")
+        apart = f"up to {apart_ns / 1e6:.3g} ms apart (tolerance {_TOLERANCE_NS / 1e6:g} ms)"
+        notes.append(f"Stamps of left and right images are {apart}; those of the left camera count.")
     return left, right, tuple(notes)
