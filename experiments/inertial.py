@@ -1,26 +1,34 @@
 """Consistency of the inertial process: NEES of pose, velocity and biases, and large first errors.
 
-    python experiments/inertial.py --trajectory V1_01.txt --trajectory room1.txt --runs 20
+    python experiments/inertial.py --trajectory V1_01.txt --trajectory room1.txt --runs 20 --out results/inertial
     python experiments/inertial.py --tilt --runs 6
 
 Worlds are those of `builtin:room`: a made trajectory, and real ones as TUM files. Each run draws first errors from the
-prior, whose tilt and accelerometer bias are correlated as after a moment at rest.
+prior, whose tilt and accelerometer bias are correlated as after a moment at rest. ``--out`` writes the table, its
+numbers and a figure. Values further than three standard errors from the expectation are marked with ``!``.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
+from matplotlib.figure import Figure
 
+from ekfslam import files
 from ekfslam.arrays import Array
 from ekfslam.config import FilterConfig
 from ekfslam.data.room import GRAVITY_M_S2, MAX_GAP_S, Room, simulate_room
 from ekfslam.data.sequence import Sequence
+from ekfslam.evaluation.tables import document, markdown_table
+from ekfslam.figures.style import EXPECTED as EXPECTED_LINE
+from ekfslam.figures.style import SERIES, legend_of, png, styled
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.geometry import se3
@@ -178,16 +186,54 @@ def outcomes(world: Room, prior: Prior, config: FilterConfig, runs: int) -> list
     return found
 
 
-def line(name: str, found: list[Outcome]) -> str:
-    """Return means and standard errors over runs, as a row of a table."""
-    cells = []
+EXPECTED = {part: at.stop - at.start for part, at in PARTS.items()}
+HEADINGS = [f"{part} ({dof})" for part, dof in EXPECTED.items()]
+HEADINGS += ["ATE [mm] (largest)", "way [m]", "ATE / way [%]", "ms a frame"]
+
+
+def figures_of(found: list[Outcome]) -> dict[str, float]:
+    """Return mean NEES and standard error of each part, and mean errors, over runs."""
+    figures: dict[str, float] = {"runs": len(found)}
     for part in PARTS:
         values = np.array([outcome.nees[part] for outcome in found])
-        error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-        cells.append(f"{values.mean():.2f} +- {error:.2f}")
+        figures[part] = float(values.mean())
+        figures[f"{part} error"] = float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan
     ate, way, ms = (np.array([getattr(o, key) for o in found]) for key in ("ate_m", "way_m", "ms"))
-    cells += [f"{1e3 * ate.mean():.0f} (max {1e3 * ate.max():.0f})", f"{way.mean():.0f}", f"{np.median(ms):.1f}"]
-    return "| " + " | ".join([f"{name} ({len(found)})", *cells]) + " |"
+    figures |= {"ate_m": float(ate.mean()), "ate_max_m": float(ate.max()), "way_m": float(way.mean())}
+    return {**figures, "ms": float(np.median(ms))}
+
+
+def is_expected(figures: dict[str, float], part: str) -> bool:
+    """Return whether a mean NEES is within three standard errors of its expectation."""
+    return abs(figures[part] - EXPECTED[part]) <= 3 * figures[f"{part} error"]
+
+
+def row(name: str, figures: dict[str, float]) -> list[str]:
+    """Return the figures of a world as cells."""
+    cells = [
+        f"{figures[part]:.2f} ± {figures[f'{part} error']:.2f}{'' if is_expected(figures, part) else ' !'}"
+        for part in PARTS
+    ]
+    ate = f"{1e3 * figures['ate_m']:.0f} ({1e3 * figures['ate_max_m']:.0f})"
+    share = f"{100 * figures['ate_m'] / figures['way_m']:.3f}"
+    return [f"{name} ({figures['runs']:.0f})", *cells, ate, f"{figures['way_m']:.0f}", share, f"{figures['ms']:.1f}"]
+
+
+@styled
+def plot(table: dict[str, dict[str, float]]) -> Figure:
+    """Draw the mean NEES of each part over its expectation, with bars of three standard errors."""
+    figure = Figure(figsize=(7.2, 3.6))
+    ax, places = figure.subplots(), np.arange(len(PARTS))
+    for i, (name, figures) in enumerate(table.items()):
+        ratio = np.array([figures[part] / EXPECTED[part] for part in PARTS])
+        bars = 3 * np.array([figures[f"{part} error"] / EXPECTED[part] for part in PARTS])
+        shift, look = 0.12 * (i - (len(table) - 1) / 2), {"color": SERIES[i % len(SERIES)]["color"], "linestyle": ""}
+        ax.errorbar(places + shift, ratio, bars, marker="os^Dv<>P"[i % 8], markersize=4, capsize=2, label=name, **look)
+    ax.axhline(1.0, **EXPECTED_LINE)
+    ax.set_xticks(places, list(PARTS))
+    ax.set(ylabel="mean NEES / expectation", title="Mean NEES over runs, bars: three standard errors")
+    legend_of(figure, [ax], 3)
+    return figure
 
 
 def main() -> None:
@@ -196,17 +242,34 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=25.0)
     parser.add_argument("--variant", action="append", choices=("invariant", "fej", "standard"))
+    parser.add_argument("--engine", action="append", choices=("auto", "reference"), help="default: auto")
     parser.add_argument("--tilt", action="store_true", help="first errors of 8.6 deg of tilt")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write table.md, table.json and nees.png")
     options = parser.parse_args()
-    headings = [*PARTS, "ATE / mm", "way / m", "ms a frame"]
-    print("| world, variant (runs) | " + " | ".join(headings) + " |\n" + "|---" * (len(headings) + 1) + "|")
-    prior = LARGE if options.tilt else Prior()
+    headings = ["world, variant, filter (runs)", *HEADINGS]
+    print(markdown_table(headings, []), flush=True)
+    prior, table = LARGE if options.tilt else Prior(), {}
     for trajectory in ["", *options.trajectory]:
         world = Room(frames=round(10 * options.seconds), trajectory=trajectory)
         for variant in options.variant or ["invariant"]:
-            config = dataclasses.replace(FILTER, variant=variant)
-            found = outcomes(world, prior, config, options.runs)
-            print(line(f"{Path(trajectory).name or 'room'}, {variant}", found), flush=True)
+            for engine in options.engine or ["auto"]:
+                config = dataclasses.replace(FILTER, variant=variant, engine=engine)
+                kind = "reference" if engine == "reference" else "engine"
+                name = f"{Path(trajectory).stem or 'made'}, {variant}, {kind}"
+                table[name] = figures_of(outcomes(world, prior, config, options.runs))
+                print(f"| {' | '.join(row(name, table[name]))} |", flush=True)
+    if options.out is not None:
+        call = f"`python experiments/inertial.py {' '.join(map(_shown, sys.argv[1:]))}`"
+        text = document(
+            f"{call}: mean NEES ± standard error.", markdown_table(headings, [row(*item) for item in table.items()])
+        )
+        contents = {options.out / "table.md": text, options.out / "table.json": json.dumps(table, indent=2) + "\n"}
+        files.write_all({**contents, options.out / "nees.png": png(plot(table), packed=True)})
+
+
+def _shown(argument: str) -> str:
+    """Return an argument without the folders of a file of data."""
+    return argument if argument.startswith("results/") else Path(argument).name or argument
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import functools
 
 import numpy as np
 import pytest
-from inertial import FILTER, LARGE, Prior, model_from_prior, outcomes, run_once
+from inertial import FILTER, LARGE, Prior, model_from_prior, outcomes
 from support.frozen import assert_equal_to_frozen_rows
 from support.gauge import gauge_directions
 
@@ -123,13 +123,3 @@ def test_stamps_that_are_late_are_found():
     config = ekfslam.Config().with_overrides({"calibration": {"time_s": 0.01, "rotation_deg": 0.3}})
     found = ekfslam.run(dataclasses.replace(sequence, inputs=(samples,)), "full", config).parameters
     assert found.value[-1, found.name.index("time offset")] == pytest.approx(-0.005, abs=3e-4)
-
-
-@pytest.mark.slow
-def test_densities_that_are_too_small_show():
-    sequence = simulate_room(Room(frames=120))
-    samples, noise = sequence.inertial, sequence.inertial.noise
-    small = dataclasses.replace(noise, **{name: value / 3 for name, value in vars(noise).items()})
-    dishonest = dataclasses.replace(sequence, inputs=(dataclasses.replace(samples, noise=small),))
-    model = model_from_prior(dishonest, Prior(), np.random.default_rng(0))
-    assert run_once(dishonest, model).nees["all"] > 30.0
