@@ -28,6 +28,7 @@ from .filters.result import Result
 from .frontend.opening import open_sequence
 from .frontend.track import TrackReport, track
 from .geometry.camera import StereoCamera
+from .given import trajectory_covariance
 from .page.report import write_report
 from .reports import Comparison, check, check_consistency, compare
 from .runner import run
@@ -85,6 +86,7 @@ __all__ = [
     "run",
     "smooth",
     "track",
+    "trajectory_covariance",
     "tune",
     "write_archive",
     "write_report",

@@ -31,6 +31,7 @@ ROOMS: tuple[tuple[str, ...], ...] = (
     ("evaluation",),
     ("resolve",),
     ("runner",),
+    ("given",),
     ("studies",),
     ("figures",),
     ("page",),
