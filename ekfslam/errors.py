@@ -97,6 +97,10 @@ class FilterError(EkfslamError):
     """A filter cannot continue."""
 
 
+class ScaleError(FilterError):
+    """A recording of one camera has neither velocities nor inertial samples: nothing tells the scale."""
+
+
 class NoVelocitiesError(FilterError):
     """Dead reckoning was requested for a recording without measured velocities."""
 

@@ -39,13 +39,13 @@ from ekfslam.data.interpolation import INTERPOLATED
 from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import MEASURED_KINDS, TWIST_STD, WITHOUT_TRACKS, WITHOUT_VELOCITIES, YAW_STD_PX, Sequence
 from ekfslam.engine.choice import in_words
-from ekfslam.errors import ConfigError, InnovationError
+from ekfslam.errors import ConfigError, InnovationError, ScaleError
 from ekfslam.filters.stretches import run_stretches, stretches_of, thinned
 from ekfslam.geometry import se3
 from ekfslam.inertial.motion import in_motion
 from ekfslam.inertial.noise import Densities, from_differences, is_refuted, likeliest_densities
 from ekfslam.models.blocks import OPTIONAL_BLOCKS, StateBlock, TwistBias
-from ekfslam.models.build import blocks_and_process, model_of
+from ekfslam.models.build import blocks_and_process, model_of, sensor_of
 from ekfslam.models.inertial_start import FirstPrior, InertialStart, at_rest, rest_of, unknown
 from ekfslam.models.model import Model
 from ekfslam.models.noise import (
@@ -59,7 +59,6 @@ from ekfslam.models.noise import (
     with_drift,
 )
 from ekfslam.models.odometry import missing_velocities, stereo_odometry, vision_noise, with_vision
-from ekfslam.models.sensors.stereo import Rig
 from ekfslam.models.sensors.velocities import AXES, VelocitySource
 from ekfslam.models.tilt import first_tilt
 from ekfslam.models.track_noise import track_noise
@@ -151,7 +150,7 @@ def resolve(
     Raises:
         ConfigError: An unknown block, an unknown setting of a block, or pixel noise that is too small.
     """
-    config = config or Config()
+    config = _with_white_tracks(sequence, config or Config())
     if mode in ("full", "smoothed") and (apart := _apart(sequence, config)) is not None:
         return apart.added_to(resolve(apart.sequence, apart.config, mode, blocks))
     sequence = recording = sequence.once(with_odometry)
@@ -255,7 +254,14 @@ def _without_velocities(sequence: Sequence) -> Sequence:
 
 
 def with_odometry(sequence: Sequence) -> Sequence:
-    """Return the recording with stereo odometry in place of velocities that were not measured or never filled in."""
+    """Return the recording with stereo odometry in place of velocities that were not measured or never filled in.
+
+    Raises:
+        ScaleError: One camera alone has neither: nothing tells the scale.
+    """
+    if sequence.camera.is_monocular:
+        _require_scale(sequence)
+        return sequence
     measured = sequence.measured_axes.reshape(2, 3).any(axis=1)
     if measured.all() or sequence.attributes.get("velocities") in MEASURED_KINDS:
         return sequence
@@ -268,6 +274,21 @@ def with_odometry(sequence: Sequence) -> Sequence:
     kind = MEASURED_KINDS[int(np.argmax(measured))]
     twist = np.where(np.repeat(measured, 3), sequence.twist, found)
     return dataclasses.replace(sequence, attributes={**sequence.attributes, "velocities": kind}).with_velocities(twist)
+
+
+def _with_white_tracks(sequence: Sequence, config: Config) -> Config:
+    """Return a configuration with white errors of tracks for one camera: the model of walking ones is that of a rig."""
+    is_open = sequence.camera.is_monocular and config.noise.drift is None
+    return config.with_overrides({"noise": {"drift": 0.0}}) if is_open else config
+
+
+def _require_scale(sequence: Sequence) -> None:
+    """Raise `ScaleError` if nothing tells the scale of a recording of one camera."""
+    if sequence.inertial is None and not sequence.measured_axes[:3].any():
+        raise ScaleError(
+            f"{sequence.name}: one camera alone cannot tell the scale: give inertial samples (imu, --imu) or "
+            "measured velocities (twist, --velocities), or the tracks of both cameras"
+        )
 
 
 def noise_of_velocities(sequence: Sequence, config: Config | None = None) -> VelocityNoise:
@@ -296,7 +317,7 @@ def settings_of(sequence: Sequence, config: Config) -> Config:
         return config
     found = noise_of_velocities(sequence, config) if sequence.has_velocities else None
     # Without velocities nothing observes the camera's rotation against the IMU, nor do noisy ones beside white tracks.
-    is_observed = found is not None and (found.is_clean or not is_white)
+    is_observed = found is not None and (found.is_clean or not is_white) and not sequence.camera.is_monocular
     if config.calibration.rotation_deg is None and is_observed:
         config = config.with_overrides({"calibration": {"rotation_deg": CAMERA_ROTATION_DEG}})
     if config.calibration.disparity_px is None and (yaw_px := sequence.attributes.get(YAW_STD_PX)) is not None:
@@ -432,7 +453,7 @@ def _model(sequence: Sequence, config: Config, noise: Noise, blocks: SequenceTyp
     densities = densities_of(config) if is_inertial(sequence) else None
     chosen, process = blocks_and_process(config.blocks, densities, config.inertial.gravity_m_s2)
     return model_of(
-        Rig(sequence.camera, sequence.T_cam_imu, noise),
+        sensor_of(sequence.camera, sequence.T_cam_imu, noise),
         noise,
         se3.inverse(sequence.initial_T_world_imu),
         config.filter.initial_covariance,
@@ -480,14 +501,21 @@ def _likeliest_densities(sequence: Sequence, config: Config) -> Densities | None
 
 
 def first_state(sequence: Sequence, config: Config, model: Model) -> InertialStart:
-    """Return the first state of an inertial process and how it was found: at rest, in motion, or not at all."""
+    """Return the first state of an inertial process and how it was found: at rest, in motion, or not at all.
+
+    Raises:
+        ScaleError: One camera in motion.
+    """
     samples = sequence.inertial
     assert samples is not None
     prior = FirstPrior.of(sequence, model, config.inertial.gravity_m_s2)
     if (rest := rest_of(sequence)) is not None:
         return at_rest(samples, *rest, prior, densities_of(config))
-    if not isinstance(model.sensor, Rig):
-        return unknown(samples, float(sequence.time_s[0]), prior, "one camera in motion")
+    if sequence.camera.is_monocular:
+        raise ScaleError(
+            f"{sequence.name}: the rig of one camera moves from the first frame on, so that scale and velocity are not "
+            "known: begin at rest (half a second), or give the tracks of both cameras"
+        )
     start, refused = in_motion(sequence, model, prior, config.filter)
     return start or unknown(samples, float(sequence.time_s[0]), prior, refused or "in motion")
 
@@ -529,6 +557,7 @@ def _sampling(sequence: Sequence, config: Config) -> dict[str, float] | None:
     given = (noise.sampling_v, noise.sampling_w, noise.sigma_v_m_s, noise.sigma_w_rad_s)
     is_open = all(value is None for value in given) and (noise.model == "auto" or is_white)
     is_open &= is_automatic(sequence, config) and sequence.has_velocities and not sequence.stated_twist_std.any()
+    is_open &= not sequence.camera.is_monocular
     white = np.where(found.sigma > _SURE * found.sigma_error, found.sigma, 0.0)
     matters = found.sampling.reshape(2, 3).max(axis=1) > np.hypot(white, VELOCITY_STD[[0, 3]])
     if not (is_open and matters.any()):

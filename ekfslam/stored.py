@@ -156,6 +156,7 @@ AXES: Mapping[str, Axis] = MappingProxyType(
         "error": Axis("world_error", "position, then rotation", (*_XYZ, *(f"rotation_{a}" for a in _XYZ))),
         "row": Axis("row", "rows of a transform", (*_XYZ, "one")),
         "column": Axis("column", "columns of a transform", (*(f"{a}_axis" for a in _XYZ), "translation")),
+        "left_pixels": Axis("pixel_of_one_camera", "coordinates in the image of one camera", ("u", "v")),
         "pixels": Axis("pixel", "coordinates in the images", ("uL", "vL", "uR", "vR")),
     }
 )

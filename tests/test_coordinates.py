@@ -298,7 +298,7 @@ def test_two_views_from_one_place_give_the_mean_of_their_images():
 def test_one_camera_alone_has_images_too():
     """Landmarks wait for parallax, and what two views leave over corrects the pose that was just updated."""
     world = small_world(frames=40)
-    sensor = Monocular(world.camera, world.T_cam_imu, world.noise)
+    sensor = Monocular(world.camera, world.T_cam_imu, world.noise, parallax_rad=0.2)
     ekf = run_joint(world, sensor, OPEN)[0]
     order = np.argsort(world.truth.landmark)
     true = world.truth.position_m[order][np.searchsorted(world.truth.landmark[order], ekf.ids)]

@@ -151,7 +151,7 @@ def test_other_worlds(name):
 @pytest.mark.slow
 def test_one_camera_waits_for_parallax():
     world = builtin("city?frames=30&outlier_fraction=0")
-    sensor = Monocular(world.camera, world.T_cam_imu, world.noise)
+    sensor = Monocular(world.camera, world.T_cam_imu, world.noise, parallax_rad=0.2)
     ekf = [
         JointEKF(sensor, FilterConfig(retire="unseen", engine=engine), world.initial_T_world_imu)
         for engine in ("engine", "reference")

@@ -182,7 +182,7 @@ def test_one_camera_maps_consistently():
     before, behind, error = [], [], {"camera": [], "reckoned": []}
     for seed in (drives := seeds(12, 5)):
         world = builtin(f"city?frames={100 if WHOLE else 60}&seed={seed}&outlier_fraction=0")
-        sensor = Monocular(world.camera, world.T_cam_imu, world.noise)
+        sensor = Monocular(world.camera, world.T_cam_imu, world.noise, parallax_rad=0.2)
         ekf, of_filter, smoothed, of_smoother = drive(world, sensor, FilterConfig(retire="unseen", retire_after=1))
         assert len(ekf.landmarks()) > 20
         before.append(of_filter.mean())
@@ -199,7 +199,8 @@ def test_one_camera_maps_consistently():
 
 def test_tracks_that_wait_are_listed_and_start_with_both_views():
     world = builtin("city?frames=60&outlier_fraction=0")
-    ekf = JointEKF(Monocular(world.camera, world.T_cam_imu, world.noise), OPEN, world.initial_T_world_imu)
+    sensor = Monocular(world.camera, world.T_cam_imu, world.noise, parallax_rad=0.2)
+    ekf = JointEKF(sensor, OPEN, world.initial_T_world_imu)
     reasons = np.concatenate([frame.report.reason for frame in run_filter(ekf, world)])
     log = ekf.log()
     assert (reasons == 5).sum() > 100

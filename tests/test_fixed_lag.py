@@ -151,7 +151,7 @@ def test_a_lag_excludes_first_estimates_and_landmarks_that_wait():
     with pytest.raises(ConfigError, match="contradicts first estimates"):
         with_lag(3, variant="fej")
     world = small_world(frames=3)
-    camera = Monocular(world.camera, world.T_cam_imu, world.noise)
+    camera = Monocular(world.camera, world.T_cam_imu, world.noise, parallax_rad=0.2)
     with pytest.raises(ConfigError, match="not with landmarks that wait"):
         JointEKF(camera, FilterConfig(lag=3), world.initial_T_world_imu, window=FixedLag)
 

@@ -8,7 +8,7 @@ the largest. If the tracks of a recording have no gaps, a track is also cut at e
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -128,7 +128,13 @@ class _Cleaning:
 
 
 def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tuple[Observations, HygieneReport]:
-    """Return the tracks that the rules of ``config`` leave, and the report; limits are multiples of the noise."""
+    """Return the tracks that the rules of ``config`` leave, and the report; limits are multiples of the noise.
+
+    Tracks of one camera have no disparities: of the rules only repeated frames, jumps and lengths apply to them.
+    """
+    if sequence.camera.is_monocular:
+        config = replace(config, reused_id_sigma=0.0, min_disparity_sigma=0.0, max_row_mismatch_sigma=0.0)
+        config = replace(config, max_depth_error=0.0, disparity_jump_sigma=0.0, moving=False)
     tracks, std = _Cleaning(sequence.observations), noise.pixel_std_px
     disparity_std, row_std = np.hypot(std[0], std[2]), np.hypot(std[1], std[3])
     if config.restart_at_repeats:
@@ -174,7 +180,10 @@ def jumps(observations: Observations, noise: Noise, sigma: float) -> BoolArray:
     order = np.lexsort((observations.frame, observations.landmark))
     frame, landmark = observations.frame[order], observations.landmark[order]
     starts = np.flatnonzero((landmark[5:] == landmark[:-5]) & (frame[5:] - frame[:-5] == 5))
-    rows, variance = cam.rectified_rows(observations.pixels_px[order], noise.pixel_std_px)
+    if observations.is_monocular:
+        rows, variance = observations.pixels_px[order], np.asarray(noise.pixel_std_px[:2]) ** 2
+    else:
+        rows, variance = cam.rectified_rows(observations.pixels_px[order], noise.pixel_std_px)
     window = rows[starts[:, None] + np.arange(6)]
     motions = np.diff(window, axis=1)[:, [0, 1, 3, 4]]
     beyond = window[:, [3, 4, 5]] - window[:, [2, 1, 0]]

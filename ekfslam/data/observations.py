@@ -32,17 +32,18 @@ from ekfslam.shown import count
 from ekfslam.stored import COUNTS, stored
 
 LARGEST_ID = 1 << 62  # pieces of cut tracks count on from the largest
+_WORDS = {2: "two", 4: "four"}
 UNSEEN = -1.0  # all four pixels of an unseen track in dense formats; or NaN
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Stereo observations of point landmarks as flat arrays, sorted by frame and, within a frame, by landmark id.
+    """Observations of point landmarks as flat arrays, sorted by frame and, within a frame, by landmark id.
 
     Args:
         frame: (K,) frame index of each observation.
         landmark: (K,) id of the landmark; any non-negative integers.
-        pixels_px: (K, 4) rectified pixels (uL, vL, uR, vR).
+        pixels_px: (K, 4) rectified pixels (uL, vL, uR, vR), or (K, 2) undistorted pixels (u, v) of one camera.
     """
 
     frame: IntArray = field(metadata=stored("K", "frame index", check=COUNTS))
@@ -53,7 +54,7 @@ class Observations:
         frame = np.asarray(self.frame, dtype=np.int64).ravel()
         landmark = np.asarray(self.landmark, dtype=np.int64).ravel()
         pixels = np.asarray(self.pixels_px, dtype=float)
-        if not len(frame) == len(landmark) == len(pixels) or pixels.shape != (len(frame), 4):
+        if not len(frame) == len(landmark) == len(pixels) or pixels.shape not in _shapes(len(frame)):
             raise ShapeError(
                 f"{len(frame)} frames, {len(landmark)} landmarks and pixels of shape {pixels.shape} do not agree",
                 field="observations",
@@ -65,13 +66,23 @@ class Observations:
     def __len__(self) -> int:
         return len(self.frame)
 
+    @property
+    def is_monocular(self) -> bool:
+        """Whether one camera saw them."""
+        return self.pixels_px.shape[1] == 2
+
+    @property
+    def of_left_camera(self) -> Observations:
+        """The observations of the left camera alone."""
+        return Observations(self.frame, self.landmark, self.pixels_px[:, :2])
+
     @cached_property
     def ids(self) -> IntArray:
         """Distinct landmark ids, ascending."""
         return np.unique(self.landmark)
 
     def at(self, frame: int) -> tuple[IntArray, Array]:
-        """Return landmark ids (n,) and pixels (n, 4) of one frame."""
+        """Return landmark ids (n,) and pixels (n, 4) or (n, 2) of one frame."""
         start, stop = np.searchsorted(self.frame, (frame, frame + 1))
         return self.landmark[start:stop], self.pixels_px[start:stop]
 
@@ -79,6 +90,10 @@ class Observations:
         """Return the observations of frames ``begin`` to ``end - 1``, which count from 0 again."""
         seen = slice(*np.searchsorted(self.frame, (begin, end)))
         return Observations(self.frame[seen] - begin, self.landmark[seen], self.pixels_px[seen])
+
+
+def _shapes(count: int) -> tuple[tuple[int, int], ...]:
+    return (count, 4), (count, 2)
 
 
 @dataclass(frozen=True)
@@ -143,21 +158,21 @@ class Truth:
 def flat_observations(dense: Array, frame_axis: int, field: str) -> tuple[Observations, tuple[str, ...]]:
     """Return the observations, and notes, of a dense 4 x T x M (``frame_axis`` 1) or 4 x M x T (2) array of pixels.
 
-    The index of a track is its landmark id. A track is unseen if all four pixels are -1 or NaN. If only the right two
-    are, there is no depth: the observation is left out. Any other missing pixel is an error.
+    The index of a track is its landmark id. A track is unseen if all its pixels are -1 or NaN. If only the right two
+    are, there is no depth: the observation is left out. Any other missing pixel is an error. One camera has 2 pixels.
     """
     missing = np.isnan(dense)
     missing |= dense == UNSEEN
     # Most entries are of tracks out of view: only the others are looked at more closely.
     first, second = np.nonzero(~missing.all(axis=0))
     pixels, unknown = dense[:, first, second], missing[:, first, second]
-    seen, only_left = ~unknown.any(axis=0), unknown[2:].all(axis=0) & ~unknown[:2].any(axis=0)
+    seen, only_left = ~unknown.any(axis=0), unknown[2:].all(axis=0) & ~unknown[:2].any(axis=0) & (len(dense) > 2)
     partly = np.flatnonzero(~(seen | only_left))
     if len(partly):
         k = int(partly[0])
         row = int(np.argmax(unknown[:, k]))
         error: type[DataError] = ShapeError
-        kind = "have some but not all of their four pixels equal to -1 (unseen)"
+        kind = f"have some but not all of their {_WORDS[len(dense)]} pixels equal to -1 (unseen)"
         if np.isnan(pixels[row, k]):
             error, kind = NonFiniteError, "are NaN in some of their pixels"
         raise error(f"{len(partly)} observations {kind}", field=field, index=(row, int(first[k]), int(second[k])))
@@ -189,11 +204,11 @@ def observations_of(
 ) -> tuple[Observations, tuple[str, ...]]:
     """Return the observations in arrays, and notes; for arguments and errors see `Sequence.from_tracks`."""
     if frame is None and landmark is None:
-        require_shape(pixels, (frames, None, 4), "pixels_px")
+        require_shape(pixels, (frames, None, _columns(pixels)), "pixels_px")
         return flat_observations(np.moveaxis(pixels, -1, 0), frame_axis=1, field="pixels_px")
     if frame is None or landmark is None:
         raise ShapeError("frame and landmark belong together", field="landmark" if landmark is None else "frame")
-    require_shape(pixels, (None, 4), "pixels_px")
+    require_shape(pixels, (None, _columns(pixels)), "pixels_px")
     indices: list[IntArray] = []
     for name, value in (("frame", frame), ("landmark", landmark)):
         whole = numbers(value, name)
@@ -203,6 +218,11 @@ def observations_of(
             raise ShapeError("not whole numbers", field=name, index=int(np.argmax(whole != np.round(whole))))
         indices.append(np.asarray(value).astype(np.int64))
     return Observations(indices[0], indices[1], pixels), ()
+
+
+def _columns(pixels: Array) -> int:
+    """Return the columns that pixels of this shape should have."""
+    return 2 if pixels.shape[-1:] == (2,) else 4
 
 
 def truth_of(T_world_imu: Array, frames: int) -> Truth | None:

@@ -1,4 +1,4 @@
-"""The built-in world ``room``: a hand-held stereo camera with an inertial unit between walls with landmarks.
+"""The built-in world ``room``: a hand-held stereo rig or one camera, with an inertial unit, between walls of landmarks.
 
 The trajectory is made from the seed and begins at rest, or is a real one: a TUM file of poses, resampled to 10 Hz. In
 both cases the truth is the cumulative cubic B-spline through the poses, so that samples and images agree exactly.
@@ -15,7 +15,7 @@ from ekfslam.arrays import Array
 from ekfslam.data.inputs import InertialNoise, InertialSamples
 from ekfslam.data.noise import Noise
 from ekfslam.data.observations import TrueMotion, Truth
-from ekfslam.data.sequence import Sequence
+from ekfslam.data.sequence import Sequence, of_left_camera
 from ekfslam.data.spline import PoseSpline, resampled
 from ekfslam.data.worlds import Recording, View, numbers_of, observed, stamps
 from ekfslam.errors import ConfigError
@@ -38,6 +38,7 @@ class Room(Recording):
     """A box around the trajectory, with landmarks on its six sides. Tracks that are lost come back under other ids.
 
     Args:
+        cameras: 2, or 1: the left camera of the rig, with the tracks and the noise of the rig.
         landmarks: Number of landmarks.
         wall_m, ceiling_m: Least distances of walls, and of floor and ceiling, from the trajectory.
         imu_rate_hz: Rate of gyroscope and accelerometer.
@@ -53,6 +54,7 @@ class Room(Recording):
     min_disparity_px: float = 5.0
     max_range_m: float = 8.0
     max_tracks: int = 40
+    cameras: int = 2
     landmarks: int = 1500
     wall_m: float = 2.5
     ceiling_m: float = 1.5
@@ -70,6 +72,8 @@ class Room(Recording):
         super().__post_init__()
         if not 1.0 <= self.imu_rate_hz <= 10_000.0:
             raise ConfigError(f"{self.name}: imu_rate_hz must be from 1 to 10000, found {self.imu_rate_hz}")
+        if self.cameras not in (1, 2):
+            raise ConfigError(f"{self.name}: cameras must be 1 or 2, found {self.cameras}")
         if self.frames * self.frame_period_s > 1e5:
             raise ConfigError(f"{self.name}: frames * frame_period_s must be at most 1e5 s")
 
@@ -96,7 +100,7 @@ def simulate_room(world: Room, rng: np.random.Generator | None = None) -> Sequen
 
     T_imu_world = se3.inverse(motion.T_world_imu)
     observations, ids, position_m = observed(world, view, T_imu_world, points_m, noise, ids_last=False)
-    return Sequence(
+    sequence = Sequence(
         name=world.name,
         source=f"builtin:{world.name}",
         time_s=time_s,
@@ -114,6 +118,7 @@ def simulate_room(world: Room, rng: np.random.Generator | None = None) -> Sequen
         noise=Noise.isotropic(0.0, 0.0, world.sigma_px),
         attributes={"world": world.name, **numbers_of(world), "trajectory": Path(world.trajectory).name},
     )
+    return sequence if world.cameras == 2 else of_left_camera(sequence)
 
 
 def _trajectory(world: Room, duration_s: float, rng: np.random.Generator) -> PoseSpline:

@@ -62,15 +62,15 @@ LEVEL_VELOCITIES_NOTE = (
 
 @dataclass(frozen=True, repr=False, init=False)
 class Sequence(Once, Shown):
-    """One recording of a stereo rig, with velocities or inertial samples of its body.
+    """One recording of a stereo rig or of one camera, with velocities or inertial samples of its body.
 
     Args:
         name: Short name for folders and titles; characters that cannot be printed are escaped (``\\x1b``).
         source: File or built-in world, named in error messages.
         time_s: (T,) strictly increasing stamps.
-        camera: Stereo intrinsics.
+        camera: Intrinsics; with one camera, the baseline becomes 0.
         T_cam_imu: (4, 4) extrinsics, IMU to left optical frame; made rigid to rounding, as files print few digits.
-        observations: Stereo observations; none only if the attributes contain `WITHOUT_TRACKS`.
+        observations: Observations by two cameras or one; none only if the attributes contain `WITHOUT_TRACKS`.
         truth: Ground truth, if there is any.
         noise: Noise that the source states, if it states any.
         inputs: Velocities and inertial samples, at any rate and from any number of sources.
@@ -114,13 +114,15 @@ class Sequence(Once, Shown):
         given |= {"time_s": frozen(np.asarray(time_s, dtype=float))}
         given |= {"camera": camera, "observations": observations, "truth": truth, "noise": noise, "notes": notes}
         given |= {"attributes": {} if attributes is None else attributes}
+        if observations.is_monocular:
+            given["camera"] = replace(camera, baseline_m=0.0)
         for field_name, value in given.items():
             object.__setattr__(self, field_name, value)
         with spelled_as_in(source):
             validate_stamps(self.time_s)
             object.__setattr__(self, "inputs", _with_twist(self, tuple(inputs), twist, velocity_frame))
             validate_inputs(self.inputs, self.time_s)
-            validate_camera(camera)
+            validate_camera(self.camera, is_stereo=not observations.is_monocular)
             object.__setattr__(self, "T_cam_imu", checked_pose(T_cam_imu, "T_cam_imu"))
             if len(observations) or self.attributes.get("tracks") != WITHOUT_TRACKS["tracks"]:
                 validate_observations(observations, len(self))
@@ -139,7 +141,7 @@ class Sequence(Once, Shown):
         facts = {
             "source": self.source,
             "frames": f"{len(self)}, {figure(seconds)} s",
-            "tracks": f"{count(len(seen.ids), 'landmark')}, {per_frame} a frame",
+            "tracks": f"{count(len(seen.ids), 'landmark')}, {per_frame} a frame{', one camera' * seen.is_monocular}",
             "truth": "none" if self.truth is None else self.truth.text,
             "noise": "not stated" if self.noise is None else "stated",
         }
@@ -189,7 +191,7 @@ class Sequence(Once, Shown):
         Args:
             time_s: (T,) stamps.
             pixels_px: (T, M, 4) pixels (uL, vL, uR, vR) of M tracks, NaN if unseen; or (K, 4) with ``frame`` and
-                ``landmark``.
+                ``landmark``. Tracks of one camera have 2 columns (u, v), undistorted.
             frame, landmark: (K,) frame index and id of each row of pixels.
             twist: (T, 6) measured velocities, see `Sequence`.
             imu: Samples of a gyroscope and an accelerometer.
@@ -311,6 +313,17 @@ class Sequence(Once, Shown):
         return self.truth.T_world_imu[0, :3, :3].T @ self.truth.motion.velocity_m_s[0]
 
 
+def of_left_camera(sequence: Sequence) -> Sequence:
+    """Return a recording as its left camera alone saw it."""
+    rig_only = {YAW_STD_PX, *(CHECKED_TRACKS if sequence.has_checked_tracks else ())}
+    return replace(
+        sequence,
+        observations=sequence.observations.of_left_camera,
+        attributes={name: value for name, value in sequence.attributes.items() if name not in rig_only},
+        notes=(*sequence.notes, "The left camera alone is used."),
+    )
+
+
 def _samples_of(sequence: Sequence) -> InertialSamples:
     if sequence.inertial is None:
         raise LostDataError("the recording has no inertial samples", source=sequence.source, field="inputs")
@@ -326,14 +339,14 @@ def _camera_pose(T_cam_imu: ArrayLike | None, is_optional: bool) -> Array:
     return T_CAM_BODY
 
 
-def validate_camera(camera: StereoCamera) -> None:
-    """Raise `NonFiniteError` or `CalibrationError` for unusable intrinsics or baseline."""
+def validate_camera(camera: StereoCamera, is_stereo: bool = True) -> None:
+    """Raise `NonFiniteError` or `CalibrationError` for unusable intrinsics, or baseline of a stereo rig."""
     values = np.array([camera.fu_px, camera.fv_px, camera.cu_px, camera.cv_px, camera.baseline_m])
     require_finite(values, "camera (fu, fv, cu, cv, baseline)", LARGEST_PX)
     if camera.fu_px <= 0 or camera.fv_px <= 0:
         message = f"intrinsic matrix K is singular or mirrored: fu {camera.fu_px:g}, fv {camera.fv_px:g}"
         raise CalibrationError(message, field="K")
-    if camera.baseline_m <= 0:
+    if is_stereo and camera.baseline_m <= 0:
         raise CalibrationError(f"stereo baseline must be positive, found {camera.baseline_m:g} m", field="baseline")
 
 

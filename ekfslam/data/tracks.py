@@ -55,14 +55,14 @@ def inspect_tracks(observations: Observations, twist: Array) -> TrackReport:
     """Inspect the tracks of a recording with velocities ``twist`` (T, 6) in m/s and rad/s."""
     earlier, later = successive(observations)
     gap = observations.frame[later] - observations.frame[earlier] > 1
-    pixels = observations.pixels_px
+    pixels, is_mono = observations.pixels_px, observations.is_monocular
     return TrackReport(
         tracks=len(observations.ids),
         observations_per_frame=np.bincount(observations.frame, minlength=len(twist)),
         repeated_frames=repeated_frames(observations, twist),
         returning_tracks=len(np.unique(observations.landmark[later[gap]])),
-        nonpositive_disparities=int((pixels[:, 0] <= pixels[:, 2]).sum()),
-        max_row_mismatch_px=float(np.abs(pixels[:, 1] - pixels[:, 3]).max(initial=0.0)),
+        nonpositive_disparities=0 if is_mono else int((pixels[:, 0] <= pixels[:, 2]).sum()),
+        max_row_mismatch_px=0.0 if is_mono else float(np.abs(pixels[:, 1] - pixels[:, 3]).max(initial=0.0)),
     )
 
 

@@ -10,6 +10,8 @@ namespace {
 
 // Share of the squared motion of a track's other rows that counts for a row.
 constexpr double ACROSS = 0.35;
+// Depth below which a point of one camera is one of a turn that is taken for a motion.
+constexpr double NEAREST_M = 0.1;
 
 // Unit vector along which a pixel lies.
 Vector3 ray(const Sensor& sensor, const Vector3& rows) {
@@ -79,7 +81,7 @@ Sensor::Triangulated Sensor::triangulate(const Vector3& rows_anchor, const Vecto
     const double s = (cosine * b.dot(origin) - a.dot(origin)) / sine_square;
     const double t = (b.dot(origin) - cosine * a.dot(origin)) / sine_square;
     const double least = std::sin(parallax_rad);
-    return {0.5 * (origin + s * a + t * b), sine_square > least * least && s > 0 && t > 0};
+    return {0.5 * (origin + s * a + t * b), sine_square > least * least && s > NEAREST_M && t > NEAREST_M};
 }
 
 Vector3 TrackError::step_variance(const Vector3& motion_px, double parallax_seen) const {

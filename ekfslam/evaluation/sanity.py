@@ -18,10 +18,11 @@ from ekfslam.data.images import baseline_doubt
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import MOVING_M_S, successive
 from ekfslam.evaluation.trajectory import absolute_trajectory_error, distance_along
-from ekfslam.filters.result import SANITY, SANITY_SEPARATOR, Result
+from ekfslam.filters.result import REASONS, SANITY, SANITY_SEPARATOR, Result
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
 from ekfslam.models.odometry import missing_velocities
+from ekfslam.models.sensors.base import WAITING
 
 _PAIRS = 5000  # observations that are examined; more say the same
 _LEAST_PAIRS = 60
@@ -123,6 +124,7 @@ def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]
     if result.mode in ("dead-reckoning", "mapping-only"):
         return ()  # their poses drift, so that rejections and distances from the truth are no evidence
     accepted, rejected = int(result.innovation.accepted.sum()), int(result.innovation.rejected.sum())
+    rejected -= result.counts.get(f"rejected: {REASONS[WAITING]}", 0)  # such an observation is used later
     if rejected > _REJECTED * max(accepted + rejected, 1):
         parts = "tracks, velocities, stamps and T_cam_imu" if sequence.has_velocities else "the tracks"
         cause = warnings[0] if warnings else f"{parts} do not fit each other"
@@ -154,7 +156,7 @@ def sanity_attributes(lines: tuple[str, ...]) -> dict[str, str]:
 def _tracks_in_front(sequence: Sequence) -> tuple[list[str], list[str]]:
     """Return a figure and a warning on points without depth."""
     pixels = sequence.observations.pixels_px
-    if not len(pixels):
+    if not len(pixels) or sequence.camera.is_monocular:
         return [], []
     behind = float((pixels[:, 0] <= pixels[:, 2]).mean())
     figures = [f"{1.0 - behind:.1%} of the observations are of points in front of the camera"]
@@ -182,7 +184,7 @@ def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str],
     Velocities, or their running means, explain the flow if they predict it better than standing still does.
     """
     earlier, later = _pairs(sequence)
-    if len(earlier) < _LEAST_PAIRS:
+    if len(earlier) < _LEAST_PAIRS or sequence.camera.is_monocular:  # a flow needs depths
         return [], [], True
     at, pixels = sequence.observations.frame[later], sequence.observations.pixels_px
     seen = np.linalg.norm(pixels[later, :2] - pixels[earlier, :2], axis=1)
@@ -230,7 +232,7 @@ def _pairs(sequence: Sequence) -> tuple[IntArray, IntArray]:
     observations, pixels = sequence.observations, sequence.observations.pixels_px
     earlier, later = successive(observations)
     adjacent = observations.frame[later] - observations.frame[earlier] == 1
-    near = pixels[earlier, 0] - pixels[earlier, 2] > cam.FLOW_FROM_PX
+    near = sequence.camera.is_monocular or pixels[earlier, 0] - pixels[earlier, 2] > cam.FLOW_FROM_PX
     moves = (pixels[later] != pixels[earlier]).any(axis=1)
     measured = ~sequence.interpolated[observations.frame[later]]
     chosen = np.flatnonzero(adjacent & near & moves & measured)

@@ -114,9 +114,9 @@ def _aligned(
 
 
 def compare_sources(sequence: Sequence) -> Comparison | None:
-    """Compare truth, velocities and vision; None if one is missing, or has too few stretches."""
+    """Compare truth, velocities and stereo vision; None if one is missing, or has too few stretches."""
     truth = sequence.truth
-    if truth is None or len(truth.frame) < 3 or not sequence.has_velocities:
+    if truth is None or len(truth.frame) < 3 or not sequence.has_velocities or sequence.camera.is_monocular:
         return None
     begin, end = _stretches(sequence.time_s, truth.frame)
     visual, known = visual_motion(sequence)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from collections.abc import Sequence as SequenceType
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from ekfslam.filters.observing import look, look_again
 from ekfslam.filters.prediction import predict
 from ekfslam.filters.reports import FrameReport, log_density
 from ekfslam.filters.result import Landmarks, Parameters
+from ekfslam.filters.standing import Stillness
 from ekfslam.filters.starting import Waiting
 from ekfslam.filters.variants import is_frozen_exactly
 from ekfslam.geometry import se3
@@ -86,6 +88,7 @@ class JointEKF(Estimate):
         self._reported: list[Array] = []  # estimates and standard deviations (2, p) after each frame
         delayed = model.sensor if isinstance(model.sensor, DelayedSensor) else None
         self._waiting = None if delayed is None else Waiting(delayed, config.gate_probability)
+        self._stillness, self._at_rest = Stillness(), cast(Measured | None, None)  # rows for the next prediction
         self._log_likelihood, self._doubt = 0.0, 1.0  # of the velocities measured since the last frame
 
     def begin(self, inputs: Array) -> None:
@@ -109,7 +112,8 @@ class JointEKF(Estimate):
             ConfigError: Measurements by further sensors of a velocity that is not in the state.
         """
         interval = inputs if isinstance(inputs, Interval) else Interval.of_one(inputs, tau_s, is_gap)
-        found = predict(self, interval, also)
+        found = predict(self, interval, also, self._at_rest)
+        self._at_rest = None
         self._log_likelihood += found.log_likelihood
         self._doubt = found.doubt
         self._log.predicted(self, interval, found)
@@ -145,10 +149,13 @@ class JointEKF(Estimate):
         self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
         likelihood = self._log_likelihood + log_density(found.nis, found.log_det, found.dof)
         self._log_likelihood = 0.0
+        # 3. A rig that stands has no velocity.
+        standing = self._stillness.judge(self, ids, measured)
+        self._at_rest = None if standing is None else standing.measured
+        is_standing = None if standing is None else standing.measured is not None
         doubt = max(self._doubt, self.motion.interval.doubt)
-        return FrameReport(
-            frame, ids, found.reason, found.nis, found.dof, found.split, likelihood, found.innovations, doubt
-        )
+        outcome = frame, ids, found.reason, found.nis, found.dof, found.split, likelihood, found.innovations
+        return FrameReport(*outcome, doubt, is_standing)
 
     def _revive(self, frame: int, ids: list[int]) -> None:
         """Bring retired landmarks and their neighbours back: the state becomes the marginal of the batch problem."""

@@ -39,13 +39,14 @@ class Prediction:
     doubt: float = 1.0
 
 
-def predict(e: Estimate, interval: Interval, also: Measured | None) -> Prediction:
+def predict(e: Estimate, interval: Interval, also: Measured | None, at_rest: Measured | None = None) -> Prediction:
     """Predict over an interval: clones and walking blocks, then measurements of blocks, then the process.
 
     Args:
         e: Estimate that changes.
         interval: Inputs.
         also: Measurements by further sensors.
+        at_rest: Rows of a rig that stood in the frame before, see `ekfslam.filters.standing`.
 
     Raises:
         ConfigError: Measurements by further sensors of a velocity that is not in the state.
@@ -55,7 +56,8 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
         if not process.has_velocity:
             raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
         also = process.referred(also, e.values, interval)
-    if e.engine is not None and also is None and (arrived := e.engine.predict(interval)) is not None:
+    extra = [some for some in (also, at_rest) if some is not None]
+    if e.engine is not None and not extra and (arrived := e.engine.predict(interval)) is not None:
         return _arrived(e, e.engine, interval, arrived)
     way_m, T_cam_imu = process.way_m(e.values, interval), np.eye(4)
     if View.name in model.layout:
@@ -66,7 +68,7 @@ def predict(e: Estimate, interval: Interval, also: Measured | None) -> Predictio
     e.coordinates = e.coordinates.copy()  # the log has those after the update
     if moved is not None:
         e.coordinates, e.values = moved.Phi @ e.coordinates, moved.values
-    moved, measured, log_likelihood, doubt = _measure(e, moved, interval, also)
+    moved, measured, log_likelihood, doubt = _measure(e, moved, interval, extra)
     # Eq. (1): the mean, and Phi and Q of eq. (2).
     step = model.step(e.values, interval, e.linear_T_imu_world, e.variant.first_estimates)
     whole = step if moved is None else step.after(moved)
@@ -102,7 +104,7 @@ def _arrived(e: Estimate, engine: Engine, interval: Interval, found: dict[str, A
 
 
 def _measure(
-    e: Estimate, moved: Transition | None, interval: Interval, also: Measured | None
+    e: Estimate, moved: Transition | None, interval: Interval, extra: list[Measured]
 ) -> tuple[Transition | None, Measured | None, float, float]:
     """Condition on measurements of blocks by the inputs, eq. (6); the first inputs start blocks instead.
 
@@ -110,7 +112,8 @@ def _measure(
         The transition that the covariance still has to follow; the measurements, their log-density, and their doubt.
     """
     process, is_first = e.model.process, e.step == 0
-    parts = [some for some in (process.measured(interval, is_first), also) if some is not None]
+    own = process.measured(interval, is_first)
+    parts = [*([] if own is None else [own]), *extra]
     begin: list[Measured] = []
     if is_first and (start := process.start(e.values, interval)) is not None:
         begun = e.model.widened(e.values, start)

@@ -27,6 +27,8 @@ class FrameReport:
         log_likelihood: Log-density of the accepted innovations, and of measured velocities if these are in the state.
         innovations: Whitened innovations of the accepted updates (joint filter only).
         doubt: Factor of the inputs' standard deviations; above 1 if the landmarks contradicted them.
+        standing: Whether the tracks rest, so that the velocity was taken as 0; False: something contradicts it. None:
+            they move, or the velocity is not in the state.
     """
 
     frame: int
@@ -38,6 +40,7 @@ class FrameReport:
     log_likelihood: float
     innovations: FrameInnovations | None = None
     doubt: float = 1.0
+    standing: bool | None = None
 
 
 def log_density(nis: float, log_det: float, dof: int) -> float:
@@ -75,4 +78,7 @@ def collect(reports: SequenceType[FrameReport]) -> tuple[Innovation, Rejections,
             counts[f"rejected: {name}"] = count
     if doubted := sum(report.doubt > 1.0 for report in reports):
         counts["rejected: velocities"] = doubted
+    for name, is_standing in (("frames at rest", True), ("rejected: zero velocity", False)):
+        if count := sum(report.standing is is_standing for report in reports):
+            counts[name] = count
     return innovation, rejections, counts

@@ -25,13 +25,21 @@ DEPTH_FROM_PX, MOTION_FROM_PX, FLOW_FROM_PX = 0.5, 1.0, 2.0
 
 @dataclass(frozen=True)
 class StereoCamera:
-    """Intrinsics of a rectified stereo pair: focal lengths and principal point in pixels, baseline in metres."""
+    """Intrinsics of a rectified stereo pair: focal lengths and principal point in pixels, baseline in metres.
+
+    One camera alone has a baseline of 0.
+    """
 
     fu_px: float
     fv_px: float
     cu_px: float
     cv_px: float
-    baseline_m: float
+    baseline_m: float = 0.0
+
+    @property
+    def is_monocular(self) -> bool:
+        """Whether this is one camera."""
+        return self.baseline_m == 0.0
 
     @property
     def matrix(self) -> Array:

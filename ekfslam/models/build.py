@@ -12,6 +12,7 @@ from ekfslam.config import CalibrationConfig, FilterConfig, LandmarkCoordinates,
 from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.noise import Noise
 from ekfslam.errors import ConfigError
+from ekfslam.geometry.camera import StereoCamera
 from ekfslam.models.blocks import (
     OPTIONAL_BLOCKS,
     Anchor,
@@ -87,6 +88,11 @@ def _blocks_of(
         if not isinstance(sensor, Rig):
             raise ConfigError(f"calibration: only a stereo rig has parameters to estimate, not {type(sensor).__name__}")
         yield Calibration(std)
+
+
+def sensor_of(camera: StereoCamera, T_cam_imu: Array, noise: Noise) -> Rig | Monocular:
+    """Return the sensor of a recording: a stereo rig, or one camera if there is no baseline."""
+    return (Monocular if camera.is_monocular else Rig)(camera, T_cam_imu, noise)
 
 
 def has_image_coordinates(sensor: Sensor, coordinates: LandmarkCoordinates) -> bool:

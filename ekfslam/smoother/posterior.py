@@ -27,10 +27,9 @@ from ekfslam.filters.log import Log
 from ekfslam.filters.loop import solvable
 from ekfslam.filters.result import Innovation, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
-from ekfslam.models.build import blocks_and_process, model_of
+from ekfslam.models.build import blocks_and_process, model_of, sensor_of
 from ekfslam.models.model import Model
 from ekfslam.models.process.inertial import Inertial
-from ekfslam.models.sensors.stereo import Rig
 from ekfslam.progress import progress
 from ekfslam.shown import Card, Shown, count, figure
 from ekfslam.smoother.optimise import MOST_ITERATIONS, maximise
@@ -262,14 +261,14 @@ def model_of_result(result: Result) -> Model:
             "recording again to smooth it"
         )
     start = log.T_predicted[0], log.initial_covariance[:6, :6]
-    rig = Rig(result.camera, result.T_cam_imu, result.noise)
+    sensor = sensor_of(result.camera, result.T_cam_imu, result.noise)
     densities = None
     if is_inertial(result):
         names = (f"inertial_{field.name}" for field in dataclasses.fields(InertialNoise))
         densities = InertialNoise(*(float(result.attributes[name]) for name in names))
     blocks, process = blocks_and_process(stored.blocks, densities, stored.inertial.gravity_m_s2)
     coordinates = stored.filter.landmark_coordinates
-    model = model_of(rig, result.noise, *start, stored.calibration, blocks, coordinates, make_process=process)
+    model = model_of(sensor, result.noise, *start, stored.calibration, blocks, coordinates, make_process=process)
     if (body := len(_columns_of(log, model))) == log.departed.shape[1] and len(log.initial_covariance) in (6, body):
         return model
     if not log.departed.shape[1] == len(log.initial_covariance) == 6:
@@ -281,7 +280,7 @@ def model_of_result(result: Result) -> Model:
     noise = dataclasses.replace(
         result.noise, twist_walk_std=None, tilt_rad=0.0, track_first_px=None, track_walk_px=None
     )
-    return model_of(dataclasses.replace(rig, noise=noise), noise, *start, coordinates="xyz")
+    return model_of(dataclasses.replace(sensor, noise=noise), noise, *start, coordinates="xyz")
 
 
 def _columns_of(log: Log, model: Model) -> IntArray:

@@ -197,7 +197,8 @@ def _sequence_fields(h5file: h5py.File) -> dict[str, Any]:
         found = read_sequence_fields(h5file, h5file.filename)
         found["name"] = printable(found["name"])
         no_index = np.empty(0, dtype=np.int64)
-        none = Observations(no_index, no_index, np.empty((0, 4)))
+        columns = 2 if found["camera"].is_monocular else 4
+        none = Observations(no_index, no_index, np.empty((0, columns)))
         with spelled_as_in(h5file.filename, SPELLING):
             Sequence(**{**found, "observations": none, "attributes": {**found["attributes"], **WITHOUT_TRACKS}})
         return found

@@ -43,6 +43,10 @@ NO_VELOCITIES = "none"  # attribute ``velocity_frame`` of a recording without ve
 _UNDRIVEN = _below("sequence", layout_of(Sequence))
 _SEQUENCE = (*_UNDRIVEN, *_below("sequence", (_TWIST,)))
 OBSERVATIONS_LAYOUT = _below("sequence/observations", layout_of(Observations))
+_OF_ONE_CAMERA = tuple(
+    item._replace(shape=("K", "left_pixels"), frame="image: u, v") if item.field == "pixels_px" else item
+    for item in OBSERVATIONS_LAYOUT
+)
 _NOISE = _below("sequence/noise", layout_of(Noise))
 _TRUTH = _below("truth", layout_of(Truth))
 _MOTION = _below("truth/motion", layout_of(TrueMotion))
@@ -103,7 +107,7 @@ def read_sequence(path: str | Path) -> Sequence:
         spelled_as_in(str(path), SPELLING),
     ):
         found = read_sequence_fields(h5file, str(path))
-        found["observations"] = Observations(**_read(h5file, OBSERVATIONS_LAYOUT))
+        found["observations"] = Observations(**_read(h5file, _layout_of_tracks(h5file)))
         if "sequence/inputs" in h5file:
             found |= _read_inputs(h5file["sequence/inputs"], found)
         return Sequence(**found)
@@ -131,7 +135,8 @@ def write_sequence_group(h5file: h5py.Group, sequence: Any, whole: bool = False)
         further = {name: value for name, value in vars(sequence.noise).items() if name not in in_data_sets}
         hdf5.write_attributes(group["noise"], further)
     if whole:
-        hdf5.write_fields(h5file, OBSERVATIONS_LAYOUT, sequence.observations)
+        layout = _OF_ONE_CAMERA if sequence.camera.is_monocular else OBSERVATIONS_LAYOUT
+        hdf5.write_fields(h5file, layout, sequence.observations)
         _write_inputs(group.create_group("inputs"), sequence)
     truth = sequence.truth
     if truth is not None:
@@ -172,6 +177,13 @@ def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
                 if further.get(name, nothing) != nothing
             )
         return found
+
+
+def _layout_of_tracks(h5file: h5py.Group) -> Layout:
+    """Return the layout of observations by two cameras, or by one if their pixels have two columns."""
+    pixels = h5file.get("sequence/observations/pixels")
+    is_of_one = isinstance(pixels, h5py.Dataset) and pixels.shape[-1:] == (2,)
+    return _OF_ONE_CAMERA if is_of_one else OBSERVATIONS_LAYOUT
 
 
 def _write_inputs(group: h5py.Group, sequence: Sequence) -> None:

@@ -12,12 +12,14 @@ from ekfslam.geometry import camera as cam
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.models.sensors.base import ACCEPTED
 
+NEAREST_M = 0.1  # nearer points are those of a turn that is taken for a motion
+
 
 @dataclass(frozen=True)
 class Monocular:
-    """The left camera of a rig as a `DelayedSensor`: of pixels (n, 4) or (n, 2) it takes (uL, vL).
+    """One camera as a `DelayedSensor`, such as the left one of a rig: of pixels (n, 4) or (n, 2) it takes (uL, vL).
 
-    Scale comes from the velocities alone.
+    Scale comes from velocities or inertial samples.
 
     Args:
         camera: Intrinsics; the baseline is not used.
@@ -30,7 +32,7 @@ class Monocular:
     camera: StereoCamera
     T_cam_imu: Array
     noise: Noise
-    parallax_rad: float = 0.2
+    parallax_rad: float = 0.03
     patience: int = 40
 
     dimension = 2
@@ -73,4 +75,5 @@ class Monocular:
         s = (cosine * (b @ origin) - a @ origin) / sine_square
         t = (b @ origin - cosine * (a @ origin)) / sine_square
         q = 0.5 * (origin + s[:, None] * a + t[:, None] * b)
-        return q, (sine_square > np.sin(self.parallax_rad) ** 2) & (s > 0) & (t > 0)
+        is_ahead = (s > NEAREST_M) & (t > NEAREST_M)
+        return q, (sine_square > np.sin(self.parallax_rad) ** 2) & is_ahead

@@ -1,0 +1,175 @@
+"""Recordings of one camera: their tracks, their scale, and the velocity of a rig that stands."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.frozen import assert_equal_to_frozen_rows
+
+import ekfslam
+from ekfslam.config import FilterConfig
+from ekfslam.data.room import CAMERA, Room, simulate_room
+from ekfslam.data.sequence import of_left_camera
+from ekfslam.errors import CalibrationError, ConfigError, ScaleError, ShapeError
+from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
+from ekfslam.filters.standing import STILL_PX, moved_px
+from ekfslam.geometry.camera import T_CAM_BODY, StereoCamera
+from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
+from ekfslam.models.build import model_of
+from ekfslam.models.process.inertial import inertial
+from ekfslam.models.sensors.monocular import Monocular
+from ekfslam.resolve import resolve
+
+ONE = StereoCamera(400.0, 410.0, 320.0, 240.0)
+
+
+@functools.cache
+def room(frames=40, seed=2, **changes):
+    return simulate_room(Room(frames=frames, seed=seed, cameras=1, **changes))
+
+
+def tracks(columns=2, **inputs):
+    """A recording from dense arrays: 5 frames, 9 tracks."""
+    pixels = np.random.default_rng(0).uniform(10.0, 400.0, (5, 9, columns))
+    pixels[2, 3] = np.nan
+    return ekfslam.Sequence.from_tracks(np.arange(5.0), pixels, ONE, **inputs)
+
+
+def test_tracks_of_one_camera_have_two_columns():
+    sequence = tracks()
+    ids, pixels = sequence.observations.at(2)
+    assert sequence.camera.is_monocular and pixels.shape == (8, 2) and 3 not in ids
+
+
+def test_tracks_with_three_columns_are_refused():
+    with pytest.raises(ShapeError, match="pixels_px"):
+        tracks(columns=3)
+
+
+def test_tracks_of_two_cameras_need_a_baseline():
+    with pytest.raises(CalibrationError, match="baseline"):
+        tracks(columns=4)
+
+
+def test_one_camera_is_written_and_read_to_the_same_bits(tmp_path):
+    ekfslam.write_sequence(room(), tmp_path / "one.h5")
+    found = ekfslam.open_sequence(tmp_path / "one.h5")
+    assert found.camera.is_monocular and found.camera == room().camera
+    np.testing.assert_array_equal(found.observations.pixels_px, room().observations.pixels_px)
+
+
+def test_the_left_camera_of_a_rig_is_a_recording_of_one_camera():
+    rig = simulate_room(Room(frames=20))
+    left = of_left_camera(rig)
+    np.testing.assert_array_equal(left.observations.pixels_px, rig.observations.pixels_px[:, :2])
+    assert left.camera == replace(CAMERA, baseline_m=0.0) and left.inertial is rig.inertial
+
+
+@pytest.mark.parametrize("inputs", [{}, {"twist": np.zeros((5, 6)), "T_cam_imu": np.eye(4)}])
+def test_one_camera_alone_does_not_tell_the_scale(inputs):
+    with pytest.raises(ScaleError, match="scale"):
+        ekfslam.run(tracks(**inputs))
+
+
+def test_a_room_has_one_camera_or_two():
+    with pytest.raises(ConfigError, match="cameras"):
+        Room(cameras=3)
+
+
+def test_one_camera_in_motion_from_the_first_frame_on_is_refused():
+    with pytest.raises(ScaleError, match="begin at rest"):
+        ekfslam.run(room(100)[60:])
+
+
+# --- standing still ---------------------------------------------------------------------------------------------------
+
+
+def spread(count=40, seed=0):
+    return np.random.default_rng(seed).uniform((0.0, 0.0), (752.0, 480.0), (count, 2))
+
+
+def test_noise_of_tracks_is_no_motion():
+    found = [moved_px(spread(), spread() + np.random.default_rng(k).normal(size=(40, 2))) for k in range(50)]
+    assert np.mean(np.array(found) < STILL_PX) > 0.8
+
+
+@pytest.mark.parametrize("grows", [np.eye(2), np.array([[0.0, -1.0], [1.0, 0.0]])])
+def test_driving_ahead_and_rolling_are_motions_though_shifts_cancel(grows):
+    before = spread()
+    assert moved_px(before, before + 0.005 * (before - before.mean(axis=0)) @ grows) > STILL_PX
+
+
+def test_traffic_before_resting_tracks_is_no_motion():
+    before = spread()
+    now = before + np.where(np.arange(40)[:, None] < 14, [6.0, 1.0], 0.0)
+    assert moved_px(before, now) < STILL_PX
+
+
+DENSITIES = ekfslam.InertialNoise(1.7e-4, 2e-3, 2e-5, 3e-3)
+
+
+def filmed(speed_m_s=0.0, depth_m=5.0, turning_rad_s=0.0, traffic=0, frames=40, sigma_px=0.3, seed=0):
+    """A recording of a level camera that moves to its right, at 20 Hz, before points at a depth of 90 to 110 %.
+
+    The gyroscope turns, the images do not. Some points drive by; others are as fast as the camera.
+    """
+    rng, time_s = np.random.default_rng(seed), 0.05 * np.arange(frames)
+    y, x = rng.uniform(-0.4, 0.4, (2, 40)) * depth_m
+    z = depth_m * rng.uniform(0.9, 1.1, 40)
+    x = x - speed_m_s * time_s[:, None] + np.where(np.arange(40) < traffic, 2.0 * time_s[:, None], 0.0)
+    pixels = np.stack([320.0 + 400.0 * x / z, 240.0 + 410.0 * y / z + 0.0 * x], axis=-1)
+    stamps = 0.005 * np.arange(-4, 10 * frames + 4)
+    turn, up = (np.tile([0.0, 0.0, z], (len(stamps), 1)) for z in (turning_rad_s, 9.81))
+    imu = ekfslam.InertialSamples(stamps, turn, up, DENSITIES)
+    return ekfslam.Sequence.from_tracks(
+        time_s, pixels + sigma_px * rng.normal(size=pixels.shape), ONE, imu=imu, T_cam_imu=T_CAM_BODY
+    )
+
+
+def outcome(sequence, first_m_s=(0.0, 0.0, 0.0)):
+    """Numbers of frames at rest and of contradicted ones, and the last velocity with its standard deviation."""
+    noise = ekfslam.Noise.isotropic(0.1, 0.1, 0.5)
+    sensor = Monocular(sequence.camera, sequence.T_cam_imu, noise)
+    blocks = Velocity(first_m_s=np.array(first_m_s)), GyroBias(std_rad_s=1e-3), AccelBias()
+    first = np.eye(4), np.diag([1e-6] * 3 + [1e-4] * 3)
+    ekf = JointEKF(model_of(sensor, noise, *first, None, blocks, make_process=inertial(DENSITIES)), FilterConfig())
+    standing = [frame.report.standing for frame in run_filter(ekf, sequence)]
+    at = ekf.model.layout["velocity"]
+    std = np.sqrt(np.diag(ekf.gaussian.body_covariance)[at])
+    return standing.count(True), standing.count(False), ekf.values["velocity"], std
+
+
+def test_a_camera_at_rest_has_no_velocity():
+    at_rest, contradicted, velocity, std = outcome(filmed())
+    assert at_rest > 25 and contradicted == 0
+    assert np.abs(velocity).max() < 0.01 and std.max() < 0.05
+
+
+def test_traffic_does_not_hide_that_a_camera_rests():
+    assert outcome(filmed(traffic=14))[0] > 15
+
+
+@pytest.mark.parametrize(("speed_m_s", "depth_m"), [(0.05, 2.0), (0.05, 8.0), (0.05, 20.0), (0.2, 30.0)])
+def test_a_slow_camera_is_not_taken_for_one_at_rest(speed_m_s, depth_m):
+    at_rest, _, velocity, std = outcome(filmed(speed_m_s, depth_m, frames=60))
+    assert at_rest == 0 or np.abs(velocity[1] + speed_m_s) < 3.0 * std[1]
+
+
+def test_a_gyroscope_that_turns_contradicts_images_at_rest():
+    assert outcome(filmed(turning_rad_s=0.05))[0] == 0
+
+
+def test_a_camera_that_surely_moves_is_not_stopped_by_a_scene_that_moves_along():
+    at_rest, contradicted, velocity, _ = outcome(filmed(), (3.0, 0.0, 0.0))
+    assert at_rest == 0 and contradicted > 25 and velocity[0] > 2.5
+
+
+def test_rows_of_a_rest_are_those_of_the_posterior():
+    config = FilterConfig(retire="never", landmark_coordinates="xyz", variant="standard")
+    sequence = simulate_room(Room(frames=60, seed=2, sigma_px=0.3))[:30]
+    ekf = JointEKF(resolve(sequence, ekfslam.Config(filter=config)).model, config)
+    standing = [frame.report.standing for frame in run_filter(ekf, sequence)]
+    assert standing.count(True) > 2 and len(ekf.ids) > 10
+    assert_equal_to_frozen_rows(ekf)
