@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.helpers import synthetic_sequence
+from support.images import write_plain
 from support.imu import FIRST_NS, HEADER, STEP_NS, motion, rows, write_imu0, write_lines, yaml_lines
 
 import ekfslam
@@ -15,12 +16,14 @@ from ekfslam import attach_inertial
 from ekfslam.errors import (
     CalibrationError,
     DataError,
+    ExtrinsicsError,
     LineError,
     LostDataError,
     NonFiniteError,
     StampError,
     UnknownFormatError,
 )
+from ekfslam.geometry import se3
 
 COUNT = 500
 TIME_NS = FIRST_NS + STEP_NS * np.arange(COUNT)
@@ -230,6 +233,27 @@ def test_frames_outside_of_the_samples_are_left_out(tmp_path):
 def test_samples_of_another_clock_are_refused_with_both_spans(tmp_path):
     with pytest.raises(LostDataError, match=r"inertial samples, 0.000 to 2.495 s, do not cover the images, 1403636579"):
         attached(written(tmp_path, time_ns=TIME_NS - FIRST_NS))
+
+
+def image_folder(place: Path) -> Path:
+    """A pair of image folders whose calibration does not state where the inertial unit is."""
+    folder = write_plain(place)
+    np.savetxt(folder / "times.txt", FIRST_NS / 1e9 + 0.1 + 0.1 * np.arange(6), fmt="%.9f")
+    return folder
+
+
+def test_images_without_extrinsics_need_a_chain_of_kalibr_beside_the_samples(tmp_path):
+    images, path = ekfslam.open_images(image_folder(tmp_path)), written(tmp_path / "imu")
+    with pytest.raises(ExtrinsicsError, match="no file states T_cam_imu"):
+        attach_inertial(images, path)
+    T = se3.exp(np.array([0.1, 0.2, 0.3, 1.0, -1.0, 0.5]))
+    lines = [f"  - [{', '.join(map(repr, row))}]" for row in T.tolist()]
+    write_lines(tmp_path / "imu/camchain-imucam.yaml", ["cam0:", "  T_cam_imu:", *lines, "  timeshift_cam_imu: -0.01"])
+    found = attach_inertial(images, path)
+    np.testing.assert_allclose(found.T_cam_imu, T, atol=1e-9)
+    np.testing.assert_allclose(found.inertial.time_s, TIME_NS / 1e9 + 0.01, atol=3e-7)
+    assert found.attributes["imu_late_s"] == -0.01
+    assert not any("The body is the left camera" in note for note in found.notes)
 
 
 def test_samples_given_as_arrays_are_looked_at_too():

@@ -11,10 +11,13 @@ import numpy as np
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.inertial import InertialRows, covered_frames, samples_of
 from ekfslam.data.inputs import Velocities
-from ekfslam.data.readers.imu_yaml import read_imu_yaml
+from ekfslam.data.readers.fields import BODY_IS_CAMERA
+from ekfslam.data.readers.imu_yaml import CHAINS, beside, chain_of, late_s, read_imu_yaml
 from ekfslam.data.readers.registry import Source, expected, read_as
+from ekfslam.data.readers.yaml import read_yaml
+from ekfslam.data.sequence import Sequence
 from ekfslam.data.velocities import NO_VELOCITIES, Recording
-from ekfslam.errors import CalibrationError, UnknownFormatError
+from ekfslam.errors import CalibrationError, ExtrinsicsError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import T_CAM_BODY
 
@@ -22,7 +25,8 @@ from ekfslam.geometry.camera import T_CAM_BODY
 def attach_inertial(recording: Recording, path: str | Path, noise: str | Path | None = None) -> Recording:
     """Return a recording, of tracks or of images, with the inertial samples of a file in place of its own.
 
-    The body of the recording has to be the inertial unit, unless the source of the samples states ``T_cam_imu``.
+    The body of the recording has to be the inertial unit. If no file of the recording states ``T_cam_imu``, that of
+    ``cam0`` in a chain of Kalibr beside the samples is taken; its ``timeshift_cam_imu`` is always applied.
 
     Args:
         recording: Recording, with velocities or without.
@@ -32,6 +36,7 @@ def attach_inertial(recording: Recording, path: str | Path, noise: str | Path | 
     Raises:
         UnknownFormatError: A file is missing or of unknown content.
         CalibrationError: The file of densities does not state all four.
+        ExtrinsicsError: Nothing states ``T_cam_imu``.
         StampError: Stamps go back, or have an impossible rate.
         LostDataError: The samples do not cover two frames.
         DataError: A line is malformed, or units cannot be right; the error says what to do.
@@ -42,12 +47,36 @@ def attach_inertial(recording: Recording, path: str | Path, noise: str | Path | 
         raise UnknownFormatError(
             f"{path}: no inertial samples ({source.problem or 'unknown content'}); {expected('inertial')}"
         )
+    rows = _with_chain(rows, Path(path), _lacks_extrinsics(recording))
     if noise is not None:
         read = read_imu_yaml(Path(noise))
         if read.noise is None:
             raise CalibrationError(" ".join(read.notes), source=str(noise))
         rows = replace(rows, noise=read.noise)
+    if rows.T_cam_imu is None and _lacks_extrinsics(recording):
+        message = (
+            "no file states T_cam_imu, from the inertial unit to the left camera; put camchain-imucam.yaml of Kalibr"
+        )
+        raise ExtrinsicsError(f"{message} beside {path}, or T_cam_imu into the calibration", source=recording.source)
     return with_rows(recording, rows)
+
+
+def _with_chain(rows: InertialRows, place: Path, takes_extrinsics: bool) -> InertialRows:
+    """Return the rows with what a chain of Kalibr beside them states."""
+    chain = beside(place if place.is_dir() else place.parent, CHAINS)
+    if chain is None:
+        return rows
+    read = read_yaml(chain)
+    rows = replace(rows, late_s=late_s(read, "cam0"))
+    if not takes_extrinsics or (found := chain_of(read, "cam0")) is None:
+        return rows
+    return replace(
+        rows, T_cam_imu=found[0], notes=(*rows.notes, f"T_cam_imu is that of cam0 in {chain.name}.", *found[1])
+    )
+
+
+def _lacks_extrinsics(recording: Sequence | ImageRecording) -> bool:
+    return any(BODY_IS_CAMERA in note for note in recording.notes)
 
 
 def with_rows(recording: Recording, rows: InertialRows) -> Recording:
@@ -56,6 +85,8 @@ def with_rows(recording: Recording, rows: InertialRows) -> Recording:
     samples, found = samples_of(rows)
     begin, end = covered_frames(samples, recording.time_s, rows.source)
     notes: list[str] = [note for note in recording.notes if not note.startswith(NO_VELOCITIES)]
+    if rows.T_cam_imu is not None:
+        notes = [note for note in notes if BODY_IS_CAMERA not in note]
     notes += [f"Inertial samples from {rows.source}.", *found]
     if (left_out := len(recording.time_s) - (end - begin)) > 0:
         recording = recording[begin:end]
@@ -64,6 +95,7 @@ def with_rows(recording: Recording, rows: InertialRows) -> Recording:
     if np.array_equal(changes.get("T_cam_imu", recording.T_cam_imu), T_CAM_BODY):
         notes.append("No file states T_cam_imu: the inertial unit is taken to be the left camera, x forward.")
     attributes = {**recording.attributes, **rows.attributes}
+    attributes |= {"imu_late_s": rows.late_s} if rows.late_s else {}
     if isinstance(recording, ImageRecording):
         changes["inertial"] = samples
     else:

@@ -177,7 +177,7 @@ class InertialSamples:
     @property
     def text(self) -> str:
         """The samples in words."""
-        n, stated = self.noise, "densities of noise not stated"
+        n, stated = self.noise, "densities of noise not stated: found from the recording"
         if n is not None:
             stated = f"gyroscope {n.gyro:.3g} rad/s/sqrt(Hz), accelerometer {n.accel:.3g} m/s^2/sqrt(Hz)"
         gaps, longest_s = self.gaps

@@ -45,9 +45,19 @@ from ekfslam.studies.sweep_table import SweepTable, read_table, write_table
 MOST_RUNS = 100_000
 _ERROR_BYTES = 400
 _KEYS = {"recordings": list, "modes": list, "variants": list, "seeds": list, "settings": dict, "cases": dict}
-_FILES = ("data", "truth", "velocities", "calibration")  # of a recording
+_FILES = ("data", "truth", "velocities", "calibration", "imu", "imu_noise")  # of a recording
 # Arguments of `open_sequence`.
-_READ_AS = ("truth", "extrinsics", "lateral", "velocities", "velocity_frame", "topics", "calibration")
+_READ_AS = (
+    "truth",
+    "extrinsics",
+    "lateral",
+    "velocities",
+    "velocity_frame",
+    "topics",
+    "calibration",
+    "imu",
+    "imu_noise",
+)
 _RECORDING_KEYS = ("data", "name", "frames", *_READ_AS)
 _TAKEN = ("key", "recording", "seed", "case", "mode", "error", "run", *KEYS)  # names of columns
 
@@ -61,7 +71,7 @@ class Recording:
     Args:
         data: Path, or ``builtin:NAME``.
         name: Name in the table.
-        truth, extrinsics, lateral, velocities, velocity_frame, topics, calibration: Arguments of
+        truth, extrinsics, lateral, velocities, velocity_frame, topics, calibration, imu, imu_noise: Arguments of
             `ekfslam.open_sequence`; ``topics`` in a file is one text with blanks between names.
         frames: Stretch ``A:B`` of the recording, empty for all of it; applied before ``prepare``.
         prepare: Function from the sequence and the seed (None without seeds) to the sequence that is run. It must be a
@@ -77,6 +87,8 @@ class Recording:
     velocity_frame: str | None = None
     topics: tuple[str, ...] = ()
     calibration: str | None = None
+    imu: str | None = None
+    imu_noise: str | None = None
     frames: str = ""
     prepare: Callable[[Sequence, int | None], Sequence] | None = None
 
@@ -102,9 +114,9 @@ class Recording:
         Raises:
             UnknownFormatError: A file is missing.
         """
-        further = {"velocities": self.velocities and _digest(Path(self.velocities)), "frames": self.frames}
-        further |= {"velocity_frame": self.velocity_frame, "topics": " ".join(self.topics)}
-        further |= {"calibration": self.calibration and _digest(Path(self.calibration))}
+        files = {name: getattr(self, name) for name in ("velocities", "calibration", "imu", "imu_noise")}
+        further = {name: path and _digest(Path(path)) for name, path in files.items()}
+        further |= {"frames": self.frames, "velocity_frame": self.velocity_frame, "topics": " ".join(self.topics)}
         facts = [self.data] if self.is_simulated else [self.extrinsics, self.lateral]
         if not self.is_simulated:
             facts += [_digest(Path(path)) for path in (self.data, self.truth) if path]

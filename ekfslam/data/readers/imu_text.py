@@ -201,7 +201,8 @@ def _read_arrays(source: Source) -> InertialRows | None:
     arrays = [require_numbers(fields, name, (len(time_s), 3)) for name in ("gyro_rad_s", "accel_m_s2")]
     calibration = beside(path.parent)
     noise = None if calibration is None else read_imu_yaml(calibration).noise
-    stamps = np.round(time_s * 1e9).astype(np.int64)
+    seconds = np.floor(time_s)
+    stamps = seconds.astype(np.int64) * 1_000_000_000 + np.round((time_s - seconds) * 1e9).astype(np.int64)
     return InertialRows(str(path), stamps, arrays[0], arrays[1], noise, attributes={"imu_sha256": checksum(path)})
 
 
@@ -216,9 +217,9 @@ def _directory(path: Path) -> bytes:
 
 
 def _recognises(source: Source) -> bool:
-    if any((source.path / name).is_file() for name in _PLACES):
-        return (source.path / _PLACES[0]).is_file() or source.path.name.startswith("imu") or not source.path.is_dir()
-    return not source.path.is_dir() and len(_words(first_row(source.path))) >= 7
+    if source.path.is_dir():
+        return any((source.path / name).is_file() for name in _PLACES)
+    return len(_words(first_row(source.path))) >= 7
 
 
 READER = Reader("imu", EXPECTED, _recognises, inertial=lambda source: read_imu(source.path))
