@@ -29,6 +29,7 @@ from .frontend.opening import open_sequence
 from .frontend.track import TrackReport, track
 from .geometry.camera import StereoCamera
 from .given import trajectory_covariance
+from .live_stereo import LiveStereo
 from .page.report import write_report
 from .reports import Comparison, check, check_consistency, compare
 from .runner import run
@@ -54,6 +55,7 @@ __all__ = [
     "InertialNoise",
     "InertialSamples",
     "LiveEKF",
+    "LiveStereo",
     "Noise",
     "NoiseConfig",
     "Observations",

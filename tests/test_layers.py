@@ -30,7 +30,7 @@ ROOMS: tuple[tuple[str, ...], ...] = (
     ("storage",),
     ("evaluation",),
     ("resolve",),
-    ("runner",),
+    ("runner", "live_stereo"),
     ("given",),
     ("studies",),
     ("figures",),

@@ -118,9 +118,9 @@ class Velocities:
         self.drop(max(bisect_right(self.stamps, before) - 1, 0))
 
     def drop(self, count: int) -> None:
-        """Drop the oldest inputs."""
-        del self.stamps[:count], self._rows[:count]
-        if count:
+        """Drop some of the oldest inputs, if any."""
+        if count > 0:
+            del self.stamps[:count], self._rows[:count]
             self._begin = None
 
 

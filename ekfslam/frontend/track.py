@@ -9,7 +9,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FrontEndConfig
-from ekfslam.data.images import ImageRecording
+from ekfslam.data.images import Image, ImageRecording, PairCalibration
 from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations, Sequence
 from ekfslam.errors import EmptyTracksError
 from ekfslam.frontend.opencv import one_thread
@@ -80,37 +80,77 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
         EmptyTracksError: Not one feature is seen in both images.
         UnknownFormatError, DataError: An image cannot be read, or has another size.
     """
-    config = config or FrontEndConfig()
-    rectified = rectification(recording.calibration)
-    T_cam_imu = rectified.T_rectified_left @ recording.T_cam_imu
-    tracker = Tracker(rectified.camera, config, rectified.valid)
-    seen, vectors, stds = [], [], []
-    with one_thread():
-        for k in progress(range(len(recording)), f"{recording.name}: tracking"):
-            left, right = rectified.apply(*recording.load(k))
-            seen.append(tracker.track(left, right, _prediction(recording, T_cam_imu, k)))
-            vectors.append(tracker.rotation.vector)
-            stds.append(tracker.rotation.std)
-    rotation, std = np.array(vectors), np.array(stds)
-    observations, single = _observations(seen, rotation, rectified.camera)
-    if not len(observations):
-        raise EmptyTracksError(
-            "no feature is seen in both images of two frames: is left right, or max_disparity too small?",
-            source=recording.source,
+    tracking = Tracking(recording.calibration, recording.T_cam_imu, config)
+    for k in progress(range(len(recording)), f"{recording.name}: tracking"):
+        tracking.add(*recording.load(k), _motion_before(recording, k))
+    return tracking.sequence(recording)
+
+
+class Tracking:
+    """Tracking of image pairs, one after another.
+
+    Args:
+        calibration: The pair.
+        T_cam_imu: (4, 4) IMU to the optical frame of the left camera before rectification.
+        config: Settings of tracking.
+
+    Attributes:
+        camera, T_cam_imu: Rectified pair; (4, 4) IMU to its left optical frame.
+    """
+
+    def __init__(self, calibration: PairCalibration, T_cam_imu: Array, config: FrontEndConfig | None = None) -> None:
+        self._config = config or FrontEndConfig()
+        self._rectified = rectification(calibration)
+        self.camera, self.T_cam_imu = self._rectified.camera, self._rectified.T_rectified_left @ T_cam_imu
+        self._tracker = Tracker(self.camera, self._config, self._rectified.valid)
+        self._seen: list[Seen] = []
+        self._vectors: list[Array] = []
+        self._stds: list[Array] = []
+
+    def add(self, left: Image, right: Image, motion_before: Array | None = None) -> Seen:
+        """Track a pair of images; ``motion_before`` (4, 4) is the predicted ``T_imu_now_before`` of the IMU, if any."""
+        if motion_before is not None:
+            motion_before = self.T_cam_imu @ motion_before @ se3.inverse(self.T_cam_imu)
+        with one_thread():
+            seen = self._tracker.track(*self._rectified.apply(left, right), motion_before)
+        self._seen.append(seen)
+        self._vectors.append(self._tracker.rotation.vector)
+        self._stds.append(self._tracker.rotation.std)
+        return seen
+
+    def last(self) -> tuple[IntArray, Array]:
+        """Return ids (n,) and pixels (n, 4) of the last frame, with the present rotation of the right camera."""
+        seen = self._seen[-1]
+        right = seen.right + correction(self.camera, self._vectors[-1], seen.right)
+        return seen.id, np.hstack([seen.left, right])
+
+    def forget(self) -> None:
+        """Forget all frames but the last one; tracks go on."""
+        del self._seen[:-1], self._vectors[:-1], self._stds[:-1]
+
+    def sequence(self, recording: ImageRecording) -> tuple[Sequence, TrackReport]:
+        """Return a recording of the frames so far with their tracks, and statistics, see `track`."""
+        rotation, std = np.array(self._vectors), np.array(self._stds)
+        observations, single = _observations(self._seen, rotation, self.camera)
+        if not len(observations):
+            raise EmptyTracksError(
+                "no feature is seen in both images of two frames: is left right, or max_disparity too small?",
+                source=recording.source,
+            )
+        report = TrackReport(
+            len(self._seen),
+            len(observations.ids),
+            len(observations),
+            np.unique(observations.landmark, return_counts=True)[1],
+            {reason: count for reason, count in self._tracker.losses.items() if count},
+            self._tracker.withheld,
+            self._tracker.refused,
+            single,
+            rotation,
+            std,
         )
-    report = TrackReport(
-        len(seen),
-        len(observations.ids),
-        len(observations),
-        np.unique(observations.landmark, return_counts=True)[1],
-        {reason: count for reason, count in tracker.losses.items() if count},
-        tracker.withheld,
-        tracker.refused,
-        single,
-        rotation,
-        std,
-    )
-    return _tracked(recording, rectified.camera, T_cam_imu, observations, _account(config, report), report), report
+        account = _account(self._config, report)
+        return _tracked(recording, self.camera, self.T_cam_imu, observations, account, report), report
 
 
 def _tracked(
@@ -158,12 +198,11 @@ def _observations(seen: list[Seen], rotation: Array, camera: StereoCamera) -> tu
     return Observations(frame[twice], ids[twice], pixels[twice]), int((~twice).sum())
 
 
-def _prediction(recording: ImageRecording, T_cam_imu: Array, k: int) -> Array | None:
-    """Return the motion (4, 4) of the camera before frame k by the measured velocities; None if there are none."""
+def _motion_before(recording: ImageRecording, k: int) -> Array | None:
+    """Return the motion (4, 4) of the IMU before frame k by the measured velocities; None if there are none."""
     if recording.twist is None or k == 0:
         return None
-    tau_s = float(recording.time_s[k] - recording.time_s[k - 1])
-    return T_cam_imu @ motion.increment(recording.twist[k], tau_s) @ se3.inverse(T_cam_imu)
+    return motion.increment(recording.twist[k], float(recording.time_s[k] - recording.time_s[k - 1]))
 
 
 def _account(config: FrontEndConfig, report: TrackReport) -> dict[str, str | int | float]:
