@@ -34,7 +34,7 @@ for bit. Every data set states its `units` and its `frame` of reference as attri
     trajectory = xarray.open_dataset("city.h5", group=group, engine="h5netcdf")
     trajectory.covariance.sel(xi="rho_x", xi_2="rho_x")     # variance along x of the IMU, by stamp
 
-pandas and xarray come with `pip install 'ekfslam[tables]'`. h5py needs nothing else.
+pandas and xarray come with `pip install 'ekfslam[paper]'`. h5py needs nothing else.
 """
 
 DIMENSIONS = """

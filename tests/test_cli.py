@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from importlib.metadata import PackageNotFoundError
 
 import h5py
 import numpy as np
@@ -13,6 +14,7 @@ from support.recordings import ece276a_fields, utias_fields, write_mat, write_np
 
 from ekfslam import open_sequence, reports
 from ekfslam.cli import main
+from ekfslam.cli.commands import doctor
 from ekfslam.errors import FilterError
 from ekfslam.storage.archive import read_archive
 
@@ -305,3 +307,17 @@ def test_info_says_whether_the_engine_is_built(capsys):
     assert lines[0].split()[0] == "engine"
     assert lines[1].split()[:2] in (["smoother", "CHOLMOD"], ["smoother", "SuperLU"])
     assert any(line.split()[0] == "BLAS" for line in lines)
+
+
+def test_doctor_names_what_is_missing_and_what_installs_it(capsys, monkeypatch):
+    def version(name):
+        if name != "rosbags":
+            raise PackageNotFoundError(name)
+        return "1.2"
+
+    monkeypatch.setattr(doctor, "requires", lambda _: ['rosbags>=0.10; extra == "ros"', "opencv; extra == 'images'"])
+    monkeypatch.setattr(doctor, "version", version)
+    assert main(["doctor"]) == 0
+    out = capsys.readouterr().out
+    assert "engine" in out and "ros           ROS 1, ROS 2 and MCAP bags: rosbags 1.2\n" in out
+    assert "lacks opencv: pip install 'ekfslam[images]'" in out

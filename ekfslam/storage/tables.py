@@ -149,4 +149,4 @@ def _package(name: str, what: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise MissingPackageError(name, "tables", what) from None
+        raise MissingPackageError(name, "paper", what) from None

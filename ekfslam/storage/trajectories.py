@@ -68,7 +68,7 @@ def bag_bytes(trajectory: Trajectory) -> bytes:
     try:
         from rosbags import rosbag2
     except ImportError as error:
-        raise MissingPackageError("rosbags", "bags", f"writing a bag ({error})") from None
+        raise MissingPackageError("rosbags", "ros", f"writing a bag ({error})") from None
     store = message_types(is_ros1=False)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bag"

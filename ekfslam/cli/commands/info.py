@@ -5,24 +5,20 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
-from threadpoolctl import threadpool_info
-
 from ekfslam import hdf5
+from ekfslam.cli.commands.doctor import print_build
 from ekfslam.cli.options import DATA, declare, open_data, table
 from ekfslam.config import Config
 from ekfslam.data.interpolation import stretches
 from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import inspect_tracks
-from ekfslam.engine.choice import MISSING
 from ekfslam.evaluation.consistency import interpolated_frames
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.sources import compare_sources, in_words
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.reports import details
 from ekfslam.resolve import noise_of_velocities, resolve
-from ekfslam.runner import versions
-from ekfslam.smoother.sparse import solvers
 from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT
 from ekfslam.storage.archive import read_archive
 
@@ -38,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def command(options: argparse.Namespace) -> None:
     if options.build:
-        _print_build()
+        print_build()
     elif _is_archive(options.data):
         _print_archive(options.data)
     else:
@@ -127,13 +123,3 @@ def _print_findings(sequence: Sequence) -> None:
 
 def _is_archive(data: str) -> bool:
     return not data.startswith(BUILTIN) and hdf5.format_of(data) == ARCHIVE_FORMAT
-
-
-def _print_build() -> None:
-    print(f"engine        {MISSING or 'compiled, C++'}")
-    print(f"smoother      {solvers.describe()}")
-    for name, version in versions().items():
-        print(f"{name.removeprefix('version_'):13s} {version}")
-    for library in threadpool_info():
-        if library["user_api"] == "blas":
-            print(f"BLAS          {library['internal_api']} {library['version']}, {library['num_threads']} threads")

@@ -1,6 +1,6 @@
 """Bags of ROS 1 and ROS 2, and MCAP: a stereo pair with CameraInfo, and velocities by Odometry or a stamped twist.
 
-The package rosbags reads them; it is an extra: ``pip install 'ekfslam[bags]'``.
+The package rosbags reads them; it is an extra: ``pip install 'ekfslam[ros]'``.
 """
 
 from __future__ import annotations

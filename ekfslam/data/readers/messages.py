@@ -55,7 +55,7 @@ class Bag:
         try:
             from rosbags import rosbag1, rosbag2
         except ImportError as error:
-            raise MissingPackageError("rosbags", "bags", f"{path}: reading a bag ({error})") from None
+            raise MissingPackageError("rosbags", "ros", f"{path}: reading a bag ({error})") from None
         self.path = path
         with self.named_errors():
             self.is_ros1 = Source.at(path).head.startswith(ROS1_MAGIC)
