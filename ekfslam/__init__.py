@@ -42,6 +42,8 @@ Equations (docstrings cite these numbers)::
     else 0                                                                           (11) errors that landmarks share
     R1 = R0 dR,  v1 = v0 + g tau + R0 dv,  p1 = p0 + v0 tau + g tau^2 / 2 + R0 dp,  u1 = R1^T v1,
     F = S(u1)^-1 Phi S(u0),  Q = S(u1)^-1 Q_z S(u1)^-T                               (12) inertial samples
+    mean f_m = -C g + ba + n,  mean w_m = bg + n,  u = 0                             (13) inertial start at rest
+    r = [log(T1 f(T0)^-1); u1 - f_u; b1 - b0], f the step (12)                       (14) residual of an interval
 
 Glossary:
 

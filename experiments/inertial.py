@@ -222,7 +222,7 @@ def row(name: str, figures: dict[str, float]) -> list[str]:
 @styled
 def plot(table: dict[str, dict[str, float]]) -> Figure:
     """Draw the mean NEES of each part over its expectation, with bars of three standard errors."""
-    figure = Figure(figsize=(7.2, 3.6))
+    figure = Figure(figsize=(7.2, 4.2))
     ax, places = figure.subplots(), np.arange(len(PARTS))
     for i, (name, figures) in enumerate(table.items()):
         ratio = np.array([figures[part] / EXPECTED[part] for part in PARTS])
@@ -232,7 +232,7 @@ def plot(table: dict[str, dict[str, float]]) -> Figure:
     ax.axhline(1.0, **EXPECTED_LINE)
     ax.set_xticks(places, list(PARTS))
     ax.set(ylabel="mean NEES / expectation", title="Mean NEES over runs, bars: three standard errors")
-    legend_of(figure, [ax], 3)
+    legend_of(figure, [ax], 2)
     return figure
 
 

@@ -27,7 +27,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages["command_line.md"] = _command_line()
     for name, content in pages.items():
         files.append(File.generated(config, name, content=content))
-    for name in ("demo/city/map", "demo/city/map_before_and_after", "consistency/nees_mid"):
+    for name in ("demo/city/map", "demo/city/map_before_and_after", "consistency/nees_mid", "inertial/nees"):
         path = ROOT / "results" / f"{name}.png"
         files.append(File.generated(config, f"pictures/{path.name}", abs_src_path=str(path)))
     return files

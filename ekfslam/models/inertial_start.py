@@ -1,7 +1,7 @@
 """First state of the inertial process, with its joint covariance: at rest, by ordinary rows.
 
-At rest the samples measure ``mean f = -C g + ba + n`` and ``mean w = bg + n``. A broad prior of the tilt, conditioned
-on these rows, has the cross-covariance of tilt and accelerometer bias, which no block-diagonal prior has.
+At rest the samples measure ``mean f = -C g + ba + n`` and ``mean w = bg + n``, eq. (13). A broad prior of the tilt,
+conditioned on these rows, has the cross-covariance of tilt and accelerometer bias, which no block-diagonal prior has.
 """
 
 from __future__ import annotations

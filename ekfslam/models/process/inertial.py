@@ -95,7 +95,7 @@ class Inertial(Process):
         return moved, from_z @ found.Phi @ _to_invariant(u_0), from_z @ found.Q @ from_z.T
 
     def residual(self, before: Values, after: Values, intervals: Intervals) -> Residual:
-        """Return ``[log(T_1 f(T_0)^-1); u_1 - f_u; b_1 - b_0]`` (m, 15) with its derivatives."""
+        """Return ``[log(T_1 f(T_0)^-1); u_1 - f_u; b_1 - b_0]`` (m, 15), eq. (14), with its derivatives."""
         m = len(intervals)
         error, by_before, by_after = np.zeros((m, 15)), *np.zeros((2, m, 15, self.layout.body))
         for k in range(m):
