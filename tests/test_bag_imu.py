@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -14,9 +13,6 @@ from support.imu import motion, write_lines, yaml_lines
 
 from ekfslam import attach_inertial, open_images
 from ekfslam.data.images import ImageRecording
-from ekfslam.data.readers.bag_imu import inertial_of
-from ekfslam.data.readers.messages import Bag
-from ekfslam.errors import LostDataError
 from ekfslam.geometry import se3
 
 COUNT, IMU_NS = 120, 5_000_000
@@ -108,12 +104,7 @@ def test_other_topics_are_named_and_a_topic_can_be_chosen(tmp_path):
     notes = opened(path).notes
     assert "Inertial samples are those of /stereo/imu." in notes  # near the images
     assert "Not used: inertial samples of /mavros/imu/data." in notes
-    with contextlib.closing(Bag(path)) as opened_bag:
-        assert len(inertial_of(opened_bag, "/mavros/imu/data")[0].time_ns) == COUNT
-        with pytest.raises(
-            LostDataError, match=r"/no: no inertial samples; topics of .*: /mavros/imu/data, /stereo/imu"
-        ):
-            inertial_of(opened_bag, "/no")
+    assert len(open_images(path, topics=["/mavros/imu/data"]).inertial.time_s) == COUNT
 
 
 def test_a_unit_without_a_known_place_is_not_used_with_a_note(tmp_path):

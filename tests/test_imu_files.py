@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.helpers import synthetic_sequence
-from support.images import write_plain
+from support.images import STAMPS_NS, write_euroc, write_plain
 from support.imu import FIRST_NS, HEADER, STEP_NS, motion, rows, write_imu0, write_lines, yaml_lines
 
 import ekfslam
 from ekfslam import attach_inertial
+from ekfslam.data.imu import attach_inertial_noise
 from ekfslam.errors import (
     CalibrationError,
     DataError,
@@ -120,6 +121,23 @@ def test_densities_are_those_of_a_file_that_is_named(tmp_path):
     write_lines(tmp_path / "sensor.yaml", yaml_lines())
     assert attached(written(tmp_path), noise=noise).inertial.noise.gyro == 3e-4
     assert attached(written(tmp_path)).inertial.noise.gyro == 1.7e-4
+
+
+def test_other_densities_are_given_to_samples_that_a_recording_has(tmp_path):
+    images = write_euroc(tmp_path)
+    write_imu0(images / "mav0/imu0", 300, STAMPS_NS[0] - 20 * STEP_NS)
+    noise = write_lines(tmp_path / "a.yaml", yaml_lines(gyroscope_noise_density=5e-4))
+    found = attach_inertial_noise(ekfslam.open_images(images), noise)
+    assert found.inertial.noise.gyro == 5e-4 and found.notes[-1].startswith("Noise densities from")
+    with pytest.raises(LostDataError, match="no inertial samples"):
+        attach_inertial_noise(recording(), noise)
+
+
+def test_a_stated_rate_that_is_not_that_of_the_stamps_and_a_time_offset_are_notes(tmp_path):
+    write_lines(tmp_path / "imu.yaml", [*yaml_lines(), "update_rate: 400.0", "time_offset: 0.02"])
+    notes = attached(written(tmp_path)).notes
+    assert "The inertial unit is stated to have 400 Hz, but its stamps have 200 Hz." in notes
+    assert any("time_offset 0.02 s against another unit, which is not applied" in note for note in notes)
 
 
 def test_missing_densities_are_a_note(tmp_path):

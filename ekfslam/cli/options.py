@@ -77,7 +77,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     "--imu-noise": {
         "type": Path,
         "metavar": "FILE",
-        "help": "sensor.yaml or imu.yaml with the noise densities of --imu (default: the one beside it)",
+        "help": "sensor.yaml or imu.yaml with the noise densities of inertial samples (default: the one beside them)",
     },
     "--topics": {
         "nargs": "+",

@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 
 from ekfslam.data.images import ImageRecording
-from ekfslam.data.inertial import InertialRows, covered_frames, samples_of
-from ekfslam.data.inputs import Velocities
+from ekfslam.data.inertial import NOT_STATED, InertialRows, covered_frames, samples_of
+from ekfslam.data.inputs import InertialNoise, InertialSamples, Velocities
 from ekfslam.data.readers.fields import BODY_IS_CAMERA
 from ekfslam.data.readers.imu_yaml import CHAINS, beside, chain_of, late_s, read_imu_yaml
 from ekfslam.data.readers.registry import Source, expected, read_as
 from ekfslam.data.readers.yaml import read_yaml
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.velocities import NO_VELOCITIES, Recording
-from ekfslam.errors import CalibrationError, ExtrinsicsError, UnknownFormatError
+from ekfslam.errors import CalibrationError, ExtrinsicsError, LostDataError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import T_CAM_BODY
+
+_DROPPED = "its densities are not used"  # in a note on a file that states some
 
 
 def attach_inertial(recording: Recording, path: str | Path, noise: str | Path | None = None) -> Recording:
@@ -49,16 +51,50 @@ def attach_inertial(recording: Recording, path: str | Path, noise: str | Path | 
         )
     rows = _with_chain(rows, Path(path), _lacks_extrinsics(recording))
     if noise is not None:
-        read = read_imu_yaml(Path(noise))
-        if read.noise is None:
-            raise CalibrationError(" ".join(read.notes), source=str(noise))
-        rows = replace(rows, noise=read.noise)
+        rows = replace(rows, noise=_stated(noise), notes=tuple(note for note in rows.notes if _DROPPED not in note))
     if rows.T_cam_imu is None and _lacks_extrinsics(recording):
         message = (
             "no file states T_cam_imu, from the inertial unit to the left camera; put camchain-imucam.yaml of Kalibr"
         )
         raise ExtrinsicsError(f"{message} beside {path}, or T_cam_imu into the calibration", source=recording.source)
     return with_rows(recording, rows)
+
+
+def attach_inertial_noise(recording: Recording, path: str | Path) -> Recording:
+    """Return a recording with other noise densities of its inertial samples, those of ``sensor.yaml`` or ``imu.yaml``.
+
+    Raises:
+        LostDataError: The recording has no inertial samples.
+        CalibrationError: The file does not state all four densities.
+    """
+    if recording.inertial is None:
+        raise LostDataError("there are no inertial samples, hence no densities of their noise", source=recording.source)
+    changes = _with_samples(recording, replace(recording.inertial, noise=_stated(path)))
+    changes["notes"] = (
+        *(note for note in recording.notes if not note.startswith(NOT_STATED) and _DROPPED not in note),
+        f"Noise densities from {path}.",
+    )
+    return replace(recording, **changes)
+
+
+def with_inertial_files(recording: Recording, samples: str | Path | None, noise: str | Path | None) -> Recording:
+    """Return a recording with the samples and the densities of files, if any are given."""
+    if samples is not None:
+        return attach_inertial(recording, samples, noise)
+    return recording if noise is None else attach_inertial_noise(recording, noise)
+
+
+def _stated(path: str | Path) -> InertialNoise:
+    read = read_imu_yaml(Path(path))
+    if read.noise is None:
+        raise CalibrationError(" ".join(read.notes), source=str(path))
+    return read.noise
+
+
+def _with_samples(recording: Sequence | ImageRecording, samples: InertialSamples) -> dict[str, Any]:
+    if isinstance(recording, ImageRecording):
+        return {"inertial": samples}
+    return {"inputs": (*(each for each in recording.inputs if isinstance(each, Velocities)), samples)}
 
 
 def _with_chain(rows: InertialRows, place: Path, takes_extrinsics: bool) -> InertialRows:
@@ -96,10 +132,7 @@ def with_rows(recording: Recording, rows: InertialRows) -> Recording:
         notes.append("No file states T_cam_imu: the inertial unit is taken to be the left camera, x forward.")
     attributes = {**recording.attributes, **rows.attributes}
     attributes |= {"imu_late_s": rows.late_s} if rows.late_s else {}
-    if isinstance(recording, ImageRecording):
-        changes["inertial"] = samples
-    else:
-        changes["inputs"] = (*(each for each in recording.inputs if isinstance(each, Velocities)), samples)
+    changes |= _with_samples(recording, samples)
     return replace(recording, notes=tuple(notes), attributes=attributes, **changes)
 
 

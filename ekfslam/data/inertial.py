@@ -17,7 +17,9 @@ from ekfslam.errors import DataError, LostDataError, ShapeError, StampError
 
 _GRAVITY = (9.0, 10.6)  # m/s^2, of a sound accelerometer at the quietest second
 _FASTEST = 35.0  # rad/s: gyroscopes end at 2000 deg/s
+_RATE_OFF = 0.1  # share by which a stated rate may be off
 _SLOWEST_HZ = 80.0  # below, means of neighbouring samples integrate poorly
+NOT_STATED = "Noise densities of the inertial unit are not stated."
 _UNITS: dict[str, tuple[float, float, str]] = {  # range of the mean |f| at the quietest second, and what to do
     "m/s^2 with gravity removed": (0.0, 0.5, "take the accelerometer itself, not the phone's linear acceleration"),
     "g": (0.85, 1.15, "multiply by 9.80665"),
@@ -37,6 +39,7 @@ class InertialRows:
         gyro_rad_s, accel_m_s2: (N, 3) angular rates and specific forces.
         noise: Densities; None if nothing states them.
         late_s: Stamp of a sample less that of an image of the same instant.
+        stated_hz: Rate that a file states; 0 if none does.
         line: (N,) lines of a text file; None for other sources.
         T_cam_imu: (4, 4) pose of the left camera, if the source states it.
         sorts: Whether stamps that go back are sorted. Else they are an error.
@@ -49,6 +52,7 @@ class InertialRows:
     accel_m_s2: Array
     noise: InertialNoise | None = None
     late_s: float = 0.0
+    stated_hz: float = 0.0
     line: IntArray | None = None
     T_cam_imu: Array | None = None
     sorts: bool = False
@@ -83,7 +87,10 @@ def samples_of(rows: InertialRows) -> tuple[InertialSamples, tuple[str, ...]]:
         notes.append(f"Stamps of the inertial unit are {rows.late_s:+.6f} s against the images: they are corrected.")
     seconds, rest = np.divmod(rows.time_ns - late_ns, 1_000_000_000)
     samples = InertialSamples(seconds + rest / 1e9, rows.gyro_rad_s, rows.accel_m_s2, noise)
-    notes += [] if noise is not None else ["Noise densities of the inertial unit are not stated."]
+    notes += [] if noise is not None else [NOT_STATED]
+    rate = 1.0 / samples.step_s
+    if rows.stated_hz and abs(np.log(rate / rows.stated_hz)) > _RATE_OFF:
+        notes.append(f"The inertial unit is stated to have {rows.stated_hz:g} Hz, but its stamps have {rate:.4g} Hz.")
     return samples, (*rows.notes, *notes, *inertial_notes(samples, rows.source))
 
 

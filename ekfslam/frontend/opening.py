@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ekfslam.config import FrontEndConfig
-from ekfslam.data.imu import attach_inertial
+from ekfslam.data.imu import with_inertial_files
 from ekfslam.data.opening import attach_truth, open_recording
 from ekfslam.data.readers.registry import Extrinsics, Lateral
 from ekfslam.data.sequence import Sequence, VelocityFrame
@@ -50,13 +50,12 @@ def open_sequence(
         DataError: A field is missing or malformed; the subclass says how.
     """
     _require("velocity_frame", velocity_frame, "velocities", velocities)
-    _require("imu_noise", imu_noise, "imu", imu)
     recording = open_recording(source, extrinsics=extrinsics, lateral=lateral, topics=topics, calibration=calibration)
 
     def with_inputs(one: Recording) -> Recording:
         if velocities is not None:
             one = attach_velocities(one, velocities, velocity_frame=velocity_frame, lateral=lateral)
-        return one if imu is None else attach_inertial(one, imu, imu_noise)
+        return with_inertial_files(one, imu, imu_noise)
 
     if isinstance(recording, Sequence):
         return with_inputs(recording if truth is None else attach_truth(recording, Path(truth)))

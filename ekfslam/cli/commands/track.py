@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ekfslam import files
 from ekfslam.cli.options import PLACES, config_file, declare, require_ours
-from ekfslam.data.imu import attach_inertial
+from ekfslam.data.imu import with_inertial_files
 from ekfslam.data.opening import attach_truth, open_images
 from ekfslam.data.readers.hdf5 import is_recording_of, sequence_image
 from ekfslam.data.velocities import attach_velocities
@@ -41,8 +41,7 @@ def command(options: argparse.Namespace) -> None:
     if options.velocities is not None:
         frame, lateral = options.velocity_frame, options.lateral
         recording = attach_velocities(recording, options.velocities, velocity_frame=frame, lateral=lateral)
-    if options.imu is not None:
-        recording = attach_inertial(recording, options.imu, options.imu_noise)
+    recording = with_inertial_files(recording, options.imu, options.imu_noise)
     sequence, report = track(recording, config.front_end)
     if options.truth is not None:
         sequence = attach_truth(sequence, options.truth)

@@ -13,7 +13,7 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.inertial import InertialRows, in_order
 from ekfslam.data.inputs import VelocitySamples, linear
-from ekfslam.data.readers.imu_yaml import beside, read_imu_yaml
+from ekfslam.data.readers.imu_yaml import beside, calibrated, read_imu_yaml
 from ekfslam.data.readers.messages import IMU, Bag, frame_of
 from ekfslam.data.sequence import TWIST_STD
 from ekfslam.errors import LostDataError
@@ -35,28 +35,20 @@ class _Stream:
         return str(self.connection.topic)
 
 
-def inertial_of(bag: Bag, topic: str | None = None, near: str = "") -> tuple[InertialRows | None, str, tuple[str, ...]]:
+def inertial_of(bag: Bag, near: str = "") -> tuple[InertialRows | None, str, tuple[str, ...]]:
     """Return the inertial samples of a bag, the name of their frame, and notes; None and no name if it has none.
 
     Forces of a stream of their own are interpolated linearly to the stamps of the gyroscope.
 
     Args:
-        bag: The bag.
-        topic: Topic of the samples, or of the gyroscope; chosen by default.
+        bag: The bag; of topics that it names, none of another is used.
         near: Topic of images; a stream that shares more of its name is preferred, then one with more messages.
-
-    Raises:
-        LostDataError: There is no such topic.
     """
     streams = [_looked_at(bag, connection) for connection in bag.connections(IMU)]
     topics = [stream.topic for stream in streams]
-    if topic is not None and topic not in topics:
-        message = f"no inertial samples; topics of {IMU}: {printable(', '.join(topics)) or 'none'}"
-        raise LostDataError(message, source=str(bag.path), field=printable(topic))
 
-    def rank(stream: _Stream) -> tuple[bool, bool, int, int, str]:
-        shared = _shared(stream.topic, near)
-        return stream.topic != topic, not stream.has_accel, -shared, -int(stream.connection.msgcount), stream.topic
+    def rank(stream: _Stream) -> tuple[bool, int, int, str]:
+        return not stream.has_accel, -_shared(stream.topic, near), -int(stream.connection.msgcount), stream.topic
 
     gyros = sorted((stream for stream in streams if stream.has_gyro), key=rank)
     gyro = next(iter(gyros), None)
@@ -99,8 +91,7 @@ def _samples(bag: Bag, gyro: _Stream, accel: _Stream) -> tuple[InertialRows, str
         rows = _paired(rows, _rows(bag, accel)[0])
     calibration = beside(bag.path if bag.path.is_dir() else bag.path.parent) or beside(bag.path.parent)
     if calibration is not None:
-        read = read_imu_yaml(calibration)
-        rows = replace(rows, noise=read.noise, notes=(*rows.notes, *read.notes))
+        rows = calibrated(rows, read_imu_yaml(calibration))
     return rows, frame
 
 

@@ -23,7 +23,7 @@ from ekfslam.data.observations import TrueMotion
 from ekfslam.data.readers.calibrations import PairFile, find_chain, kalibr_camera, read_pair
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
 from ekfslam.data.readers.imu_text import read_imu
-from ekfslam.data.readers.imu_yaml import beside, pose_of, read_imu_yaml
+from ekfslam.data.readers.imu_yaml import beside, calibrated, pose_of, read_imu_yaml
 from ekfslam.data.readers.pictures import SUFFIXES, pair_files, pair_stamps
 from ekfslam.data.readers.poses import Poses, stamped_poses, truth_of_frames
 from ekfslam.data.readers.registry import CALIBRATION, Reader, Source
@@ -107,8 +107,7 @@ def _inertial(mav: Path) -> tuple[InertialRows, Array | None] | None:
     if file is None:
         return rows, None
     read = read_imu_yaml(file)
-    notes = rows.notes if file.parent == path.parent else (*rows.notes, *read.notes)
-    return replace(rows, noise=read.noise, notes=notes), read.T_body_imu
+    return rows if file.parent == path.parent else calibrated(rows, read), read.T_body_imu
 
 
 def _mav(folder: Path) -> Path | None:

@@ -8,6 +8,7 @@ states the densities of noise.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +19,7 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.inertial import InertialRows
 from ekfslam.data.readers.fields import checksum, require_numbers
-from ekfslam.data.readers.imu_yaml import beside, read_imu_yaml
+from ekfslam.data.readers.imu_yaml import beside, calibrated, read_imu_yaml
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row, line_of, parse_numbers, read_lines
 from ekfslam.errors import LineError, StampError, UnknownFormatError
@@ -78,18 +79,23 @@ def read_imu(place: Path) -> InertialRows:
         numbers.append(number)
     table = np.array(values)
     time_ns, note = clock.stamps(table[:, 0], columns.unit, path)
-    calibration = beside(path.parent)
-    read = None if calibration is None else read_imu_yaml(calibration)
-    return InertialRows(
+    rows_of_file = InertialRows(
         str(path),
         time_ns,
         table[:, 1:4] * columns.factor[:3],
         table[:, 4:] * columns.factor[3:],
-        None if read is None else read.noise,
         line=np.array(numbers),
-        notes=(*columns.notes, *note, *(() if read is None else read.notes)),
-        attributes={"imu_sha256": checksum(path, *([] if calibration is None else [calibration]))},
+        notes=(*columns.notes, *note),
     )
+    return _with_densities(rows_of_file, path)
+
+
+def _with_densities(rows: InertialRows, path: Path) -> InertialRows:
+    """Return samples of a file with the densities beside it, and its digest."""
+    calibration = beside(path.parent)
+    attributes = {"imu_sha256": checksum(path, *([] if calibration is None else [calibration]))}
+    rows = replace(rows, attributes=attributes)
+    return rows if calibration is None else calibrated(rows, read_imu_yaml(calibration))
 
 
 def _words(line: str) -> list[str]:
@@ -198,12 +204,10 @@ def _read_arrays(source: Source) -> InertialRows | None:
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise UnknownFormatError(f"{path}: damaged ({error})") from None
     time_s = require_numbers(fields, "imu_time_s", (None,))
-    arrays = [require_numbers(fields, name, (len(time_s), 3)) for name in ("gyro_rad_s", "accel_m_s2")]
-    calibration = beside(path.parent)
-    noise = None if calibration is None else read_imu_yaml(calibration).noise
+    gyro, accel = (require_numbers(fields, name, (len(time_s), 3)) for name in ("gyro_rad_s", "accel_m_s2"))
     seconds = np.floor(time_s)
     stamps = seconds.astype(np.int64) * 1_000_000_000 + np.round((time_s - seconds) * 1e9).astype(np.int64)
-    return InertialRows(str(path), stamps, arrays[0], arrays[1], noise, attributes={"imu_sha256": checksum(path)})
+    return _with_densities(InertialRows(str(path), stamps, gyro, accel), path)
 
 
 def _has_arrays(source: Source) -> bool:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.data.checks import require_rigid, spelled_as_in
+from ekfslam.data.inertial import InertialRows
 from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.readers.yaml import Calibration, read_yaml
 from ekfslam.errors import CalibrationError, ExtrinsicsError
@@ -24,6 +25,8 @@ _KEYS = {
     "accel_walk": "accelerometer_random_walk",
 }
 
+_FURTHER = ("time_offset", "rate_hz", "update_rate")
+
 
 @dataclass(frozen=True)
 class InertialCalibration:
@@ -33,12 +36,14 @@ class InertialCalibration:
         path: File that was read.
         noise: Densities; None if some are missing.
         T_body_imu: (4, 4) ``T_BS``; None if it is not stated.
-        notes: Missing densities.
+        rate_hz: ``rate_hz`` or ``update_rate``; 0 if it is not stated.
+        notes: Missing densities, and a time offset that is not applied.
     """
 
     path: Path
     noise: InertialNoise | None
     T_body_imu: Array | None
+    rate_hz: float
     notes: tuple[str, ...]
 
 
@@ -61,8 +66,17 @@ def read_imu_yaml(path: Path) -> InertialCalibration:
             noise = InertialNoise(**values)
         else:
             notes = (f"{path.name} does not state {', '.join(missing)}: its densities are not used.",)
+        further = [prefix + name for name in _FURTHER]
+        offset, *rates = (_number(read, name) if name in read else 0.0 for name in further)
+        if offset:
+            notes += (f"{path.name} states time_offset {offset:g} s against another unit, which is not applied.",)
     key = next((key for key in (f"{prefix}T_BS.data", f"{prefix}T_BS") if read.values.get(key)), None)
-    return InertialCalibration(path, noise, None if key is None else pose_of(read, key), notes)
+    return InertialCalibration(path, noise, None if key is None else pose_of(read, key), max(rates), notes)
+
+
+def calibrated(rows: InertialRows, read: InertialCalibration) -> InertialRows:
+    """Return samples with the densities of a file."""
+    return replace(rows, noise=read.noise, stated_hz=read.rate_hz, notes=(*rows.notes, *read.notes))
 
 
 def _number(read: Calibration, key: str) -> float:
