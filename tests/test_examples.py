@@ -175,3 +175,130 @@ def test_ros2_node(tmp_path):
         command = [sys.executable, EXAMPLES / "ros2_node.py"]
         alone = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
         assert alone.returncode == 1 and alone.stderr.startswith("this node needs ROS 2")
+
+
+def example(name):
+    """The module of an example."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def rendered(frames):
+    pytest.importorskip("cv2")
+    from support.rendered import recording
+
+    return recording(frames, distorted=False, rotation_rad=np.zeros(3))
+
+
+def image_message(image, t):
+    height, width = image.shape
+    found = Message(encoding="mono8", data=image.tobytes(), height=height, width=width, step=width)
+    found.header.stamp = Message(sec=int(t), nanosec=round(1e9 * (t % 1.0)))
+    return found
+
+
+@pytest.mark.slow
+def test_ros2_stereo(tmp_path):
+    """The node without ROS: images and velocities as ROS has them go in, and poses near the truth come out."""
+    from support.rendered import BASELINE_M, PINHOLE, SIZE, T_CAM_BODY, drive
+
+    module, world = example("ros2_stereo"), rendered(12)
+    module.T_CAM_IMU = T_CAM_BODY
+    published, heard, said = [], {}, []
+    node = SimpleNamespace(
+        create_publisher=lambda kind, topic, depth: SimpleNamespace(publish=published.append),
+        create_subscription=lambda kind, topic, callback, depth: heard.update({topic: callback}),
+        get_logger=lambda: SimpleNamespace(warning=said.append, error=said.append),
+    )
+    kinds = dict.fromkeys(("Image", "CameraInfo", "Imu", "TwistStamped", "PoseWithCovarianceStamped"), Message)
+    slam = module.Slam(node, SimpleNamespace(**kinds), learn=4, delay_s=0.0, queue=12)
+    P = np.hstack([PINHOLE, [[-300.0 * BASELINE_M], [0.0], [0.0]]])
+    heard["right/camera_info"](Message(p=P.ravel().tolist(), width=SIZE[0], height=SIZE[1]))
+    noise = 0.05 * np.random.default_rng(0).standard_normal((12, 6))
+    for k, t in enumerate(world.time_s.tolist()):
+        twist = Message()
+        twist.header.stamp = Message(sec=int(t), nanosec=round(1e9 * (t % 1.0)))
+        for part, values in (("linear", drive(12)[k, :3] + noise[k, :3]), ("angular", drive(12)[k, 3:])):
+            setattr(twist.twist, part, Message(**dict(zip("xyz", values.tolist(), strict=True))))
+        heard["velocities"](twist)
+        for side, image in zip(("left", "right"), world.load(k), strict=True):
+            heard[f"{side}/image_rect"](image_message(image, t))
+        if k == 8:
+            slam.stereo.flush()
+    slam.stereo.flush()
+    slam.stereo.__exit__()
+    assert said == [] and len(published) >= 3 and slam.stereo.live.counts.taken_in == 12
+    T, T_true = slam.stereo.pose().T_world_imu, world.truth.T_world_imu[-1]
+    assert np.linalg.norm(T[:3, 3] - T_true[:3, 3]) < 0.2  # of 5.5 m
+    assert published[-1].header.frame_id == "map" and len(published[-1].pose.covariance) == 36
+    colours = Message(encoding="bgr8", data=bytes(range(24)), height=2, width=4, step=12)
+    assert module.grey(colours)[0, 1] == round(0.114 * 3 + 0.587 * 4 + 0.299 * 5)
+    if importlib.util.find_spec("rclpy") is None:
+        command = [sys.executable, EXAMPLES / "ros2_stereo.py"]
+        alone = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
+        assert alone.returncode == 1 and alone.stderr.startswith("this node needs ROS 2")
+
+
+class Device:
+    """A device of pyrealsense2 that plays images and samples at rest."""
+
+    def __init__(self, world):
+        from support.rendered import BASELINE_M, SIZE
+
+        self.world = world
+        names = SimpleNamespace(infrared="infrared", accel="accel", gyro="gyro")
+        self.stream, self.format = names, SimpleNamespace(y8="y8", motion_xyz_f32="xyz")
+        R_cam_imu = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+        intrinsics = SimpleNamespace(fx=300.0, fy=300.0, ppx=199.5, ppy=99.5, width=SIZE[0], height=SIZE[1])
+        none = SimpleNamespace(rotation=np.eye(3).ravel().tolist(), translation=[-BASELINE_M, 0.0, 0.0])
+        turn = SimpleNamespace(rotation=R_cam_imu.T.ravel().tolist(), translation=[0.1, 0.2, -0.3])
+        video = SimpleNamespace(get_intrinsics=lambda: intrinsics, get_extrinsics_to=lambda other: none)
+        profiles = {
+            "infrared": SimpleNamespace(as_video_stream_profile=lambda: video),
+            "gyro": SimpleNamespace(get_extrinsics_to=lambda other: turn),
+        }
+        profile = SimpleNamespace(get_stream=lambda kind, index=0: profiles[kind])
+        self.config = lambda: SimpleNamespace(enable_stream=lambda *a: None, resolve=lambda pipeline: profile)
+        self.pipeline = lambda: SimpleNamespace(start=self.play, stop=lambda: None)
+
+    def play(self, wanted, on_frame):
+        rng = np.random.default_rng(0)
+        messages = [(0.1 * k, "images", k) for k in range(8)]
+        messages += [(0.005 * i - 0.05, "gyro", 1e-3 * rng.standard_normal(3)) for i in range(170)]
+        messages += [(0.008 * i - 0.06, "accel", [0, 0, 9.81] + 1e-2 * rng.standard_normal(3)) for i in range(120)]
+        for t, kind, value in sorted(messages, key=lambda message: message[0]):
+            images = [SimpleNamespace(get_data=lambda image=image: image) for image in self.world.load(0)]
+            frame = SimpleNamespace(
+                get_timestamp=lambda t=t: 1e3 * (5.0 + t),
+                is_frameset=lambda kind=kind: kind == "images",
+                is_motion_frame=lambda kind=kind: kind != "images",
+                as_frameset=lambda images=images: SimpleNamespace(get_infrared_frame=lambda index: images[index - 1]),
+                as_motion_frame=lambda value=value: SimpleNamespace(
+                    get_motion_data=lambda: SimpleNamespace(**dict(zip("xyz", value, strict=True)))
+                ),
+                get_profile=lambda kind=kind: SimpleNamespace(stream_type=lambda: kind),
+            )
+            on_frame(frame)
+
+
+@pytest.mark.slow
+def test_realsense(tmp_path):
+    """The example on a device that stands still: pose, biases and tilt are those of rest."""
+    module = example("realsense")
+    camera = module.Camera(Device(rendered(2)), learn=4, queue=8)
+    camera.start()
+    camera.stop()
+    camera.stereo.flush()
+    live = camera.stereo.live
+    assert live.is_inertial and live.counts.taken_in == 8 and camera.stereo.skipped == 0
+    pose = live.pose(live.time_s)
+    assert np.linalg.norm(pose.T_world_imu[:3, 3]) < 0.02
+    assert np.abs(pose.T_world_imu[:3, :3] @ [0, 0, 1] - [0, 0, 1]).max() < 0.01
+    value, covariance = live.block("velocity", live.time_s)
+    assert np.linalg.norm(value) < 0.05 and np.linalg.eigvalsh(covariance)[0] > 0
+    if importlib.util.find_spec("pyrealsense2") is None:
+        command = [sys.executable, EXAMPLES / "realsense.py"]
+        alone = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
+        assert alone.returncode == 1 and alone.stderr.startswith("this example needs pyrealsense2")
