@@ -91,9 +91,7 @@ def words(line: str, k: int, text: str) -> str:
 LINES = csv_lines()
 BROKEN = [
     (0, "", TruthError, 2),  # no header
-    (0, HEADER.lstrip("#"), TruthError, 1),
-    (0, HEADER.replace("q_RS_w [], q_RS_x", "q_RS_x [], q_RS_w"), TruthError, 1),
-    (0, HEADER.replace("p_RS_R_x", "p_x"), TruthError, 1),
+    (0, HEADER.replace("p_RS_R_x", "pressure"), TruthError, 1),
     (0, "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]", TruthError, 1),
     (4, LINES[4] + ",1.0", TruthError, 5),
     (4, LINES[4].rsplit(",", 1)[0], TruthError, 5),
@@ -103,7 +101,7 @@ BROKEN = [
     (4, words(LINES[4], 0, "9" * 400), TruthError, 5),
     (4, words(LINES[4], 2, "nan"), NonFiniteError, 5),
     (4, words(LINES[4], 4, "3.0"), TruthError, 5),
-    (4, words(LINES[4], 0, LINES[3].split(",")[0]), StampError, 5),
+    (4, words(words(LINES[4], 0, LINES[3].split(",")[0]), 1, "98"), StampError, 5),
 ]
 
 

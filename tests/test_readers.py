@@ -485,7 +485,7 @@ def test_malformed_truth_files_name_file_and_line(npz, tmp_path, T_cam0_cam):
         (kitti, "1.2x " + kitti[3].split(" ", 1)[1], TruthError),
         (kitti, "2.5 " + kitti[3].split(" ", 1)[1], TruthError),
         (tum, tum[3].rsplit(" ", 1)[0] + " 3.0", TruthError),
-        (tum, tum[2], StampError),
+        (tum, f"{tum[2].split()[0]} {tum[3].split(' ', 1)[1]}", StampError),
     ]
     for lines, replacement, error in cases:
         path = tmp_path / "truth.txt"

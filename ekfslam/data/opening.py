@@ -91,10 +91,11 @@ def _images(place: Source) -> ImageRecording | None:
 def attach_truth(sequence: Sequence, path: Path) -> Sequence:
     """Replace the truth of a sequence by the poses of a file or folder.
 
-    The content decides the format: KITTI odometry, TUM, the csv of EuRoC or a folder with it, or a drive folder of
-    KITTI raw. A pose with a stamp is given to the frame with the nearest stamp, if that is within half the median time
-    step. Without stamps, row i is the pose of frame i. If a recording begins at a later image n of a drive (KITTI), row
-    n is that of its first frame, unless the file of poses was cut there, too (see `truth_of_frames`).
+    The content decides the format: KITTI odometry or KITTI-360, TUM, the csv of EuRoC or a folder with it, or a drive
+    folder of KITTI raw. A header names the columns, if there is one. A pose with a stamp is given to the frame with the
+    nearest stamp, if that is within half the median time step. Without stamps, row i is the pose of frame i. If a
+    recording begins at a later image n of a drive (KITTI), row n is that of its first frame, unless the file of poses
+    was cut there, too (see `truth_of_frames`).
 
     Stamps are compared in seconds as they are stored. If both clocks have different origins, the error names both
     spans. Text after ``#`` is a comment. Extra rows are cut, and missing ones leave frames without truth, with a note.
@@ -130,7 +131,7 @@ def attach_truth(sequence: Sequence, path: Path) -> Sequence:
     return dataclasses.replace(
         sequence,
         truth=truth,
-        notes=(*sequence.notes, note),
+        notes=(*sequence.notes, note, *poses.notes),
         attributes={**sequence.attributes, "truth_checksum_sha256": checksum(*poses.files)},
     )
 

@@ -21,7 +21,7 @@ from ekfslam.evaluation.trajectory import absolute_trajectory_error, distance_al
 from ekfslam.filters.result import REASONS, SANITY, SANITY_SEPARATOR, Result
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
-from ekfslam.models.odometry import missing_velocities
+from ekfslam.models.odometry import missing_velocities, stereo_odometry
 from ekfslam.models.sensors.base import WAITING
 
 _PAIRS = 5000  # observations that are examined; more say the same
@@ -105,7 +105,8 @@ def inspect_sequence(sequence: Sequence) -> Sanity:
     if len(sequence) > 1:
         figures.insert(0, f"median step {np.median(tau[1:]):.4g} s, longest {tau[1:].max():.4g} s")
     if len(sequence) < 2 or not sequence.has_velocities:
-        return Sanity(tuple(figures), (*warnings, *unfilled))
+        by_vision = () if warnings or unfilled else _inspect_truth_by_vision(sequence)
+        return Sanity(tuple(figures), (*warnings, *unfilled, *by_vision))
     speed, turning = (np.linalg.norm(sequence.twist[:, axes], axis=1) for axes in (slice(3), slice(3, 6)))
     path = f"path {float(speed @ tau):.4g} m by velocities"
     if sequence.truth is not None and len(sequence.truth.frame) > 1:
@@ -249,16 +250,24 @@ def _off(sequence: Sequence, points: Array, seen: Array, turns: BoolArray) -> tu
     return float(np.median(parts[0])), float(np.median(parts[-1]))
 
 
-def _inspect_truth(sequence: Sequence) -> list[str]:
-    """Return a warning if the truth moves differently from the velocities, over stretches of some frames."""
+def _inspect_truth_by_vision(sequence: Sequence) -> tuple[str, ...]:
+    """Return a warning if the truth of a recording without velocities moves differently from its stereo odometry."""
+    if sequence.truth is None or sequence.camera.is_monocular or len(_pairs(sequence)[0]) < _LEAST_PAIRS:
+        return ()
+    return tuple(_inspect_truth(sequence, sequence.once(stereo_odometry), "stereo odometry says"))
+
+
+def _inspect_truth(sequence: Sequence, twist: Array | None = None, said: str = "the velocities say") -> list[str]:
+    """Return a warning if the truth moves differently from velocities (T, 6), over stretches of some frames."""
     truth = sequence.truth
     if truth is None or len(truth.frame) <= _WINDOW:
         return []
-    T = se3.inverse(motion.integrate(np.eye(4), sequence.twist, np.diff(sequence.time_s)))[truth.frame]
+    twist = sequence.twist if twist is None else twist
+    T = se3.inverse(motion.integrate(np.eye(4), twist, np.diff(sequence.time_s)))[truth.frame]
     P = truth.T_world_imu
     step, true_step = (se3.inverse(poses[:-_WINDOW]) @ poses[_WINDOW:] for poses in (T, P))
     duration = sequence.time_s[truth.frame[_WINDOW:]] - sequence.time_s[truth.frame[:-_WINDOW]]
-    drift_m, drift_rad = _noise_over_window(sequence)
+    drift_m, drift_rad = _noise_over_window(sequence, twist)
     least_m, least_rad = np.maximum(MOVING_M_S * duration, drift_m), np.full(len(step), max(_LEAST_TURN, drift_rad))
     way = _disagreement(step[:, :3, 3], true_step[:, :3, 3], least_m, drift_m)
     turn = _disagreement(se3.so3_log(step[:, :3, :3]), se3.so3_log(true_step[:, :3, :3]), least_rad, drift_rad)
@@ -266,16 +275,16 @@ def _inspect_truth(sequence: Sequence) -> list[str]:
         return []
     lengths, true_lengths = (np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True) for poses in (step, true_step))
     if way > _OTHER_WAY and _disagreement(lengths, true_lengths, least_m, drift_m) < _SAME_LENGTH:
-        moves = f"it moves as far as the velocities say, but another way ({way:.0%} of it apart)"
+        moves = f"it moves as far as {said}, but another way ({way:.0%} of it apart)"
         return [f"the truth looks like poses of another body than the IMU: {moves}"]
-    moves, turns = f"moves another way than the velocities, {way:.0%}", f"turns otherwise, {turn:.0%}"
+    moves, turns = f"moves another way than {said}, {way:.0%}", f"turns otherwise, {turn:.0%}"
     how = f"{moves if way > turn else turns} of it"
     return [f"the truth looks like that of another recording: over {_WINDOW} frames it {how} apart"]
 
 
-def _noise_over_window(sequence: Sequence) -> tuple[float, float]:
+def _noise_over_window(sequence: Sequence, twist: Array) -> tuple[float, float]:
     """Return bounds on the sum of white velocity noise over a stretch, m and rad: `_SURE` deviations."""
-    changes = np.median(np.abs(np.diff(sequence.twist, axis=0)), axis=0)
+    changes = np.median(np.abs(np.diff(twist, axis=0)), axis=0)
     std = changes / (0.6745 * np.sqrt(2.0)) * np.median(np.diff(sequence.time_s)) * np.sqrt(_WINDOW)
     return _SURE * float(np.linalg.norm(std[:3])), _SURE * float(np.linalg.norm(std[3:]))
 

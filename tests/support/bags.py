@@ -115,11 +115,16 @@ def twist(stamp_ns: int, values: Any, frame: str = "base") -> Callable[[Any], An
     return make
 
 
-def odometry(stamp_ns: int, values: Any, covariance: Any = UNFILLED) -> Callable[[Any], Any]:
+def odometry(
+    stamp_ns: int, values: Any, covariance: Any = UNFILLED, pose: np.ndarray | None = None
+) -> Callable[[Any], Any]:
+    T_odom_base = np.eye(4) if pose is None else pose
+
     def make(types: Any) -> Any:
         inner = types["geometry_msgs/msg/Twist"](linear=vector(types, values[:3]), angular=vector(types, values[3:]))
-        point = types["geometry_msgs/msg/Point"](x=0.0, y=0.0, z=0.0)
-        turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+        point = types["geometry_msgs/msg/Point"](**dict(zip("xyz", T_odom_base[:3, 3].tolist(), strict=True)))
+        quaternion = Rotation.from_matrix(T_odom_base[:3, :3]).as_quat().tolist()
+        turn = types["geometry_msgs/msg/Quaternion"](**dict(zip("xyzw", quaternion, strict=True)))
         pose = types["geometry_msgs/msg/Pose"](position=point, orientation=turn)
         return types["nav_msgs/msg/Odometry"](
             header=header(types, stamp_ns, "odom"),

@@ -34,6 +34,7 @@ from ekfslam.data.readers.messages import (
     frame_of,
 )
 from ekfslam.data.readers.pictures import pair_stamps
+from ekfslam.data.readers.poses import velocities_of
 from ekfslam.data.readers.registry import CALIBRATION, Reader, Source
 from ekfslam.data.readers.text import first_row
 from ekfslam.data.readers.yaml import read_yaml
@@ -187,13 +188,15 @@ def _velocities(bag: Bag) -> tuple[VelocitySamples | None, str, tuple[str, ...]]
     others = [connection.topic for connection in streams if connection.topic != chosen.topic]
     topic = printable(chosen.topic)
     notes = (f"Velocities are those of {topic}.", *(f"Not used: velocities of {printable(name)}." for name in others))
-    rows, frame, covariances = [], "", []
+    rows, frame, covariances, poses = [], "", [], []
     for message in bag.messages(chosen):
         # With covariance a twist is one level further down.
         twist = message.twist if hasattr(message.twist, "linear") else message.twist.twist
         covariances.append(getattr(message.twist, "covariance", np.zeros(36)))
         name = message.child_frame_id if chosen.msgtype == ODOMETRY else message.header.frame_id
         frame = frame or frame_of(name)
+        if chosen.msgtype == ODOMETRY:
+            poses.append(messages.pose_of(message.pose.pose))
         linear, angular = twist.linear, twist.angular
         rows.append([messages.stamp_of(message), linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
     table = np.array(rows, dtype=float).reshape(-1, 7)
@@ -204,7 +207,11 @@ def _velocities(bag: Bag) -> tuple[VelocitySamples | None, str, tuple[str, ...]]
     if len(np.unique(table[:, 0])) < 2:
         raise StampError("all messages have the same stamp", field=topic)
     order, said = in_order_of_stamps(np.column_stack([table[:, 0], np.arange(len(table))]), 0, f"messages of {topic}")
-    table, notes = table[order[:, 1].astype(int)], (*notes, *said)
+    kept = order[:, 1].astype(int)
+    table, notes = table[kept], (*notes, *said)
+    if poses and not table[:, 1:].any() and len(kept) > 2 and not (np.array(poses) == poses[0]).all():
+        stamps, twist, note = velocities_of(table[:, 0], np.array(poses)[kept])
+        return VelocitySamples(str(bag.path), stamps, twist), frame, (*notes, f"The twist of {topic} is 0. {note}")
     std, note = messages.stated_std(np.array(covariances, dtype=float))
     attributes = {TWIST_STD: " ".join(map(repr, std.tolist()))} if std.any() else {}
     notes += (note,) if note else ()

@@ -21,13 +21,14 @@ from ekfslam.data.imu import with_rows
 from ekfslam.data.inertial import InertialRows
 from ekfslam.data.observations import TrueMotion
 from ekfslam.data.readers.calibrations import PairFile, find_chain, kalibr_camera, read_pair
+from ekfslam.data.readers.columns import POSE, header_of, read_named, without_repeats
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
 from ekfslam.data.readers.imu_text import read_imu
 from ekfslam.data.readers.imu_yaml import beside, calibrated, pose_of, read_imu_yaml
 from ekfslam.data.readers.pictures import SUFFIXES, pair_files, pair_stamps
 from ekfslam.data.readers.poses import Poses, stamped_poses, truth_of_frames
 from ekfslam.data.readers.registry import CALIBRATION, Reader, Source
-from ekfslam.data.readers.text import Table, first_row, line_of, parse_table, read_lines, rows_of
+from ekfslam.data.readers.text import Table, first_row, line_of, read_lines, rows_of
 from ekfslam.data.readers.yaml import read_yaml
 from ekfslam.errors import (
     CalibrationError,
@@ -46,7 +47,6 @@ MOTION = (
     *(f"b_w_RS_S_{axis}" for axis in "xyz"),
     *(f"b_a_RS_S_{axis}" for axis in "xyz"),
 )
-_AS_TUM = [0, 1, 2, 3, 5, 6, 7, 4]  # the quaternion with w last
 _FOLDERS = ("state_groundtruth_estimate0", "mocap0")  # mocap0: TUM-VI
 _PLACES = ("data.csv", *(f"{above}{folder}/data.csv" for above in ("", "mav0/") for folder in _FOLDERS))
 
@@ -207,31 +207,27 @@ def find_euroc_truth(folder: Path) -> Path | None:
 def read_euroc(path: Path) -> Poses:
     """Read the poses ``T_R_S`` of the body (the IMU) in the reference frame, from a csv or the csv of a folder.
 
-    They are stamped in ns, with quaternions w first. The header must name these eight columns. Velocities and biases
-    are read if the next nine columns hold them; others are not.
+    The header must name eight columns, as EuRoC (stamps in ns, quaternions w first), OpenVINS or evo do. Velocities
+    and biases are read if the header names them as EuRoC does.
     """
     path = find_euroc_truth(path) or path
     lines = read_lines(path, f"expected {TRUTH.expected}")
-    number, line = next(iter(rows_of(lines, comment=None)), (1, ""))
-    header = [word.split("[")[0].strip() for word in line.removeprefix("#").split(",")]
-    if not line.startswith("#") or tuple(header[: len(COLUMNS)]) != COLUMNS:
+    number, _ = next(iter(rows_of(lines, comment=None)), (1, ""))
+    header = header_of(lines)
+    if header is None or not header.place.keys() >= set(POSE):
         expected = f"expected #{', '.join(COLUMNS)}, ..."
         raise TruthError(f"the header is missing or differs; {expected}", **line_of(path, number))
-    has_motion = tuple(header[len(COLUMNS) : len(COLUMNS) + len(MOTION)]) == MOTION
-    table = parse_table(
-        lines,
-        path,
-        columns=len(header),
-        used=len(COLUMNS) + has_motion * len(MOTION),
-        separator=",",
-        # Nanoseconds since 1970 have more digits than a float; as integers they lose none.
-        converters={0: lambda word: int(word) / 1e9},
-        error=TruthError,
-    )
+    names = [word.split("[")[0].strip() for word in lines[header.line - 1].split(",")]
+    begin = names.index(MOTION[0]) if MOTION[0] in names else -1
+    has_motion = begin >= 0 and tuple(names[begin : begin + len(MOTION)]) == MOTION
+    further = {name: begin + i for i, name in enumerate(MOTION)} if has_motion else {}
+    header = replace(header, place={**header.place, **further})
+    table = read_named(path, lines, header, (*POSE, *further), TruthError)
     if not len(table.values):
         raise UnknownFormatError(f"{path}: holds no poses; expected lines of {', '.join(COLUMNS)}, ...")
-    poses = stamped_poses(Table(path, table.values[:, _AS_TUM], table.line))
-    return replace(poses, motion=TrueMotion(*np.split(table.values[:, 8:17], 3, axis=1))) if has_motion else poses
+    table, notes = without_repeats(table)
+    poses = replace(stamped_poses(Table(path, table.values[:, : len(POSE)], table.line)), notes=notes)
+    return replace(poses, motion=TrueMotion(*np.split(table.values[:, 8:], 3, axis=1))) if further else poses
 
 
 def _has_truth(source: Source) -> bool:

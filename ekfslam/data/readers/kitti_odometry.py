@@ -139,6 +139,24 @@ def _recognises(folder: Path) -> bool:
     return find_pair(folder) is not None or len([word for word in words if not word.endswith(":")]) == _COLUMNS
 
 
+def read_kitti_360(path: Path, sequence: Sequence) -> Poses:
+    """Read poses of KITTI-360: a number of an image, and ``T_world_imu`` (12 numbers) or ``T_world_cam0`` (16)."""
+    lines = read_lines(path, f"expected {POSES_360.expected}")
+    table = parse_table(lines, path, columns=len(first_row(path).split()), error=TruthError)
+    frame = table.values[:, 0]
+    if (frame != np.floor(frame)).any() or (np.diff(frame) <= 0).any() or (frame < 0).any():
+        raise TruthError("the first column is no increasing number of an image", source=str(path), field="line")
+    matrices = table.values[:, 1:13].reshape(-1, 3, 4)
+    T = se3.transform(matrices[:, :, :3], matrices[:, :, 3])
+    try:
+        require_rigid(T, "line", TruthError)
+    except TruthError as error:
+        assert isinstance(error.index, int)
+        raise TruthError(error.message, **table.where(error.index)) from None
+    of_camera = table.values.shape[1] == 17
+    return Poses(T @ sequence.T_cam_imu if of_camera else T, None, (path,), frame=frame.astype(np.int64))
+
+
 IMAGES = Reader(
     "kitti_odometry_images",
     "a folder of KITTI odometry (image_0 image_1 calib.txt times.txt)",
@@ -150,4 +168,10 @@ POSES = Reader(
     f"{_COLUMNS} numbers a line (KITTI odometry)",
     lambda source: len(first_row(source.path).split()) == _COLUMNS,
     truth=lambda source, sequence: read_kitti_odometry(source.path, sequence),
+)
+POSES_360 = Reader(
+    "KITTI-360",
+    "13 or 17 numbers a line (KITTI-360: frame and pose)",
+    lambda source: len(first_row(source.path).split()) in (13, 17) and "," not in first_row(source.path),
+    truth=lambda source, sequence: read_kitti_360(source.path, sequence),
 )

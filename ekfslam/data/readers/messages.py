@@ -256,10 +256,20 @@ def stated_std(covariances: Array) -> tuple[Array, str]:
 
 def transform_of(transform: Any) -> Array:
     """Return the pose (4, 4) of the child frame of a Transform in its parent."""
+    return _rigid(transform.translation, transform.rotation, "tf_static")
+
+
+def pose_of(pose: Any) -> Array:
+    """Return a Pose (4, 4)."""
+    return _rigid(pose.position, pose.orientation, "odometry")
+
+
+def _rigid(t: Any, q: Any, field: str) -> Array:
     from scipy.spatial.transform import Rotation
 
-    t, q = transform.translation, transform.rotation
     quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
+    if not quaternion.any() and field == "odometry":
+        quaternion[3] = 1.0  # never filled in
     if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-3:
-        raise CalibrationError("a transform without a unit quaternion", field="tf_static")
+        raise CalibrationError("a transform without a unit quaternion", field=field)
     return se3.transform(Rotation.from_quat(quaternion).as_matrix(), np.array([t.x, t.y, t.z], dtype=float))

@@ -9,6 +9,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.observations import TrueMotion
+from ekfslam.data.readers.columns import without_repeats
 from ekfslam.data.readers.text import Table
 from ekfslam.data.sequence import Truth
 from ekfslam.data.truth_noise import TruthNoise
@@ -30,6 +31,8 @@ class Poses:
         files: Files that were read.
         noise: Accuracy of the poses; None if the format does not state it.
         motion: Velocities and biases of the same rows; None if the file has none.
+        frame: (F,) number of the image of each row in its drive; None if rows are all images, or have stamps.
+        notes: Facts about the reading.
     """
 
     T_world_imu: Array
@@ -37,19 +40,37 @@ class Poses:
     files: tuple[Path, ...]
     noise: TruthNoise | None = None
     motion: TrueMotion | None = None
+    frame: IntArray | None = None
+    notes: tuple[str, ...] = ()
 
 
 def stamped_poses(table: Table) -> Poses:
     """Return the poses in rows of seconds, metres (3), and a quaternion (4) with w last."""
     from scipy.spatial.transform import Rotation
 
-    table.require_increasing()
+    table, notes = without_repeats(table)
     time_s, position_m, quaternion = table.values[:, 0], table.values[:, 1:4], table.values[:, 4:]
     defect = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0)
     if (defect > _QUATERNION_TOLERANCE).any():
         row = int(np.argmax(defect > _QUATERNION_TOLERANCE))
         raise TruthError(f"not a unit quaternion: its norm is off by {defect[row]:.2g}", **table.where(row))
-    return Poses(se3.transform(Rotation.from_quat(quaternion).as_matrix(), position_m), time_s, (table.path,))
+    return Poses(
+        se3.transform(Rotation.from_quat(quaternion).as_matrix(), position_m), time_s, (table.path,), notes=notes
+    )
+
+
+def velocities_of(time_s: Array, T_world_body: Array) -> tuple[Array, Array, str]:
+    """Return stamps (N-1,) and velocities (N-1, 6) between successive poses, in the body, and a note.
+
+    The velocity of an interval is that of a constant twist between its poses, at the middle of the interval.
+    """
+    step = np.diff(time_s)
+    twist = se3.log(se3.inverse(T_world_body[:-1]) @ T_world_body[1:]) / step[:, None]
+    note = (
+        f"Velocities are differences of {len(time_s)} poses. Nothing states their noise: it is estimated like that of "
+        "other velocities. A constant offset or drift of the poses is in it, jumps are not."
+    )
+    return time_s[:-1] + 0.5 * step, twist, note
 
 
 def truth_of_frames(time_s: Array, poses: Poses, first: int = 0) -> Truth:
@@ -58,6 +79,9 @@ def truth_of_frames(time_s: Array, poses: Poses, first: int = 0) -> Truth:
     Without stamps, row ``first`` is the pose of the first frame, unless the file was cut there, too: it has as many
     rows as there are frames, or does not begin with the identity, as whole files do.
     """
+    if poses.frame is not None:
+        known = np.flatnonzero((poses.frame >= first) & (poses.frame < first + len(time_s)))
+        return Truth(poses.frame[known] - first, poses.T_world_imu[known], noise=poses.noise)
     if poses.time_s is None:
         is_whole = not len(poses.T_world_imu) or bool(np.abs(poses.T_world_imu[0] - np.eye(4)).max() < _SAME_POSE)
         begin = first if is_whole and len(poses.T_world_imu) != len(time_s) else 0

@@ -49,7 +49,7 @@ def read_lines(path: Path, expected: str) -> list[str]:
     """Return the lines of a text file."""
     try:
         require_file(path, is_text=True)
-        return path.read_text(encoding="utf-8").splitlines()
+        return path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError, UnknownFormatError) as error:
         raise UnknownFormatError(f"{path}: not a readable text file ({error}); {expected}") from None
 
@@ -66,7 +66,7 @@ def first_row(path: Path, comment: str | None = "#") -> str:
     """Return the first line that holds more than a comment, without that; empty if there is none, or no text file."""
     try:
         require_file(path, is_text=True)
-        with path.open(encoding="utf-8", errors="replace") as file:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
             return next((content for _, content in rows_of(file, comment)), "")
     except (OSError, UnknownFormatError):
         return ""

@@ -6,14 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ekfslam.data.readers.poses import Poses, stamped_poses
+from ekfslam.data.inputs import VelocitySamples
+from ekfslam.data.readers.columns import POSE, header_of, read_named
+from ekfslam.data.readers.fields import checksum
+from ekfslam.data.readers.poses import Poses, stamped_poses, velocities_of
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
-from ekfslam.data.sequence import Sequence
 from ekfslam.data.trajectory import Moving, Trajectory
-from ekfslam.errors import ShapeError, TruthError
+from ekfslam.errors import DataError, LineError, LostDataError, ShapeError, TruthError
 
 COLUMNS = ("time", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
+_WIDTHS = (8, 20, 29, 44)  # alone, with covariances of rotation and position, with a triangle, with all 36
 AXES = ("x", "y", "z", "rx", "ry", "rz")  # position, then rotation, along the axes of world
 UPPER = np.triu_indices(len(AXES))
 COVARIANCE = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER, strict=True))
@@ -41,7 +44,7 @@ def read_trajectory(path: str | Path, *, frame: Moving = "body") -> Trajectory:
         DataError: A line is malformed, or the stamps of the two files differ; the subclass says how.
     """
     path = Path(path)
-    poses = stamped_poses(parse_table(read_lines(path, f"expected {READER.expected}"), path, columns=len(COLUMNS)))
+    poses = _read(path)
     assert poses.time_s is not None
     beside = covariance_path(path)
     if not beside.is_file():
@@ -57,14 +60,41 @@ def read_trajectory(path: str | Path, *, frame: Moving = "body") -> Trajectory:
     return Trajectory(poses.time_s, poses.T_world_imu, covariance, frame)
 
 
+def _read(path: Path, error: type[DataError] = LineError) -> Poses:
+    """Read the eight columns, by their header if it names all columns of the file."""
+    lines = read_lines(path, f"expected {READER.expected}")
+    header, width = header_of(lines), _width(path)
+    if header is not None and header.count == width and header.place.keys() >= set(POSE):
+        return stamped_poses(read_named(path, lines, header, POSE, error))
+    return stamped_poses(parse_table(lines, path, columns=width, used=len(COLUMNS), error=error))
+
+
+def _width(path: Path) -> int:
+    """Return the number of columns of a file: eight, or more with a covariance (12, 21 or 36 numbers)."""
+    width = len(first_row(path).split())
+    return width if width in _WIDTHS else len(COLUMNS)
+
+
 def _recognises(source: Source) -> bool:
     row = first_row(source.path)
-    return len(row.split()) == len(COLUMNS) and "," not in row
+    return len(row.split()) in _WIDTHS and "," not in row
 
 
-def _truth(source: Source, sequence: Sequence) -> Poses:
-    lines = read_lines(source.path, f"expected {READER.expected}")
-    return stamped_poses(parse_table(lines, source.path, columns=len(COLUMNS), error=TruthError))
+def _inputs(source: Source) -> VelocitySamples:
+    """Return the velocities between poses of an odometry."""
+    poses = _read(source.path)
+    assert poses.time_s is not None
+    if len(poses.time_s) < 3:
+        raise LostDataError(f"{len(poses.time_s)} poses; three are needed for velocities", source=str(source.path))
+    time_s, twist, note = velocities_of(poses.time_s, poses.T_world_imu)
+    attributes = {"velocities_sha256": checksum(source.path)}
+    return VelocitySamples(str(source.path), time_s, twist, attributes=attributes, notes=(*poses.notes, note))
 
 
-READER = Reader("TUM", f"{len(COLUMNS)} numbers a line (TUM: {' '.join(COLUMNS)})", _recognises, truth=_truth)
+READER = Reader(
+    "TUM",
+    f"{len(COLUMNS)} numbers a line (TUM: {' '.join(COLUMNS)}), with a covariance or without",
+    _recognises,
+    truth=lambda source, _: _read(source.path, TruthError),
+    inputs=_inputs,
+)

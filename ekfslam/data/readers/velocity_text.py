@@ -1,26 +1,42 @@
 """Text files of velocities, one sample a line: seconds, three linear and three angular velocities (m/s, rad/s).
 
-Columns are separated by blanks, as in files of TUM, or by commas. A comment line ``# frame: level`` (or ``imu``) states
-the frame of the velocities.
+Columns are separated by blanks, as in files of TUM, or by commas. Three columns are ``time vx wz`` of a planar robot.
+A header may name columns in any order; velocities that it does not name are 0. A comment line ``# frame: level`` (or
+``imu``) states the frame of the velocities.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
+from pathlib import Path
 from typing import cast, get_args
 
+import numpy as np
+
 from ekfslam.data.inputs import VelocityFrame, VelocitySamples
+from ekfslam.data.readers.columns import TWIST, Header, header_of, read_named, without_repeats
 from ekfslam.data.readers.fields import checksum
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
 from ekfslam.errors import ConfigError, UnknownFormatError
 
 COLUMNS = ("time", "vx", "vy", "vz", "wx", "wy", "wz")
+PLANAR = ("time", "vx", "wz")  # of a robot with wheels; the others are 0
 _FRAME_LINE = re.compile(r"#\s*frame\s*[:=]\s*(\S+)\s*", re.IGNORECASE)
 
 
 def _recognises(source: Source) -> bool:
-    return len(first_row(source.path).replace(",", " ").split()) == len(COLUMNS)
+    count = len(first_row(source.path).replace(",", " ").split())
+    return count in (len(COLUMNS), len(PLANAR)) or _header(source.path) is not None
+
+
+def _header(path: Path) -> Header | None:
+    """Return a header that names velocities."""
+    if not first_row(path):
+        return None
+    header = header_of(read_lines(path, f"expected {READER.expected}"))
+    return header if header is not None and {"vx", "wz"} <= header.place.keys() else None
 
 
 def _inputs(source: Source) -> VelocitySamples:
@@ -35,20 +51,35 @@ def _inputs(source: Source) -> VelocitySamples:
             rows[number] = ""
     if stated and stated not in get_args(VelocityFrame):
         raise ConfigError(f"{path}: the frame of velocities must be imu or level, found {stated!r}")
-    separator = "," if "," in "".join(row.split("#")[0] for row in rows) else None
-    table = parse_table(rows, path, columns=len(COLUMNS), separator=separator)
+    if (header := _header(path)) is not None:
+        table = read_named(path, lines, header, TWIST)
+    else:
+        separator = "," if "," in "".join(row.split("#")[0] for row in rows) else None
+        is_planar = len(first_row(path).replace(",", " ").split()) == len(PLANAR)
+        table = parse_table(rows, path, columns=len(PLANAR if is_planar else COLUMNS), separator=separator)
+        if is_planar:
+            planar = np.zeros((len(table.values), len(COLUMNS)))
+            planar[:, [0, 1, 6]] = table.values
+            table = replace(table, values=planar)
     if not len(table.values):
         raise UnknownFormatError(f"{path}: holds no velocities; expected {READER.expected}")
-    table.require_increasing()
+    table, repeated = without_repeats(table)
     frame = cast(VelocityFrame, stated or "imu")
-    notes = () if stated else (f"{path.name} does not say in which frame its velocities are: they are taken as imu.",)
+    notes = (
+        repeated
+        if stated
+        else (
+            *repeated,
+            f"{path.name} does not say in which frame its velocities are: they are taken as imu.",
+        )
+    )
     attributes = {"velocities_sha256": checksum(path)}
     return VelocitySamples(str(path), table.values[:, 0], table.values[:, 1:], frame, None, attributes, notes)
 
 
 READER = Reader(
     "velocities",
-    f"a text file of {' '.join(COLUMNS)} (s, m/s, rad/s; blanks or commas)",
+    f"a text file of {' '.join(COLUMNS)} or {' '.join(PLANAR)} (s, m/s, rad/s; blanks or commas)",
     _recognises,
     inputs=_inputs,
 )
