@@ -136,3 +136,12 @@ def test_another_recording_takes_the_samples_of_a_bag(tmp_path):
     sequence = synthetic_sequence(frames=5)
     sequence = dataclasses.replace(sequence, time_s=(FIRST_NS + STEP_NS * np.arange(5)) / 1e9, inputs=())
     assert len(attach_inertial(sequence, path).inertial.time_s) == COUNT
+
+
+def test_messages_without_stamps_have_the_time_of_writing(tmp_path):
+    bag = pair()
+    for k in range(COUNT):
+        bag.add("/imu/data", KIND, int(TIME_NS[k]), imu(0, GYRO[k], ACCEL[k]))
+    found = opened(write(tmp_path, bag))
+    np.testing.assert_allclose(found.inertial.time_s, (TIME_NS + 7_000_000) / 1e9, atol=3e-7)  # see `support.bags`
+    assert "Messages of /imu/data have no stamps: the times of writing are taken." in found.notes

@@ -13,7 +13,7 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.inertial import InertialRows, in_order
 from ekfslam.data.inputs import VelocitySamples, linear
-from ekfslam.data.readers.imu_yaml import beside, calibrated, read_imu_yaml
+from ekfslam.data.readers.imu_yaml import NAMES, beside, calibrated, read_imu_yaml
 from ekfslam.data.readers.messages import IMU, Bag, frame_of
 from ekfslam.data.sequence import TWIST_STD
 from ekfslam.errors import LostDataError
@@ -89,25 +89,37 @@ def _samples(bag: Bag, gyro: _Stream, accel: _Stream) -> tuple[InertialRows, str
     rows, frame = _rows(bag, gyro)
     if accel is not gyro:
         rows = _paired(rows, _rows(bag, accel)[0])
-    calibration = beside(bag.path if bag.path.is_dir() else bag.path.parent) or beside(bag.path.parent)
+    calibration = beside_bag(bag.path, NAMES)
     if calibration is not None:
         rows = calibrated(rows, read_imu_yaml(calibration))
     return rows, frame
 
 
+def beside_bag(path: Path, names: tuple[str, ...]) -> Path | None:
+    """Return the first file with one of some names in the folder of a bag, or beside it."""
+    return (beside(path, names) if path.is_dir() else None) or beside(path.parent, names)
+
+
 def _rows(bag: Bag, stream: _Stream) -> tuple[InertialRows, str]:
     stamps: list[int] = []
+    times: list[int] = []
     table: list[list[float]] = []
     frame = ""
-    for _, content in bag.raw(stream.connection):
+    for written_ns, content in bag.raw(stream.connection):
         message = bag.message(stream.connection, content)
         w, f = message.angular_velocity, message.linear_acceleration
         frame = frame or frame_of(message.header.frame_id)
         stamps.append(bag.stamp_ns(content))
+        times.append(written_ns)
         table.append([w.x, w.y, w.z, f.x, f.y, f.z])
     values, topic = np.array(table, dtype=float).reshape(-1, 6), printable(stream.topic)
     known = np.isfinite(values).all(axis=1)
-    notes = () if known.all() else (f"{int((~known).sum())} samples of {topic} are NaN or infinite: they are dropped.",)
+    notes: tuple[str, ...] = ()
+    notes = (
+        notes if known.all() else (f"{int((~known).sum())} samples of {topic} are NaN or infinite: they are dropped.",)
+    )
+    if not any(stamps):
+        stamps, notes = times, (*notes, f"Messages of {topic} have no stamps: the times of writing are taken.")
     time_ns, values = np.array(stamps, dtype=np.int64)[known], values[known]
     rows = InertialRows(f"{bag.path}: {topic}", time_ns, values[:, :3], values[:, 3:], sorts=True, notes=notes)
     return rows, frame

@@ -20,10 +20,10 @@ from ekfslam.data.inertial import InertialRows
 from ekfslam.data.inputs import VelocitySamples
 from ekfslam.data.readers import messages
 from ekfslam.data.readers.bag_cameras import Camera, in_order_of_stamps, pair_of, places_of
-from ekfslam.data.readers.bag_imu import imu_of_bag, inertial_of, velocities_of_unit
+from ekfslam.data.readers.bag_imu import beside_bag, imu_of_bag, inertial_of, velocities_of_unit
 from ekfslam.data.readers.calibrations import PairFile
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
-from ekfslam.data.readers.imu_yaml import CHAINS, beside, chain_of, late_s
+from ekfslam.data.readers.imu_yaml import CHAINS, chain_of, late_s
 from ekfslam.data.readers.messages import (
     COMPRESSED,
     IMAGE,
@@ -165,7 +165,7 @@ def _unit(bag: Bag, left: Camera, frame: str, file: PairFile | None) -> tuple[Ar
         return file.T_cam_imu, file.late_s, (f"T_cam_imu is that of {file.files[0].name}.",)
     T = np.eye(4) if frame and frame == left.frame else _transform(bag, left.frame, frame) if frame else None
     late, notes = 0.0, tuple[str, ...]()
-    chain = beside(bag.path.parent, CHAINS)
+    chain = beside_bag(bag.path, CHAINS)
     if chain is not None:
         read = read_yaml(chain)
         late = late_s(read, "cam0")

@@ -37,7 +37,7 @@ _SAME = {"nsec": "ns", "sec": "s", "seconds": "s"}
 _RATES_HZ = 20.0, 8000.0  # of inertial units: at one of them a step tells the unit of stamps
 _KIND = (
     ("", re.compile(r"cov|angular_?acc|orient|mag|temp|quat|seq")),
-    ("gyro", re.compile(r"gyro|gyr$|omega|ang|(^|_)(w|g)(_|$)")),
+    ("gyro", re.compile(r"gyro|gyr$|omega|ang|rot_?rate|(^|_)(w|g)(_|$)")),
     ("accel", re.compile(r"acc|force|(^|_)(a|f)(_|$)")),
 )
 _WANTED = ("time", *(f"{kind} {axis}" for kind in ("gyro", "accel") for axis in "xyz"))
