@@ -117,6 +117,49 @@ def alone(path: str | Path) -> Iterator[None]:
         os.close(folder)
 
 
+@contextmanager
+def claimed(path: str | Path) -> Iterator[None]:
+    """Claim a file for one writer, from reading to the end of writing. An empty file is removed at the end.
+
+    Raises:
+        WriteError: Another process or thread has claimed it, or it cannot be written.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = _locked(path)
+    except BlockingIOError:
+        raise WriteError(f"{path}: another run is writing there; wait for its end, or choose another folder") from None
+    except OSError as error:
+        raise WriteError(f"{path}: cannot be written: {error.strerror or error}") from None
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            if path.stat().st_size == 0:
+                path.unlink()
+        os.close(file)
+
+
+def _locked(path: Path) -> int:
+    """Open and lock a file; `BlockingIOError` if somebody else has."""
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if fcntl is None or os.path.samestat(os.fstat(file), path.stat()):
+                return file
+        except FileNotFoundError:
+            pass  # its owner has removed it in between: a new one is free
+        except OSError as error:
+            os.close(file)
+            if isinstance(error, BlockingIOError):
+                raise
+            return os.open(path, os.O_RDONLY)  # a file system without locks: no caller is told
+        os.close(file)
+
+
 def _target(path: str | Path) -> Path:
     """Return the file at the end of all symbolic links."""
     try:

@@ -20,7 +20,7 @@ from support.running import processes
 from ekfslam import open_sequence
 from ekfslam.cli import main
 from ekfslam.config import Config
-from ekfslam.errors import ArchiveError, ConfigError
+from ekfslam.errors import ArchiveError, ConfigError, WriteError
 from ekfslam.evaluation.summary import KEYS, summarise
 from ekfslam.figures.sweep import plot_sweep
 from ekfslam.runner import run
@@ -466,3 +466,35 @@ def test_xarray_opens_the_table(tmp_path, undisturbed):
         assert found["ate_m"].dims == ("run",)
         np.testing.assert_array_equal(found["ate_m"], undisturbed.columns["ate_m"])
         assert set(undisturbed.columns) == set(found.data_vars)
+
+
+def test_a_second_sweep_into_the_same_table_is_told_and_loses_nothing(tmp_path):
+    path, other = tmp_path / "sweep.h5", Sweep((Recording("builtin:loop?frames=5", "loop"),))
+    sweep = Sweep((Recording("builtin:city?frames=5", "city"),))
+
+    class Meanwhile:
+        """An executor during whose first run another sweep begins."""
+
+        def submit(self, function, *arguments):
+            with pytest.raises(WriteError, match="another run is writing there"), open_executor("serial") as executor:
+                run_sweep(other, path, executor)
+            with open_executor("serial") as executor:
+                return executor.submit(function, *arguments)
+
+    table = run_sweep(sweep, path, Meanwhile())
+    assert len(table.rows()) == 1 and [p.name for p in tmp_path.iterdir()] == ["sweep.h5"]
+    with pytest.raises(ArchiveError, match="holds runs of another study"), open_executor("serial") as executor:
+        run_sweep(other, path, executor)
+    assert read_table(path).rows() == table.rows()
+
+
+def test_contents_of_folders_and_of_files_that_a_description_names_decide_a_run(tmp_path):
+    (tmp_path / "left").mkdir()
+    image, calib = tmp_path / "left" / "0.png", tmp_path / "calibration.toml"
+    calib.write_text('left = "left"\n')
+    found = set()
+    for data in (tmp_path, calib):
+        for content in (b"a", b"b"):  # equal in size
+            image.write_bytes(content)
+            found.add(Recording(str(data), "images").content)
+    assert len(found) == 4

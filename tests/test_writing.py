@@ -93,7 +93,7 @@ def test_what_is_no_place_for_a_file_is_refused_before_the_work(tmp_path, capsys
     os.mkfifo("fifo")
     Path("file").touch()
     before = sorted(path.name for path in tmp_path.iterdir())
-    monkeypatch.setattr("ekfslam.cli.commands.run.run", lambda *_: pytest.fail("the work was done"))
+    monkeypatch.setattr("ekfslam.cli.commands.run.run_modes", lambda *_: pytest.fail("the work was done"))
     assert main(["run", CITY, *QUICK, "--out", place]) == 2
     assert "cannot be written" in one_line(capsys)
     assert sorted(path.name for path in tmp_path.iterdir()) == before

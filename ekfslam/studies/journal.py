@@ -11,12 +11,14 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ekfslam import files
 from ekfslam.errors import ArchiveError, WriteError
 from ekfslam.progress import progress as with_progress
 from ekfslam.studies.executors import completed
@@ -81,6 +83,14 @@ class Journal:
     def __init__(self, archive: Path, study: Any, blank: Callable[[str], Record]) -> None:
         self.path, self.blank = archive.with_name(f".{archive.name}.journal"), blank
         self._heading = json.dumps(study, sort_keys=True).encode()
+
+    def claimed(self) -> AbstractContextManager[None]:
+        """Claim journal and archive, from reading to the end of writing.
+
+        Raises:
+            WriteError: Another study or sweep writes there.
+        """
+        return files.claimed(self.path)
 
     def entries(self) -> Iterator[tuple[Key, Record]]:
         """Yield key and record of each run, up to the first incomplete entry.

@@ -346,12 +346,10 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
     Raises:
         ArchiveError: ``path`` holds another study (the message names the difference), is no archive of a study, or
             cannot be written.
+        WriteError: Another study writes there.
     """
     path = Path(path)
     archive = StudyArchive.empty(study)
-    if path.exists():
-        _take_over(archive, path)
-    before = archive.runs
     decides = {**study.parameters, "runs": None, **versions()}
     journal = Journal(
         path, decides, lambda level: {variant: _blank(study.levels[level].frames) for variant in study.variants}
@@ -365,13 +363,17 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
         if archive.runs > before:
             write_study(path, archive)
 
-    tasks = {
-        (level, run): (study, level, run)
-        for run in range(study.runs)
-        for level in study.levels
-        if not archive.done[level][run]
-    }
-    run_missing(journal, tasks, lambda task: executor.submit(run_one, *task), keep, save, "consistency", progress)
+    with journal.claimed():
+        if path.exists():
+            _take_over(archive, path)
+        before = archive.runs
+        tasks = {
+            (level, run): (study, level, run)
+            for run in range(study.runs)
+            for level in study.levels
+            if not archive.done[level][run]
+        }
+        run_missing(journal, tasks, lambda task: executor.submit(run_one, *task), keep, save, "consistency", progress)
     return archive
 
 

@@ -20,13 +20,14 @@ import tomllib
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import ekfslam
 from ekfslam.config import MODES, VARIANTS, Config, FrontEndConfig
 from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.sequence import Sequence, stretch
@@ -150,7 +151,7 @@ class Task:
     @cached_property
     def key(self) -> str:
         """Digest of everything that decides its numbers, as 64 hexadecimal digits."""
-        facts: list[Any] = [self.recording.content, self.mode, dataclasses.asdict(self.config), versions()]
+        facts: list[Any] = [self.recording.content, self.mode, dataclasses.asdict(self.config), versions(), _program()]
         if self.recording.prepare is not None:
             facts.append(self.seed)
         if self.columns:
@@ -252,6 +253,7 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
 
     Raises:
         ArchiveError: ``path`` holds runs that are not part of this sweep, or cannot be written.
+        WriteError: Another sweep writes there.
     """
     path = Path(path)
     tasks = {(task.key, 0): task for task in sweep.tasks}
@@ -260,7 +262,7 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
     def keep(key: Key, record: Record) -> None:
         if key not in tasks:
             raise ArchiveError(
-                f"{path} holds runs of another study, of other recordings or of another release; move it away or "
+                f"{path} holds runs of another study, of other recordings or of another build; move it away or "
                 "choose another folder"
             )
         done[key] = record["run"]
@@ -269,14 +271,16 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
         if done:
             write_table(path, _table(sweep, done))
 
-    if path.exists():
-        for row in read_table(path).rows():
-            keep((row["key"], 0), _record(sweep.columns, row, row["error"]))
     journal = Journal(path, "sweep", lambda _: _record(sweep.columns, {}))
-    missing = {key: task for key, task in tasks.items() if key not in done}
-    run_missing(
-        journal, missing, lambda task: executor.submit(run_task, task, limit_gb()), keep, save, "sweep", progress
-    )
+    with journal.claimed():
+        if path.exists():
+            for row in read_table(path).rows():
+                keep((row["key"], 0), _record(sweep.columns, row, row["error"]))
+        missing = {key: task for key, task in tasks.items() if key not in done}
+        limit = limit_gb()
+        run_missing(
+            journal, missing, lambda task: executor.submit(run_task, task, limit), keep, save, "sweep", progress
+        )
     return _table(sweep, done)
 
 
@@ -409,12 +413,33 @@ def _source(value: Any) -> str:
         ) from None
 
 
-@lru_cache(maxsize=256)
 def _digest(path: Path) -> str:
-    """Return the digest of a file, or of the names and sizes in a folder."""
+    """Return the digest of a file, or of all files in a folder; of a TOML file also that of the paths it names."""
     if path.is_dir():
-        listed = [f"{p.relative_to(path)} {p.stat().st_size}" for p in sorted(path.rglob("*")) if p.is_file()]
-        return hashlib.sha256("\n".join(listed).encode()).hexdigest()
+        inside = [f"{p.relative_to(path)} {_digest_of_file(p)}" for p in sorted(path.rglob("*")) if p.is_file()]
+        return hashlib.sha256("\n".join(inside).encode()).hexdigest()
     require_file(path)
+    named = [path.parent / text for text in _texts_in(path)] if path.suffix == ".toml" else []
+    return " ".join([_digest_of_file(path), *(_digest(other) for other in named if other.exists() and other != path)])
+
+
+def _texts_in(path: Path) -> list[str]:
+    """Return the texts in the first level of a TOML file; of a damaged one, which the run will name, none."""
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8")).values()
+    except (OSError, ValueError, RecursionError):
+        return []
+    return [value for value in values if isinstance(value, str) and value and "\0" not in value]
+
+
+def _digest_of_file(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@cache
+def _program() -> str:
+    """Return the digest of the sources and the compiled module of this program."""
+    folder = Path(ekfslam.__file__).parent
+    own = sorted(p for ending in ("*.py", "*.so", "*.pyd") for p in folder.rglob(ending))
+    return hashlib.sha256("".join(_digest_of_file(p) for p in own).encode()).hexdigest()
