@@ -16,6 +16,7 @@ from ekfslam import open_sequence
 from ekfslam.config import Config, FilterConfig
 from ekfslam.data.simulate import builtin
 from ekfslam.engine import choice
+from ekfslam.errors import DataError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.live import LiveEKF
 from ekfslam.filters.loop import one_thread, run_filter
@@ -259,12 +260,12 @@ def test_an_impossible_covariance_is_refused(value):
 @pytest.mark.parametrize(
     ("ids", "pixels", "words"),
     [
-        (np.array([3, 3]), np.ones((2, 4)), "distinct"),
-        (np.array([3]), np.ones((2, 4)), "one row"),
-        (np.array([3]), np.ones((1, 2)), "one row"),
+        (np.array([3, 3]), np.ones((2, 4)), "observed twice"),
+        (np.array([3]), np.ones((2, 4)), "expected shape 1"),
+        (np.array([3]), np.ones((1, 2)), "expected 4 numbers"),
     ],
 )
 def test_arguments_of_a_wrong_shape_are_refused(ids, pixels, words):
     problem = resolve(builtin("city?frames=3"))
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(DataError, match=words):
         filter_of(problem, "engine").update(0, ids, pixels)

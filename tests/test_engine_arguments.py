@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.compiled import Case, compiled
+from support.compiled import Case, arguments, compiled
+from support.predicting import inertial_filters, walking_filters
 
 engine = pytest.importorskip("ekfslam.engine._engine", reason="the engine is not built")
+from ekfslam.engine.face import Engine, process_of  # noqa: E402
 from ekfslam.errors import EkfslamError  # noqa: E402
 
 NAMED = (TypeError, ValueError, IndexError, KeyError, OverflowError, RuntimeError, MemoryError, EkfslamError)
@@ -144,3 +146,219 @@ def test_clones_of_columns_that_are_not_there_are_refused(made, arguments):
 def test_an_impossible_number_of_considered_columns_is_refused(made, columns):
     with pytest.raises(ValueError, match=r"columns.* must be among"):
         made[1].copy().consider(columns)
+
+
+def test_landmarks_that_were_revived_and_not_adopted_are_named(made):
+    filter_ = made[1].copy()
+    filter_.revive(filter_.table())
+    for call in (filter_.covariance, filter_.landmark_blocks, lambda: filter_.rest(9, np.array([1]))):
+        with pytest.raises(ValueError, match="adopt must follow"):
+            call()
+
+
+# --- the constructor --------------------------------------------------------------------------------------------------
+
+
+def settings_of_filter():
+    """Return the arguments of a `Filter`."""
+    e, _ = Case().estimate(np.eye(4), np.random.default_rng(2))
+    return arguments(e)
+
+
+ODD = [
+    None,
+    -1,
+    2**40,
+    2**70,
+    1.5,
+    np.nan,
+    np.inf,
+    True,
+    "text",
+    [],
+    {},
+    np.ones(3),
+    np.ones((9, 9)),
+    np.full(3, np.nan),
+]
+
+
+@pytest.mark.parametrize("place", range(8))
+def test_each_argument_of_the_constructor_may_be_anything(place):
+    given = settings_of_filter()
+    for odd in ODD:
+        attempt(engine.Filter, *given[:place], odd, *given[place + 1 :])
+    if isinstance(given[place], dict):
+        for key in given[place]:
+            for odd in ODD:
+                attempt(engine.Filter, *given[:place], given[place] | {key: odd}, *given[place + 1 :])
+            left = {name: value for name, value in given[place].items() if name != key}
+            with pytest.raises(KeyError):
+                engine.Filter(*given[:place], left, *given[place + 1 :])
+
+
+@pytest.mark.parametrize("which", range(4))
+def test_each_entry_of_a_block_may_be_anything(which):
+    blocks, *others = settings_of_filter()
+    for key in blocks[which]:
+        for odd in ODD:
+            changed = [{**block, key: odd} if i == which else block for i, block in enumerate(blocks)]
+            attempt(engine.Filter, changed, *others)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"at": 1}, "must follow"),
+        ({"value_at": 3}, "must follow"),
+        ({"size": 5}, "six columns"),
+        ({"kind": "direction"}, "another size"),
+        ({"name": "view"}, "first block"),
+    ],
+)
+def test_blocks_that_do_not_fit_are_named(change, words):
+    blocks, *others = settings_of_filter()
+    with pytest.raises(ValueError, match=words):
+        engine.Filter([{**blocks[0], **change}, *blocks[1:]], *others)
+
+
+# --- predictions ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def predicting():
+    """Return a filter of each kind that predicts in C++, with the arguments of its `set_process`."""
+    made = []
+    for ekf in (inertial_filters()[0], walking_filters(True)[0]):
+        laws = [block.as_data() for block in ekf.model.layout.blocks]
+        made.append((Engine(ekf.model, ekf.config).filter, laws, process_of(ekf.model)))
+    return made
+
+
+@pytest.mark.parametrize("kind", range(2))
+def test_each_entry_of_a_process_may_be_anything(predicting, kind):
+    filter_, laws, settings = predicting[kind]
+    for odd in ODD:
+        attempt(filter_.copy().set_process, laws, odd)
+        attempt(filter_.copy().set_process, odd, settings)
+        for key in settings:
+            other = filter_.copy()
+            attempt(other.set_process, laws, settings | {key: odd})
+            attempt(other.predict, 0.1, np.array([0.1]), np.ones((1, 6)), False, 1.0)
+        for i in range(len(laws)):
+            for key in laws[i]:
+                other = filter_.copy()
+                attempt(other.set_process, [*laws[:i], {**laws[i], key: odd}, *laws[i + 1 :]], settings)
+                attempt(other.predict, 0.1, np.array([0.1]), np.ones((1, 6)), False, 1.0)
+
+
+@pytest.mark.parametrize("kind", range(2))
+def test_each_argument_of_a_prediction_may_be_anything(predicting, kind):
+    filter_ = predicting[kind][0]
+    fits = [0.1, np.array([0.04, 0.06]), np.ones((2, 6)), False, 1.0]
+    misaligned = np.frombuffer(bytes(8 * 12 + 1), dtype=np.uint8)[1:].view(float).reshape(2, 6)
+    filter_.copy().predict(*fits)
+    filter_.copy().predict(*fits[:2], misaligned, *fits[3:])
+    filter_.copy().predict(*fits[:2], np.ones((4, 12))[::2, ::2], *fits[3:])
+    for place in range(5):
+        for odd in (*ODD, *MATRICES, -1.0, 1e300):
+            attempt(filter_.copy().predict, *fits[:place], odd, *fits[place + 1 :])
+
+
+# --- the covariance ---------------------------------------------------------------------------------------------------
+
+BODY, VIEW, PREVIOUS = 24, 6, 12
+
+
+def covariance_of_two():
+    """Return a covariance with two landmarks, and arguments that fit its verbs."""
+    rng = np.random.default_rng(0)
+    P = engine.Gaussian(np.eye(BODY), VIEW, PREVIOUS)
+    Y = np.zeros((6, BODY))
+    Y[:, :6] = np.eye(6)
+    P.propagate(np.eye(BODY), 0.01 * np.eye(BODY))
+    P.open_view(Y)
+    width = P.lead[-1]
+    P.augment(rng.normal(size=(2, 3, width)), np.stack([np.eye(3)] * 2))
+    rows = [[1, 0], rng.normal(size=(2, 3, width)), rng.normal(size=(2, 3, 3)), np.ones((2, 3)), np.ones((2, 3))]
+    return P, Y, width, rows
+
+
+def verbs(P, Y, width, rows):
+    """Return the arguments that fit each verb, by name."""
+    at = P.project(*rows)
+    solution = P.solve(at)
+    square, blocks = np.eye(BODY), np.stack([np.eye(3)] * 2)
+    return {
+        "project": rows,
+        "solve": [at],
+        "without": [solution, [True, False]],
+        "solve_body": [np.ones((2, BODY)), np.ones(2), np.ones(2)],
+        "correction": [solution],
+        "given_others": [solution, [1]],
+        "information": [solution, np.ones((6, 2))],
+        "apply": [solution],
+        "propagate": [square, square],
+        "open_view": [Y, Y],
+        "add_noise": [square],
+        "augment": [np.ones((2, 3, width)), blocks],
+        "transform_body": [VIEW, np.eye(6)],
+        "transform_landmarks": [[1, 0], blocks, np.ones((2, 3, 6)), VIEW],
+        "rest": [[True, False]],
+        "marginalise": [[True, False]],
+        "replace": [np.eye(BODY + 6)],
+        "consider": [2],
+        "clone": [0, 0, BODY],
+        "covariance_of": [[0, 1]],
+        "landmark_blocks": [[1]],
+    }
+
+
+CUBES = [np.ones((2, 3, 40)), np.ones((2, 2, 3)), np.ones((1, 3, 3)), np.empty((0, 3, 6)), np.full((2, 3, 6), np.nan)]
+CUBES += [np.ones((4, 6, 12))[::2, ::2, ::2], np.ones((2, 3, 6), dtype=np.float32)]
+FLAGS = [[True], [True] * 3, [], [0, 5], [-1], [1, 1], [2**40]]
+
+
+@pytest.mark.parametrize("name", verbs(*covariance_of_two()))
+def test_each_argument_of_the_covariance_may_be_anything(name):
+    fits = verbs(*covariance_of_two())[name]
+    for place in range(len(fits)):
+        for odd in (*ODD, *MATRICES, *CUBES, *FLAGS):
+            P, *others = covariance_of_two()
+            given = verbs(P, *others)[name]
+            attempt(getattr(P, name), *given[:place], odd, *given[place + 1 :])
+            P.covariance_of([*range(P.landmarks)])
+    P, *others = covariance_of_two()
+    getattr(P, name)(*verbs(P, *others)[name])
+
+
+def test_rows_wider_than_the_leading_columns_are_refused():
+    P, _, width, rows = covariance_of_two()
+    for wrong in (width + 1, width - 1, 2 * width, 0):
+        with pytest.raises(ValueError, match="width"):
+            P.project(rows[0], np.ones((2, 3, wrong)), *rows[2:])
+        with pytest.raises(ValueError, match="width"):
+            P.augment(np.ones((2, 3, wrong)), np.stack([np.eye(3)] * 2))
+
+
+def test_a_solution_of_an_earlier_covariance_is_refused():
+    P, *others = covariance_of_two()
+    given = verbs(P, *others)
+    at, solution = given["solve"][0], given["apply"][0]
+    P.apply(solution)
+    for call in (lambda: P.apply(solution), lambda: P.solve(at), lambda: P.correction(solution)):
+        with pytest.raises(ValueError, match="changed since"):
+            call()
+
+
+def test_rows_of_a_dormant_landmark_are_refused():
+    P, _, _, rows = covariance_of_two()
+    P.rest([True, False])
+    with pytest.raises(ValueError, match="dormant"):
+        P.project(*rows)
+
+
+@pytest.mark.parametrize("columns", [(0, 3, -1), (6, 6, -1), (20, 6, -1), (-1, 6, -1), (6, -1, 7)])
+def test_views_that_overlap_or_do_not_fit_are_refused(columns):
+    with pytest.raises(ValueError, match=r"column|view"):
+        engine.Gaussian(np.eye(BODY), *columns)

@@ -513,7 +513,7 @@ def test_wrong_rows_are_named(pair: Pair) -> None:
     pair.predict()
     rows = pair.rows(np.array([3, 1]))
     rows[4][1] = -1e6
-    with pytest.raises(RuntimeError, match="not positive definite"):
+    with pytest.raises(ValueError, match="variances must be positive"):
         pair.project(rows)
 
 

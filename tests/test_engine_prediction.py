@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from support.compiled import CALIBRATION, CAMERA, EXTRINSICS, NOISE, TRACKS
+from support.predicting import POSES, assert_same, see
 
 from ekfslam.config import FilterConfig
 from ekfslam.data.interval import Interval
@@ -57,11 +58,6 @@ BLOCKS = {
     "all": lambda rng: (Begun(slip_y_m_s=0.3), up_of(rng), CameraJitter(), VisionDrift()),
     "none": lambda rng: (),
 }
-POSES = {
-    "identity": 1e-9 * np.ones(6),
-    "pi": np.array([3.0, -1.0, 2.0, 0.1, np.pi - 1e-7, 0.0]),
-    "far": np.array([30.0, -10.0, 2.0, 0.4, -0.9, 1.1]),
-}
 
 
 def filters_of(blocks, pose, noise=TRACKS, calibration=None):
@@ -82,32 +78,6 @@ def intervals(rng):
     for pieces, is_gap, doubt, size in kinds:
         dt_s = rng.uniform(0.02, 0.1, pieces)
         yield Interval(float(dt_s.sum()), dt_s, size * rng.normal(size=(pieces, 6)), bool(is_gap), float(doubt))
-
-
-def see(ekf, frame):
-    """Update by four landmarks, in another order each time, whose images stay where they are."""
-    rng = np.random.default_rng(3)
-    pixels = np.column_stack([rng.uniform(100, 500, 4), rng.uniform(100, 400, 4)])
-    measured = np.column_stack([pixels, pixels[:, 0] - rng.uniform(20, 60, 4), pixels[:, 1]])
-    order = np.roll(np.arange(4), frame)[: 3 + frame % 2]
-    return ekf.update(frame, np.array([7, 3, 9, 5])[order], measured[order])
-
-
-def assert_close(one, other, what, tolerance):
-    size = np.abs(other).max(initial=1.0)
-    np.testing.assert_allclose(one, other, atol=tolerance * size, rtol=tolerance, err_msg=what)
-
-
-def assert_same(one, other, tolerance=1e-13):
-    for name, value in other.values.items():
-        assert_close(one.values[name], value, name, tolerance)
-    for name in ("coordinates", "imu_twist", "P", "step"):
-        assert_close(getattr(one, name), getattr(other, name), name, tolerance)
-    for name in ("T_departed", "T_predicted", "way_m", "T_cam_imu_before"):
-        assert_close(getattr(one.motion, name), getattr(other.motion, name), name, tolerance)
-    logs = one.log(), other.log()
-    for field in dataclasses.fields(logs[0]):
-        assert_close(*(np.asarray(getattr(log, field.name), dtype=float) for log in logs), field.name, tolerance)
 
 
 @pytest.mark.parametrize("pose", POSES)

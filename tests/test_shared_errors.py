@@ -274,7 +274,8 @@ def test_which_models_have_views():
 def test_views_of_a_prediction():
     """The view before is the view; the view is the camera of the blocks, which wander on."""
     model, _ = everything(np.eye(4), KINDS["tracks"])
-    ekf, rng, layout = JointEKF(model, OPEN), np.random.default_rng(0), model.layout
+    config = dataclasses.replace(OPEN, engine="reference")  # whose values may be set
+    ekf, rng, layout = JointEKF(model, config), np.random.default_rng(0), model.layout
     root = rng.normal(size=(layout.body, layout.body))
     P = root @ root.T
     ekf.P = P.copy()

@@ -40,8 +40,9 @@ def require_shape(value: ArrayLike, shape: tuple[int | None, ...], name: str) ->
 
 def require_finite(value: Array, name: str, largest: float = LARGEST) -> None:
     """Raise `NonFiniteError` with the index of the first number that is NaN, infinite, or larger than ``largest``."""
-    bad = np.argwhere(~(np.abs(value) <= largest))
-    if len(bad):
+    small = np.abs(value) <= largest
+    if not small.all():
+        bad = np.argwhere(~small)
         index = tuple(int(i) for i in bad[0])
         kind = f"larger than {largest:g}" if np.isfinite(np.asarray(value)[index]) else "NaN or infinite"
         raise NonFiniteError(

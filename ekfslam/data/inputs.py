@@ -211,12 +211,15 @@ class InertialSamples:
 
         It is a gap if a step is more than three times the median. Raise `LostDataError` as `Velocities.interval`.
         """
-        part = self.between(begin_s, end_s)
         _require_cover(self, begin_s, end_s)
-        inside = part.time_s[(part.time_s > begin_s) & (part.time_s < end_s)]
-        stamps = np.concatenate([[begin_s], inside, [end_s]])
-        values = part.at(stamps)
-        is_gap = len(part.time_s) > 1 and bool(np.diff(part.time_s).max() > GAP_STEPS * self.step_s)
+        begin = max(int(np.searchsorted(self.time_s, begin_s, side="right")) - 1, 0)
+        part = slice(begin, int(np.searchsorted(self.time_s, end_s)) + 1)
+        time_s, rows = self.time_s[part], np.hstack([self.gyro_rad_s[part], self.accel_m_s2[part]])
+        inside = (time_s > begin_s) & (time_s < end_s)
+        first, last = linear(time_s, rows, np.array([begin_s, end_s]))
+        stamps = np.concatenate([[begin_s], time_s[inside], [end_s]])
+        values = np.concatenate([[first], rows[inside], [last]])
+        is_gap = len(time_s) > 1 and bool(np.diff(time_s).max() > GAP_STEPS * self.step_s)
         return Interval(end_s - begin_s, np.diff(stamps), 0.5 * (values[1:] + values[:-1]), is_gap)
 
 

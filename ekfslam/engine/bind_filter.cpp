@@ -1,4 +1,5 @@
 // `Filter` for Python: made from plain data, predicted by Python, updated in C++ with the GIL released.
+#include <cmath>
 #include <unordered_set>
 
 #include "binding.hpp"
@@ -39,20 +40,59 @@ std::vector<Block> blocks_of(const nb::list& given) {
     return blocks;
 }
 
-constexpr Index MOST_CONSIDERED = 10000;
+constexpr Index MOST_CONSIDERED = 10000, MOST_COLUMNS = 10000;
 
 void require_range(const std::string& name, Index first, Index size, Index count) {
     if (first >= 0 && size >= 0 && first <= count && size <= count - first) return;
     throw nb::value_error((name + " must be among " + std::to_string(count)).c_str());
 }
 
-// Blocks whose columns and values are those of a state.
-void require_places(const std::vector<Block>& blocks, Index body, Index values) {
-    for (const Block& block : blocks) {
-        require_range("columns of block " + block.name, block.at, block.size, body);
-        require_range("values of block " + block.name, block.value_at, block.value_size, values);
-        for (const Index parameter : block.free) require_range("free parameters", parameter, 1, block.value_size);
+void require(bool holds, const std::string& what) {
+    if (!holds) throw nb::value_error(what.c_str());
+}
+
+// The value of a kind of block has so many numbers.
+Index value_size(const Block& block) {
+    switch (block.kind) {
+        case Kind::pose:
+            return 16;
+        case Kind::calibration:
+            return 9;
+        default:
+            return block.size;
     }
+}
+
+// Blocks that follow each other in columns and values, the pose first, each of the size of its kind.
+void require_places(const std::vector<Block>& blocks) {
+    require(!blocks.empty() && blocks[0].name == "pose", "the first block must be the pose");
+    Index at = 0, value_at = 0;
+    std::unordered_set<std::string> names;
+    for (const Block& block : blocks) {
+        const std::string named = "block " + block.name;
+        require(names.insert(block.name).second, named + " is there twice");
+        require(block.size >= 0 && block.size <= MOST_COLUMNS, named + " has an impossible size");
+        require(block.at == at && block.value_at == value_at, named + " must follow the one before");
+        require(block.value_size == value_size(block), named + " has a value of another size than its kind");
+        const bool is_view = block.name == "view" || block.name == "previous_view" || block.name == "anchor";
+        const bool is_pose = block.kind == Kind::pose;
+        require(is_pose == (is_view || block.name == "pose"), named + " has the kind of another");
+        require(!(is_pose || block.moves_camera) || block.size == 6, named + " must have six columns");
+        require(!block.moves_camera || block.kind == Kind::vector, named + " must be a vector to move the camera");
+        require(block.kind != Kind::direction || block.size == 3, named + " must have three columns");
+        const bool is_calibration = block.kind == Kind::calibration;
+        require(static_cast<Index>(block.free.size()) == (is_calibration ? block.size : 0),
+                named + " must have one free parameter for each column");
+        Index last = -1;
+        for (const Index parameter : block.free) {
+            require(parameter > last && parameter < 9, named + " has free parameters that do not ascend");
+            last = parameter;
+        }
+        at += block.size;
+        value_at += block.value_size;
+    }
+    require(names.count("view") || !(names.count("previous_view") || names.count("anchor")),
+            "a view of the past needs one of the present");
 }
 
 Sensor sensor_of(const nb::dict& from) {
@@ -71,6 +111,18 @@ Sensor sensor_of(const nb::dict& from) {
     sensor.variance_px2 = get<Vector3>(from, "variance_px2");
     sensor.parallax_rad = get<double>(from, "parallax_rad");
     sensor.patience = get<Index>(from, "patience");
+    const double* numbers[] = {&sensor.fu_px,
+                               &sensor.fv_px,
+                               &sensor.cu_px,
+                               &sensor.cv_px,
+                               &sensor.baseline_m,
+                               &sensor.disparity_offset_px,
+                               &sensor.least_disparity_px,
+                               &sensor.weight_left,
+                               &sensor.parallax_rad};
+    for (const double* number : numbers) require(std::isfinite(*number), "numbers of the sensor must be finite");
+    require_finite("T_cam_imu", sensor.T_cam_imu);
+    require_finite("variance_px2", sensor.variance_px2);
     return sensor;
 }
 
@@ -82,6 +134,8 @@ std::optional<TrackError> track_error_of(const nb::object& given) {
     error.walk_std = get<Vector3>(from, "walk_std");
     error.flow_px = get<double>(from, "flow_px");
     error.parallax = get<double>(from, "parallax");
+    require_finite("first_std", error.first_std);
+    require_finite("walk_std", error.walk_std);
     return error;
 }
 
@@ -101,6 +155,9 @@ Config config_of(const nb::dict& from) {
     config.dormant = get<Index>(from, "dormant");
     config.input_gate = get<double>(from, "input_gate");
     config.doubt = get<double>(from, "doubt");
+    for (const double number : {config.gate, config.gate_probability, config.waiting_gate, config.min_depth_m,
+                                config.moving_sigma, config.moving_share, config.input_gate, config.doubt})
+        require(!std::isnan(number), "numbers of the settings must not be NaN");
     return config;
 }
 
@@ -109,26 +166,6 @@ Matrix uniform(Index frame, Index rows, Index columns) {
     const nb::gil_scoped_acquire held;
     const nb::object generator = nb::module_::import_("numpy.random").attr("default_rng")(frame);
     return nb::cast<Matrix>(generator.attr("random")(nb::make_tuple(rows, columns)));
-}
-
-[[noreturn]] void raise_innovation_error(Index frame, const Ids& ids) {
-    const nb::object type = nb::module_::import_("ekfslam.errors").attr("InnovationError");
-    const nb::object error = type(frame, array(ids).attr("tolist")());
-    PyErr_SetObject(type.ptr(), error.ptr());
-    throw nb::python_error();
-}
-
-// Calls a function of the filter that may find an innovation covariance without an inverse.
-template <class Function>
-auto guarded(const Filter& filter, Index frame, Function&& function) {
-    try {
-        return function();
-    } catch (const Error& error) {
-        Ids ids;
-        for (const Index slot : error.slots)
-            if (slot < filter.e.table.size()) ids.push_back(filter.e.table.id[static_cast<std::size_t>(slot)]);
-        raise_innovation_error(frame, ids);
-    }
 }
 
 // Shares (2, b) of the blocks that move the camera, of single observations and of differences.
@@ -147,16 +184,18 @@ void set_shares(Estimate& e, const Matrix& shares) {
 Filter make(const nb::list& blocks, const nb::dict& sensor, const nb::object& track_error, const nb::dict& config,
             const Vector& values, const Vector& coordinates, const Matrix& P, const Matrix& shares) {
     const std::vector<Block> parts = blocks_of(blocks);
+    require_places(parts);
     Index body = 0, size = 0;
     for (const Block& block : parts) {
         body += block.size;
         size += block.value_size;
     }
-    require_places(parts, body, size);
     require_shape("values", values, size, 1);
     require_shape("coordinates", coordinates, body, 1);
     require_shape("P", P, body, body);
     require_finite("values", values);
+    require_finite("coordinates", coordinates);
+    require_finite("shares", shares);
     require_covariance(P);
     Filter filter(
         Estimate(config_of(config), sensor_of(sensor), track_error_of(track_error), parts, values, coordinates, P));
@@ -169,6 +208,8 @@ Filter make(const nb::list& blocks, const nb::dict& sensor, const nb::object& tr
 void set_mean(Filter& filter, const Vector& values, const Vector& coordinates) {
     require_shape("values", values, filter.e.values.flat.size(), 1);
     require_shape("coordinates", coordinates, filter.e.coordinates.size(), 1);
+    require_finite("values", values);
+    require_finite("coordinates", coordinates);
     filter.e.values.flat = values;
     filter.e.coordinates = coordinates;
 }
@@ -177,6 +218,8 @@ void propagate(Filter& filter, const Matrix& Phi, const Matrix& Q) {
     const Index body = filter.e.columns.body;
     require_shape("Phi", Phi, body, body);
     require_shape("Q", Q, body, body);
+    require_finite("Phi", Phi);
+    require_finite("Q", Q);
     if (filter.e.is_open) close_views(filter.e);
     filter.e.gaussian.propagate(Phi, Q);
 }
@@ -184,9 +227,12 @@ void propagate(Filter& filter, const Matrix& Phi, const Matrix& Q) {
 // Condition on measurements of blocks during a prediction, eq. (6) and (7').
 nb::tuple measure(Filter& filter, const Vector& values, const Vector& coordinates, const Matrix& H,
                   const Vector& residual, const Vector& variance) {
-    Estimate& e = filter.e;
+    Estimate& e = whole(filter).e;
     require_shape("H", H, residual.size(), e.columns.body);
     require_shape("variance", variance, residual.size(), 1);
+    require_finite("H", H);
+    require_finite("residual", residual);
+    require_finite("variance", variance);
     if (e.is_open) close_views(e);
     set_mean(filter, values, coordinates);
     return guarded(filter, e.step + 1, [&] {
@@ -210,6 +256,10 @@ nb::tuple arrive(Filter& filter, const Vector& values, const Vector& coordinates
                  const std::optional<std::pair<Matrix4, double>>& last, const Matrix& shares) {
     Estimate& e = filter.e;
     require_shape("noise", noise, e.columns.body, e.columns.body);
+    for (const Eigen::Ref<const Matrix>& one :
+         {Eigen::Ref<const Matrix>(imu_twist), Eigen::Ref<const Matrix>(noise), Eigen::Ref<const Matrix>(T_departed),
+          Eigen::Ref<const Matrix>(T_predicted)})
+        require_finite("an array", one);
     propagate(filter, Phi, Q);
     set_mean(filter, values, coordinates);
     e.imu_twist = imu_twist;
@@ -226,6 +276,7 @@ nb::tuple arrive(Filter& filter, const Vector& values, const Vector& coordinates
 }
 
 nb::tuple look_again(Filter& filter, const Vector6& imu_twist) {
+    require_finite("imu_twist", imu_twist);
     filter.e.imu_twist = imu_twist;
     open_views(filter.e);
     return mean_of(filter);
@@ -233,6 +284,7 @@ nb::tuple look_again(Filter& filter, const Vector6& imu_twist) {
 
 nb::dict update(Filter& filter, Index frame, const Integers& ids, const Matrix& measured, bool is_rested,
                 const nb::object& twist_after) {
+    whole(filter);
     const Ids seen = ids_of(ids);
     const Matrix columns = measured.transpose();
     if (std::unordered_set<std::int64_t>(seen.begin(), seen.end()).size() != seen.size())
@@ -240,6 +292,7 @@ nb::dict update(Filter& filter, Index frame, const Integers& ids, const Matrix& 
     if (columns.cols() != static_cast<Index>(seen.size()) ||
         columns.rows() < (filter.e.sensor.type == Sensor::rig ? 4 : 2))
         throw nb::value_error("measured must have one row of pixels for each id");
+    require_finite("measured", columns);
     filter.e.twist_after = [&](const Values& after) {
         const nb::gil_scoped_acquire held;
         if (twist_after.is_none()) throw nb::value_error("twist_after must be a function for a time offset");
@@ -265,6 +318,9 @@ nb::tuple adopt(Filter& filter, const Vector& values, const Vector& coordinates,
     require_shape("coordinates", coordinates, body, 1);
     require_shape("position_m", position_m, count, 3);
     require_shape("P", P, body + 3 * count, body + 3 * count);
+    require_finite("values", values);
+    require_finite("coordinates", coordinates);
+    require_finite("position_m", position_m);
     require_covariance(P);
     filter.adopt(values, coordinates, position_m.transpose(), P);
     return mean_of(filter);
@@ -276,86 +332,99 @@ Slots all(const Filter& filter) {
     return slots;
 }
 
-void bind_reading(nb::class_<Filter>& bound) {
-    bound.def("values", [](const Filter& filter) { return array(filter.e.values.flat); })
-        .def("table", [](const Filter& filter) { return table_of(filter.e.table); })
-        .def("landmarks", [](const Filter& filter) { return filter.e.table.size(); })
-        .def("considered", [](const Filter& filter) { return filter.e.gaussian.considered(); })
-        .def("body_covariance", [](const Filter& filter) { return rows(filter.e.gaussian.body_covariance()); })
-        .def("covariance", [](const Filter& filter) { return rows(filter.e.gaussian.covariance_of(all(filter))); })
-        .def(
-            "covariance_of",
-            [](const Filter& filter, const Integers& slots) {
-                return rows(filter.e.gaussian.covariance_of(slots_of(slots, filter.e.table.size())));
-            },
-            arg("slots"))
-        .def("landmark_blocks",
-             [](const Filter& filter) { return blocks(filter.e.gaussian.landmark_blocks(all(filter))); })
-        .def(
-            "landmark_blocks_of",
-            [](const Filter& filter, const Integers& slots) {
-                return blocks(filter.e.gaussian.landmark_blocks(slots_of(slots, filter.e.table.size())));
-            },
-            arg("slots"))
-        .def(
-            "consider",
-            [](Filter& filter, Index columns) {
-                require_range("considered columns", 0, columns, MOST_CONSIDERED);
-                return filter.e.gaussian.consider(columns);
-            },
-            arg("columns"))
-        .def(
-            "clone",
-            [](Filter& filter, Index source, Index size, Index to) {
-                const Index body = filter.e.columns.body;
-                require_range("columns of blocks", source, size, body);
-                require_range("considered columns", to - body, size, filter.e.gaussian.considered());
-                filter.e.gaussian.clone(source, size, to);
-            },
-            arg("source"), arg("size"), arg("to"));
+void bind_reading(nb::class_<Shared>& bound) {
+    bound.def("values", reading(+[](const Filter& filter) { return array(filter.e.values.flat); }))
+        .def("table", reading(+[](const Filter& filter) { return table_of(filter.e.table); }))
+        .def("landmarks", reading(+[](const Filter& filter) { return filter.e.table.size(); }))
+        .def("considered", reading(+[](const Filter& filter) { return filter.e.gaussian.considered(); }))
+        .def("body_covariance",
+             reading(+[](const Filter& filter) { return rows(filter.e.gaussian.body_covariance()); }))
+        .def("covariance",
+             reading(+[](const Filter& filter) { return rows(whole(filter).e.gaussian.covariance_of(all(filter))); }))
+        .def("covariance_of", reading(+[](const Filter& filter, const Integers& slots) {
+                 return rows(whole(filter).e.gaussian.covariance_of(slots_of(slots, filter.e.table.size())));
+             }),
+             arg("slots"))
+        .def("landmark_blocks", reading(+[](const Filter& filter) {
+                 return blocks(whole(filter).e.gaussian.landmark_blocks(all(filter)));
+             }))
+        .def("landmark_blocks_of", reading(+[](const Filter& filter, const Integers& slots) {
+                 return blocks(whole(filter).e.gaussian.landmark_blocks(slots_of(slots, filter.e.table.size())));
+             }),
+             arg("slots"))
+        .def("consider", changing(+[](Filter& filter, Index columns) {
+                 require_range("considered columns", 0, columns, MOST_CONSIDERED);
+                 return filter.e.gaussian.consider(columns);
+             }),
+             arg("columns"))
+        .def("clone", changing(+[](Filter& filter, Index source, Index size, Index to) {
+                 const Index body = filter.e.columns.body;
+                 require_range("columns of blocks", source, size, body);
+                 require_range("considered columns", to - body, size, filter.e.gaussian.considered());
+                 filter.e.gaussian.clone(source, size, to);
+             }),
+             arg("source"), arg("size"), arg("to"));
 }
 
 }  // namespace
 
+void refuse() {
+    const nb::object type = nb::module_::import_("ekfslam.errors").attr("FilterError");
+    PyErr_SetString(type.ptr(), "the filter is in use by another thread");
+    throw nb::python_error();
+}
+
+void raise_innovation_error(const Filter& filter, Index frame, const Error& error) {
+    Ids ids;
+    for (const Index slot : error.slots)
+        if (slot < filter.e.table.size()) ids.push_back(filter.e.table.id[static_cast<std::size_t>(slot)]);
+    const nb::object type = nb::module_::import_("ekfslam.errors").attr("InnovationError");
+    const nb::object raised = type(frame, array(ids).attr("tolist")());
+    PyErr_SetObject(type.ptr(), raised.ptr());
+    throw nb::python_error();
+}
+
 void bind_filter(nb::module_& module) {
-    nb::class_<Filter> bound(module, "Filter", "The joint filter; predictions may come from Python.");
+    nb::class_<Shared> bound(module, "Filter", "The joint filter; predictions may come from Python.");
     bound
         .def(
             "__init__",
-            [](Filter* self, const nb::list& blocks, const nb::dict& sensor, const nb::object& track_error,
+            [](Shared* self, const nb::list& blocks, const nb::dict& sensor, const nb::object& track_error,
                const nb::dict& config, const Vector& values, const Vector& coordinates, const Matrix& P,
                const Matrix& shares) {
-                new (self) Filter(make(blocks, sensor, track_error, config, values, coordinates, P, shares));
+                new (self) Shared(make(blocks, sensor, track_error, config, values, coordinates, P, shares));
             },
             arg("blocks"), arg("sensor"), arg("track_error").none(), arg("config"), arg("values"), arg("coordinates"),
             arg("P"), arg("shares"))
-        .def("copy", [](const Filter& filter) { return Filter(filter); })
-        .def("propagate", &propagate, arg("Phi"), arg("Q"))
-        .def("measure", &measure, arg("values"), arg("coordinates"), arg("H"), arg("residual"), arg("variance"))
-        .def("arrive", &arrive, arg("values"), arg("coordinates"), arg("imu_twist"), arg("Phi"), arg("Q"),
+        .def("copy",
+             [](const Shared& shared) {
+                 const Hold hold(shared);
+                 return std::make_unique<Shared>(shared.filter);
+             })
+        .def("propagate", changing(&propagate), arg("Phi"), arg("Q"))
+        .def("measure", changing(&measure), arg("values"), arg("coordinates"), arg("H"), arg("residual"),
+             arg("variance"))
+        .def("arrive", changing(&arrive), arg("values"), arg("coordinates"), arg("imu_twist"), arg("Phi"), arg("Q"),
              arg("T_departed"), arg("T_predicted"), arg("noise"), arg("numbers"), arg("last").none(), arg("shares"))
-        .def(
-            "rest",
-            [](Filter& filter, Index frame, const Integers& ids) {
-                return retired_of(filter.rest(frame, ids_of(ids)));
-            },
-            arg("frame"), arg("ids"))
-        .def("update", &update, arg("frame"), arg("ids"), arg("measured"), arg("is_rested"), arg("twist_after").none())
-        .def(
-            "revive",
-            [](Filter& filter, const nb::dict& more) { filter.revive(table_from(more, filter.e.sensor.dimension())); },
-            arg("more"))
-        .def("adopt", &adopt, arg("values"), arg("coordinates"), arg("position_m"), arg("P"))
-        .def("look_again", &look_again, arg("imu_twist"))
-        .def(
-            "replace",
-            [](Filter& filter, const Matrix& P) {
-                const Index size = filter.e.columns.body + filter.e.gaussian.considered() + 3 * filter.e.table.size();
-                require_shape("P", P, size, size);
-                require_covariance(P);
-                filter.e.gaussian.replace(P);
-            },
-            arg("P"));
+        .def("rest", changing(+[](Filter& filter, Index frame, const Integers& ids) {
+                 return retired_of(whole(filter).rest(frame, ids_of(ids)));
+             }),
+             arg("frame"), arg("ids"))
+        .def("update", changing(&update), arg("frame"), arg("ids"), arg("measured"), arg("is_rested"),
+             arg("twist_after").none())
+        .def("revive", changing(+[](Filter& filter, const nb::dict& more) {
+                 whole(filter).revive(table_from(more, filter.e.sensor.dimension()));
+             }),
+             arg("more"))
+        .def("adopt", changing(&adopt), arg("values"), arg("coordinates"), arg("position_m"), arg("P"))
+        .def("look_again", changing(&look_again), arg("imu_twist"))
+        .def("replace", changing(+[](Filter& filter, const Matrix& P) {
+                 const Index size = filter.e.columns.body + filter.e.gaussian.considered() + 3 * filter.e.table.size();
+                 require_shape("P", P, size, size);
+                 require_covariance(P);
+                 filter.e.gaussian.replace(P);
+             }),
+             arg("P"));
     bind_process(bound);
     bind_reading(bound);
 }

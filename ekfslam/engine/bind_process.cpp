@@ -1,40 +1,96 @@
 // The prediction by velocities for Python: laws of blocks from plain data.
+#include <cmath>
+
 #include "binding.hpp"
 
 namespace ekfslam::binding {
 
 namespace {
 
+void require_vector(const Block& block) {
+    if (block.kind == Kind::vector && block.value_size == block.size) return;
+    throw nb::value_error(("block " + block.name + " must be a vector").c_str());
+}
+
 Law law_of(const nb::dict& from, const Block& block) {
     Law law;
-    law.walks = get<std::string>(from, "transition") == "gauss_markov";
+    const std::string transition = get<std::string>(from, "transition");
+    law.transition = transition == "gauss_markov" ? Law::gauss_markov : transition == "walk" ? Law::walk : Law::stays;
     law.turns = get<std::string>(from, "turn_velocities") == "up";
     const std::string share = get<std::string>(from, "camera_share");
     law.share = share == "one" ? Law::one : share == "way" ? Law::way : Law::none;
     law.offset = get<Matrix>(from, "offset");
     if (law.offset.cols() != 0) require_shape("offset", law.offset, 6, block.size);
-    if (!law.walks) return law;
+    if (law.turns && block.kind != Kind::direction) throw nb::value_error("only a direction turns velocities");
+    if (law.transition == Law::stays) return law;
+    require_vector(block);
     law.std = get<Vector>(from, "std");
+    require_shape("std", law.std, block.size, 1);
+    if (law.transition == Law::walk) return law;
     law.time_s = get<Vector>(from, "time_s");
     law.length_m = get<Vector>(from, "length_m");
     law.least_way_m = get<double>(from, "least_way_m");
-    for (const Vector* one : {&law.std, &law.time_s, &law.length_m}) require_shape("walk", *one, block.size, 1);
+    for (const Vector* one : {&law.time_s, &law.length_m}) require_shape("scales", *one, block.size, 1);
     return law;
 }
 
-void set_process(Filter& filter, const nb::list& laws, const Vector6& pose_std, const Vector6& gap_std) {
+Place place_of(const Filter& filter, const char* name, Index size) {
+    const Block* block = filter.e.block(name);
+    if (!block || block->size != size) throw nb::value_error((std::string(name) + " is no block of it").c_str());
+    require_vector(*block);
+    return {block->at, block->value_at};
+}
+
+Velocities velocities_of(const Filter& filter, const nb::dict& from) {
+    Velocities out{get<Vector6>(from, "pose_std"), get<Vector6>(from, "gap_std"), {}};
+    if (!get<bool>(from, "walks")) return out;
+    out.twist = place_of(filter, "twist", 6);
+    out.twist_std = get<Vector6>(from, "twist_std");
+    out.is_measured = get<bool>(from, "is_measured");
+    return out;
+}
+
+Inertial inertial_of(const Filter& filter, const nb::dict& from) {
+    return {get<double>(from, "gyro"),        get<double>(from, "accel"),        get<double>(from, "gyro_walk"),
+            get<double>(from, "accel_walk"),  get<double>(from, "gravity_m_s2"), place_of(filter, "velocity", 3),
+            place_of(filter, "gyro_bias", 3), place_of(filter, "accel_bias", 3)};
+}
+
+void set_process(Filter& filter, const nb::list& laws, const nb::dict& settings) {
     if (laws.size() != filter.e.blocks.size()) throw nb::value_error("laws must have one item for each block");
-    Process process{{}, pose_std, gap_std};
+    const Block* pose = filter.e.block("pose");
+    if (!pose || pose->at != 0 || pose->kind != Kind::pose) throw nb::value_error("the first block must be the pose");
+    Process process;
     for (std::size_t i = 0; i < laws.size(); ++i)
         process.laws.push_back(law_of(nb::cast<nb::dict>(laws[i]), filter.e.blocks[i]));
+    for (const Law& law : process.laws)
+        if (law.share != Law::none &&
+            !filter.e.blocks[static_cast<std::size_t>(&law - process.laws.data())].moves_camera)
+            throw nb::value_error("only a block that moves the camera has a share");
+    const std::string kind = get<std::string>(settings, "kind");
+    if (kind == "inertial") {
+        process.inertial = inertial_of(filter, settings);
+    } else if (kind == "velocities") {
+        process.velocities = velocities_of(filter, settings);
+    } else {
+        throw nb::value_error(("unknown kind of a process: " + kind).c_str());
+    }
     filter.process = process;
 }
 
 nb::dict predict(Filter& filter, double tau_s, const Vector& dt_s, const Matrix& inputs, bool is_gap, double doubt) {
     if (!filter.process) throw nb::value_error("predictions of this filter come from Python");
+    whole(filter);
     require_shape("inputs", inputs, dt_s.size(), 6);
-    const Departed departed = ekfslam::predict(filter.e, *filter.process, {tau_s, dt_s, inputs, is_gap, doubt});
-    const Matrix4 transposed = departed.T_cam_imu.transpose();
+    require_finite("inputs", inputs);
+    require_finite("dt_s", dt_s);
+    if (dt_s.size() == 0 || !(dt_s.array() >= 0.0).all()) throw nb::value_error("dt_s must be durations, at least one");
+    if (!std::isfinite(tau_s) || tau_s < 0.0) throw nb::value_error("tau_s must be a duration");
+    if (!std::isfinite(doubt) || doubt <= 0.0) throw nb::value_error("doubt must be positive");
+    const Departed departed = guarded(filter, filter.e.step + 1, [&] {
+        return ekfslam::predict(filter.e, *filter.process, {tau_s, dt_s, inputs, is_gap, doubt});
+    });
+    const Matrix4 transposed = departed.T_cam_imu.transpose(), T_departed = filter.e.motion.T_departed.transpose();
     nb::dict out;
     out["values"] = array(filter.e.values.flat);
     out["coordinates"] = array(filter.e.coordinates);
@@ -42,16 +98,19 @@ nb::dict predict(Filter& filter, double tau_s, const Vector& dt_s, const Matrix&
     out["imu_twist"] = array(filter.e.imu_twist);
     out["way_m"] = filter.e.motion.way_m;
     out["T_cam_imu"] = array(Vector(transposed.reshaped()));
+    out["T_departed"] = array(Vector(T_departed.reshaped()));
+    out["nis"] = departed.nis;
+    out["log_det"] = departed.log_det;
+    out["doubt"] = departed.doubt;
     return out;
 }
 
 }  // namespace
 
-nb::class_<Filter> bind_process(nb::class_<Filter> filter) {
+void bind_process(nb::class_<Shared>& bound) {
     using nb::arg;
-    filter.def("set_process", &set_process, arg("laws"), arg("pose_std"), arg("gap_std"))
-        .def("predict", &predict, arg("tau_s"), arg("dt_s"), arg("inputs"), arg("is_gap"), arg("doubt"));
-    return filter;
+    bound.def("set_process", changing(&set_process), arg("laws"), arg("settings"))
+        .def("predict", changing(&predict), arg("tau_s"), arg("dt_s"), arg("inputs"), arg("is_gap"), arg("doubt"));
 }
 
 }  // namespace ekfslam::binding

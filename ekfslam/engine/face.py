@@ -7,7 +7,7 @@ predictions, references and reports need.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -16,10 +16,10 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
 from ekfslam.data.interval import Interval
 from ekfslam.geometry.camera import DEPTH_FROM_PX
-from ekfslam.models.blocks import StateBlock, Values
+from ekfslam.models.blocks import StateBlock, Twist, Values
 from ekfslam.models.build import has_image_coordinates
 from ekfslam.models.model import Model
-from ekfslam.models.process.velocities import VelocityInputs
+from ekfslam.models.process import Inertial, VelocityInputs, VelocityWalk
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
 
@@ -35,6 +35,10 @@ class Engine:
 
     Args:
         model, config: Model and resolved settings, see `ekfslam.engine.choice`.
+
+    Attributes:
+        filter: `Filter` of the compiled module.
+        predicts: Whether predictions are made in C++, too.
     """
 
     def __init__(self, model: Model, config: FilterConfig) -> None:
@@ -45,7 +49,7 @@ class Engine:
         self._places = _places(model.layout.blocks, model.initial_values())
         self._camera = [block for block in model.layout.blocks if block.coupling == "camera"]
         error = model.track_error
-        self._filter = Filter(
+        self.filter = Filter(
             _blocks(model, self._places),
             _sensor(model.sensor),
             None if error is None else vars(error),
@@ -56,16 +60,15 @@ class Engine:
             self._shares(0.0),
         )
         laws = [law for block in model.layout.blocks if (law := block.as_data()) is not None]
-        self._predicts = type(model.process) is VelocityInputs and len(laws) == len(model.layout.blocks)
-        if self._predicts:
-            noise = model.noise.process
-            self._filter.set_process(
-                laws, np.asarray(noise.pose_std, dtype=float), np.asarray(noise.gap_std, dtype=float)
-            )
+        process = process_of(model)
+        self.predicts = False
+        if process is not None and len(laws) == len(model.layout.blocks):
+            self.filter.set_process(laws, process)
+            self.predicts = True
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Engine:
         copy = object.__new__(Engine)
-        copy.__dict__.update(self.__dict__, _filter=self._filter.copy())
+        copy.__dict__.update(self.__dict__, filter=self.filter.copy())
         return copy
 
     def _flat(self, values: Values) -> Array:
@@ -85,27 +88,29 @@ class Engine:
     @property
     def values(self) -> dict[str, Array]:
         """Estimate of every state block by name."""
-        return self.named(self._filter.values())
+        return self.named(self.filter.values())
 
     # --- predictions --------------------------------------------------------------------------------------------------
 
     def predict(self, interval: Interval) -> dict[str, Any] | None:
-        """Predict by velocities that are inputs, eq. (1) and (2); None: the model needs the prediction in Python.
+        """Predict by eq. (1) and (2), or (12); None: the model needs the prediction in Python.
 
         Returns:
-            Flat ``values``, ``coordinates`` and ``departed`` coordinates, ``imu_twist``, ``way_m``, and the extrinsics
-            ``T_cam_imu`` of the frame before.
+            Flat ``values``, ``coordinates`` and ``departed`` coordinates, ``imu_twist``, ``way_m``, the pose
+            ``T_departed`` that the process moved, and the extrinsics ``T_cam_imu`` of the frame before; ``nis`` and
+            ``log_det`` of inputs that measure velocities in the state, and the factor ``doubt`` of their standard
+            deviations.
         """
-        if not self._predicts:
+        if not self.predicts:
             return None
-        found: dict[str, Any] = self._filter.predict(
+        found: dict[str, Any] = self.filter.predict(
             interval.tau_s, interval.dt_s, interval.inputs, interval.is_gap, interval.doubt
         )
         return found
 
     def propagate(self, Phi: Array, Q: Array) -> None:
         """Propagate the blocks, eq. (2)."""
-        self._filter.propagate(Phi, Q)
+        self.filter.propagate(Phi, Q)
 
     def measure(
         self, values: Values, coordinates: Array, H: Array, residual: Array, variance: Array
@@ -115,7 +120,7 @@ class Engine:
         Returns:
             Values and coordinates after it, NIS and ``log det S``.
         """
-        flat, coordinates, nis, log_det = self._filter.measure(
+        flat, coordinates, nis, log_det = self.filter.measure(
             self._flat(values), coordinates, H, residual, np.asarray(variance, dtype=float)
         )
         return self.named(flat), coordinates, nis, log_det
@@ -139,7 +144,7 @@ class Engine:
         Returns:
             Values and coordinates with those of the view.
         """
-        flat, coordinates = self._filter.arrive(
+        flat, coordinates = self.filter.arrive(
             self._flat(values),
             coordinates,
             imu_twist,
@@ -158,7 +163,7 @@ class Engine:
 
     def rest(self, frame: int, ids: IntArray) -> dict[str, Any] | None:
         """Let landmarks out of view sleep or retire; return those that retired, None: there are none."""
-        found: dict[str, Any] | None = self._filter.rest(frame, ids)
+        found: dict[str, Any] | None = self.filter.rest(frame, ids)
         return found
 
     def update(
@@ -171,54 +176,54 @@ class Engine:
             twist_after: Velocity (6,) of the IMU at this frame by corrected values, for a time offset.
         """
         function = None if twist_after is None else lambda flat: twist_after(self.named(flat))
-        found: dict[str, Any] = self._filter.update(frame, ids, measured, is_rested, function)
+        found: dict[str, Any] = self.filter.update(frame, ids, measured, is_rested, function)
         return found
 
     def look_again(self, imu_twist: Array) -> tuple[dict[str, Array], Array]:
         """Open the view of the first frame for a velocity (6,) of the IMU; return values and coordinates."""
-        flat, coordinates = self._filter.look_again(imu_twist)
+        flat, coordinates = self.filter.look_again(imu_twist)
         return self.named(flat), coordinates
 
     def table(self) -> dict[str, Array | IntArray]:
         """Return the columns of the landmark table."""
-        found: dict[str, Array | IntArray] = self._filter.table()
+        found: dict[str, Array | IntArray] = self.filter.table()
         return found
 
     def revive(self, more: dict[str, Any]) -> None:
         """Append landmarks to the table, given its columns; `adopt` must follow."""
-        self._filter.revive(more)
+        self.filter.revive(more)
 
     def adopt(self, values: Values, coordinates: Array, position_m: Array, P: Array) -> tuple[dict[str, Array], Array]:
         """Replace mean and covariance of blocks and landmarks; return values and coordinates with those of the view."""
-        flat, coordinates = self._filter.adopt(self._flat(values), coordinates, position_m, P)
+        flat, coordinates = self.filter.adopt(self._flat(values), coordinates, position_m, P)
         return self.named(flat), coordinates
 
     def replace(self, P: Array) -> None:
         """Replace the covariance (body+3n, body+3n)."""
-        self._filter.replace(P)
+        self.filter.replace(P)
 
     # --- the covariance -----------------------------------------------------------------------------------------------
 
     @property
     def considered(self) -> int:
         """Number of considered columns, between body and landmarks."""
-        return int(self._filter.considered())
+        return int(self.filter.considered())
 
     @property
     def landmarks(self) -> int:
         """Number n of landmarks."""
-        return int(self._filter.landmarks())
+        return int(self.filter.landmarks())
 
     @property
     def P(self) -> Array:
         """(body+3n, body+3n), a copy."""
-        P = self._filter.covariance()
+        P = self.filter.covariance()
         return np.asarray(0.5 * (P + P.T))
 
     @property
     def body_covariance(self) -> Array:
         """(body, body), a copy; with the considered columns."""
-        return np.asarray(self._filter.body_covariance())
+        return np.asarray(self.filter.body_covariance())
 
     @property
     def is_finite(self) -> bool:
@@ -228,22 +233,22 @@ class Engine:
     def landmark_blocks(self, slot: IntArray | None = None) -> Array:
         """Return the landmarks' own covariances (k, 3, 3), of all or at slots (k,)."""
         if slot is None:
-            return np.asarray(self._filter.landmark_blocks())
-        return np.asarray(self._filter.landmark_blocks_of(slot))
+            return np.asarray(self.filter.landmark_blocks())
+        return np.asarray(self.filter.landmark_blocks_of(slot))
 
     def covariance_of(self, slot: IntArray) -> Array:
         """Return the covariance (body+3k, body+3k) of the body and of the landmarks at the slots (k,)."""
-        return np.asarray(self._filter.covariance_of(slot))
+        return np.asarray(self.filter.covariance_of(slot))
 
     def consider(self, columns: int) -> int:
         """Add considered columns, and return the first of them."""
-        first = int(self._filter.consider(columns))
+        first = int(self.filter.consider(columns))
         self.body += columns
         return first
 
     def clone(self, source: slice, to: slice) -> None:
         """Copy body columns into considered ones."""
-        self._filter.clone(source.start, source.stop - source.start, to.start)
+        self.filter.clone(source.start, source.stop - source.start, to.start)
 
 
 def flops() -> float:
@@ -276,6 +281,21 @@ def _blocks(model: Model, places: dict[str, tuple[slice, tuple[int, ...]]]) -> l
         }
         for block in model.layout.blocks
     ]
+
+
+def process_of(model: Model) -> dict[str, Any] | None:
+    """Return the process as data; None: it is a class of Python alone."""
+    process = model.process
+    if type(process) is Inertial:
+        densities = {name: float(value) for name, value in vars(process.noise).items()}
+        return {"kind": "inertial", **densities, "gravity_m_s2": process.gravity_m_s2}
+    if type(process) not in (VelocityInputs, VelocityWalk):
+        return None
+    stds = {name: np.asarray(getattr(model.noise.process, name), dtype=float) for name in ("pose_std", "gap_std")}
+    if not process.estimates_velocity:
+        return {"kind": "velocities", "walks": False, **stds}
+    twist_std, twist = np.asarray(model.noise.process.twist_std, dtype=float), cast(Twist, model.layout.block("twist"))
+    return {"kind": "velocities", "walks": True, **stds, "twist_std": twist_std, "is_measured": twist.is_measured}
 
 
 def _sensor(sensor: Any) -> dict[str, Any]:

@@ -40,6 +40,13 @@ bool has_blocks_of_camera(const Estimate& e) {
 Filter::Filter(Estimate estimate, std::int64_t landmark, std::int64_t observation)
     : e(std::move(estimate)), next_landmark(landmark), next_observation(observation) {}
 
+void Filter::restore(State before) {
+    e = std::move(before.e);
+    waiting = std::move(before.waiting);
+    next_landmark = before.next_landmark;
+    next_observation = before.next_observation;
+}
+
 Report Filter::update(Index frame, const Ids& ids, const Matrix& measured) {
     Retired out = rest(frame, ids);
     Report report = take(frame, ids, measured);
@@ -95,6 +102,7 @@ Report Filter::take(Index frame, const Ids& ids, const Matrix& measured) {
         const int waits = e.sensor.type == Sensor::rig ? DISPARITY : WAITING;
         report.reason[fresh[i]] = started[i] ? ACCEPTED : waits;
     }
+    moving.insert(report.moving.begin(), report.moving.end());
     return report;
 }
 
@@ -121,10 +129,7 @@ void Filter::take_in(Correction& found, Index frame, Report& report) {
 
 void Filter::split(const Slots& moves, Report& report) {
     Flags gone(e.table.id.size(), false);
-    for (Index slot : moves) {
-        gone[slot] = true;
-        moving.insert(e.table.id[slot]);
-    }
+    for (Index slot : moves) gone[slot] = true;
     report.moving = picked(e.table.id, where(gone));
     const std::int64_t after = e.config.misses_to_split;
     for (Index i = 0; i < e.table.size(); ++i) {

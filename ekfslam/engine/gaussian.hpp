@@ -73,6 +73,7 @@ class Gaussian {
     const Columns& columns() const { return columns_; }
     Lead lead() const;                                                   // of rows in the present frame
     Index landmarks() const { return static_cast<Index>(row_.size()); }  // in the table's order, dormant ones included
+    bool is_dormant(Index slot) const { return row_[static_cast<std::size_t>(slot)] < 0; }
     Index considered() const { return considered_; }
     Index width() const { return P_AA_.rows() + static_cast<Index>(rest_.size()); }  // n_X
 

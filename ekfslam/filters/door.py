@@ -8,8 +8,10 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.checks import LARGEST, LARGEST_PX, LARGEST_VELOCITY, require_finite, require_shape, validate_stamps
+from ekfslam.data.interval import Interval
 from ekfslam.data.observations import LARGEST_ID
-from ekfslam.errors import DataError, DuplicateObservationError, ShapeError
+from ekfslam.errors import DataError, DuplicateObservationError, ShapeError, StampError
+from ekfslam.models.process import Measured
 from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
@@ -61,8 +63,50 @@ def checked_inputs(value: Any, size: int, name: str) -> Array:
     return found
 
 
+def checked_interval(inputs: Interval | Any, tau_s: Any, is_gap: bool) -> Interval:
+    """Return the interval of a prediction, given one or its only inputs (6,).
+
+    Raises:
+        DataError: Inputs are no finite real numbers (n, 6), or time does not increase.
+    """
+    if not isinstance(inputs, Interval):
+        one = checked_inputs(inputs, 6, "inputs")
+        inputs = Interval.of_one(one, checked_stamp(tau_s), bool(is_gap))
+    tau, dt_s = checked_stamp(inputs.tau_s), checked_numbers(inputs.dt_s, "dt_s")
+    rows = checked_numbers(inputs.inputs, "inputs", LARGEST_VELOCITY)
+    if dt_s.ndim != 1 or rows.shape != (len(dt_s), 6):
+        require_shape(dt_s, (None,), "dt_s")
+        require_shape(rows, (len(dt_s), 6), "inputs")
+    if not tau > 0 or not len(dt_s) or dt_s.min() < 0:
+        raise StampError(f"time must increase, found an interval of {tau:g} s in pieces of {dt_s} s", field="tau_s")
+    if not (doubt := checked_stamp(inputs.doubt)) > 0:
+        raise DataError(f"must be positive, found {doubt}", field="doubt")
+    return Interval(tau, dt_s, rows, bool(inputs.is_gap), doubt)
+
+
+def require_measured(also: Measured | None) -> None:
+    """Raise `DataError` unless measurements of further sensors are finite, with positive standard deviations."""
+    if also is None:
+        return
+    n = len(also.axis)
+    for name in ("value", "std"):
+        require_shape(checked_numbers(getattr(also, name), f"also.{name}"), (n,), f"also.{name}")
+    require_shape(also.is_biased, (n,), "also.is_biased")
+    if not (also.std > 0).all():
+        raise DataError("must be positive", field="also.std")
+    if not np.isin(also.axis, np.arange(6)).all():
+        raise DataError(f"must be from 0 to 5, found {also.axis}", field="also.axis")
+
+
+def checked_frame(value: Any) -> int:
+    """Return the number of a frame; raise `DataError` unless it is a whole number that is not negative."""
+    if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= 0:
+        return int(value)
+    raise DataError(f"expected a whole number that is not negative, found {value!r}", field="frame")
+
+
 def checked_observations(sensor: Sensor, ids: Any, measured: Any) -> tuple[IntArray, Array]:
-    """Return ids (n,), ascending, and measurements (n, m) of a sensor's landmarks, such as pixels.
+    """Return ids (n,) and measurements (n, m) of a sensor's landmarks, such as pixels.
 
     Raises:
         DuplicateObservationError: An id occurs twice.
@@ -77,16 +121,21 @@ def checked_observations(sensor: Sensor, ids: Any, measured: Any) -> tuple[IntAr
     if widths is not None and numbers.shape[1] not in widths:
         wanted = " or ".join(map(str, widths))
         raise ShapeError(f"expected {wanted} numbers an observation, found {numbers.shape[1]}", field="pixels")
-    order = np.argsort(landmark, kind="stable")
-    landmark, numbers = landmark[order], numbers[order]
-    twice = np.flatnonzero(np.diff(landmark) == 0)
-    if len(twice):
-        raise DuplicateObservationError(f"landmark {landmark[twice[0]]} is observed twice", field="ids")
+    ascending = np.sort(landmark)
+    if len(landmark) > 1 and not np.diff(ascending).all():
+        twice = ascending[np.flatnonzero(np.diff(ascending) == 0)[0]]
+        raise DuplicateObservationError(f"landmark {twice} is observed twice", field="ids")
     if widths is None:
         rows = np.asarray(sensor.rows(numbers), dtype=float)
         require_shape(rows, (len(landmark), sensor.dimension), "pixels (as rows)")
         require_finite(rows, "pixels (as rows)")
     return landmark, numbers
+
+
+def ascending(ids: IntArray, measured: Array) -> tuple[IntArray, Array]:
+    """Return observations in the order of their ids (n,)."""
+    order = np.argsort(ids)
+    return ids[order], measured[order]
 
 
 def _checked_ids(ids: Any) -> IntArray:

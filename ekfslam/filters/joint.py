@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Sequence as SequenceType
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import cast
 
@@ -19,6 +20,7 @@ from ekfslam.data.interval import Interval
 from ekfslam.errors import ConfigError
 from ekfslam.filters import compiled
 from ekfslam.filters import frame as frames
+from ekfslam.filters.door import checked_frame, checked_inputs, checked_interval, checked_observations, require_measured
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.lifecycle import Marginal, Relinearised, Retired, Revival
 from ekfslam.filters.log import Log
@@ -29,6 +31,7 @@ from ekfslam.filters.reports import FrameReport, log_density
 from ekfslam.filters.result import Landmarks, Parameters
 from ekfslam.filters.standing import Stillness
 from ekfslam.filters.starting import Waiting
+from ekfslam.filters.undo import OneAtATime, all_or_nothing
 from ekfslam.filters.variants import is_frozen_exactly
 from ekfslam.geometry import se3
 from ekfslam.models.blocks import PreviousView, StateBlock
@@ -81,6 +84,7 @@ class JointEKF(Estimate):
             coordinates = config.landmark_coordinates
             model = model_of(sensor, sensor.noise, se3.inverse(T_world_imu), P_pose, calibration, blocks, coordinates)
         super().__init__(model, config)
+        self._in_use = OneAtATime()
         self.window = window(model, config) if config.lag and window is not None else None
         self._look_again()
         self.revival, self.retired, self._revived = revival, Retired(), False
@@ -93,7 +97,7 @@ class JointEKF(Estimate):
 
     def begin(self, inputs: Array) -> None:
         """Take the inputs (c,) at the first frame, for a time offset, eq. (9); no prediction leads to this frame."""
-        self.imu_twist = self.model.process.begin(self.values, np.asarray(inputs, dtype=float))
+        self.imu_twist = self.model.process.begin(self.values, checked_inputs(inputs, 6, "inputs"))
         self._look_again()
         self._log.amend(seen_twist=self.imu_twist)
 
@@ -110,13 +114,22 @@ class JointEKF(Estimate):
 
         Raises:
             ConfigError: Measurements by further sensors of a velocity that is not in the state.
+            DataError: Inputs are no finite real numbers, or time does not increase.
+            FilterError: Another thread uses the filter.
+
+        An error leaves the filter as it was.
         """
-        interval = inputs if isinstance(inputs, Interval) else Interval.of_one(inputs, tau_s, is_gap)
-        found = predict(self, interval, also, self._at_rest)
-        self._at_rest = None
-        self._log_likelihood += found.log_likelihood
-        self._doubt = found.doubt
-        self._log.predicted(self, interval, found)
+        interval = checked_interval(inputs, tau_s, is_gap)
+        require_measured(also)
+        is_python = (
+            also is not None or self._at_rest is not None or (self.engine is not None and not self.engine.predicts)
+        )
+        with self._in_use, self._all_or_nothing(is_python):
+            found = predict(self, interval, also, self._at_rest)
+            self._at_rest = None
+            self._log_likelihood += found.log_likelihood
+            self._doubt = found.doubt
+            self._log.predicted(self, interval, found)
 
     def update(self, frame: int, ids: IntArray, measured: Array) -> FrameReport:
         """Retire landmarks out of view, correct with known ones (6), start new ones (5).
@@ -131,9 +144,24 @@ class JointEKF(Estimate):
 
         Raises:
             InnovationError: The innovation covariance is not positive definite.
+            DataError: Arguments have another shape or kind, or are not finite.
+            FilterError: Another thread uses the filter.
+
+        An error leaves the filter as it was.
         """
+        frame, (ids, measured) = checked_frame(frame), checked_observations(self.sensor, ids, measured)
+        with self._in_use:
+            returning = [] if self.revival is None else self.retired.among(ids)
+            with self._all_or_nothing(bool(returning) or self.window is not None):
+                return self._update(frame, ids, measured, returning)
+
+    def _all_or_nothing(self, changes_engine: bool) -> AbstractContextManager[None]:
+        return all_or_nothing(
+            self, self._log, self.retired, (self.window, self._waiting, self._stillness), changes_engine
+        )
+
+    def _update(self, frame: int, ids: IntArray, measured: Array, returning: list[int]) -> FrameReport:
         # 1. Retire landmarks out of view, revive those that come back; correct with known landmarks, start new ones.
-        returning = [] if self.revival is None else self.retired.among(ids)
         if (engine := self.engine) is None:
             frames.rest(self, self.retired, frame, ids)
             self._revive(frame, returning)
@@ -146,7 +174,6 @@ class JointEKF(Estimate):
         # 2. Linearise the last frames again.
         if self.window is not None and self.step:
             self._relinearise(self.window)
-        self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
         likelihood = self._log_likelihood + log_density(found.nis, found.log_det, found.dof)
         self._log_likelihood = 0.0
         # 3. A rig that stands has no velocity.
@@ -154,6 +181,7 @@ class JointEKF(Estimate):
         self._at_rest = None if standing is None else standing.measured
         is_standing = None if standing is None else standing.measured is not None
         doubt = max(self._doubt, self.motion.interval.doubt)
+        self._reported.append(self.model.reported(self.values, self.gaussian.body_covariance))
         outcome = frame, ids, found.reason, found.nis, found.dof, found.split, likelihood, found.innovations
         return FrameReport(*outcome, doubt, is_standing)
 

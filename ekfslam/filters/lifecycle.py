@@ -86,6 +86,27 @@ class Retired:
         self.reappeared: list[int] = []
         self.moving: set[int] = set()
         self._dropped = 0
+        self._rows_before: dict[int, int | None] = {}  # entries of `row_of` that have changed since `mark`
+
+    def mark(self) -> tuple[int, int, int, set[int]]:
+        """Return a mark of this moment for `restore`; an earlier one is of no use any more."""
+        self._rows_before = {}
+        return len(self._parts), len(self.revived), len(self.reappeared), set(self.moving)
+
+    def restore(self, mark: tuple[int, int, int, set[int]]) -> None:
+        """Forget everything since a mark."""
+        parts, revived, reappeared, self.moving = mark
+        for grown, length in ((self._parts, parts), (self._rows, parts)):
+            del grown[length:]
+        del self.revived[revived:], self.reappeared[reappeared:]
+        for i, row in self._rows_before.items():
+            self.row_of.pop(i, None)
+            if row is not None:
+                self.row_of[i] = row
+
+    def _leave(self, i: int) -> None:
+        """Take an id from those that may come back."""
+        self._rows_before.setdefault(i, self.row_of.pop(i))
 
     @property
     def counts(self) -> dict[str, int]:
@@ -105,7 +126,9 @@ class Retired:
         self._parts.append(gone)
         self._rows.append(rows)
         if may_return:
-            self.row_of.update(zip(gone.id.tolist(), rows.tolist(), strict=True))
+            for i, row in zip(gone.id.tolist(), rows.tolist(), strict=True):
+                self._rows_before.setdefault(i, self.row_of.get(i))
+                self.row_of[i] = row
             verdicts = zip(columns["misses"].tolist(), columns["evidence"], strict=True)
             self._verdicts.update(zip(rows.tolist(), verdicts, strict=True))
 
@@ -118,7 +141,7 @@ class Retired:
         again = self.among(ids)
         self.reappeared.extend(again)
         for i in again:
-            del self.row_of[i]
+            self._leave(i)
 
     def drop(self) -> None:
         """Drop all landmarks that have left; they cannot come back. Tracks that move stay known."""
@@ -169,7 +192,7 @@ class Retired:
             initial_m=log.first_position_m[back],
         )
         for i in came.id.tolist():
-            del self.row_of[i]
+            self._leave(i)
         self.revived.extend(ids)
 
 

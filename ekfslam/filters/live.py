@@ -25,7 +25,7 @@ from ekfslam.data.inputs import InertialNoise, InertialSamples
 from ekfslam.data.noise import Noise
 from ekfslam.errors import ClockError, ConfigError, MissingVelocityError
 from ekfslam.filters.admission import Admission, Dropped, Kind
-from ekfslam.filters.door import checked_inputs, checked_observations, checked_stamp
+from ekfslam.filters.door import ascending, checked_inputs, checked_observations, checked_stamp
 from ekfslam.filters.driven import Driven, copied
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.joint import JointEKF
@@ -198,7 +198,7 @@ class LiveEKF:
             DataError: Shapes disagree, a number is not finite, an id occurs twice, or another image has the stamp.
             EkfslamError: As `predict`.
         """
-        landmark, measured = checked_observations(self.ekf.sensor, ids, pixels)
+        landmark, measured = ascending(*checked_observations(self.ekf.sensor, ids, pixels))
         t = checked_stamp(t)
         with self.lock:
             self._watch_clock("image", t)

@@ -68,6 +68,22 @@ class LogBook:
         for name, value in arrays.items():
             self._parts[name].append(value)
 
+    def mark(self) -> tuple[int, dict, dict[str, int], int, int]:
+        """Return a mark of this moment for `restore`."""
+        lengths = {name: len(parts) for name, parts in self._parts.items()}
+        return len(self._frames), dict(self._frames[-1]), lengths, self._landmarks, self._observations
+
+    def restore(self, mark: tuple[int, dict, dict[str, int], int, int]) -> None:
+        """Forget everything since a mark."""
+        frames, last, lengths, self._landmarks, self._observations = mark
+        del self._frames[frames:]
+        self._frames[-1] = last
+        for name, length in lengths.items():
+            parts = self._parts[name]
+            if len(parts) < length:  # joined since then, see `since`
+                parts[:] = [np.concatenate(parts)[: self._landmarks]]
+            del parts[length:]
+
     def predicted(self, now: Estimate, interval: Interval, found: Prediction) -> None:
         """Add a frame, reached by a prediction over an interval."""
         if found.measured is not None:

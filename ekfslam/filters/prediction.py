@@ -94,13 +94,18 @@ def predict(e: Estimate, interval: Interval, also: Measured | None, at_rest: Mea
 def _arrived(e: Estimate, engine: Engine, interval: Interval, found: dict[str, Any]) -> Prediction:
     """Take in a prediction of the engine, which keeps what it needs of the motion."""
     e.forget_table()
-    T_departed, W = e.T_imu_world, e.motion.W_predicted
+    T_departed, W = found["T_departed"].reshape(4, 4), e.motion.W_predicted
     e.updated_view = PreviousView.name if e.updated_view == View.name else None
     e.values, e.coordinates = engine.named(found["values"]), found["coordinates"]
     T_cam_imu = found["T_cam_imu"].reshape(4, 4)
     e.motion = Motion(T_departed, e.T_imu_world, W, W, interval, found["way_m"], T_cam_imu, np.zeros((0, 0)))
+    measured, doubt = e.model.process.measured(interval, e.step == 0), found["doubt"]
+    log_likelihood = 0.0
+    if measured is not None and e.step:
+        measured = replace(measured, std=doubt * measured.std)
+        log_likelihood = log_density(found["nis"], found["log_det"], len(measured.value))
     e.imu_twist, e.step = found["imu_twist"], e.step + 1
-    return Prediction(found["departed"], None, 0.0)
+    return Prediction(found["departed"], measured, log_likelihood, doubt)
 
 
 def _measure(

@@ -14,7 +14,7 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.geometry import se3
 
-LONGEST_S = 0.05  # of a piece, so that the rest of the series below is rounding
+LONGEST_S, WIDEST_RAD = 0.05, 0.1  # of a piece, so that the rest of the series below is rounding
 _TERMS = 10
 PHI, NU, R, BG, BA = (slice(3 * i, 3 * i + 3) for i in range(5))  # of z
 _EYE = np.eye(3)

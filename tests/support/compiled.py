@@ -99,20 +99,25 @@ def flat(e, values=None):
     return np.concatenate([np.ravel(values[block.name]) for block in e.model.layout.blocks])
 
 
-def compiled(engine, e, P=None, values=None, position_m=None, waiting_gate=1e9):
-    """Return a `Filter` of the module in the state of a reference estimate with covariance P, its view open."""
-    values, body = flat(e, values), e.model.layout.body
+def arguments(e, values=None, waiting_gate=1e9):
+    """Return the arguments of a `Filter` of the module for a reference estimate."""
     error = e.model.track_error
-    made = engine.Filter(
+    return [
         _blocks(e.model),
         _sensor(e.sensor),
         None if error is None else vars(error),
         {**_CONFIG, **_settings(e.config), "waiting_gate": waiting_gate},
-        values,
+        flat(e) if values is None else values,
         e.coordinates,
         e.model.prior_covariance,
         _shares(e),
-    )
+    ]
+
+
+def compiled(engine, e, P=None, values=None, position_m=None, waiting_gate=1e9):
+    """Return a `Filter` of the module in the state of a reference estimate with covariance P, its view open."""
+    values, body = flat(e, values), e.model.layout.body
+    made = engine.Filter(*arguments(e, values, waiting_gate))
     for _ in range(e.step):
         arrive(made, e, values, np.eye(body), np.zeros((body, body)))
     table = {name: np.ascontiguousarray(getattr(e.table, name)) for name in _COLUMNS}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -25,7 +26,12 @@ class Twist(StateBlock):
     name = "twist"
     size = 6
     per_frame = True
+    laws: ClassVar = {"transition": "walk"}
 
     def transition(self, tau_s: Array | float, way_m: Array | float) -> tuple[Array, Array] | None:
         std = np.broadcast_to(self.walk_std, (*np.shape(tau_s), 6))
         return np.ones_like(std), std
+
+    def as_data(self) -> dict[str, Any] | None:
+        data = super().as_data()
+        return data and {**data, "std": np.broadcast_to(self.walk_std, 6).astype(float)}

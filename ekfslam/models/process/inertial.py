@@ -19,7 +19,7 @@ from ekfslam.data.interval import Interval, Intervals
 from ekfslam.data.noise import Noise
 from ekfslam.errors import ConfigError
 from ekfslam.geometry import se3
-from ekfslam.geometry.preintegration import LONGEST_S, NU, PHI, Increment, R, increments
+from ekfslam.geometry.preintegration import LONGEST_S, NU, PHI, WIDEST_RAD, Increment, R, increments
 from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
 from ekfslam.models.blocks.base import Layout, StateBlock, Values
 from ekfslam.models.process.base import MakeProcess, Measured, Process, Residual, Step
@@ -72,8 +72,9 @@ class Inertial(Process):
         return Step(moved, self.imu_twist(values, moved, interval), Phi, Q)
 
     def _increments(self, interval: Interval, gyro_bias: Array, accel_bias: Array) -> Increment:
-        """Return the increments of the pieces of an interval; long ones are divided."""
-        parts = np.ceil(interval.dt_s / LONGEST_S).astype(int)
+        """Return the increments of the pieces of an interval; long ones and wide turns are divided."""
+        turn_rad = interval.dt_s * np.linalg.norm(interval.inputs[:, :3] - gyro_bias, axis=1)
+        parts = np.ceil(np.maximum(interval.dt_s / LONGEST_S, turn_rad / WIDEST_RAD)).astype(int).clip(1)
         inputs = np.repeat(interval.inputs, parts, axis=0)
         white = _GAP_FACTOR if interval.is_gap else 1.0
         noise = self.noise
