@@ -302,5 +302,5 @@ def test_a_definition_that_a_bag_brings_is_not_used(tmp_path):
 def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
     path = write(tmp_path, stereo())
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    with pytest.raises(MissingPackageError, match=r"pip install 'ekfslam\[bags\]'"):
+    with pytest.raises(MissingPackageError, match=r"pip install 'ekfslam\[ros\]'"):
         open_images(path)

@@ -42,7 +42,10 @@ def require(fields: Mapping[str, Any], name: str) -> NDArray:
     """Return a field of a file as an array of any type."""
     if name not in fields:
         raise ShapeError("this field is missing", field=name)
-    return np.asarray(fields[name])
+    try:
+        return np.asarray(fields[name])
+    except (ValueError, RecursionError):
+        raise ShapeError("a list of lists of different lengths", field=name) from None
 
 
 def require_numbers(

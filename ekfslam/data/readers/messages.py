@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
 from ekfslam.data.images import Image
+from ekfslam.data.readers.compressed import require_room
 from ekfslam.data.readers.pictures import decode_gray, size_of_image, upper_eight
 from ekfslam.data.readers.registry import Source
 from ekfslam.errors import CalibrationError, EkfslamError, LostDataError, MissingPackageError, UnknownFormatError
@@ -58,6 +59,7 @@ class Bag:
             raise MissingPackageError("rosbags", "ros", f"{path}: reading a bag ({error})") from None
         self.path = path
         with self.named_errors():
+            require_room(path)
             self.is_ros1 = Source.at(path).head.startswith(ROS1_MAGIC)
             self._reader: Any = rosbag1.Reader(path) if self.is_ros1 else rosbag2.Reader(path)
             self._reader.open()

@@ -51,7 +51,11 @@ def read_pickled(path: Path, expected: str) -> dict[str, Any]:
         begin = stream.tell()
         _inspect(stream)
         stream.seek(begin)
-        found = _unboxed(_Restricted(stream).load())
+        loaded = _Restricted(stream, Budget(str(path))).load()
+        Budget(str(path)).take(_size(loaded, {}), "the dictionary with all its lists")
+        found = _unboxed(loaded)
+    except RecursionError:
+        raise UnknownFormatError(f"{path}: lists in lists, too deep; {expected}") from None
     except (ValueError, EOFError, OverflowError) as error:
         raise UnknownFormatError(f"{path}: damaged .npy file ({_clean(error)}); {expected}") from None
     except (TypeError, AttributeError, KeyError, IndexError):  # their words are about Python's objects, not the file
@@ -155,7 +159,7 @@ def _boxed(array: NDArray) -> _Array:
     return box
 
 
-def _known(ndarray: _Known) -> dict[tuple[str, str], _Known]:
+def _known(ndarray: _Known, budget: Budget) -> dict[tuple[str, str], _Known]:
     """Return the functions that pickled arrays call, by module and name, for one file."""
 
     def reconstruct(kind: Any, shape: Any, code: Any) -> _Array:
@@ -170,6 +174,7 @@ def _known(ndarray: _Known) -> dict[tuple[str, str], _Known]:
         return _numbers(values, kind, (), "C").item()
 
     def encode(text: str, encoding: str) -> bytes:
+        budget.take(len(text), "the text in it")  # each call makes a copy
         return text.encode("latin-1")  # bytes that were pickled for Python 2
 
     found = {("numpy", "ndarray"): ndarray, ("numpy", "dtype"): _Known(lambda code, *_: _Type(code))}
@@ -188,9 +193,9 @@ def _no_array(*_: Any) -> NoReturn:
 class _Restricted(pickle.Unpickler):
     """Unpickler that knows only the names of `_known`."""
 
-    def __init__(self, stream: io.BytesIO) -> None:
+    def __init__(self, stream: io.BytesIO, budget: Budget) -> None:
         super().__init__(stream, encoding="latin-1")
-        self._names = _known(_Known(_no_array))
+        self._names = _known(_Known(_no_array), budget)
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in self._names:
@@ -199,6 +204,22 @@ class _Restricted(pickle.Unpickler):
 
     def persistent_load(self, pid: Any) -> NoReturn:
         raise pickle.UnpicklingError("the file refers to objects outside of it")
+
+
+def _size(value: Any, known: dict[int, int]) -> int:
+    """Return the bytes of a value if each list is written out wherever it occurs; ``known`` holds those of lists."""
+    value = value.value if isinstance(value, _Array) else value
+    if isinstance(value, np.ndarray):
+        return int(value.nbytes)
+    if not isinstance(value, dict | list | tuple):
+        return len(value) if isinstance(value, str | bytes) else 8
+    if id(value) not in known:
+        known[id(value)] = -1
+        entries = value.values() if isinstance(value, dict) else value
+        known[id(value)] = 8 + sum(_size(entry, known) for entry in entries)
+    if known[id(value)] < 0:
+        raise pickle.UnpicklingError("a list that contains itself")
+    return known[id(value)]
 
 
 def _unboxed(value: Any, depth: int = 2) -> Any:

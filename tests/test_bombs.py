@@ -1,0 +1,138 @@
+"""Small files that would become large: shared lists, texts encoded again and again, compressed bags, ragged lists."""
+
+from __future__ import annotations
+
+import bz2
+import contextlib
+import pickle
+import re
+import sqlite3
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.bags import stereo, write
+from support.npy import npy_fields, write_npy
+
+from ekfslam import open_images, open_sequence
+from ekfslam.data.simulate import builtin
+from ekfslam.errors import EkfslamError, UnknownFormatError
+from ekfslam.limits import reading_up_to
+
+
+def npy_of(path: Path, pickled: bytes) -> Path:
+    """An .npy file of an array of one object that some bytes pickle."""
+    head = b"{'descr': '|O', 'fortran_order': False, 'shape': (), }"
+    head += b" " * (63 - (len(head) + 10) % 64) + b"\n"
+    path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + pickled)
+    return path
+
+
+def test_shared_lists_are_counted_wherever_they_occur(tmp_path):
+    value: object = [1.0] * 10
+    for _ in range(30):
+        value = [value] * 10
+    path = npy_of(tmp_path / "a.npy", pickle.dumps({"timestamps": value}, 2))
+    assert path.stat().st_size < 3000
+    with pytest.raises(UnknownFormatError, match=r"a\.npy: the dictionary with all its lists claims .* --read-limit"):
+        open_sequence(path)
+
+
+def test_a_list_that_contains_itself_is_refused(tmp_path):
+    value: list[object] = [1.0]
+    value.append(value)
+    with pytest.raises(UnknownFormatError, match="a list that contains itself"):
+        open_sequence(npy_of(tmp_path / "a.npy", pickle.dumps({"timestamps": value}, 2)))
+
+
+def test_a_text_that_is_encoded_again_and_again_is_counted(tmp_path):
+    text = "x" * 1_000_000
+    encode = b"c_codecs\nencode\n"
+    body = b"\x80\x02}X" + struct.pack("<I", 1) + b"a]("
+    first = encode + b"X" + struct.pack("<I", len(text)) + text.encode() + b"q\x01X\x06\x00\x00\x00latin1\x86R"
+    again = encode + b"h\x01X\x06\x00\x00\x00latin1\x86R"
+    path = npy_of(tmp_path / "a.npy", body + first + again * 400 + b"es.")
+    with reading_up_to(0.05), pytest.raises(UnknownFormatError, match=r"a\.npy: the text in it claims"):
+        open_sequence(path)
+
+
+FIELDS = ("features", "timestamps", "v_t", "w_t", "K_l", "K_r", "extL_T_imu", "extR_T_imu")
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("ragged", [[[1.0, 2.0], [3.0]], [[1.0], 2.0], [[], [[1.0]]]], ids=["rows", "mixed", "deep"])
+def test_ragged_lists_are_a_named_error(tmp_path, field, ragged):
+    path = write_npy(tmp_path / "a.npy", {**npy_fields(builtin("loop?frames=5")), field: ragged})
+    with pytest.raises(EkfslamError, match=field):
+        open_sequence(path)
+
+
+def test_a_bag_that_is_compressed_as_a_whole_is_counted_before_it_is_written(tmp_path):
+    zstd = pytest.importorskip("rosbags.rosbag2.reader").zstd
+    path = write(tmp_path, stereo())
+    file = next(path.glob("*.db3"))
+    file.with_name(f"{file.name}.zstd").write_bytes(zstd.compress(bytes(80_000_000)))
+    file.unlink()
+    with (
+        reading_up_to(0.01),
+        pytest.raises(UnknownFormatError, match="the file, decompressed, claims"),
+    ):
+        open_images(path)
+
+
+def test_messages_that_are_compressed_one_by_one_are_counted(tmp_path):
+    zstd = pytest.importorskip("rosbags.rosbag2.reader").zstd
+    path = write(tmp_path, stereo())
+    metadata = path / "metadata.yaml"
+    text = re.sub(r"compression_format: .*", "compression_format: zstd", metadata.read_text())
+    metadata.write_text(re.sub(r"compression_mode: .*", "compression_mode: MESSAGE", text))
+    with contextlib.closing(sqlite3.connect(next(path.glob("*.db3")))) as database:
+        database.execute("UPDATE messages SET data = ?", (zstd.compress(bytes(80_000_000)),))
+        database.commit()
+    with reading_up_to(0.01), pytest.raises(UnknownFormatError, match="decompressed, claims"):
+        open_images(path)
+
+
+@pytest.mark.parametrize("claims", [80_000_000, 100])
+@pytest.mark.parametrize("frames", [1, 40])
+def test_a_chunk_of_mcap_is_counted_whatever_it_claims(tmp_path, claims, frames):
+    zstd = pytest.importorskip("rosbags.rosbag2.reader").zstd
+    data = zstd.compress(bytes(80_000_000 // frames)) * frames
+    chunk = struct.pack("<QQQII", 0, 1, claims, 0, 4) + b"zstd" + struct.pack("<Q", len(data)) + data
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + b"\x06" + struct.pack("<Q", len(chunk)) + chunk)
+    with reading_up_to(0.01), pytest.raises(UnknownFormatError, match=r"a\.mcap: a chunk.* claims .* --read-limit"):
+        open_images(path)
+
+
+@pytest.mark.parametrize("claims", [80_000_000, 100])
+def test_a_chunk_of_ros1_is_counted_whatever_it_claims(tmp_path, claims):
+    def record(fields: dict[bytes, bytes], data: bytes) -> bytes:
+        header = b"".join(struct.pack("<I", len(k) + len(v) + 1) + k + b"=" + v for k, v in fields.items())
+        return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
+
+    fields = {b"op": b"\x05", b"compression": b"bz2", b"size": struct.pack("<I", claims)}
+    path = tmp_path / "a.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n" + record(fields, bz2.compress(bytes(80_000_000))))
+    with reading_up_to(0.01), pytest.raises(UnknownFormatError, match=r"a\.bag: a chunk.* claims .* --read-limit"):
+        open_images(path)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap", "ros2"])
+def test_bags_of_usual_sizes_are_read_within_a_small_limit(tmp_path, kind):
+    path = write(tmp_path, stereo(), kind)
+    with reading_up_to(0.01):
+        assert open_images(path) is not None
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff", "pgm"])
+def test_images_that_claim_huge_sizes_are_refused_by_their_header(tmp_path, suffix):
+    from PIL import Image as Pillow
+
+    from ekfslam.data.readers.pictures import read_gray
+
+    path = tmp_path / f"a.{suffix}"
+    Pillow.fromarray(np.zeros((4000, 4000), np.uint8)).save(path)
+    with reading_up_to(0.02), pytest.raises(UnknownFormatError, match=r"the image claims .* --read-limit"):
+        read_gray(path)
