@@ -118,6 +118,15 @@ def test_a_given_calibration_takes_precedence_in_a_euroc_folder(tmp_path):
     assert any("c.yaml states no T_cam_imu" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("given", ["mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml", "mav0", "."])
+def test_sensor_files_of_euroc_serve_other_recordings(tmp_path, given):
+    folder = write_euroc(tmp_path)
+    found, own = read_pair(folder / given), open_images(folder)
+    np.testing.assert_allclose(found.pair().T_right_left, own.calibration.T_right_left, atol=1e-12)
+    np.testing.assert_allclose(found.T_cam_imu, own.T_cam_imu, atol=1e-12)
+    np.testing.assert_array_equal(found.pair().K_right, own.calibration.K_right)
+
+
 # ROS
 
 R1, R2 = (se3.so3_exp(np.array(w)) for w in ([0.01, -0.02, 0.005], [-0.01, 0.01, 0.02]))

@@ -13,10 +13,10 @@ import pytest
 from PIL import Image as Pillow
 from support.images import FRAMES, STAMPS_NS, picture, write_euroc, write_plain
 
-from ekfslam import attach_truth, open_images
+from ekfslam import attach_truth, open_images, open_sequence
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.sequence import Observations, Sequence
-from ekfslam.errors import CalibrationError, LostDataError, UnknownFormatError
+from ekfslam.errors import CalibrationError, EmptyTracksError, LostDataError, UnknownFormatError
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.geometry.camera import StereoCamera
 
@@ -264,6 +264,8 @@ def test_a_baseline_that_is_hardly_in_metres_is_named(tmp_path, baseline, words)
     found = opened(folder)
     pattern = words.replace("(", r"\(").replace(")", r"\)")
     assert re.search(pattern, found.notes[0])
+    with pytest.raises(EmptyTracksError, match=pattern):
+        open_sequence(folder)
     sequence = as_sequence(opened(write_kitti(tmp_path)))
     assert not inspect_sequence(sequence).warnings
     changed = dataclasses.replace(sequence, camera=StereoCamera(700.0, 700.0, 600.0, 180.0, baseline))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FrontEndConfig
-from ekfslam.data.images import Image, ImageRecording, PairCalibration
+from ekfslam.data.images import Image, ImageRecording, PairCalibration, baseline_doubt
 from ekfslam.data.sequence import CHECKED_TRACKS, WITHOUT_VELOCITIES, Observations, Sequence
 from ekfslam.errors import EmptyTracksError
 from ekfslam.frontend.opencv import one_thread
@@ -133,10 +133,10 @@ class Tracking:
         rotation, std = np.array(self._vectors), np.array(self._stds)
         observations, single = _observations(self._seen, rotation, self.camera)
         if not len(observations):
-            raise EmptyTracksError(
-                "no feature is seen in both images of two frames: is left right, or max_disparity too small?",
-                source=recording.source,
-            )
+            doubt = baseline_doubt(float(np.linalg.norm(recording.calibration.T_right_left[:3, 3])))
+            causes = doubt or "is left right, or max_disparity too small?"
+            message = f"no feature is seen in both images of two frames: {causes}"
+            raise EmptyTracksError(message, source=recording.source)
         report = TrackReport(
             len(self._seen),
             len(observations.ids),

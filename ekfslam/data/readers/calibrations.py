@@ -1,6 +1,7 @@
 """Calibrations of a pair in the files of other programs, for images that bring none.
 
 - Kalibr and OpenVINS: a chain with ``cam0 cam1``, or the configuration that names it (``relative_config_imucam``).
+- EuRoC: ``cam0/sensor.yaml`` and ``cam1/sensor.yaml`` (either file, or the folder above).
 - ROS: ``left.yaml`` and ``right.yaml`` of camera_calibration, as in CameraInfo (either file, or their folder).
 - OpenCV: ``K1 D1 K2 D2 R T`` (or ``M1 ...``) of stereo_calib.
 - ORB-SLAM: ``LEFT.K D R P`` and ``RIGHT``; ``Camera1 Camera2 Stereo.T_c1_c2``; ``Camera.fx ... Camera.bf``.
@@ -219,6 +220,9 @@ def find_chain(*folders: Path) -> Path | None:
 
 def _in_folder(folder: Path) -> Path:
     chain = find_chain(folder)
+    if chain is None:
+        places = (folder / above / "cam0/sensor.yaml" for above in ("", "mav0"))
+        chain = next((file for file in places if file.is_file()), None)
     lefts = [file for file in sorted((*folder.glob("*.yaml"), *folder.glob("*.yml"))) if side_of(file.stem) == 0]
     if chain is None and not lefts:
         raise UnknownFormatError(f"{folder}: no calibration of a pair; {EXPECTED}")
@@ -265,6 +269,21 @@ def _size(read: Calibration, *keys: str) -> Size:
         message = f"expected whole numbers of pixels, found {width:g} and {height:g}"
         raise CalibrationError(message, field=keys[0])
     return int(width), int(height)
+
+
+def _euroc(read: Calibration) -> PairFile:
+    """Read ``sensor.yaml`` of a camera of EuRoC and that of the other side: ``cam0/sensor.yaml cam1/sensor.yaml``."""
+    path = read.path
+    folder = other_side(path.parent.resolve())
+    other = other_side(path) or (folder / path.name if folder is not None else None)
+    if other is None or not other.is_file():
+        raise UnknownFormatError(f"{path}: it has one camera, and there is none of the other side, as cam0 and cam1")
+    is_right = side_of(path.stem) == 1 or side_of(path.resolve().parent.name) == 1
+    reads = (read_yaml(other), read) if is_right else (read, read_yaml(other))
+    cameras = [kalibr_camera(each, "", "distortion_coefficients") for each in reads]
+    poses = [se3.inverse(pose_of(each, "T_BS.data" if "T_BS.data" in each else "T_BS")) for each in reads]
+    files = (reads[0].path, reads[1].path)
+    return PairFile(cameras[0], cameras[1], poses[1] @ se3.inverse(poses[0]), files, poses[0])
 
 
 def _openvins(read: Calibration) -> PairFile:
@@ -409,6 +428,7 @@ def _pose(read: Calibration, key: str) -> Array:
 _FORMATS: dict[str, Any] = {
     "relative_config_imucam": _openvins,
     "cam0": _chain,
+    "T_BS": _euroc,
     "camera_matrix": _ros,
     "LEFT.K": _orb_rectifying,
     "Camera1.fx": _orb_two,
