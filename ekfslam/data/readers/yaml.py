@@ -61,10 +61,10 @@ def read_yaml(path: Path) -> Calibration:
     parts: dict[str, list[str]] = {}
     above: list[tuple[int, str]] = []
     for raw in read_lines(path, "expected a calibration in YAML"):
-        line = re.sub(r"(^|\s)#.*$", "", raw).rstrip()
+        line = (re.sub(r"(^|\s)#.*$", "", raw) if "#" in raw else raw).rstrip()
         if not line or line.startswith(("%", "---")):
             continue
-        match = _KEY.match(line)
+        match = _KEY.match(line) if ":" in line else None
         if match:
             depth = len(match.group(1))
             above = [entry for entry in above if entry[0] < depth] + [(depth, match.group(2))]
