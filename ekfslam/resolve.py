@@ -508,7 +508,7 @@ def first_state(sequence: Sequence, config: Config, model: Model) -> InertialSta
     """
     samples = sequence.inertial
     assert samples is not None
-    prior = FirstPrior.of(sequence, model, config.inertial.gravity_m_s2)
+    prior = FirstPrior.of(sequence.initial_T_world_imu, model, config.inertial.gravity_m_s2)
     if (rest := rest_of(sequence)) is not None:
         return at_rest(samples, *rest, prior, densities_of(config))
     if sequence.camera.is_monocular:

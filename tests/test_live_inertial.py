@@ -7,7 +7,7 @@ import pytest
 
 from ekfslam import LiveEKF
 from ekfslam.config import Config
-from ekfslam.data.inputs import InertialNoise
+from ekfslam.data.inputs import InertialNoise, InertialSamples
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError, LateError
 from ekfslam.filters.joint import JointEKF
@@ -168,3 +168,23 @@ def test_a_rig_with_an_inertial_unit_from_a_given_start(problem):
     sent(live, messages(sequence))
     error = se3.log(se3.inverse(live.pose(live.time_s).T_world_imu) @ sequence.truth.T_world_imu[-1])
     assert np.linalg.norm(error[:3]) < 0.05 and live.counts.taken_in == FRAMES
+
+
+def test_a_rest_gives_tilt_and_biases(problem):
+    """Its samples, one second of them, lead to the truth from a pose without the tilt."""
+    sequence, rng = problem.sequence, np.random.default_rng(3)
+    densities, true = InertialNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3), sequence.truth
+    T, t = true.T_world_imu[0], float(sequence.time_s[0]) - 1.0 + 0.005 * np.arange(200)
+    noise = np.sqrt(200.0) * np.repeat([densities.gyro, densities.accel], 3) * rng.standard_normal((200, 6))
+    gyro = true.motion.gyro_bias_rad_s[0] + noise[:, :3]
+    accel = T[:3, :3].T @ [0.0, 0.0, 9.81] + true.motion.accel_bias_m_s2[0] + noise[:, 3:]
+    tilted = T @ se3.transform(se3.so3_exp(np.array([0.2, -0.1, 0.0])), np.zeros(3))
+    rest = InertialSamples(t, gyro, accel)
+    live = LiveEKF.from_rig(sequence.camera, sequence.T_cam_imu, sequence.noise, tilted, imu=densities, rest=rest)
+    up = live.ekf.T_imu_world[:3, 2] @ (T[:3, :3].T @ [0.0, 0.0, 1.0])
+    assert up > np.cos(0.03)  # the bias of the accelerometer, 0.1 m/s^2, looks like a tilt of 0.01
+    np.testing.assert_allclose(live.ekf.values["gyro_bias"], true.motion.gyro_bias_rad_s[0], atol=1e-3)
+    sent(live, messages(sequence))
+    value, covariance = live.block("gyro_bias")
+    error = value - true.motion.gyro_bias_rad_s[-1]
+    assert error @ np.linalg.solve(covariance, error) < 16.3

@@ -275,7 +275,7 @@ def test_the_log_is_bounded_by_choice():
     with pytest.raises(PosteriorError, match="log_frames"):
         live.ekf.log()
     assert len(live.ekf.landmarks().id) == len(live.ekf.ids)
-    with pytest.raises(ConfigError, match="log_frames"):
+    with pytest.raises(ConfigError, match="must be positive"):
         new(log_frames=0)
 
 

@@ -34,7 +34,9 @@ from ekfslam.filters.streams import Samples, Velocities
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.models.build import blocks_and_process, model_of
+from ekfslam.models.inertial_start import FirstPrior, at_rest
 from ekfslam.models.model import Model
+from ekfslam.models.process.inertial import GRAVITY_M_S2
 from ekfslam.models.sensors.stereo import Rig
 
 MOST_IMAGES = 10_000  # that wait
@@ -87,10 +89,8 @@ class LiveEKF:
         backlog: int = 100_000,
         log_frames: float = 10_000,
     ) -> None:
-        if not (delay_s >= 0 and gap_s > 0 and history_s >= 0):
-            raise ConfigError("delay_s and history_s must not be negative, and gap_s must be positive")
-        if not (jump_s > 0 and backlog >= 1 and log_frames >= 1):
-            raise ConfigError("jump_s must be positive, and backlog and log_frames must be at least 1")
+        if not (delay_s >= 0 and history_s >= 0 and gap_s > 0 and jump_s > 0 and backlog >= 1 and log_frames >= 1):
+            raise ConfigError("delay_s and history_s must not be negative; all other numbers must be positive")
         if late not in ("raise", "count"):
             raise ConfigError(f"late: expected 'raise' or 'count', found {late!r}")
         self.delay_s, self.gap_s, self.history_s = delay_s, gap_s, history_s
@@ -120,6 +120,7 @@ class LiveEKF:
         config: FilterConfig | None = None,
         *,
         imu: InertialNoise | None = None,
+        rest: InertialSamples | None = None,
         **window: Any,
     ) -> LiveEKF:
         """Return the live filter of a stereo rig with measured velocities or an inertial unit.
@@ -130,11 +131,13 @@ class LiveEKF:
             T_world_imu: (4, 4) first pose, by default the origin; with an inertial unit, gravity is along -z of world.
             config: Settings of the filter; by default landmarks out of view are retired.
             imu: Densities of an inertial unit that gives samples instead of velocities.
+            rest: Samples of a rest before the first image, which give tilt and biases; the pose gives the remainder.
             window: Further arguments of `LiveEKF`.
         """
         settings = config or FilterConfig(retire="unseen")
         start, rig = np.eye(4) if T_world_imu is None else T_world_imu, Rig(camera, T_cam_imu, noise)
-        return cls(JointEKF(rig if imu is None else _inertial(rig, imu, start, settings), settings, start), **window)
+        sensor = rig if imu is None else _inertial(rig, imu, start, settings, rest)
+        return cls(JointEKF(sensor, settings, start), **window)
 
     @property
     def ekf(self) -> JointEKF:
@@ -268,8 +271,7 @@ class LiveEKF:
         """Return the value and the covariance of a state block at a stamp, such as ``velocity`` or ``gyro_bias``.
 
         Raises:
-            ConfigError: ``live.ekf.model.layout`` has no such block.
-            EkfslamError: As `pose`.
+            EkfslamError: As `pose`; or ``live.ekf.model.layout`` has no such block.
         """
         with self.lock:
             layout = self.ekf.model.layout
@@ -304,8 +306,14 @@ class LiveEKF:
         return reports
 
 
-def _inertial(rig: Rig, imu: InertialNoise, T_world_imu: Array, settings: FilterConfig) -> Model:
-    """Return the model of a rig with an inertial unit."""
+def _inertial(
+    rig: Rig, imu: InertialNoise, T_world_imu: Array, settings: FilterConfig, rest: InertialSamples | None
+) -> Model:
+    """Return the model of a rig with an inertial unit, which starts from a pose or from a rest."""
     blocks, process = blocks_and_process({}, imu)
     P, coordinates = settings.initial_covariance, settings.landmark_coordinates
-    return model_of(rig, rig.noise, se3.inverse(T_world_imu), P, None, blocks, coordinates, False, process)
+    model = model_of(rig, rig.noise, se3.inverse(T_world_imu), P, None, blocks, coordinates, False, process)
+    if rest is None:
+        return model
+    prior = FirstPrior.of(T_world_imu, model, GRAVITY_M_S2)
+    return at_rest(rest, float(rest.time_s[0]), float(rest.time_s[-1]), prior, imu).begun(model)

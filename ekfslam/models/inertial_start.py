@@ -85,14 +85,14 @@ class FirstPrior:
     gravity_m_s2: float
 
     @staticmethod
-    def of(sequence: Sequence, model: Model, gravity_m_s2: float) -> FirstPrior:
-        """Return the prior of a recording, which starts at its true position and heading, or at 0, and of a model."""
+    def of(T_world_imu: Array, model: Model, gravity_m_s2: float) -> FirstPrior:
+        """Return the prior of a model, with position and heading of a first pose (4, 4)."""
         pose, gyro, accel = (model.layout.block(name) for name in ("pose", GyroBias.name, AccelBias.name))
         position, heading, gyro_std, accel_std = np.sqrt(
             [pose.prior_covariance()[0, 0], pose.prior_covariance()[3, 3]]
             + [block.prior_covariance()[0, 0] for block in (gyro, accel)]
         ).tolist()
-        return FirstPrior(sequence.initial_T_world_imu, position, heading, gyro_std, accel_std, gravity_m_s2)
+        return FirstPrior(T_world_imu, position, heading, gyro_std, accel_std, gravity_m_s2)
 
     def levelled(self, up: Array) -> Array:
         """Return ``T_imu_world`` (4, 4) with ``up`` (3,), a unit vector of the IMU frame, along z of world.
