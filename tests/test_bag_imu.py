@@ -43,7 +43,7 @@ def opened(path: Path) -> ImageRecording:
 
 def assert_samples(found: ImageRecording) -> None:
     samples = found.inertial
-    np.testing.assert_allclose(samples.time_s, TIME_NS / 1e9, atol=3e-7)
+    np.testing.assert_allclose(samples.time_s, TIME_NS / 1e9, rtol=0, atol=3e-7)
     np.testing.assert_allclose(samples.gyro_rad_s, GYRO)
     np.testing.assert_allclose(samples.accel_m_s2, ACCEL)
 
@@ -70,7 +70,7 @@ def test_forces_of_their_own_stream_are_interpolated_to_the_gyroscope(tmp_path):
         bag.add("/camera/accel/sample", KIND, stamp, imu(stamp, [0, 0, 0], line[k], is_known=(False, True)))
     samples = opened(write(tmp_path, bag)).inertial
     inside = (TIME_NS[0] + 7_000_000 <= TIME_NS) & (TIME_NS[0] + 7_000_000 + 39 * 16_000_000 >= TIME_NS)
-    np.testing.assert_allclose(samples.time_s, TIME_NS[inside] / 1e9, atol=3e-7)
+    np.testing.assert_allclose(samples.time_s, TIME_NS[inside] / 1e9, rtol=0, atol=3e-7)
     place = (TIME_NS[inside] - TIME_NS[0] - 7_000_000) / 16e6
     expected = np.array([0.1, 9.7, 0.3]) + 0.5 * place[:, None] * [0.01, 0.02, -0.01]
     np.testing.assert_allclose(samples.accel_m_s2, expected, atol=1e-9)
@@ -119,7 +119,7 @@ def test_a_chain_of_kalibr_beside_the_bag_places_the_unit(tmp_path):
     write_lines(tmp_path / "camchain-imucam-x.yaml", ["cam0:", "  T_cam_imu:", *rows, "  timeshift_cam_imu: 0.01"])
     found = opened(write(tmp_path, with_imu(pair(edge=None))))
     np.testing.assert_allclose(found.T_cam_imu, T, atol=1e-9)
-    np.testing.assert_allclose(found.inertial.time_s, TIME_NS / 1e9 - 0.01, atol=3e-7)
+    np.testing.assert_allclose(found.inertial.time_s, TIME_NS / 1e9 - 0.01, rtol=0, atol=3e-7)
 
 
 def test_velocities_of_wheels_are_turned_into_the_frame_of_the_unit(tmp_path):
@@ -143,5 +143,7 @@ def test_messages_without_stamps_have_the_time_of_writing(tmp_path):
     for k in range(COUNT):
         bag.add("/imu/data", KIND, int(TIME_NS[k]), imu(0, GYRO[k], ACCEL[k]))
     found = opened(write(tmp_path, bag))
-    np.testing.assert_allclose(found.inertial.time_s, (TIME_NS + 7_000_000) / 1e9, atol=3e-7)  # see `support.bags`
+    np.testing.assert_allclose(
+        found.inertial.time_s, (TIME_NS + 7_000_000) / 1e9, rtol=0, atol=3e-7
+    )  # see `support.bags`
     assert "Messages of /imu/data have no stamps: the times of writing are taken." in found.notes
