@@ -146,7 +146,7 @@ def test_a_start_in_motion_without_enough_points_says_so():
 @pytest.mark.parametrize("is_stated", [True, False])
 def test_densities_of_flight_are_found_from_innovations(is_stated):
     """Samples with 5 and 10 times the stated noise of gyroscope and accelerometer, or of no stated noise."""
-    sequence = simulate_room(Room(frames=160, seed=1, gyro=8.5e-4, accel=2e-2))
+    sequence = simulate_room(Room(frames=300, seed=1, gyro=8.5e-4, accel=2e-2))
     noise = NOISE if is_stated else None
     sequence = dataclasses.replace(sequence, inputs=(dataclasses.replace(sequence.inertial, noise=noise),))
     problem = resolve(sequence)

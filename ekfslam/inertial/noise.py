@@ -25,9 +25,9 @@ from ekfslam.models.model import Model
 # Ratio of differences over a density from which on it is refuted.
 _REFUTED = 1.5
 # Stretches: seconds, most of them, tracks in each.
-_STRETCH_S, _LEAST_S, _MOST, _TRACKS = 4.0, 1.5, 5, 25
-# Factors as powers of 2: their bound, and the standard deviation of their prior.
-_BOUND, _SPREAD = 6.0, 1.5
+_STRETCH_S, _LEAST_S, _MOST, _TRACKS = 10.0, 1.5, 3, 30
+# Factors as powers of 2: their bound, and the standard deviations of their prior.
+_BOUND, _SPREAD = 6.0, np.array([1.5, 1.5, 0.8])
 # Walks of biases over white noise, of units that state both: per root of a second.
 _WALK = (0.1, 0.5)
 _SURE, _LEAST_GAIN = 3.0, 20.0  # standard errors; see `ekfslam.resolve`
@@ -82,20 +82,21 @@ def likeliest_densities(sequence: Sequence, config: FilterConfig, begun: Begun) 
     assert samples is not None
     upper, stated = from_differences(samples), samples.noise
     base = stated or upper
-    search = _Search(config, base, list(_begun_stretches(sequence, upper, begun)))
-    if not search.stretches:
-        return None
     # Half way between the stated densities and the differences.
-    middle = [
-        0.5 * math.log2(max(u, 1e-12) / max(b, 1e-12)) for u, b in ((upper.gyro, base.gyro), (upper.accel, base.accel))
-    ]
-    at = search.best((round(middle[0], 3), round(middle[1], 3), 0.0))
+    ratio = ((upper.gyro, base.gyro), (upper.accel, base.accel))
+    middle = [round(0.5 * math.log2(max(u, 1e-12) / max(b, 1e-12)), 3) for u, b in ratio]
+    stretches = list(_begun_stretches(sequence, upper, begun))
+    if not stretches:
+        return None
+    search = _Search(config, base, (middle[0], middle[1], 0.0), stretches)
+    at = search.best()
     if stated is not None and not search.gains((0.0, 0.0, 0.0), at):
         return Densities(stated, "as stated: no others are clearly likelier")
     noise = search.noise(at)
     of = f"{2.0 ** at[0]:.2g} and {2.0 ** at[1]:.2g} times the stated densities, " if stated else ""
     text = f"found from {len(search.stretches)} stretches: {of}gyroscope {noise.gyro:.2g} rad/s/sqrt(Hz), "
-    return Densities(noise, f"{text}accelerometer {noise.accel:.2g} m/s^2/sqrt(Hz)")
+    walk = f"walks of biases {noise.gyro_walk:.2g} and {noise.accel_walk:.2g} per root of a second"
+    return Densities(noise, f"{text}accelerometer {noise.accel:.2g} m/s^2/sqrt(Hz), {walk}")
 
 
 def _begun_stretches(
@@ -103,8 +104,10 @@ def _begun_stretches(
 ) -> Iterator[tuple[Sequence, Callable[[InertialNoise], Model]]]:
     """Yield stretches with few tracks that have a first state, and their models."""
     time_s = sequence.time_s
-    count = int(np.clip((time_s[-1] - time_s[0]) / _STRETCH_S, 1, _MOST))
-    length = int(np.clip(np.searchsorted(time_s - time_s[0], _STRETCH_S, "right"), 2, len(sequence)))
+    duration_s = float(time_s[-1] - time_s[0])
+    count = int(np.clip(duration_s / (0.5 * _STRETCH_S), 1, _MOST))
+    long_s = min(_STRETCH_S, duration_s / count)
+    length = int(np.clip(np.searchsorted(time_s - time_s[0], long_s, "right"), 2, len(sequence)))
     for frames in stretches_of(len(sequence), length, count):
         try:
             part = sequence[frames.start : frames.stop]
@@ -125,9 +128,11 @@ class _Search:
         self,
         config: FilterConfig,
         base: InertialNoise,
+        middle: Factors,
         stretches: list[tuple[Sequence, Callable[[InertialNoise], Model]]],
     ) -> None:
-        self.base, self.stretches, self._config = base, stretches, replace(config, lag=0, revive=-1)
+        self.base, self.middle, self.stretches = base, middle, stretches
+        self._config = replace(config, lag=0, revive=-1)
         self._scores: dict[Factors, Array] = {}
 
     def noise(self, at: Factors) -> InertialNoise:
@@ -136,8 +141,8 @@ class _Search:
         return InertialNoise(base.gyro * gyro, base.accel * accel, base.gyro_walk * walk, base.accel_walk * walk)
 
     def value(self, at: Factors) -> float:
-        """Return the log-likelihood with a weak prior of factors near 1, by which they stay if data say nothing."""
-        return float(self.score(at).sum()) - 0.5 * float(np.sum(np.square(at))) / _SPREAD**2
+        """Return the log-likelihood with a weak prior, by which factors stay in its middle if data say nothing."""
+        return float(self.score(at).sum()) - 0.5 * float(np.sum((np.subtract(at, self.middle) / _SPREAD) ** 2))
 
     def score(self, at: Factors) -> Array:
         """Return the log-likelihood of each stretch."""
@@ -158,9 +163,9 @@ class _Search:
         error = np.sqrt(len(gain)) * float(gain.std()) if np.isfinite(gain).all() else 0.0
         return bool(gain.sum() > max(_SURE * error, _LEAST_GAIN))
 
-    def best(self, at: Factors) -> Factors:
+    def best(self) -> Factors:
         """Return the likeliest factors: by steps along one axis after the other, then by parabolas."""
-        at = self._climbed(at, 2.0, (0, 1))
+        at = self._climbed(self.middle, 2.0, (0, 1))
         at = self._climbed(at, 2.0, (2,))
         at = self._climbed(at, 1.0, (0, 1))
         return self._vertex(self._vertex(at, 0), 1)
