@@ -51,6 +51,7 @@ from ekfslam.models.model import Model
 from ekfslam.models.noise import (
     CAMERA_ROTATION_DEG,
     MIN_DISPARITY_SIGMA,
+    MONOCULAR_PIXEL_STD_PX,
     VELOCITY_STD,
     VelocityNoise,
     automatic_noise,
@@ -340,6 +341,8 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
         stated = automatic_noise(found, sequence.velocity_frame, sequence.has_checked_tracks)
     else:
         stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
+    if sequence.camera.is_monocular and sequence.noise is None:
+        stated = dataclasses.replace(stated, pixel_std_px=np.full(4, MONOCULAR_PIXEL_STD_PX))
     if not sequence.has_velocities:
         stated = vision_noise(stated, sequence.twist)
     if is_inertial(sequence):

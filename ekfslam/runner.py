@@ -70,6 +70,8 @@ def run(
         raise NoVelocitiesError(
             f"{sequence.name}: no measured velocities, so no dead reckoning; the other modes use vision"
         )
+    if mode == "mapping-only" and sequence.camera.is_monocular:
+        raise ConfigError(f"{sequence.name}: mapping-only needs depths, which one camera does not see; use full")
     timings = timings or Timings()
     if mode == "smoothed":
         full = run(sequence, "full", config, further, timings)

@@ -73,6 +73,30 @@ def test_one_camera_alone_does_not_tell_the_scale(inputs):
         ekfslam.run(tracks(**inputs))
 
 
+def test_a_run_of_one_camera_from_rest_finds_the_scale_in_both_filters():
+    results = []
+    for engine in ("engine", "reference"):
+        config = ekfslam.Config().with_overrides({"filter": {"engine": engine}})
+        results.append(ekfslam.run(room(100), config=config))
+    found, true = (
+        T[:, :3, 3] - T[:, :3, 3].mean(axis=0) for T in (results[0].T_world_imu, room(100).truth.T_world_imu)
+    )
+    assert np.linalg.norm(found) / np.linalg.norm(true) == pytest.approx(1.0, abs=0.01)
+    assert results[0].counts["frames at rest"] >= 2
+    np.testing.assert_allclose(results[0].T_world_imu, results[1].T_world_imu, atol=1e-8)
+
+
+def test_one_camera_has_no_map_without_its_poses():
+    with pytest.raises(ConfigError, match="depths"):
+        ekfslam.run(room(), "mapping-only")
+
+
+def test_a_recording_is_opened_as_its_left_camera_sees_it():
+    assert ekfslam.open_sequence("builtin:room?frames=20", camera="left").camera.is_monocular
+    with pytest.raises(ConfigError, match="--camera"):
+        ekfslam.open_sequence("builtin:room", camera="right")
+
+
 def test_a_room_has_one_camera_or_two():
     with pytest.raises(ConfigError, match="cameras"):
         Room(cameras=3)

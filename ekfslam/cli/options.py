@@ -96,6 +96,11 @@ _SHARED: dict[str, dict[str, Any]] = {
         "default": "corrected",
         "help": "sign of the lateral velocity of KITTI, stored positive to the right (default: %(default)s)",
     },
+    "--camera": {
+        "choices": ("both", "left"),
+        "default": "both",
+        "help": "left: the left camera alone, with the scale of inertial samples or velocities (default: %(default)s)",
+    },
     "--frames": {"type": _stretch, "metavar": "A:B", "help": "frames A to B - 1 only, like a slice in Python"},
     "--extrinsics": {
         "choices": ("corrected", "as-stored"),
@@ -128,7 +133,7 @@ PLACES = (
     "--calibration",
     "--lateral",
 )  # parts of a recording in other files
-DATA = (*PLACES, "--frames", "--extrinsics", "--truth-noise")
+DATA = (*PLACES, "--camera", "--frames", "--extrinsics", "--truth-noise")
 
 # Flags that override a setting, the table and key of it, and how argparse declares the flag.
 _SETTINGS: tuple[tuple[str, str, dict[str, Any], str], ...] = (
@@ -196,6 +201,7 @@ def open_data(options: argparse.Namespace, data: str) -> Sequence:
         imu_noise=options.imu_noise,
         topics=options.topics,
         calibration=options.calibration,
+        camera=options.camera,
         front_end=config_file(options).front_end,
     )
     return sequence if options.frames is None else sequence[options.frames]

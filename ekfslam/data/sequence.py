@@ -314,7 +314,9 @@ class Sequence(Once, Shown):
 
 
 def of_left_camera(sequence: Sequence) -> Sequence:
-    """Return a recording as its left camera alone saw it."""
+    """Return a recording as its left camera alone saw it; a recording of one camera stays as it is."""
+    if sequence.camera.is_monocular:
+        return sequence
     rig_only = {YAW_STD_PX, *(CHECKED_TRACKS if sequence.has_checked_tracks else ())}
     return replace(
         sequence,

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Literal, get_args
 
 from ekfslam.config import FrontEndConfig
 from ekfslam.data.imu import with_inertial_files
 from ekfslam.data.opening import attach_truth, open_recording
 from ekfslam.data.readers.registry import Extrinsics, Lateral
-from ekfslam.data.sequence import Sequence, VelocityFrame
+from ekfslam.data.sequence import Sequence, VelocityFrame, of_left_camera
 from ekfslam.data.velocities import Recording, attach_velocities
 from ekfslam.errors import ConfigError
+
+Camera = Literal["both", "left"]
 
 
 def open_sequence(
@@ -26,6 +29,7 @@ def open_sequence(
     imu_noise: str | Path | None = None,
     topics: Iterable[str] = (),
     calibration: str | Path | None = None,
+    camera: Camera = "both",
     front_end: FrontEndConfig | None = None,
 ) -> Sequence:
     """Open the recording in a file or folder, or the built-in world ``builtin:NAME``.
@@ -33,13 +37,13 @@ def open_sequence(
     Args:
         source: Path of a recording, or ``builtin:NAME``. Stereo images are tracked.
         extrinsics: Reading of ``cam_T_imu`` of an .npz recording, see `read_ece276a`; else only ``corrected``.
-        lateral: Reading of the lateral velocity of KITTI (.npz, .mat, drive folder), which is stored with the wrong
-            sign, see `with_lateral`; else only ``corrected``.
+        lateral: Sign of the lateral velocity of KITTI (.npz, .mat, folder), see `with_lateral`; else ``corrected``.
         truth: File or folder of true poses to use in place of the recording's own, see `attach_truth`.
         velocities, velocity_frame: File or recording with other velocities, their frame, see `attach_velocities`.
         imu, imu_noise: Files of inertial samples and of their noise densities, see `attach_inertial`.
         topics: Topics of a bag: left and right images, velocities, inertial samples. Others are chosen automatically.
         calibration: Calibration of the pair in place of the recording's own, see `read_pair`.
+        camera: ``left`` takes the left camera of a stereo recording alone; images are tracked in both before.
         front_end: Settings of tracking; None for the defaults.
 
     Raises:
@@ -58,11 +62,18 @@ def open_sequence(
         return with_inertial_files(one, imu, imu_noise)
 
     if isinstance(recording, Sequence):
-        return with_inputs(recording if truth is None else attach_truth(recording, Path(truth)))
+        return _choice_of(camera)(with_inputs(recording if truth is None else attach_truth(recording, Path(truth))))
     from ekfslam.frontend.track import track
 
-    tracked = track(with_inputs(recording), front_end)[0]
+    tracked = _choice_of(camera)(track(with_inputs(recording), front_end)[0])
     return tracked if truth is None else attach_truth(tracked, Path(truth))
+
+
+def _choice_of(camera: Camera) -> Callable[[Sequence], Sequence]:
+    """Return the function that leaves the tracks of these cameras."""
+    if camera not in get_args(Camera):
+        raise ConfigError(f"camera (--camera) must be one of {', '.join(get_args(Camera))}, found {camera!r}")
+    return of_left_camera if camera == "left" else lambda sequence: sequence
 
 
 def _require(name: str, value: object, needed: str, other: object) -> None:

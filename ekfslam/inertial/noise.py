@@ -26,10 +26,14 @@ from ekfslam.models.model import Model
 _REFUTED = 1.5
 # Stretches: seconds, most of them, tracks in each.
 _STRETCH_S, _LEAST_S, _MOST, _TRACKS = 10.0, 1.5, 3, 30
+# Length of the one stretch of a single camera, which starts where the recording does: at rest.
+_FIRST_S = 15.0
 # Factors as powers of 2: their bound, and the standard deviations of their prior.
 _BOUND, _SPREAD = 6.0, np.array([1.5, 1.5, 0.8])
 # Walks of biases over white noise, of units that state both: per root of a second.
 _WALK = (0.1, 0.5)
+# Walks of biases of one camera's unit that states none, at most: 4 times those of data sheets of small units.
+_LARGEST_WALKS = (1e-4, 1e-2)
 _SURE, _LEAST_GAIN = 3.0, 20.0  # standard errors; see `ekfslam.resolve`
 
 Begun = Callable[[Sequence, InertialNoise], Callable[[InertialNoise], Model]]
@@ -82,6 +86,10 @@ def likeliest_densities(sequence: Sequence, config: FilterConfig, begun: Begun) 
     assert samples is not None
     upper, stated = from_differences(samples), samples.noise
     base = stated or upper
+    is_monocular = sequence.camera.is_monocular
+    if stated is None and is_monocular:
+        walks = np.minimum((base.gyro_walk, base.accel_walk), _LARGEST_WALKS)
+        base = replace(base, gyro_walk=float(walks[0]), accel_walk=float(walks[1]))
     # Half way between the stated densities and the differences.
     ratio = ((upper.gyro, base.gyro), (upper.accel, base.accel))
     middle = [round(0.5 * math.log2(max(u, 1e-12) / max(b, 1e-12)), 3) for u, b in ratio]
@@ -89,7 +97,8 @@ def likeliest_densities(sequence: Sequence, config: FilterConfig, begun: Begun) 
     if not stretches:
         return None
     search = _Search(config, base, (middle[0], middle[1], 0.0), stretches)
-    at = search.best()
+    # One short stretch of one camera does not tell walks of biases from errors of its tracks.
+    at = search.best(has_walks=not is_monocular)
     if stated is not None and not search.gains((0.0, 0.0, 0.0), at):
         return Densities(stated, "as stated: no others are clearly likelier")
     noise = search.noise(at)
@@ -108,7 +117,10 @@ def _begun_stretches(
     count = int(np.clip(duration_s / (0.5 * _STRETCH_S), 1, _MOST))
     long_s = min(_STRETCH_S, duration_s / count)
     length = int(np.clip(np.searchsorted(time_s - time_s[0], long_s, "right"), 2, len(sequence)))
-    for frames in stretches_of(len(sequence), length, count):
+    stretches = stretches_of(len(sequence), length, count)
+    if sequence.camera.is_monocular:
+        stretches = [range(int(np.searchsorted(time_s - time_s[0], _FIRST_S, "right")))]
+    for frames in stretches:
         try:
             part = sequence[frames.start : frames.stop]
             if part.time_s[-1] - part.time_s[0] < _LEAST_S:
@@ -163,10 +175,10 @@ class _Search:
         error = np.sqrt(len(gain)) * float(gain.std()) if np.isfinite(gain).all() else 0.0
         return bool(gain.sum() > max(_SURE * error, _LEAST_GAIN))
 
-    def best(self) -> Factors:
+    def best(self, has_walks: bool = True) -> Factors:
         """Return the likeliest factors: by steps along one axis after the other, then by parabolas."""
         at = self._climbed(self.middle, 2.0, (0, 1))
-        at = self._climbed(at, 2.0, (2,))
+        at = self._climbed(at, 2.0, (2,)) if has_walks else at
         at = self._climbed(at, 1.0, (0, 1))
         return self._vertex(self._vertex(at, 0), 1)
 

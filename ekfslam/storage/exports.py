@@ -217,6 +217,8 @@ def g2o_text(result: Result) -> str:
             f"{result.sequence_name}: inertial samples moved the poses; g2o has no vertices for velocity and biases; "
             "take information"
         )
+    if result.camera.is_monocular:
+        raise ArchiveError(f"{result.sequence_name}: g2o has no vertices that one camera sees; take information")
     return "".join(f"{line}\n" for line in _graph(result, result.log))
 
 

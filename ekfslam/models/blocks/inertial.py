@@ -51,7 +51,7 @@ class Velocity(_Vector):
 class GyroBias(_Vector):
     """Bias (3,) of a gyroscope, rad/s: measured = true + bias + white noise. The inertial process lets it walk."""
 
-    std_rad_s: float = 0.01
+    std_rad_s: float = 0.05
     first_rad_s: Array = field(default_factory=lambda: np.zeros(3))
 
     name = "gyro_bias"
