@@ -512,9 +512,10 @@ def first_state(sequence: Sequence, config: Config, model: Model) -> InertialSta
     samples = sequence.inertial
     assert samples is not None
     prior = FirstPrior.of(sequence.initial_T_world_imu, model, config.inertial.gravity_m_s2)
-    if (rest := rest_of(sequence)) is not None:
+    is_monocular = sequence.camera.is_monocular
+    if (rest := rest_of(sequence) or (rest_of(sequence, is_loose=True) if is_monocular else None)) is not None:
         return at_rest(samples, *rest, prior, densities_of(config))
-    if sequence.camera.is_monocular:
+    if is_monocular:
         raise ScaleError(
             f"{sequence.name}: the rig of one camera moves from the first frame on, so that scale and velocity are not "
             "known: begin at rest (half a second), or give the tracks of both cameras"

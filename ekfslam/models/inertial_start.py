@@ -153,23 +153,28 @@ def unknown(samples: InertialSamples, begin_s: float, prior: FirstPrior, why: st
     return InertialStart(T, none, none, none, P, f"not found ({why}): slow and level within 17 deg")
 
 
-def rest_of(sequence: Sequence) -> tuple[float, float] | None:
+def rest_of(sequence: Sequence, is_loose: bool = False) -> tuple[float, float] | None:
     """Return begin and end of a rest that the first frame is in or at the end of, by images and samples; None: motion.
 
-    Samples before the first frame are preferred: no step of the process uses them again.
+    Samples before the first frame are preferred: no step of the process uses them again. If ``is_loose``, images may
+    move twice as far, as a few noisy tracks seem to, but samples have to be quiet.
     """
     samples, first = sequence.inertial, float(sequence.time_s[0])
     assert samples is not None
-    still = next((tau for tau in _REST_S if _images_rest(sequence, tau) and _steady_s(samples, first, tau) >= tau), 0.0)
+    most, limit = (2.0 * _MOTION_PX, _QUIET) if is_loose else (_MOTION_PX, _STEADY)
+    rests = (
+        tau for tau in _REST_S if _images_rest(sequence, tau, most) and _steady_s(samples, first, tau, limit) >= tau
+    )
+    still = next(rests, 0.0)
     before = _steady_s(samples, first, -_BEFORE_S, _STEADY if still else _QUIET)
     if before >= _SHARE * _REST_S[-1]:
         return first - before, first
     return (first, first + _SHARE * still) if still else None  # its end may be the begin of a motion
 
 
-def _images_rest(sequence: Sequence, duration_s: float) -> bool:
+def _images_rest(sequence: Sequence, duration_s: float, most_px: float) -> bool:
     motion = image_motion(sequence, 0, int(np.searchsorted(sequence.time_s, sequence.time_s[0] + duration_s, "right")))
-    return motion is not None and motion <= _MOTION_PX
+    return motion is not None and motion <= most_px
 
 
 def image_motion(sequence: Sequence, begin: int, end: int) -> float | None:
