@@ -83,7 +83,7 @@ class Observations:
 
     def at(self, frame: int) -> tuple[IntArray, Array]:
         """Return landmark ids (n,) and pixels (n, 4) or (n, 2) of one frame."""
-        start, stop = np.searchsorted(self.frame, (frame, frame + 1))
+        start, stop = self.frame.searchsorted((frame, frame + 1))
         return self.landmark[start:stop], self.pixels_px[start:stop]
 
     def stretch(self, begin: int, end: int) -> Observations:

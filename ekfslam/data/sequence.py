@@ -250,12 +250,15 @@ class Sequence(Once, Shown):
     def interval(self, frame: int, kind: type[Input] = Velocities) -> Interval:
         """Return the inputs of a kind that lead to a frame from the frame before; `LostDataError` if there are none."""
         begin_s, end_s = float(self.time_s[frame - 1]), float(self.time_s[frame])
-        velocities = self.velocities
         if kind is InertialSamples:
             return _samples_of(self).interval(begin_s, end_s)
-        if velocities is None or velocities.has_stamps(self.time_s):
+        if (velocities := self.velocities) is None or self._has_one_velocity_a_frame:
             return Interval.of_one(self.twist[frame], end_s - begin_s, bool(self.interpolated[frame]))
         return velocities.interval(begin_s, end_s)
+
+    @cached_property
+    def _has_one_velocity_a_frame(self) -> bool:
+        return self.velocities is not None and self.velocities.has_stamps(self.time_s)
 
     def inputs_at(self, frame: int, kind: type[Input] = Velocities) -> Array:
         """Return the inputs (6,) of a kind at a frame; `LostDataError` if there are none."""

@@ -1,5 +1,7 @@
 #include <algorithm>
+#include <limits>
 #include <numeric>
+#include <optional>
 
 #include "consensus.hpp"
 #include "lapack.hpp"
@@ -9,8 +11,29 @@ namespace {
 
 constexpr Index SAMPLES = 100;
 
-// e^T C^-1 e.
-double square(const Block3& C, const Vector& e) { return e.dot(C.partialPivLu().solve(e)); }
+using Sample = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMajor, 9, 9>;  // of three landmarks
+using ByOne = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMajor, 9, 3>;
+using OfSample = Eigen::Matrix<double, Eigen::Dynamic, 1, Eigen::ColMajor, 9, 1>;
+using OfOne = Eigen::Matrix<double, Eigen::Dynamic, 1, Eigen::ColMajor, 3, 1>;
+
+// e^T C^-1 e, by C = L D L^T.
+double square(const Block3& C, const OfOne& e) {
+    Block3 L = C;  // D on its diagonal
+    OfOne y = e;
+    double sum = 0.0;
+    for (Index j = 0; j < C.rows(); ++j) {
+        for (Index l = 0; l < j; ++l) {
+            L(j, j) -= L(j, l) * L(j, l) * L(l, l);
+            y[j] -= L(j, l) * y[l];
+        }
+        sum += y[j] * y[j] / L(j, j);
+        for (Index i = j + 1; i < C.rows(); ++i) {
+            for (Index l = 0; l < j; ++l) L(i, j) -= L(i, l) * L(j, l) * L(l, l);
+            L(i, j) /= L(j, j);
+        }
+    }
+    return sum;
+}
 
 // Rows of landmarks, d each.
 Slots rows_of(const Slots& landmarks, Index d) {
@@ -54,24 +77,34 @@ struct Tally {
     Vector squares;
 };
 
-Tally tally(const Matrix& S, const Matrix& residual, const Vector& focal, double gate, const Slots& sample) {
+// Nothing if the cost exceeds `most`.
+std::optional<Tally> tally(const Matrix& S, const Matrix& residual, const Vector& focal, double gate,
+                           const Slots& sample, double most) {
     const Index d = residual.rows(), k = residual.cols();
     const Slots rows = rows_of(sample, d);
-    const Matrix S_ka = S(Eigen::all, rows), S_aa = S_ka(rows, Eigen::all);
-    const Vector r_a = residual.reshaped()(rows);
-    const Eigen::PartialPivLU<Matrix> solver(S_aa);
-    const Matrix gain = solver.solve(S_ka.transpose());  // (rows, k d)
-    const Vector moved = gain.transpose() * r_a;
-    Tally found{r_a.dot(solver.solve(r_a)), Vector::Zero(k)};
-    for (Index i = 0; i < k; ++i) {
+    const Index size = static_cast<Index>(rows.size());
+    const Eigen::LLT<Sample> factor(S(rows, rows));
+    if (factor.info() != Eigen::Success) return std::nullopt;
+    const Sample U = factor.matrixU();
+    OfSample w(size);
+    for (Index j = 0; j < size; ++j) w[j] = (residual.data()[rows[j]] - U.col(j).head(j).dot(w.head(j))) / U(j, j);
+    Tally found{w.squaredNorm(), Vector::Zero(k)};
+    double cost = found.cost;
+    for (Index i = 0; i < k && cost <= most; ++i) {
         if (std::find(sample.begin(), sample.end(), i) != sample.end()) continue;
-        const Vector by = moved.segment(i * d, d);
+        ByOne W(size, d);
+        for (Index c = 0; c < d; ++c)
+            for (Index j = 0; j < size; ++j)
+                W(j, c) = (S(rows[j], i * d + c) - U.col(j).head(j).dot(W.col(c).head(j))) / U(j, j);
+        const OfOne by = W.transpose().lazyProduct(w);
         const double bend = by.squaredNorm() / focal[i];
         Block3 left = S.block(i * d, i * d, d, d);
-        left -= gain.middleCols(i * d, d).transpose() * S_ka.middleRows(i * d, d).transpose();
+        left -= W.transpose().lazyProduct(W);
         left.diagonal().array() += bend * bend;
         found.squares[i] = square(left, residual.col(i) - by);
+        cost += std::min(found.squares[i], gate);
     }
+    if (cost > most) return std::nullopt;
     found.cost += found.squares.cwiseMin(gate).sum();
     return found;
 }
@@ -127,10 +160,12 @@ std::vector<Slots> samples_of(Index k, Index frame, const Uniform& uniform) {
 
 Flags agreeing(const Matrix& S, const Matrix& residual, const Vector& focal, double gate,
                const std::vector<Slots>& samples) {
-    Tally best = tally(S, residual, focal, gate, samples.front());
-    for (std::size_t i = 1; i < samples.size(); ++i) {
-        Tally next = tally(S, residual, focal, gate, samples[i]);
-        if (next.cost < best.cost) best = std::move(next);
+    // Costs only grow from landmark to landmark; the margin is for sums in another order.
+    constexpr double margin = 1.0 + 1e-9;
+    Tally best{std::numeric_limits<double>::infinity(), Vector::Constant(residual.cols(), gate + 1.0)};
+    for (const Slots& sample : samples) {
+        std::optional<Tally> next = tally(S, residual, focal, gate, sample, margin * best.cost);
+        if (next && next->cost < best.cost) best = std::move(*next);
     }
     Flags agree(static_cast<std::size_t>(residual.cols()));
     for (Index i = 0; i < residual.cols(); ++i) agree[i] = best.squares[i] <= gate;

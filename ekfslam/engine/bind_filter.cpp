@@ -282,8 +282,8 @@ nb::tuple look_again(Filter& filter, const Vector6& imu_twist) {
     return mean_of(filter);
 }
 
-nb::dict update(Filter& filter, Index frame, const Integers& ids, const Matrix& measured, bool is_rested,
-                const nb::object& twist_after) {
+nb::object update(Filter& filter, Index frame, const Integers& ids, const Matrix& measured, bool is_rested,
+                  const nb::object& twist_after) {
     whole(filter);
     const Ids seen = ids_of(ids);
     const Matrix columns = measured.transpose();

@@ -110,56 +110,83 @@ Table table_from(const nb::dict& from, Index dimension) {
     return table;
 }
 
+namespace {
+
+// Numbers of a report one after another: two arrays cross the border in place of fifty. Their order is that of
+// ekfslam/engine/report.py.
+struct Packed {
+    Ids whole;
+    std::vector<double> real;
+
+    template <class Values>
+    void add_whole(const Values& values) {
+        whole.insert(whole.end(), values.begin(), values.end());
+    }
+    void add(const Eigen::Ref<const Matrix>& values) {
+        for (Index j = 0; j < values.cols(); ++j)
+            real.insert(real.end(), values.col(j).data(), values.col(j).data() + values.rows());
+    }
+    // Matrices with one column a landmark, side by side: their numbers for each landmark follow each other.
+    void add_beside(std::initializer_list<const Matrix*> parts) {
+        for (Index j = 0; j < (*parts.begin())->cols(); ++j)
+            for (const Matrix* part : parts)
+                real.insert(real.end(), part->col(j).data(), part->col(j).data() + part->rows());
+    }
+    // Returns the number of landmarks, and whether they may return.
+    nb::tuple add(const Retired& retired) {
+        const Table& table = retired.table;
+        for (auto column : {&Table::id, &Table::first_frame, &Table::last_frame, &Table::observations, &Table::log_row,
+                            &Table::misses})
+            add_whole(table.*column);
+        add_beside({&table.position_m, &table.initial_m, &table.evidence});
+        for (const Matrix3& covariance : retired.covariance) add(covariance);
+        return nb::make_tuple(table.size(), retired.may_return);
+    }
+    nb::tuple arrays() {
+        const std::size_t count = real.size();
+        return nb::make_tuple(array(std::move(whole)), owned(std::move(real), {count}));
+    }
+};
+
+}  // namespace
+
 nb::object retired_of(const Retired& retired) {
     if (retired.table.size() == 0) return nb::none();
-    nb::dict out;
-    out["table"] = table_of(retired.table);
-    out["covariance"] = blocks(retired.covariance);
-    out["may_return"] = retired.may_return;
-    return out;
+    Packed packed;
+    const nb::tuple part = packed.add(retired);
+    return nb::make_tuple(packed.arrays(), part);
 }
 
-nb::dict report_of(Report report, const Filter& filter) {
-    nb::dict out, taken, begun, innovations;
+nb::object report_of(const Report& report, const Filter& filter) {
+    const Taken& taken = report.taken;
+    const Begun& begun = report.begun;
+    const FrameInnovations& innovations = report.innovations;
+    const auto count = static_cast<std::int64_t>(begun.ids.size());
+    Packed packed;
+    for (const Ids* ids : {&report.split, &report.moving, &begun.ids, &innovations.landmark}) packed.add_whole(*ids);
+    packed.add_whole(report.reason);
+    packed.add_whole(taken.landmark);
+    for (std::int64_t i = 0; i < count; ++i) packed.whole.push_back(filter.next_landmark - count + i);
+    packed.add_whole(taken.previous);
+    packed.whole.insert(packed.whole.end(), begun.ids.size(), -1);
+    for (const Vector* values : {&filter.e.values.flat, &report.updated_values, &taken.values}) packed.add(*values);
+    for (const Vector* values : {&filter.e.coordinates, &report.updated_coordinates, &taken.coordinates})
+        packed.add(*values);
+    packed.add(filter.e.imu_twist);
+    packed.add(taken.imu_twist);
+    packed.add_beside({&taken.rows, &taken.variance, &taken.position_m});
+    if (count) packed.add_beside({&begun.rows, &begun.variance, &begun.position_m});
+    packed.add(begun.rows_before);
+    packed.add(innovations.score);
+    packed.add(innovations.information);
+    packed.add_beside({&innovations.alone, &innovations.apart});
     nb::list retired;
     for (const Retired& part : report.retired)
-        if (part.table.size() > 0) retired.append(retired_of(part));
-    out["retired"] = retired;
-    out["reason"] = array(Ids(report.reason.begin(), report.reason.end()));
-    out["nis"] = report.nis;
-    out["log_det"] = report.log_det;
-    out["dof"] = report.dof;
-    out["doubt"] = report.doubt;
-    out["split"] = array(std::move(report.split));
-    out["moving"] = array(std::move(report.moving));
-    innovations["landmark"] = array(std::move(report.innovations.landmark));
-    innovations["alone"] = rows(std::move(report.innovations.alone));
-    innovations["apart"] = rows(std::move(report.innovations.apart));
-    innovations["score"] = array(report.innovations.score);
-    innovations["information"] = rows(report.innovations.information);
-    out["innovations"] = innovations;
-    taken["landmark"] = array(std::move(report.taken.landmark));
-    taken["previous"] = array(std::move(report.taken.previous));
-    taken["rows"] = rows(std::move(report.taken.rows));
-    taken["variance"] = rows(std::move(report.taken.variance));
-    taken["position_m"] = rows(std::move(report.taken.position_m));
-    taken["values"] = array(std::move(report.taken.values));
-    taken["coordinates"] = array(std::move(report.taken.coordinates));
-    taken["imu_twist"] = array(report.taken.imu_twist);
-    out["taken"] = taken;
-    out["updated_values"] = array(std::move(report.updated_values));
-    out["updated_coordinates"] = array(std::move(report.updated_coordinates));
-    begun["ids"] = array(std::move(report.begun.ids));
-    begun["position_m"] = rows(std::move(report.begun.position_m));
-    begun["rows"] = rows(std::move(report.begun.rows));
-    begun["variance"] = rows(std::move(report.begun.variance));
-    begun["step_before"] = report.begun.step_before;
-    begun["rows_before"] = rows(std::move(report.begun.rows_before));
-    out["begun"] = begun;
-    out["values"] = array(filter.e.values.flat);
-    out["coordinates"] = array(filter.e.coordinates);
-    out["imu_twist"] = array(filter.e.imu_twist);
-    return out;
+        if (part.table.size() > 0) retired.append(packed.add(part));
+    const nb::tuple counts = nb::make_tuple(report.split.size(), report.moving.size(), begun.ids.size(),
+                                            innovations.landmark.size(), report.reason.size(), taken.landmark.size());
+    return nb::make_tuple(packed.arrays(), counts, retired, begun.step_before, report.nis, report.log_det, report.dof,
+                          report.doubt);
 }
 
 }  // namespace ekfslam::binding

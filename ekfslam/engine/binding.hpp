@@ -129,7 +129,8 @@ nb::object blocks(const std::vector<Matrix3>& values);  // (k, 3, 3), symmetric
 
 nb::dict table_of(const Table& table);
 Table table_from(const nb::dict& from, Index dimension);
-nb::dict report_of(Report report, const Filter& filter);
-nb::object retired_of(const Retired& retired);  // None: there is none
+// Tuples for ekfslam/engine/report.py. None: no landmark has retired.
+nb::object report_of(const Report& report, const Filter& filter);
+nb::object retired_of(const Retired& retired);
 
 }  // namespace ekfslam::binding

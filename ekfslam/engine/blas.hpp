@@ -27,16 +27,18 @@ inline void multiply(char a, char b, double alpha, const Given& A, const Given& 
     if (m && n) lapack::dgemm(&a, &b, &m, &n, &k, &alpha, data(A), &lda, data(B), &ldb, &beta, C.data(), &ldc);
 }
 
-// Lower triangle of C <- alpha op(A) op(A)^T + beta C.
-inline void square(char a, double alpha, const Given& A, double beta, Part C) {
-    char lower = 'L';
+// A triangle of C <- alpha op(A) op(A)^T + beta C, 'L' or 'U'.
+inline void square(char triangle, char a, double alpha, const Given& A, double beta, Part C) {
     int n = size(C.rows()), k = size(a == 'N' ? A.cols() : A.rows()), lda = stride(A), ldc = stride(C);
     flops() += 1.0 * n * n * k;
     if (n && k)
-        lapack::dsyrk(&lower, &a, &n, &k, &alpha, data(A), &lda, &beta, C.data(), &ldc);
+        lapack::dsyrk(&triangle, &a, &n, &k, &alpha, data(A), &lda, &beta, C.data(), &ldc);
     else if (n && beta != 1.0)
         C *= beta;
 }
+
+// Its lower triangle.
+inline void square(char a, double alpha, const Given& A, double beta, Part C) { square('L', a, alpha, A, beta, C); }
 
 // B <- op(A)^-1 B (side 'L') or B op(A)^-1 ('R') for triangular A.
 inline void solve(char side, char triangle, char a, const Given& A, Part B) {

@@ -108,11 +108,17 @@ class Settling {
             found_.linear = std::move(linear);
             found_.coordinates = std::move(coordinates);
             if (round + 1 == rounds) break;
-            Settled settled = found_;
-            settled.prior = e_;
-            if (e_.has_time_offset()) turn(e_.twist_after(retract_values(e_, found_.change)));
+            std::optional<Settled> before;  // another velocity turns the estimate
+            if (e_.has_time_offset()) {
+                before = found_;
+                before->prior = e_;
+                turn(e_.twist_after(retract_values(e_, found_.change)));
+            }
             Relinearised next = relinearised(e_, found_.change, slots_, measured_);
-            if (is_straight(next.seen.rows.only(where(found_.inside)))) return settled;
+            if (is_straight(next.seen.rows.only(where(found_.inside)))) {
+                if (before) return before;
+                break;
+            }
             some.clear();
             for (Index i = 0; i < next.seen.q.cols(); ++i) {
                 if (e_.sensor.in_view(next.seen.q.col(i), e_.config.min_depth_m)) some.push_back(i);

@@ -23,7 +23,7 @@ struct Tried {
         const Slots which = where(inside);
         if (which.size() == inside.size()) return;
         some = picked(some, which);
-        projection = projection.only(which);
+        projection.keep(which);
         S = picked(S, which);
     }
 };

@@ -31,8 +31,7 @@ void Dormant::append(const std::vector<Index>& at, const Matrix& K_new, const st
         larger.topLeftCorner(before, before) = S_.topLeftCorner(before, before);
         S_ = std::move(larger);
     }
-    S_.block(0, before, after, after - before).setZero();
-    S_.block(before, 0, after - before, before).setZero();
+    S_.block(before, 0, after - before, after).setZero();
     for (std::size_t i = 0; i < S_new.size(); ++i) {
         const Index own = before + static_cast<Index>(3 * i);
         S_.block<3, 3>(own, own) = S_new[i];
@@ -49,7 +48,7 @@ void Dormant::keep(const std::vector<Index>& which) {
     cross = Matrix(cross(Eigen::all, own));
     const Index n = static_cast<Index>(own.size());
     for (Index j = 0; j < n; ++j)  // in place: they ascend
-        for (Index i = 0; i < n; ++i) S_(i, j) = S_(own[static_cast<std::size_t>(i)], own[static_cast<std::size_t>(j)]);
+        for (Index i = j; i < n; ++i) S_(i, j) = S_(own[static_cast<std::size_t>(i)], own[static_cast<std::size_t>(j)]);
     squares_ = Matrix(squares_(own, Eigen::all));
 }
 
@@ -64,15 +63,23 @@ void Dormant::add(const Matrix& A, double sign) {
 
 void Dormant::turn(Index which, const Matrix3& M) {
     const Index own = 3 * which;
-    auto S = S_.topLeftCorner(K.cols(), K.cols());
-    S.middleRows(own, 3) = (M * S.middleRows(own, 3)).eval();
-    S.middleCols(own, 3) = (S.middleCols(own, 3) * M.transpose()).eval();
+    const Index below = K.cols() - own - 3;
+    auto before = S_.block(own, 0, 3, own), after = S_.block(own + 3, own, below, 3);
+    auto S = S_.block<3, 3>(own, own);
+    before = (M * before).eval();
+    after = (after * M.transpose()).eval();
+    S = (M * Matrix3(S.selfadjointView<Eigen::Lower>()) * M.transpose()).eval();
     squares_.middleRows(own, 3) = (M * squares_.middleRows(own, 3)).eval();
     cross.middleCols(own, 3) = (cross.middleCols(own, 3) * M.transpose()).eval();
 }
 
 Matrix Dormant::rows(const std::vector<Index>& own) const {
-    Matrix S = S_.leftCols(K.cols())(own, Eigen::all);
+    Matrix S(static_cast<Index>(own.size()), K.cols());
+    for (Index i = 0; i < S.rows(); ++i) {
+        const Index row = own[static_cast<std::size_t>(i)];
+        S.row(i).head(row) = S_.row(row).head(row);
+        S.row(i).tail(K.cols() - row) = S_.col(row).segment(row, K.cols() - row).transpose();
+    }
     const Matrix left = squares_(own, Eigen::all) * sign_.asDiagonal();
     blas::multiply('N', 'T', 1.0, left, squares_, 1.0, S);
     return S;
@@ -80,7 +87,8 @@ Matrix Dormant::rows(const std::vector<Index>& own) const {
 
 Matrix3 Dormant::block(Index which) const {
     const auto squares = squares_.middleRows(3 * which, 3);
-    return S_.block<3, 3>(3 * which, 3 * which) + squares * sign_.asDiagonal() * squares.transpose();
+    const Matrix3 S = S_.block<3, 3>(3 * which, 3 * which).selfadjointView<Eigen::Lower>();
+    return S + squares * sign_.asDiagonal() * squares.transpose();
 }
 
 void Dormant::fold() {
@@ -91,7 +99,6 @@ void Dormant::fold() {
             if (sign_(j) == sign) which.push_back(j);
         if (!which.empty()) blas::square('N', sign, squares_(Eigen::all, which), 1.0, S);
     }
-    blas::mirror(S);
     squares_.resize(K.cols(), 0);
     sign_.resize(0);
 }

@@ -36,7 +36,7 @@ class Dormant {
 
    private:
     void fold();
-    Matrix S_{0, 0};        // with room for more
+    Matrix S_{0, 0};        // its lower triangle, with room for more
     Matrix squares_{0, 0};  // S is this much more, or less, than S_: U diag(sign) U^T
     Vector sign_;
 };

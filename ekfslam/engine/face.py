@@ -15,6 +15,7 @@ from scipy.special import gammaincinv
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
 from ekfslam.data.interval import Interval
+from ekfslam.engine.report import Gone, Report, report, retired
 from ekfslam.geometry.camera import DEPTH_FROM_PX
 from ekfslam.models.blocks import StateBlock, Twist, Values
 from ekfslam.models.build import has_image_coordinates
@@ -47,6 +48,7 @@ class Engine:
         self._model = model
         self.body = model.layout.body
         self._places = _places(model.layout.blocks, model.initial_values())
+        self._numbers = max(at.stop for at, _ in self._places.values())
         self._camera = [block for block in model.layout.blocks if block.coupling == "camera"]
         error = model.track_error
         self.filter = Filter(
@@ -161,14 +163,13 @@ class Engine:
 
     # --- frames -------------------------------------------------------------------------------------------------------
 
-    def rest(self, frame: int, ids: IntArray) -> dict[str, Any] | None:
+    def rest(self, frame: int, ids: IntArray) -> Gone | None:
         """Let landmarks out of view sleep or retire; return those that retired, None: there are none."""
-        found: dict[str, Any] | None = self.filter.rest(frame, ids)
-        return found
+        return retired(self.filter.rest(frame, ids))
 
     def update(
         self, frame: int, ids: IntArray, measured: Array, is_rested: bool, twist_after: Callable[[Values], Array] | None
-    ) -> dict[str, Any]:
+    ) -> Report:
         """Update by a frame's observations, and return what the log and the report need.
 
         Args:
@@ -176,8 +177,8 @@ class Engine:
             twist_after: Velocity (6,) of the IMU at this frame by corrected values, for a time offset.
         """
         function = None if twist_after is None else lambda flat: twist_after(self.named(flat))
-        found: dict[str, Any] = self.filter.update(frame, ids, measured, is_rested, function)
-        return found
+        found = self.filter.update(frame, ids, measured, is_rested, function)
+        return report(found, self._numbers, self._model.layout.body, self._model.sensor.dimension)
 
     def look_again(self, imu_twist: Array) -> tuple[dict[str, Array], Array]:
         """Open the view of the first frame for a velocity (6,) of the IMU; return values and coordinates."""

@@ -210,9 +210,14 @@ void Gaussian::propagate(const Matrix& Phi, const Matrix& Q) {
     }
     if (!changed.empty()) push_front(changed);
     const Index r = static_cast<Index>(rest_.size()), n = P_AA_.rows(), b = static_cast<Index>(body.size());
-    std::vector<Index> at = range(n, r), all = range(0, n + P_eA_.rows());
+    std::vector<Index> at = range(n, r);
     for (Index i = 0; i < front_size(); ++i) at.push_back(front_at() + i);
-    const Matrix Phi_b = Phi(body, body), Q_b = Q(body, body), before = gathered(at, all);
+    const Matrix Phi_b = Phi(body, body), Q_b = Q(body, body);
+    Matrix before(b, n + P_eA_.rows());  // rows of P over [A, e]
+    before.topLeftCorner(r, n) = P_eA_.topRows(r);
+    before.topRightCorner(r, P_eA_.rows()) = P_ee_.topRows(r);
+    before.bottomLeftCorner(b - r, n) = P_AA_.middleRows(front_at(), b - r);
+    before.bottomRightCorner(b - r, P_eA_.rows()) = P_eA_.middleCols(front_at(), b - r).transpose();
     Matrix rows(b, before.cols());
     blas::multiply('N', 'N', 1.0, Phi_b, before, 0.0, rows);
     const Matrix P_bb = Matrix(rows(Eigen::all, at)) * Phi_b.transpose() + Q_b;

@@ -46,6 +46,7 @@ struct Projection {
     std::vector<Index> place;  // (k) of each landmark in T^T
 
     Projection only(const Slots& which) const;
+    void keep(const Slots& which);                 // ascending, in place
     Eigen::Block<const Matrix> of(Index i) const;  // (f - begin, d) columns of T^T of landmark i
     Eigen::Map<const Matrix> root(Index i) const;  // L_i
     Matrix own_variance(Index i) const;            // (d, d) of H P H^T for landmark i

@@ -12,6 +12,8 @@ namespace ekfslam {
 namespace {
 using Small = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMajor, 8, 8>;  // (d, d)
 using Narrow = Eigen::Matrix<double, 3, Eigen::Dynamic, Eigen::ColMajor, 3, 8>;              // (3, d)
+// Columns on which rows depend directly: four views, ln baseline and disparity.
+using Leading = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMajor, 26, 8>;
 
 // H <- H L^-T in place for a few columns of H and lower triangular L.
 template <class Columns>
@@ -34,24 +36,50 @@ Rows Rows::only(const Slots& which) const {
     return some;
 }
 
-Projection Projection::only(const Slots& which) const {
-    const Index d = rows.dimension(), k = static_cast<Index>(which.size());
-    Slots sorted(which.size()), columns;
+namespace {
+// Places of some landmarks in T^T among each other, and those that they have now in the new order.
+std::pair<Slots, Slots> order_of(const Projection& at, const Slots& which) {
+    Slots sorted(which.size()), place(which.size()), now;
     std::iota(sorted.begin(), sorted.end(), 0);
-    const auto place_of = [&](Index i) { return place[static_cast<std::size_t>(which[static_cast<std::size_t>(i)])]; };
+    const auto place_of = [&](Index i) {
+        return at.place[static_cast<std::size_t>(which[static_cast<std::size_t>(i)])];
+    };
     std::sort(sorted.begin(), sorted.end(), [&](Index i, Index j) { return place_of(i) < place_of(j); });
-    Projection some{rows.only(which), {}, {}, columns_of(G, which, d), {}, Slots(which.size())};
-    for (Index p = 0; p < k; ++p) {
-        columns.push_back(place_of(sorted[static_cast<std::size_t>(p)]));
-        some.place[static_cast<std::size_t>(sorted[static_cast<std::size_t>(p)])] = p;
+    for (const Index i : sorted) {
+        place[static_cast<std::size_t>(i)] = static_cast<Index>(now.size());
+        now.push_back(place_of(i));
     }
-    some.T = columns_of(T, columns, d);
+    return {std::move(place), std::move(now)};
+}
+}  // namespace
+
+Projection Projection::only(const Slots& which) const {
+    const Index d = rows.dimension();
+    auto [own, columns] = order_of(*this, which);
+    Projection some{rows.only(which), {}, columns_of(T, columns, d), columns_of(G, which, d), {}, std::move(own)};
     for (Index i : which) {
-        const double* own = L.data() + i * d * d;
-        some.L.insert(some.L.end(), own, own + d * d);
+        some.L.insert(some.L.end(), root(i).data(), root(i).data() + d * d);
         some.begin.push_back(begin[static_cast<std::size_t>(i)]);
     }
     return some;
+}
+
+void Projection::keep(const Slots& which) {
+    const Index d = rows.dimension(), k = static_cast<Index>(which.size());
+    auto [own, columns] = order_of(*this, which);
+    rows = rows.only(which);
+    for (Index p = 0; p < k; ++p) {
+        const Index i = which[static_cast<std::size_t>(p)], column = columns[static_cast<std::size_t>(p)];
+        std::copy_n(L.begin() + i * d * d, d * d, L.begin() + p * d * d);
+        begin[static_cast<std::size_t>(p)] = begin[static_cast<std::size_t>(i)];
+        if (i != p) G.middleCols(p * d, d) = G.middleCols(i * d, d);
+        if (column != p) T.middleCols(p * d, d) = T.middleCols(column * d, d);
+    }
+    L.resize(static_cast<std::size_t>(k * d * d));
+    begin.resize(which.size());
+    place = std::move(own);
+    G.conservativeResize(Eigen::NoChange, k * d);
+    T.conservativeResize(Eigen::NoChange, k * d);
 }
 
 Eigen::Map<const Matrix> Projection::root(Index i) const {
@@ -134,7 +162,7 @@ bool Gaussian::whiten(Projection& at, Index i, const Matrix& H_x) const {
         for (Index j = 0; j < d; ++j)
             B.col(j).tail(n - landmark.begin) = H_m(0, j) * K.col(0) + H_m(1, j) * K.col(1) + H_m(2, j) * K.col(2);
     }
-    Matrix H = H_x.middleCols(i * d, d);
+    Leading H = H_x.middleCols(i * d, d);
     divide(H, L);
     const Lead lead = this->lead();
     B.middleRows(front_at(), front_size()) += H.topRows(front_size());

@@ -1,5 +1,7 @@
 #include "root.hpp"
 
+#include <cmath>
+
 #include "blas.hpp"
 
 namespace ekfslam {
@@ -7,26 +9,39 @@ namespace ekfslam {
 namespace {
 // Smallest pivot of a Cholesky factorisation, in the variance of its column, that is more than rounding.
 constexpr double LEAST_PIVOT = 1e-14;
-// Triangles of this size are not divided further.
-constexpr Index SMALL = 48;
+// Triangles of this size are not divided further; roots of this size need no BLAS.
+constexpr Index SMALL = 48, SMALLEST = 24;
+
+// P = F F^T with upper triangular F, in place of the upper triangle; false if P is not positive definite. The lower
+// triangle is not touched. Reversing rows and columns for LAPACK would take longer than the factorisation.
+bool to_upper_root(Eigen::Ref<Matrix> P) {
+    const Index n = P.rows(), a = n / 2, b = n - a;
+    if (n > SMALLEST) {
+        if (!to_upper_root(P.bottomRightCorner(b, b))) return false;
+        blas::solve('R', 'U', 'T', P.bottomRightCorner(b, b), P.topRightCorner(a, b));
+        blas::square('U', 'N', -1.0, P.topRightCorner(a, b), 1.0, P.topLeftCorner(a, a));
+        return to_upper_root(P.topLeftCorner(a, a));
+    }
+    for (Index j = n - 1; j >= 0; --j) {
+        if (!(P(j, j) > 0.0) || !std::isfinite(P(j, j))) return false;
+        P(j, j) = std::sqrt(P(j, j));
+        const auto column = P.col(j).head(j) *= 1.0 / P(j, j);
+        for (Index i = 0; i < j; ++i) P.col(i).head(i + 1) -= column(i) * column.head(i + 1);
+    }
+    return true;
+}
 }  // namespace
 
 Root::Root(const Matrix& P, const Vector& of) {
     const Index n = P.rows();
-    // An upper root is the reversed lower root of the reversed matrix.
-    Matrix reversed(n, n);
-    for (Index j = 0; j < n; ++j) reversed.col(j).tail(n - j) = P.col(n - 1 - j).head(n - j).reverse();
-    regular = blas::factorise(reversed);
-    for (Index j = 0; regular && j < n; ++j) regular = std::pow(reversed(j, j), 2) > LEAST_PIVOT * of(n - 1 - j);
+    F = P;
+    regular = to_upper_root(F);
+    for (Index j = 0; regular && j < n; ++j) regular = std::pow(F(j, j), 2) > LEAST_PIVOT * of(j);
     if (!regular) {
         pivot(P, of);
         return;
     }
-    F.resize(n, n);
-    for (Index j = 0; j < n; ++j) {
-        F.col(n - 1 - j).head(n - j) = reversed.col(j).tail(n - j).reverse();
-        F.col(n - 1 - j).tail(j).setZero();
-    }
+    for (Index j = 0; j < n; ++j) F.col(j).tail(n - 1 - j).setZero();
 }
 
 void Root::pivot(const Matrix& P, const Vector& of) {

@@ -70,7 +70,8 @@ void Gaussian::solve_left(Solution& s) const {
             blas::square('N', 1.0, s.at.T.block(stair.begin, stair.column, f - stair.begin, stair.width), 1.0,
                          s.M.bottomRightCorner(f - stair.begin, f - stair.begin));
     }
-    s.C = s.M;
+    s.C.resize(f, f);
+    for (Index j = 0; j < f; ++j) s.C.col(j).tail(f - j) = s.M.col(j).tail(f - j);
     if (!blas::factorise(s.C)) throw Error("the innovation covariance is not positive definite", s.at.rows.slot);
     Vector white(k * d);
     for (Index i = 0; i < k; ++i) white.segment(s.at.place[static_cast<std::size_t>(i)] * d, d) = s.w.col(i);

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.engine.face import Engine
+from ekfslam.engine.report import Gone
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.frame import Outcome
 from ekfslam.filters.innovations import FrameInnovations
@@ -46,34 +47,31 @@ def update(
     needs_twist = e.model.observer.has_time_offset and e.motion.tau_s
     e.forget_table()
     found = engine.update(frame, ids, measured, is_rested, twist_after if needs_twist else None)
-    for gone in found["retired"]:
+    for gone in found.retired:
         _keep(retired, gone)
-    retired.moving.update(found["moving"].tolist())
-    if (doubt := found["doubt"]) != e.motion.interval.doubt:
-        e.motion = e.motion.doubted(doubt)
-    views = ("pose", *e.model.layout.views)
+    retired.moving.update(found.moving.tolist())
+    if found.doubt != e.motion.interval.doubt:
+        e.motion = e.motion.doubted(found.doubt)
     # The log has the rows at their linearisation, then those of new landmarks.
-    taken, begun = found["taken"], found["begun"]
-    accepted = Accepted(*(taken[name] for name in ("landmark", "previous", "rows", "variance", "position_m")))
-    log.corrected(e, accepted, engine.named(taken["values"], views), taken["imu_twist"], taken["coordinates"])
-    log.amend(T_updated=engine.named(found["updated_values"], views)["pose"], updated=found["updated_coordinates"])
-    seen = [(e.step, begun["rows"], begun["variance"])]
-    if begun["step_before"] >= 0:
-        seen.insert(0, (begun["step_before"], begun["rows_before"], begun["variance"]))
-    if len(begun["ids"]):
-        log.started(begun["ids"], begun["position_m"], *seen)
-        retired.start_again(begun["ids"])
-    e.values, e.coordinates, e.imu_twist = engine.named(found["values"]), found["coordinates"], found["imu_twist"]
-    return Outcome(
-        found["reason"],
-        found["nis"],
-        found["log_det"],
-        found["dof"],
-        found["split"],
-        FrameInnovations(**found["innovations"]),
-    )
+    linear = engine.named(found.linear, ("pose", *e.model.layout.views))
+    known, observed = len(found.landmark) - len(found.begun), Accepted(found.landmark, found.previous, found.numbers)
+    waited = found.step_before >= 0
+    log.corrected(e, observed[:known] if waited else observed, linear, found.linear_twist, found.linear_coordinates)
+    log.amend(T_updated=engine.named(found.updated, ("pose",))["pose"], updated=found.updated_coordinates)
+    if len(found.begun):
+        begun = observed[known:]
+        log.entered(found.begun, begun.numbers[:, -3:])
+        if waited:
+            d = e.sensor.dimension
+            numbers = np.hstack([found.rows_before, begun.numbers[:, d:]])
+            log.observed(found.step_before, Accepted(begun.landmark, begun.previous, numbers))
+            log.observed(e.step, begun)
+        retired.start_again(found.begun)
+    e.values, e.coordinates, e.imu_twist = engine.named(found.values), found.coordinates, found.imu_twist
+    innovations = FrameInnovations(*found.innovations)
+    return Outcome(found.reason, found.nis, found.log_det, found.dof, found.split, innovations)
 
 
-def _keep(retired: Retired, gone: dict[str, Any]) -> None:
+def _keep(retired: Retired, gone: Gone) -> None:
     """Keep the last estimates of landmarks that left the state."""
-    retired.take(landmarks_of(gone["table"], gone["covariance"]), gone["table"], gone["may_return"])
+    retired.take(landmarks_of(gone.columns, gone.covariance), gone.columns, gone.may_return)

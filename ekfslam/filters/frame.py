@@ -103,7 +103,8 @@ def _take(e: Estimate, log: LogBook, found: Correction, frame: int) -> None:
     slot, linear = found.slot, found.linear
     follows = (e.table.last_step[slot] == e.step - 1) & (e.model.track_error is not None)
     previous = np.where(follows, e.table.last_observation[slot], -1)
-    accepted = Accepted(e.table.log_row[slot], previous, found.measured, found.variance, linear.position_m[slot])
+    numbers = np.hstack([found.measured, found.variance, linear.position_m[slot]])
+    accepted = Accepted(e.table.log_row[slot], previous, numbers)
     log.corrected(e, accepted, linear.values, linear.imu_twist, found.coordinates)
     e.table.observed(found.slot, e.step, found.measured, log.last(len(found.slot)))
     correction = found.done.correction

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -18,29 +17,33 @@ from ekfslam.geometry import se3
 from ekfslam.models.blocks import PreviousView, Values
 from ekfslam.models.process import Measured
 
-# Arrays over observations, pieces of inputs and measurements, by the one that holds their frames.
+# Arrays over observations, pieces of inputs and measurements; the first one holds their frames.
 _OF_FRAMES = {
-    "frame": ("frame", "landmark", "previous", "rows", "variance", "position_m"),
-    "input_frame": ("input_frame", "input_dt_s", "inputs"),
-    "measured_frame": ("measured_frame", *(f"measured_{field.name}" for field in fields(Measured))),
+    "observed": ("frame", "landmark", "previous", "numbers"),
+    "driven": ("input_frame", "input_dt_s", "inputs"),
+    "measured": ("measured_frame", *(f"measured_{field.name}" for field in fields(Measured))),
 }
+_NUMBERS = ("rows", "variance", "position_m")  # of observations, side by side
+_OF_LANDMARKS = ("id", "first_position_m")
+_ONE = np.eye(4)
 
 
 @dataclass(frozen=True)
 class Accepted:
-    """Accepted observations (k) of known landmarks.
+    """Accepted observations (k).
 
     Args:
         landmark, previous: (k,) rows of the log; places of the observations in the frame before, or -1.
-        rows, variance: (k, d) measured rows; variances of these or of their differences.
-        position_m: (k, 3) landmarks at the linearisation.
+        numbers: (k, 2d+3) measured rows (d), their variances or those of their differences (d), and the landmark at the
+            linearisation (3).
     """
 
     landmark: IntArray
     previous: IntArray
-    rows: Array
-    variance: Array
-    position_m: Array
+    numbers: Array
+
+    def __getitem__(self, some: slice) -> Accepted:
+        return Accepted(self.landmark[some], self.previous[some], self.numbers[some])
 
 
 class LogBook:
@@ -54,42 +57,41 @@ class LogBook:
         self._first_estimates = start.variant.first_estimates
         self._initial_covariance = start.gaussian.body_covariance
         self._frames: list[dict] = []
-        self._parts: defaultdict[str, list] = defaultdict(list)
+        # Parts of the arrays over frames, each with its frame; and of those over landmarks.
+        self._parts: dict[str, list[tuple]] = {name: [] for name in _OF_FRAMES}
+        self._begun: list[tuple[IntArray, Array]] = []
         self._landmarks = self._observations = 0
         self._is_dropped = False
         # Empty parts, for a log to which nothing is added.
         none, no_index, no_rows = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, start.sensor.dimension))
         self.started(no_index, np.empty((0, 3)), (0, no_rows, no_rows))
         self._measured(Measured(no_index, none, none, np.empty(0, dtype=bool)))
-        self._add(input_frame=no_index, input_dt_s=none, inputs=np.empty((0, 6)))
+        self._parts["driven"].append((0, none, np.empty((0, 6))))
         self._add_frame(start, start.coordinates)
 
-    def _add(self, **arrays: NDArray) -> None:
-        for name, value in arrays.items():
-            self._parts[name].append(value)
-
-    def mark(self) -> tuple[int, dict, dict[str, int], int, int]:
+    def mark(self) -> tuple[int, dict, dict[str, int], int, int, int]:
         """Return a mark of this moment for `restore`."""
         lengths = {name: len(parts) for name, parts in self._parts.items()}
-        return len(self._frames), dict(self._frames[-1]), lengths, self._landmarks, self._observations
+        last = dict(self._frames[-1])
+        return len(self._frames), last, lengths, len(self._begun), self._landmarks, self._observations
 
-    def restore(self, mark: tuple[int, dict, dict[str, int], int, int]) -> None:
+    def restore(self, mark: tuple[int, dict, dict[str, int], int, int, int]) -> None:
         """Forget everything since a mark."""
-        frames, last, lengths, self._landmarks, self._observations = mark
+        frames, last, lengths, begun, self._landmarks, self._observations = mark
         del self._frames[frames:]
         self._frames[-1] = last
         for name, length in lengths.items():
-            parts = self._parts[name]
-            if len(parts) < length:  # joined since then, see `since`
-                parts[:] = [np.concatenate(parts)[: self._landmarks]]
-            del parts[length:]
+            del self._parts[name][length:]
+        if len(self._begun) < begun:  # joined since then
+            ids, positions_m = self._all_begun()
+            self._begun = [(ids[: self._landmarks], positions_m[: self._landmarks])]
+        del self._begun[begun:]
 
     def predicted(self, now: Estimate, interval: Interval, found: Prediction) -> None:
         """Add a frame, reached by a prediction over an interval."""
         if found.measured is not None:
             self._measured(found.measured)
-        frame = np.full(len(interval.dt_s), now.step)
-        self._add(input_frame=frame, input_dt_s=interval.dt_s, inputs=interval.inputs)
+        self._parts["driven"].append((now.step, interval.dt_s, interval.inputs))
         self._add_frame(now, found.departed)
 
     def _add_frame(self, now: Estimate, departed: Array) -> None:
@@ -104,7 +106,7 @@ class LogBook:
                 "T_departed": motion.T_departed,
                 "T_predicted": T,
                 "T_linear": T,
-                "T_linear_before": motion.T_departed,
+                "T_linear_before": (_ONE, motion.T_departed),  # T_cam_imu and T_cam_world
                 "T_updated": T,
                 "departed": departed,
                 "linear": coordinates,
@@ -113,31 +115,28 @@ class LogBook:
             }
         )
 
-    def amend(self, **values: Array | float) -> None:
+    def amend(self, **values: Array | float | tuple[Array, Array]) -> None:
         """Replace fields of the frame that is being written, by their names in `Log`."""
         self._frames[-1].update(values)
 
     def _measured(self, rows: Measured) -> None:
         """Add measurements of blocks during the interval to the next frame."""
-        self._add(measured_frame=np.full(len(rows.axis), len(self._frames)))
-        self._add(**{f"measured_{field.name}": getattr(rows, field.name) for field in fields(rows)})
+        self._parts["measured"].append((len(self._frames), *(getattr(rows, field.name) for field in fields(rows))))
 
     def corrected(
         self, now: Estimate, accepted: Accepted, values: Values, imu_twist: Array, coordinates: Array
     ) -> None:
         """Add the correction of this frame, with the values at which it was linearised."""
-        T_before = now.motion.T_departed
+        before = _ONE, now.motion.T_departed
         if (view := values.get(PreviousView.name)) is not None and now.step:
-            T_before = se3.inverse(now.motion.T_cam_imu_before) @ view
-        self._observed(
-            now.step, accepted.landmark, accepted.rows, accepted.variance, accepted.position_m, accepted.previous
-        )
+            before = now.motion.T_cam_imu_before, view
+        self.observed(now.step, accepted)
         self.amend(
             doubt=now.motion.interval.doubt,
             seen_twist=imu_twist,
             linear=coordinates.copy(),
             T_linear=values["pose"],
-            T_linear_before=T_before,
+            T_linear_before=before,
         )
 
     def started(self, ids: IntArray, positions_m: Array, *views: tuple[int, Array, Array]) -> IntArray:
@@ -145,29 +144,30 @@ class LogBook:
 
         Each view is a frame, rows (n, d) and variances (n, d).
         """
-        self._add(id=ids, first_position_m=positions_m)
-        at = np.arange(self._landmarks, self._landmarks + len(ids))
-        self._landmarks += len(ids)
+        at = self.entered(ids, positions_m)
         for step, rows, variance in views:
-            self._observed(step, at, rows, variance, positions_m, np.full(len(ids), -1))
+            self.observed(step, Accepted(at, np.full(len(ids), -1), np.hstack([rows, variance, positions_m])))
         return at
+
+    def entered(self, ids: IntArray, positions_m: Array) -> IntArray:
+        """Add landmarks (n,) without their observations, and return their rows in the log."""
+        self._begun.append((ids, positions_m))
+        self._landmarks += len(ids)
+        return np.arange(self._landmarks - len(ids), self._landmarks)
+
+    def observed(self, step: int, accepted: Accepted) -> None:
+        """Add observations at a frame."""
+        self._parts["observed"].append((step, accepted.landmark, accepted.previous, accepted.numbers))
+        self._observations += len(accepted.landmark)
 
     def last(self, count: int) -> IntArray:
         """Return the places of the last observations."""
         return np.arange(self._observations - count, self._observations)
 
-    def _observed(
-        self, step: int, landmark: IntArray, rows: Array, variance: Array, position_m: Array, previous: IntArray
-    ) -> None:
-        frame = np.full(len(landmark), step)
-        self._add(frame=frame, landmark=landmark, previous=previous)
-        self._add(rows=rows, variance=variance, position_m=position_m)
-        self._observations += len(landmark)
-
     def drop(self) -> None:
         """Drop all but the present frame; there is no log from then on."""
         self._is_dropped = True
-        del self._frames[:-1]
+        del self._frames[:-1], self._begun[1:]
         for parts in self._parts.values():
             del parts[1:]
 
@@ -175,14 +175,25 @@ class LogBook:
         """Return the log so far; raise `PosteriorError` if a part was dropped."""
         if self._is_dropped:
             raise PosteriorError("the log of a long live run was dropped: see log_frames of LiveEKF")
-        return self._log(0, {name: np.concatenate(parts) for name, parts in self._parts.items()})
+        arrays = {name: value for group, parts in self._parts.items() for name, value in _joined(group, parts).items()}
+        return self._log(0, arrays | dict(zip(_OF_LANDMARKS, self._all_begun(), strict=True)))
+
+    def _all_begun(self) -> tuple[IntArray, Array]:
+        """Return ids and first positions of all landmarks."""
+        ids, positions_m = map(np.concatenate, zip(*self._begun, strict=True))
+        self._begun = [(ids, positions_m)]
+        return ids, positions_m
 
     def _log(self, first: int, arrays: dict[str, NDArray]) -> Log:
+        frames = self._frames[first:]
+        columns = {name: np.array([frame[name] for frame in frames]) for name in self._frames[0]}
+        T_cam_imu, T_cam_world = np.moveaxis(columns["T_linear_before"], 1, 0)
+        columns["T_linear_before"] = se3.inverse(T_cam_imu) @ T_cam_world
         return Log(
             first_estimates=self._first_estimates,
             has_views=True,
             initial_covariance=self._initial_covariance,
-            **{name: np.array([frame[name] for frame in self._frames[first:]]) for name in self._frames[0]},
+            **columns,
             **arrays,
         )
 
@@ -197,21 +208,31 @@ class LogBook:
         Returns:
             The log, and the rows (m,) of its landmarks in the whole log, ascending.
         """
-        arrays = {}
-        for key, names in _OF_FRAMES.items():
-            parts, begin = self._parts[key], first if key == "frame" else first + 1
-            count = next((n for n, part in enumerate(reversed(parts)) if len(part) and part[0] < begin), len(parts))
-            for name in names:
-                arrays[name] = np.concatenate([self._parts[name][0][:0], *self._parts[name][len(parts) - count :]])
-            arrays[key] = arrays[key] - first
+        arrays: dict[str, NDArray] = {}
+        for group, parts in self._parts.items():
+            begin = first if group == "observed" else first + 1
+            count = next((n for n, part in enumerate(reversed(parts)) if len(part[1]) and part[0] < begin), len(parts))
+            found = _joined(group, [(0, *(array[:0] for array in parts[0][1:])), *parts[len(parts) - count :]])
+            found[_OF_FRAMES[group][0]] -= first
+            arrays |= found
         before = self._observations - len(arrays["frame"])
         wanted = (arrays["frame"] >= observed - first) | np.isin(arrays["landmark"], landmarks)
         place = np.append(np.where(wanted, np.cumsum(wanted) - 1, -1), -1)
         arrays["previous"] = place[np.maximum(arrays["previous"] - before, -1)]
-        arrays |= {name: arrays[name][wanted] for name in _OF_FRAMES["frame"]}
+        arrays |= {name: arrays[name][wanted] for name in ("frame", "landmark", "previous", *_NUMBERS)}
         rows, place = np.unique(np.concatenate([arrays["landmark"], landmarks]), return_inverse=True)
         arrays["landmark"] = place[: len(arrays["landmark"])]
-        for name in ("id", "first_position_m"):
-            self._parts[name] = [np.concatenate(self._parts[name])]
-            arrays[name] = self._parts[name][0][rows]
+        arrays |= {name: value[rows] for name, value in zip(_OF_LANDMARKS, self._all_begun(), strict=True)}
         return self._log(first, arrays), rows
+
+
+def _joined(group: str, parts: list[tuple]) -> dict[str, NDArray]:
+    """Return the arrays over frames of a group, by name, from its parts."""
+    frame, *columns = zip(*parts, strict=True)
+    arrays = np.repeat(frame, [len(part) for part in columns[0]]), *map(np.concatenate, columns)
+    found: dict[str, NDArray] = dict(zip(_OF_FRAMES[group], arrays, strict=True))
+    if group == "observed":
+        numbers = found.pop("numbers")
+        d = (numbers.shape[1] - 3) // 2
+        found |= zip(_NUMBERS, map(np.ascontiguousarray, np.split(numbers, [d, 2 * d], axis=1)), strict=True)
+    return found

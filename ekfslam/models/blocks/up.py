@@ -73,10 +73,11 @@ class Up(StateBlock):
     def reported(self, values: Values, covariance: Array, layout: Layout) -> tuple[Array, Array]:
         """Return roll and pitch of the IMU and their standard deviations, rad."""
         up = self.in_imu(values)
-        theta, psi, R = slice(layout["pose"].start + 3, layout["pose"].stop), layout[self.name], values["pose"][:3, :3]
-        cross = R @ covariance[psi, theta]
-        variance = (covariance[theta, theta] + cross + cross.T + R @ covariance[psi, psi] @ R.T).diagonal()
-        return np.array([np.arctan2(up[1], up[2]), -np.arcsin(up[0])]), np.sqrt(variance[:2])
+        begin, psi, R = layout["pose"].start + 3, layout[self.name], values["pose"][:2, :3]
+        theta = slice(begin, begin + 2)
+        variance = ((2.0 * covariance[theta, psi] + R @ covariance[psi, psi]) * R).sum(axis=1)
+        variance += covariance[theta, theta].diagonal()
+        return np.array([np.arctan2(up[1], up[2]), -np.arcsin(up[0])]), np.sqrt(variance)
 
     @property
     def reported_prior_std(self) -> Array:
