@@ -85,7 +85,8 @@ def test_one_motion_that_no_vehicle_has_is_left_out():
     spoiled = dataclasses.replace(sequence, observations=dataclasses.replace(observations, pixels_px=pixels))
     found, true = stereo_odometry(spoiled), sequence.twist
     assert np.abs(found[1, :3] - true[1, :3]).max() < 2.0
-    np.testing.assert_allclose(found[3:], stereo_odometry(sequence)[3:], atol=1e-4)
+    # An alignment stops at steps below 1e-4 m, in .1 s: it ends elsewhere by up to 1e-3 m/s from other starts.
+    np.testing.assert_allclose(found[3:], stereo_odometry(sequence)[3:], atol=1e-3)
 
 
 def moved(twist, step_s=0.1):
