@@ -283,7 +283,7 @@ def gap(text: str) -> str:
         (lambda text: text.replace(" ", " x", 1), LineError, "line[1]"),
         (lambda text: text + "1 2 3\n", LineError, "3 columns, expected 7"),
         (lambda text: text + "1e9 nan 0 0 0 0 0\n", NonFiniteError, "line[31]"),
-        (lambda text: text + text.splitlines()[-1], StampError, "line[31]"),
+        (lambda text: text + text.split()[-7] + " 9" * 6, StampError, "line[31]"),
         (lambda text: "".join(text.splitlines(keepends=True)[:10]), LostDataError, "outside of the samples"),
         (lambda text: text.splitlines()[0] + "\n", LostDataError, "two are needed"),
         (gap, LostDataError, "a gap of"),

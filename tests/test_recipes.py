@@ -65,7 +65,7 @@ def test_settings_studies_and_rejections(cooked):
 
 def test_files(cooked):
     found, folder = cooked
-    assert np.loadtxt(folder / "drive.tum").shape == (40, 8)
+    assert np.loadtxt(folder / "drive.txt").shape == (40, 8)
     assert (folder / "drive.ply").read_bytes().startswith(b"ply")
     assert found["11"]["variance"].sizes == {"time": 40} and len(found["11"]["landmarks"]) > 100
     found["11"]["trajectory"].close()

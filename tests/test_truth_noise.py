@@ -152,9 +152,9 @@ def test_the_figure_states_both():
     sequence = synthetic_sequence(frames=30, landmarks=40)
     results = {"full": synthetic_result(sequence)}
     exact = plot_errors(results, sequence.truth).axes[0].get_title()
-    assert "(6 expected)" in exact and "truth noise" not in exact
+    assert "NEES (6)" in exact and "truth noise" not in exact
     noisy = plot_errors(results, dataclasses.replace(sequence.truth, noise=NOISE)).axes[0].get_title()
-    assert "(6 expected)" in noisy and "with truth noise" in noisy
+    assert "NEES (6)" in noisy and "with truth noise" in noisy
 
 
 # Where it comes from

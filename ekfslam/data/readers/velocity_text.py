@@ -35,7 +35,10 @@ def _header(path: Path) -> Header | None:
     """Return a header that names velocities."""
     if not first_row(path):
         return None
-    header = header_of(read_lines(path, f"expected {READER.expected}"))
+    try:
+        header = header_of(read_lines(path, f"expected {READER.expected}"))
+    except UnknownFormatError:  # no text
+        return None
     return header if header is not None and {"vx", "wz"} <= header.place.keys() else None
 
 
