@@ -252,13 +252,9 @@ class Sequence(Once, Shown):
         begin_s, end_s = float(self.time_s[frame - 1]), float(self.time_s[frame])
         if kind is InertialSamples:
             return _samples_of(self).interval(begin_s, end_s)
-        if (velocities := self.velocities) is None or self._has_one_velocity_a_frame:
+        if (velocities := self.velocities) is None or self.once(_has_one_velocity_a_frame):
             return Interval.of_one(self.twist[frame], end_s - begin_s, bool(self.interpolated[frame]))
         return velocities.interval(begin_s, end_s)
-
-    @cached_property
-    def _has_one_velocity_a_frame(self) -> bool:
-        return self.velocities is not None and self.velocities.has_stamps(self.time_s)
 
     def inputs_at(self, frame: int, kind: type[Input] = Velocities) -> Array:
         """Return the inputs (6,) of a kind at a frame; `LostDataError` if there are none."""
@@ -327,6 +323,10 @@ def of_left_camera(sequence: Sequence) -> Sequence:
         attributes={name: value for name, value in sequence.attributes.items() if name not in rig_only},
         notes=(*sequence.notes, "The left camera alone is used."),
     )
+
+
+def _has_one_velocity_a_frame(sequence: Sequence) -> bool:
+    return sequence.velocities is not None and sequence.velocities.has_stamps(sequence.time_s)
 
 
 def _samples_of(sequence: Sequence) -> InertialSamples:
