@@ -11,6 +11,7 @@ namespace {
 
 // Largest variance of an innovation, in those of the measurement, at which linearising still means anything.
 constexpr double MOST_BLURRED = 1e8;
+constexpr Index MOST_AVERAGED = 250;  // landmarks
 
 // Landmarks (j) of a frame that are tried, their rows, and S of each by itself.
 struct Tried {
@@ -155,7 +156,7 @@ double median(std::vector<double> values) {
 // Whether the prior spreads rows so far that linearising them once costs more than their noise. A rotation that moves a
 // row by s px has a term of second order of s^2 / (2 f) there, f being the row's derivative by the rotation. All
 // landmarks share most of it, and their noise averages out: wide means that in the median it exceeds half of
-// sigma / sqrt(k).
+// sigma / sqrt(k). Of more than 250 landmarks the errors that they share are larger than what averages out.
 bool is_wide(const Estimate& e, const Rows& rows, const Blocks& S) {
     const Vector focal = focal_lengths(by_pose(e, rows), rows.dimension());
     std::vector<double> spread;
@@ -163,7 +164,7 @@ bool is_wide(const Estimate& e, const Rows& rows, const Blocks& S) {
         const double most = (S[i].diagonal() - rows.variance.col(i)).maxCoeff();
         spread.push_back(most / (focal[i] * std::sqrt(rows.variance.col(i).minCoeff())));
     }
-    return median(spread) > 1.0 / std::sqrt(static_cast<double>(rows.count()));
+    return median(spread) > 1.0 / std::sqrt(static_cast<double>(std::min<Index>(rows.count(), MOST_AVERAGED)));
 }
 
 // The velocity at this frame as corrected by its observations, for eq. (9). With the measured velocity a time offset

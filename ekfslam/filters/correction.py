@@ -19,6 +19,8 @@ from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, MOVING
 # Largest variance of an innovation, in those of the measurement, at which linearising still means anything.
 _MOST_BLURRED = 1e8
 
+_MOST_AVERAGED = 250  # landmarks
+
 
 @dataclass(frozen=True)
 class Correction:
@@ -109,13 +111,17 @@ def _is_wide(tried: Projection) -> bool:
 
     A rotation that moves a row by s px has a term of second order of ``s^2 / (2 f)`` there, f being the row's
     derivative by the rotation (the focal length, or more). All landmarks of a frame share most of it, and their noise
-    averages out: wide means that in the median the term exceeds half of ``sigma / sqrt(k)``.
+    averages out: wide means that in the median the term exceeds half of ``sigma / sqrt(k)``. Of more than 250 landmarks
+    the errors that they share are larger than what averages out.
     """
     rows, k = tried.rows, len(tried.rows.residual)
     if not k:
         return False
     spread = np.diagonal(tried.variances, axis1=1, axis2=2).max(axis=1)
-    return bool(np.median(spread / (focal_lengths(rows) * np.sqrt(rows.variance.min(axis=1)))) > 1.0 / np.sqrt(k))
+    return bool(
+        np.median(spread / (focal_lengths(rows) * np.sqrt(rows.variance.min(axis=1))))
+        > 1.0 / np.sqrt(min(k, _MOST_AVERAGED))
+    )
 
 
 def focal_lengths(rows: Rows) -> Array:
