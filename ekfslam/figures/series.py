@@ -248,7 +248,7 @@ def _unwrapped(T_world_imu: Array) -> Array:
     """Return position (m), roll, pitch and yaw (degrees) of poses (T, 4, 4) as (T, 6), angles without jumps."""
     from scipy.spatial.transform import Rotation
 
-    yaw_pitch_roll = Rotation.from_matrix(T_world_imu[:, :3, :3]).as_euler("ZYX")
+    yaw_pitch_roll = Rotation.from_matrix(np.array(T_world_imu[:, :3, :3])).as_euler("ZYX")
     return np.hstack([T_world_imu[:, :3, 3], np.degrees(np.unwrap(yaw_pitch_roll[:, ::-1], axis=0))])
 
 
@@ -256,7 +256,7 @@ def _attitude_std(T_world_imu: Array, covariance: Array) -> Array:
     """Return standard deviations (T, 3) of roll, pitch and yaw, rad, to first order: E has their derivatives."""
     from scipy.spatial.transform import Rotation
 
-    _, pitch, roll = Rotation.from_matrix(T_world_imu[:, :3, :3]).as_euler("ZYX").T
+    _, pitch, roll = Rotation.from_matrix(np.array(T_world_imu[:, :3, :3])).as_euler("ZYX").T
     sin, cos, zero = np.sin(roll), np.cos(roll), np.zeros_like(roll)
     level = np.maximum(np.cos(pitch), 1e-9)
     rows = [zero + 1.0, sin * np.tan(pitch), cos * np.tan(pitch), zero, cos, -sin, zero, sin / level, cos / level]

@@ -89,7 +89,7 @@ def _log_pose(recording: Any, place: str, result: Result, time_s: Array, color: 
     rr = _rerun()
     T = result.T_world_imu
     moves = rr.Transform3D.columns(
-        translation=T[:, :3, 3], quaternion=Rotation.from_matrix(T[:, :3, :3]).as_quat().astype(np.float32)
+        translation=T[:, :3, 3], quaternion=Rotation.from_matrix(np.array(T[:, :3, :3])).as_quat().astype(np.float32)
     )
     _send(recording, place, time_s, moves)
     axes, turns = ellipsoids(result.covariance[:, :3, :3])  # rho is along the axes of the IMU

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ekfslam.arrays import Array
 from ekfslam.errors import ArchiveError, MissingPackageError
 from ekfslam.filters.result import REASONS, Result
+from ekfslam.storage.trajectories import position_and_quaternion
 from ekfslam.stored import Item, coordinate, values_of
 
 if TYPE_CHECKING:
@@ -39,13 +40,10 @@ def covariance_columns(P: Array, name: str = "cov_{}_m2") -> Columns:
 
 
 def _trajectory(result: Result) -> Columns:
-    from scipy.spatial.transform import Rotation
-
-    T = result.T_world_imu
+    names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
     return {
         "time_s": result.time_s,
-        **_named(("x_m", "y_m", "z_m"), T[:, :3, 3]),
-        **_named(("qx", "qy", "qz", "qw"), Rotation.from_matrix(T[:, :3, :3]).as_quat()),
+        **_named(names, position_and_quaternion(result.T_world_imu)),
         **covariance_columns(result.position_covariance_world),
         **covariance_columns(result.rotation_covariance_world, "rot_cov_{}_rad2"),
     }

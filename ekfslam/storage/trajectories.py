@@ -29,7 +29,8 @@ def position_and_quaternion(T: Array) -> Array:
     """Return ``x y z qx qy qz qw`` (..., 7) of transforms (..., 4, 4)."""
     from scipy.spatial.transform import Rotation
 
-    return np.concatenate([T[..., :3, 3], Rotation.from_matrix(T[..., :3, :3]).as_quat()], axis=-1)
+    R = np.array(T[..., :3, :3])  # a copy: SciPy 1.12 refuses what is read-only
+    return np.concatenate([T[..., :3, 3], Rotation.from_matrix(R).as_quat()], axis=-1)
 
 
 def tum_text(trajectory: Trajectory) -> str:
