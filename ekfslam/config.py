@@ -40,16 +40,11 @@ _KINDS: dict[type, str] = {float: "number", int: "whole number", str: "string", 
 
 @dataclass(frozen=True)
 class Rule:
-    """Rule for the value of a setting.
+    """Rule for the value of a setting."""
 
-    Args:
-        kind: ``float`` (any number), ``int``, ``str`` or ``bool``.
-        words: Further condition, as it follows "must" in a message.
-        holds: Function that returns whether a value of the kind meets this condition.
-    """
-
-    kind: type
-    words: str = ""
+    kind: type  # float (any number), int, str or bool
+    words: str = ""  # further condition, as it follows "must" in a message
+    # Function that returns whether a value of the kind meets this condition.
     holds: Callable[[Any], bool] = lambda _: True
 
     def plain(self, value: Any) -> Any:

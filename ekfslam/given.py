@@ -20,17 +20,11 @@ _LENGTH = 0.05  # by which lengths may differ
 
 
 class Covered(NamedTuple):
-    """A trajectory with its covariances.
+    """A trajectory with its covariances."""
 
-    Args:
-        trajectory: Its poses of the body that belong to frames, in its own world, with covariances.
-        sequence: The frames of the recording from the first of them to the last.
-        result: These frames as a result of mode ``given``, aligned with the recording at the first pose.
-    """
-
-    trajectory: Trajectory
-    sequence: Sequence
-    result: Result
+    trajectory: Trajectory  # its poses of the body that belong to frames, in its own world, with covariances
+    sequence: Sequence  # the frames of the recording from the first of them to the last
+    result: Result  # these frames as a result of mode given, aligned with the recording at the first pose
 
 
 def trajectory_covariance(

@@ -336,10 +336,7 @@ def require_coordinates(group: h5py.Group, layout: Iterable[Item], coordinates: 
 
 
 def read_fields(
-    group: h5py.Group,
-    layout: Iterable[Item],
-    sizes: dict[str, int] | None = None,
-    coordinates: Coordinates = NONE,
+    group: h5py.Group, layout: Iterable[Item], sizes: dict[str, int] | None = None, coordinates: Coordinates = NONE
 ) -> dict[str, Any]:
     """Read the data sets of a layout by field, checked; the first one along a shared length decides it.
 

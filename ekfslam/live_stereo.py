@@ -46,18 +46,12 @@ _BOUNDED = {"retire": "unseen", "retire_after": 10, "dormant": 0, "revive": -1, 
 
 @dataclass(frozen=True)
 class Tracked:
-    """Tracks of a frame.
+    """Tracks of a frame."""
 
-    Args:
-        time_s: Stamp.
-        ids, pixels_px: (n,) ids and (n, 4) pixels.
-        twist: (6,) mean velocity of the IMU since the frame before, by vision alone.
-    """
-
-    time_s: float
-    ids: IntArray
+    time_s: float  # stamp
+    ids: IntArray  # ids, pixels_px: (n,) ids and (n, 4) pixels
     pixels_px: Array
-    twist: Array
+    twist: Array  # (6,) mean velocity of the IMU since the frame before, by vision alone
 
 
 class Learner:

@@ -114,10 +114,7 @@ class Comparison(Shown):
 
 
 def compare(
-    sequence: Sequence,
-    modes: Iterable[Mode] = MODES,
-    config: Config | None = None,
-    timings: Timings | None = None,
+    sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | None = None, timings: Timings | None = None
 ) -> Comparison:
     """Run several modes with one configuration; ``timings`` are those of `run`.
 
@@ -255,17 +252,11 @@ def _compared(
 
 @dataclass(frozen=True, repr=False)
 class ConsistencyReport(Shown):
-    """Results of `check_consistency`.
+    """Results of `check_consistency`."""
 
-    Args:
-        archive: All values of all runs.
-        summary: Averages and their bounds, as written to ``summary.json``.
-        paths: Files written.
-    """
-
-    archive: StudyArchive
-    summary: dict[str, Any]
-    paths: list[Path]
+    archive: StudyArchive  # all values of all runs
+    summary: dict[str, Any]  # averages and their bounds, as written to summary.json
+    paths: list[Path]  # files written
 
     def card(self) -> Card:
         """Return the card that ``repr`` and a notebook show."""

@@ -91,20 +91,14 @@ _DENSITIES = tuple(field.name for field in dataclasses.fields(InertialNoise))
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything that an estimator needs.
+    """Everything that an estimator needs."""
 
-    Args:
-        sequence: Recording with cleaned tracks.
-        hygiene: Report of cleaning; None: tracks were not cleaned.
-        account: Attributes of a result that say where the noise comes from.
-        beside: Velocities that are measured beside inertial samples, such as those of wheels; None if there are none.
-    """
-
-    sequence: Sequence
+    sequence: Sequence  # recording with cleaned tracks
     config: Config
     model: Model
-    hygiene: HygieneReport | None
-    account: Mapping[str, str | int | float]
+    hygiene: HygieneReport | None  # report of cleaning; None: tracks were not cleaned
+    account: Mapping[str, str | int | float]  # attributes of a result that say where the noise comes from
+    # Velocities that are measured beside inertial samples, such as those of wheels; None if there are none.
     beside: VelocitySource | None = None
 
     @property

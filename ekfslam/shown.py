@@ -7,17 +7,11 @@ from typing import NamedTuple
 
 
 class Card(NamedTuple):
-    """A short view of a record.
+    """A short view of a record."""
 
-    Args:
-        title: Size of the record in a few words.
-        facts: Key figures by name.
-        further: Useful Python calls on the record.
-    """
-
-    title: str
-    facts: dict[str, str]
-    further: tuple[str, ...] = ()
+    title: str  # size of the record in a few words
+    facts: dict[str, str]  # key figures by name
+    further: tuple[str, ...] = ()  # useful Python calls on the record
 
 
 class Shown:

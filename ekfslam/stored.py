@@ -42,16 +42,11 @@ COVARIANCE_TOLERANCE = 1e-6  # of correlations: far above rounding, far below wh
 
 
 class Check(NamedTuple):
-    """Allowed values of a field.
+    """Allowed values of a field."""
 
-    Args:
-        kinds: NumPy kind: ``f`` numbers, ``i`` whole numbers, ``b`` truth values, ``S`` text.
-        words: Requirement of each value, as it follows "must".
-        holds: Function of values and shared lengths that returns which values pass, in the shape of the first axes.
-    """
-
-    kinds: str
-    words: str
+    kinds: str  # NumPy kind: f numbers, i whole numbers, b truth values, S text
+    words: str  # requirement of each value, as it follows "must"
+    # Function of values and shared lengths that returns which values pass, in the shape of the first axes.
     holds: Callable[[NDArray, Sizes], NDArray]
 
 
@@ -189,25 +184,15 @@ def coordinate(name: str, length: int, given: Mapping[str, NDArray]) -> NDArray:
 
 
 class Item(NamedTuple):
-    """A data set.
+    """A data set."""
 
-    Args:
-        name: Path of the data set below its group.
-        field: Field of the record that it holds.
-        shape: Names of its axes, see `AXES`.
-        units: Attribute ``units``.
-        frame: Attribute ``frame``, the frame of reference.
-        check: Allowed values.
-        codes: Meanings of whole numbers from 0, the attribute ``names``.
-    """
-
-    name: str
-    field: str
-    shape: Shape
-    units: str
-    frame: str
-    check: Check = NUMBERS
-    codes: tuple[str, ...] = ()
+    name: str  # path of the data set below its group
+    field: str  # field of the record that it holds
+    shape: Shape  # names of its axes, see `AXES`
+    units: str  # attribute units
+    frame: str  # attribute frame, the frame of reference
+    check: Check = NUMBERS  # allowed values
+    codes: tuple[str, ...] = ()  # meanings of whole numbers from 0, the attribute names
 
     @property
     def place(self) -> tuple[str, str]:
@@ -229,15 +214,10 @@ Layout = tuple[Item, ...]
 
 
 class Attribute(NamedTuple):
-    """A field that is an attribute of the group.
+    """A field that is an attribute of the group."""
 
-    Args:
-        kind: bool, int, str, or tuple for several texts.
-        along: Shared length that the texts name one by one.
-    """
-
-    kind: type
-    along: str = ""
+    kind: type  # bool, int, str, or tuple for several texts
+    along: str = ""  # shared length that the texts name one by one
 
 
 def stored(

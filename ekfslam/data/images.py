@@ -54,19 +54,13 @@ class Distortion:
 
 @dataclass(frozen=True)
 class PairCalibration:
-    """Calibration of two cameras, rectified or not; raise a `DataError` if it is impossible.
+    """Calibration of two cameras, rectified or not; raise a `DataError` if it is impossible."""
 
-    Args:
-        K_left, K_right: (3, 3) intrinsic matrices, px.
-        size: Width and height of the images of both, px.
-        T_right_left: (4, 4) left to right optical frame; that of a rectified pair is `side_by_side`.
-        distortion_left, distortion_right: Distortion of the lenses.
-    """
-
-    K_left: Array
+    K_left: Array  # K_left, K_right: (3, 3) intrinsic matrices, px
     K_right: Array
-    size: tuple[int, int]
-    T_right_left: Array
+    size: tuple[int, int]  # width and height of the images of both, px
+    T_right_left: Array  # (4, 4) left to right optical frame; that of a rectified pair is `side_by_side`
+    # distortion_left, distortion_right: Distortion of the lenses.
     distortion_left: Distortion = field(default_factory=Distortion)
     distortion_right: Distortion = field(default_factory=Distortion)
 

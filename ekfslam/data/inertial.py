@@ -31,32 +31,19 @@ _UNITS: dict[str, tuple[float, float, str]] = {  # range of the mean |f| at the 
 
 @dataclass(frozen=True)
 class InertialRows:
-    """Samples in the order of a file, on any clock.
+    """Samples in the order of a file, on any clock."""
 
-    Args:
-        source: File or stream, for messages.
-        time_ns: (N,) stamps; integers, because those since 1970 have more digits than a float.
-        gyro_rad_s, accel_m_s2: (N, 3) angular rates and specific forces.
-        noise: Densities; None if nothing states them.
-        late_s: Stamp of a sample less that of an image of the same instant.
-        stated_hz: Rate that a file states; 0 if none does.
-        line: (N,) lines of a text file; None for other sources.
-        T_cam_imu: (4, 4) pose of the left camera, if the source states it.
-        sorts: Whether stamps that go back are sorted. Else they are an error.
-        notes, attributes: Facts for the recording that takes the samples.
-    """
-
-    source: str
-    time_ns: IntArray
-    gyro_rad_s: Array
+    source: str  # file or stream, for messages
+    time_ns: IntArray  # (N,) stamps; integers, because those since 1970 have more digits than a float
+    gyro_rad_s: Array  # gyro_rad_s, accel_m_s2: (N, 3) angular rates and specific forces
     accel_m_s2: Array
-    noise: InertialNoise | None = None
-    late_s: float = 0.0
-    stated_hz: float = 0.0
-    line: IntArray | None = None
-    T_cam_imu: Array | None = None
-    sorts: bool = False
-    notes: tuple[str, ...] = ()
+    noise: InertialNoise | None = None  # densities; None if nothing states them
+    late_s: float = 0.0  # stamp of a sample less that of an image of the same instant
+    stated_hz: float = 0.0  # rate that a file states; 0 if none does
+    line: IntArray | None = None  # (N,) lines of a text file; None for other sources
+    T_cam_imu: Array | None = None  # (4, 4) pose of the left camera, if the source states it
+    sorts: bool = False  # whether stamps that go back are sorted. Else they are an error.
+    notes: tuple[str, ...] = ()  # notes, attributes: facts for the recording that takes the samples
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
 
     def where(self, row: int) -> dict[str, Any]:

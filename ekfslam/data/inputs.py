@@ -110,21 +110,14 @@ class Velocities:
 
 @dataclass(frozen=True)
 class VelocitySamples:
-    """Velocities as a file has them, before they are brought to the stamps of a recording.
-
-    Args:
-        source: File.
-        time_s: (N,) increasing stamps.
-        twist: (N, 6) ``[v; w]`` in ``velocity_frame``.
-        T_cam_imu: (4, 4) extrinsics of the recording that holds them; None for a text file.
-        attributes, notes: Facts about these velocities for the recording that takes them.
-    """
+    """Velocities as a file has them, before they are brought to the stamps of a recording."""
 
     source: str
-    time_s: Array
-    twist: Array
+    time_s: Array  # (N,) increasing stamps
+    twist: Array  # (N, 6) [v; w] in velocity_frame
     velocity_frame: VelocityFrame = "imu"
-    T_cam_imu: Array | None = None
+    T_cam_imu: Array | None = None  # (4, 4) extrinsics of the recording that holds them; None for a text file
+    # attributes, notes: Facts about these velocities for the recording that takes them.
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 

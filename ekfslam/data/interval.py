@@ -14,20 +14,13 @@ class Interval:
     """The inputs that lead from one frame to the next, in pieces with one row of inputs each.
 
     A row is a velocity ``[v; w]``, constant during the piece, or the mean inertial sample ``[w; f]`` of the piece.
-
-    Args:
-        tau_s: Duration.
-        dt_s: (n,) durations of the pieces, in order of time; their sum is ``tau_s`` to rounding.
-        inputs: (n, c) one row a piece.
-        is_gap: Whether inputs were interpolated across a gap.
-        doubt: Factor of the inputs' standard deviations; above 1 where landmarks contradict them.
     """
 
     tau_s: float
-    dt_s: Array
-    inputs: Array
-    is_gap: bool = False
-    doubt: float = 1.0
+    dt_s: Array  # (n,) durations of the pieces, in order of time; their sum is tau_s to rounding
+    inputs: Array  # (n, c) one row a piece
+    is_gap: bool = False  # whether inputs were interpolated across a gap
+    doubt: float = 1.0  # factor of the inputs' standard deviations; above 1 where landmarks contradict them
 
     @staticmethod
     def of_one(inputs: Array, tau_s: float, is_gap: bool = False) -> Interval:
@@ -37,19 +30,12 @@ class Interval:
 
 @dataclass(frozen=True)
 class Intervals:
-    """Successive intervals as flat arrays: m intervals with N pieces in all.
+    """Successive intervals as flat arrays: m intervals with N pieces in all."""
 
-    Args:
-        tau_s: (m,) durations.
-        is_gap, doubt: (m,) see `Interval`.
-        start: (m+1,) first piece of each interval, and N.
-        dt_s, inputs: (N,), (N, c) of the pieces.
-    """
-
-    tau_s: Array
-    is_gap: BoolArray
-    start: IntArray
-    dt_s: Array
+    tau_s: Array  # (m,) durations
+    is_gap: BoolArray  # is_gap, doubt: (m,) see `Interval`
+    start: IntArray  # (m+1,) first piece of each interval, and N
+    dt_s: Array  # dt_s, inputs: (N,), (N, c) of the pieces
     inputs: Array
     doubt: Array | float = 1.0
 

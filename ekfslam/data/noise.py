@@ -17,19 +17,13 @@ ACROSS = 0.35
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Errors of the velocities that move the pose.
+    """Errors of the velocities that move the pose."""
 
-    Args:
-        twist_std: (6,) white noise of a sample, m/s and rad/s.
-        motion_std: (6,) error of the motion beyond it, which no averaging of velocities removes.
-        walk_std: (6,) change of the true velocities from one sample to the next. None: nothing is assumed of it.
-        gap_std: (6,) further error of samples that were interpolated across a gap.
-    """
-
-    twist_std: Array
-    motion_std: Array
+    twist_std: Array  # (6,) white noise of a sample, m/s and rad/s
+    motion_std: Array  # (6,) error of the motion beyond it, which no averaging of velocities removes
+    # (6,) change of the true velocities from one sample to the next. None: nothing is assumed of it.
     walk_std: Array | None
-    gap_std: Array
+    gap_std: Array  # (6,) further error of samples that were interpolated across a gap
 
     def pose_std_during(self, is_gap: BoolArray | bool, doubt: Array | float = 1.0) -> Array:
         """Return the error (..., 6) of velocities that move the pose.
@@ -59,17 +53,12 @@ class TrackError:
     An observation is ``z(k) = h(k) + e(k)`` with ``e ~ N(0, first^2)`` at landmark initialisation. While the track goes
     on, ``e(k) = e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2 + (way / depth / parallax)^2))``: features are followed
     worse the further they move, and the more their surroundings are deformed.
-
-    Args:
-        first_std: (3,) standard deviation at landmark initialisation, in the sensor's rows, px.
-        walk_std: (3,) of the innovation from one frame to the next, px.
-        flow_px: Motion in the image at which the variance of the walk has doubled; infinite: it never grows.
-        parallax: Way of the camera, as a share of the depth, at which the variance of the walk has doubled.
     """
 
-    first_std: Array
-    walk_std: Array
-    flow_px: float
+    first_std: Array  # (3,) standard deviation at landmark initialisation, in the sensor's rows, px
+    walk_std: Array  # (3,) of the innovation from one frame to the next, px
+    flow_px: float  # motion in the image at which the variance of the walk has doubled; infinite: it never grows
+    # Way of the camera, as a share of the depth, at which the variance of the walk has doubled.
     parallax: float = np.inf
 
     def step_variance(self, motion_px: Array, parallax: Array) -> Array:

@@ -129,8 +129,7 @@ class Truth:
         metadata=stored("M", "landmark id", check=COUNTS, name="landmarks/id"),
     )
     position_m: Array = field(
-        default_factory=lambda: np.empty((0, 3)),
-        metadata=stored("M xyz", "m", "world", name="landmarks/position"),
+        default_factory=lambda: np.empty((0, 3)), metadata=stored("M xyz", "m", "world", name="landmarks/position")
     )
     noise: TruthNoise | None = None
     motion: TrueMotion | None = None

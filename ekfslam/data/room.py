@@ -35,18 +35,7 @@ _MARGIN_S = 0.02  # of samples before the first image and after the last
 
 @dataclass(frozen=True)
 class Room(Recording):
-    """A box around the trajectory, with landmarks on its six sides. Tracks that are lost come back under other ids.
-
-    Args:
-        cameras: 2, or 1: the left camera of the rig, with the tracks and the noise of the rig.
-        landmarks: Number of landmarks.
-        wall_m, ceiling_m: Least distances of walls, and of floor and ceiling, from the trajectory.
-        imu_rate_hz: Rate of gyroscope and accelerometer.
-        gyro, accel, gyro_walk, accel_walk: Densities, see `InertialNoise`; by default those of EuRoC.
-        gyro_bias_std_rad_s, accel_bias_std_m_s2: Standard deviations of the first biases.
-        trajectory: TUM file of poses with gravity along -z; "" for a trajectory made from the seed.
-        start_s: Time in the trajectory at which the recording begins.
-    """
+    """A box around the trajectory, with landmarks on its six sides. Tracks that are lost come back under other ids."""
 
     name: str = "room"
     frames: int = 250
@@ -54,19 +43,21 @@ class Room(Recording):
     min_disparity_px: float = 5.0
     max_range_m: float = 8.0
     max_tracks: int = 40
-    cameras: int = 2
-    landmarks: int = 1500
-    wall_m: float = 2.5
+    cameras: int = 2  # 2, or 1: the left camera of the rig, with the tracks and the noise of the rig
+    landmarks: int = 1500  # number of landmarks
+    wall_m: float = 2.5  # wall_m, ceiling_m: least distances of walls, and of floor and ceiling, from the trajectory
     ceiling_m: float = 1.5
-    imu_rate_hz: float = 200.0
+    imu_rate_hz: float = 200.0  # rate of gyroscope and accelerometer
+    # gyro, accel, gyro_walk, accel_walk: Densities, see `InertialNoise`; by default those of EuRoC.
     gyro: float = 1.6968e-4
     accel: float = 2.0e-3
     gyro_walk: float = 1.9393e-5
     accel_walk: float = 3.0e-3
+    # gyro_bias_std_rad_s, accel_bias_std_m_s2: Standard deviations of the first biases.
     gyro_bias_std_rad_s: float = 0.01
     accel_bias_std_m_s2: float = 0.1
-    trajectory: str = ""
-    start_s: float = 0.0
+    trajectory: str = ""  # TUM file of poses with gravity along -z; "" for a trajectory made from the seed
+    start_s: float = 0.0  # time in the trajectory at which the recording begins
 
     def __post_init__(self) -> None:
         super().__post_init__()

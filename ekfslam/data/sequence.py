@@ -29,12 +29,7 @@ from ekfslam.data.observations import (
     validate_truth,
 )
 from ekfslam.data.once import Once
-from ekfslam.errors import (
-    CalibrationError,
-    ExtrinsicsError,
-    LostDataError,
-    ShapeError,
-)
+from ekfslam.errors import CalibrationError, ExtrinsicsError, LostDataError, ShapeError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import T_CAM_BODY, StereoCamera
 from ekfslam.names import printable

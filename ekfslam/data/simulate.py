@@ -64,9 +64,6 @@ class City(Drive):
     """Streets between crossings, left, left, right, right and so on, with a stop in every third.
 
     No landmark id ever comes back: each unbroken run of observations of a physical point is a track with its own id.
-
-    Args:
-        landmarks_per_m: Physical points along each metre of street, both sides together.
     """
 
     name: str = "city"
@@ -76,7 +73,7 @@ class City(Drive):
     max_tracks: int = 66
     loss_probability: float = 0.02
     outlier_fraction: float = 0.03
-    landmarks_per_m: float = 4.0
+    landmarks_per_m: float = 4.0  # physical points along each metre of street, both sides together
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -91,22 +88,16 @@ class City(Drive):
 
 @dataclass(frozen=True)
 class Loop(Drive):
-    """A ring driven at constant speed; landmarks keep their ids, loop after loop (157 frames each by default).
-
-    Args:
-        radius_m, speed_m_s: Radius of the ring, and speed along it.
-        landmarks: Number of landmarks inside and outside of the ring.
-        landmark_offset_m: Largest distance of landmarks outside of the ring; inside it is a fifth of the radius.
-        landmark_height_m: Largest height of landmarks above the ground.
-    """
+    """A ring driven at constant speed; landmarks keep their ids, loop after loop (157 frames each by default)."""
 
     name: str = "loop"
     frames: int = 472
-    radius_m: float = 20.0
+    radius_m: float = 20.0  # radius_m, speed_m_s: radius of the ring, and speed along it
     speed_m_s: float = 8.0
-    landmarks: int = 100
+    landmarks: int = 100  # number of landmarks inside and outside of the ring
+    # Largest distance of landmarks outside of the ring; inside it is a fifth of the radius.
     landmark_offset_m: float = 16.0
-    landmark_height_m: float = 4.0
+    landmark_height_m: float = 4.0  # largest height of landmarks above the ground
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -15,18 +15,12 @@ _BASIS = np.array([[5.0, 3.0, -3.0, 1.0], [1.0, 3.0, 3.0, -2.0], [0.0, 0.0, 0.0,
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion at some times.
+    """A motion at some times."""
 
-    Args:
-        T_world_imu: (n, 4, 4) poses.
-        velocity_m_s, acceleration_m_s2: (n, 3) in world.
-        rate_rad_s: (n, 3) in the body.
-    """
-
-    T_world_imu: Array
-    velocity_m_s: Array
+    T_world_imu: Array  # (n, 4, 4) poses
+    velocity_m_s: Array  # velocity_m_s, acceleration_m_s2: (n, 3) in world
     acceleration_m_s2: Array
-    rate_rad_s: Array
+    rate_rad_s: Array  # (n, 3) in the body
 
     def specific_force(self, gravity_m_s2: float) -> Array:
         """Return what an accelerometer in the body measures (n, 3), m/s^2."""
@@ -36,17 +30,11 @@ class Motion:
 
 @dataclass(frozen=True)
 class PoseSpline:
-    """Uniform cumulative cubic B-spline, separate for position and rotation.
+    """Uniform cumulative cubic B-spline, separate for position and rotation."""
 
-    Args:
-        begin_s: Time of the second control pose, where the spline begins; it ends at the last but one.
-        step_s: Time between control poses.
-        T: (k, 4, 4) control poses ``T_world_imu``, which the spline passes closely.
-    """
-
-    begin_s: float
-    step_s: float
-    T: Array
+    begin_s: float  # time of the second control pose, where the spline begins; it ends at the last but one
+    step_s: float  # time between control poses
+    T: Array  # (k, 4, 4) control poses T_world_imu, which the spline passes closely
 
     @property
     def end_s(self) -> float:

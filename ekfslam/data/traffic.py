@@ -45,17 +45,11 @@ _VELOCITY, _POINT, _TRACK, _DISPARITY, _RESIDUAL = slice(0, 6), slice(6, 8), sli
 
 @dataclass(frozen=True)
 class Flow:
-    """Motion of tracks over single intervals, in units of the standard deviations of w.
+    """Motion of tracks over single intervals, in units of the standard deviations of w."""
 
-    Args:
-        frame: (n,) frame that the interval leads to.
-        track: (n,) landmark id, ascending.
-        rows: (n, 3, 10) derivatives H by x (6), F by c (2) and k by e, and the residual r.
-    """
-
-    frame: IntArray
-    track: IntArray
-    rows: Array
+    frame: IntArray  # (n,) frame that the interval leads to
+    track: IntArray  # (n,) landmark id, ascending
+    rows: Array  # (n, 3, 10) derivatives H by x (6), F by c (2) and k by e, and the residual r
 
     def only(self, which: BoolArray) -> Flow:
         """Return the intervals that a mask (n,) selects."""

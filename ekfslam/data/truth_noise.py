@@ -15,30 +15,20 @@ class TruthNoise:
 
     Errors of the first pose and of the world move the whole estimate, which starts at the first true pose. Drift and
     turned body grow with time and motion. The other errors belong to single poses.
-
-    Args:
-        first_roll_rad, first_pitch_rad, first_yaw_rad: Attitude of the first pose, about the axes of the IMU.
-        first_position_m: Position of the first pose, each axis.
-        world_tilt_rad: Error of the vertical of the world, about each level axis of it.
-        turn_rad: Constant error of the axes of the true body, about each axis: of extrinsics, say.
-        drift_m_sqrt_s: Random walk of the position, each axis: standard deviation after one second.
-        scale: Error of all distances, as a share of them: of a projection of the Earth, say.
-        stamp_s: Jitter of the stamps: an error along the motion, in proportion to the velocities.
-        position_m: Position of each pose, each axis.
-        attitude_rad: Attitude of each pose, each axis.
     """
 
+    # first_roll_rad, first_pitch_rad, first_yaw_rad: Attitude of the first pose, about the axes of the IMU.
     first_roll_rad: float = 0.0
     first_pitch_rad: float = 0.0
     first_yaw_rad: float = 0.0
-    first_position_m: float = 0.0
-    stamp_s: float = 0.0
-    position_m: float = 0.0
-    attitude_rad: float = 0.0
-    world_tilt_rad: float = 0.0
-    turn_rad: float = 0.0
-    drift_m_sqrt_s: float = 0.0
-    scale: float = 0.0
+    first_position_m: float = 0.0  # position of the first pose, each axis
+    stamp_s: float = 0.0  # jitter of the stamps: an error along the motion, in proportion to the velocities
+    position_m: float = 0.0  # position of each pose, each axis
+    attitude_rad: float = 0.0  # attitude of each pose, each axis
+    world_tilt_rad: float = 0.0  # error of the vertical of the world, about each level axis of it
+    turn_rad: float = 0.0  # constant error of the axes of the true body, about each axis: of extrinsics, say
+    drift_m_sqrt_s: float = 0.0  # random walk of the position, each axis: standard deviation after one second
+    scale: float = 0.0  # error of all distances, as a share of them: of a projection of the Earth, say
 
     @property
     def text(self) -> str:
@@ -59,18 +49,12 @@ class TruthNoise:
 
 
 class Doubt(NamedTuple):
-    """A stretch in which the truth contradicts velocities and vision, which agree.
+    """A stretch in which the truth contradicts velocities and vision, which agree."""
 
-    Args:
-        begin, end: First and last frame.
-        axis: Axis 0 to 5 of the pose error in the IMU frame.
-        size: Offset of the later poses, m or rad.
-    """
-
-    begin: int
+    begin: int  # begin, end: first and last frame
     end: int
-    axis: int
-    size: float
+    axis: int  # axis 0 to 5 of the pose error in the IMU frame
+    size: float  # offset of the later poses, m or rad
 
 
 _DOUBTS, _DRIFT = "truth_doubts", "truth_drift_m_sqrt_s"

@@ -41,32 +41,20 @@ _MOST_IN_VIEW = 20_000_000  # landmarks times frames
 
 @dataclass(frozen=True)
 class Recording:
-    """Settings of every world: sampling, noise, and the limits of the tracker.
+    """Settings of every world: sampling, noise, and the limits of the tracker."""
 
-    Args:
-        name: Name of the sequence.
-        seed: Seed of the generator.
-        frames: Number of stamps, at least 2.
-        frame_period_s: Nominal time between stamps.
-        stamp_jitter_s: Standard deviation of a stamp (cut at a third of the period).
-        sigma_px: White noise of each of the four pixels.
-        min_disparity_px, max_range_m: Landmarks with less disparity, or farther from the camera, are not tracked.
-        max_tracks: The tracker follows no more landmarks than this at a time.
-        loss_probability: Chance that the tracker misses a visible landmark in a frame.
-        outlier_fraction: Share of observations that are grossly displaced.
-    """
-
-    name: str
-    seed: int = 0
-    frames: int = 1000
-    frame_period_s: float = 0.1
-    stamp_jitter_s: float = 0.001
-    sigma_px: float = 1.0
+    name: str  # name of the sequence
+    seed: int = 0  # seed of the generator
+    frames: int = 1000  # number of stamps, at least 2
+    frame_period_s: float = 0.1  # nominal time between stamps
+    stamp_jitter_s: float = 0.001  # standard deviation of a stamp (cut at a third of the period)
+    sigma_px: float = 1.0  # white noise of each of the four pixels
+    # min_disparity_px, max_range_m: Landmarks with less disparity, or farther from the camera, are not tracked.
     min_disparity_px: float = 6.0
     max_range_m: float = 40.0
-    max_tracks: int = 1000
-    loss_probability: float = 0.0
-    outlier_fraction: float = 0.0
+    max_tracks: int = 1000  # the tracker follows no more landmarks than this at a time
+    loss_probability: float = 0.0  # chance that the tracker misses a visible landmark in a frame
+    outlier_fraction: float = 0.0  # share of observations that are grossly displaced
 
     def __post_init__(self) -> None:
         for key, value in numbers_of(self).items():

@@ -128,13 +128,7 @@ class Engine:
         return self.named(flat), coordinates, nis, log_det
 
     def arrive(
-        self,
-        values: Values,
-        coordinates: Array,
-        imu_twist: Array,
-        Phi: Array,
-        Q: Array,
-        motion: Any,
+        self, values: Values, coordinates: Array, imu_twist: Array, Phi: Array, Q: Array, motion: Any
     ) -> tuple[dict[str, Array], Array]:
         """End a prediction: propagate by eq. (2), take the mean of the blocks, and open the view of this frame.
 

@@ -18,44 +18,34 @@ class Gone(NamedTuple):
 
 
 class Report(NamedTuple):
-    """A frame in the engine; flat values and coordinates as in `Engine`, rows (k, d).
+    """A frame in the engine; flat values and coordinates as in `Engine`, rows (k, d)."""
 
-    Args:
-        retired: Landmarks that retired, in the order in which they left.
-        reason: (n,) outcome of each observation.
-        nis, log_det, dof, doubt: Of the accepted rows; factor of the inputs' standard deviations.
-        split, moving: Ids of tracks that start again, and that were found to move.
-        innovations: Arguments of `ekfslam.filters.innovations.FrameInnovations`.
-        landmark, previous, numbers: (k+j,), (k+j,), (k+j, 2d+3) of the log, see `ekfslam.filters.logbook.Accepted`: k
-            observations of known landmarks, then those of j new ones.
-        linear, linear_coordinates, linear_twist: Values, coordinates, and velocity of the IMU of the linearisation.
-        updated, updated_coordinates: After the correction, before new landmarks start.
-        begun: (j,) ids of new landmarks.
-        step_before, rows_before: Frame of the log and rows of their first view that waited for this one; -1: none.
-        values, coordinates, imu_twist: At the end.
-    """
-
-    retired: list[Gone]
-    reason: IntArray
-    nis: float
+    retired: list[Gone]  # landmarks that retired, in the order in which they left
+    reason: IntArray  # (n,) outcome of each observation
+    nis: float  # nis, log_det, dof, doubt: of the accepted rows; factor of the inputs' standard deviations
     log_det: float
     dof: int
     doubt: float
-    split: IntArray
+    split: IntArray  # split, moving: ids of tracks that start again, and that were found to move
     moving: IntArray
+    # Arguments of `ekfslam.filters.innovations.FrameInnovations`.
     innovations: tuple[IntArray, Array, Array, Array, Array]
+    # landmark, previous, numbers: (k+j,), (k+j,), (k+j, 2d+3) of the log, see `ekfslam.filters.logbook.Accepted`: k
+    # observations of known landmarks, then those of j new ones.
     landmark: IntArray
     previous: IntArray
     numbers: Array
+    # linear, linear_coordinates, linear_twist: Values, coordinates, and velocity of the IMU of the linearisation.
     linear: Array
     linear_coordinates: Array
     linear_twist: Array
-    updated: Array
+    updated: Array  # updated, updated_coordinates: after the correction, before new landmarks start
     updated_coordinates: Array
-    begun: IntArray
+    begun: IntArray  # (j,) ids of new landmarks
+    # step_before, rows_before: Frame of the log and rows of their first view that waited for this one; -1: none.
     step_before: int
     rows_before: Array
-    values: Array
+    values: Array  # values, coordinates, imu_twist: at the end
     coordinates: Array
     imu_twist: Array
 

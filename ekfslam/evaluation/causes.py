@@ -59,22 +59,15 @@ _REMEDY = {
 
 @dataclass(frozen=True)
 class Cause:
-    """A defect of the model.
+    """A defect of the model."""
 
-    Args:
-        kind: ``bias``, ``scale``, ``direction``, ``delay``, ``shared drift``, ``shared noise``, ``pixel noise``,
-            ``tracks``, ``motion``, ``smoother``, ``nis``, ``outliers``, ``moving`` or ``velocities``.
-        where: Axes, or rows of the image.
-        factor: Ratio of these errors to the stated ones, in standard deviations; NaN if it does not apply.
-        text: Description.
-        remedy: The next step; empty if there is none.
-    """
-
+    # Bias, scale, direction, delay, shared drift, shared noise, pixel noise, tracks, motion, smoother, nis, outliers,
+    # moving or velocities.
     kind: str
-    where: tuple[str, ...]
-    factor: float
-    text: str
-    remedy: str = ""
+    where: tuple[str, ...]  # axes, or rows of the image
+    factor: float  # ratio of these errors to the stated ones, in standard deviations; NaN if it does not apply
+    text: str  # description
+    remedy: str = ""  # the next step; empty if there is none
 
 
 class Causes(NamedTuple):

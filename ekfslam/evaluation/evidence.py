@@ -51,19 +51,12 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Deviation of n series of innovations from white noise of the stated size.
+    """Deviation of n series of innovations from white noise of the stated size."""
 
-    Args:
-        size: Mean square per degree of freedom.
-        correlation: (21, n) autocorrelation, lags 0 to 20 frames.
-        factor: (n,) square root of the long-run variance: ratio of errors to covariance.
-        persistence: (n,) long-run variance about the mean, divided by the variance; 1 if white.
-    """
-
-    size: Ratio
-    correlation: Array
-    factor: Array
-    persistence: Array
+    size: Ratio  # mean square per degree of freedom
+    correlation: Array  # (21, n) autocorrelation, lags 0 to 20 frames
+    factor: Array  # (n,) square root of the long-run variance: ratio of errors to covariance
+    persistence: Array  # (n,) long-run variance about the mean, divided by the variance; 1 if white
 
 
 @dataclass(frozen=True)
@@ -72,44 +65,28 @@ class SharedInnovations(Whiteness):
 
     Axes are examined by falling ``factor``, each corrected for the axes before it, because an error in yaw resembles
     one in lateral position. ``std`` and ``correlation`` are of each axis alone.
-
-    Args:
-        std: (6,) standard deviation about 0; 1 expected.
-        order: (6,) axes, worst first.
-        factor_low: (6,) ``factor`` minus three standard errors.
-        frames: Number of frames examined.
     """
 
-    std: Array
-    order: IntArray
-    factor_low: Array
-    frames: int
+    std: Array  # (6,) standard deviation about 0; 1 expected
+    order: IntArray  # (6,) axes, worst first
+    factor_low: Array  # (6,) factor minus three standard errors
+    frames: int  # number of frames examined
 
 
 @dataclass(frozen=True)
 class TrackInnovations(Whiteness):
-    """Errors of single observations, without the shared motion, along tracks, by `ROWS`.
+    """Errors of single observations, without the shared motion, along tracks, by `ROWS`."""
 
-    Args:
-        scale: Ratio of the variances to the stated ones, corrected for the cut of the gate.
-        pairs: (21,) number of pairs of observations behind ``correlation``.
-    """
-
-    scale: float
-    pairs: IntArray
+    scale: float  # ratio of the variances to the stated ones, corrected for the cut of the gate
+    pairs: IntArray  # (21,) number of pairs of observations behind correlation
 
 
 @dataclass(frozen=True)
 class SmootherAgreement:
-    """Filtered minus smoothed poses, whose covariance is ``P_filter - P_smoothed``.
+    """Filtered minus smoothed poses, whose covariance is ``P_filter - P_smoothed``."""
 
-    Args:
-        std: (6,) root mean square of each axis in expected deviations; NaN if the smoother gained nothing there.
-        frames: Number of frames compared.
-    """
-
-    std: Array
-    frames: int
+    std: Array  # (6,) root mean square of each axis in expected deviations; NaN if the smoother gained nothing there
+    frames: int  # number of frames compared
 
     @property
     def size(self) -> float:

@@ -28,37 +28,26 @@ _NOTABLE, _BAD = 1.3, 2.0  # factors
 
 @dataclass(frozen=True)
 class Honesty:
-    """The verdict on a run, and its evidence; None for evidence that the run does not offer.
+    """The verdict on a run, and its evidence; None for evidence that the run does not offer."""
 
-    Args:
-        name, frames: Name of the recording, number of frames.
-        nis: NIS per degree of freedom.
-        shared, tracks, smoother, truth: The evidence.
-        rejected: Share of all observations by reason of rejection.
-        systematic: Errors that all frames show.
-        vision: (6,) share of the pose that vision decides, see `ekfslam.evaluation.evidence.vision_share`.
-        smoother_skipped, innovations_skipped: Reason for a missing smoother or missing innovations; else empty.
-        factors: (6,) ratio of errors to standard deviations of the pose, along `AXES`, by innovations alone. None if
-            they do not tell.
-        causes: Causes of a covariance that is too small or too large, worst first.
-        findings: Other defects.
-    """
-
-    name: str
+    name: str  # name, frames: name of the recording, number of frames
     frames: int
-    nis: Ratio | None
-    shared: SharedInnovations | None
+    nis: Ratio | None  # NIS per degree of freedom
+    shared: SharedInnovations | None  # shared, tracks, smoother, truth: the evidence
     tracks: evidence.TrackInnovations | None
-    rejected: dict[str, float]
-    systematic: tuple[Systematic, ...]
-    vision: Array | None
+    rejected: dict[str, float]  # share of all observations by reason of rejection
+    systematic: tuple[Systematic, ...]  # errors that all frames show
+    vision: Array | None  # (6,) share of the pose that vision decides, see `ekfslam.evaluation.evidence.vision_share`
     smoother: evidence.SmootherAgreement | None
     truth: evidence.TruthAgreement | None
+    # smoother_skipped, innovations_skipped: Reason for a missing smoother or missing innovations; else empty.
     smoother_skipped: str
     innovations_skipped: str
+    # (6,) ratio of errors to standard deviations of the pose, along `AXES`, by innovations alone. None if they do not
+    # tell.
     factors: Array | None
-    causes: tuple[Cause, ...]
-    findings: tuple[Cause, ...]
+    causes: tuple[Cause, ...]  # causes of a covariance that is too small or too large, worst first
+    findings: tuple[Cause, ...]  # other defects
 
     @property
     def factor(self) -> float:

@@ -37,20 +37,13 @@ _NOISE = "(6), with truth noise"
 
 @dataclass(frozen=True)
 class Metric:
-    """A registered figure of merit.
+    """A registered figure of merit."""
 
-    Args:
-        heading, fmt: Heading in tables, with unit or expected value, and format of the value.
-        compute: Function that returns the value, or the values of several metrics.
-        place: Place of the value among several; None if it is alone.
-        definition: The definition in one line, if the heading does not say all.
-    """
-
-    heading: str
+    heading: str  # heading, fmt: heading in tables, with unit or expected value, and format of the value
     fmt: str
-    compute: Function
-    place: int | None = None
-    definition: str = ""
+    compute: Function  # function that returns the value, or the values of several metrics
+    place: int | None = None  # place of the value among several; None if it is alone
+    definition: str = ""  # the definition in one line, if the heading does not say all
 
 
 METRICS: dict[str, Metric] = {}  # by key, in the order of tables

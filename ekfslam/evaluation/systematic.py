@@ -29,21 +29,14 @@ _NEIGHBOURS = (((_APART, 0), slice(None, -_APART)), ((0, _APART), slice(_APART, 
 
 @dataclass(frozen=True)
 class Systematic:
-    """An error that innovations show in all frames.
+    """An error that innovations show in all frames."""
 
-    Args:
-        kind: ``bias`` of a velocity, ``scale`` of the way, ``direction`` of the motion, or ``delay`` of the velocities.
-        axis: Name of the axis, one of `AXES`, or x, y, z of the IMU about which the motion is turned; else empty.
-        value: Velocities minus camera, in m/s or rad/s, as a share, in rad, or in s. The filter hides a part of it.
-        sigmas: ``value`` divided by its standard error, which allows for correlation over time.
-        also: Kinds that explain the innovations almost as well.
-    """
-
-    kind: str
-    axis: str
+    kind: str  # bias of a velocity, scale of the way, direction of the motion, or delay of the velocities
+    axis: str  # name of the axis, one of `AXES`, or x, y, z of the IMU about which the motion is turned; else empty
+    # Velocities minus camera, in m/s or rad/s, as a share, in rad, or in s. The filter hides a part of it.
     value: float
-    sigmas: float
-    also: tuple[str, ...] = ()
+    sigmas: float  # value divided by its standard error, which allows for correlation over time
+    also: tuple[str, ...] = ()  # kinds that explain the innovations almost as well
 
 
 def systematic_errors(result: Result, examined: BoolArray) -> tuple[tuple[Systematic, ...], WhitenedInnovations]:

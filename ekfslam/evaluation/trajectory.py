@@ -59,17 +59,11 @@ def absolute_trajectory_error(T_est: Array, T_true: Array, align: bool, by: Call
 
 
 class Part(NamedTuple):
-    """A part of the squared trajectory error that one number explains.
+    """A part of the squared trajectory error that one number explains."""
 
-    Args:
-        name: ``roll``, ``pitch`` or ``yaw`` of the first pose, ``x``, ``y`` or ``z`` of a shift in world, or ``scale``.
-        value: Error of that number: rad, m, or a ratio.
-        share: Share of the squared error that it removes after the parts before it.
-    """
-
-    name: str
-    value: float
-    share: float
+    name: str  # roll, pitch or yaw of the first pose, x, y or z of a shift in world, or scale
+    value: float  # error of that number: rad, m, or a ratio
+    share: float  # share of the squared error that it removes after the parts before it
 
 
 PARTS = ("roll", "pitch", "yaw", "x", "y", "z", "scale")

@@ -32,30 +32,20 @@ _ABSCISSAE = {"s": "time [s]", "m": "distance driven [m]"}
 
 @dataclass(frozen=True)
 class Series:
-    """A curve over time or distance.
+    """A curve over time or distance."""
 
-    Args:
-        name, unit: Label of the y axis.
-        x, y: (n,) the curve.
-        low, high: (n,) bounds; None without bounds.
-        bounds_expectation: Whether the bounds hold values of an honest run; otherwise they are those of the estimate.
-        levels: Values to compare with: expected ones, or bounds of the prior.
-        is_positive: Whether large ratios matter, so that the axis may be logarithmic.
-        mean: Mean by degrees of freedom, for titles.
-        x_unit: ``s`` over time, ``m`` over distance driven.
-    """
-
-    name: str
+    name: str  # name, unit: label of the y axis
     unit: str
-    x: Array
+    x: Array  # x, y: (n,) the curve
     y: Array
-    low: Array | None = None
+    low: Array | None = None  # low, high: (n,) bounds; None without bounds
     high: Array | None = None
+    # Whether the bounds hold values of an honest run; otherwise they are those of the estimate.
     bounds_expectation: bool = False
-    levels: tuple[float, ...] = ()
-    is_positive: bool = False
-    mean: float | None = None
-    x_unit: str = "s"
+    levels: tuple[float, ...] = ()  # values to compare with: expected ones, or bounds of the prior
+    is_positive: bool = False  # whether large ratios matter, so that the axis may be logarithmic
+    mean: float | None = None  # mean by degrees of freedom, for titles
+    x_unit: str = "s"  # s over time, m over distance driven
 
     @property
     def labels(self) -> tuple[str, str]:

@@ -27,41 +27,27 @@ class Dropped(NamedTuple):
 
 @dataclasses.dataclass
 class LiveCounts:
-    """Counts of all messages: none is dropped without being counted.
+    """Counts of all messages: none is dropped without being counted."""
 
-    Args:
-        velocities, samples, images: Messages in time.
-        taken_in: Images that the filter has processed.
-        late_velocities, late_samples, late_images: Rejected messages, older than the last processed image.
-        out_of_order: Messages in time that came after a later one of their kind.
-        held: Images processed with extrapolated inputs, since none had arrived in time.
-        gaps: Images after inputs more than ``gap_s`` apart.
-        repeated: Rejected messages with the stamp of another one of their kind.
-        jumps: Rejected messages whose stamps were more than ``jump_s`` off.
-        refused: Rejected messages, because too many waited.
-        unused: Images older than all samples, inputs older than all images, and messages dropped by `LiveEKF.reset`.
-        failed: Images that the filter could not process; the prediction to their stamp remains.
-        resets: Calls of `LiveEKF.reset`, and new beginnings after a clock had jumped before the first image.
-        log_drops: Times that the log was dropped.
-    """
-
-    velocities: int = 0
+    velocities: int = 0  # velocities, samples, images: messages in time
     images: int = 0
-    taken_in: int = 0
+    taken_in: int = 0  # images that the filter has processed
+    # late_velocities, late_samples, late_images: Rejected messages, older than the last processed image.
     late_velocities: int = 0
     late_images: int = 0
-    out_of_order: int = 0
-    held: int = 0
-    gaps: int = 0
+    out_of_order: int = 0  # messages in time that came after a later one of their kind
+    held: int = 0  # images processed with extrapolated inputs, since none had arrived in time
+    gaps: int = 0  # images after inputs more than gap_s apart
     samples: int = 0
     late_samples: int = 0
-    repeated: int = 0
-    jumps: int = 0
-    refused: int = 0
+    repeated: int = 0  # rejected messages with the stamp of another one of their kind
+    jumps: int = 0  # rejected messages whose stamps were more than jump_s off
+    refused: int = 0  # rejected messages, because too many waited
+    # Images older than all samples, inputs older than all images, and messages dropped by `LiveEKF.reset`.
     unused: int = 0
-    failed: int = 0
-    resets: int = 0
-    log_drops: int = 0
+    failed: int = 0  # images that the filter could not process; the prediction to their stamp remains
+    resets: int = 0  # calls of `LiveEKF.reset`, and new beginnings after a clock had jumped before the first image
+    log_drops: int = 0  # times that the log was dropped
 
 
 class Admission:

@@ -28,19 +28,12 @@ _AHEAD = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Change:
-    """Landmark errors after a correction, ``d_i+ = M_i d_i + B_i x``.
+    """Landmark errors after a correction, ``d_i+ = M_i d_i + B_i x``."""
 
-    Args:
-        slot: (n,) slots of the landmarks, ascending.
-        columns: (c,) body columns of x.
-        B: (n, 3, c).
-        M: (n, 3, 3); None is the identity.
-    """
-
-    slot: IntArray
-    columns: IntArray
-    B: Array
-    M: Array | None = None
+    slot: IntArray  # (n,) slots of the landmarks, ascending
+    columns: IntArray  # (c,) body columns of x
+    B: Array  # (n, 3, c)
+    M: Array | None = None  # (n, 3, 3); None is the identity
 
     def only(self, slot: IntArray) -> Change:
         """Return the change of some of the landmarks."""
@@ -50,15 +43,10 @@ class Change:
 
 @dataclass(frozen=True)
 class CameraPoints:
-    """Landmarks in the frame of a camera.
+    """Landmarks in the frame of a camera."""
 
-    Args:
-        q: (n, 3) points.
-        q_linear, R_linear: (n, 3), (3, 3) points and rotation from world at which derivatives are taken.
-    """
-
-    q: Array
-    q_linear: Array
+    q: Array  # (n, 3) points
+    q_linear: Array  # q_linear, R_linear: (n, 3), (3, 3) points and rotation from world at which derivatives are taken
     R_linear: Array
 
 
@@ -68,14 +56,10 @@ class CameraCoordinates:
 
     A landmark counts by its position (x, y, z) in the camera frame instead if it is behind the camera, far off its axis
     or without disparity, or if a correction would change its disparity by too large a factor.
-
-    Args:
-        sensor: Sensor of the filter.
-        min_depth_m: Depth below which a landmark is behind the camera.
     """
 
-    sensor: Sensor
-    min_depth_m: float
+    sensor: Sensor  # sensor of the filter
+    min_depth_m: float  # depth below which a landmark is behind the camera
 
     def retract(self, before: CameraPoints, T_after: Array, z: Array, d: Array) -> tuple[Array, BoolArray]:
         """Return ``m+`` (n, 3) of eq. (7'), and whether (n,) each landmark counts by its image.

@@ -24,37 +24,22 @@ _MOST_AVERAGED = 250  # landmarks
 
 @dataclass(frozen=True)
 class Correction:
-    """Correction by a frame's known landmarks.
+    """Correction by a frame's known landmarks."""
 
-    Args:
-        solution: Eq. (6) solved, to be applied to the covariance; None: nothing was accepted.
-        done: Correction of the mean, NIS and ``log det S`` of the accepted rows.
-        dof: Degrees of freedom of the NIS.
-        verdict: (k,) `ACCEPTED` or a reason code for each landmark.
-        slot, measured, variance: (j,), (j, d), (j, d) of the accepted landmarks.
-        linear: Mean at which the accepted rows were linearised.
-        coordinates: (body,) coordinates there.
-        innovations: Innovations of the accepted rows in the first iteration.
-        outside: Number of landmarks outside of the gate, whether or not they seem to move, too.
-        is_wide: Whether the prediction is too uncertain to linearise at, see `_is_wide`.
-        gaussian: Covariance that ``solution`` belongs to, if it is not that of the prediction.
-        doubt: Factor of the noise of the inputs in it.
-    """
-
-    solution: Solution | None
-    done: Conditioned
-    dof: int
-    verdict: IntArray
-    slot: IntArray
+    solution: Solution | None  # eq. (6) solved, to be applied to the covariance; None: nothing was accepted.
+    done: Conditioned  # correction of the mean, NIS and log det S of the accepted rows
+    dof: int  # degrees of freedom of the NIS
+    verdict: IntArray  # (k,) `ACCEPTED` or a reason code for each landmark
+    slot: IntArray  # slot, measured, variance: (j,), (j, d), (j, d) of the accepted landmarks
     measured: Array
     variance: Array
-    linear: Mean
-    coordinates: Array
-    innovations: FrameInnovations
-    outside: int = 0
-    is_wide: bool = False
-    gaussian: Gaussian | None = None
-    doubt: float = 1.0
+    linear: Mean  # mean at which the accepted rows were linearised
+    coordinates: Array  # (body,) coordinates there
+    innovations: FrameInnovations  # innovations of the accepted rows in the first iteration
+    outside: int = 0  # number of landmarks outside of the gate, whether or not they seem to move, too
+    is_wide: bool = False  # whether the prediction is too uncertain to linearise at, see `_is_wide`
+    gaussian: Gaussian | None = None  # covariance that solution belongs to, if it is not that of the prediction
+    doubt: float = 1.0  # factor of the noise of the inputs in it
 
 
 def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correction:

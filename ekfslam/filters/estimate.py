@@ -26,42 +26,28 @@ from ekfslam.models.sensors.base import Sensor
 
 @dataclass(frozen=True)
 class Mean:
-    """Mean at which observations are linearised.
+    """Mean at which observations are linearised."""
 
-    Args:
-        values: Values of the blocks.
-        position_m: (n, 3) landmarks.
-        imu_twist: (6,) velocity of the IMU at the image, for a time offset, eq. (9).
-    """
-
-    values: dict[str, Array]
-    position_m: Array
-    imu_twist: Array
+    values: dict[str, Array]  # values of the blocks
+    position_m: Array  # (n, 3) landmarks
+    imu_twist: Array  # (6,) velocity of the IMU at the image, for a time offset, eq. (9).
 
 
 @dataclass(frozen=True)
 class Motion:
-    """The last prediction, eq. (1); before the first one, an empty one.
+    """The last prediction, eq. (1); before the first one, an empty one."""
 
-    Args:
-        T_departed: (4, 4) ``T_imu_world`` before it.
-        T_predicted: (4, 4) predicted ``T_imu_world`` of this frame.
-        W_predicted, W_predicted_before: (4, 4) first estimates of the view of this frame and of that of the one before.
-        interval: Inputs.
-        way_m: Length of the way.
-        T_cam_imu_before: (4, 4) extrinsics of the frame before, after its update: the view's for the pose.
-        Q: (body, body) covariance of the noise that the process added, to the view, too; empty if the engine predicts.
-        last: (4, 4) motion over the interval before, ``T_departed = last T``, and its duration in s, if there was one.
-    """
-
-    T_departed: Array
-    T_predicted: Array
+    T_departed: Array  # (4, 4) T_imu_world before it
+    T_predicted: Array  # (4, 4) predicted T_imu_world of this frame
+    # W_predicted, W_predicted_before: (4, 4) first estimates of the view of this frame and of that of the one before.
     W_predicted: Array
     W_predicted_before: Array
-    interval: Interval
-    way_m: Array
-    T_cam_imu_before: Array
+    interval: Interval  # inputs
+    way_m: Array  # length of the way
+    T_cam_imu_before: Array  # (4, 4) extrinsics of the frame before, after its update: the view's for the pose
+    # (body, body) covariance of the noise that the process added, to the view, too; empty if the engine predicts.
     Q: Array
+    # (4, 4) motion over the interval before, T_departed = last T, and its duration in s, if there was one.
     last: tuple[Array, float] | None = None
 
     @staticmethod

@@ -23,15 +23,11 @@ from ekfslam.models.sensors.base import ACCEPTED, DISPARITY, MOVING, WAITING
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a frame's observations; arguments are those of `ekfslam.filters.reports.FrameReport`.
-
-    Args:
-        log_det: ``log det S`` of the accepted rows.
-    """
+    """Outcome of a frame's observations; arguments are those of `ekfslam.filters.reports.FrameReport`."""
 
     reason: IntArray
     nis: float
-    log_det: float
+    log_det: float  # log det S of the accepted rows
     dof: int
     split: IntArray
     innovations: FrameInnovations
@@ -49,13 +45,7 @@ def rest(e: Estimate, retired: Retired, frame: int, ids: IntArray) -> None:
 
 
 def update(
-    e: Estimate,
-    log: LogBook,
-    retired: Retired,
-    waiting: Waiting | None,
-    frame: int,
-    ids: IntArray,
-    measured: Array,
+    e: Estimate, log: LogBook, retired: Retired, waiting: Waiting | None, frame: int, ids: IntArray, measured: Array
 ) -> Outcome:
     """Correct with known landmarks (6), start new ones (5); landmarks out of view have left, see `rest`.
 

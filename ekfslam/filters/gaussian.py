@@ -22,18 +22,13 @@ _ABOVE = ~np.tri(_BLOCK, dtype=bool)
 
 @dataclass(frozen=True)
 class Rows:
-    """Linearised measurements of k landmarks, d rows each.
+    """Linearised measurements of k landmarks, d rows each."""
 
-    Args:
-        slot: (k,) place of each landmark in the state.
-        H_x, H_m: (k, d, seen), (k, d, 3) derivatives by the leading body columns and by the landmark, eq. (4).
-        residual, variance: (k, d).
-    """
-
-    slot: IntArray
+    slot: IntArray  # (k,) place of each landmark in the state
+    # H_x, H_m: (k, d, seen), (k, d, 3) derivatives by the leading body columns and by the landmark, eq. (4).
     H_x: Array
     H_m: Array
-    residual: Array
+    residual: Array  # residual, variance: (k, d)
     variance: Array
 
     def only(self, which: BoolArray | IntArray) -> Rows:
@@ -87,28 +82,17 @@ class Solution:
 
     Rows E are removed by projection of the whitened rows to those orthogonal to ``A = L^-1 E``, because
     ``S_kk^-1 = L^-T (I - A (A^T A)^-1 A^T) L^-1``.
-
-    Args:
-        Y: (body+3n, m) ``(L^-1 H P)^T``, with ``P - Y Y^T`` the covariance afterwards.
-        L: (m, m) in the lower triangle; the upper one is not used.
-        white: (m,) ``L^-1 r``.
-        log_det: ``log det S``.
-        shape: (k, d) of the rows; d is 1 for rows of the body alone.
-        variance: (m,).
-        considered: Columns of the mean that stay.
-        left: (k,) which landmarks are left; None: all.
-        Q: (m, r) orthonormal basis of the removed rows.
     """
 
-    Y: Array
-    L: Array
-    white: Array
-    log_det: float
-    shape: tuple[int, int]
-    variance: Array
-    considered: slice
-    left: BoolArray | None = None
-    Q: Array | None = None
+    Y: Array  # (body+3n, m) (L^-1 H P)^T, with P - Y Y^T the covariance afterwards
+    L: Array  # (m, m) in the lower triangle; the upper one is not used
+    white: Array  # (m,) L^-1 r
+    log_det: float  # log det S
+    shape: tuple[int, int]  # (k, d) of the rows; d is 1 for rows of the body alone
+    variance: Array  # (m,)
+    considered: slice  # columns of the mean that stay
+    left: BoolArray | None = None  # (k,) which landmarks are left; None: all
+    Q: Array | None = None  # (m, r) orthonormal basis of the removed rows
 
     @cached_property
     def done(self) -> Conditioned:

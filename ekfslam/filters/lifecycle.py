@@ -20,20 +20,13 @@ PATIENCE = 30
 
 @dataclass(frozen=True)
 class Marginal:
-    """Mean and covariance of all blocks and of some landmarks, given everything in a log.
+    """Mean and covariance of all blocks and of some landmarks, given everything in a log."""
 
-    Args:
-        values: Estimates of the blocks that change.
-        columns, coordinates: (c,) body columns whose coordinates change, and their new coordinates.
-        position_m: (n, 3) landmarks.
-        P: (body+3n, body+3n) covariance in the order of a filter's state.
-    """
-
-    values: dict[str, Array]
-    columns: IntArray
+    values: dict[str, Array]  # estimates of the blocks that change
+    columns: IntArray  # columns, coordinates: (c,) body columns whose coordinates change, and their new coordinates
     coordinates: Array
-    position_m: Array
-    P: Array
+    position_m: Array  # (n, 3) landmarks
+    P: Array  # (body+3n, body+3n) covariance in the order of a filter's state
 
 
 class Revival(Protocol):

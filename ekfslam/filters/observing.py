@@ -15,17 +15,11 @@ from ekfslam.models.observer import Moment, Projected
 
 @dataclass(frozen=True)
 class Present:
-    """The camera of the present frame in the errors of the state: ``W_true = exp(z^) W``, ``z = by x``.
+    """The camera of the present frame in the errors of the state: ``W_true = exp(z^) W``, ``z = by x``."""
 
-    Args:
-        T_cam_world: (4, 4) W.
-        T_linear: (4, 4) camera at which the rest of H is taken: the same, or (FEJ) the predicted one.
-        by: (6, seen); if the view is in the state, it selects its columns.
-    """
-
-    T_cam_world: Array
-    T_linear: Array
-    by: Array
+    T_cam_world: Array  # (4, 4) W
+    T_linear: Array  # (4, 4) camera at which the rest of H is taken: the same, or (FEJ) the predicted one
+    by: Array  # (6, seen); if the view is in the state, it selects its columns
 
 
 def moment(e: Estimate, at: Mean) -> Moment:

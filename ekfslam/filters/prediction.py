@@ -24,19 +24,12 @@ from ekfslam.models.process import Measured
 
 @dataclass(frozen=True)
 class Prediction:
-    """Results of a prediction that are not part of the estimate.
+    """Results of a prediction that are not part of the estimate."""
 
-    Args:
-        departed: (body,) coordinates before the process moved its blocks.
-        measured: Measurements of blocks during the interval, if any.
-        log_likelihood: Log-density of these measurements, or 0.
-        doubt: Largest factor of the standard deviations of measurements that the state contradicts, or 1.
-    """
-
-    departed: Array
-    measured: Measured | None
-    log_likelihood: float
-    doubt: float = 1.0
+    departed: Array  # (body,) coordinates before the process moved its blocks
+    measured: Measured | None  # measurements of blocks during the interval, if any
+    log_likelihood: float  # log-density of these measurements, or 0
+    doubt: float = 1.0  # largest factor of the standard deviations of measurements that the state contradicts, or 1
 
 
 def predict(e: Estimate, interval: Interval, also: Measured | None, at_rest: Measured | None = None) -> Prediction:

@@ -15,31 +15,20 @@ from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, WAITING
 
 @dataclass(frozen=True)
 class FrameReport:
-    """Outcome of one frame's observations.
+    """Outcome of one frame's observations."""
 
-    Args:
-        frame: Frame index.
-        ids: (n,) landmark ids seen.
-        reason: (n,) `ACCEPTED` or an index into `REASONS`.
-        nis: Normalised innovation squared of the accepted updates.
-        dof: Degrees of freedom of the NIS.
-        split: Ids of tracks that were split: their observation starts a new landmark.
-        log_likelihood: Log-density of the accepted innovations, and of measured velocities if these are in the state.
-        innovations: Whitened innovations of the accepted updates (joint filter only).
-        doubt: Factor of the inputs' standard deviations; above 1 if the landmarks contradicted them.
-        standing: Whether the tracks rest, so that the velocity was taken as 0; False: something contradicts it. None:
-            they move, or the velocity is not in the state.
-    """
-
-    frame: int
-    ids: IntArray
-    reason: IntArray
-    nis: float
-    dof: int
-    split: IntArray
+    frame: int  # frame index
+    ids: IntArray  # (n,) landmark ids seen
+    reason: IntArray  # (n,) `ACCEPTED` or an index into `REASONS`
+    nis: float  # normalised innovation squared of the accepted updates
+    dof: int  # degrees of freedom of the NIS
+    split: IntArray  # ids of tracks that were split: their observation starts a new landmark
+    # Log-density of the accepted innovations, and of measured velocities if these are in the state.
     log_likelihood: float
-    innovations: FrameInnovations | None = None
-    doubt: float = 1.0
+    innovations: FrameInnovations | None = None  # whitened innovations of the accepted updates (joint filter only)
+    doubt: float = 1.0  # factor of the inputs' standard deviations; above 1 if the landmarks contradicted them
+    # Whether the tracks rest, so that the velocity was taken as 0; False: something contradicts it. None: they move, or
+    # the velocity is not in the state.
     standing: bool | None = None
 
 

@@ -92,19 +92,14 @@ class Landmarks:
 
 @dataclass(frozen=True)
 class Innovation:
-    """Per-frame innovation statistics.
+    """Per-frame innovation statistics."""
 
-    Args:
-        nis: (T,) normalised innovation squared ``r^T S^-1 r`` of the accepted observations; 0 where there are none.
-        dof: (T,) its degrees of freedom (three a landmark).
-        accepted: (T,) observations that updated or started a landmark.
-        rejected: (T,) observations that did not.
-    """
-
+    # (T,) normalised innovation squared r^T S^-1 r of the accepted observations; 0 where there are none.
     nis: Array = field(metadata=stored("T"))
-    dof: IntArray = field(metadata=stored("T", "count", check=COUNTS))
+    dof: IntArray = field(metadata=stored("T", "count", check=COUNTS))  # (T,) its degrees of freedom (three a landmark)
+    # (T,) observations that updated or started a landmark.
     accepted: IntArray = field(metadata=stored("T", "count", check=COUNTS))
-    rejected: IntArray = field(metadata=stored("T", "count", check=COUNTS))
+    rejected: IntArray = field(metadata=stored("T", "count", check=COUNTS))  # (T,) observations that did not
 
 
 @dataclass(frozen=True)
@@ -194,15 +189,11 @@ class Parameters:
 
 @dataclass(frozen=True)
 class PosePairs:
-    """Cross-covariances of the errors of reported poses.
+    """Cross-covariances of the errors of reported poses."""
 
-    Args:
-        first, second: (n,) frames j < k.
-        cross: (n, 6, 6) covariance of ``xi_j`` (rows) and ``xi_k`` as both were reported.
-    """
-
-    first: IntArray = field(metadata=stored("pair", "frame index", check=FRAMES))
+    first: IntArray = field(metadata=stored("pair", "frame index", check=FRAMES))  # first, second: (n,) frames j < k
     second: IntArray = field(metadata=stored("pair", "frame index", check=FRAMES))
+    # (n, 6, 6) covariance of xi_j (rows) and xi_k as both were reported.
     cross: Array = field(metadata=stored("pair xi xi", _POSE_COVARIANCE, "imu of first, imu of second"))
 
     def __len__(self) -> int:

@@ -17,20 +17,13 @@ from ekfslam.models.blocks import View
 
 @dataclass(frozen=True)
 class Moved:
-    """The mean after a correction.
+    """The mean after a correction."""
 
-    Args:
-        mean: The mean after the correction.
-        awake, asleep: Slots of landmarks corrected in the view, eq. (7'), and in world, eq. (7).
-        in_image: (k,) which of the former count by their images.
-        before: The former in the view before the correction; None: no view.
-    """
-
-    mean: Mean
-    awake: IntArray
+    mean: Mean  # the mean after the correction
+    awake: IntArray  # awake, asleep: slots of landmarks corrected in the view, eq. (7'), and in world, eq. (7).
     asleep: IntArray
-    in_image: BoolArray
-    before: CameraPoints | None
+    in_image: BoolArray  # (k,) which of the former count by their images
+    before: CameraPoints | None  # the former in the view before the correction; None: no view
 
 
 def retract(e: Estimate, correction: Array) -> None:

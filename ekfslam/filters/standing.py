@@ -36,13 +36,9 @@ _ROUNDS, _SURE = 5, 3.0  # of the robust fit; standard deviations of the gyrosco
 
 @dataclass(frozen=True)
 class Standing:
-    """Finding in a frame whose tracks rest.
+    """Finding in a frame whose tracks rest."""
 
-    Args:
-        measured: The rows ``u = 0``; None if something contradicts the rest.
-    """
-
-    measured: Measured | None
+    measured: Measured | None  # the rows u = 0; None if something contradicts the rest
 
 
 @dataclass(frozen=True)

@@ -16,51 +16,32 @@ _SCALES = 0.25, 4.0  # smallest and largest scale of a sampled patch
 
 @dataclass(frozen=True)
 class Features(Rows):
-    """Tracked features.
+    """Tracked features."""
 
-    Args:
-        id: (n,) ids of the tracks.
-        left, right: (n, 2) pixels, without the correction of the right camera's rotation.
-        disparity: (n,) disparity at first sight.
-        strikes: (n,) number of frames in a row in which a feature did not move as the rig.
-        patches_left, patches_right: Patches of first sight.
-    """
-
-    id: IntArray
-    left: Array
+    id: IntArray  # (n,) ids of the tracks
+    left: Array  # left, right: (n, 2) pixels, without the correction of the right camera's rotation
     right: Array
-    disparity: Array
-    strikes: IntArray
-    patches_left: Templates
+    disparity: Array  # (n,) disparity at first sight
+    strikes: IntArray  # (n,) number of frames in a row in which a feature did not move as the rig
+    patches_left: Templates  # patches_left, patches_right: patches of first sight
     patches_right: Templates
 
 
 @dataclass(frozen=True)
 class Followed:
-    """Features in the next images.
+    """Features in the next images."""
 
-    Args:
-        left, right: (n, 2) pixels, aligned to the patches of first sight.
-        is_found, is_found_back: (n,) whether optical flow found a feature, and its way back.
-        score_left, score_right: (n,) correlation with first sight.
-        shift: (n,) shift by the alignment, px.
-    """
-
-    left: Array
+    left: Array  # left, right: (n, 2) pixels, aligned to the patches of first sight
     right: Array
-    is_found: BoolArray
+    is_found: BoolArray  # is_found, is_found_back: (n,) whether optical flow found a feature, and its way back
     is_found_back: BoolArray
-    score_left: Array
+    score_left: Array  # score_left, score_right: (n,) correlation with first sight
     score_right: Array
-    shift: Array
+    shift: Array  # (n,) shift by the alignment, px
 
 
 def follow(
-    features: Features,
-    before: tuple[Image, Image],
-    now: tuple[Image, Image],
-    guess: tuple[Array, Array],
-    levels: int,
+    features: Features, before: tuple[Image, Image], now: tuple[Image, Image], guess: tuple[Array, Array], levels: int
 ) -> Followed:
     """Find features in the next pair of images, given guesses of their pixels (n, 2) in both.
 

@@ -19,18 +19,13 @@ _LEAST_COSINE = 0.5  # between the optical axes, and between them and the plane 
 
 @dataclass(frozen=True)
 class Rectification:
-    """Warp of the images of a pair.
+    """Warp of the images of a pair."""
 
-    Args:
-        camera: Rectified pair.
-        T_rectified_left: (4, 4) left optical frame to that of the rectified left camera: a rotation.
-        maps: Pixels (height, width, 2) float32 to read from the left and the right image; None leaves them as they are.
-        valid: Masks (height, width) of the rectified pixels that show something; None for all.
-    """
-
-    camera: StereoCamera
-    T_rectified_left: Array
+    camera: StereoCamera  # rectified pair
+    T_rectified_left: Array  # (4, 4) left optical frame to that of the rectified left camera: a rotation
+    # Pixels (height, width, 2) float32 to read from the left and the right image; None leaves them as they are.
     maps: tuple[Float32Array, Float32Array] | None
+    # Masks (height, width) of the rectified pixels that show something; None for all.
     valid: tuple[BoolArray, BoolArray] | None
 
     def apply(self, left: Image, right: Image) -> tuple[Image, Image]:

@@ -175,11 +175,7 @@ def _tracked(
         noise=recording.noise,
         velocity_frame=recording.velocity_frame,
         notes=(*recording.notes, *report.lines),
-        attributes={
-            **recording.attributes,
-            **(WITHOUT_VELOCITIES if recording.twist is None else {}),
-            **account,
-        },
+        attributes={**recording.attributes, **(WITHOUT_VELOCITIES if recording.twist is None else {}), **account},
     )
 
 

@@ -21,10 +21,7 @@ def radtan(xy: Array, coefficients: Sequence[float]) -> Array:
     r2 = x * x + y * y
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     return np.stack(
-        [
-            radial * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            radial * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
+        [radial * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), radial * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
         axis=-1,
     )
 

@@ -22,18 +22,13 @@ _EYE = np.eye(3)
 
 @dataclass(frozen=True)
 class Increment:
-    """Preintegrated samples: motion from (I, 0, 0) without gravity; leading dimensions are free.
+    """Preintegrated samples: motion from (I, 0, 0) without gravity; leading dimensions are free."""
 
-    Args:
-        R, v, p: (..., 3, 3), (..., 3) m/s, (..., 3) m at the end, in the IMU frame at the start.
-        Phi, Q: (..., 15, 15) transition and noise of ``z``.
-    """
-
-    R: Array
+    R: Array  # R, v, p: (..., 3, 3), (..., 3) m/s, (..., 3) m at the end, in the IMU frame at the start
     v: Array
     p: Array
     tau_s: Array
-    Phi: Array
+    Phi: Array  # Phi, Q: (..., 15, 15) transition and noise of z
     Q: Array
 
     def __getitem__(self, index: slice | int) -> Increment:

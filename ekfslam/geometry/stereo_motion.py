@@ -37,23 +37,14 @@ _FITS = 9.0  # mean square of a point's rows, in variances
 
 @dataclass(frozen=True)
 class Alignment:
-    """Motion between two frames, with residuals.
+    """Motion between two frames, with residuals."""
 
-    Args:
-        T_now_before: (4, 4) coordinates of the camera before to those of the camera now.
-        true_px: (n, 3) estimates of the true rows before.
-        residual_px: (n, 3) r; infinite for points behind the camera.
-        H: (n, 3, 6) derivative of the prediction by xi, ``T_now_before = exp(xi^) T_hat``.
-        B: (n, 3, 3) derivative of the prediction by the rows before.
-        W: (n, 3, 3) robust weights, 1/px^2.
-    """
-
-    T_now_before: Array
-    true_px: Array
-    residual_px: Array
-    H: Array
-    B: Array
-    W: Array
+    T_now_before: Array  # (4, 4) coordinates of the camera before to those of the camera now
+    true_px: Array  # (n, 3) estimates of the true rows before
+    residual_px: Array  # (n, 3) r; infinite for points behind the camera
+    H: Array  # (n, 3, 6) derivative of the prediction by xi, T_now_before = exp(xi^) T_hat
+    B: Array  # (n, 3, 3) derivative of the prediction by the rows before
+    W: Array  # (n, 3, 3) robust weights, 1/px^2
 
     @property
     def information(self) -> Array:

@@ -13,17 +13,7 @@ from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.noise import Noise
 from ekfslam.errors import ConfigError
 from ekfslam.geometry.camera import StereoCamera
-from ekfslam.models.blocks import (
-    OPTIONAL_BLOCKS,
-    Anchor,
-    Calibration,
-    Pose,
-    PreviousView,
-    StateBlock,
-    Twist,
-    Up,
-    View,
-)
+from ekfslam.models.blocks import OPTIONAL_BLOCKS, Anchor, Calibration, Pose, PreviousView, StateBlock, Twist, Up, View
 from ekfslam.models.blocks.calibration import prior_std
 from ekfslam.models.model import Model
 from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess

@@ -31,22 +31,14 @@ RHO, THETA, DU, DBG, DBA = (slice(3 * i, 3 * i + 3) for i in range(5))  # of the
 
 @dataclass(frozen=True)
 class InertialStart:
-    """First state of the inertial process.
+    """First state of the inertial process."""
 
-    Args:
-        T_imu_world: (4, 4) pose.
-        velocity_m_s: (3,) in the IMU frame.
-        gyro_bias_rad_s, accel_bias_m_s2: (3,).
-        covariance: (15, 15) of the errors of pose, velocity and biases, in this order.
-        text: How it was found.
-    """
-
-    T_imu_world: Array
-    velocity_m_s: Array
-    gyro_bias_rad_s: Array
+    T_imu_world: Array  # (4, 4) pose
+    velocity_m_s: Array  # (3,) in the IMU frame
+    gyro_bias_rad_s: Array  # gyro_bias_rad_s, accel_bias_m_s2: (3,)
     accel_bias_m_s2: Array
-    covariance: Array
-    text: str
+    covariance: Array  # (15, 15) of the errors of pose, velocity and biases, in this order
+    text: str  # how it was found
 
     def begun(self, model: Model) -> Model:
         """Return a model whose estimates start here."""
@@ -68,21 +60,14 @@ class InertialStart:
 
 @dataclass(frozen=True)
 class FirstPrior:
-    """What is known before the samples are looked at.
+    """What is known before the samples are looked at."""
 
-    Args:
-        T_world_imu: (4, 4) first pose; of its rotation the heading alone is used.
-        position_std_m, heading_std_rad: Standard deviations.
-        gyro_bias_std_rad_s, accel_bias_std_m_s2: Of the biases, each axis, whose means are 0.
-        gravity_m_s2: Magnitude of gravity.
-    """
-
-    T_world_imu: Array
-    position_std_m: float
+    T_world_imu: Array  # (4, 4) first pose; of its rotation the heading alone is used
+    position_std_m: float  # position_std_m, heading_std_rad: standard deviations
     heading_std_rad: float
-    gyro_bias_std_rad_s: float
+    gyro_bias_std_rad_s: float  # gyro_bias_std_rad_s, accel_bias_std_m_s2: of the biases, each axis, whose means are 0
     accel_bias_std_m_s2: float
-    gravity_m_s2: float
+    gravity_m_s2: float  # magnitude of gravity
 
     @staticmethod
     def of(T_world_imu: Array, model: Model, gravity_m_s2: float) -> FirstPrior:

@@ -20,18 +20,12 @@ from ekfslam.models.sensors.base import Sensor
 
 @dataclass(frozen=True)
 class Transition:
-    """A change of the blocks from one frame towards the next: ``x+ = Phi x + w``.
+    """A change of the blocks from one frame towards the next: ``x+ = Phi x + w``."""
 
-    Args:
-        values: All blocks after it.
-        Phi: (body, body).
-        Q: (body, body) covariance of w.
-        imu_twist: (6,) velocity of the IMU at its end, if a process moved the pose.
-    """
-
-    values: dict[str, Array]
-    Phi: Array
-    Q: Array
+    values: dict[str, Array]  # all blocks after it
+    Phi: Array  # (body, body)
+    Q: Array  # (body, body) covariance of w
+    # (6,) velocity of the IMU at its end, if a process moved the pose.
     imu_twist: Array = field(default_factory=lambda: np.zeros(6))
 
     def after(self, first: Transition) -> Transition:

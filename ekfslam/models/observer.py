@@ -22,23 +22,14 @@ GIVEN = np.zeros(9)
 
 @dataclass(frozen=True)
 class Moment:
-    """Everything but landmarks that observations of one frame depend on.
+    """Everything but landmarks that observations of one frame depend on."""
 
-    Args:
-        T_imu_world: (..., 4, 4) pose.
-        T_linear: (..., 4, 4) pose at which its error is linearised: the same, or (FEJ) the predicted one.
-        calibration: (9,) parameters.
-        twist: (..., 6) velocities of the IMU, for the time offset.
-        shared: Values (..., size) of the blocks in `Model.shared`, by name.
-        way_m: (...) way driven since the frame before.
-    """
-
-    T_imu_world: Array
-    T_linear: Array
-    calibration: Array = field(default_factory=lambda: np.zeros(9))
-    twist: Array = field(default_factory=lambda: np.zeros(6))
-    shared: Values = field(default_factory=dict)
-    way_m: Array = field(default_factory=lambda: np.zeros(()))
+    T_imu_world: Array  # (..., 4, 4) pose
+    T_linear: Array  # (..., 4, 4) pose at which its error is linearised: the same, or (FEJ) the predicted one
+    calibration: Array = field(default_factory=lambda: np.zeros(9))  # (9,) parameters
+    twist: Array = field(default_factory=lambda: np.zeros(6))  # (..., 6) velocities of the IMU, for the time offset
+    shared: Values = field(default_factory=dict)  # values (..., size) of the blocks in `Model.shared`, by name
+    way_m: Array = field(default_factory=lambda: np.zeros(()))  # (...) way driven since the frame before
 
     def at(self, index: IntArray | int) -> Moment:
         """Return the moments of observations, given the frame (n,) of each, from a moment of all frames."""
@@ -49,15 +40,10 @@ class Moment:
 
 @dataclass(frozen=True)
 class Camera:
-    """The camera of a frame: ``W = T_cam_imu T_imu_world``, with the error ``W_true = exp(z^) W``, ``z = by x``.
+    """The camera of a frame: ``W = T_cam_imu T_imu_world``, with the error ``W_true = exp(z^) W``, ``z = by x``."""
 
-    Args:
-        T_cam_imu: (..., 4, 4) extrinsics of that frame, with calibration, time offset and shared errors.
-        by: (..., 6, seen) Y, derivative of z by the leading columns of the layout.
-    """
-
-    T_cam_imu: Array
-    by: Array
+    T_cam_imu: Array  # (..., 4, 4) extrinsics of that frame, with calibration, time offset and shared errors
+    by: Array  # (..., 6, seen) Y, derivative of z by the leading columns of the layout
 
     def at(self, *index: IntArray | int) -> Camera:
         """Return the cameras at indices of the leading dimensions."""

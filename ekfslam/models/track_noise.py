@@ -42,21 +42,13 @@ _COORDINATES = np.array([1.0, 2.0, 1.0]) / 3.0  # weights of the variances of ro
 
 @dataclass(frozen=True)
 class TrackNoise:
-    """White errors of tracks and steps of their walk, rows ``(uL, v, uR)``.
+    """White errors of tracks and steps of their walk, rows ``(uL, v, uR)``."""
 
-    Args:
-        white: (3,) variances of white errors, px^2; negative if steps persist.
-        white_error: (3,) their standard errors.
-        step: (3,) variances of the walk from one frame to the next, px^2.
-        step_error: (3,) their standard errors.
-        length: Frames of the track of a typical observation.
-    """
-
-    white: Array
-    white_error: Array
-    step: Array
-    step_error: Array
-    length: int
+    white: Array  # (3,) variances of white errors, px^2; negative if steps persist
+    white_error: Array  # (3,) their standard errors
+    step: Array  # (3,) variances of the walk from one frame to the next, px^2
+    step_error: Array  # (3,) their standard errors
+    length: int  # frames of the track of a typical observation
 
     @property
     def is_white(self) -> bool:

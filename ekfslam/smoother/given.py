@@ -33,17 +33,11 @@ _LEAST = 3  # poses
 
 @dataclass(frozen=True)
 class Given:
-    """A given trajectory, aligned at its first pose with a posterior.
+    """A given trajectory, aligned at its first pose with a posterior."""
 
-    Args:
-        T_world_imu: (T, 4, 4) poses; of frames without one, from the one before and the motion of the posterior.
-        G: (T, 6, 6) see the module.
-        length: Its length over that of the posterior.
-    """
-
-    T_world_imu: Array
-    G: Array
-    length: float
+    T_world_imu: Array  # (T, 4, 4) poses; of frames without one, from the one before and the motion of the posterior
+    G: Array  # (T, 6, 6) see the module
+    length: float  # its length over that of the posterior
 
 
 def compared(found: Posterior, frame: IntArray, T_world_imu: Array) -> Given:

@@ -38,35 +38,22 @@ def robust(config: PosteriorConfig, s: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A problem at a state.
-
-    Args:
-        cost: Half the sum of squares, under the kernel.
-        weight: (K,) robust weight of each observation.
-        system: All factors, linearised and weighted there.
-    """
+    """A problem at a state."""
 
     state: State
-    cost: float
-    weight: Array
-    system: LinearSystem
+    cost: float  # half the sum of squares, under the kernel
+    weight: Array  # (K,) robust weight of each observation
+    system: LinearSystem  # all factors, linearised and weighted there
 
 
 @dataclass(frozen=True)
 class Maximum:
-    """The maximum a posteriori.
+    """The maximum a posteriori."""
 
-    Args:
-        state: All unknowns there.
-        costs: Costs at the start and after each step.
-        linearised: The state and the weights of ``information``, at most one last step away.
-        information: The factorised system.
-    """
-
-    state: State
-    costs: tuple[float, ...]
-    linearised: Evaluation
-    information: JointInformation
+    state: State  # all unknowns there
+    costs: tuple[float, ...]  # costs at the start and after each step
+    linearised: Evaluation  # the state and the weights of information, at most one last step away
+    information: JointInformation  # the factorised system
 
 
 def evaluate(problem: BatchProblem, state: State, config: PosteriorConfig, min_depth_m: float) -> Evaluation | None:
@@ -82,11 +69,7 @@ def evaluate(problem: BatchProblem, state: State, config: PosteriorConfig, min_d
 
 
 def maximise(
-    problem: BatchProblem,
-    start: State,
-    config: PosteriorConfig,
-    min_depth_m: float,
-    iterations: Iterable[int],
+    problem: BatchProblem, start: State, config: PosteriorConfig, min_depth_m: float, iterations: Iterable[int]
 ) -> Maximum:
     """Find the maximum a posteriori of all factors, by Levenberg-Marquardt with iteratively reweighted factors.
 

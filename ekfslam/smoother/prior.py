@@ -37,25 +37,15 @@ class First:
 
 @dataclass(frozen=True)
 class Prior:
-    """A Gaussian over the first frame and landmarks, see the module.
+    """A Gaussian over the first frame and landmarks, see the module."""
 
-    Args:
-        T_reference: (4, 4) pose ``T_imu_world`` from which xi counts.
-        T_cam_imu: (4, 4) extrinsics of the camera of the images.
-        mean: (p,).
-        B: (p, p).
-        landmarks: (n,) rows of the landmarks in the log of the filter, ascending.
-        in_image: (n,) whether a landmark counts by its image, or by (x, y, z).
-        sizes: Columns of frame, further blocks and drive.
-    """
-
-    T_reference: Array
-    T_cam_imu: Array
-    mean: Array
-    B: Array
-    landmarks: IntArray
-    in_image: BoolArray
-    sizes: tuple[int, int, int]
+    T_reference: Array  # (4, 4) pose T_imu_world from which xi counts
+    T_cam_imu: Array  # (4, 4) extrinsics of the camera of the images
+    mean: Array  # (p,)
+    B: Array  # (p, p)
+    landmarks: IntArray  # (n,) rows of the landmarks in the log of the filter, ascending
+    in_image: BoolArray  # (n,) whether a landmark counts by its image, or by (x, y, z)
+    sizes: tuple[int, int, int]  # columns of frame, further blocks and drive
 
     @staticmethod
     def at_state(

@@ -88,8 +88,7 @@ class ProcessFactors:
         smallest = np.linalg.eigvalsh(Q / scale[:, :, None] / scale[:, None, :])[:, 0] if len(Q) else np.empty(0)
         if not (smallest > 0).all():
             raise IllPosedError(
-                "velocities without noise (sigma_v or sigma_w is 0) before frames",
-                1 + np.flatnonzero(~(smallest > 0)),
+                "velocities without noise (sigma_v or sigma_w is 0) before frames", 1 + np.flatnonzero(~(smallest > 0))
             )
         return np.linalg.inv(np.linalg.cholesky(Q))
 

@@ -17,26 +17,17 @@ from ekfslam.smoother.sparse.factors import FirstFrame
 
 @dataclass(frozen=True)
 class State:
-    """A trajectory, a map, and the other blocks.
+    """A trajectory, a map, and the other blocks."""
 
-    Args:
-        T_imu_world: (T, 4, 4) poses.
-        positions_m: (M, 3) landmarks in world.
-        zeta: (w+a,) first frame in units of its prior: ``T_0 = exp((B zeta)^) T_prior``, and its blocks by addition to
-            their prior means.
-        shared: (T, w-6) values of the blocks of a frame that observations depend on, without its pose.
-        aux: (T, a) values of the further blocks of a frame.
-        drive: (g,) coordinates of the blocks of the drive: sums of corrections.
-        drive_values: Values of the blocks of the drive, by name.
-    """
-
-    T_imu_world: Array
-    positions_m: Array
+    T_imu_world: Array  # (T, 4, 4) poses
+    positions_m: Array  # (M, 3) landmarks in world
+    # (w+a,) first frame in units of its prior: T_0 = exp((B zeta)^) T_prior, and its blocks by addition to their prior
+    # means.
     zeta: Array
-    shared: Array
-    aux: Array
-    drive: Array
-    drive_values: Mapping[str, Array]
+    shared: Array  # (T, w-6) values of the blocks of a frame that observations depend on, without its pose
+    aux: Array  # (T, a) values of the further blocks of a frame
+    drive: Array  # (g,) coordinates of the blocks of the drive: sums of corrections
+    drive_values: Mapping[str, Array]  # values of the blocks of the drive, by name
 
 
 class Unknowns:

@@ -22,25 +22,16 @@ from ekfslam.smoother.unknowns import Unknowns
 
 @dataclass(frozen=True)
 class Views:
-    """Cameras of T frames, h of each: that of single observations and, if it differs, that of differences.
+    """Cameras of T frames, h of each: that of single observations and, if it differs, that of differences."""
 
-    Args:
-        observer: Sensor with the blocks that observations depend on.
-        sensor: Sensor with its calibration.
-        T_view_world: (T h, 4, 4) cameras.
-        by_frame: (T, 6 h, w) derivative of their errors by the unknowns of their frame.
-        by_drive: (T h, 6, g) derivative by the unknowns of the drive.
-        drive_place: (c,) places of the calibration's columns among those of the drive.
-        seen: (s,) columns of a frame by which its views are regular: the pose and, if there are two views, a block of
-            which they have different shares. All, if there is none.
-    """
-
-    observer: Observer
-    sensor: Sensor
-    T_view_world: Array
-    by_frame: Array
-    by_drive: Array
-    drive_place: IntArray
+    observer: Observer  # sensor with the blocks that observations depend on
+    sensor: Sensor  # sensor with its calibration
+    T_view_world: Array  # (T h, 4, 4) cameras
+    by_frame: Array  # (T, 6 h, w) derivative of their errors by the unknowns of their frame
+    by_drive: Array  # (T h, 6, g) derivative by the unknowns of the drive
+    drive_place: IntArray  # (c,) places of the calibration's columns among those of the drive
+    # (s,) columns of a frame by which its views are regular: the pose and, if there are two views, a block of which
+    # they have different shares. All, if there is none.
     seen: IntArray
 
     @staticmethod
@@ -77,19 +68,12 @@ class Views:
 
 @dataclass(frozen=True)
 class Observed:
-    """Observations of one kind: single ones, or differences.
+    """Observations of one kind: single ones, or differences."""
 
-    Args:
-        which: (n,) their numbers in the log.
-        views: The view (n,) of each; then, of differences, the view (n,) before.
-        landmark: (n,) rows of the landmarks in the log.
-        rows, scale: (n, d) rows or their differences, and reciprocals of their standard deviations.
-    """
-
-    which: IntArray
-    views: tuple[IntArray, ...]
-    landmark: IntArray
-    rows: Array
+    which: IntArray  # (n,) their numbers in the log
+    views: tuple[IntArray, ...]  # the view (n,) of each; then, of differences, the view (n,) before
+    landmark: IntArray  # (n,) rows of the landmarks in the log
+    rows: Array  # rows, scale: (n, d) rows or their differences, and reciprocals of their standard deviations
     scale: Array
 
     def only(self, some: BoolArray) -> Observed:

@@ -54,18 +54,12 @@ _NOISE = "noise_"  # before the names of attributes
 
 @dataclass(frozen=True, repr=False)
 class Archive(Shown):
-    """The content of an archive: the sequence without its observations, and the results of its modes.
+    """The content of an archive: the sequence without its observations, and the results of its modes."""
 
-    Args:
-        name, source, time_s, camera, T_cam_imu, truth, noise, notes, attributes: As in `Sequence`.
-        twist, velocity_frame: As in `Sequence`; None if the recording has no velocities.
-        results: Mode to result, in the order of writing.
-    """
-
-    name: str
+    name: str  # name, source, time_s, camera, T_cam_imu, truth, noise, notes, attributes: as in `Sequence`
     source: str
     time_s: Array
-    twist: Array | None
+    twist: Array | None  # twist, velocity_frame: as in `Sequence`; None if the recording has no velocities
     camera: StereoCamera
     T_cam_imu: Array
     truth: Truth | None
@@ -73,7 +67,7 @@ class Archive(Shown):
     velocity_frame: VelocityFrame | None
     notes: tuple[str, ...]
     attributes: Mapping[str, str | int | float]
-    results: Mapping[str, Result]
+    results: Mapping[str, Result]  # mode to result, in the order of writing
 
     def card(self) -> Card:
         """Return the card that ``repr`` and a notebook show."""

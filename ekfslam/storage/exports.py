@@ -279,25 +279,16 @@ def information_bytes(result: Result, found: Posterior | None = None) -> bytes:
 
 
 class Export(NamedTuple):
-    """A format.
+    """A format."""
 
-    Args:
-        ending: Ending of its files.
-        words: Contents of a file.
-        write: Function that returns the contents for a result.
-        begins: First bytes of a file, if they tell it from other formats.
-        columns: Number of columns of a table of numbers, which tells its files from other formats.
-        poses: Function that returns the contents for a trajectory, if the format is of poses alone.
-        frame: Moving frame of these poses by default.
-    """
-
-    ending: str
-    words: str
-    write: Callable[[Result], str | bytes]
-    begins: bytes = b""
-    columns: int = 0
+    ending: str  # ending of its files
+    words: str  # contents of a file
+    write: Callable[[Result], str | bytes]  # function that returns the contents for a result
+    begins: bytes = b""  # first bytes of a file, if they tell it from other formats
+    columns: int = 0  # number of columns of a table of numbers, which tells its files from other formats
+    # Function that returns the contents for a trajectory, if the format is of poses alone.
     poses: Callable[[Trajectory], str | bytes] | None = None
-    frame: Moving = "body"
+    frame: Moving = "body"  # moving frame of these poses by default
 
 
 def is_export(path: Path, format: str) -> bool:

@@ -102,8 +102,7 @@ def _odometry(types: Any, trajectory: Trajectory, k: int) -> tuple[int, Any]:
     none = dict.fromkeys("xyz", 0.0)
     twist = kind["Twist"](linear=kind["Vector3"](**none), angular=kind["Vector3"](**none))
     pose = kind["Pose"](
-        position=kind["Point"](x=x, y=y, z=z),
-        orientation=kind["Quaternion"](**dict(zip("xyzw", turn, strict=True))),
+        position=kind["Point"](x=x, y=y, z=z), orientation=kind["Quaternion"](**dict(zip("xyzw", turn, strict=True)))
     )
     stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     return stamp_ns, kind["Odometry"](

@@ -272,19 +272,13 @@ def _put_errors(record: dict[str, NDArray], known: BoolArray, T_est: Array, T_tr
 
 @dataclass(frozen=True, repr=False)
 class StudyArchive(Shown):
-    """A study and its finished runs.
+    """A study and its finished runs."""
 
-    Args:
-        study: The study.
-        done: Level to mask (runs,) of finished runs.
-        data: Level to variant to field to values (runs, ...), see `VARIANT_LAYOUT`.
-        software: Versions that wrote the archive.
-    """
-
-    study: Study
-    done: Mapping[str, BoolArray]
+    study: Study  # the study
+    done: Mapping[str, BoolArray]  # level to mask (runs,) of finished runs
+    # Level to variant to field to values (runs, ...), see `VARIANT_LAYOUT`.
     data: Mapping[str, Mapping[str, Mapping[str, NDArray]]]
-    software: Mapping[str, str] = dataclasses.field(default_factory=versions)
+    software: Mapping[str, str] = dataclasses.field(default_factory=versions)  # versions that wrote the archive
 
     @staticmethod
     def empty(study: Study) -> StudyArchive:

@@ -163,24 +163,19 @@ class Task:
 class Sweep:
     """A product of recordings, modes, variants, seeds and settings to run.
 
-    Args:
-        recordings: The recordings.
-        modes, variants: Names in `MODES` and `VARIANTS`.
-        seeds: Seeds of built-in worlds and of prepared recordings; none for their own.
-        settings: Values to try, by table and key or by dotted name such as ``noise.sigma_px``.
-        cases: Sets of settings by name; the names become the column ``case``.
-        columns: Further figures of merit by name, with the restrictions of `Recording.prepare`.
-
     Raises:
         ConfigError: There is nothing to run, too much, or something unknown.
     """
 
-    recordings: tuple[Recording, ...]
-    modes: tuple[str, ...] = ("full",)
+    recordings: tuple[Recording, ...]  # the recordings
+    modes: tuple[str, ...] = ("full",)  # modes, variants: names in `MODES` and `VARIANTS`
     variants: tuple[str, ...] = ("invariant",)
-    seeds: tuple[int, ...] = ()
+    seeds: tuple[int, ...] = ()  # seeds of built-in worlds and of prepared recordings; none for their own
+    # Values to try, by table and key or by dotted name such as noise.sigma_px.
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    # Sets of settings by name; the names become the column case.
     cases: Mapping[str, Case] = dataclasses.field(default_factory=dict)
+    # Further figures of merit by name, with the restrictions of `Recording.prepare`.
     columns: Mapping[str, Column] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -42,17 +42,12 @@ SHOWN = (
 
 @dataclass(frozen=True)
 class SweepTable:
-    """The results of a sweep. Methods raise a `ConfigError` for an unknown column.
+    """The results of a sweep. Methods raise a `ConfigError` for an unknown column."""
 
-    Args:
-        columns: Name to values (n,): numbers as floats, NaN if missing; all else as text, empty if missing.
-        swept: Names of the columns that distinguish the runs.
-        asked: Number of runs of the complete sweep.
-    """
-
+    # Name to values (n,): numbers as floats, NaN if missing; all else as text, empty if missing.
     columns: Mapping[str, NDArray]
-    swept: tuple[str, ...]
-    asked: int
+    swept: tuple[str, ...]  # names of the columns that distinguish the runs
+    asked: int  # number of runs of the complete sweep
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))

@@ -216,44 +216,27 @@ def _start(base: Noise, found: VelocityNoise, drift: bool) -> tuple[dict[str, fl
 
 @dataclass(frozen=True)
 class Peak:
-    """The maximum of a likelihood.
+    """The maximum of a likelihood."""
 
-    Args:
-        x: (n,) logarithms of the free parameters.
-        inside: (m,) indices of the parameters inside their search range.
-        H: (m, m) Hessian of these.
-        gradients: (m, T) gradients of the frames.
-        log_likelihood: Value at the maximum.
-        runs: Number of runs.
-        converged: Whether the last step was short.
-    """
-
-    x: Array
-    inside: IntArray
-    H: Array
-    gradients: Array
-    log_likelihood: float
-    runs: int
-    converged: bool
+    x: Array  # (n,) logarithms of the free parameters
+    inside: IntArray  # (m,) indices of the parameters inside their search range
+    H: Array  # (m, m) Hessian of these
+    gradients: Array  # (m, T) gradients of the frames
+    log_likelihood: float  # value at the maximum
+    runs: int  # number of runs
+    converged: bool  # whether the last step was short
 
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Likelihood of the innovations as a function of the logarithms of some parameters.
+    """Likelihood of the innovations as a function of the logarithms of some parameters."""
 
-    Args:
-        parts: Stretches of the recording.
-        base: Noise whose parameters are replaced.
-        free: Names of the parameters.
-        gated, ungated: Settings of the filter that reject wrong matches, and that reject nothing.
-        measured: (6,) velocities whose noise the parameters are.
-    """
-
-    parts: list[Sequence]
-    base: Noise
-    free: list[str]
-    gated: Config
+    parts: list[Sequence]  # stretches of the recording
+    base: Noise  # noise whose parameters are replaced
+    free: list[str]  # names of the parameters
+    gated: Config  # gated, ungated: settings of the filter that reject wrong matches, and that reject nothing
     ungated: Config
+    # (6,) velocities whose noise the parameters are.
     measured: BoolArray = field(default_factory=lambda: np.ones(6, dtype=bool))
 
     def noise(self, x: Array) -> Noise:

@@ -16,10 +16,7 @@ from ekfslam.figures.style import png
 from ekfslam.figures.tracks import plot_tracks
 from ekfslam.frontend.track import track
 
-EXAMPLES = (
-    "track sequences/06 --out 06.h5",
-    "track sequences/06 --truth poses/06.txt --features 250 --out 06.h5",
-)
+EXAMPLES = ("track sequences/06 --out 06.h5", "track sequences/06 --truth poses/06.txt --features 250 --out 06.h5")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -63,22 +63,14 @@ class Camera:
 
 @dataclass(frozen=True)
 class BagPair:
-    """The stereo pair of a bag.
-
-    Args:
-        left, right: The cameras.
-        calibration: Calibration of their images.
-        R_cam_optical: (3, 3) rotation from the optical frame of the left camera to its images.
-        file: Calibration in a file, if it was taken in place of CameraInfo.
-        notes: Facts about the choice.
-    """
+    """The stereo pair of a bag."""
 
     left: Camera
     right: Camera
     calibration: PairCalibration
-    R_cam_optical: Array
-    file: PairFile | None
-    notes: tuple[str, ...]
+    R_cam_optical: Array  # (3, 3) rotation from the optical frame of the left camera to its images
+    file: PairFile | None  # calibration in a file, if it was taken in place of CameraInfo
+    notes: tuple[str, ...]  # facts about the choice
 
 
 def parts_of(topic: str) -> tuple[str, str]:

@@ -24,15 +24,7 @@ from ekfslam.data.readers.bag_imu import beside_bag, imu_of_bag, inertial_of, ve
 from ekfslam.data.readers.calibrations import PairFile
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
 from ekfslam.data.readers.imu_yaml import CHAINS, chain_of, late_s
-from ekfslam.data.readers.messages import (
-    COMPRESSED,
-    IMAGE,
-    ODOMETRY,
-    TRANSFORMS,
-    VELOCITIES,
-    Bag,
-    frame_of,
-)
+from ekfslam.data.readers.messages import COMPRESSED, IMAGE, ODOMETRY, TRANSFORMS, VELOCITIES, Bag, frame_of
 from ekfslam.data.readers.pictures import pair_stamps
 from ekfslam.data.readers.poses import velocities_of
 from ekfslam.data.readers.registry import CALIBRATION, Reader, Source

@@ -68,41 +68,25 @@ EXPECTED = (
 
 @dataclass(frozen=True)
 class CameraFile:
-    """Calibration of one camera.
+    """Calibration of one camera."""
 
-    Args:
-        K: (3, 3) intrinsic matrix.
-        lens: Distortion.
-        size: Width and height of images, if the file states them.
-    """
-
-    K: Array
+    K: Array  # (3, 3) intrinsic matrix
     lens: Distortion
-    size: Size | None = None
+    size: Size | None = None  # width and height of images, if the file states them
 
 
 @dataclass(frozen=True)
 class PairFile:
-    """Calibration of a pair as files have it.
-
-    Args:
-        left, right: Calibrations of the cameras.
-        T_right_left: (4, 4) left to right optical frame.
-        files: Files that were read.
-        T_cam_imu: (4, 4) IMU to left optical frame; None if it is not stated.
-        notes: Facts about the reading.
-        topics: Topics of left and right images that the files name.
-        late_s: Stamp of an inertial sample less that of an image of the same instant.
-    """
+    """Calibration of a pair as files have it."""
 
     left: CameraFile
     right: CameraFile
-    T_right_left: Array
-    files: tuple[Path, ...]
-    T_cam_imu: Array | None = None
-    notes: tuple[str, ...] = ()
-    topics: tuple[str, str] | None = None
-    late_s: float = 0.0
+    T_right_left: Array  # (4, 4) left to right optical frame
+    files: tuple[Path, ...]  # files that were read
+    T_cam_imu: Array | None = None  # (4, 4) IMU to left optical frame; None if it is not stated
+    notes: tuple[str, ...] = ()  # facts about the reading
+    topics: tuple[str, str] | None = None  # topics of left and right images that the files name
+    late_s: float = 0.0  # stamp of an inertial sample less that of an image of the same instant
 
     def pair(self, size: Size | None = None) -> PairCalibration:
         """Return the calibration for images of a size, by default the stated one; raise `CalibrationError` if none."""

@@ -35,21 +35,13 @@ TWIST = ("time", "vx", "vy", "vz", "wx", "wy", "wz")
 
 @dataclass(frozen=True)
 class Header:
-    """Columns that the first line of a file names.
+    """Columns that the first line of a file names."""
 
-    Args:
-        place: Column by canonical name: `POSE` and `TWIST`.
-        count: Number of columns.
-        line: Number of the line, from 1.
-        separator: Separator of columns; None for blanks.
-        second: Length of the unit of stamps, s.
-    """
-
-    place: Mapping[str, int]
-    count: int
-    line: int
-    separator: str | None
-    second: float
+    place: Mapping[str, int]  # column by canonical name: `POSE` and `TWIST`
+    count: int  # number of columns
+    line: int  # number of the line, from 1
+    separator: str | None  # separator of columns; None for blanks
+    second: float  # length of the unit of stamps, s
 
 
 def header_of(lines: list[str]) -> Header | None:

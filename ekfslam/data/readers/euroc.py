@@ -30,13 +30,7 @@ from ekfslam.data.readers.poses import Poses, stamped_poses, truth_of_frames
 from ekfslam.data.readers.registry import CALIBRATION, Reader, Source
 from ekfslam.data.readers.text import Table, first_row, line_of, read_lines, rows_of
 from ekfslam.data.readers.yaml import read_yaml
-from ekfslam.errors import (
-    CalibrationError,
-    LineError,
-    LostDataError,
-    TruthError,
-    UnknownFormatError,
-)
+from ekfslam.errors import CalibrationError, LineError, LostDataError, TruthError, UnknownFormatError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import T_CAM_BODY
 
@@ -164,16 +158,11 @@ def _images(camera: Path) -> _Images:
 
 
 class _Rig(NamedTuple):
-    """Calibration of the pair, pose of the body in the left camera, and what else the files say.
-
-    Args:
-        T_cam_body: (4, 4); None if it is not stated, so that the body is the left camera.
-        late_s: Stamp of an inertial sample less that of an image of the same instant.
-    """
+    """Calibration of the pair, pose of the body in the left camera, and what else the files say."""
 
     pair: PairFile
-    T_cam_body: Array | None
-    late_s: float
+    T_cam_body: Array | None  # (4, 4); None if it is not stated, so that the body is the left camera
+    late_s: float  # stamp of an inertial sample less that of an image of the same instant
     files: tuple[Path, ...]
     notes: tuple[str, ...]
 
@@ -242,8 +231,5 @@ IMAGES = Reader(
     images=lambda source: open_euroc(source.path, source.calibration),
 )
 TRUTH = Reader(
-    "EuRoC",
-    "a EuRoC ground-truth csv or its folder",
-    _has_truth,
-    truth=lambda source, _: read_euroc(source.path),
+    "EuRoC", "a EuRoC ground-truth csv or its folder", _has_truth, truth=lambda source, _: read_euroc(source.path)
 )

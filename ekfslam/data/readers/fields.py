@@ -49,11 +49,7 @@ def require(fields: Mapping[str, Any], name: str) -> NDArray:
 
 
 def require_numbers(
-    fields: Mapping[str, Any],
-    name: str,
-    shape: tuple[int | None, ...],
-    dtype: type = np.float64,
-    finite: bool = True,
+    fields: Mapping[str, Any], name: str, shape: tuple[int | None, ...], dtype: type = np.float64, finite: bool = True
 ) -> NDArray:
     """Return a field of a file as numbers of a shape (None stands for any length) and type, finite by default."""
     value = require(fields, name)

@@ -30,21 +30,13 @@ _FURTHER = ("time_offset", "rate_hz", "update_rate")
 
 @dataclass(frozen=True)
 class InertialCalibration:
-    """What a file says of an inertial unit.
+    """What a file says of an inertial unit."""
 
-    Args:
-        path: File that was read.
-        noise: Densities; None if some are missing.
-        T_body_imu: (4, 4) ``T_BS``; None if it is not stated.
-        rate_hz: ``rate_hz`` or ``update_rate``; 0 if it is not stated.
-        notes: Missing densities, and a time offset that is not applied.
-    """
-
-    path: Path
-    noise: InertialNoise | None
-    T_body_imu: Array | None
-    rate_hz: float
-    notes: tuple[str, ...]
+    path: Path  # file that was read
+    noise: InertialNoise | None  # densities; None if some are missing
+    T_body_imu: Array | None  # (4, 4) T_BS; None if it is not stated
+    rate_hz: float  # rate_hz or update_rate; 0 if it is not stated
+    notes: tuple[str, ...]  # missing densities, and a time offset that is not applied
 
 
 def read_imu_yaml(path: Path) -> InertialCalibration:

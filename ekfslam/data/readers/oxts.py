@@ -51,22 +51,14 @@ _STAMP = re.compile(r"((?:19|20)\d\d-\d\d-\d\d) (\d\d:\d\d:\d\d(?:\.\d{1,9})?)")
 
 @dataclass(frozen=True)
 class Oxts:
-    """Recording of the GPS/INS unit of a drive.
+    """Recording of the GPS/INS unit of a drive."""
 
-    Args:
-        time_s: (T,) stamps of the packets, seconds since 1970 on the recorder's clock.
-        twist: (T, 6) velocities ``[v; w]`` in the IMU frame.
-        truth: Poses of every frame that has a packet.
-        notes, attributes: Repairs, and interpolated intervals.
-        files: Files that were read.
-    """
-
-    time_s: Array
-    twist: Array
-    truth: Truth
-    notes: tuple[str, ...]
+    time_s: Array  # (T,) stamps of the packets, seconds since 1970 on the recorder's clock
+    twist: Array  # (T, 6) velocities [v; w] in the IMU frame
+    truth: Truth  # poses of every frame that has a packet
+    notes: tuple[str, ...]  # notes, attributes: repairs, and interpolated intervals
     attributes: dict[str, str]
-    files: tuple[Path, ...]
+    files: tuple[Path, ...]  # files that were read
 
 
 def read_oxts(folder: Path, lateral: Lateral = "corrected") -> Oxts:

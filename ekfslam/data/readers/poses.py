@@ -23,25 +23,16 @@ _SAME_POSE = 1e-6
 
 @dataclass(frozen=True)
 class Poses:
-    """True poses of a file.
+    """True poses of a file."""
 
-    Args:
-        T_world_imu: (F, 4, 4) poses.
-        time_s: (F,) increasing stamps; None if row i is the pose of frame i.
-        files: Files that were read.
-        noise: Accuracy of the poses; None if the format does not state it.
-        motion: Velocities and biases of the same rows; None if the file has none.
-        frame: (F,) number of the image of each row in its drive; None if rows are all images, or have stamps.
-        notes: Facts about the reading.
-    """
-
-    T_world_imu: Array
-    time_s: Array | None
-    files: tuple[Path, ...]
-    noise: TruthNoise | None = None
-    motion: TrueMotion | None = None
+    T_world_imu: Array  # (F, 4, 4) poses
+    time_s: Array | None  # (F,) increasing stamps; None if row i is the pose of frame i
+    files: tuple[Path, ...]  # files that were read
+    noise: TruthNoise | None = None  # accuracy of the poses; None if the format does not state it
+    motion: TrueMotion | None = None  # velocities and biases of the same rows; None if the file has none
+    # (F,) number of the image of each row in its drive; None if rows are all images, or have stamps.
     frame: IntArray | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # facts about the reading
 
 
 def stamped_poses(table: Table) -> Poses:

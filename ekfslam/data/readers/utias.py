@@ -122,8 +122,5 @@ def _tracks(source: Source) -> Sequence:
 
 
 READER = Reader(
-    "utias",
-    "a .mat recording (UTIAS)",
-    lambda source: source.head.startswith((b"MATLAB 5.0", b"MATLAB 7.3")),
-    _tracks,
+    "utias", "a .mat recording (UTIAS)", lambda source: source.head.startswith((b"MATLAB 5.0", b"MATLAB 7.3")), _tracks
 )

@@ -71,10 +71,7 @@ def _inputs(source: Source) -> VelocitySamples:
     notes = (
         repeated
         if stated
-        else (
-            *repeated,
-            f"{path.name} does not say in which frame its velocities are: they are taken as imu.",
-        )
+        else (*repeated, f"{path.name} does not say in which frame its velocities are: they are taken as imu.")
     )
     attributes = {"velocities_sha256": checksum(path)}
     return VelocitySamples(str(path), table.values[:, 0], table.values[:, 1:], frame, None, attributes, notes)

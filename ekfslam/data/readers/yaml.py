@@ -25,15 +25,10 @@ _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w
 
 @dataclass(frozen=True)
 class Calibration:
-    """Texts of a file by key, such as ``cam0.T_cam_imu``.
+    """Texts of a file by key, such as ``cam0.T_cam_imu``."""
 
-    Args:
-        path: File that was read.
-        values: Text by key; the key of a block and a dot precede the keys in it.
-    """
-
-    path: Path
-    values: Mapping[str, str]
+    path: Path  # file that was read
+    values: Mapping[str, str]  # text by key; the key of a block and a dot precede the keys in it
 
     def __contains__(self, key: str) -> bool:
         return key in self.values

@@ -18,11 +18,7 @@ Coupling = Literal["none", "velocity", "level", "camera", "sensor"]
 # The error of a block: a vector is added, a pose or a direction is premultiplied by exp, of a calibration only the free
 # parameters move; a class that overrides `StateBlock.retract` has its own, unless it says otherwise.
 Retraction = Literal["vector", "pose", "direction", "calibration", "own"]
-_COUPLED_BY: dict[str, Coupling] = {
-    "velocity_offset": "velocity",
-    "turn_velocities": "level",
-    "camera_share": "camera",
-}
+_COUPLED_BY: dict[str, Coupling] = {"velocity_offset": "velocity", "turn_velocities": "level", "camera_share": "camera"}
 
 
 class StateBlock:

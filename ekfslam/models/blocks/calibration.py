@@ -35,13 +35,9 @@ def prior_std(config: CalibrationConfig) -> Array:
 
 @dataclass(frozen=True)
 class Calibration(StateBlock):
-    """Calibration parameters of a `Rig`, one set for the drive; its value is all nine, its error the free ones.
+    """Calibration parameters of a `Rig`, one set for the drive; its value is all nine, its error the free ones."""
 
-    Args:
-        std: (9,) prior standard deviations; parameters with 0 are not free.
-    """
-
-    std: Array
+    std: Array  # (9,) prior standard deviations; parameters with 0 are not free
 
     name = "calibration"
     coupling = "sensor"

@@ -19,15 +19,11 @@ class CameraJitter(GaussMarkov):
 
     Swinging mounts, jitter of stamps, motion blur and rolling shutters look like it. It is a Gauss-Markov process of
     time, [m; rad] along the axes of the IMU.
-
-    Args:
-        translation_m, rotation_deg: Stationary standard deviations, each axis.
-        time_s: Its time constant.
     """
 
-    translation_m: float = 0.02
+    translation_m: float = 0.02  # translation_m, rotation_deg: stationary standard deviations, each axis
     rotation_deg: float = 0.06
-    time_s: float = 0.6
+    time_s: float = 0.6  # its time constant
 
     name = "camera_jitter"
     is_seen = True

@@ -32,14 +32,10 @@ class Velocity(_Vector):
 
     Its additive error is the right-invariant error of the world velocity, turned into the body (Barrau and Bonnabel,
     "The invariant extended Kalman filter as a stable observer", 2017).
-
-    Args:
-        std_m_s: Standard deviation of the first velocity, each axis.
-        first_m_s: (3,) first velocity.
     """
 
-    std_m_s: float = 0.15
-    first_m_s: Array = field(default_factory=lambda: np.zeros(3))
+    std_m_s: float = 0.15  # standard deviation of the first velocity, each axis
+    first_m_s: Array = field(default_factory=lambda: np.zeros(3))  # (3,) first velocity
 
     name = "velocity"
 

@@ -11,15 +11,10 @@ from ekfslam.models.blocks.base import StateBlock
 
 @dataclass(frozen=True)
 class Pose(StateBlock):
-    """``T_imu_world = exp(xi^) T_hat``, moved by the process.
+    """``T_imu_world = exp(xi^) T_hat``, moved by the process."""
 
-    Args:
-        T_imu_world: (4, 4) first pose.
-        covariance: (6, 6) covariance of its error.
-    """
-
-    T_imu_world: Array
-    covariance: Array
+    T_imu_world: Array  # (4, 4) first pose
+    covariance: Array  # (6, 6) covariance of its error
 
     name = "pose"
     size = 6

@@ -13,15 +13,10 @@ from ekfslam.models.blocks.base import StateBlock
 
 @dataclass(frozen=True)
 class Twist(StateBlock):
-    """True velocities (6,) of an interval, m/s and rad/s, in the frame of the measured ones; a walk from the first one.
+    """True velocities (6,) of an interval, m/s and rad/s, in the frame of the measured ones: a walk from the first."""
 
-    Args:
-        walk_std: (6,) standard deviation of their change from one interval to the next.
-        is_measured: Whether the recording's velocities measure them; else these only start them.
-    """
-
-    walk_std: Array
-    is_measured: bool = True
+    walk_std: Array  # (6,) standard deviation of their change from one interval to the next
+    is_measured: bool = True  # whether the recording's velocities measure them; else these only start them
 
     name = "twist"
     size = 6

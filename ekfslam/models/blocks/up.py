@@ -19,16 +19,12 @@ class Up(StateBlock):
 
     With the pose ``T_imu_world = exp([rho; theta]^) T_hat`` of rotation R, up in the IMU frame is ``R up`` and turns by
     ``exp(phi^)``, ``phi = theta + R psi``: nothing when the world turns as a whole.
-
-    Args:
-        direction: (3,) first estimate.
-        tilt_rad: (3,) standard deviations of its angles about the axes of the first pose; the third one turns nothing.
-        R_world_imu: (3, 3) rotation of the first pose.
     """
 
-    direction: Array
+    direction: Array  # (3,) first estimate
+    # (3,) standard deviations of its angles about the axes of the first pose; the third one turns nothing.
     tilt_rad: Array
-    R_world_imu: Array
+    R_world_imu: Array  # (3, 3) rotation of the first pose
 
     name = "up"
     size = 3

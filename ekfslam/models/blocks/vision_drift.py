@@ -24,16 +24,12 @@ class VisionDrift(GaussMarkov):
     Defaults are those of KLT tracks on eight drives, filtered with the true motion in place of the velocities: after
     the camera's rotation is estimated, translations of 5 (forward), 2 and 1.5 % are left, and rotations of 0.015 to
     0.04 deg/m, whose autocorrelation is below a third after 20 m.
-
-    Args:
-        translation_percent: Stationary standard deviation of the translation, each axis, in percent of the way.
-        rotation_deg_m: Stationary standard deviation of the rotation, each axis, in degrees a metre of way.
-        length_m: Way after which a share 1/e is left.
     """
 
+    # Stationary standard deviation of the translation, each axis, in percent of the way.
     translation_percent: float = 4.0
-    rotation_deg_m: float = 0.02
-    length_m: float = 20.0
+    rotation_deg_m: float = 0.02  # stationary standard deviation of the rotation, each axis, in degrees a metre of way
+    length_m: float = 20.0  # way after which a share 1/e is left
 
     name = "vision_drift"
     is_seen = True

@@ -29,49 +29,32 @@ from ekfslam.models.blocks.base import Layout, Values
 
 @dataclass(frozen=True)
 class Step:
-    """A step over one interval, or over m of them (then with a leading dimension).
+    """A step over one interval, or over m of them (then with a leading dimension)."""
 
-    Args:
-        values: The blocks that it moves, after it, by name; they have p columns.
-        imu_twist: (..., 6) velocity ``[v; w]`` of the IMU at the end of the step, m/s and rad/s in the IMU frame.
-        Phi: (..., p, body) derivative of the errors of these blocks by all errors before the step.
-        Q: (..., p, p) covariance of the noise that the step adds; it grows as the square of `Interval.doubt`.
-    """
-
-    values: Values
-    imu_twist: Array
-    Phi: Array
-    Q: Array
+    values: Values  # the blocks that it moves, after it, by name; they have p columns
+    imu_twist: Array  # (..., 6) velocity [v; w] of the IMU at the end of the step, m/s and rad/s in the IMU frame
+    Phi: Array  # (..., p, body) derivative of the errors of these blocks by all errors before the step
+    Q: Array  # (..., p, p) covariance of the noise that the step adds; it grows as the square of `Interval.doubt`
 
 
 @dataclass(frozen=True)
 class Residual:
-    """The error of steps between states that are not their solution; m intervals.
+    """The error of steps between states that are not their solution; m intervals."""
 
-    Args:
-        error: (m, p) own errors of the state after, as seen from the prediction: 0 if it is the prediction.
-        by_before: (m, p, body) derivative by the errors of the process's own blocks in the frame before.
-        by_after: (m, p, body) derivative by the errors of its own blocks, and of all other blocks, in the frame after.
-    """
-
-    error: Array
-    by_before: Array
+    error: Array  # (m, p) own errors of the state after, as seen from the prediction: 0 if it is the prediction
+    by_before: Array  # (m, p, body) derivative by the errors of the process's own blocks in the frame before
+    # (m, p, body) derivative by the errors of its own blocks, and of all other blocks, in the frame after.
     by_after: Array
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Scalar measurements of blocks by inputs, each of one component of the process (an axis of its velocity).
+    """Scalar measurements of blocks by inputs, each of one component of the process (an axis of its velocity)."""
 
-    Args:
-        axis, value, std: (n,) components, measured values, and standard deviations.
-        is_biased: (n,) whether they come from the recording's own inputs, whose biases are in the state.
-    """
-
-    axis: IntArray
+    axis: IntArray  # axis, value, std: (n,) components, measured values, and standard deviations
     value: Array
     std: Array
-    is_biased: BoolArray
+    is_biased: BoolArray  # (n,) whether they come from the recording's own inputs, whose biases are in the state
 
     @staticmethod
     def concatenate(parts: Iterable[Measured]) -> Measured:

@@ -20,20 +20,13 @@ class Monocular:
     """One camera as a `DelayedSensor`, such as the left one of a rig: of pixels (n, 4) or (n, 2) it takes (uL, vL).
 
     Scale comes from velocities or inertial samples.
-
-    Args:
-        camera: Intrinsics; the baseline is not used.
-        T_cam_imu: (4, 4) extrinsics.
-        noise: White noise of pixels, and noise of velocities.
-        parallax_rad: Angle between two rays beyond which their landmark is initialised.
-        patience: Frames after which the anchor moves on.
     """
 
-    camera: StereoCamera
-    T_cam_imu: Array
-    noise: Noise
-    parallax_rad: float = 0.03
-    patience: int = 40
+    camera: StereoCamera  # intrinsics; the baseline is not used
+    T_cam_imu: Array  # (4, 4) extrinsics
+    noise: Noise  # white noise of pixels, and noise of velocities
+    parallax_rad: float = 0.03  # angle between two rays beyond which their landmark is initialised
+    patience: int = 40  # frames after which the anchor moves on
 
     dimension = 2
 

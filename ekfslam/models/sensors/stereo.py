@@ -21,16 +21,13 @@ class Rig:
     """A `Sensor`: measurements are pixels (n, 4), rows those of the rectified pair whose errors are independent.
 
     If pixel noise is white these are (uL, v, uR); if tracks err they are (u, v, disparity) with u = uL.
-
-    Args:
-        camera, T_cam_imu, noise: Intrinsics, extrinsics (4, 4), and noise of pixels, tracks and velocities.
-        disparity_offset_px: Offset of all disparities from those of the camera's matrix.
     """
 
+    # camera, T_cam_imu, noise: Intrinsics, extrinsics (4, 4), and noise of pixels, tracks and velocities.
     camera: StereoCamera
     T_cam_imu: Array
     noise: Noise
-    disparity_offset_px: float = 0.0
+    disparity_offset_px: float = 0.0  # offset of all disparities from those of the camera's matrix
 
     dimension = 3
 

@@ -20,22 +20,15 @@ class VelocitySource:
     Each measures the mean velocity of the interval between frames that its stamp lies in, ``(t[k-1], t[k]]``. The state
     holds it in the block `Twist`, or in the block `Velocity` of inertial samples, which takes linear axes only.
 
-    Args:
-        time_s: (n,) ascending stamps, on the clock of the recording.
-        axes: Which of `AXES` are measured, a of them.
-        value: (n, a) measurements, m/s or rad/s, in the frame of the recording's velocities.
-        std: (a,) their standard deviations.
-        is_biased: Whether blocks of biases, such as `TwistBias`, are in them.
-
     Raises:
         ConfigError: An unknown axis, stamps that do not ascend, or sizes that do not fit.
     """
 
-    time_s: Array
-    axes: tuple[str, ...]
-    value: Array
-    std: Array
-    is_biased: bool = False
+    time_s: Array  # (n,) ascending stamps, on the clock of the recording
+    axes: tuple[str, ...]  # which of `AXES` are measured, a of them
+    value: Array  # (n, a) measurements, m/s or rad/s, in the frame of the recording's velocities
+    std: Array  # (a,) their standard deviations
+    is_biased: bool = False  # whether blocks of biases, such as `TwistBias`, are in them
 
     def __post_init__(self) -> None:
         unknown = [axis for axis in self.axes if axis not in AXES]

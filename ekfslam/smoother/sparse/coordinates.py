@@ -27,19 +27,12 @@ SOLVED = (*REDUCED, "landmarks")
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Coordinates of a system, see the module.
+    """Coordinates of a system, see the module."""
 
-    Args:
-        N: (T, w+a, w+a) unknowns of each frame by its coordinates.
-        C: (T, 6 h, s) views of each frame by its seen coordinates.
-        Q_first: (w+a, w+a) turn of the first frame.
-        width: Number of columns w of ``frames``.
-    """
-
-    N: Array
-    C: Array
-    Q_first: Array
-    width: int
+    N: Array  # (T, w+a, w+a) unknowns of each frame by its coordinates
+    C: Array  # (T, 6 h, s) views of each frame by its seen coordinates
+    Q_first: Array  # (w+a, w+a) turn of the first frame
+    width: int  # number of columns w of frames
 
     @staticmethod
     def of(system: LinearSystem) -> Coordinates:

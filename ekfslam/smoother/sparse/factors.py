@@ -30,31 +30,20 @@ _SINGULAR = 1e-12
 
 @dataclass(frozen=True)
 class Term:
-    """The part of a factor over one group of unknowns.
+    """The part of a factor over one group of unknowns."""
 
-    Args:
-        group: One of `GROUPS`, or ``views``.
-        index: (n,) unknown that each constraint touches.
-        J: (n, d, size) whitened Jacobian.
-    """
-
-    group: str
-    index: IntArray
-    J: Array
+    group: str  # one of `GROUPS`, or views
+    index: IntArray  # (n,) unknown that each constraint touches
+    J: Array  # (n, d, size) whitened Jacobian
 
 
 @dataclass(frozen=True)
 class Factor:
-    """n whitened constraints of d rows each: ``sum_t J_t x_t = r``.
+    """n whitened constraints of d rows each: ``sum_t J_t x_t = r``."""
 
-    Args:
-        r: (n, d) residual that the unknowns explain.
-        terms: One for each unknown that a constraint touches. Terms without columns are dropped.
-        observation: (n,) number of the observation that each constraint comes from, for the robust kernel.
-    """
-
-    r: Array
-    terms: tuple[Term, ...]
+    r: Array  # (n, d) residual that the unknowns explain
+    terms: tuple[Term, ...]  # one for each unknown that a constraint touches. Terms without columns are dropped.
+    # (n,) number of the observation that each constraint comes from, for the robust kernel.
     observation: IntArray | None = None
 
     def __post_init__(self) -> None:
@@ -86,16 +75,11 @@ class FirstFrame:
     """Prior of the first frame: ``(eps_0, aux_0) = B zeta`` with ``zeta ~ N(-zeta_hat, I)``.
 
     Unknowns of the first frame count in units of their prior, so that its covariance ``B B^T`` may be singular.
-
-    Args:
-        B: (w+a, w+a) root of the covariance.
-        zeta: (w+a,) where the system is linearised.
-        width: Size w of ``eps_0``.
     """
 
-    B: Array
-    zeta: Array
-    width: int
+    B: Array  # (w+a, w+a) root of the covariance
+    zeta: Array  # (w+a,) where the system is linearised
+    width: int  # size w of eps_0
 
     @cached_property
     def log_determinant(self) -> float:
@@ -106,26 +90,17 @@ class FirstFrame:
 
 @dataclass(frozen=True)
 class LinearSystem:
-    """All factors of a problem, linearised, to be solved in the least-squares sense.
+    """All factors of a problem, linearised, to be solved in the least-squares sense."""
 
-    Args:
-        factors: All but the prior of the first frame.
-        first: That prior.
-        counts: Number of unknowns of each of the `GROUPS`.
-        sizes: Columns of one unknown of each group.
-        ids: (M,) landmark ids, for error messages.
-        views: (T, 6 h, w) derivative of the h views of each frame by its unknowns ``frames``; view ``h k + i`` is the
-            i-th one of frame k. None: no term touches views.
-        seen: (s,) columns of ``frames`` by which ``views`` is regular, or all; None: all.
-    """
-
-    factors: tuple[Factor, ...]
-    first: FirstFrame
-    counts: Mapping[str, int]
-    sizes: Mapping[str, int]
-    ids: IntArray = field(repr=False)
+    factors: tuple[Factor, ...]  # all but the prior of the first frame
+    first: FirstFrame  # that prior
+    counts: Mapping[str, int]  # number of unknowns of each of the `GROUPS`
+    sizes: Mapping[str, int]  # columns of one unknown of each group
+    ids: IntArray = field(repr=False)  # (M,) landmark ids, for error messages
+    # (T, 6 h, w) derivative of the h views of each frame by its unknowns frames; view h k + i is the i-th one of frame
+    # k. None: no term touches views.
     views: Array | None = None
-    seen: IntArray | None = None
+    seen: IntArray | None = None  # (s,) columns of frames by which views is regular, or all; None: all
 
     @staticmethod
     def of(

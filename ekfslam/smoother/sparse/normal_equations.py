@@ -17,19 +17,12 @@ from ekfslam.smoother.sparse.structure import Batch, Structure
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Blocks of ``J^T J`` and ``J^T r``.
+    """Blocks of ``J^T J`` and ``J^T r``."""
 
-    Args:
-        landmarks: (M, 3, 3) diagonal blocks of the landmarks.
-        pairs: For each reduced group, blocks (p, 3, size) of its pairs with landmarks.
-        products: For each product of the structure, blocks (p, high, wide).
-        gradient: For each group, ``J^T r`` (count, size).
-    """
-
-    landmarks: Array
-    pairs: dict[str, Array]
-    products: list[Array]
-    gradient: dict[str, Array]
+    landmarks: Array  # (M, 3, 3) diagonal blocks of the landmarks
+    pairs: dict[str, Array]  # for each reduced group, blocks (p, 3, size) of its pairs with landmarks
+    products: list[Array]  # for each product of the structure, blocks (p, high, wide)
+    gradient: dict[str, Array]  # for each group, J^T r (count, size)
 
 
 def normal_equations(structure: Structure, factors: Sequence[Factor], coordinates: Coordinates) -> NormalEquations:

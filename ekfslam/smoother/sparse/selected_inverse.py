@@ -123,21 +123,14 @@ def selected_inverse(L: sp.csc_array) -> sp.csc_array:
 
 @dataclass(frozen=True)
 class _Supernodes:
-    """The supernodes of a Cholesky factor, in the order of their columns; lists, which Python reads faster.
+    """The supernodes of a Cholesky factor, in the order of their columns; lists, which Python reads faster."""
 
-    Args:
-        first, width: First column of each, and their number.
-        height: Number of rows, those of the columns themselves included.
-        parent: Supernode that owns the first row below the columns; -1 of a root.
-        children: Number of children.
-        rows_in_parent: (height - width,) places of the rows below the columns among the rows of the parent.
-    """
-
-    first: list[int]
+    first: list[int]  # first, width: first column of each, and their number
     width: list[int]
-    height: list[int]
-    parent: list[int]
-    children: list[int]
+    height: list[int]  # number of rows, those of the columns themselves included
+    parent: list[int]  # supernode that owns the first row below the columns; -1 of a root
+    children: list[int]  # number of children
+    # (height - width,) places of the rows below the columns among the rows of the parent.
     rows_in_parent: list[IntArray]
 
 

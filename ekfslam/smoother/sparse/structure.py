@@ -27,19 +27,12 @@ AT_ONCE = 20_000  # constraints or pairs of them, so that temporary arrays stay 
 
 @dataclass(frozen=True)
 class Side:
-    """Columns of the constraints of a factor that touch the same unknowns, other than landmarks.
+    """Columns of the constraints of a factor that touch the same unknowns, other than landmarks."""
 
-    Args:
-        group: One of `REDUCED`; views count as what their frames have seen.
-        index: (s,) unknown of each stretch of constraints.
-        term: Number of the term.
-        view: (s,) number of the view among those of its frame; None: the term is over coordinates.
-    """
-
-    group: str
-    index: IntArray
-    term: int
-    view: IntArray | None
+    group: str  # one of `REDUCED`; views count as what their frames have seen
+    index: IntArray  # (s,) unknown of each stretch of constraints
+    term: int  # number of the term
+    view: IntArray | None  # (s,) number of the view among those of its frame; None: the term is over coordinates
 
     @cached_property
     def once(self) -> bool:
@@ -49,44 +42,28 @@ class Side:
 
 @dataclass(frozen=True)
 class Batch:
-    """The constraints of a factor, in *stretches* that touch the same unknowns other than landmarks.
+    """The constraints of a factor, in *stretches* that touch the same unknowns other than landmarks."""
 
-    Args:
-        order: (n,) constraints, those of a stretch together; None: they are so already.
-        start: (s,) first one of each stretch.
-        sides: Terms that are not over landmarks.
-        landmarks: Numbers of the terms over landmarks.
-        pairs: For each such term and each side, the pair (n,) of each constraint in order; over views the number of
-            the view among those of all pairs.
-    """
-
-    order: IntArray | None
-    start: IntArray
-    sides: tuple[Side, ...]
-    landmarks: tuple[int, ...]
+    order: IntArray | None  # (n,) constraints, those of a stretch together; None: they are so already
+    start: IntArray  # (s,) first one of each stretch
+    sides: tuple[Side, ...]  # terms that are not over landmarks
+    landmarks: tuple[int, ...]  # numbers of the terms over landmarks
+    # For each such term and each side, the pair (n,) of each constraint in order; over views the number of the view
+    # among those of all pairs.
     pairs: dict[tuple[int, int], IntArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Product:
-    """Blocks ``J_row^T J_column`` of two terms of a factor, and the blocks of the reduced matrix they are added to.
+    """Blocks ``J_row^T J_column`` of two terms of a factor, and the blocks of the reduced matrix they are added to."""
 
-    Args:
-        batch: Number of the factor.
-        row, column: Numbers of sides, or of the terms over landmarks.
-        which: Stretches (m,), or constraints of two landmarks, that take part.
-        index: (m,) place of each among the `places`; None: they are in order.
-        places: (p, 2) blocks of the reduced matrix.
-        of_landmarks: Whether both are landmarks.
-    """
-
-    batch: int
-    row: int
+    batch: int  # number of the factor
+    row: int  # row, column: numbers of sides, or of the terms over landmarks
     column: int
-    which: IntArray
-    index: IntArray | None
-    places: IntArray
-    of_landmarks: bool = False
+    which: IntArray  # stretches (m,), or constraints of two landmarks, that take part
+    index: IntArray | None  # (m,) place of each among the `places`; None: they are in order
+    places: IntArray  # (p, 2) blocks of the reduced matrix
+    of_landmarks: bool = False  # whether both are landmarks
 
 
 @dataclass(frozen=True)
@@ -94,20 +71,14 @@ class Coupling:
     """Couples of unknowns that eliminated landmarks connect, and the pairs (landmark, unknown) that do it.
 
     Couples are sorted by their numbers of pairs, so that many can be summed in one matrix product.
-
-    Args:
-        row, column: Groups of the unknowns.
-        later, earlier: Pairs of either group, those of one couple together.
-        sizes: (c,) number of pairs of each couple.
-        couples: (c, 2) row and column blocks of the reduced matrix.
     """
 
-    row: str
+    row: str  # row, column: groups of the unknowns
     column: str
-    later: NDArray[np.int32]
+    later: NDArray[np.int32]  # later, earlier: pairs of either group, those of one couple together
     earlier: NDArray[np.int32]
-    sizes: IntArray
-    couples: IntArray
+    sizes: IntArray  # (c,) number of pairs of each couple
+    couples: IntArray  # (c, 2) row and column blocks of the reduced matrix
 
     def portions(self) -> Iterator[tuple[slice, NDArray[np.int32], NDArray[np.int32]]]:
         """Yield couples with one number of pairs, few enough for the cache: their slice, later, earlier (g, size)."""
