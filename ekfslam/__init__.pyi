@@ -30,6 +30,7 @@ from .frontend.track import TrackReport, track
 from .geometry.camera import StereoCamera
 from .given import trajectory_covariance
 from .live_stereo import LiveStereo
+from .others import Others
 from .page.report import write_report
 from .reports import Comparison, check, check_consistency, compare
 from .runner import run
@@ -59,6 +60,7 @@ __all__ = [
     "Noise",
     "NoiseConfig",
     "Observations",
+    "Others",
     "Posterior",
     "PosteriorConfig",
     "Reader",

@@ -6,12 +6,12 @@ import dataclasses
 from typing import NamedTuple
 
 from ekfslam.config import Config
-from ekfslam.data.readers.poses import Poses, truth_of_frames
+from ekfslam.data.readers.poses import Poses
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.trajectory import Trajectory, from_left_error
-from ekfslam.errors import TruthError
 from ekfslam.evaluation.sanity import sanity_attributes
 from ekfslam.filters.result import Result
+from ekfslam.others import placed_poses
 from ekfslam.runner import run
 from ekfslam.smoother.given import compared, given_result
 from ekfslam.smoother.posterior import posterior
@@ -47,13 +47,7 @@ def trajectory_covariance(
         PosteriorError, IllPosedError: As `ekfslam.posterior`.
     """
     T = trajectory.T_world if trajectory.moving == "body" else trajectory.T_world @ sequence.T_cam_imu
-    placed = truth_of_frames(sequence.time_s, Poses(T, trajectory.time_s, ()))
-    if len(placed.frame) < 3:
-        spans = [f"{stamps[0]:.3f} to {stamps[-1]:.3f} s" for stamps in (trajectory.time_s, sequence.time_s)]
-        raise TruthError(
-            f"{name}: {len(placed.frame)} of {len(T)} poses belong to frames: its stamps are {spans[0]}, those of "
-            f"{sequence.name} {spans[1]}"
-        )
+    placed = placed_poses(sequence, Poses(T, trajectory.time_s, ()), name)
     first, last = int(placed.frame[0]), int(placed.frame[-1])
     covered = sequence[first : last + 1]
     full = run(covered, "full", config)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
+from ekfslam.data.trajectory import Trajectory
 from ekfslam.errors import EkfslamError, FilterError, IllPosedError, PosteriorError
 from ekfslam.evaluation.brief import ATE, brief, brief_rows
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations, verdict_on
@@ -24,6 +25,7 @@ from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.older import older_figures, remove_figures
 from ekfslam.filters.result import Result
+from ekfslam.others import Others
 from ekfslam.runner import run
 from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.posterior import posterior, smooth
@@ -114,14 +116,24 @@ class Comparison(Shown):
 
 
 def compare(
-    sequence: Sequence, modes: Iterable[Mode] = MODES, config: Config | None = None, timings: Timings | None = None
+    sequence: Sequence,
+    modes: Iterable[Mode] = MODES,
+    config: Config | None = None,
+    timings: Timings | None = None,
+    others: Others | Mapping[str, Trajectory | str | Path] | None = None,
 ) -> Comparison:
     """Run several modes with one configuration; ``timings`` are those of `run`.
 
+    ``others`` are trajectories of other programs by name, as files or `ekfslam.Trajectory`; they are results, too. See
+    `ekfslam.others.Others` for their frame and world.
+
     Raises:
-        ConfigError: Unknown mode.
+        ConfigError: Unknown mode, or a name that no trajectory can have.
         FilterError: No mode has a result; if some have, `Comparison.skipped` tells why others have none.
+        TruthError: Fewer than three poses of a trajectory belong to frames. Others as of `ekfslam.others`.
     """
+    others = Others.of(others)
+    others.results(sequence)  # a mistake there should not cost the runs
     if config is not None:
         sequence = with_truth_noise(sequence, config.truth)
     timings = timings or Timings()
@@ -129,6 +141,7 @@ def compare(
     if skipped and not results:
         raise FilterError("; ".join(f"no {mode}: {reason}" for mode, reason in skipped.items()))
     with timings.part("evaluation"):
+        results |= others.results(sequence, next(iter(results.values())))
         summary = summarise_all(sequence, len(sequence.observations.ids), results)
     return Comparison(sequence, results, summary, skipped)
 
@@ -179,8 +192,11 @@ def compare_into(
     figures: bool = True,
     verbose: bool = False,
     timings: Timings | None = None,
+    others: Others | None = None,
 ) -> str:
     """Save `compare` into a folder, and return the text for a terminal: notes of the reader, `brief`, folder written.
+
+    Paths of ``others`` may hold the name of the folder as ``{name}``.
 
     ``verbose`` adds all figures of merit, counts and parameters, and lists the files.
 
@@ -189,7 +205,8 @@ def compare_into(
         FilterError: No mode has a result.
     """
     timings = timings or Timings()
-    comparison = compare(sequence, modes, config, timings)
+    others = None if others is None else others.named(folder.name)
+    comparison = compare(sequence, modes, config, timings, others)
     paths = comparison.save(folder, force, figures, timings)
     notes = "".join(f"{sequence.name}: {note}\n" for note in sequence.notes)
     with timings.part("evaluation"):

@@ -31,7 +31,7 @@ ROOMS: tuple[tuple[str, ...], ...] = (
     ("evaluation",),
     ("resolve",),
     ("runner", "live_stereo"),
-    ("given",),
+    ("given", "others"),
     ("studies",),
     ("figures",),
     ("page",),

@@ -5,16 +5,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from ekfslam import files
 from ekfslam.config import ENGINES, VARIANTS, Config
 from ekfslam.data.sequence import Sequence, stretch
+from ekfslam.data.trajectory import Moving
 from ekfslam.errors import WriteError
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.filters.result import Result
 from ekfslam.frontend.opening import open_sequence
+from ekfslam.others import Others, World
 from ekfslam.storage.archive import Archive
 
 DEFAULT_DATA = "builtin:city"
@@ -115,6 +117,24 @@ _SHARED: dict[str, dict[str, Any]] = {
         "help": "standard deviations of the truth, in place of the defaults of its format: roll_deg, pitch_deg, "
         "yaw_deg, first_position_m, stamp_s, position_m, attitude_deg",
     },
+    "--with": {
+        "dest": "others",
+        "action": "append",
+        "default": [],
+        "metavar": "[NAME=]FILE",
+        "help": "trajectory of another program to compare with: TUM (covariances in FILE.cov.txt), EuRoC csv or KITTI; "
+        "may be given several times; {name} in it is the recording's name",
+    },
+    "--with-frame": {
+        "choices": get_args(Moving),
+        "help": "moving frame of the poses of --with: body or left camera (default: camera for KITTI, otherwise body)",
+    },
+    "--with-world": {
+        "choices": get_args(World),
+        "default": "first",
+        "help": "first: move them so that their first pose is the recording's; given: leave their world "
+        "(default: %(default)s)",
+    },
     "--config": {
         "type": Path,
         "metavar": "FILE.toml",
@@ -122,6 +142,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     },
     **{flag: {"action": _Retired, "nargs": 0, "help": argparse.SUPPRESS} for flag in RETIRED},
 }
+OTHERS = ("--with", "--with-frame", "--with-world")
 EXECUTOR = ("--workers", "--executor")
 PLACES = (
     "--truth",
@@ -205,6 +226,13 @@ def open_data(options: argparse.Namespace, data: str) -> Sequence:
         front_end=config_file(options).front_end,
     )
     return sequence if options.frames is None else sequence[options.frames]
+
+
+def others_of(options: argparse.Namespace, recordings: int = 1) -> Others:
+    """Return the trajectories of the options of `OTHERS`."""
+    others = Others.parse(options.others, options.with_frame, options.with_world)
+    others.require_distinct(recordings)
+    return others
 
 
 def print_warnings(sequence: Sequence) -> None:

@@ -84,20 +84,30 @@ def attributes_of_part(
     return {**others, **_attributes(is_interpolated)}
 
 
+def stretches_text(which: BoolArray) -> str:
+    """Return every run of True as text, such as ``1-12 178-182``."""
+    return " ".join(f"{begin}-{end}" for begin, end in stretches(which))
+
+
+def stretches_of(text: str, length: int) -> BoolArray | None:
+    """Return the mask (length,) of a text of `stretches_text`; None if it is none."""
+    if not re.fullmatch(r"\d+-\d+( \d+-\d+)*", text):
+        return None
+    found = np.zeros(length, dtype=bool)
+    for begin, end in (map(int, stretch.split("-")) for stretch in text.split()):
+        found[begin : end + 1] = True
+    return found
+
+
 def _attributes(is_interpolated: BoolArray) -> dict[str, str]:
-    found = " ".join(f"{begin}-{end}" for begin, end in stretches(is_interpolated))
+    found = stretches_text(is_interpolated)
     return {INTERPOLATED: found} if found else {}
 
 
 def known_intervals(attributes: Mapping[str, str | int | float], twist: Array) -> BoolArray:
     """Return interpolated intervals (T,) of a recording, by its attributes or else by its velocities."""
-    text = str(attributes.get(INTERPOLATED, ""))
-    if not re.fullmatch(r"\d+-\d+( \d+-\d+)*", text):
-        return interpolated_intervals(twist)
-    found = np.zeros(len(twist), dtype=bool)
-    for begin, end in (map(int, stretch.split("-")) for stretch in text.split()):
-        found[begin : end + 1] = True
-    return found
+    found = stretches_of(str(attributes.get(INTERPOLATED, "")), len(twist))
+    return interpolated_intervals(twist) if found is None else found
 
 
 def interpolation_notes(twist: Array) -> tuple[str, ...]:

@@ -59,3 +59,18 @@ def from_left_error(time_s: Array, T_world_imu: Array, covariance: Array) -> Tra
     R = np.zeros_like(covariance)
     R[:, :3, :3] = R[:, 3:, 3:] = T_world_imu[:, :3, :3]
     return Trajectory(time_s, T_world_imu, R @ covariance @ np.swapaxes(R, 1, 2))
+
+
+def left_error_covariance(trajectory: Trajectory, T_cam_imu: Array) -> Array | None:
+    """Return the covariances (F, 6, 6) of ``xi`` of the body, the inverse of `from_left_error`; None if unknown.
+
+    They are the same in every world. Those of a camera are turned by the adjoint of ``T_imu_cam``.
+    """
+    if trajectory.covariance is None:
+        return None
+    A = np.zeros_like(trajectory.covariance)
+    A[:, :3, :3] = A[:, 3:, 3:] = np.swapaxes(trajectory.T_world[:, :3, :3], 1, 2)
+    if trajectory.moving == "camera":
+        A = se3.adjoint(se3.inverse(T_cam_imu)) @ A
+    covariance = A @ trajectory.covariance @ np.swapaxes(A, 1, 2)
+    return 0.5 * (covariance + np.swapaxes(covariance, 1, 2))

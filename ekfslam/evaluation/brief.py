@@ -9,6 +9,7 @@ from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.honesty import Honesty, judge
 from ekfslam.evaluation.tables import MISSING, document, markdown_table, significant
 from ekfslam.evaluation.trajectory import absolute_trajectory_error, align_se3, align_yaw
+from ekfslam.evaluation.truth import estimated
 from ekfslam.filters.result import Result
 from ekfslam.storage.archive import Archive
 
@@ -23,9 +24,10 @@ def brief_rows(result: Result, truth: Truth | None) -> dict[str, str]:
     """
     first, *rest = result.brief.items()
     rows = dict([first])
+    truth = truth and estimated(result, truth)
     if truth is not None and len(truth.frame):
         T_est, T_true = result.T_world_imu[truth.frame], truth.T_world_imu
-        by = align_se3 if result.inertial is None else align_yaw
+        by = align_yaw if result.knows_vertical else align_se3
         ate_m, aligned_m = (absolute_trajectory_error(T_est, T_true, align, by) for align in (False, True))
         rows[ATE] = f"{significant(ate_m)} m ({significant(aligned_m)} m)"
     return rows | dict(rest)

@@ -18,6 +18,7 @@ from ekfslam.data.sequence import WITHOUT_VELOCITIES, Truth
 from ekfslam.evaluation import whiteness
 from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_error, pose_nees, pose_nees_apart
 from ekfslam.evaluation.tables import plus_minus
+from ekfslam.evaluation.truth import estimated
 from ekfslam.filters.result import REASONS, Result, WhitenedInnovations
 from ekfslam.geometry import motion, se3
 from ekfslam.models.blocks import OPTIONAL_BLOCKS
@@ -232,7 +233,8 @@ def truth_agreement(result: Result, truth: Truth | None, interpolated: BoolArray
 
     Frames after ``interpolated`` (T,) intervals, and stretches in which the truth stands alone, are left out.
     """
-    if truth is None or not len(truth.frame):
+    truth = truth and estimated(result, truth)
+    if truth is None or not len(truth.frame) or not result.has_covariance:
         return None
     measured = truth if interpolated is None else measured_truth(truth, interpolated, result.time_s)
     _, nees = pose_nees_apart(result, measured) or pose_nees(result, measured, with_truth_noise=True)

@@ -78,8 +78,10 @@ class Honesty:
         nees = f"pose NEES {self.truth.nees:.3g}, {POSE_DOF} expected" if self.truth is not None else ""
         if not self.causes:
             if true == 1.0:
-                return f"consistent as far as {by} and the truth of one drive can tell ({nees})"
-            return f"standard deviations {_size(true)} by the truth ({nees}), for a reason that {by} do not show"
+                known = "the truth of one drive" if self.nis is None else f"{by} and the truth of one drive"
+                return f"consistent as far as {known} can tell ({nees})"
+            reason = "" if self.nis is None else f", for a reason that {by} do not show"
+            return f"standard deviations {_size(true)} by the truth ({nees}){reason}"
         said = f"by the truth they are {_size(true)}" if true != 1.0 else "the truth of one drive does not show it"
         return f"{self._by_innovations(by)}; {said} ({nees})"
 
@@ -236,6 +238,8 @@ def require_innovations(result: Result) -> None:
 
 def _missing_innovations(result: Result) -> str:
     """Return why a run has no innovations to be judged by; empty if it has."""
+    if result.is_other:
+        return f"nothing to judge by: {result.mode!r} has no innovations, and no covariance to compare with a truth"
     if result.whitened is None:
         why = "was made before innovations were kept: run again" if result.mode == "full" else "has none: check 'full'"
         return f"no innovations to judge by: the result of {result.mode!r} {why}"

@@ -24,6 +24,7 @@ from ekfslam.evaluation import trajectory
 from ekfslam.evaluation.consistency import measured_truth, pose_nees, pose_nees_apart, pose_nees_by_axis
 from ekfslam.evaluation.inertial import inertial_nees
 from ekfslam.evaluation.relative import FRAMES, PATHS_M, over_frames, over_path, relative_pose_nees
+from ekfslam.evaluation.truth import estimated
 from ekfslam.filters.inertial_states import InertialStates
 from ekfslam.filters.result import Innovation, Result
 
@@ -74,18 +75,21 @@ def offered(result: Result, truth: Truth | None, interpolated: BoolArray) -> dic
     """Return the values that metrics may take by name, None if missing.
 
     ``result``, its ``landmarks``, ``innovation`` (None without an update) and states of an ``inertial`` unit,
-    ``truth``, the ``interpolated`` intervals (T,) of the recording; with true poses ``T_est`` and ``T_true``
-    (n, 4, 4) at their frames, and ``measured``, the truth of frames that no interpolated interval leads to.
+    ``truth``, the ``interpolated`` intervals (T,) of the recording, ``vertical`` if it is known; with true poses
+    ``T_est`` and ``T_true`` (n, 4, 4) at their frames, and if there are covariances ``measured``, the truth of frames
+    that no interpolated interval leads to.
     """
+    truth = truth and estimated(result, truth)
     known = truth if truth is not None and len(truth.frame) else None
     return {
         "result": result,
+        "vertical": result.knows_vertical or None,
         "landmarks": result.landmarks,
         "innovation": result.innovation if result.innovation.dof.any() else None,
         "interpolated": interpolated,
         "inertial": result.inertial,
         "truth": truth,
-        "measured": known and measured_truth(known, interpolated, result.time_s),
+        "measured": known and (measured_truth(known, interpolated, result.time_s) if result.has_covariance else None),
         "T_est": known and result.T_world_imu[known.frame],
         "T_true": known and known.T_world_imu,
     }
@@ -117,7 +121,7 @@ metric("ate_aligned_m", "ATE [m], SE(3)-aligned", ".3f")(partial(trajectory.abso
     "Root mean square of position errors after the turn about the vertical and the shift of least squares; an inertial "
     "unit knows the vertical.",
 )
-def ate_aligned_4dof(T_est: Array, T_true: Array, inertial: InertialStates) -> float:
+def ate_aligned_4dof(T_est: Array, T_true: Array, vertical: bool) -> float:
     """Return the ATE after `align_yaw`, four degrees of freedom."""
     return trajectory.absolute_trajectory_error(T_est, T_true, align=True, by=trajectory.align_yaw)
 
@@ -208,8 +212,8 @@ metric("landmark_rmse_m", "landmark RMSE [m]", ".3f")(trajectory.landmark_rmse)
 
 @metrics(("accepted", "accepted", "d"), ("rejected", "rejected", "d"))
 def observations(result: Result) -> tuple[int, int] | None:
-    """Return the numbers of accepted and rejected observations; None of a posterior, which rejects none."""
-    if "observations" in result.counts:
+    """Return the numbers of accepted and rejected observations; None of a posterior or another program."""
+    if "observations" in result.counts or result.is_other:
         return None
     return int(result.innovation.accepted.sum()), int(result.innovation.rejected.sum())
 
@@ -219,9 +223,11 @@ def observations(result: Result) -> tuple[int, int] | None:
     ("ms_per_frame_max", "ms/frame max", ".2f"),
     ("total_s", "total [s]", ".2f"),
 )
-def times(result: Result) -> tuple[float, float, float]:
-    """Return the wall-clock time of frames: median and largest, ms, and the sum, s."""
+def times(result: Result) -> tuple[float, float, float] | None:
+    """Return the wall-clock time of frames: median and largest, ms, and the sum, s; None of another program."""
     ms = result.ms_per_frame
+    if result.is_other:
+        return None
     return float(np.median(ms)), float(ms.max()), float(ms.sum()) / 1e3
 
 

@@ -11,6 +11,7 @@ from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.metrics import METRICS, Value, computed, offered
 from ekfslam.evaluation.tables import document, markdown_table, number, significant
 from ekfslam.evaluation.trajectory import Part, absolute_trajectory_error, error_parts
+from ekfslam.evaluation.truth import estimated
 from ekfslam.filters.result import Result
 from ekfslam.storage.archive import Archive
 
@@ -41,6 +42,7 @@ def summarise_all(sequence: Sequence | Archive, landmarks: int | None, results: 
 
 def error_in_words(result: Result, truth: Truth | None) -> str:
     """Return both ATE of a run, and the parts of the unaligned one in words; empty without true poses."""
+    truth = truth and estimated(result, truth)
     if truth is None or len(truth.frame) < _LEAST_POSES:
         return ""
     T_est, T_true = result.T_world_imu[truth.frame], truth.T_world_imu

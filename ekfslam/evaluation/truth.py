@@ -1,4 +1,4 @@
-"""The noise of a recording's truth as a configuration has it."""
+"""The truth that a run is compared with: its noise as a configuration has it, its frames those of the run."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import dataclasses
 import math
 
 from ekfslam.config import TruthConfig
+from ekfslam.data.interpolation import stretches_of
+from ekfslam.data.observations import TrueMotion, Truth
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.truth_noise import TruthNoise
+from ekfslam.filters.result import OTHER_MISSING, Result
 
 
 def with_truth_noise(sequence: Sequence, settings: TruthConfig) -> Sequence:
@@ -28,3 +31,14 @@ def with_truth_noise(sequence: Sequence, settings: TruthConfig) -> Sequence:
         return sequence
     noise = dataclasses.replace(sequence.truth.noise or TruthNoise(), **given)
     return dataclasses.replace(sequence, truth=dataclasses.replace(sequence.truth, noise=noise))
+
+
+def estimated(result: Result, truth: Truth) -> Truth:
+    """Return the true poses of frames that have an estimate: all, but for the gaps of another program."""
+    missing = stretches_of(str(result.attributes.get(OTHER_MISSING, "")), len(result.time_s))
+    if missing is None or not missing[truth.frame].any():
+        return truth
+    kept = ~missing[truth.frame]
+    motion = truth.motion and TrueMotion(*(value[kept] for value in vars(truth.motion).values()))
+    frame, T_world_imu = truth.frame[kept], truth.T_world_imu[kept]
+    return dataclasses.replace(truth, frame=frame, T_world_imu=T_world_imu, motion=motion)

@@ -104,7 +104,7 @@ def plot_side(results: Mapping[str, Result], truth: Truth | None = None) -> Figu
         heights.append(truth.T_world_imu[:, 2, 3])
     for mode, result in results.items():
         line = line_of(mode)
-        one = height(result.T_world_imu, result.covariance)
+        one = height(result.T_world_imu, result.covariance if result.has_covariance else None)
         draw_series(ax, one, line["color"], {**line, "zorder": 3}, label=mode)
     low, high = min(z.min() for z in heights), max(z.max() for z in heights)
     margin = 0.06 * (high - low) + 0.05

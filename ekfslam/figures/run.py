@@ -39,9 +39,8 @@ def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolA
         errors, color = series.errors(result, truth), style_of(result.mode)["color"]
         for ax, error in zip(column, errors, strict=True):
             draw_series(ax, error, color, {"color": "black", "linewidth": 1.0}, levels=ZERO)
-        inside = f"{100 * series.share_inside(errors):.1f} % inside {BAND_SIGMAS:g} sigma"
         share_x(*column)
-        said = [title, _ate_words(result, truth), inside, _nees_words(result, truth, interpolated)]
+        said = [title, _ate_words(result, truth), series.inside_words(errors), _nees_words(result, truth, interpolated)]
         column[0].set_title("\n".join(said), fontsize=9.0)
     name, break_ = next(iter(results.values())).sequence_name, "\n" if len(columns) == 1 else " "
     figure.suptitle(f"{name}:{break_}estimate minus truth, world axes")
@@ -55,6 +54,8 @@ def _ate_words(result: Result, truth: Truth) -> str:
 
 def _nees_words(result: Result, truth: Truth, interpolated: BoolArray | None) -> str:
     """Return the mean pose NEES for a title, and the one with truth noise if the truth states noise."""
+    if not result.has_covariance:
+        return ""
     exact, noisy = (series.nees(result, truth, interpolated, noise).mean for noise in (False, True))
     if exact is None:
         return ""

@@ -16,6 +16,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_nees, world_axes_errors, world_axes_std
 from ekfslam.evaluation.trajectory import align_se3, distance_along
+from ekfslam.evaluation.truth import estimated
 from ekfslam.figures.style import BAND_ALPHA, BOUNDS, EXPECTED, Style, log_axis
 from ekfslam.filters.inertial_states import FIELDS, UNITS
 from ekfslam.filters.result import Result
@@ -99,13 +100,15 @@ def draw_series(ax: Axes, series: Series, band: str, line: Style, levels: Style 
 
 def errors(result: Result, truth: Truth) -> list[Series]:
     """Return estimate minus truth along the axes of world, three positions and three rotations, with 3-sigma bounds."""
+    truth = estimated(result, truth)
     T, x = result.T_world_imu[truth.frame], _time(result)[truth.frame]
     error = _SCALES * world_axes_errors(T, truth.T_world_imu)
     bound = BAND_SIGMAS * _SCALES * world_axes_std(T, result.covariance[truth.frame])
-    return [
+    found = [
         Series(name, unit, x, error[:, i], -bound[:, i], bound[:, i], levels=(0.0,))
         for i, (name, unit) in enumerate(zip(_AXES, _UNITS, strict=True))
     ]
+    return found if result.has_covariance else [dataclasses.replace(one, low=None, high=None) for one in found]
 
 
 def inertial(result: Result, truth: Truth | None = None) -> list[tuple[Series, Series | None]]:
@@ -156,13 +159,15 @@ def _with_bounds(
     return found
 
 
-def share_inside(series: Iterable[Series]) -> float:
-    """Return the share of the values of several series of equal length within their bounds."""
-    return float(np.mean([one.share_inside for one in series]))
+def inside_words(series: Iterable[Series]) -> str:
+    """Return the share of the values of several series of equal length within their bounds, as words."""
+    shares = [one.share_inside for one in series if one.low is not None]
+    return f"{100 * np.mean(shares):.1f} % inside {BAND_SIGMAS:g} sigma" if shares else "no covariance"
 
 
 def nees(result: Result, truth: Truth, interpolated: BoolArray | None = None, with_truth_noise: bool = True) -> Series:
     """Return the pose NEES of the frames that no ``interpolated`` interval (T,) leads to."""
+    truth = estimated(result, truth)
     judged = truth if interpolated is None else measured_truth(truth, interpolated, result.time_s)
     frame, values = pose_nees(result, judged, with_truth_noise)
     known = np.isfinite(values)
@@ -185,6 +190,7 @@ def nis(result: Result) -> Series:
 
 def distance_from_truth(result: Result, truth: Truth, align: bool) -> Series:
     """Return the distance of the estimated position from the true one, without or after `align_se3`."""
+    truth = estimated(result, truth)
     estimate, true = result.T_world_imu[truth.frame, :3, 3], truth.T_world_imu[:, :3, 3]
     off = (se3.apply(align_se3(estimate, true), estimate) if align else estimate) - true
     x = _time(result)[truth.frame]

@@ -77,7 +77,10 @@ VARIANTS: Mapping[str, Style] = {
     "invariant-iterated": _style(SKY_BLUE, (0, (4, 1, 1, 1)), "v"),
     "standard-iterated": _style(ORANGE, ":", "P"),
 }
-OTHER: Style = _style(SKY_BLUE, "-.", "v")  # other programs, dense references, archives with names of their own
+# Other programs, dense references, archives with names of their own.
+OTHER: Style = _style(SKY_BLUE, "-.", "v")
+_FURTHER = (_style(VERMILLION, (0, (4, 1, 1, 1)), "P"), _style(GREEN, (0, (6, 2)), "X"), _style(ORANGE, ":", "<"))
+_TOLD_APART = {"as filtered": OTHER, "given": OTHER}  # and further names in the order in which they are drawn
 
 TRUTH: Style = {"color": BLACK, "linestyle": "-", "linewidth": 2.2}
 LANDMARK_COLOR, FIRST_LANDMARK_COLOR = BROWN, SKY_BLUE  # as estimated last, and as initialised
@@ -108,8 +111,9 @@ Format = Literal["png", "svg", "pdf"]  # of files
 
 
 def style_of(name: str) -> Style:
-    """Return colour, line style and marker of a mode or variant; those of `OTHER` for any other name."""
-    return MODES.get(name) or VARIANTS.get(name) or OTHER
+    """Return colour, line style and marker of a mode or variant; other names take turns, the first one is `OTHER`."""
+    own = MODES.get(name) or VARIANTS.get(name)
+    return own or _TOLD_APART.setdefault(name, (OTHER, *_FURTHER)[(len(_TOLD_APART) - 2) % 4])
 
 
 def line_of(name: str) -> Style:

@@ -52,8 +52,12 @@ _PARAMETER_UNITS = "see attribute unit of the group"
 # Pixel noise below which a linearised update gains more information than it should. In both built-in worlds the pose
 # NEES is the same from 0.7 to 0.1 px, twice as large at 0.03 px, ten times at 0.01 px.
 LINEAR_FROM_PX = 0.1
+_LAST_STD = "std of last position, heading"
 # Attribute with the doubts about a recording and a run, see `ekfslam.evaluation.sanity`.
 SANITY, SANITY_SEPARATOR = "sanity", " | "
+# Attributes of a trajectory of another program: its file, frames without a pose of their own, whether it knows the
+# vertical; see `ekfslam.others`.
+OTHER, OTHER_MISSING, OTHER_LEVEL = "other", "other_missing", "other_level"
 
 
 @dataclass(frozen=True)
@@ -304,6 +308,21 @@ class Result(Shown):
         return Card(f"{self.mode} on {self.sequence_name}", facts, further)
 
     @property
+    def is_other(self) -> bool:
+        """Whether the poses are those of another program."""
+        return OTHER in self.attributes
+
+    @property
+    def has_covariance(self) -> bool:
+        """Whether the poses have covariances; those of another program may have none, stored as 0."""
+        return not self.is_other or bool(self.covariance.any())
+
+    @property
+    def knows_vertical(self) -> bool:
+        """Whether accelerations have shown the vertical, so that only yaw and position are open."""
+        return self.inertial is not None or bool(self.attributes.get(OTHER_LEVEL, 0))
+
+    @property
     def brief(self) -> dict[str, str]:
         """Size, last standard deviations, share of the observations used, and time, in words by heading.
 
@@ -316,9 +335,9 @@ class Result(Shown):
         each_ms = float(np.median(self.ms_per_frame))
         return {
             "frames, way": f"{len(self.time_s)} in {figure(seconds)} s, {figure(way_m)} m",
-            "std of last position, heading": f"{figure(position_m)} m, {figure(float(heading_deg))} deg",
-            "observations used": self._used,
-            "time": f"{figure(total_s)} s, {figure(each_ms)} ms a frame",
+            **({_LAST_STD: f"{figure(position_m)} m, {figure(float(heading_deg))} deg"} if self.has_covariance else {}),
+            **({} if self.is_other else {"observations used": self._used}),
+            **({} if self.is_other else {"time": f"{figure(total_s)} s, {figure(each_ms)} ms a frame"}),
         }
 
     @property
@@ -440,7 +459,7 @@ class Result(Shown):
     def remarks(self) -> tuple[str, ...]:
         """Warnings about the run, one sentence each."""
         remarks = []
-        if self.mode != "dead-reckoning" and not len(self.landmarks):
+        if self.mode != "dead-reckoning" and not self.is_other and not len(self.landmarks):
             remarks.append("not one observation was used: the trajectory is that of dead reckoning")
         finest_px = float(np.min(self.noise.pixel_std_px))
         if self.mode == "full" and self.noise.track_first_px is None and finest_px < LINEAR_FROM_PX:

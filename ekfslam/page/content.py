@@ -174,8 +174,7 @@ def _plotted_run(section: Section, j: int, kept: IntArray) -> dict[str, Any]:
     errors = [] if truth is None else series.errors(result, truth)
     words = "Without truth there are no errors to show."
     if errors:
-        inside = f"{100 * series.share_inside(errors):.1f} % inside"
-        words = f"Estimate minus truth along the axes of world, with {series.BAND_SIGMAS:g}-sigma bounds: {inside}."
+        words = f"Estimate minus truth along the axes of world, with bounds: {series.inside_words(errors)}."
     return {
         "label": run.label,
         "mode": result.mode,
@@ -207,7 +206,7 @@ def _inertial(run: Run, j: int) -> Iterator[dict[str, Any]]:
 def _consistency(run: Run, j: int) -> Iterator[dict[str, Any]]:
     """Yield the plots of NEES and NIS of a run."""
     percent = f"{100 * series.PROBABILITY:g} %"
-    if run.truth is not None:
+    if run.truth is not None and run.result.has_covariance:
         nees = series.nees(run.result, run.truth, run.archive.interpolated)
         if nees.mean is not None:
             words = f"6 expected, mean {nees.mean:.3g}; grey: {percent} of honest poses"

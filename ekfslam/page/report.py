@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -18,12 +19,14 @@ from typing import Any
 
 from ekfslam import files
 from ekfslam.config import Config
+from ekfslam.data.trajectory import Trajectory
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.brief import brief_rows
 from ekfslam.evaluation.evidence import BLIND
 from ekfslam.evaluation.summary import definitions, error_in_words, merit_rows
 from ekfslam.evaluation.tables import MISSING
 from ekfslam.names import components, printable
+from ekfslam.others import Others
 from ekfslam.page.content import PART, Run, Section, plotted, remarks_of, sections_of, told_apart
 from ekfslam.runner import versions
 from ekfslam.shown import count
@@ -46,18 +49,37 @@ _KEY_FIGURES = (
 _MOST_CARDS = 4  # of more runs, only those judged by innovations have a card
 
 
-def write_report(archives: Sequence[str | Path], path: str | Path, title: str = "") -> Path:
+def write_report(
+    archives: Sequence[str | Path],
+    path: str | Path,
+    title: str = "",
+    others: Others | Mapping[str, Trajectory | str | Path] | None = None,
+) -> Path:
     """Write one HTML page of archives, and return its path; archives of one recording share a section.
 
-    The title is by default the names of the recordings.
+    The title is by default the names of the recordings. ``others`` are trajectories of other programs, as in
+    `ekfslam.compare`; ``{name}`` in a path is the name of the recording.
 
     Raises:
         ArchiveError: There is none, there are too many, or one cannot be read or holds no run.
         WriteError: The page cannot be written.
+        ConfigError, TruthError: A trajectory cannot be compared, see `ekfslam.others`.
     """
     files.require_writable(path)
-    files.write_all({Path(path): report_page(read_archives(archives), title)})
+    files.write_all({Path(path): report_page(_joined(read_archives(archives), Others.of(others)), title)})
     return Path(path)
+
+
+def _joined(archives: Mapping[str, Archive], others: Others) -> dict[str, Archive]:
+    """Return archives with trajectories of other programs as results of the first archive of each recording."""
+    found, seen = dict(archives), set[tuple[str, bytes]]()
+    for label, archive in archives.items():
+        if (recording := (archive.name, archive.time_s.tobytes())) not in seen:
+            seen.add(recording)
+            theirs = others.named(archive.name).results(archive, next(iter(archive.results.values())))
+            found[label] = replace(archive, results={**archive.results, **theirs})
+    others.require_distinct(len(seen))
+    return found
 
 
 def read_archives(paths: Sequence[str | Path]) -> dict[str, Archive]:
@@ -202,14 +224,15 @@ def _expecting(text: str, expected: str) -> str:
 def _detail(run: Run) -> str:
     result = run.result
     hygiene = () if result.hygiene is None else result.hygiene.lines(result.config["hygiene"])
+    noise = {key: value for key, value in vars(result.noise).items() if value is not None}
     blocks = [
         ("Remarks", _list(result.remarks)),
         ("Counts", _pairs(result.counts)),
         ("Track hygiene", _list(hygiene)),
         ("Estimated parameters", _list(() if result.parameters is None else result.parameters.lines)),
         ("Velocity and biases at the end", _list(() if result.inertial is None else result.inertial.lines)),
-        ("Configuration", _configuration(result.config)),
-        ("Assumed noise", _pairs({key: value for key, value in vars(result.noise).items() if value is not None})),
+        ("Configuration", "" if result.is_other else _configuration(result.config)),
+        ("Assumed noise", "" if result.is_other else _pairs(noise)),
         ("Attributes", _pairs(result.attributes)),
     ]
     shown = "".join(f"<h4>{heading}</h4>{content}" for heading, content in blocks if content)

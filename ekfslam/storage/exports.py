@@ -12,6 +12,7 @@ import csv
 import io
 import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -105,7 +106,8 @@ class Poses(NamedTuple):
 
 def trajectory_of(result: Result) -> Poses:
     """Return the poses of a result with their covariances."""
-    return Poses(from_left_error(result.time_s, result.T_world_imu, result.covariance), result.T_cam_imu)
+    poses = from_left_error(result.time_s, result.T_world_imu, result.covariance)
+    return Poses(poses if result.has_covariance else replace(poses, covariance=None), result.T_cam_imu)
 
 
 def true_trajectory(archive: Archive, place: str, format: str) -> Poses:

@@ -5,10 +5,21 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
+from typing import Any
 
 from ekfslam import files
 from ekfslam.cli.modes import declare_modes
-from ekfslam.cli.options import DEFAULT_DATA, EXECUTOR, configured, declare, declare_run, open_data, print_warnings
+from ekfslam.cli.options import (
+    DEFAULT_DATA,
+    EXECUTOR,
+    OTHERS,
+    configured,
+    declare,
+    declare_run,
+    open_data,
+    others_of,
+    print_warnings,
+)
 from ekfslam.config import MODES
 from ekfslam.errors import ConfigError
 from ekfslam.names import components
@@ -22,6 +33,7 @@ EXAMPLES = (
     "compare 0027.npz --truth poses/07.txt --out results/local",
     "compare drives/*.mat --workers 8 --no-figures",
     "compare a.mat b.mat --modes dead-reckoning full --sigma-v 0.5 --sigma-w 0.05",
+    "compare drives/*.mat --with 'orb=theirs/{name}.txt' --with-frame camera",
 )
 
 
@@ -29,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "data", nargs="*", default=[DEFAULT_DATA])
     declare_modes(parser, MODES)
     declare(parser, "--out", default=Path("results/local"), help="default: %(default)s")
-    declare(parser, "--no-figures", "--verbose", "--timings", *EXECUTOR)
+    declare(parser, "--no-figures", "--verbose", "--timings", *OTHERS, *EXECUTOR)
     declare_run(parser)
 
 
@@ -38,13 +50,14 @@ def command(options: argparse.Namespace) -> None:
     for flag in ("truth", "timings"):
         if getattr(options, flag) and len(options.data) > 1:
             raise ConfigError(f"--{flag} belongs to one recording, but several are given; compare them one by one")
-    timings = Timings()
+    timings, others = Timings(), others_of(options, len(options.data))
     # Read everything first: a mistyped last name should not cost the first hour.
     with timings.part("reading"):
         sequences = [open_data(options, data) for data in options.data]
     folders = [options.out / name for name in components(sequence.name for sequence in sequences)]
     for sequence, folder in zip(sequences, folders, strict=True):
         files.require_writable(folder / "archive.h5")
+        others.named(folder.name).results(sequence)
         if not options.force:
             require_same_origin(folder / "archive.h5", sequence)
     with timings.part("automatic model"):
@@ -53,7 +66,8 @@ def command(options: argparse.Namespace) -> None:
     recordings = dict(zip(folders, sequences, strict=True))
     where = "serial" if len(recordings) == 1 and options.executor == "processes" else options.executor
     workers = options.workers or min(len(recordings), os.cpu_count() or 1)
-    chosen = {"force": options.force, "figures": not options.no_figures, "verbose": options.verbose}
+    chosen: dict[str, Any] = {"force": options.force, "figures": not options.no_figures, "verbose": options.verbose}
+    chosen["others"] = others
     if where == "serial":  # the clock is that of this process
         chosen["timings"] = timings
     with open_executor(where, workers) as executor:

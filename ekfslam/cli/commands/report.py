@@ -5,18 +5,19 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ekfslam.cli.options import declare, require_ours
+from ekfslam.cli.options import OTHERS, declare, others_of, require_ours
 from ekfslam.page.report import is_report, write_report
 
 EXAMPLES = (
     "report results/local/city/archive.h5",
     "report results/*/archive.h5 --out report.html --title 'All drives'",
+    "report city.h5 --with mine.tum",
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "archive", nargs="+")
-    declare(parser, "--force")
+    declare(parser, "--force", *OTHERS)
     parser.add_argument("--out", type=Path, metavar="FILE", help="default: report.html in the first archive's folder")
     parser.add_argument("--title", default="", metavar="TEXT", help="heading; default: the names of the recordings")
 
@@ -24,4 +25,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def command(options: argparse.Namespace) -> None:
     path = options.out or options.archive[0].parent / "report.html"
     require_ours(options, path, is_report)
-    print(write_report(options.archive, path, options.title))
+    print(write_report(options.archive, path, options.title, others_of(options)))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ekfslam.arrays import Array
 from ekfslam.data.inputs import VelocitySamples
 from ekfslam.data.readers.columns import POSE, header_of, read_named
 from ekfslam.data.readers.fields import checksum
@@ -14,6 +15,7 @@ from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
 from ekfslam.data.trajectory import Moving, Trajectory
 from ekfslam.errors import DataError, LineError, LostDataError, ShapeError, TruthError
+from ekfslam.stored import COVARIANCES
 
 COLUMNS = ("time", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _WIDTHS = (8, 20, 29, 44)  # alone, with covariances of rotation and position, with a triangle, with all 36
@@ -46,18 +48,31 @@ def read_trajectory(path: str | Path, *, frame: Moving = "body") -> Trajectory:
     path = Path(path)
     poses = _read(path)
     assert poses.time_s is not None
-    beside = covariance_path(path)
-    if not beside.is_file():
-        return Trajectory(poses.time_s, poses.T_world_imu, None, frame)
+    return Trajectory(poses.time_s, poses.T_world_imu, covariances_beside(path, poses.time_s), frame)
+
+
+def covariances_beside(path: Path, time_s: Array) -> Array | None:
+    """Return the covariances (n, 6, 6) of poses from the file beside theirs, see `read_trajectory`; None without one.
+
+    ``mine.tum`` may have ``mine.cov.txt`` as well as ``mine.tum.cov.txt``.
+    """
+    places = (covariance_path(path), path.with_suffix(COVARIANCE_ENDING))
+    beside = next((place for place in places if place.is_file() and place != path), None)
+    if beside is None:
+        return None
     words = f"expected a stamp and {len(COVARIANCE)} numbers a line"
     table = parse_table(read_lines(beside, words), beside, columns=1 + len(COVARIANCE))
     if not len(table.values):
-        return Trajectory(poses.time_s, poses.T_world_imu, None, frame)
-    if not np.array_equal(table.values[:, 0], poses.time_s):
+        return None
+    if not np.array_equal(table.values[:, 0], time_s):
         raise ShapeError(f"the stamps are not those of {path.name}", source=str(beside), field="time")
     covariance = np.zeros((len(table.values), 6, 6))
     covariance[(slice(None), *UPPER)] = covariance[(slice(None), *UPPER[::-1])] = table.values[:, 1:]
-    return Trajectory(poses.time_s, poses.T_world_imu, covariance, frame)
+    is_wrong = ~COVARIANCES.holds(covariance, {})
+    if is_wrong.any():
+        where = table.where(int(np.argmax(is_wrong)))
+        raise ShapeError("the covariance is not positive semi-definite; expected the upper triangle by rows", **where)
+    return covariance
 
 
 def _read(path: Path, error: type[DataError] = LineError) -> Poses:
