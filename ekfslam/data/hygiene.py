@@ -1,8 +1,8 @@
 """Track hygiene: the stage between a recording and the filters that cuts tracks and drops observations.
 
 The rules use tracks, their pixel noise, and measured velocities; none needs an estimate. A rule either *drops* an
-observation, or *cuts* a track: from that observation on the track has an id of its own. Ids of new pieces count on from
-the largest. If the tracks of a recording have no gaps, a track is also cut at every gap that a rule makes.
+observation, or *cuts* a track: from that observation on the track has an id of its own, counted on from the largest. If
+the tracks of a recording have no gaps, a track is also cut at every gap that a rule makes.
 """
 
 from __future__ import annotations
@@ -172,10 +172,9 @@ def jumps(observations: Observations, noise: Noise, sigma: float) -> BoolArray:
     """Return whether (K,) the pixels of a track jump at an observation, and stay there: it shows another point.
 
     Three observations before and three from there on, in successive frames, decide. The course of a track is the median
-    of the two motions before and the two after. The motion beyond this course is measured over one, three and five
-    frames about the jump; one bad observation does not change the median of the three. A jump exceeds the differences
-    within the course. After the common motion of the frame's tracks is subtracted, it also exceeds ``sigma`` standard
-    deviations of pixel noise and of the scatter of these tracks together.
+    of the two motions before and the two after. The jump is the median of the motions beyond it over one, three and
+    five frames. It exceeds the differences within the course and, less the common motion of the frame's tracks,
+    ``sigma`` standard deviations of pixel noise and of the scatter of these tracks together.
     """
     order = np.lexsort((observations.frame, observations.landmark))
     frame, landmark = observations.frame[order], observations.landmark[order]
@@ -204,7 +203,7 @@ def reused_ids(sequence: Sequence, observations: Observations, noise: Noise, sig
 
     Velocities alone place both points in the world. They may be ``sigma`` standard deviations apart: those of both
     triangulations, and of the velocity noise that accumulates during the gap, in position and (over the way and the
-    distance to the point) in heading. After a long drive this allows much, so a landmark that comes back is not cut.
+    distance to the point) in heading. So a landmark that comes back after a long drive is not cut.
     """
     found = np.zeros(len(observations), dtype=bool)
     earlier, later = successive(observations)
@@ -246,11 +245,11 @@ def reused_ids(sequence: Sequence, observations: Observations, noise: Noise, sig
 def disparity_jumps(sequence: Sequence, noise: Noise, sigma: float) -> IntArray:
     """Return the ids (n,) of tracks in frames in which the stereo matches of most tracks change at once.
 
-    Velocities predict the change of depth of a point, and so of its disparity. A track jumps by the rest of the change,
-    in standard deviations of both disparities and of the velocities, less twice the jumps in the two neighbouring
-    intervals: traffic changes over many frames, a new stereo match does once. If the median of a frame's tracks jumps
-    by more than ``sigma``, all tracks that lead into the frame are affected. Tracks with less than ``sigma`` deviations
-    of disparity do not count, nor do those of two frames; at least `_COMPANY` must be left.
+    Velocities predict the change of a point's disparity. A track jumps by the rest of the change, in standard
+    deviations of both disparities and of the velocities, less twice the jumps in the two neighbouring intervals:
+    traffic changes over many frames, a new stereo match does once. If the median of a frame's tracks, at least
+    `_COMPANY`, jumps by more than ``sigma``, all tracks that lead into the frame are affected. Tracks with less than
+    ``sigma`` deviations of disparity do not count, nor do those of two frames.
     """
     o, camera = sequence.observations, sequence.camera
     earlier, later = adjacent(o)

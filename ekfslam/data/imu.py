@@ -12,13 +12,11 @@ from ekfslam.data.images import ImageRecording
 from ekfslam.data.inertial import NOT_STATED, InertialRows, covered_frames, samples_of
 from ekfslam.data.inputs import InertialNoise, InertialSamples, Velocities
 from ekfslam.data.readers.fields import BODY_IS_CAMERA
-from ekfslam.data.readers.imu_yaml import CHAINS, beside, chain_of, late_s, read_imu_yaml
+from ekfslam.data.readers.imu_yaml import find_chain, read_chain, read_imu_yaml
 from ekfslam.data.readers.registry import Source, expected, read_as
-from ekfslam.data.readers.yaml import read_yaml
 from ekfslam.data.sequence import Sequence
-from ekfslam.data.velocities import NO_VELOCITIES, Recording
+from ekfslam.data.velocities import NO_VELOCITIES, Recording, of_body
 from ekfslam.errors import CalibrationError, ExtrinsicsError, LostDataError, UnknownFormatError
-from ekfslam.geometry import se3
 from ekfslam.geometry.camera import T_CAM_BODY
 
 _DROPPED = "its densities are not used"  # in a note on a file that states some
@@ -39,9 +37,8 @@ def attach_inertial(recording: Recording, path: str | Path, noise: str | Path | 
         UnknownFormatError: A file is missing or of unknown content.
         CalibrationError: The file of densities does not state all four.
         ExtrinsicsError: Nothing states ``T_cam_imu``.
-        StampError: Stamps go back, or have an impossible rate.
         LostDataError: The samples do not cover two frames.
-        DataError: A line is malformed, or units cannot be right; the error says what to do.
+        DataError: Stamps go back, a line is malformed, or units cannot be right; the error says what to do.
     """
     source = Source.at(path)
     rows: InertialRows | None = read_as(source, "inertial")
@@ -61,12 +58,7 @@ def attach_inertial(recording: Recording, path: str | Path, noise: str | Path | 
 
 
 def attach_inertial_noise(recording: Recording, path: str | Path) -> Recording:
-    """Return a recording with other noise densities of its inertial samples, those of ``sensor.yaml`` or ``imu.yaml``.
-
-    Raises:
-        LostDataError: The recording has no inertial samples.
-        CalibrationError: The file does not state all four densities.
-    """
+    """Return a recording with the noise densities of ``sensor.yaml`` or ``imu.yaml`` for its inertial samples."""
     if recording.inertial is None:
         raise LostDataError("there are no inertial samples, hence no densities of their noise", source=recording.source)
     changes = _with_samples(recording, replace(recording.inertial, noise=_stated(path)))
@@ -99,16 +91,12 @@ def _with_samples(recording: Sequence | ImageRecording, samples: InertialSamples
 
 def _with_chain(rows: InertialRows, place: Path, takes_extrinsics: bool) -> InertialRows:
     """Return the rows with what a chain of Kalibr beside them states."""
-    chain = beside(place if place.is_dir() else place.parent, CHAINS)
+    chain = find_chain(place if place.is_dir() else place.parent)
     if chain is None:
         return rows
-    read = read_yaml(chain)
-    rows = replace(rows, late_s=late_s(read, "cam0"))
-    if not takes_extrinsics or (found := chain_of(read, "cam0")) is None:
-        return rows
-    return replace(
-        rows, T_cam_imu=found[0], notes=(*rows.notes, f"T_cam_imu is that of cam0 in {chain.name}.", *found[1])
-    )
+    late_s, T_cam_imu, notes = read_chain(chain)
+    rows = replace(rows, late_s=late_s)
+    return replace(rows, T_cam_imu=T_cam_imu, notes=(*rows.notes, *notes)) if takes_extrinsics else rows
 
 
 def _lacks_extrinsics(recording: Sequence | ImageRecording) -> bool:
@@ -127,21 +115,10 @@ def with_rows(recording: Recording, rows: InertialRows) -> Recording:
     if (left_out := len(recording.time_s) - (end - begin)) > 0:
         recording = recording[begin:end]
         notes.append(f"{left_out} frames before or after all inertial samples are left out.")
-    changes: dict[str, Any] = {} if rows.T_cam_imu is None else _of_body(recording, rows)
+    changes: dict[str, Any] = {} if rows.T_cam_imu is None else of_body(recording, rows.T_cam_imu)
     if np.array_equal(changes.get("T_cam_imu", recording.T_cam_imu), T_CAM_BODY):
         notes.append("No file states T_cam_imu: the inertial unit is taken to be the left camera, x forward.")
     attributes = {**recording.attributes, **rows.attributes}
     attributes |= {"imu_late_s": rows.late_s} if rows.late_s else {}
     changes |= _with_samples(recording, samples)
     return replace(recording, notes=tuple(notes), attributes=attributes, **changes)
-
-
-def _of_body(recording: Recording, rows: InertialRows) -> dict[str, Any]:
-    """Return the extrinsics of the inertial unit, and the truth of the recording for it."""
-    assert rows.T_cam_imu is not None
-    changes: dict[str, Any] = {"T_cam_imu": rows.T_cam_imu}
-    moved = se3.inverse(recording.T_cam_imu) @ rows.T_cam_imu
-    if recording.truth is not None and np.abs(moved - np.eye(4)).max() > 1e-6:
-        T_world_imu = recording.truth.T_world_imu @ moved
-        changes["truth"] = replace(recording.truth, T_world_imu=T_world_imu, motion=None)
-    return changes

@@ -54,14 +54,11 @@ class InertialRows:
 
 
 def samples_of(rows: InertialRows) -> tuple[InertialSamples, tuple[str, ...]]:
-    """Return the samples on the clock of the images, and notes.
-
-    Repeated stamps are dropped and counted. Densities of 0 count as not stated.
+    """Return the samples on the clock of the images, and notes; repeated stamps are dropped, densities of 0 not stated.
 
     Raises:
         StampError: A stamp goes back, and the rows are not to be sorted.
-        ShapeError: There are less than two samples.
-        DataError: The units cannot be right.
+        DataError: There are less than two samples, or the units cannot be right.
     """
     rows, notes = in_order(rows)
     if len(rows.time_ns) < 2:
@@ -178,11 +175,7 @@ def _is_slow(factor: float) -> bool:
 
 
 def covered_frames(samples: InertialSamples, time_s: Array, source: str) -> tuple[int, int]:
-    """Return the first frame and the end of those (T,) within the samples, or at most one step outside.
-
-    Raises:
-        LostDataError: There are less than two.
-    """
+    """Return the first frame and the end of those (T,) within the samples, or at most one step outside: two or more."""
     reach = samples.step_s
     begin = int(np.searchsorted(time_s, samples.time_s[0] - reach))
     end = int(np.searchsorted(time_s, samples.time_s[-1] + reach, side="right"))

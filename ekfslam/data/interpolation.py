@@ -1,7 +1,7 @@
 """Stretches of a recording that were never measured: where a unit had a gap, and a line was drawn across it.
 
 OXTS units (KITTI) fill gaps of velocities and poses so. In the first second of 2011_09_30_drive_0020 the true poses
-move by 10.5 m/s and the velocities are 11.5 m/s; yaw rates are wrong by up to 2.7 deg/s.
+move by 10.5 m/s and the velocities are 11.5 m/s.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ def interpolated_intervals(twist: Array) -> BoolArray:
     """Return which intervals (T,) have interpolated velocities; ``[k]`` leads from frame k-1 to frame k.
 
     All six velocities of (T, 6) must have second differences of 0, to rounding, at `SHORTEST` samples in a row, and
-    must change: a vehicle that stands still, and a simulation of constant velocity, have nothing interpolated. A line
-    that was rounded to few digits, or had noise added, is not recognised.
+    must change: nothing is interpolated at rest or at constant velocity. A line that was rounded to few digits, or had
+    noise added, is not recognised.
     """
     found = np.zeros(len(twist), dtype=bool)
     if len(twist) < SHORTEST + 2:
@@ -43,9 +43,8 @@ def interpolated_intervals(twist: Array) -> BoolArray:
 def interpolated_poses(T_world_imu: Array) -> BoolArray:
     """Return which intervals (n,) between poses (n, 4, 4) are interpolated; ``[k]`` leads from pose k-1 to pose k.
 
-    A line between two poses is driven at any speed, so jitter of stamps hides it. But successive motions along it have
-    one direction, to rounding, in position and rotation. A rig at rest, and straight lines of a simulation, whose
-    motions hardly ever bend, have nothing interpolated.
+    Jitter of stamps hides a line between two poses, but successive motions along it have one direction, to rounding, in
+    position and rotation. Nothing is interpolated at rest, or on straight lines whose motions hardly ever bend.
     """
     found = np.zeros(len(T_world_imu), dtype=bool)
     if len(found) < SHORTEST + 2:

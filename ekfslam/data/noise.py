@@ -26,12 +26,7 @@ class ProcessNoise:
     gap_std: Array  # (6,) further error of samples that were interpolated across a gap
 
     def pose_std_during(self, is_gap: BoolArray | bool, doubt: Array | float = 1.0) -> Array:
-        """Return the error (..., 6) of velocities that move the pose.
-
-        Args:
-            is_gap: (...) whether they were interpolated.
-            doubt: (...) factor of their standard deviations.
-        """
+        """Return the error (..., 6) of velocities that move the pose, interpolated or not, times ``doubt`` (...)."""
         std = np.hypot(self.pose_std, np.where(np.asarray(is_gap)[..., None], self.gap_std, 0.0))
         return std * np.asarray(doubt)[..., None]
 
@@ -50,9 +45,9 @@ class ProcessNoise:
 class TrackError:
     """Error of a track in the image, eq. (10): it starts with the track and then walks.
 
-    An observation is ``z(k) = h(k) + e(k)`` with ``e ~ N(0, first^2)`` at landmark initialisation. While the track goes
-    on, ``e(k) = e(k-1) + N(0, walk^2 (1 + (flow / flow_px)^2 + (way / depth / parallax)^2))``: features are followed
-    worse the further they move, and the more their surroundings are deformed.
+    ``z(k) = h(k) + e(k)`` with ``e ~ N(0, first^2)`` at landmark initialisation, then ``e(k) = e(k-1) + N(0, walk^2 (1
+    + (flow / flow_px)^2 + (way / depth / parallax)^2))``: features are followed worse the further they move, and the
+    more their surroundings are deformed.
     """
 
     first_std: Array  # (3,) standard deviation at landmark initialisation, in the sensor's rows, px
@@ -64,11 +59,8 @@ class TrackError:
     def step_variance(self, motion_px: Array, parallax: Array) -> Array:
         """Return the variances (n, 3) of differences from the frame before.
 
-        The error of a row grows with its own motion, and with the share `ACROSS` of the others' motion.
-
-        Args:
-            motion_px: (n, 3) motion of the rows.
-            parallax: (n,) way of the camera over the depth.
+        The error of a row grows with its own motion (n, 3) px, and with the share `ACROSS` of the others'; ``parallax``
+        (n,) is the way of the camera over the depth.
         """
         square = np.asarray(motion_px) ** 2
         flow = (1.0 - ACROSS) * square + ACROSS * square.sum(axis=1, keepdims=True)

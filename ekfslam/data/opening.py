@@ -27,10 +27,7 @@ def open_recording(
     topics: Iterable[str] = (),
     calibration: str | Path | None = None,
 ) -> Sequence | ImageRecording:
-    """Open a recording as it is stored: as images if it has any, otherwise as tracks.
-
-    For arguments and errors see `ekfslam.open_sequence`.
-    """
+    """Open a recording as images if it has any, otherwise as tracks; for arguments see `ekfslam.open_sequence`."""
     choices = {"extrinsics": (extrinsics, Extrinsics), "lateral": (lateral, Lateral)}
     for name, (choice, known) in choices.items():
         if choice not in get_args(known):
@@ -58,13 +55,11 @@ def open_images(
     topics: Iterable[str] = (),
     calibration: str | Path | None = None,
 ) -> ImageRecording | None:
-    """Open a recording of stereo images; return None if no reader finds images there.
-
-    For arguments see `ekfslam.open_sequence`.
+    """Open a recording of stereo images; None: no reader finds images there. For arguments see `ekfslam.open_sequence`.
 
     Raises:
         UnknownFormatError: A file of the recording is missing or damaged.
-        DataError: A field is missing or malformed; the subclass says how.
+        DataError: A field is missing or malformed.
     """
     return _images(_placed(Source.at(source, lateral=lateral), topics, calibration))
 
@@ -92,22 +87,18 @@ def attach_truth(sequence: Sequence, path: Path) -> Sequence:
     """Replace the truth of a sequence by the poses of a file or folder.
 
     The content decides the format: KITTI odometry or KITTI-360, TUM, the csv of EuRoC or a folder with it, or a drive
-    folder of KITTI raw. A header names the columns, if there is one. A pose with a stamp is given to the frame with the
-    nearest stamp, if that is within half the median time step. Without stamps, row i is the pose of frame i. If a
-    recording begins at a later image n of a drive (KITTI), row n is that of its first frame, unless the file of poses
-    was cut there, too (see `truth_of_frames`).
+    folder of KITTI raw. A pose with a stamp is given to the frame with the nearest stamp, if that is within half the
+    median time step. Without stamps, row i is the pose of frame i. If a recording begins at a later image n of a drive
+    (KITTI), row n is that of its first frame, unless the file of poses was cut there, too (see `truth_of_frames`).
 
-    Stamps are compared in seconds as they are stored. If both clocks have different origins, the error names both
+    Stamps are compared in seconds as they are stored; if both clocks have different origins, the error names both
     spans. Text after ``#`` is a comment. Extra rows are cut, and missing ones leave frames without truth, with a note.
-
     Poses of KITTI come with their noise (`ekfslam.data.truth_noise`); TUM and EuRoC state none.
 
     Raises:
         UnknownFormatError: The file is missing, is not text, or has no known format.
         TruthError: A line is malformed or not a rigid transform, or less than 90 % of the frames are covered.
-        NonFiniteError: A line holds NaN or infinity.
-        StampError: The stamps do not increase.
-        DataError: A drive folder of KITTI raw is malformed; the subclass says how.
+        DataError: A line holds NaN, the stamps do not increase, or a drive folder is malformed.
     """
     poses: Poses | None = read_as(Source.at(path), "truth", sequence)
     if poses is None:

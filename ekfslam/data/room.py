@@ -1,7 +1,7 @@
 """The built-in world ``room``: a hand-held stereo rig or one camera, with an inertial unit, between walls of landmarks.
 
-The trajectory is made from the seed and begins at rest, or is a real one: a TUM file of poses, resampled to 10 Hz. In
-both cases the truth is the cumulative cubic B-spline through the poses, so that samples and images agree exactly.
+The trajectory is made from the seed and begins at rest, or is a TUM file of poses, resampled to 10 Hz. The truth is the
+cumulative cubic B-spline through the poses, so that samples and images agree exactly.
 """
 
 from __future__ import annotations

@@ -181,7 +181,7 @@ class Sequence(Once, Shown):
         noise: Noise | None = None,
         name: str = "tracks",
     ) -> Sequence:
-        """Build a recording from arrays.
+        """Build a recording from arrays; raise a `DataError` if one is malformed, or does not fit the others.
 
         Args:
             time_s: (T,) stamps.
@@ -194,9 +194,6 @@ class Sequence(Once, Shown):
                 forward, left and up.
             T_world_imu: (T, 4, 4) true poses, NaN if unknown.
             camera, velocity_frame, noise, name: See `Sequence`.
-
-        Raises:
-            DataError: An array is malformed, or does not fit the others; the subclass says how.
         """
         stamps = numbers(time_s, "time_s")
         validate_stamps(stamps)

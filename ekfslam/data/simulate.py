@@ -1,11 +1,9 @@
 """Simulated drives with exact truth: the embedded default data, and the raw material of Monte Carlo studies.
 
-Three worlds are built in. ``city`` is a drive through streets with short tracks, whose ids never come back, and some
-gross outliers. ``loop`` is a ring driven several times past the same few landmarks, which keep their ids. ``room`` is
-hand-held, with inertial samples, see `ekfslam.data.room`.
-
-The truth of a drive obeys the model of the filters exactly: the velocity is constant over every interval and
-integrates by eq. (1). The world frame is the IMU frame of the first stamp, x forward, y left, z up.
+``city`` is a drive through streets with short tracks, whose ids never come back, and some gross outliers. ``loop`` is a
+ring driven several times past the same few landmarks, which keep their ids. ``room`` is hand-held, with inertial
+samples, see `ekfslam.data.room`. The truth of a drive obeys eq. (1) exactly, with one velocity an interval. The world
+frame is the IMU frame of the first stamp, x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -119,12 +117,7 @@ BUILTIN: Mapping[str, World] = MappingProxyType({"city": City(), "loop": Loop(),
 
 
 def builtin(name: str) -> Sequence:
-    """Return the sequence of a built-in world such as ``city``, or of a variation such as ``city?seed=3&frames=200``.
-
-    Raises:
-        UnknownFormatError: There is no such world.
-        ConfigError: A parameter is unknown or out of range.
-    """
+    """Return the sequence of a built-in world, ``city``, or of a variation of it, ``city?seed=3&frames=200``."""
     base, _, query = name.partition("?")
     if base not in BUILTIN:
         raise UnknownFormatError(f"no built-in world {base!r}; known: {', '.join(BUILTIN)}")
@@ -141,15 +134,12 @@ def builtin(name: str) -> Sequence:
 
 
 def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
-    """Record a world once; every call gives the same bits.
-
-    The recording has the true noise, all true poses (but see `Drive` on the prior), and the true position of every
-    observed landmark.
+    """Record a world once, with the true noise, all true poses (but see `Drive` on the prior) and landmarks.
 
     Args:
         world: World, whose seed decides stamps, drive and landmarks.
         rng: Generator of first pose, noise, losses and outliers, to record the same drive again with other noise. By
-            default the world's own generator goes on, so that the seed decides everything.
+            default the world's own generator goes on: every call gives the same bits.
     """
     if isinstance(world, Room):
         return simulate_room(world, rng)
@@ -205,10 +195,7 @@ def _drive(world: Loop | City, rng: np.random.Generator) -> tuple[Array, Array, 
 
 
 def _drive_streets(time_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return distance (T,) m and heading (T,) rad in a city, both 0 at the first stamp.
-
-    Every manoeuvre has a duration, a speed at its end and an angle to turn by.
-    """
+    """Return distance (T,) m and heading (T,) rad in a city, both 0 at the first stamp."""
     accelerate_s, brake_s, stand_s, start_s, turn_s = 3.5, 3.5, 3.0, 3.0, 5.0
     streets = int(time_s[-1] / (accelerate_s + brake_s + turn_s)) + 1
     cruise_m_s = rng.uniform(9.0, 12.0, (streets, 2))

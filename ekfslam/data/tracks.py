@@ -86,8 +86,8 @@ def repeated_frames(observations: Observations, twist: Array) -> IntArray:
     """Return ascending frames of a moving rig that repeat the previous frame's pixels in every common track.
 
     One common track is enough: a subpixel tracker does not return the same four numbers from another image. Velocities
-    ``twist`` (T, 6) say whether the rig moves; at rest, pixels may repeat. In such a frame the tracker was restarted at
-    the old pixels in the new image: they are right, but show other points than before, so no track leads across.
+    ``twist`` (T, 6) say whether the rig moves. In such a frame the tracker was restarted at the old pixels in the new
+    image: they are right, but show other points than before, so no track leads across.
     """
     earlier, later = adjacent(observations)
     same = (observations.pixels_px[earlier] == observations.pixels_px[later]).all(axis=1)

@@ -65,13 +65,7 @@ class Prior(NamedTuple):
 
 
 def moving_tracks(sequence: Sequence, observations: Observations, noise: Noise) -> IntArray:
-    """Return the ids (m,) of tracks that probably move; none unless velocities are noisy and errors of tracks walk.
-
-    Args:
-        sequence: Recording with its velocities.
-        observations: Tracks to judge.
-        noise: Noise whose errors of tracks are those over many frames.
-    """
+    """Return the ids (m,) of tracks that probably move; none unless velocities are noisy and errors of tracks walk."""
     error, ids = noise.track_error, observations.ids
     if error is None or noise.twist_walk_std is None or not sequence.has_velocities or not len(ids):
         return ids[:0]
@@ -147,13 +141,7 @@ def velocity_prior(sequence: Sequence, frames: IntArray, noise: Noise) -> Prior:
 
 
 def moving_probability(flow: Flow, frames: IntArray, prior: Prior) -> Array:
-    """Return the probability (n,) that a track moves, for the tracks of a window in ascending order.
-
-    Args:
-        flow: Motion over intervals that lead to ``frames``.
-        frames: (m,) successive frames.
-        prior: Prior of x over these intervals.
-    """
+    """Return the probability (n,) that a track moves, in ascending order of tracks, by their flow over frames (m,)."""
     rows, interval = flow.rows, flow.frame - frames[0]
     ids, track = np.unique(flow.track, return_inverse=True)
     products, weight, moves = rows.swapaxes(1, 2) @ rows, np.ones(len(rows)), np.zeros(len(ids))
@@ -183,7 +171,6 @@ def _solved(
         products: (k, 10, 10) ``rows^T rows`` of single intervals, weighted.
         interval, track: (k,) their index among intervals and tracks.
         site: (n, 3, 3) information of c and e beside the rows, and (n, 3) information vector.
-        prior: Prior of x.
     """
     m, n = len(prior.vector), len(site[0])
     of_interval, of_track = _summed(products, interval, m), _summed(products, track, n)
@@ -216,9 +203,8 @@ def _summed(products: Array, group: IntArray, groups: int) -> Array:
 def _judged(information: Array, vector: Array) -> tuple[Array, Array, tuple[Array, Array]]:
     """Judge points by what the others say of c: information (n, 2, 2) and information vector (n, 2).
 
-    Returns:
-        c (n, 2) by that alone; the probability (n,) that a point moves; and the information (n, 2, 2) and vector (n, 2)
-        that bring c to the mean and covariance of the mixture of both hypotheses.
+    Return c (n, 2) by that alone; the probability (n,) that a point moves; and the information (n, 2, 2) and vector (n,
+    2) that bring c to the mean and covariance of the mixture of both hypotheses.
     """
     # A share of the free start keeps it regular where the others say nothing.
     V = np.linalg.inv(information + _FREE_M_S**-2 * np.eye(2))

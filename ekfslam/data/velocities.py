@@ -48,11 +48,9 @@ def attach_velocities(
         lateral: Reading of the lateral velocity of KITTI, see `ekfslam.open_sequence`.
 
     Raises:
-        ConfigError: There is no such frame.
         UnknownFormatError: The file is missing or of unknown content.
-        StampError: Stamps do not increase.
         LostDataError: Frames lie outside of the samples, or in a gap between them.
-        DataError: The file is malformed; the subclass says how.
+        DataError: The file is malformed.
     """
     if velocity_frame is not None and velocity_frame not in get_args(VelocityFrame):
         raise ConfigError(f"the frame of velocities must be imu or level, found {velocity_frame!r}")
@@ -68,18 +66,20 @@ def attach_velocities(
     notes += [*found.notes, f"Velocities ({found.velocity_frame} frame) from {path}: {how}."]
     changes: dict[str, Any] = {"twist": twist, "velocity_frame": found.velocity_frame}
     if found.T_cam_imu is not None:
-        changes |= _of_body(recording, found.T_cam_imu)
+        changes |= of_body(recording, found.T_cam_imu)
         notes.append("The body is the IMU of the recording that the velocities are from, and T_cam_imu is its own.")
     attributes = {**own, **found.attributes, **stated_at(found, recording.time_s), **gaps}
     return replace(recording, notes=tuple(notes), attributes=attributes, **changes)
 
 
-def _of_body(recording: Sequence | ImageRecording, T_cam_imu: Array) -> dict[str, Any]:
+def of_body(recording: Sequence | ImageRecording, T_cam_imu: Array) -> dict[str, Any]:
     """Return the extrinsics of another body, and the truth of a recording for it."""
-    if recording.truth is None:
-        return {"T_cam_imu": T_cam_imu}
-    T_world_imu = recording.truth.T_world_imu @ se3.inverse(recording.T_cam_imu) @ T_cam_imu
-    return {"T_cam_imu": T_cam_imu, "truth": replace(recording.truth, T_world_imu=T_world_imu, motion=None)}
+    changes: dict[str, Any] = {"T_cam_imu": T_cam_imu}
+    moved = se3.inverse(recording.T_cam_imu) @ T_cam_imu
+    if recording.truth is not None and np.abs(moved - np.eye(4)).max() > 1e-6:
+        T_world_imu = recording.truth.T_world_imu @ moved
+        changes["truth"] = replace(recording.truth, T_world_imu=T_world_imu, motion=None)
+    return changes
 
 
 def read_velocities(path: Path, lateral: Lateral = "corrected") -> VelocitySamples:

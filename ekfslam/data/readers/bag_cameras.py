@@ -13,7 +13,8 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.data.checks import spelled_as_in
 from ekfslam.data.images import Distortion, PairCalibration, side_by_side
 from ekfslam.data.readers import messages
-from ekfslam.data.readers.calibrations import PairFile, find_chain, lens_of, read_pair, rectified_apart
+from ekfslam.data.readers.calibrations import PairFile, lens_of, read_pair, rectified_apart, shift_of
+from ekfslam.data.readers.imu_yaml import find_chain
 from ekfslam.data.readers.messages import CAMERA_INFO, COMPRESSED, IMAGE, Bag, frame_of
 from ekfslam.data.readers.pictures import without_side
 from ekfslam.errors import CalibrationError, LostDataError
@@ -90,15 +91,9 @@ def first_of(bag: Bag, connection: Any) -> Any:
 def pair_of(bag: Bag, calibration: str | None = None) -> BagPair:
     """Choose the stereo pair of a bag: named topics, otherwise by CameraInfo, a calibration file, or the topics' names.
 
-    Of several pairs a rectified one is preferred, then images that are not compressed. Depth and the like are no
-    candidates. Without CameraInfo, the chain of Kalibr beside the bag is taken if no file is given.
-
-    Args:
-        bag: The bag.
-        calibration: File for `read_pair`, which takes precedence over CameraInfo.
-
-    Raises:
-        CalibrationError: There is no such pair, or its calibration is impossible; the message lists all topics.
+    Of several pairs a rectified one is preferred, then images that are not compressed. A ``calibration`` file for
+    `read_pair` takes precedence over CameraInfo. Without either, the chain of Kalibr beside the bag is taken. Raise
+    `CalibrationError`, which lists all topics, if there is no such pair.
     """
     cameras = _cameras(bag)
     if calibration is None and sum(camera.info is not None for camera in cameras) < 2:
@@ -156,10 +151,8 @@ def _by_info(bag: Bag, cameras: list[Camera]) -> tuple[Camera, Camera, tuple[str
         ]
     pairs = _best(pairs)
     if not pairs:
-        found = printable(", ".join(camera.topic for camera in known)) or "none"
-        message = (
-            f"expected two cameras with images and CameraInfo, found {len(known)}: {found}; {_WAYS}; {listed(bag)}"
-        )
+        found = f"found {len(known)}: {printable(', '.join(camera.topic for camera in known)) or 'none'}"
+        message = f"expected two cameras with images and CameraInfo, {found}; {_WAYS}; {listed(bag)}"
         raise CalibrationError(message, field="topics")
     return (*pairs[0], _others(pairs))
 
@@ -211,9 +204,8 @@ def _by_names(bag: Bag, cameras: list[Camera], file: PairFile) -> tuple[Camera, 
     is_distorted = file.left.lens.model != "none"
     pairs.sort(key=lambda pair: (pair[0].is_rectified == is_distorted, _rank(pair[0]), pair[0].topic))
     if not pairs:
-        raise CalibrationError(
-            f"no two topics are of a left and a right camera by name; {_WAYS}; {listed(bag)}", field="topics"
-        )
+        message = f"no two topics are of a left and a right camera by name; {_WAYS}; {listed(bag)}"
+        raise CalibrationError(message, field="topics")
     return (*pairs[0], _others(pairs))
 
 
@@ -234,8 +226,7 @@ def places_of(camera: Camera) -> tuple[IntArray, int, tuple[str, ...]]:
     rows, notes = in_order_of_stamps(np.array(found, dtype=np.int64), 1, f"images of {topic}")
     bits = max(largest.bit_length(), 8) if is_deep else 16
     if is_deep:
-        note = f"Images of 16 bits of {topic} use {bits}, by the largest value: the upper eight of these are kept."
-        notes = (*notes, note)
+        notes += (f"Images of 16 bits of {topic} use {bits}, by the largest value: the upper eight of these are kept.",)
     return rows, bits, notes
 
 
@@ -257,9 +248,7 @@ def _calibration(left: Camera, right: Camera) -> tuple[PairCalibration, Array]:
     if left.is_rectified != right.is_rectified:
         raise CalibrationError("images of one camera are rectified, of the other not", field="topics")
     P_left, P_right = left.projection, right.projection
-    if not P_right[0, 0] > 0:
-        raise CalibrationError("P has no positive focal length", field="CameraInfo")
-    baseline_m = float(-P_right[0, 3] / P_right[0, 0])
+    baseline_m = shift_of(P_right, "CameraInfo")
     R_left, R_right = (_rotation(camera) for camera in (left, right))
     if left.is_rectified:
         return PairCalibration(P_left[:, :3], P_right[:, :3], left.size, side_by_side(baseline_m)), R_left

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ekfslam.arrays import Array, IntArray
+from ekfslam.arrays import Array
 from ekfslam.data.inertial import InertialRows, in_order
 from ekfslam.data.inputs import VelocitySamples, linear
-from ekfslam.data.readers.imu_yaml import NAMES, beside, calibrated, read_imu_yaml
+from ekfslam.data.readers.imu_yaml import beside, calibrated, read_imu_yaml
 from ekfslam.data.readers.messages import IMU, Bag, frame_of
 from ekfslam.data.sequence import TWIST_STD
 from ekfslam.errors import LostDataError
@@ -38,11 +38,8 @@ class _Stream:
 def inertial_of(bag: Bag, near: str = "") -> tuple[InertialRows | None, str, tuple[str, ...]]:
     """Return the inertial samples of a bag, the name of their frame, and notes; None and no name if it has none.
 
-    Forces of a stream of their own are interpolated linearly to the stamps of the gyroscope.
-
-    Args:
-        bag: The bag; of topics that it names, none of another is used.
-        near: Topic of images; a stream that shares more of its name is preferred, then one with more messages.
+    Forces of a stream of their own are interpolated linearly to the stamps of the gyroscope. A stream that shares more
+    of its name with ``near``, a topic of images, is preferred, then one with more messages.
     """
     streams = [_looked_at(bag, connection) for connection in bag.connections(IMU)]
     topics = [stream.topic for stream in streams]
@@ -89,22 +86,14 @@ def _samples(bag: Bag, gyro: _Stream, accel: _Stream) -> tuple[InertialRows, str
     rows, frame = _rows(bag, gyro)
     if accel is not gyro:
         rows = _paired(rows, _rows(bag, accel)[0])
-    calibration = beside_bag(bag.path, NAMES)
+    calibration = beside(*([bag.path] if bag.path.is_dir() else []), bag.path.parent)
     if calibration is not None:
         rows = calibrated(rows, read_imu_yaml(calibration))
     return rows, frame
 
 
-def beside_bag(path: Path, names: tuple[str, ...]) -> Path | None:
-    """Return the first file with one of some names in the folder of a bag, or beside it."""
-    return (beside(path, names) if path.is_dir() else None) or beside(path.parent, names)
-
-
 def _rows(bag: Bag, stream: _Stream) -> tuple[InertialRows, str]:
-    stamps: list[int] = []
-    times: list[int] = []
-    table: list[list[float]] = []
-    frame = ""
+    stamps, times, table, frame = list[int](), list[int](), list[list[float]](), ""
     for written_ns, content in bag.raw(stream.connection):
         message = bag.message(stream.connection, content)
         w, f = message.angular_velocity, message.linear_acceleration
@@ -114,10 +103,8 @@ def _rows(bag: Bag, stream: _Stream) -> tuple[InertialRows, str]:
         table.append([w.x, w.y, w.z, f.x, f.y, f.z])
     values, topic = np.array(table, dtype=float).reshape(-1, 6), printable(stream.topic)
     known = np.isfinite(values).all(axis=1)
-    notes: tuple[str, ...] = ()
-    notes = (
-        notes if known.all() else (f"{int((~known).sum())} samples of {topic} are NaN or infinite: they are dropped.",)
-    )
+    lost = f"{int((~known).sum())} samples of {topic} are NaN or infinite: they are dropped."
+    notes = () if known.all() else (lost,)
     if not any(stamps):
         stamps, notes = times, (*notes, f"Messages of {topic} have no stamps: the times of writing are taken.")
     time_ns, values = np.array(stamps, dtype=np.int64)[known], values[known]
@@ -129,32 +116,19 @@ def _paired(gyro: InertialRows, accel: InertialRows) -> InertialRows:
     """Return the samples of a gyroscope with forces of another stream at its stamps, as far as these reach."""
     (gyro, of_gyro), (accel, of_accel) = in_order(gyro), in_order(accel)
     notes = (*gyro.notes, *of_gyro, *accel.notes, *of_accel)
-    if len(gyro.time_ns) < 2 or len(accel.time_ns) < 2:
-        raise LostDataError(
-            f"{min(len(gyro.time_ns), len(accel.time_ns))} samples; two are needed", source=accel.source
-        )
+    fewest = min(len(gyro.time_ns), len(accel.time_ns))
+    if fewest < 2:
+        raise LostDataError(f"{fewest} samples; two are needed", source=accel.source)
     inside = (gyro.time_ns >= accel.time_ns[0]) & (gyro.time_ns <= accel.time_ns[-1])
-    time_ns = gyro.time_ns[inside]
-    first = accel.time_ns[0]
+    time_ns, first = gyro.time_ns[inside], accel.time_ns[0]
     since = [(stamps - first) / 1e9 for stamps in (accel.time_ns, time_ns)]
     steps = np.diff(since[0])
     rates = 1.0 / np.median(steps), 1e9 / np.median(np.diff(gyro.time_ns))
     notes += (f"Forces at {rates[0]:.4g} Hz are interpolated to the stamps of the gyroscope, {rates[1]:.4g} Hz.",)
-    notes += _pauses(steps)
-    return replace(
-        gyro,
-        time_ns=time_ns,
-        gyro_rad_s=gyro.gyro_rad_s[inside],
-        accel_m_s2=linear(since[0], accel.accel_m_s2, since[1]),
-        notes=notes,
-    )
-
-
-def _pauses(steps: Array) -> tuple[str, ...]:
-    gaps: IntArray = np.flatnonzero(steps > 3.0 * np.median(steps))
-    if not len(gaps):
-        return ()
-    return (f"The forces have {len(gaps)} gaps of more than three steps; the longest is {steps.max():.3g} s.",)
+    if count := int((steps > 3.0 * np.median(steps)).sum()):
+        notes += (f"The forces have {count} gaps of more than three steps; the longest is {steps.max():.3g} s.",)
+    forces = linear(since[0], accel.accel_m_s2, since[1])
+    return replace(gyro, time_ns=time_ns, gyro_rad_s=gyro.gyro_rad_s[inside], accel_m_s2=forces, notes=notes)
 
 
 def imu_of_bag(path: Path) -> InertialRows | None:
@@ -167,7 +141,7 @@ def imu_of_bag(path: Path) -> InertialRows | None:
 def velocities_of_unit(
     velocities: VelocitySamples, T_imu_base: Array | None, frame: str
 ) -> tuple[VelocitySamples | None, str]:
-    """Return velocities of another body, such as wheels, as velocities of the inertial unit, and a note.
+    """Return velocities of another body, such as wheels, as those of the inertial unit, and a note.
 
     ``v_imu = R v + t x R w`` with ``T_imu_base = [R, t]``; None if that is not known.
     """

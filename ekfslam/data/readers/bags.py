@@ -20,16 +20,15 @@ from ekfslam.data.inertial import InertialRows
 from ekfslam.data.inputs import VelocitySamples
 from ekfslam.data.readers import messages
 from ekfslam.data.readers.bag_cameras import Camera, in_order_of_stamps, pair_of, places_of
-from ekfslam.data.readers.bag_imu import beside_bag, imu_of_bag, inertial_of, velocities_of_unit
+from ekfslam.data.readers.bag_imu import imu_of_bag, inertial_of, velocities_of_unit
 from ekfslam.data.readers.calibrations import PairFile
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
-from ekfslam.data.readers.imu_yaml import CHAINS, chain_of, late_s
+from ekfslam.data.readers.imu_yaml import find_chain, read_chain
 from ekfslam.data.readers.messages import COMPRESSED, IMAGE, ODOMETRY, TRANSFORMS, VELOCITIES, Bag, frame_of
 from ekfslam.data.readers.pictures import pair_stamps
 from ekfslam.data.readers.poses import velocities_of
 from ekfslam.data.readers.registry import CALIBRATION, Reader, Source
 from ekfslam.data.readers.text import first_row
-from ekfslam.data.readers.yaml import read_yaml
 from ekfslam.data.sequence import TWIST_STD
 from ekfslam.data.velocities import is_covered, resample, stated_at
 from ekfslam.errors import LostDataError, StampError, UnknownFormatError
@@ -42,11 +41,9 @@ class BagPairs:
     """Load pairs of images from a bag, which is opened at the first call.
 
     Args:
-        path: Path of the bag.
         topics: Topics of the left and the right images.
         places: (T, 2) time of writing and stamp, ns, of the left and the right images.
-        size: Required width and height of all images.
-        bits: Used bits of images of 16 bits, see `read_gray`.
+        size, bits: Required width and height; used bits of images of 16 bits, see `decode_gray`.
     """
 
     def __init__(
@@ -82,18 +79,14 @@ class BagPairs:
 def open_bag(path: Path, topics: tuple[str, ...] = (), calibration: str | None = None) -> ImageRecording:
     """Open the images of the stereo pair of a bag, its calibration, inertial samples and velocities if it has any.
 
-    The CameraInfo of the right camera has a baseline in P. Topics with ``rect`` in their last part are rectified
-    images with the camera P; others are as the lens sees them, with K, D and R. The body is the inertial unit if
-    ``/tf_static``, or a chain of Kalibr beside the bag, connects it to the camera; else the frame of the velocities.
-    If nothing connects that to the camera either, the body is the left camera.
+    The CameraInfo of the right camera has a baseline in P. Topics with ``rect`` in their last part are rectified images
+    with the camera P; others are as the lens sees them, with K, D and R. The body is the inertial unit if
+    ``/tf_static``, or a chain of Kalibr beside the bag, connects it to the camera; else the frame of the velocities. If
+    nothing connects that to the camera either, the body is the left camera.
 
     Args:
-        path: Path of the bag.
         topics: Topics to use: left and right images, velocities, inertial samples; those of other types are chosen.
         calibration: File for `calibrations.read_pair` in place of CameraInfo.
-
-    Raises:
-        MissingPackageError: rosbags is not installed.
     """
     with contextlib.closing(Bag(path, topics)) as bag, spelled_as_in(str(path)):
         pair = pair_of(bag, calibration)
@@ -156,14 +149,11 @@ def _unit(bag: Bag, left: Camera, frame: str, file: PairFile | None) -> tuple[Ar
     if file is not None and file.T_cam_imu is not None:
         return file.T_cam_imu, file.late_s, (f"T_cam_imu is that of {file.files[0].name}.",)
     T = np.eye(4) if frame and frame == left.frame else _transform(bag, left.frame, frame) if frame else None
-    late, notes = 0.0, tuple[str, ...]()
-    chain = beside_bag(bag.path, CHAINS)
+    late, chain = 0.0, find_chain(bag.path if bag.path.is_dir() else bag.path.parent, bag.path.resolve().parent)
     if chain is not None:
-        read = read_yaml(chain)
-        late = late_s(read, "cam0")
-        if T is None and (found := chain_of(read, "cam0")) is not None:
-            T, notes = found[0], (f"T_cam_imu is that of cam0 in {chain.name}.", *found[1])
-            return T, late, notes
+        late, T_chain, notes = read_chain(chain)
+        if T is None and T_chain is not None:
+            return T_chain, late, notes
     if T is not None:
         return T, late, (f"T_cam_imu is that of {printable(frame)} to {printable(left.frame)} in /tf_static.",)
     where = f"/tf_static does not connect {printable(frame) or 'it'} and {printable(left.frame)}"

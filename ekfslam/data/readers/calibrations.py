@@ -20,7 +20,7 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.data.checks import require_finite, require_rigid, require_shape, spelled_as_in
 from ekfslam.data.images import Distortion, DistortionModel, PairCalibration, side_by_side
-from ekfslam.data.readers.imu_yaml import chain_of, late_s, pose_of
+from ekfslam.data.readers.imu_yaml import chain_of, find_chain, late_s, pose_of
 from ekfslam.data.readers.pictures import other_side, side_of
 from ekfslam.data.readers.text import read_lines
 from ekfslam.data.readers.yaml import Calibration, read_yaml
@@ -28,14 +28,6 @@ from ekfslam.errors import CalibrationError, DataError, ExtrinsicsError, Unknown
 from ekfslam.geometry import se3
 
 Size = tuple[int, int]
-CHAINS = (
-    "camchain-imucam*.yaml",
-    "kalibr_imucam_chain.yaml",
-    "camchain.yaml",
-    "*camchain*.yaml",
-    "*imucam*chain*.yaml",
-    "*camchain*.yml",
-)  # patterns of the usual names, the likelier first
 _MODELS: dict[str, DistortionModel] = {
     "none": "none",
     "radial-tangential": "radtan",
@@ -46,18 +38,8 @@ _MODELS: dict[str, DistortionModel] = {
     "fisheye": "equidistant",
     "KannalaBrandt8": "equidistant",
 }
-_KEYS = {
-    "left",
-    "right",
-    "times",
-    "rate_hz",
-    "T_right_left",
-    "baseline_m",
-    "T_cam_imu",
-    "velocities",
-    "bit_depth",
-    "calibration",
-}
+_KEYS = {"left", "right", "times", "rate_hz", "T_right_left", "baseline_m", "T_cam_imu"}
+_KEYS |= {"velocities", "bit_depth", "calibration"}
 _TABLES = {"left_camera", "right_camera"}
 _CAMERA_KEYS = {"intrinsics", "distortion_model", "distortion"}
 EXPECTED = (
@@ -124,7 +106,7 @@ def read_pair(path: str | Path) -> PairFile:
 
     Raises:
         UnknownFormatError: The file is missing or of unknown content.
-        DataError: A key is missing or malformed; the subclass says how.
+        DataError: A key is missing or malformed.
     """
     path = Path(path)
     if path.is_dir():
@@ -197,11 +179,6 @@ def _numbers(value: Any, shape: tuple[int | None, ...], name: str) -> Array:
     return found
 
 
-def find_chain(*folders: Path) -> Path | None:
-    """Return the first chain of Kalibr in some folders, under any of the usual names."""
-    return next((file for folder in folders for name in CHAINS for file in sorted(folder.glob(name))), None)
-
-
 def _in_folder(folder: Path) -> Path:
     chain = find_chain(folder)
     if chain is None:
@@ -215,25 +192,20 @@ def _in_folder(folder: Path) -> Path:
 
 def _chain(read: Calibration) -> PairFile:
     """Read ``cam0`` and ``cam1`` of a chain of Kalibr."""
-    cameras = [kalibr_camera(read, f"{name}.", "distortion_coeffs") for name in ("cam0", "cam1")]
-    poses, notes = [], tuple[str, ...]()
-    for name in ("cam0", "cam1"):
-        found = chain_of(read, name)
-        poses.append(None if found is None else found[0])
-        notes += () if found is None else found[1]
-    if poses[0] is not None and poses[1] is not None:
-        T_right_left = poses[1] @ se3.inverse(poses[0])
+    cameras = [_kalibr_camera(read, f"{name}.", "distortion_coeffs") for name in ("cam0", "cam1")]
+    (T_left, notes), (T_right, further) = (chain_of(read, name) for name in ("cam0", "cam1"))
+    if T_left is not None and T_right is not None:
+        T_right_left = T_right @ se3.inverse(T_left)
     elif "cam1.T_cn_cnm1" in read:
         T_right_left = pose_of(read, "cam1.T_cn_cnm1")
     else:
         raise CalibrationError("neither T_cn_cnm1 nor T_cam_imu of both cameras is stated", field="cam1")
-    topics = [read.values.get(f"{name}.rostopic", "").strip().strip("\"'") for name in ("cam0", "cam1")]
-    named = (topics[0], topics[1]) if all(topics) else None
-    return PairFile(cameras[0], cameras[1], T_right_left, (read.path,), poses[0], notes, named, late_s(read, "cam0"))
+    left, right = (read.values.get(f"{name}.rostopic", "").strip().strip("\"'") for name in ("cam0", "cam1"))
+    topics, late = (left, right) if left and right else None, late_s(read, "cam0")
+    return PairFile(cameras[0], cameras[1], T_right_left, (read.path,), T_left, (*notes, *further), topics, late)
 
 
-def kalibr_camera(read: Calibration, prefix: str, coefficients: str) -> CameraFile:
-    """Return a camera of Kalibr or EuRoC."""
+def _kalibr_camera(read: Calibration, prefix: str, coefficients: str) -> CameraFile:
     with spelled_as_in(str(read.path), {"distortion": f"{prefix}{coefficients}"}):
         if (kind := read.word(f"{prefix}camera_model")) != "pinhole":
             raise CalibrationError(f"expected pinhole, found {kind!r}", field=f"{prefix}camera_model")
@@ -263,26 +235,24 @@ def _euroc(read: Calibration) -> PairFile:
     if other is None or not other.is_file():
         raise UnknownFormatError(f"{path}: it has one camera, and there is none of the other side, as cam0 and cam1")
     is_right = side_of(path.stem) == 1 or side_of(path.resolve().parent.name) == 1
-    reads = (read_yaml(other), read) if is_right else (read, read_yaml(other))
-    cameras = [kalibr_camera(each, "", "distortion_coefficients") for each in reads]
-    poses = [se3.inverse(pose_of(each, "T_BS.data" if "T_BS.data" in each else "T_BS")) for each in reads]
-    files = (reads[0].path, reads[1].path)
-    return PairFile(cameras[0], cameras[1], poses[1] @ se3.inverse(poses[0]), files, poses[0])
+    return read_euroc_pair(other, path) if is_right else read_euroc_pair(path, other)
+
+
+def read_euroc_pair(*paths: Path) -> PairFile:
+    """Read ``sensor.yaml`` of the left and of the right camera of EuRoC, with ``T_BS``."""
+    reads = [read_yaml(path) for path in paths]
+    left, right = (_kalibr_camera(read, "", "distortion_coefficients") for read in reads)
+    T_left, T_right = (se3.inverse(pose_of(read, "T_BS")) for read in reads)
+    if left.size != right.size:
+        message = f"{right.size} differs from {left.size} of the left camera"
+        raise CalibrationError(message, source=str(paths[1]), field="resolution")
+    return PairFile(left, right, T_right @ se3.inverse(T_left), paths, T_left)
 
 
 def _openvins(read: Calibration) -> PairFile:
     """Follow the configuration of an estimator to its chain."""
     found = read_pair(read.path.parent / read.word("relative_config_imucam"))
     return replace(found, files=(*found.files, read.path))
-
-
-def _matrix(read: Calibration, key: str, rows: int, columns: int) -> Array:
-    """Return a matrix of OpenCV, ROS or a plain list."""
-    return read.numbers(f"{key}.data" if f"{key}.data" in read else key, rows * columns).reshape(rows, columns)
-
-
-def _list(read: Calibration, key: str) -> Array:
-    return read.numbers(f"{key}.data" if f"{key}.data" in read else key)
 
 
 def _ros(read: Calibration) -> PairFile:
@@ -296,11 +266,12 @@ def _ros(read: Calibration) -> PairFile:
     cameras, turned, shifts = [], [], []
     for each in reads:
         with spelled_as_in(str(each.path)):
-            K, P = _matrix(each, "camera_matrix", 3, 3), _matrix(each, "projection_matrix", 3, 4)
+            P = each.matrix("projection_matrix", 3, 4)
             model = each.word("distortion_model") if "distortion_model" in each else "plumb_bob"
-            lens = lens_of(model, _list(each, "distortion_coefficients"), "distortion_model")
-            cameras.append(CameraFile(K, lens, _size(each, "image_width", "image_height")))
-            turned.append(_rotation(_matrix(each, "rectification_matrix", 3, 3), "rectification_matrix"))
+            lens = lens_of(model, each.numbers("distortion_coefficients"), "distortion_model")
+            size = _size(each, "image_width", "image_height")
+            cameras.append(CameraFile(each.matrix("camera_matrix", 3, 3), lens, size))
+            turned.append(_rotation(each, "rectification_matrix"))
             shifts.append(shift_of(P, "projection_matrix"))
     if not (shifts[0] == 0 < shifts[1]):
         found = f"expected a baseline on the right and none on the left, found {shifts[1]:g} and {shifts[0]:g} m"
@@ -322,8 +293,8 @@ def rectified_apart(R_left: Array, R_right: Array, baseline_m: float) -> Array:
     return se3.inverse(turn_right) @ side_by_side(baseline_m) @ turn_left
 
 
-def _rotation(R: Array, key: str) -> Array:
-    T = se3.transform(R, np.zeros(3))
+def _rotation(read: Calibration, key: str) -> Array:
+    T = se3.transform(read.matrix(key, 3, 3), np.zeros(3))
     require_rigid(T, key, ExtrinsicsError)
     return se3.nearest_rigid(T)[:3, :3]
 
@@ -334,11 +305,11 @@ def _opencv(read: Calibration) -> PairFile:
     beside = read.path.with_name(read.path.name.replace("intrinsics", "extrinsics"))
     further = read_yaml(beside) if "R.data" not in read and "R" not in read and beside != read.path else read
     cameras = [
-        CameraFile(_matrix(read, f"{letter}{i}", 3, 3), lens_of("plumb_bob", _list(read, f"D{i}"), f"D{i}"))
+        CameraFile(read.matrix(f"{letter}{i}", 3, 3), lens_of("plumb_bob", read.numbers(f"D{i}"), f"D{i}"))
         for i in (1, 2)
     ]
     with spelled_as_in(str(further.path)):
-        T = se3.transform(_rotation(_matrix(further, "R", 3, 3), "R"), _matrix(further, "T", 3, 1)[:, 0])
+        T = se3.transform(_rotation(further, "R"), further.numbers("T", 3))
     return PairFile(cameras[0], cameras[1], T, tuple(dict.fromkeys((read.path, further.path))))
 
 
@@ -347,10 +318,10 @@ def _orb_rectifying(read: Calibration) -> PairFile:
     cameras, turned = [], []
     for side in ("LEFT", "RIGHT"):
         size = _size(read, f"{side}.width", f"{side}.height") if f"{side}.width" in read else _orb_size(read)
-        lens = lens_of("plumb_bob", _list(read, f"{side}.D"), f"{side}.D")
-        cameras.append(CameraFile(_matrix(read, f"{side}.K", 3, 3), lens, size))
-        turned.append(_rotation(_matrix(read, f"{side}.R", 3, 3), f"{side}.R"))
-    T = rectified_apart(turned[0], turned[1], shift_of(_matrix(read, "RIGHT.P", 3, 4), "RIGHT.P"))
+        lens = lens_of("plumb_bob", read.numbers(f"{side}.D"), f"{side}.D")
+        cameras.append(CameraFile(read.matrix(f"{side}.K", 3, 3), lens, size))
+        turned.append(_rotation(read, f"{side}.R"))
+    T = rectified_apart(turned[0], turned[1], shift_of(read.matrix("RIGHT.P", 3, 4), "RIGHT.P"))
     return PairFile(cameras[0], cameras[1], T, (read.path,), _orb_body(read))
 
 
@@ -377,7 +348,7 @@ def _orb_two(read: Calibration) -> PairFile:
         baseline = float(read.numbers("Stereo.b", 1)[0]) if "Stereo.b" in read else _orb_bf(read, left)
         return PairFile(left, left, side_by_side(baseline), (read.path,), _orb_body(read))
     right = _orb_camera(read, "Camera2") if "Camera2.fx" in read else left
-    T_left_right = _pose(read, "Stereo.T_c1_c2")
+    T_left_right = pose_of(read, "Stereo.T_c1_c2")
     return PairFile(left, right, se3.inverse(T_left_right), (read.path,), _orb_body(read))
 
 
@@ -389,7 +360,7 @@ def _orb_one(read: Calibration) -> PairFile:
     """Read the settings of ORB-SLAM2 for rectified images, with ``Camera.bf``, or for two fisheyes with ``Tlr``."""
     left = _orb_camera(read, "Camera")
     if any(key.startswith("Tlr") for key in read.values):
-        T_left_right = np.vstack([_matrix(read, "Tlr", 3, 4), [0.0, 0.0, 0.0, 1.0]])
+        T_left_right = np.vstack([read.matrix("Tlr", 3, 4), [0.0, 0.0, 0.0, 1.0]])
         require_rigid(T_left_right, "Tlr", ExtrinsicsError)
         T = se3.inverse(se3.nearest_rigid(T_left_right))
         return PairFile(left, _orb_camera(read, "Camera2"), T, (read.path,), _orb_body(read))
@@ -399,13 +370,7 @@ def _orb_one(read: Calibration) -> PairFile:
 def _orb_body(read: Calibration) -> Array | None:
     """Return ``T_cam_imu`` of ``IMU.T_b_c1`` or ``Tbc``, poses of the left camera in the body."""
     key = next((name for name in ("IMU.T_b_c1", "Tbc") if any(k.startswith(name) for k in read.values)), None)
-    return None if key is None else se3.inverse(_pose(read, key))
-
-
-def _pose(read: Calibration, key: str) -> Array:
-    T = _matrix(read, key, 4, 4)
-    require_rigid(T, key, ExtrinsicsError)
-    return se3.nearest_rigid(T)
+    return None if key is None else se3.inverse(pose_of(read, key))
 
 
 # Formats by a key that tells them, the first that fits.

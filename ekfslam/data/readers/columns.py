@@ -88,8 +88,7 @@ def read_named(
 ) -> Table:
     """Return the rows of some named columns, in that order, with stamps in s; columns that are missing are 0.
 
-    Raises:
-        DataError: A line has another number of columns, or no number in one of these; the type is ``error``.
+    A line with another number of columns, or no number in one of these, raises an ``error``.
     """
     columns = [header.place.get(name, -1) for name in names]
 
@@ -99,9 +98,8 @@ def read_named(
 
     picked = [""] * header.line
     for number, line in enumerate(lines[header.line :], start=header.line + 1):
-        words = (
-            [word.strip() for word in line.split("#")[0].split(header.separator)] if line.split("#")[0].strip() else []
-        )
+        text = line.split("#")[0]
+        words = [word.strip() for word in text.split(header.separator)] if text.strip() else []
         if words and len(words) != header.count:
             raise error(f"{len(words)} columns, expected {header.count}", **line_of(path, number))
         picked.append(" ".join((words[column] or "?") if column >= 0 else "0" for column in columns) if words else "")
@@ -109,11 +107,7 @@ def read_named(
 
 
 def without_repeats(table: Table) -> tuple[Table, tuple[str, ...]]:
-    """Return a table without lines that repeat their predecessor, and a note that counts them.
-
-    Raises:
-        StampError: A stamp does not increase.
-    """
+    """Return a table without lines that repeat their predecessor, and a note; stamps must increase."""
     same = (np.diff(table.values, axis=0) == 0).all(axis=1)
     kept = np.flatnonzero(np.concatenate([[True], ~same])[: len(table.values)])
     found = Table(table.path, table.values[kept], table.line[kept])

@@ -1,7 +1,6 @@
 """Sizes of compressed parts of bags, found before anything is decompressed into memory or to the disk.
 
-A part states its size, but may lie: so it is decompressed piece by piece until the budget is spent, and nothing of this
-is kept.
+A part states its size, but may lie: so it is decompressed piece by piece, and dropped, until the budget is spent.
 """
 
 from __future__ import annotations

@@ -47,11 +47,10 @@ _FLIPPED = np.diag([1.0, -1.0, -1.0, 1.0])
 def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Lateral = "corrected") -> Sequence:
     """Read ``features`` (4 x M x T, -1 or NaN where unseen), velocities (3 x T), stamps, ``K``, ``b``, extrinsics.
 
-    There are two editions. That of the report has ``rotational_velocity`` and ``cam_T_imu``. The later one, of
-    KITTI-360, has ``angular_velocity`` and ``imu_T_cam``, a true camera-to-IMU pose; it ignores both options.
+    The edition of the report has ``rotational_velocity`` and ``cam_T_imu``. The later one, of KITTI-360, has
+    ``angular_velocity`` and ``imu_T_cam``, a true camera-to-IMU pose; it ignores both options.
 
     Args:
-        path: Path of the .npz file.
         extrinsics: ``corrected`` takes ``T_cam_imu = [R, -R t]`` from the stored rotation and translation;
             ``as-stored`` takes the stored matrix, which reproduces the report.
         lateral: Sign of the lateral velocity, see `with_lateral`; ``as-stored`` reproduces the report.

@@ -69,10 +69,7 @@ def read_ece276a_npy(path: Path) -> Sequence:
 
 
 def open_ece276a_images(path: Path) -> ImageRecording | None:
-    """Open lists of images ``cam_imgs_L cam_imgs_R``, all in memory, with the velocities and calibration.
-
-    The path is that of the recording or of its images; return None unless both exist.
-    """
+    """Open images ``cam_imgs_L cam_imgs_R``, all in memory, with the velocities and the calibration of a recording."""
     name = path.stem.removesuffix("_imgs")
     recording, images = path.with_name(f"{name}.npy"), path.with_name(f"{name}_imgs.npy")
     if not (recording.is_file() and images.is_file()):

@@ -20,18 +20,16 @@ from ekfslam.data.images import ImageRecording
 from ekfslam.data.imu import with_rows
 from ekfslam.data.inertial import InertialRows
 from ekfslam.data.observations import TrueMotion
-from ekfslam.data.readers.calibrations import PairFile, find_chain, kalibr_camera, read_pair
+from ekfslam.data.readers.calibrations import PairFile, read_euroc_pair, read_pair
 from ekfslam.data.readers.columns import POSE, header_of, read_named, without_repeats
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
 from ekfslam.data.readers.imu_text import read_imu
-from ekfslam.data.readers.imu_yaml import beside, calibrated, pose_of, read_imu_yaml
+from ekfslam.data.readers.imu_yaml import beside, calibrated, find_chain, read_imu_yaml
 from ekfslam.data.readers.pictures import SUFFIXES, pair_files, pair_stamps
 from ekfslam.data.readers.poses import Poses, stamped_poses, truth_of_frames
 from ekfslam.data.readers.registry import CALIBRATION, Reader, Source
 from ekfslam.data.readers.text import Table, first_row, line_of, read_lines, rows_of
-from ekfslam.data.readers.yaml import read_yaml
-from ekfslam.errors import CalibrationError, LineError, LostDataError, TruthError, UnknownFormatError
-from ekfslam.geometry import se3
+from ekfslam.errors import LineError, LostDataError, TruthError, UnknownFormatError
 from ekfslam.geometry.camera import T_CAM_BODY
 
 CAMERAS = ("cam0", "cam1")
@@ -58,7 +56,7 @@ def open_euroc(folder: Path, calibration: str | None = None) -> ImageRecording:
     rig, imu = _calibration(mav, calibration), _inertial(mav)
     time_s = left.time_ns[in_left] / 1e9
     files = ([left.files[i] for i in in_left], [right.files[i] for i in in_right])
-    load, deep = pair_files(*files, rig.pair.left.size)
+    load, deep = pair_files(*files, rig.left.size)
     notes = (*left.notes, *right.notes, *alone, *deep, *rig.notes)
     truth, found = None, find_euroc_truth(mav)
     if found is not None:
@@ -69,9 +67,9 @@ def open_euroc(folder: Path, calibration: str | None = None) -> ImageRecording:
         name=place.name if place.name != "mav0" else place.parent.name,
         source=str(folder),
         time_s=time_s,
-        calibration=rig.pair.pair(load.size),
+        calibration=rig.pair(load.size),
         load=load,
-        T_cam_imu=T_CAM_BODY if rig.T_cam_body is None else rig.T_cam_body,
+        T_cam_imu=T_CAM_BODY if rig.T_cam_imu is None else rig.T_cam_imu,
         truth=truth if truth is not None and len(truth.frame) else None,
         notes=("There are no velocities and no inertial samples.", *notes),
         attributes={
@@ -82,11 +80,11 @@ def open_euroc(folder: Path, calibration: str | None = None) -> ImageRecording:
     )
     if imu is None:
         return recording
-    if rig.T_cam_body is None:
+    if rig.T_cam_imu is None:
         note = f"Inertial samples are not used: {rig.files[0].name} states no T_cam_imu."
         return replace(recording, notes=(*recording.notes, note))
     rows, T_body_imu = imu
-    T_cam_imu = None if T_body_imu is None else rig.T_cam_body @ T_body_imu
+    T_cam_imu = None if T_body_imu is None else rig.T_cam_imu @ T_body_imu
     return with_rows(recording, replace(rows, late_s=rig.late_s, T_cam_imu=T_cam_imu))
 
 
@@ -95,9 +93,7 @@ def _inertial(mav: Path) -> tuple[InertialRows, Array | None] | None:
     path = mav / "imu0/data.csv"
     if not path.is_file():
         return None
-    places = (path.parent, mav, mav.parent, mav / "dso", mav.parent / "dso")
-    file = next((file for place in places if (file := beside(place)) is not None), None)
-    rows = read_imu(path)
+    file, rows = beside(path.parent, mav, mav.parent, mav / "dso", mav.parent / "dso"), read_imu(path)
     if file is None:
         return rows, None
     read = read_imu_yaml(file)
@@ -157,35 +153,18 @@ def _images(camera: Path) -> _Images:
     return _Images(next(as_ns), [found[stamp] for stamp in stamps], next(as_ns), notes)
 
 
-class _Rig(NamedTuple):
-    """Calibration of the pair, pose of the body in the left camera, and what else the files say."""
-
-    pair: PairFile
-    T_cam_body: Array | None  # (4, 4); None if it is not stated, so that the body is the left camera
-    late_s: float  # stamp of an inertial sample less that of an image of the same instant
-    files: tuple[Path, ...]
-    notes: tuple[str, ...]
-
-
-def _calibration(mav: Path, given: str | None) -> _Rig:
+def _calibration(mav: Path, given: str | None) -> PairFile:
     """Return the calibration of the pair and of the body: of a given file, ``sensor.yaml``, or a chain of Kalibr."""
-    places = [place / sub for place in (mav, mav.parent) for sub in ("dso", ".")]
-    paths = [mav / name / "sensor.yaml" for name in CAMERAS]
-    chain = given or (None if paths[0].is_file() else find_chain(*places))
-    if chain is not None:
-        found = read_pair(chain)
-        notes = (f"The calibration is that of {found.files[0].name}.", *found.notes) if given else found.notes
-        notes += (
-            () if found.T_cam_imu is not None else (f"{found.files[0].name} states no T_cam_imu. {BODY_IS_CAMERA}",)
-        )
-        return _Rig(found, found.T_cam_imu, found.late_s, found.files, notes)
-    reads = [read_yaml(path) for path in paths]
-    left, right = (kalibr_camera(read, "", "distortion_coefficients") for read in reads)
-    T_left, T_right = (se3.inverse(pose_of(read, "T_BS.data" if "T_BS.data" in read else "T_BS")) for read in reads)
-    if left.size != right.size:
-        message = f"{right.size} differs from {left.size} of the left camera"
-        raise CalibrationError(message, source=str(paths[1]), field="resolution")
-    return _Rig(PairFile(left, right, T_right @ se3.inverse(T_left), tuple(paths)), T_left, 0.0, tuple(paths), ())
+    own = mav / CAMERAS[0] / "sensor.yaml"
+    places = (place / sub for place in (mav, mav.parent) for sub in ("dso", "."))
+    chain = given or (None if own.is_file() else find_chain(*places))
+    if chain is None:
+        return read_euroc_pair(own, mav / CAMERAS[1] / "sensor.yaml")
+    found = read_pair(chain)
+    notes = (f"The calibration is that of {found.files[0].name}.", *found.notes) if given else found.notes
+    if found.T_cam_imu is None:
+        notes += (f"{found.files[0].name} states no T_cam_imu. {BODY_IS_CAMERA}",)
+    return replace(found, notes=notes)
 
 
 def find_euroc_truth(folder: Path) -> Path | None:
@@ -196,8 +175,8 @@ def find_euroc_truth(folder: Path) -> Path | None:
 def read_euroc(path: Path) -> Poses:
     """Read the poses ``T_R_S`` of the body (the IMU) in the reference frame, from a csv or the csv of a folder.
 
-    The header must name eight columns, as EuRoC (stamps in ns, quaternions w first), OpenVINS or evo do. Velocities
-    and biases are read if the header names them as EuRoC does.
+    The header must name eight columns, as EuRoC (stamps in ns, quaternions w first), OpenVINS or evo do. Velocities and
+    biases are read if it names them as EuRoC does.
     """
     path = find_euroc_truth(path) or path
     lines = read_lines(path, f"expected {TRUTH.expected}")

@@ -1,10 +1,8 @@
 """ekfslam's own HDF5 form of a `Sequence`, and its groups for others (the result archive) to embed.
 
-Data sets are those that the metadata of `Sequence`, `Observations`, `Noise`, `Truth`, `TrueMotion` and of inputs state:
-in ``/sequence`` with its groups ``observations``, ``noise`` and ``inputs/<i>``, and in ``/truth`` with ``motion``.
-Velocities at the stamps of the frames are ``sequence/twist``; ``velocity_frame`` is ``none`` without velocities. The
-other fields of noise, the camera and the attributes of the sequence are attributes of groups. See `ekfslam.hdf5` for
-the common part of all files.
+Data sets are those that the metadata of the records state: in ``/sequence`` with its groups ``observations``, ``noise``
+and ``inputs/<i>``, and in ``/truth`` with ``motion``. ``sequence/twist`` has velocities at the stamps of the frames;
+``velocity_frame`` is ``none`` without velocities. Other fields are attributes. See `ekfslam.hdf5` for the common part.
 """
 
 from __future__ import annotations
@@ -70,11 +68,7 @@ SPELLING = {part + item.field: item.name for part, layout in _PARTS.items() for 
 
 
 def write_sequence(sequence: Sequence, path: str | Path) -> None:
-    """Write a sequence to a new HDF5 file (or over an old one), so that `read_sequence` restores it bit for bit.
-
-    Raises:
-        ArchiveError: The file cannot be written.
-    """
+    """Write a sequence to a new HDF5 file (or over an old one), so that `read_sequence` restores it bit for bit."""
     files.write(path, sequence_image(sequence))
 
 
@@ -100,7 +94,7 @@ def read_sequence(path: str | Path) -> Sequence:
     Raises:
         UnknownFormatError: The file is missing, damaged, or HDF5 of another format.
         ArchiveError: A newer release wrote the file.
-        DataError: A field is missing or malformed; the subclass says how.
+        DataError: A field is missing or malformed.
     """
     with (
         hdf5.opened(path, FORMAT, FORMAT_VERSION, error=UnknownFormatError) as h5file,
@@ -114,12 +108,9 @@ def read_sequence(path: str | Path) -> Sequence:
 
 
 def write_sequence_group(h5file: h5py.Group, sequence: Any, whole: bool = False) -> None:
-    """Write ``/sequence`` and ``/truth`` below an open file or group.
+    """Write ``/sequence`` and ``/truth`` of a `Sequence`, or of a record with its fields, below an open file or group.
 
-    Args:
-        h5file: File or group to write below.
-        sequence: A `Sequence`, or a record with the same fields except observations and inputs.
-        whole: Whether to write observations and inputs, too.
+    Observations and inputs are written only if ``whole``.
     """
     has_twist = sequence.velocities is not None if isinstance(sequence, Sequence) else sequence.twist is not None
     hdf5.write_fields(h5file, _SEQUENCE if has_twist else _UNDRIVEN, sequence)
@@ -148,11 +139,7 @@ def write_sequence_group(h5file: h5py.Group, sequence: Any, whole: bool = False)
 
 
 def read_sequence_fields(h5file: h5py.Group, source: str) -> dict[str, Any]:
-    """Return the arguments of `Sequence` below an open file or group, except observations and inputs.
-
-    Raises:
-        DataError: A field is missing or malformed; the subclass says how.
-    """
+    """Return the arguments of `Sequence` below an open file or group, except observations and inputs."""
     with spelled_as_in(source, SPELLING):
         attributes, names = hdf5.facts(_group(h5file, "sequence/attributes")), _attributes(h5file, "sequence")
         camera = StereoCamera(**_numbers(h5file, "sequence/camera", StereoCamera))

@@ -47,13 +47,9 @@ _BARE: dict[str, Any] = {"times": "times.txt"}  # of a folder without its own fi
 
 
 def open_folder(path: Path, calibration: str | None = None) -> ImageRecording:
-    """Open the images that a calibration describes, see this module.
+    """Open the images that a calibration describes, see this module. Without ``T_cam_imu`` the body is the left camera.
 
-    Without ``T_cam_imu`` the body is the left camera.
-
-    Args:
-        path: Folder, or its ``calibration.toml``.
-        calibration: File for `calibrations.read_pair`; it takes precedence, and the folder may lack its own.
+    A ``calibration`` for `calibrations.read_pair` takes precedence; the folder may then lack its own.
     """
     file = _file_of(path)
     folder, values = file.parent, (_BARE if calibration and not file.is_file() else read_toml(file))

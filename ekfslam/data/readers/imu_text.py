@@ -1,8 +1,7 @@
 """Text files of an inertial unit, ``data.csv`` of EuRoC among them, and arrays of the export of OpenVINS's simulator.
 
 A row is ``timestamp [ns], w_x, w_y, w_z [rad/s], a_x, a_y, a_z [m/s^2]``. A header may name other columns, orders and
-units. Without a unit of the stamps, the step between them decides. ``sensor.yaml`` or ``imu.yaml`` beside the file
-states the densities of noise.
+units. Without a unit of the stamps, the step between them decides.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def read_imu(place: Path) -> InertialRows:
 
     Raises:
         UnknownFormatError: The file is missing or no text, or its header names other columns.
-        DataError: A line is malformed, or the stamps have an impossible rate; the error names file and line.
+        DataError: A line is malformed, or the stamps have an impossible rate.
     """
     path = next((place / name for name in _PLACES if (place / name).is_file()), place)
     lines = read_lines(path, f"expected {EXPECTED}")
@@ -79,22 +78,15 @@ def read_imu(place: Path) -> InertialRows:
         numbers.append(number)
     table = np.array(values)
     time_ns, note = clock.stamps(table[:, 0], columns.unit, path)
-    rows_of_file = InertialRows(
-        str(path),
-        time_ns,
-        table[:, 1:4] * columns.factor[:3],
-        table[:, 4:] * columns.factor[3:],
-        line=np.array(numbers),
-        notes=(*columns.notes, *note),
-    )
-    return _with_densities(rows_of_file, path)
+    gyro, accel = table[:, 1:4] * columns.factor[:3], table[:, 4:] * columns.factor[3:]
+    notes = (*columns.notes, *note)
+    return _with_densities(InertialRows(str(path), time_ns, gyro, accel, line=np.array(numbers), notes=notes), path)
 
 
 def _with_densities(rows: InertialRows, path: Path) -> InertialRows:
     """Return samples of a file with the densities beside it, and its digest."""
     calibration = beside(path.parent)
-    attributes = {"imu_sha256": checksum(path, *([] if calibration is None else [calibration]))}
-    rows = replace(rows, attributes=attributes)
+    rows = replace(rows, attributes={"imu_sha256": checksum(path, *([] if calibration is None else [calibration]))})
     return rows if calibration is None else calibrated(rows, read_imu_yaml(calibration))
 
 
@@ -176,15 +168,14 @@ class _Clock:
         likely = [unit for unit, ns in _NS.items() if step and _RATES_HZ[0] <= 1e9 / (step * ns) <= _RATES_HZ[1]]
         since_1970 = next((unit for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)) if first >= least), "")
         unit = stated or (likely[0] if likely else since_1970 or "s")
-        if stated and step and likely and not 1.0 <= 1e9 / (step * _NS[stated]) <= 1e5:
-            message = f"stamps in {stated} with steps of {step:g} would be {1e9 / (step * _NS[stated]):.3g} Hz"
-            raise StampError(
-                f"{message}: they look like {likely[0]}; correct the header", source=str(path), field="time"
-            )
-        if first * _NS[unit] > 9e18:
-            raise StampError(
-                f"stamps in {unit} are too large, the first is {self.first}", source=str(path), field="time"
-            )
+        problem = ""
+        if stated and step and likely and not 1.0 <= (rate := 1e9 / (step * _NS[stated])) <= 1e5:
+            problem = f"stamps in {stated} with steps of {step:g} would be {rate:.3g} Hz: they look like {likely[0]}"
+            problem += "; correct the header"
+        elif first * _NS[unit] > 9e18:
+            problem = f"stamps in {unit} are too large, the first is {self.first}"
+        if problem:
+            raise StampError(problem, source=str(path), field="time")
         note = () if stated or unit == "ns" else (f"Stamps of {path.name} are taken as {unit}, by their steps.",)
         return round(self.first * _NS[unit]) + np.round(since * _NS[unit]).astype(np.int64), note
 
@@ -211,13 +202,11 @@ def _read_arrays(source: Source) -> InertialRows | None:
 
 
 def _has_arrays(source: Source) -> bool:
-    return source.head.startswith(b"PK") and b"imu_time_s.npy" in _directory(source.path)
-
-
-def _directory(path: Path) -> bytes:
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 65536))
-        return file.read()
+    if not source.head.startswith(b"PK"):
+        return False
+    with source.path.open("rb") as file:
+        file.seek(max(0, source.path.stat().st_size - 65536))  # the directory of a zip file is at its end
+        return b"imu_time_s.npy" in file.read()
 
 
 def _recognises(source: Source) -> bool:

@@ -15,17 +15,19 @@ from ekfslam.data.readers.yaml import Calibration, read_yaml
 from ekfslam.errors import CalibrationError, ExtrinsicsError
 from ekfslam.geometry import se3
 
-# Names of files beside samples that may state densities, and places of these.
-NAMES = ("sensor.yaml", "imu.yaml", "imu0.yaml", "imu_config.yaml", "kalibr_imu_chain.yaml")
-CHAINS = ("camchain-imucam.yaml", "kalibr_imucam_chain.yaml", "camchain.yaml")
+# Names of files beside samples that may state densities.
+_NAMES = ("sensor.yaml", "imu.yaml", "imu-*.yaml", "imu0.yaml", "imu_config.yaml", "kalibr_imu_chain.yaml")
+# Patterns of the usual names of chains, the likelier first.
+_CHAINS = (
+    *("camchain-imucam*.yaml", "kalibr_imucam_chain.yaml", "camchain.yaml"),
+    *("*camchain*.yaml", "*imucam*chain*.yaml", "*camchain*.yml"),
+)
 _KEYS = {
     "gyro": "gyroscope_noise_density",
     "accel": "accelerometer_noise_density",
     "gyro_walk": "gyroscope_random_walk",
     "accel_walk": "accelerometer_random_walk",
 }
-
-_FURTHER = ("time_offset", "rate_hz", "update_rate")
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,7 @@ class InertialCalibration:
 
 
 def read_imu_yaml(path: Path) -> InertialCalibration:
-    """Read densities at the top or below a key such as ``imu0``, and ``T_BS``.
-
-    Raises:
-        CalibrationError: A density is not one number; or `DataError` if it is negative or not finite.
-    """
+    """Read densities at the top or below a key such as ``imu0``, and ``T_BS``."""
     read = read_yaml(path)
     block = next((key.rpartition(".")[0] for key in read.values if key.rpartition(".")[2] in _KEYS.values()), "")
     prefix = f"{block}." if block else ""
@@ -58,12 +56,12 @@ def read_imu_yaml(path: Path) -> InertialCalibration:
             noise = InertialNoise(**values)
         else:
             notes = (f"{path.name} does not state {', '.join(missing)}: its densities are not used.",)
-        further = [prefix + name for name in _FURTHER]
+        further = (f"{prefix}{name}" for name in ("time_offset", "rate_hz", "update_rate"))
         offset, *rates = (_number(read, name) if name in read else 0.0 for name in further)
         if offset:
             notes += (f"{path.name} states time_offset {offset:g} s against another unit, which is not applied.",)
-    key = next((key for key in (f"{prefix}T_BS.data", f"{prefix}T_BS") if read.values.get(key)), None)
-    return InertialCalibration(path, noise, None if key is None else pose_of(read, key), max(rates), notes)
+    key = read.place(f"{prefix}T_BS")
+    return InertialCalibration(path, noise, pose_of(read, key) if read.values.get(key) else None, max(rates), notes)
 
 
 def calibrated(rows: InertialRows, read: InertialCalibration) -> InertialRows:
@@ -80,30 +78,41 @@ def _number(read: Calibration, key: str) -> float:
 
 def pose_of(read: Calibration, key: str) -> Array:
     """Return a transform (4, 4) of a file."""
-    pose = read.numbers(key, 16).reshape(4, 4)
+    pose = read.matrix(key, 4, 4)
     with spelled_as_in(str(read.path)):
-        require_rigid(pose, key, ExtrinsicsError)
+        require_rigid(pose, read.place(key), ExtrinsicsError)
     return se3.nearest_rigid(pose)
 
 
-def beside(place: Path, names: tuple[str, ...] = NAMES) -> Path | None:
-    """Return the first file with one of some names in a folder; names of Kalibr may go on, as ``imu-NAME.yaml``."""
-    for name in names:
-        stem, _, ending = name.rpartition(".")
-        if (place / name).is_file():
-            return place / name
-        if stem in ("imu", "camchain-imucam") and (found := sorted(place.glob(f"{stem}-*.{ending}"))):
-            return found[0]
-    return None
+def _first_of(names: tuple[str, ...], folders: tuple[Path, ...]) -> Path | None:
+    return next((file for folder in folders for name in names for file in sorted(folder.glob(name))), None)
 
 
-def chain_of(read: Calibration, camera: str) -> tuple[Array, tuple[str, ...]] | None:
-    """Return ``T_cam_imu`` (4, 4) of a camera in a chain of Kalibr or OpenVINS, and notes; None: it is not stated."""
+def beside(*folders: Path) -> Path | None:
+    """Return the first file with densities of an inertial unit in some folders, under any of the usual names."""
+    return _first_of(_NAMES, folders)
+
+
+def find_chain(*folders: Path) -> Path | None:
+    """Return the first chain of Kalibr in some folders, under any of the usual names."""
+    return _first_of(_CHAINS, folders)
+
+
+def read_chain(path: Path) -> tuple[float, Array | None, tuple[str, ...]]:
+    """Return `late_s` and ``T_cam_imu`` of ``cam0`` in a chain, None if it is not stated, and notes."""
+    read = read_yaml(path)
+    T_cam_imu, notes = chain_of(read, "cam0")
+    notes = () if T_cam_imu is None else (f"T_cam_imu is that of cam0 in {path.name}.", *notes)
+    return late_s(read, "cam0"), T_cam_imu, notes
+
+
+def chain_of(read: Calibration, camera: str) -> tuple[Array | None, tuple[str, ...]]:
+    """Return ``T_cam_imu`` (4, 4) of a camera in a chain of Kalibr or OpenVINS, None if it is not stated, and notes."""
     if (key := f"{camera}.T_cam_imu") in read:
         return pose_of(read, key), ()
     if (key := f"{camera}.T_imu_cam") in read:
         return se3.inverse(pose_of(read, key)), (f"{read.path.name} states {key}: it is inverted.",)
-    return None
+    return None, ()
 
 
 def late_s(read: Calibration, camera: str) -> float:

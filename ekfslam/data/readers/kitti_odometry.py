@@ -1,7 +1,6 @@
-"""The KITTI odometry benchmark: folders of rectified stereo images, and text files of true poses.
+"""The KITTI odometry benchmark: folders of rectified stereo images, and text files of true poses (12 numbers a frame).
 
-A folder has ``image_0 image_1`` (gray) or ``image_2 image_3`` (colour), ``calib.txt`` and ``times.txt``. Poses are 12
-numbers a line, one line a frame.
+A folder has ``image_0 image_1`` (gray) or ``image_2 image_3`` (colour), ``calib.txt`` and ``times.txt``.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from ekfslam.data.readers.fields import BODY_IS_CAMERA
 from ekfslam.data.readers.pictures import PAIRS, find_pair, in_order, numbered_images, pair_files
 from ekfslam.data.readers.poses import FIRST_IMAGE, Poses
 from ekfslam.data.readers.registry import Reader
-from ekfslam.data.readers.text import first_row, parse_table, read_keys, read_lines, rows_of
+from ekfslam.data.readers.text import Table, first_row, parse_table, read_keys, read_lines, rows_of
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.truth_noise import KITTI_TRUTH_NOISE
 from ekfslam.errors import CalibrationError, LostDataError, ShapeError, TruthError, UnknownFormatError
@@ -31,8 +30,8 @@ _LABELS = ("P0", "P1")
 def open_kitti_odometry(folder: Path) -> ImageRecording:
     """Open a sequence of the benchmark, or a run of its images: rectified pairs and stamps, without velocities.
 
-    Image n has line n of ``times.txt``, counted from 0; or the file begins at the first image, see `_first_line`. The
-    body is the left camera. The gray pair is preferred.
+    Image n has line n of ``times.txt``, or the file begins at the first image, see `_first_line`. The body is the left
+    camera.
     """
     names = find_pair(folder)
     lacking = _lacking(folder, names)
@@ -72,10 +71,9 @@ def open_kitti_odometry(folder: Path) -> ImageRecording:
 
 
 def _first_line(times_s: Array, first: int, frames: int) -> int:
-    """Return the line of the first image, which has a number: that number, or 0 if the file was cut there, too.
+    """Return the line of the first image: its number, or 0 if the file was cut there, too.
 
-    It was if it has as many lines as there are images, or if its first stamp is that of the image: whole files of the
-    benchmark begin at 0 s.
+    It was if it has as many lines as there are images, or begins at their first stamp: whole files begin at 0 s.
     """
     if first and len(times_s) > 1:
         step_s = float(np.median(np.diff(times_s)))
@@ -93,9 +91,8 @@ def _lacking(folder: Path, names: tuple[str, str] | None) -> list[str]:
         lacking.append("times.txt (a stamp in seconds a line)")
     lines = [line for _, line in rows_of(read_lines(folder / "calib.txt", "expected P0: and 12 numbers"))]
     if not any(":" in line for line in lines):
-        lacking.append(
-            f"labels in calib.txt (P0: and P1: before the 12 numbers of the cameras; {len(lines)} lines have none)"
-        )
+        found = f"{len(lines)} lines have none"
+        lacking.append(f"labels in calib.txt (P0: and P1: before the 12 numbers of the cameras; {found})")
     return lacking
 
 
@@ -104,9 +101,8 @@ def _calibration(path: Path, keys: tuple[str, ...], size: tuple[int, int]) -> Pa
     values = read_keys(path, dict.fromkeys(keys, _COLUMNS), "expected P0: and 12 numbers")
     left, right = (values[key].reshape(3, 4) for key in keys)
     if not np.allclose(left[:, :3], right[:, :3], rtol=1e-6, atol=1e-9):
-        raise ShapeError(
-            "the two cameras have different intrinsics, so the pair is not rectified", source=str(path), field="P"
-        )
+        message = "the two cameras have different intrinsics, so the pair is not rectified"
+        raise ShapeError(message, source=str(path), field="P")
     shift = np.linalg.solve(left[:, :3], right[:, 3] - left[:, 3])
     if not -shift[0] > 10.0 * np.abs(shift[1:]).max():
         raise CalibrationError("the right camera is not to the right of the left one", source=str(path), field="P")
@@ -115,21 +111,26 @@ def _calibration(path: Path, keys: tuple[str, ...], size: tuple[int, int]) -> Pa
 
 
 def read_kitti_odometry(path: Path, sequence: Sequence) -> Poses:
-    """Read 3x4 matrices: row i is ``T_cam0_cam`` of frame i, the pose of the left camera in its first frame.
+    """Read 3x4 matrices: row i is ``T_cam0_cam`` of frame i, with `KITTI_TRUTH_NOISE`, the noise of the GPS/INS unit.
 
     ``T_world_imu = T_imu_cam T_cam0_cam T_cam_imu`` with the sequence's extrinsics, so the first pose is the identity.
-    The poses are from the GPS/INS unit of KITTI, so their noise is `KITTI_TRUTH_NOISE`.
     """
     table = parse_table(read_lines(path, f"expected {POSES.expected}"), path, columns=_COLUMNS, error=TruthError)
-    matrices = table.values.reshape(-1, 3, 4)
-    T_cam0_cam = se3.transform(matrices[:, :, :3], matrices[:, :, 3])
+    T_cam0_cam = _rigid_rows(table, 0)
+    T_world_imu = se3.inverse(sequence.T_cam_imu) @ T_cam0_cam @ sequence.T_cam_imu
+    return Poses(T_world_imu, None, (path,), KITTI_TRUTH_NOISE)
+
+
+def _rigid_rows(table: Table, first: int) -> Array:
+    """Return the transforms (n, 4, 4) in twelve columns of a file; raise `TruthError` for one that is not rigid."""
+    matrices = table.values[:, first : first + 12].reshape(-1, 3, 4)
+    T = se3.transform(matrices[:, :, :3], matrices[:, :, 3])
     try:
-        require_rigid(T_cam0_cam, "line", TruthError)
+        require_rigid(T, "line", TruthError)
     except TruthError as error:
         assert isinstance(error.index, int)
         raise TruthError(error.message, **table.where(error.index)) from None
-    T_world_imu = se3.inverse(sequence.T_cam_imu) @ T_cam0_cam @ sequence.T_cam_imu
-    return Poses(T_world_imu, None, (path,), KITTI_TRUTH_NOISE)
+    return T
 
 
 def _recognises(folder: Path) -> bool:
@@ -146,13 +147,7 @@ def read_kitti_360(path: Path, sequence: Sequence) -> Poses:
     frame = table.values[:, 0]
     if (frame != np.floor(frame)).any() or (np.diff(frame) <= 0).any() or (frame < 0).any():
         raise TruthError("the first column is no increasing number of an image", source=str(path), field="line")
-    matrices = table.values[:, 1:13].reshape(-1, 3, 4)
-    T = se3.transform(matrices[:, :, :3], matrices[:, :, 3])
-    try:
-        require_rigid(T, "line", TruthError)
-    except TruthError as error:
-        assert isinstance(error.index, int)
-        raise TruthError(error.message, **table.where(error.index)) from None
+    T = _rigid_rows(table, 1)
     of_camera = table.values.shape[1] == 17
     return Poses(T @ sequence.T_cam_imu if of_camera else T, None, (path,), frame=frame.astype(np.int64))
 

@@ -1,9 +1,8 @@
 """Drive folders of KITTI raw: velocities, calibration, 6-DoF truth, and rectified stereo images if there are any.
 
 Geiger, Lenz, Stiller, Urtasun, *Vision meets Robotics: The KITTI Dataset* (IJRR 2013), and the readme of its
-development kit. A drive has ``oxts/timestamps.txt`` and packets ``oxts/data/0000000000.txt ...`` (see `oxts`), and
-``image_00/timestamps.txt``, ``image_00/data/0000000000.png ...`` and ``image_01`` (gray), or ``image_02`` and
-``image_03`` (colour). The three files ``calib_*.txt`` are in it or in the folder above.
+development kit. A drive has ``oxts`` (see `oxts`), and ``image_00 image_01`` (gray) or ``image_02 image_03`` (colour)
+with ``data/0000000000.png ...``. The three files ``calib_*.txt`` are in it or in the folder above.
 """
 
 from __future__ import annotations
@@ -83,13 +82,12 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray", lateral: Lateral = "
 
     Args:
         folder: Drive folder, such as ``2011_09_30/2011_09_30_drive_0027_sync``.
-        pair: Stereo pair that is the camera: ``gray`` (image_00, image_01) or ``color`` (image_02, image_03).
+        pair: ``gray`` (image_00, image_01) or ``color`` (image_02, image_03).
         lateral: Sign of the lateral velocity, see `with_lateral`.
 
     Raises:
-        ConfigError: There is no such pair.
         UnknownFormatError: A file or folder is missing or is not text.
-        DataError: A line is malformed or inconsistent; see `read_oxts` and `read_calibration`.
+        DataError: A line is malformed or inconsistent.
     """
     if pair not in CAMERAS:
         raise ConfigError(f"pair must be one of {', '.join(CAMERAS)}, found {pair!r}")
@@ -113,10 +111,7 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray", lateral: Lateral = "
 
 
 def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> ImageRecording | None:
-    """Open the rectified images of a sync drive with its velocities and truth; return None if it has no images.
-
-    Frame k is packet k, as far as there are images. The gray pair is preferred.
-    """
+    """Open the rectified images of a sync drive, with velocities and truth; None without images. Frame k is packet k."""
     pair = next((pair for pair in CAMERAS if (folder / f"image_{CAMERAS[pair][0]}" / "data").is_dir()), None)
     if pair is None:
         return None
@@ -159,9 +154,8 @@ def read_calibration(folder: Path, pair: Pair = "gray") -> tuple[StereoCamera, A
         T_cam_imu = [I, t] R_rect_00 T_cam00_velo T_velo_imu,   baseline = t_x(left) - t_x(right).
     """
     left, right = (f"P_rect_{number}" for number in CAMERAS[pair])
-    files = tuple(
-        _find_calibration(folder, f"calib_{name}.txt") for name in ("imu_to_velo", "velo_to_cam", "cam_to_cam")
-    )
+    names = ("imu_to_velo", "velo_to_cam", "cam_to_cam")
+    files = tuple(_find_calibration(folder, f"calib_{name}.txt") for name in names)
     T_velo_imu, T_cam00_velo = (_rigid(path) for path in files[:2])
     cam_to_cam = files[2]
     values = read_keys(cam_to_cam, {"R_rect_00": 9, left: 12, right: 12}, EXPECTED)

@@ -1,7 +1,7 @@
 """Numeric arrays of MATLAB 5 files. `scipy.io.loadmat` crashes the interpreter on some damaged files.
 
-A file is 128 bytes of header and then elements: a tag (type, number of bytes) and data. A matrix is an element whose
-data are elements again: flags, dimensions, name, values. Since MATLAB 7 every matrix comes compressed by zlib.
+After 128 bytes of header come elements: a tag (type, number of bytes) and data. The data of a matrix are elements
+again: flags, dimensions, name, values. Since MATLAB 7 every matrix is compressed by zlib.
 """
 
 from __future__ import annotations
@@ -24,12 +24,7 @@ _MOST_DEFLATED = 1032  # bytes of one compressed byte
 
 
 def parse_mat(content: bytes, budget: Budget) -> dict[str, NDArray]:
-    """Return every variable of a file by name; an empty array of objects stands for other than real numbers.
-
-    Args:
-        content: Content of the file.
-        budget: Limit of the decompressed size.
-    """
+    """Return every variable of a file by name; an empty array of objects stands for other than real numbers."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise ValueError("the header states no byte order")

@@ -1,7 +1,6 @@
 """Messages of ROS 1 and ROS 2 bags, and MCAP, by the package rosbags.
 
-Definitions of messages in a bag are not used, because rosbags would make code of them. Only types of the distributions
-that rosbags knows are read.
+Only types of the distributions that rosbags knows are read: of definitions in a bag, rosbags would make code.
 """
 
 from __future__ import annotations
@@ -47,9 +46,7 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 class Bag:
     """An open bag: a file, or a folder with ``metadata.yaml``; raises `MissingPackageError` without rosbags.
 
-    Args:
-        path: Path of the bag.
-        named: Topics that take precedence over all others of their types, in this order.
+    Topics that are ``named`` take precedence over all others of their types, in this order.
     """
 
     def __init__(self, path: Path, named: tuple[str, ...] = ()) -> None:

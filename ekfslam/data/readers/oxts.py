@@ -204,15 +204,11 @@ def _check_steps(time_s: Array, stamp_ns: IntArray, stamped: BoolArray, path: Pa
 def _repair_notes(stamped: BoolArray, present: BoolArray) -> Iterator[str]:
     empty, lost = np.flatnonzero(~stamped), np.flatnonzero(~present)
     if len(empty):
-        yield (
-            f"oxts/timestamps.txt: {len(empty)} of {len(stamped)} lines are empty, the first is line {empty[0] + 1}; "
-            "their stamps are interpolated."
-        )
+        share = f"{len(empty)} of {len(stamped)} lines are empty, the first is line {empty[0] + 1}"
+        yield f"oxts/timestamps.txt: {share}; their stamps are interpolated."
     if len(lost):
-        yield (
-            f"oxts/data: {len(lost)} packets are missing, the first is {lost[0]:010d}.txt; their velocities are "
-            "interpolated, their frames have no truth."
-        )
+        what = f"{len(lost)} packets are missing, the first is {lost[0]:010d}.txt; their velocities are interpolated"
+        yield f"oxts/data: {what}, their frames have no truth."
 
 
 def _read_packet(path: Path) -> Array:

@@ -1,8 +1,7 @@
 """Pickled dictionaries of NumPy arrays in .npy files, read without running code of the file.
 
-``numpy.save`` pickles a dictionary. `pickle` calls any function that a file names; here only arrays, their types,
-scalars and plain containers are allowed. Every operation of the file is checked before the first one runs, so that none
-claims more memory than the file has bytes.
+`pickle` calls any function that a file names; here only arrays, their types, scalars and plain containers are allowed.
+Every operation is checked before the first one runs, so that none claims more memory than the file has bytes.
 """
 
 from __future__ import annotations

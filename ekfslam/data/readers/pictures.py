@@ -48,17 +48,16 @@ _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM")  # PPM includes pgm
 
 
 def read_gray(path: Path, size: tuple[int, int] | None = None, bits: int = 16) -> Image:
-    """Read an image file as (height, width) uint8. Colours become luma.
-
-    ``size`` is the required width and height; any by default. Of values of 16 bits, ``bits`` are used: the upper eight
-    of these remain.
-    """
+    """Read an image file as (height, width) uint8, colours as luma; see `decode_gray`."""
     require_file(path)
     return decode_gray(path.read_bytes(), str(path), size, bits)
 
 
 def decode_gray(content: bytes, source: str, size: tuple[int, int] | None = None, bits: int = 16) -> Image:
-    """Return `read_gray` of the bytes of an image file; ``source`` names it in messages."""
+    """Return the pixels (height, width) uint8 of the bytes of an image file; ``source`` names it in messages.
+
+    ``size`` is the required width and height. Of values of 16 bits, ``bits`` are used: the upper eight of these remain.
+    """
     with _opened(io.BytesIO(content), source) as image:
         width, height = image.size
         Budget(source).take(4 * width * height, "the image")
@@ -117,12 +116,8 @@ def pair_files(
 
     Args:
         left, right: Files of each frame.
-        size: Width and height as calibrated; by default those of the first image.
+        size: Width and height as calibrated; by default those of the first image. Others raise `CalibrationError`.
         bits: Used bits of images of 16 bits; by default those of the largest value in all files.
-
-    Raises:
-        CalibrationError: An image has another size.
-        UnknownFormatError: A file is no readable image.
     """
     whose, deep = ("the calibration" if size else str(left[0])), []
     for path in (*left, *right):
@@ -184,7 +179,7 @@ def find_pair(folder: Path) -> tuple[str, str] | None:
 
 
 def images_of_sides(left: Path, right: Path) -> tuple[dict[str, Path], dict[str, Path]]:
-    """Return the images of two folders, which may be one, by the part of their names that is the same on both sides.
+    """Return the images of two folders, or of one, by the part of their names that both sides share.
 
     ``left_0001`` and ``right_0001``, ``0001_l`` and ``0001_r`` are pairs, as are equal names in two folders.
     """

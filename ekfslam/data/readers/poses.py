@@ -45,15 +45,14 @@ def stamped_poses(table: Table) -> Poses:
     if (defect > _QUATERNION_TOLERANCE).any():
         row = int(np.argmax(defect > _QUATERNION_TOLERANCE))
         raise TruthError(f"not a unit quaternion: its norm is off by {defect[row]:.2g}", **table.where(row))
-    return Poses(
-        se3.transform(Rotation.from_quat(quaternion).as_matrix(), position_m), time_s, (table.path,), notes=notes
-    )
+    T_world_imu = se3.transform(Rotation.from_quat(quaternion).as_matrix(), position_m)
+    return Poses(T_world_imu, time_s, (table.path,), notes=notes)
 
 
 def velocities_of(time_s: Array, T_world_body: Array) -> tuple[Array, Array, str]:
     """Return stamps (N-1,) and velocities (N-1, 6) between successive poses, in the body, and a note.
 
-    The velocity of an interval is that of a constant twist between its poses, at the middle of the interval.
+    The velocity of an interval is a constant twist, stamped at its middle.
     """
     step = np.diff(time_s)
     twist = se3.log(se3.inverse(T_world_body[:-1]) @ T_world_body[1:]) / step[:, None]

@@ -1,11 +1,8 @@
 """The registry of formats: each file of this folder that reads a format holds a `Reader` of it.
 
-To add a format, add a file: no other file names the formats. This is a complete one::
+To add a format, add a file; no other file names the formats. This is a complete one::
 
-    def tracks(source: Source) -> Sequence:
-        ...
-
-    READER = Reader("mine", "a .mine file", lambda source: source.head.startswith(b"MINE"), tracks)
+    READER = Reader("mine", "a .mine file", lambda source: source.head.startswith(b"MINE"), read_tracks)
 """
 
 from __future__ import annotations
@@ -109,10 +106,7 @@ def readers(*kinds: Kind) -> tuple[Reader, ...]:
 
 
 def read_as(source: Source, kind: Kind, *arguments: Any) -> Any:
-    """Return what the first suitable reader finds in a source; None if no reader finds this kind of data there.
-
-    Further arguments are those of the reader's function.
-    """
+    """Return what the first suitable reader finds in a source, given its further arguments; None: no such data."""
     for reader in readers(kind):
         if reader.recognises(source):
             found = getattr(reader, kind)(source, *arguments)

@@ -1,7 +1,4 @@
-"""Text files of numbers: lines of columns, with comments, empty lines and headers.
-
-Every error names the file and the line, counted from 1.
-"""
+"""Text files of numbers: columns, comments, headers. Every error names the file and the line, counted from 1."""
 
 from __future__ import annotations
 
@@ -109,8 +106,7 @@ def parse_table(
         lines, path: Lines of a file, and its name in messages.
         columns: Number of columns; that of the first row by default.
         used: Number of columns that are read; the others may hold anything.
-        separator: Separator of columns; blanks by default.
-        comment: Beginning of a comment; None if there are none.
+        separator, comment: By default blanks, and ``#``; None: there are no comments.
         converters, error: See `parse_numbers`.
     """
     values: list[list[float]] = []

@@ -33,17 +33,13 @@ def covariance_path(path: Path) -> Path:
 def read_trajectory(path: str | Path, *, frame: Moving = "body") -> Trajectory:
     """Read the poses of a TUM file, and their covariances from the file beside it if there is one.
 
-    Lines of ``poses.cov.txt`` are the stamps of ``poses.txt`` and 21 numbers: the upper triangle of the covariance by
-    rows, ``x_x x_y x_z x_rx ... rz_rz``. The axes are those of world; x, y, z in m, the rotations about them in rad,
-    see `Trajectory`.
-
-    Args:
-        path: File of poses.
-        frame: Moving frame, which the file does not name.
+    Lines of ``poses.cov.txt`` are a stamp of ``poses.txt`` and 21 numbers: the upper triangle of the covariance by
+    rows, ``x_x x_y x_z x_rx ... rz_rz``, along the axes of world, m and rad, see `Trajectory`. ``frame`` is the moving
+    frame, which the file does not name.
 
     Raises:
         UnknownFormatError: A file is missing or no text.
-        DataError: A line is malformed, or the stamps of the two files differ; the subclass says how.
+        DataError: A line is malformed, or the stamps of the two files differ.
     """
     path = Path(path)
     poses = _read(path)
@@ -76,18 +72,13 @@ def covariances_beside(path: Path, time_s: Array) -> Array | None:
 
 
 def _read(path: Path, error: type[DataError] = LineError) -> Poses:
-    """Read the eight columns, by their header if it names all columns of the file."""
+    """Read the eight columns, by their header if it names all columns of the file; a covariance may follow them."""
     lines = read_lines(path, f"expected {READER.expected}")
-    header, width = header_of(lines), _width(path)
+    header, width = header_of(lines), len(first_row(path).split())
+    width = width if width in _WIDTHS else len(COLUMNS)
     if header is not None and header.count == width and header.place.keys() >= set(POSE):
         return stamped_poses(read_named(path, lines, header, POSE, error))
     return stamped_poses(parse_table(lines, path, columns=width, used=len(COLUMNS), error=error))
-
-
-def _width(path: Path) -> int:
-    """Return the number of columns of a file: eight, or more with a covariance (12, 21 or 36 numbers)."""
-    width = len(first_row(path).split())
-    return width if width in _WIDTHS else len(COLUMNS)
 
 
 def _recognises(source: Source) -> bool:

@@ -33,10 +33,9 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
     """Read tracks ``y_k_j`` (4 x T x M, -1 where unseen), stamps, velocities, calibration and 6-DoF truth.
 
     The vehicle frame ``v`` is the IMU frame, the inertial frame ``i`` the world; ``T_world_imu`` has the rotation
-    ``exp(theta_vk_i^)`` and ``T_cam_imu = [C_c_v, -C_c_v rho_v_c_v]``. Stamps, velocities and truth may run longer than
-    the tracks: they are cut, with a note. Starry Night adds landmark positions ``rho_i_pj_i`` and noise variances. The
-    truth of a KITTI drive has the noise `KITTI_TRUTH_NOISE`; that of Starry Night states none. ``lateral`` is the sign
-    of the lateral velocity of a KITTI drive, see `with_lateral`; Starry Night has no level velocities.
+    ``exp(theta_vk_i^)`` and ``T_cam_imu = [C_c_v, -C_c_v rho_v_c_v]``. What runs longer than the tracks is cut, with a
+    note. Starry Night adds landmarks ``rho_i_pj_i`` and noise variances, and has no level velocities, hence no
+    ``lateral`` (see `with_lateral`). The truth of a KITTI drive has the noise `KITTI_TRUTH_NOISE`.
     """
     fields = _load(path)
     with spelled_as_in(str(path), _SPELLING):

@@ -1,8 +1,7 @@
 """Text files of velocities, one sample a line: seconds, three linear and three angular velocities (m/s, rad/s).
 
-Columns are separated by blanks, as in files of TUM, or by commas. Three columns are ``time vx wz`` of a planar robot.
-A header may name columns in any order; velocities that it does not name are 0. A comment line ``# frame: level`` (or
-``imu``) states the frame of the velocities.
+Blanks or commas separate columns. Three columns are ``time vx wz`` of a planar robot. A header may name columns in any
+order; the others are 0. A comment ``# frame: level`` (or ``imu``) states the frame of the velocities.
 """
 
 from __future__ import annotations
@@ -68,11 +67,8 @@ def _inputs(source: Source) -> VelocitySamples:
         raise UnknownFormatError(f"{path}: holds no velocities; expected {READER.expected}")
     table, repeated = without_repeats(table)
     frame = cast(VelocityFrame, stated or "imu")
-    notes = (
-        repeated
-        if stated
-        else (*repeated, f"{path.name} does not say in which frame its velocities are: they are taken as imu.")
-    )
+    unsaid = f"{path.name} does not say in which frame its velocities are: they are taken as imu."
+    notes = repeated if stated else (*repeated, unsaid)
     attributes = {"velocities_sha256": checksum(path)}
     return VelocitySamples(str(path), table.values[:, 0], table.values[:, 1:], frame, None, attributes, notes)
 

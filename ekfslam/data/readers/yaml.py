@@ -1,7 +1,6 @@
 """Calibrations in YAML, as EuRoC and Kalibr write them.
 
-Only the part of YAML in such files is read: lines ``key: value``, blocks below a key by indentation, and lists of
-numbers in brackets or by dashes, over several lines. Nothing of a file is evaluated.
+Only ``key: value``, blocks by indentation, and lists of numbers (brackets or dashes) are read. Nothing is evaluated.
 """
 
 from __future__ import annotations
@@ -39,16 +38,25 @@ class Calibration:
             raise CalibrationError("this key is missing", source=str(self.path), field=key)
         return self.values[key].strip().strip("\"'")
 
+    def place(self, key: str) -> str:
+        """Return the key of some numbers: ``data`` below a key if it is there, as in matrices of OpenCV and ROS."""
+        return f"{key}.data" if f"{key}.data" in self.values else key
+
     def numbers(self, key: str, count: int | None = None) -> Array:
         """Return the numbers (n,) of a key; raise `CalibrationError` if they are missing or not ``count``."""
+        key = self.place(key)
         text = self.word(key)
-        found = np.array([float(number) for number in _NUMBER.findall(text)])
-        if (word := _WORD.search(_NUMBER.sub("", text))) is not None:
-            message = f"expected numbers, found {printable(word.group())!r}"
-            raise CalibrationError(message, source=str(self.path), field=key)
-        if count is not None and len(found) != count:
-            raise CalibrationError(f"expected {count} numbers, found {len(found)}", source=str(self.path), field=key)
-        return found
+        found, word = _NUMBER.findall(text), _WORD.search(_NUMBER.sub("", text))
+        if word is not None or count not in (None, len(found)):
+            what = f"expected {count} numbers, found {len(found)}"
+            if word is not None:
+                what = f"expected numbers, found {printable(word.group())!r}"
+            raise CalibrationError(what, source=str(self.path), field=key)
+        return np.array(found, dtype=float)
+
+    def matrix(self, key: str, rows: int, columns: int) -> Array:
+        """Return the numbers of a key as a matrix."""
+        return self.numbers(key, rows * columns).reshape(rows, columns)
 
 
 def read_yaml(path: Path) -> Calibration:
