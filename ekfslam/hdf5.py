@@ -63,9 +63,8 @@ def opened(
 ) -> Iterator[h5py.File]:
     """Open a file for reading; it must have this format, and at most this version.
 
-    Raises:
-        ArchiveError: A newer release wrote the file.
-        EkfslamError: Of type ``error``: the file is missing, has another format, or proves damaged while it is open.
+    A newer one raises `ArchiveError`; one that is missing, of another format, or proves damaged while open, an
+    ``error``.
     """
     try:
         require_file(path)
@@ -207,11 +206,8 @@ def read_record(
 ) -> dict[str, Any]:
     """Read the stored fields of a class of records, checked as `read_fields` does.
 
-    Args:
-        group, sizes, coordinates: As for `read_fields`.
-        record: Class of the record.
-        complete: Function of class and fields that adds fields which older releases did not write.
-        former: Data sets that older releases wrote for a class, for ``complete``.
+    ``complete``, a function of class and fields, adds fields that older releases did not write, by the data sets
+    ``former`` that they wrote for a class.
     """
     layout = stored.layout_of(record)
     found: dict[str, Any] = {}
@@ -261,13 +257,8 @@ def write_fields(
 ) -> None:
     """Write the data sets of a layout, from a record or mapping with their fields, and their dimensions.
 
-    Args:
-        group, layout, record: Place, data sets, and their values.
-        sizes: Known shared lengths; those found here are added.
-        coordinates: Values along dimensions by name, if no data set of the layout holds them.
-
-    Raises:
-        ArchiveError: A value breaks its check: such a file could not be read again.
+    Known shared lengths are ``sizes``; those found here are added. ``coordinates`` are values along dimensions by name,
+    if no data set of the layout holds them. A value that breaks its check raises an `ArchiveError`.
     """
     layout = tuple(layout)
     values = [
@@ -338,13 +329,7 @@ def require_coordinates(group: h5py.Group, layout: Iterable[Item], coordinates: 
 def read_fields(
     group: h5py.Group, layout: Iterable[Item], sizes: dict[str, int] | None = None, coordinates: Coordinates = NONE
 ) -> dict[str, Any]:
-    """Read the data sets of a layout by field, checked; the first one along a shared length decides it.
-
-    Arguments are those of `write_fields`. Coordinates in the file must equal the given ones.
-
-    Raises:
-        ArchiveError: A data set is missing, has another shape or type, or breaks its check.
-    """
+    """Read the data sets of a layout by field, checked; the first one along a shared length decides it."""
     layout = tuple(layout)
     found = _read(group, layout, {} if sizes is None else sizes)
     require_coordinates(group, layout, coordinates)

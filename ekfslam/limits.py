@@ -20,11 +20,7 @@ _limit: ContextVar[int] = ContextVar("limit", default=int(DEFAULT_GB * 1e9))
 
 @contextmanager
 def reading_up_to(gb: float) -> Iterator[None]:
-    """Set the limit on the size of files within the context, in gigabytes of numbers.
-
-    Raises:
-        ConfigError: The limit is not between 0 and 1e6.
-    """
+    """Set the limit on the size of files within the context, in gigabytes of numbers."""
     if not 0 < gb <= 1e6:
         raise ConfigError(f"the limit of reading must be a positive number of gigabytes, found {gb}")
     token = _limit.set(int(gb * 1e9))
@@ -40,12 +36,7 @@ def limit_gb() -> float:
 
 
 class Budget:
-    """The bytes that one file may still claim.
-
-    Args:
-        source: Name of the file, for messages.
-        error: Type of the error if the file claims more.
-    """
+    """The bytes that the file ``source`` may still claim; more raises an ``error``."""
 
     def __init__(self, source: str, error: type[EkfslamError] = UnknownFormatError) -> None:
         self.source, self.error, self.left = source, error, _limit.get()

@@ -402,11 +402,7 @@ class LiveStereo:
         return live.pose(t)
 
     def flush(self) -> None:
-        """Process everything that waits, since nothing more will come.
-
-        Raises:
-            EkfslamError: A frame could not be processed by a thread.
-        """
+        """Process everything that waits, since nothing more will come."""
         self._line.wait()
         with self._frame_lock:
             if self._first is not None and len(self._first) > 1:

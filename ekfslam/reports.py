@@ -149,11 +149,7 @@ def compare(
 def run_modes(
     sequence: Sequence, modes: Iterable[Mode], config: Config | None = None, timings: Timings | None = None
 ) -> dict[str, Result]:
-    """Return the results of several modes; the filter runs once for ``full`` and ``smoothed``.
-
-    Raises:
-        FilterError, IllPosedError: A mode has no result.
-    """
+    """Return the results of several modes; the filter runs once for ``full`` and ``smoothed``."""
     results, skipped = _run_all(sequence, list(modes), config, timings or Timings(), is_strict=True)
     assert not skipped
     return results
@@ -199,10 +195,6 @@ def compare_into(
     Paths of ``others`` may hold the name of the folder as ``{name}``.
 
     ``verbose`` adds all figures of merit, counts and parameters, and lists the files.
-
-    Raises:
-        ArchiveError: The folder holds results of another recording, or cannot be written.
-        FilterError: No mode has a result.
     """
     timings = timings or Timings()
     others = None if others is None else others.named(folder.name)
@@ -294,10 +286,6 @@ def check_consistency(
     """Run a study into a folder, or its missing part; write ``study.h5``, ``summary.json``, ``table.md`` and figures.
 
     ``executor`` and ``workers`` are those of `open_executor`.
-
-    Raises:
-        ArchiveError: The directory holds another study, or cannot be written.
-        ConfigError: The executor is unknown, not installed or not reachable.
     """
     from ekfslam.figures.study import draw_study_figures
     from ekfslam.figures.style import pngs
@@ -326,11 +314,7 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
     """Judge the covariance of a run, and write ``check.json``, ``check.md`` and ``check.png``.
 
     Innovations need no truth; if the archive has one, it is compared, too. The files go into ``directory``, by default
-    the folder of the archive.
-
-    Raises:
-        ArchiveError: The archive cannot be read or has no such mode.
-        HonestyError: The run has no innovations: another mode than full, or an older release.
+    the folder of the archive. Raise `HonestyError` if the run has no innovations.
     """
     from ekfslam.figures.check import plot_check
     from ekfslam.figures.style import png

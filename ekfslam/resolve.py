@@ -138,12 +138,8 @@ def resolve(
 ) -> Problem:
     """Return the problem of a recording.
 
-    Args:
-        mode: Mode of the run. Dead reckoning needs no clean tracks; only the joint filter needs the track scale.
-        blocks: State blocks in addition to those of the configuration and the automatic model.
-
-    Raises:
-        ConfigError: An unknown block, an unknown setting of a block, or pixel noise that is too small.
+    Dead reckoning needs no clean tracks; only the joint filter needs the track scale. ``blocks`` are state blocks in
+    addition to those of the configuration and the automatic model.
     """
     config = _with_white_tracks(sequence, config or Config())
     if mode in ("full", "smoothed") and (apart := _apart(sequence, config)) is not None:
@@ -249,11 +245,7 @@ def _without_velocities(sequence: Sequence) -> Sequence:
 
 
 def with_odometry(sequence: Sequence) -> Sequence:
-    """Return the recording with stereo odometry in place of velocities that were not measured or never filled in.
-
-    Raises:
-        ScaleError: One camera alone has neither: nothing tells the scale.
-    """
+    """Return the recording with stereo odometry in place of velocities that were not measured or never filled in."""
     if sequence.camera.is_monocular:
         _require_scale(sequence)
         return sequence
@@ -295,9 +287,9 @@ def noise_of_velocities(sequence: Sequence, config: Config | None = None) -> Vel
 
 
 def settings_of(sequence: Sequence, config: Config) -> Config:
-    """Return a configuration with every automatic setting resolved that depends on the recording alone.
+    """Return a configuration with every automatic setting resolved that depends on the recording alone, but its noise.
 
-    Explicit settings take precedence. `noise_of` gives the noise; `resolve` adds the track scale.
+    Explicit settings take precedence.
     """
     config = _with_retirement(sequence, config)
     if sequence.has_checked_tracks and config.filter.split_after is None:
@@ -498,11 +490,7 @@ def _likeliest_densities(sequence: Sequence, config: Config) -> Densities | None
 
 
 def first_state(sequence: Sequence, config: Config, model: Model) -> InertialStart:
-    """Return the first state of an inertial process and how it was found: at rest, in motion, or not at all.
-
-    Raises:
-        ScaleError: One camera in motion.
-    """
+    """Return the first state of an inertial process and how it was found: at rest, in motion, or not at all."""
     samples = sequence.inertial
     assert samples is not None
     prior = FirstPrior.of(sequence.initial_T_world_imu, model, config.inertial.gravity_m_s2)

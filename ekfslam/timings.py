@@ -12,8 +12,7 @@ _BEGIN = perf_counter()  # the wall-clock time of Python's own start is not know
 class Timings:
     """A clock that charges one part at a time: an inner part interrupts the outer one.
 
-    Args:
-        part: Name of the part that is charged first, with all CPU time since the start of the process.
+    All CPU time since the start of the process is charged to the first one.
     """
 
     def __init__(self, part: str = "imports") -> None:

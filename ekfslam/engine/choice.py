@@ -41,11 +41,7 @@ def obstacle(model: Model, config: FilterConfig) -> str:
 
 
 def uses_engine(model: Model, config: FilterConfig) -> bool:
-    """Return whether the engine runs a model.
-
-    Raises:
-        ConfigError: The settings ask for the engine, which cannot run the model.
-    """
+    """Return whether the engine runs a model; raise `ConfigError` if it must and cannot."""
     reason = "" if config.engine == "reference" else obstacle(model, config)
     if config.engine == "engine" and reason:
         raise ConfigError(f"filter.engine = 'engine' is impossible: {reason}")

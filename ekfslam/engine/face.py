@@ -117,11 +117,7 @@ class Engine:
     def measure(
         self, values: Values, coordinates: Array, H: Array, residual: Array, variance: Array
     ) -> tuple[dict[str, Array], Array, float, float]:
-        """Condition on rows H (k, body) of the blocks during a prediction, eq. (6) and (7').
-
-        Returns:
-            Values and coordinates after it, NIS and ``log det S``.
-        """
+        """Condition on rows H (k, body) of the blocks, eq. (6) and (7'); return the mean, NIS and ``log det S``."""
         flat, coordinates, nis, log_det = self.filter.measure(
             self._flat(values), coordinates, H, residual, np.asarray(variance, dtype=float)
         )
@@ -132,13 +128,8 @@ class Engine:
     ) -> tuple[dict[str, Array], Array]:
         """End a prediction: propagate by eq. (2), take the mean of the blocks, and open the view of this frame.
 
-        Args:
-            values, coordinates, imu_twist: Mean after the prediction.
-            Phi, Q: (body, body) transition of the blocks; views do not count.
-            motion: `ekfslam.filters.estimate.Motion` of the prediction.
-
-        Returns:
-            Values and coordinates with those of the view.
+        ``Phi`` and ``Q`` (body, body) are those of the blocks; views do not count. Return values and coordinates with
+        those of the view.
         """
         flat, coordinates = self.filter.arrive(
             self._flat(values),
@@ -164,11 +155,9 @@ class Engine:
     def update(
         self, frame: int, ids: IntArray, measured: Array, is_rested: bool, twist_after: Callable[[Values], Array] | None
     ) -> Report:
-        """Update by a frame's observations, and return what the log and the report need.
+        """Update by a frame's observations, unless `rest` was called, and return what the log and the report need.
 
-        Args:
-            is_rested: Whether `rest` was called for this frame.
-            twist_after: Velocity (6,) of the IMU at this frame by corrected values, for a time offset.
+        ``twist_after`` returns the velocity (6,) of the IMU at this frame by corrected values, for a time offset.
         """
         function = None if twist_after is None else lambda flat: twist_after(self.named(flat))
         found = self.filter.update(frame, ids, measured, is_rested, function)

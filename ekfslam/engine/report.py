@@ -87,13 +87,7 @@ def retired(found: tuple[Any, ...] | None) -> Gone | None:
 
 
 def report(found: tuple[Any, ...], values: int, body: int, dimension: int) -> Report:
-    """Return what a frame did, of `Filter.update`.
-
-    Args:
-        found: Arrays, counts and numbers of the engine.
-        values, body: Lengths of flat values and of coordinates.
-        dimension: Rows d of an observation.
-    """
+    """Return what a frame did, of `Filter.update`, given the lengths of values, coordinates and rows."""
     arrays, (split, moving, begun, whitened, seen, taken), gone, step_before, nis, log_det, dof, doubt = found
     parts, d = _Parts(arrays), dimension
     whole, real, logged = parts.whole, parts.real, taken + begun

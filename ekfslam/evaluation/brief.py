@@ -42,10 +42,7 @@ def brief_table(data: Sequence | Archive, results: Mapping[str, Result]) -> str:
 
 
 def verdict_lines(data: Sequence | Archive, result: Result, archive: Any = "ARCHIVE") -> list[str]:
-    """Return the verdict on a run, and the next step; nothing for a run without innovations.
-
-    ``archive`` is the file to name in a command.
-    """
+    """Return the verdict on a run, and the next step with ``archive`` in its command; nothing without innovations."""
     if result.whitened is None:
         return []
     found = judge(result, truth=data.truth, interpolated=data.interpolated)

@@ -160,10 +160,7 @@ def pose_errors(result: Result, truth: Truth, with_truth_noise: bool) -> tuple[A
 
 
 def pose_nees(result: Result, truth: Truth, with_truth_noise: bool = False) -> tuple[IntArray, Array]:
-    """Return the frames with true pose (n,) and the pose NEES there (n,), 6 degrees of freedom.
-
-    NaN if the estimate's own P is singular, with truth noise and without.
-    """
+    """Return the frames with true pose (n,) and the pose NEES there (n,), of 6 degrees of freedom; NaN: singular."""
     values = nees(*pose_errors(result, truth, with_truth_noise=False))
     if with_truth_noise and truth.noise is not None:
         values = np.where(np.isnan(values), np.nan, nees(*pose_errors(result, truth, with_truth_noise)))
@@ -234,10 +231,7 @@ def nanmean(values: Array, axis: int) -> Array:
 
 
 def chi2_bounds(dof: ArrayLike, probability: float, runs: ArrayLike = 1) -> tuple[Array, Array]:
-    """Return the two-sided bounds that hold the mean of ``runs`` independent chi-square values with ``probability``.
-
-    ``dof`` are the degrees of freedom of one value (any shape).
-    """
+    """Return the two-sided bounds that hold the mean of ``runs`` chi-square values with ``probability``."""
     tails = (1.0 - probability) / 2.0
     runs = np.asarray(runs)
     total = np.asarray(dof) * runs

@@ -229,10 +229,7 @@ def smoother_agreement(result: Result, smoothed: Posterior) -> SmootherAgreement
 
 
 def truth_agreement(result: Result, truth: Truth | None, interpolated: BoolArray | None) -> TruthAgreement | None:
-    """Compare a run with the truth; None if none is left.
-
-    Frames after ``interpolated`` (T,) intervals, and stretches in which the truth stands alone, are left out.
-    """
+    """Compare a run with the truth, but for interpolated frames and stretches in which it stands alone."""
     truth = truth and estimated(result, truth)
     if truth is None or not len(truth.frame) or not result.has_covariance:
         return None

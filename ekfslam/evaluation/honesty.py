@@ -181,14 +181,9 @@ def judge(
     truth: Truth | None = None,
     interpolated: BoolArray | None = None,
 ) -> Honesty:
-    """Judge the covariance of a run by its innovations, and by its smoother and its truth if they are given.
+    """Judge the covariance of a run by its innovations, and by its posterior and its truth if they are given.
 
-    Args:
-        result: A run of any mode.
-        smoothed: Its posterior.
-        skipped: Reason for a missing posterior.
-        truth: Truth of the recording.
-        interpolated: (T,) interpolated intervals; the frames after them are not compared with truth.
+    ``skipped`` is the reason for a missing posterior. Frames after ``interpolated`` (T,) intervals are not compared.
     """
     rejected = evidence.rejected_shares(result)
     smoother = None if smoothed is None else evidence.smoother_agreement(result, smoothed)

@@ -56,10 +56,7 @@ def gauge_covariance(result: Result, truth: Truth) -> Array:
 
 
 def free_pose_errors(result: Result, truth: Truth) -> tuple[Array, Array]:
-    """Return the errors ``xi`` (n, 6) of poses from the truth aligned at its first pose, and their covariance.
-
-    Noise of the truth is included.
-    """
+    """Return the errors ``xi`` (n, 6) of poses from the truth aligned at its first pose, and their covariance."""
     aligned = aligned_at_first(truth, result.T_world_imu)
     error, covariance = pose_errors(result, aligned, with_truth_noise=True)
     return error, covariance - gauge_covariance(result, truth)

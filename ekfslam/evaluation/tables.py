@@ -20,17 +20,7 @@ _NARROWEST = 4  # a rule needs three dashes and a colon
 def markdown_table(
     headings: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1, padded: bool = False
 ) -> str:
-    """Return a Markdown table without a final line end.
-
-    Args:
-        headings: Column headings.
-        rows: Cells of each row, as many as there are headings.
-        left: Number of text columns, aligned to the left; the other columns are numbers, aligned to the right.
-        padded: Pad the cells for terminals.
-
-    Raises:
-        ValueError: A row has more or fewer cells than there are headings.
-    """
+    """Return a Markdown table without a final line end, padded for terminals or not; ``left`` columns are text."""
     lines = [[cell.replace("|", "\\|").replace("\n", " ") for cell in line] for line in (headings, *rows)]
     if any(len(line) != len(headings) for line in lines):
         raise ValueError(f"every row must have {len(headings)} cells")

@@ -38,10 +38,7 @@ def relative_error(samples: int, lags: int) -> float:
 
 
 def along_tracks(frame: IntArray, landmark: IntArray, values: Array, lags: int) -> tuple[Array, IntArray]:
-    """Return the autocovariance (lags+1, d) along all tracks, and the number of pairs (lags+1,) behind it.
-
-    A landmark (K,) has at most one value (K, d) in a frame (K,). NaN does not count.
-    """
+    """Return the autocovariance (lags+1, d) along all tracks of values (K, d), and the number of pairs (lags+1,)."""
     span = (int(frame.max()) if len(frame) else 0) + lags + 1
     key = landmark.astype(np.int64) * span + frame
     order = np.argsort(key)
@@ -59,10 +56,7 @@ def along_tracks(frame: IntArray, landmark: IntArray, values: Array, lags: int) 
 
 
 def ratio_error(values: Array, dof: IntArray, lags: int) -> float:
-    """Return the standard error of ``sum values / sum dof``, (T,) each, which allows for correlation over time.
-
-    Never less than that of independent chi-square values.
-    """
+    """Return the standard error of ``sum values / sum dof``, (T,) each, which allows for correlation over time."""
     total = float(dof.sum())
     if total == 0:
         return float("nan")

@@ -53,20 +53,10 @@ def write_animation(
     pictures: int = 200,
     per_second: int = 20,
 ) -> None:
-    """Write a drive as a moving map from above.
+    """Write a drive as a moving map from above, ``.gif``, or ``.mp4``, which needs the program ffmpeg.
 
     A landmark appears in the frame of its first observation, at its last estimate: archives hold no earlier ones.
-
-    Args:
-        path: Target file: ``.gif``, or ``.mp4``, which needs the program ffmpeg.
-        results: Mode to result.
-        truth: Known poses.
-        pictures: Largest number of pictures, spread over the drive.
-        per_second: Pictures per second.
-
-    Raises:
-        ConfigError: Another ending, a number out of range, or ffmpeg is missing or fails.
-        WriteError: The file cannot be written.
+    ``pictures`` is their largest number, spread over the drive; ``per_second`` their rate.
     """
     path = Path(path)
     if path.suffix not in FORMATS:

@@ -73,12 +73,8 @@ class Series:
 def draw_series(ax: Axes, series: Series, band: str, line: Style, levels: Style = EXPECTED, label: str = "_") -> None:
     """Draw a curve, its bounds and levels with labelled axes.
 
-    Args:
-        ax: Target axes.
-        series: The curve.
-        band: Colour of the bounds of an estimate; bounds of expected values are grey.
-        line, levels: Styles of curve and levels.
-        label: Label of the curve in legends, which leave out names that begin with ``_``.
+    ``band`` colours the bounds of an estimate; those of expected values are grey. Legends leave out a ``label`` that
+    begins with ``_``.
     """
     if series.low is not None and series.high is not None:
         if series.bounds_expectation:

@@ -149,10 +149,7 @@ def _written(figure: Figure) -> list[Text]:
 
 
 def share_x(*column: Axes) -> None:
-    """Give axes above each other the view of all along x; only the lowest shows its x axis, the others its grid.
-
-    Ticks take most of the time of a drawing, so the axes above have none.
-    """
+    """Give axes above each other the view of all along x; only the lowest has ticks, which are slow to draw."""
     *upper, lowest = column
     views = [ax.get_xlim() for ax in column]
     lowest.set_xlim(min(low for low, _ in views), max(high for _, high in views))
@@ -168,11 +165,7 @@ def share_x(*column: Axes) -> None:
 def legend_of(
     figure: Figure, axes: Iterable[Axes], columns: int, title: str | None = None, extra: Iterable[Line2D] = ()
 ) -> float:
-    """Add a legend of several axes below them, where it hides no data, with one entry for equal labels.
-
-    Returns:
-        Height of the legend, inches.
-    """
+    """Add a legend of several axes below them, one entry for equal labels, and return its height in inches."""
     found = [ax.get_legend_handles_labels() for ax in axes]
     handles = {label: handle for pair in found for handle, label in zip(*pair, strict=True)}
     shown = [*handles.values(), *extra]

@@ -27,11 +27,8 @@ _UNITS |= {"ms": "ms", "m": "m", "s": "s"}
 def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
     """Draw a column of figures of merit against a setting: one line for each choice of the others, means over seeds.
 
-    Every recording has a panel. Bands are the range over seeds. The title counts runs without the figure.
-
-    Raises:
-        ConfigError: There is no such column.
-        ValueError: The figure is no number, or there are more than 24 lines in a panel, or more than 24 panels.
+    Every recording has a panel, at most 24 of 24 lines. Bands are the range over seeds. The title counts runs without
+    it.
     """
     y, x = table.column(figure), table.column(setting)
     if y.dtype.kind != "f":

@@ -22,10 +22,7 @@ _DEPTHS_M = (3.0, 60.0)
 
 @styled
 def plot_tracks(recording: ImageRecording, sequence: Sequence, report: TrackReport) -> Figure:
-    """Draw left images with tracks, track lengths, losses by reason, and the rotation of the right camera.
-
-    The images of the recording are read again.
-    """
+    """Draw left images with tracks, track lengths, losses by reason, and the rotation of the right camera."""
     rectified = rectification(recording.calibration)
     frames = np.unique(np.linspace(min(_TRAIL, len(sequence) - 1), len(sequence) - 1, _SHOWN).round().astype(int))
     height, width = rectified.apply(*recording.load(0))[0].shape

@@ -29,12 +29,7 @@ _ELLIPSOIDS = 2000  # of landmarks: more are slow to draw
 
 
 def write_viewer_file(archive: Archive, path: str | Path) -> None:
-    """Write an archive as a file of Rerun (``.rrd``), as a whole or not at all.
-
-    Raises:
-        MissingPackageError: Rerun is not installed.
-        WriteError: The file cannot be written.
-    """
+    """Write an archive as a file of Rerun (``.rrd``), as a whole or not at all."""
     files.require_writable(path)
     recording = _new_recording(archive.name)
     memory = recording.memory_recording()
@@ -50,12 +45,7 @@ def is_viewer_file(path: Path) -> bool:
 
 
 def show_archive(archive: Archive) -> None:
-    """Open the viewer on this machine, and show an archive in it.
-
-    Raises:
-        MissingPackageError: Rerun is not installed.
-        ConfigError: Its viewer cannot be started.
-    """
+    """Open the viewer on this machine, and show an archive in it."""
     recording = _new_recording(archive.name)
     try:
         recording.spawn()

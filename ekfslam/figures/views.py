@@ -21,11 +21,7 @@ def map_of(result: Result, truth: Any = None) -> Figure:
 
 
 def errors_of(result: Result, truth: Any) -> Figure:
-    """Draw estimate minus truth over time by `plot_errors`, with ``truth`` as for `map_of`.
-
-    Raises:
-        TruthError: The truth is missing or has no pose, or has frames that the result has not.
-    """
+    """Draw estimate minus truth over time by `plot_errors`, with ``truth`` as for `map_of`."""
     found = _truth(truth)
     if found is None or not len(found.frame):
         raise TruthError("errors need true poses, and there are none", source=result.sequence_name)
@@ -42,10 +38,7 @@ def trajectory_of(result: Result, truth: Any = None) -> Figure:
 
 @styled
 def plot_trajectory(result: Result, truth: Truth | None = None) -> Figure:
-    """Draw position (m, axes of world) and attitude (degrees) over time with 3-sigma bands.
-
-    The attitude is yaw about z of world, then pitch, then roll.
-    """
+    """Draw position (m, axes of world) and yaw, pitch and roll (degrees) over time with 3-sigma bands."""
     figure = Figure(figsize=(8.0, 7.6))
     axes = figure.subplots(3, 2)
     color = line_of(result.mode)["color"]

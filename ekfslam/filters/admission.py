@@ -51,15 +51,10 @@ class LiveCounts:
 
 
 class Admission:
-    """Judge of messages by their stamps.
+    """Judge of messages by their stamps: ``raise`` an error at one that cannot be used, or ``count`` it.
 
-    Args:
-        late: ``raise`` an error at a message that cannot be used, or only ``count`` it.
-        jump_s: Time by which a stamp may be after the newest one.
-
-    Attributes:
-        counts, dropped: See `ekfslam.filters.live.LiveEKF`.
-        newest: Newest stamp of each kind; minus infinity before the first.
+    ``jump_s`` is the time by which a stamp may be after the newest one. `counts` and `dropped` are those of `LiveEKF`,
+    `newest` holds the newest stamp of each kind.
     """
 
     def __init__(self, late: Literal["raise", "count"], jump_s: float) -> None:
@@ -79,11 +74,9 @@ class Admission:
         return max(self.newest.values())
 
     def has_jumped(self, kind: Kind, t: float, time_s: float | None) -> bool:
-        """Return whether a message is one of many in a row whose stamps agree, far from all others.
+        """Return whether a message stamped t is one of many in a row whose stamps agree, far from all others.
 
-        Args:
-            kind, t: The message.
-            time_s: Stamp of the last processed image; None before the first.
+        ``time_s`` is the stamp of the last processed image; None before the first.
         """
         newest = self.newest_s
         # An older stamp is just out of order unless the filter is past it, or has not begun.
@@ -99,16 +92,12 @@ class Admission:
         return np.isfinite(self.newest_s) and t > self.newest_s + self.jump_s
 
     def accepts(self, kind: Kind, t: float, time_s: float | None, is_repeated: bool, is_full: bool) -> bool:
-        """Return whether a message can be used; count it, and list it or raise if not.
+        """Return whether a message of a kind, stamped t, can be used; count it, and list it or raise if not.
 
         Args:
-            kind, t: The message.
             time_s: Stamp up to which the filter has used messages of its kind; None before the first image.
             is_repeated: Whether another message has its kind and stamp.
             is_full: Whether no more messages of its kind may wait.
-
-        Raises:
-            LateError, ClockError, StampError, BacklogError: It cannot be used, and is not only counted.
         """
         newest = self.newest_s
         reason: Reason = "late"

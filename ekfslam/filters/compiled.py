@@ -33,13 +33,7 @@ def update(
     measured: Array,
     is_rested: bool,
 ) -> Outcome:
-    """Let landmarks out of view leave, correct with known ones (6), start new ones (5).
-
-    Other arguments are those of `ekfslam.filters.frame.update`.
-
-    Args:
-        is_rested: Whether `rest` was called for this frame.
-    """
+    """Let landmarks out of view leave, unless `rest` was called; correct with known ones (6), start new ones (5)."""
 
     def twist_after(after: Values) -> Array:
         return e.model.process.imu_twist({"pose": e.motion.T_departed}, after, e.motion.interval)

@@ -69,11 +69,7 @@ class _Settled:
 
 
 def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correction:
-    """Solve eq. (6) as `ekfslam.filters.correction.correct` does, and decide doubtful frames by consensus.
-
-    Raises:
-        InnovationError: The innovation covariance is not positive definite.
-    """
+    """Solve eq. (6) as `ekfslam.filters.correction.correct` does, and decide doubtful frames by consensus."""
     evidence = e.table.evidence.copy()
     found = correction.correct(e, frame, slot, measured)
     gate = gates.threshold(e.config.gate_probability, e.sensor.dimension)
@@ -239,16 +235,10 @@ def _at(e: Estimate, solution: Solution) -> Mean:
 
 
 def agreeing(S: Array, rows: Rows, gate: float, generator: np.random.Generator) -> BoolArray:
-    """Return which landmarks (k,) agree with the best of small samples of them.
+    """Return which landmarks (k,) agree with the best of small samples of them, given their covariance S (k d, k d).
 
     A sample corrects the predictions of all other landmarks. What it moves by s px may be wrong by ``s^2 / f``, as
-    linearised.
-
-    Args:
-        S: (k d, k d) joint covariance of the innovations.
-        rows: The k landmarks.
-        gate: Threshold for one landmark.
-        generator: Source of samples, if there are too many to try them all.
+    linearised. ``generator`` draws samples if there are too many to try them all.
     """
     (k, d), r = rows.residual.shape, rows.residual
     sample = samples_of(k, generator)
@@ -281,14 +271,9 @@ def samples_of(k: int, generator: np.random.Generator) -> IntArray:
 def refined(S: Array, residual: Array, inside: BoolArray, gate: float) -> BoolArray:
     """Return the landmarks (k,) that agree with all others of them, starting from those ``inside`` (k,).
 
-    The innovation of a landmark given those of all others has the square ``y_i^T K_ii^-1 y_i`` with ``K = S_AA^-1`` and
-    ``y = K r_A``. The worst one leaves first: with it inside, it may seem that others are wrong.
-
-    Args:
-        S: (k d, k d) joint covariance of the innovations (k, d).
-        residual: The innovations.
-        inside: Where to start.
-        gate: Threshold for one landmark.
+    The innovation of a landmark given those of all others, with joint covariance S (k d, k d), has the square ``y_i^T
+    K_ii^-1 y_i`` with ``K = S_AA^-1`` and ``y = K r_A``. The worst one leaves first: with it inside, it may seem that
+    others are wrong. ``gate`` is the threshold for one landmark.
     """
     (k, d), some = residual.shape, np.flatnonzero(inside)
     S_kdkd = S.reshape(k, d, k, d)
@@ -317,11 +302,7 @@ def refined(S: Array, residual: Array, inside: BoolArray, gate: float) -> BoolAr
 
 
 def inverse(S: Array) -> Array:
-    """Return the inverse of a covariance, by Cholesky.
-
-    Raises:
-        LinAlgError: It is not positive definite.
-    """
+    """Return the inverse of a covariance, by Cholesky."""
     if not len(S):
         return S
     L, failed = lapack.dpotrf(S, lower=1)

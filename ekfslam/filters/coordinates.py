@@ -64,10 +64,8 @@ class CameraCoordinates:
     def retract(self, before: CameraPoints, T_after: Array, z: Array, d: Array) -> tuple[Array, BoolArray]:
         """Return ``m+`` (n, 3) of eq. (7'), and whether (n,) each landmark counts by its image.
 
-        Args:
-            before: Points before the correction, with derivatives at the estimate.
-            T_after: (4, 4) ``T_cam_world`` after the correction.
-            z, d: (6,), (n, 3) correction of the view and of the landmarks.
+        Points ``before`` the correction have derivatives at the estimate; z (6,) and d (n, 3) correct view and
+        landmarks; ``T_after`` (4, 4) is ``T_cam_world`` after it.
         """
         q = before.q
         step = z[:3] + q @ se3.skew(z[3:]).T + d @ before.R_linear.T
@@ -87,14 +85,9 @@ def points_in(T_cam_world: Array, positions_m: Array, T_linear: Array, linear_po
 def change_in_view(
     slot: IntArray, columns: IntArray, before: CameraPoints, after: CameraPoints, in_image: BoolArray, turned: Array
 ) -> Change:
-    """Return ``M`` and ``B`` of eq. (7').
+    """Return ``M`` and ``B`` of eq. (7') for landmarks before and after a correction, and the view's body columns.
 
-    Args:
-        slot: (n,) slots of the landmarks.
-        columns: (6,) body columns of the view.
-        before, after: The landmarks before and after the correction.
-        in_image: (n,) whether they count by their images.
-        turned: (6, 6) D of eq. (7').
+    ``turned`` (6, 6) is D of eq. (7'); ``in_image`` (n,) says which landmarks count by their images.
     """
     # The image is its own inverse: its derivative at an image is the inverse of that at the point.
     J = image_jacobian(np.where(in_image[:, None], before.q, _AHEAD))
@@ -117,15 +110,10 @@ def is_in_image(sensor: Sensor, q: Array, min_depth_m: float) -> BoolArray:
 
 
 def moved_by_image(q: Array, step: Array, in_image: BoolArray, factor: float) -> tuple[Array, BoolArray]:
-    """Return points that a correction moves linearly in the image, ``y+ = y + J dq``, and the others by dq itself.
+    """Return points that a correction moves linearly in the image, ``y+ = y + J dq``, and which of them (n,) did.
 
-    Args:
-        q, step: (n, 3) points in the camera frame, and dq.
-        in_image: (n,) which points have an image.
-        factor: Points whose disparity changes by a larger one count by themselves, too.
-
-    Returns:
-        The points after it, and which of them (n,) moved in the image.
+    Points q (n, 3) in the camera frame without an image, and those whose disparity changes by more than ``factor``,
+    move by dq itself.
     """
     front = np.where(in_image[:, None], q, _AHEAD)
     y = image(front)

@@ -133,10 +133,7 @@ def _gate_jointly(
 def _gate_alone(
     e: Estimate, frame: int, rows: Rows, seen: Projected, verdict: IntArray, gate: float
 ) -> tuple[IntArray, Projection, int]:
-    """Return the landmarks (j,) that pass the gate by themselves, with ``H P H^T``; write verdicts on others.
-
-    The last result is the number of those outside of the gate.
-    """
+    """Return the landmarks (j,) that pass the gate by themselves, ``H P H^T``, and the number of the others."""
     some = np.flatnonzero(verdict == ACCEPTED)
     rows = rows if len(some) == len(verdict) else rows.only(some)
     tried = e.gaussian.project(rows, frame, e.ids[rows.slot])

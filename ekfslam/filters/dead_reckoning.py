@@ -11,16 +11,10 @@ from ekfslam.geometry import motion, se3
 
 
 def dead_reckon(sequence: Sequence, noise: Noise, initial_covariance: Array) -> tuple[Array, Array]:
-    """Return poses and covariances from the velocities alone, eq. (1) and (2).
+    """Return ``T_imu_world`` (T, 4, 4) and covariances (T, 6, 6) of ``xi`` from the velocities alone, eq. (1) and (2).
 
-    Args:
-        sequence: Recording, which starts at its `initial_T_world_imu`. Velocities of visual odometry have the standard
-            deviation of the twist's walk.
-        noise: Velocity noise.
-        initial_covariance: (6, 6) of the first pose's error ``xi``.
-
-    Returns:
-        ``T_imu_world`` (T, 4, 4), the report's inverse poses, and the covariance (T, 6, 6) of their error ``xi``.
+    The first pose is `initial_T_world_imu`, its error has ``initial_covariance``. Velocities of visual odometry have
+    the standard deviation of the twist's walk.
     """
     tau = np.diff(sequence.time_s)
     T_imu_world = motion.integrate(se3.inverse(sequence.initial_T_world_imu), sequence.twist, tau)

@@ -21,11 +21,7 @@ _WIDTHS: dict[type, tuple[int, ...]] = {Rig: (4,), Monocular: (2, 4)}
 
 
 def checked_numbers(value: Any, name: str, largest: float = LARGEST) -> Array:
-    """Return real, finite numbers of any shape as a new array.
-
-    Raises:
-        DataError: Booleans, text, complex numbers or other objects; a ragged list; or a number is NaN or too large.
-    """
+    """Return real, finite numbers of any shape as a new array; raise `DataError` for anything else."""
     found = _plain(value, name)
     if found.dtype.kind not in "iuf":
         raise DataError(f"expected real numbers, found {found.dtype}", field=name)
@@ -35,11 +31,7 @@ def checked_numbers(value: Any, name: str, largest: float = LARGEST) -> Array:
 
 
 def checked_stamp(t: Any) -> float:
-    """Return a stamp in s.
-
-    Raises:
-        DataError: It is no finite number, or no time in s.
-    """
+    """Return a stamp in s; raise `DataError` if it is none."""
     if type(t) is float and -LARGEST <= t <= LARGEST:
         return t
     found = _plain(t, "t")
@@ -53,22 +45,14 @@ def checked_stamp(t: Any) -> float:
 
 
 def checked_inputs(value: Any, size: int, name: str) -> Array:
-    """Return velocities or samples (size,).
-
-    Raises:
-        DataError: See `checked_numbers`; or another shape.
-    """
+    """Return velocities or samples (size,), see `checked_numbers`."""
     found = checked_numbers(value, name, LARGEST_VELOCITY)
     require_shape(found, (size,), name)
     return found
 
 
 def checked_interval(inputs: Interval | Any, tau_s: Any, is_gap: bool) -> Interval:
-    """Return the interval of a prediction, given one or its only inputs (6,).
-
-    Raises:
-        DataError: Inputs are no finite real numbers (n, 6), or time does not increase.
-    """
+    """Return the interval of a prediction, given one or its only inputs (6,)."""
     if not isinstance(inputs, Interval):
         one = checked_inputs(inputs, 6, "inputs")
         inputs = Interval.of_one(one, checked_stamp(tau_s), bool(is_gap))
@@ -106,13 +90,7 @@ def checked_frame(value: Any) -> int:
 
 
 def checked_observations(sensor: Sensor, ids: Any, measured: Any) -> tuple[IntArray, Array]:
-    """Return ids (n,) and measurements (n, m) of a sensor's landmarks, such as pixels.
-
-    Raises:
-        DuplicateObservationError: An id occurs twice.
-        DataError: Shapes disagree with each other or with the sensor, an id is no whole number that is not negative, or
-            a measurement is no finite real number.
-    """
+    """Return ids (n,) and measurements (n, m) of a sensor's landmarks, such as pixels; raise `DataError` for others."""
     landmark, numbers = _checked_ids(ids), checked_numbers(measured, "pixels", LARGEST_PX)
     widths = _WIDTHS.get(type(sensor))
     if not numbers.size and not len(landmark):

@@ -27,8 +27,7 @@ class Driven:
     Args:
         ekf: New filter.
         inputs: Inputs; those that are not needed any more are dropped.
-        history_s, log_frames: See `ekfslam.filters.live.LiveEKF`.
-        counts: Counts of ``taken_in``, ``held``, ``gaps`` and ``log_drops``.
+        history_s, log_frames, counts: See `ekfslam.filters.live.LiveEKF`.
 
     Attributes:
         time_s: Stamp of the last image; None before the first.
@@ -74,10 +73,7 @@ class History:
     """Estimates after the last images, and predictions from them, whose cost is amortised over the inputs.
 
     Velocities since the last image are joined to one. Predictions by samples go on from those kept after every 32.
-
-    Args:
-        inputs: Inputs; those that are not needed any more are dropped.
-        history_s: Time before the last image for which estimates are kept.
+    Estimates are kept for ``history_s`` before the last image.
     """
 
     def __init__(self, inputs: Velocities, history_s: float) -> None:

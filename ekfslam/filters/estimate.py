@@ -188,21 +188,13 @@ class Estimate:
         return np.concatenate([np.empty(0), *(self.values[block.name] for block in self.model.layout.curved)])
 
     def covariance_of(self, ids: IntArray) -> Array:
-        """Return the joint covariance (b+3k, b+3k) of the blocks and of some active landmarks.
-
-        Raises:
-            KeyError: An id is not active.
-        """
+        """Return the joint covariance (b+3k, b+3k) of the blocks and of some active landmarks."""
         joint = self.gaussian.covariance_of(self.slots(ids))
         kept = np.delete(np.arange(len(joint)), slice(self.model.layout.body, self.gaussian.body))
         return joint[np.ix_(kept, kept)]
 
     def slots(self, ids: IntArray) -> IntArray:
-        """Return the slots (k,) of active landmarks.
-
-        Raises:
-            KeyError: An id is not active.
-        """
+        """Return the slots (k,) of active landmarks; raise a `KeyError` for others."""
         slot, is_known = self.table.lookup(np.asarray(ids))
         if not is_known.all():
             raise KeyError(f"landmark ids {np.asarray(ids)[~is_known].tolist()} are not active")

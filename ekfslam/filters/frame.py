@@ -49,13 +49,8 @@ def update(
 ) -> Outcome:
     """Correct with known landmarks (6), start new ones (5); landmarks out of view have left, see `rest`.
 
-    Args:
-        e, log, retired: Filter, its log, and the landmarks that have left it.
-        waiting: Tracks that wait for a second view, if the sensor needs two.
-        frame, ids, measured: As in `ekfslam.filters.joint.JointEKF.update`.
-
-    Raises:
-        InnovationError: The innovation covariance is not positive definite.
+    ``waiting`` are tracks that wait for a second view, if the sensor needs two. Further arguments are those of
+    `ekfslam.filters.joint.JointEKF.update`.
     """
     # 1. Screen observations that cannot be used at all.
     rows = e.sensor.rows(measured)

@@ -36,11 +36,7 @@ def diagonal(variance: Array) -> Array:
 
 
 def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> Array:
-    """Return ``r_i^T S_i^-1 r_i`` (n,) for S (n, d, d) and residuals (n, d).
-
-    Raises:
-        InnovationError: A block of S is not positive definite; names the frame and the landmarks.
-    """
+    """Return ``r_i^T S_i^-1 r_i`` (n,) for S (n, d, d) and residuals (n, d); S must be positive definite."""
     try:
         whitened = np.linalg.solve(np.linalg.cholesky(S), residual[..., None])[..., 0]
         return np.einsum("ni,ni->n", whitened, whitened)
@@ -54,11 +50,7 @@ def most_given_others(left: Rows, S: Array) -> Array:
     """Return the upper bound ``e_i^T V^-1 S_i V^-1 e_i`` (k,) of the squares of `agrees_with_others`.
 
     The others can only make an innovation more certain: ``((S^-1)_ii)^-1 <= S_i``. Landmarks that pass the gate by this
-    bound need no `Solution.given_others`.
-
-    Args:
-        left: Rows with the residuals that the correction leaves.
-        S: (k, d, d) covariances of the innovations, each by itself.
+    bound need no `Solution.given_others`. ``left`` has the residuals that the correction leaves, S is (k, d, d).
     """
     y = left.residual / left.variance
     return np.einsum("ni,nij,nj->n", y, S, y)

@@ -220,11 +220,7 @@ class Gaussian:
         P[:b, :b] = 0.5 * (P_bb + P_bb.T)
 
     def project(self, rows: Rows, frame: int, ids: IntArray) -> Projection:
-        """Return the rows projected through P.
-
-        Raises:
-            InnovationError: The variance of some landmark's rows is not positive definite.
-        """
+        """Return the rows projected through P."""
         k, d, size = *rows.residual.shape, len(self._P)
         H_x, seen = rows.H_x.reshape(k * d, self.seen), self.seen
         HP = (H_x @ self._P[:seen]).reshape(k, d, size)
@@ -235,11 +231,7 @@ class Gaussian:
         return Projection(rows, HP, HPH)
 
     def solve(self, projection: Projection, frame: int, ids: IntArray) -> Solution:
-        """Solve eq. (6) for projected rows.
-
-        Raises:
-            InnovationError: The innovation covariance is not positive definite.
-        """
+        """Solve eq. (6) for projected rows; raise `InnovationError` if S is not positive definite."""
         rows = projection.rows
         return self._solve(projection.HP, projection.HPH, rows.residual, rows.variance, frame, ids)
 
@@ -350,11 +342,7 @@ def transform_part(P: Array, own: IntArray | slice, M: Array | None, B: Array, c
 
 
 def add_square(P: Array, A: Array, sign: float) -> None:
-    """Add ``sign A A^T`` to symmetric C-ordered P in place, which stays symmetric to the last bit; A is (n, k).
-
-    Raises:
-        ValueError: P is not C-contiguous: BLAS would update a copy of it.
-    """
+    """Add ``sign A A^T`` to symmetric C-ordered P in place, which stays symmetric to the last bit; A is (n, k)."""
     _require_order(P)
     # NumPy's row-major P is LAPACK's column-major P^T: the upper triangle there is the lower one here.
     blas.dsyrk(sign, A, beta=1.0, c=P.T, lower=0, overwrite_c=1)

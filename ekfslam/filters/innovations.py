@@ -43,9 +43,8 @@ def innovations_of(solution: Solution, landmark: IntArray, rows: Rows, S: Array,
     """Return the innovations of one frame.
 
     Args:
-        solution: Solution of eq. (6) for the rows.
         landmark: (k,) row of each landmark in the log.
-        rows: Accepted rows.
+        rows: Accepted rows, with eq. (6) solved for them.
         S: (k, d, d) innovation covariance of each landmark by itself.
         left: (k, d) residuals that the correction leaves.
     """

@@ -156,9 +156,7 @@ class Retired:
         """Put returning landmarks back into the table, and the neighbours that will probably be seen next.
 
         Args:
-            table: Table that grows.
             known: All landmarks, in the order of the log.
-            log: Record up to now.
             ids: Landmarks that were seen again.
             revival: Source of the neighbours.
             frame: Present frame.

@@ -181,8 +181,7 @@ class LiveEKF:
             gyro, accel: (3,) angular rates, rad/s, and specific forces, m/s^2, in the IMU frame.
             t: Stamp in s.
 
-        Raises:
-            EkfslamError: As `predict`.
+        Errors are those of `predict`.
         """
         if not self.is_inertial:
             raise ConfigError("this filter takes velocities: call predict(velocities, t)")
@@ -197,9 +196,7 @@ class LiveEKF:
             pixels: (n, 4) rectified pixels (uL, vL, uR, vR), or the measurements of another sensor.
             t: Stamp in s.
 
-        Raises:
-            DataError: Shapes disagree, a number is not finite, an id occurs twice, or another image has the stamp.
-            EkfslamError: As `predict`.
+        Errors are those of `predict`.
         """
         landmark, measured = ascending(*checked_observations(self.ekf.sensor, ids, pixels))
         t = checked_stamp(t)
@@ -236,12 +233,7 @@ class LiveEKF:
             self.reset()
 
     def flush(self) -> list[FrameReport]:
-        """Process all images that wait, since nothing more will come, and return reports on them.
-
-        Raises:
-            MissingVelocityError: No velocity or sample has come at all.
-            FilterError: The filter cannot process an image; it goes on without it.
-        """
+        """Process all images that wait, since nothing more will come, and return reports on them."""
         with self.lock:
             if self._waiting and not self._inputs.stamps:
                 raise MissingVelocityError(self._waiting[0][0])
@@ -268,11 +260,7 @@ class LiveEKF:
             return Pose(t, then.T_world_imu, then.gaussian.body_covariance[:6, :6].copy(), is_held)
 
     def block(self, name: str, t: float | None = None) -> tuple[Array, Array]:
-        """Return the value and the covariance of a state block at a stamp, such as ``velocity`` or ``gyro_bias``.
-
-        Raises:
-            EkfslamError: As `pose`; or ``live.ekf.model.layout`` has no such block.
-        """
+        """Return value and covariance of a state block at a stamp, such as ``velocity``, see `pose`."""
         with self.lock:
             layout = self.ekf.model.layout
             if name not in layout:

@@ -47,11 +47,7 @@ class Accepted:
 
 
 class LogBook:
-    """Grows a `Log` frame by frame; arrays are joined when the log is read.
-
-    Args:
-        start: Filter before the first frame.
-    """
+    """Grows a `Log` frame by frame, from a filter before its first frame; arrays are joined when the log is read."""
 
     def __init__(self, start: Estimate) -> None:
         self._first_estimates = start.variant.first_estimates
@@ -198,15 +194,10 @@ class LogBook:
         )
 
     def since(self, first: int, observed: int, landmarks: IntArray) -> tuple[Log, IntArray]:
-        """Return the log since a frame, which becomes frame 0, at a cost that does not grow with the log.
+        """Return the log since a frame, which becomes frame 0, and the rows (m,) of its landmarks in the whole log.
 
-        Args:
-            first: That frame.
-            observed: Frame before which only observations of some landmarks are wanted.
-            landmarks: Rows (n,) of these; they are included even if they are not observed.
-
-        Returns:
-            The log, and the rows (m,) of its landmarks in the whole log, ascending.
+        Its cost does not grow with the log. Before the frame ``observed``, only observations of some landmarks are
+        wanted: their rows (n,) are included even if they are not observed.
         """
         arrays: dict[str, NDArray] = {}
         for group, parts in self._parts.items():

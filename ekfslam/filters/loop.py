@@ -33,11 +33,7 @@ def one_thread() -> AbstractContextManager[object]:
 
 @contextmanager
 def solvable() -> Iterator[None]:
-    """Raise a named error for a matrix that cannot be inverted or decomposed; also a decorator.
-
-    Raises:
-        FilterError: NumPy raised LinAlgError inside.
-    """
+    """Raise `FilterError` for a matrix that cannot be inverted or decomposed; also a decorator."""
     try:
         yield
     except np.linalg.LinAlgError as error:

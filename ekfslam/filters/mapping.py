@@ -18,13 +18,7 @@ from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, Sensor
 
 
 class IndependentLandmarks:
-    """Independent EKF updates of all landmarks of a frame in one batch.
-
-    Args:
-        sensor: Sensor with its noise.
-        config: Gate and limits.
-        T_imu_world: (T, 4, 4) exact poses of all frames.
-    """
+    """Independent EKF updates of all landmarks of a frame in one batch, given the exact poses (T, 4, 4)."""
 
     def __init__(self, sensor: Sensor, config: FilterConfig, T_imu_world: Array) -> None:
         self.sensor, self.config, self._poses = sensor, config, T_imu_world

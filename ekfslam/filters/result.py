@@ -400,11 +400,7 @@ class Result(Shown):
         return self.inertial
 
     def frame_at(self, time_s: float) -> int:
-        """Return the frame whose stamp is nearest to a time on the clock of the recording, s.
-
-        Raises:
-            ShapeError: The time is before the first frame or after the last.
-        """
+        """Return the frame whose stamp is nearest to a time on the clock of the recording, s."""
         first_s, last_s = self.time_s[[0, -1]].tolist()
         if not first_s <= time_s <= last_s:
             raise ShapeError(f"{time_s:g} s is not within {first_s:g} to {last_s:g} s", source=self.sequence_name)
@@ -415,9 +411,6 @@ class Result(Shown):
 
         The map has the landmarks seen in these frames. Estimates, ``counts``, ``config`` and ``attributes`` stay those
         of the whole run; log, whitened innovations and hygiene are left out.
-
-        Raises:
-            ShapeError: There are no such frames.
         """
         begin, end = np.searchsorted(self.time_s, (begin_s, end_s)).tolist()
         if begin >= end:

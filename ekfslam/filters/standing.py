@@ -60,12 +60,7 @@ class Stillness:
         self._R = np.eye(3)
 
     def judge(self, e: Estimate, ids: IntArray, measured: Array) -> Standing | None:
-        """Return the finding in a frame, after the update by its observations; None: the rig moves, or may.
-
-        Args:
-            e: Estimate.
-            ids, measured: (n,), (n, 4) or (n, 2) tracks of the frame.
-        """
+        """Return the finding in a frame with tracks (n,), after the update by them; None: the rig moves, or may."""
         sensor = e.sensor
         if Velocity.name not in e.model.layout or not isinstance(sensor, Rig | Monocular):
             return None

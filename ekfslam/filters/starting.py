@@ -25,16 +25,9 @@ from ekfslam.models.sensors.base import DelayedSensor
 
 
 def start(e: Estimate, log: LogBook, frame: int, ids: IntArray, rows: Array) -> BoolArray:
-    """Append new landmarks with their full cross-covariance, eq. (5).
+    """Append new landmarks with their full cross-covariance, eq. (5), given tracks (n,) that are not in the state.
 
-    Args:
-        e: Estimate that grows.
-        log: Record of the observations.
-        frame: Frame index.
-        ids, rows: (n,), (n, d) new tracks, distinct from all in the state.
-
-    Returns:
-        Whether (n,) each track is in front of the sensor and has a landmark now.
+    Return whether (n,) each track is in front of the sensor and has a landmark now.
     """
     error, parameters = e.model.track_error, e.model.observer.parameters(e.values)
     q, has_depth = e.model.observer.inverted(parameters, rows)
@@ -52,12 +45,7 @@ def start(e: Estimate, log: LogBook, frame: int, ids: IntArray, rows: Array) -> 
 
 
 class Waiting:
-    """Tracks seen from the anchor that have no landmark yet.
-
-    Args:
-        sensor: Sensor that needs two views of a landmark.
-        gate_probability: Chi-square gate on the remaining rows of two views.
-    """
+    """Tracks seen from the anchor that have no landmark yet; a chi-square gate tests the remaining rows."""
 
     def __init__(self, sensor: DelayedSensor, gate_probability: float) -> None:
         self._sensor, self._gate_probability = sensor, gate_probability

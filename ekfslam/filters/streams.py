@@ -19,11 +19,7 @@ _MANY = 64  # velocities that are joined at once
 
 
 class Velocities:
-    """Velocities (6,); each holds since the stamp of the one before.
-
-    Args:
-        gap_s: Spacing above which an interval is a gap.
-    """
+    """Velocities (6,); each holds since the stamp of the one before. Spacing above ``gap_s`` is a gap."""
 
     def __init__(self, gap_s: float) -> None:
         self.gap_s = gap_s

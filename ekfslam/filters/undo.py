@@ -38,8 +38,6 @@ def all_or_nothing(
     """Restore state, covariance, log and counts of a filter if an error is raised inside.
 
     Args:
-        e: The filter, all attributes of its class included.
-        log, retired: Its books.
         parts: Further parts of it that replace their attributes.
         changes_engine: Whether several calls of the engine follow; one alone changes all or nothing.
     """

@@ -42,11 +42,8 @@ def rectification(calibration: PairCalibration) -> Rectification:
     """Return the rectification of a pair.
 
     The new x axis is along the baseline, the new optical axis is the mean of the two across it (Fusiello, Trucco and
-    Verri, "A compact algorithm for rectification of stereo pairs", MVA 2000). The focal length is the mean of the
-    four. The principal point centres both images.
-
-    Raises:
-        CalibrationError: The cameras look in different directions, or along the baseline.
+    Verri, "A compact algorithm for rectification of stereo pairs", MVA 2000). The focal length is the mean of the four.
+    The principal point centres both images.
     """
     T, K_left, K_right = calibration.T_right_left, calibration.K_left, calibration.K_right
     if calibration.is_rectified:

@@ -76,9 +76,7 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
 
     Raises:
         MissingPackageError: OpenCV is not installed.
-        CalibrationError: The pair cannot be rectified.
-        EmptyTracksError: Not one feature is seen in both images.
-        UnknownFormatError, DataError: An image cannot be read, or has another size.
+        DataError: The pair cannot be rectified, an image has another size, or not one feature is seen in both images.
     """
     tracking = Tracking(recording.calibration, recording.T_cam_imu, config)
     for k in progress(range(len(recording)), f"{recording.name}: tracking"):
@@ -87,16 +85,7 @@ def track(recording: ImageRecording, config: FrontEndConfig | None = None) -> tu
 
 
 class Tracking:
-    """Tracking of image pairs, one after another.
-
-    Args:
-        calibration: The pair.
-        T_cam_imu: (4, 4) IMU to the optical frame of the left camera before rectification.
-        config: Settings of tracking.
-
-    Attributes:
-        camera, T_cam_imu: Rectified pair; (4, 4) IMU to its left optical frame.
-    """
+    """Tracking of image pairs, one after another; ``camera`` and ``T_cam_imu`` are those of the rectified pair."""
 
     def __init__(self, calibration: PairCalibration, T_cam_imu: Array, config: FrontEndConfig | None = None) -> None:
         self._config = config or FrontEndConfig()

@@ -76,10 +76,7 @@ class Tracker:
         self._generator = np.random.default_rng(config.seed)
 
     def track(self, left: Image, right: Image, prediction: Array | None = None) -> Seen:
-        """Track the next frame of rectified images; a prediction is the motion ``T_now_before`` of the camera.
-
-        Without prediction the motion of the last interval serves.
-        """
+        """Track the next frame of rectified images, predicted by a motion ``T_now_before``, by default the last one."""
         motion, reported = None, np.empty(0, dtype=bool)
         guess = self._motion if prediction is None else prediction
         if self._images is not None:

@@ -45,12 +45,7 @@ _PASSES = 4
 def in_motion(
     sequence: Sequence, model: Model, prior: FirstPrior, config: FilterConfig
 ) -> tuple[InertialStart | None, str]:
-    """Return the state at the first frame, from the first window that serves, and why earlier windows do not.
-
-    Args:
-        sequence: Recording with clean tracks.
-        model: Model with a stereo rig and the inertial process.
-    """
+    """Return the state at the first frame, from the first window that serves, and why earlier ones do not."""
     since = sequence.time_s - sequence.time_s[0]
     last = int(np.searchsorted(since, _ENDS_S[-1], "right"))
     motions = dict(stereo_motions(sequence, last, float(np.mean(model.noise.pixel_std_px))))

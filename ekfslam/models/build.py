@@ -38,16 +38,12 @@ def model_of(
     """Return the model of a sensor, its noise and the calibration to estimate.
 
     Args:
-        sensor, noise: Sensor of landmarks; noise of velocities and tracks.
         T_imu_world, covariance: (4, 4) first pose, and (6, 6) covariance of its error.
         calibration: Prior standard deviations of the calibration to estimate; None: it is not estimated.
         blocks: Further state blocks.
         coordinates: Coordinates of landmarks; ``image`` needs views in the state.
         measures_twist: Whether velocities are measured, see `Twist`.
         make_process: The process that moves the blocks; its own blocks besides the pose are among ``blocks``.
-
-    Raises:
-        ConfigError: A calibration to estimate without a stereo rig; a block twice; a block that the sensor cannot use.
     """
     chosen: list[StateBlock] = [
         Pose(T_imu_world, covariance),
@@ -93,11 +89,7 @@ def has_image_coordinates(sensor: Sensor, coordinates: LandmarkCoordinates) -> b
 def optional_blocks(
     settings: Mapping[str, Mapping[str, Any]], known_blocks: Mapping[str, type[StateBlock]] = OPTIONAL_BLOCKS
 ) -> tuple[StateBlock, ...]:
-    """Return the blocks of the tables ``[blocks.<name>]`` of a configuration, given the classes by name.
-
-    Raises:
-        ConfigError: An unknown block, or a setting that it does not have.
-    """
+    """Return the blocks of the tables ``[blocks.<name>]`` of a configuration, given the classes by name."""
     chosen = []
     for name, values in settings.items():
         if name not in known_blocks:

@@ -80,10 +80,7 @@ class FirstPrior:
         return FirstPrior(T_world_imu, position, heading, gyro_std, accel_std, gravity_m_s2)
 
     def levelled(self, up: Array) -> Array:
-        """Return ``T_imu_world`` (4, 4) with ``up`` (3,), a unit vector of the IMU frame, along z of world.
-
-        It differs from the pose by the least turn, which leaves heading and position.
-        """
+        """Return ``T_imu_world`` (4, 4), turned least so that a unit vector (3,) of the IMU frame is up in world."""
         T = self.T_world_imu.copy()
         T[:3, :3] = _least_turn(T[:3, :3] @ up, np.array([0.0, 0.0, 1.0])) @ T[:3, :3]
         return se3.inverse(T)

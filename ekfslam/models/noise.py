@@ -126,11 +126,9 @@ class VelocityNoise:
 
 
 def velocity_noise(twist: Array, measured: BoolArray | None = None, stated_std: Array | None = None) -> VelocityNoise:
-    """Return white noise and walk of velocities (T, 6), m/s and rad/s.
+    """Return white noise and walk of velocities (T, 6), m/s and rad/s, of which ``stated_std`` (6,) is the least noise.
 
-    Args:
-        measured: (6,) axes that are measured; by default those that are not exactly 0 throughout, or all if none is.
-        stated_std: (6,) white noise that the sensor states; an axis has at least this.
+    ``measured`` (6,) axes are by default those that are not exactly 0 throughout, or all if none is.
     """
     twist = np.asarray(twist, dtype=float)
     measured = is_measured(twist) if measured is None else measured

@@ -14,15 +14,9 @@ def linearise(
 ) -> tuple[Array, Array, Array]:
     """Linearise observations of landmarks (n, 3) in world, eq. (4).
 
-    Args:
-        sensor: Sensor that sees them.
-        T_imu_world, positions_m: Pose (4, 4) or poses (n, 4, 4), and positions (n, 3): the estimates, at which A is
-            taken.
-        T_linear, linear_positions_m: Pose and positions for the rest of H: the estimates, or (FEJ) the first ones.
-
-    Returns:
-        The points in the camera frame (n, 3) m; ``H_x`` (n, d, 6), derivative by the pose error ``xi`` of
-        ``T_imu_world = exp(xi^) T_hat``; ``H_m`` (n, d, 3), derivative by the landmark position.
+    A is taken at the estimates, the rest of H at the estimates or (FEJ) at the first ones. Return the points in the
+    camera frame (n, 3) m; ``H_x`` (n, d, 6), derivative by the pose error ``xi`` of ``T_imu_world = exp(xi^) T_hat``;
+    ``H_m`` (n, d, 3), derivative by the landmark position.
     """
     q = se3.apply(sensor.T_cam_imu @ T_imu_world, positions_m)
     A = sensor.jacobian(q) @ sensor.T_cam_imu[:3, :3]
@@ -33,17 +27,11 @@ def linearise(
 def initialise(
     sensor: Sensor, T_imu_world: Array, rows: Array, variance: Array, T_linear: Array
 ) -> tuple[Array, Array, Array]:
-    """Initialise landmarks from one observation each, eq. (5).
+    """Initialise landmarks from one observation each, rows (n, 3) with variances, eq. (5).
 
-    Args:
-        sensor: Sensor that saw them.
-        T_imu_world: (4, 4) pose.
-        rows, variance: (n, 3) observed rows and their variances.
-        T_linear: (4, 4) pose at which G is taken: the same, or (FEJ) the predicted one.
-
-    Returns:
-        Positions (n, 3) in world; ``G`` (n, 3, 6), their derivative by the pose error; the part (n, 3, 3) of their
-        covariance that the measurement causes, ``C^T (A^T V^-1 A)^-1 C``, the exact limit of a diffuse prior.
+    Return positions (n, 3) in world; ``G`` (n, 3, 6), their derivative by the pose error, at ``T_linear`` (FEJ); the
+    part (n, 3, 3) of their covariance that the measurement causes, ``C^T (A^T V^-1 A)^-1 C``, the exact limit of a
+    diffuse prior.
     """
     q = sensor.invert(rows)
     T_world_cam = se3.inverse(sensor.T_cam_imu @ T_imu_world)

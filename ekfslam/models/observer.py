@@ -169,12 +169,10 @@ class Observer:
         T_linear: Array | None = None,
         linear_positions_m: Array | None = None,
     ) -> Projected:
-        """Return landmarks as a camera in world sees them, eq. (3) and (4).
+        """Return landmarks (n, 3) as a camera in world sees them, eq. (3) and (4).
 
-        Args:
-            parameters: (9,) calibration, of which the intrinsics count here.
-            T_cam_world, positions_m: (4, 4) or (n, 4, 4), (n, 3) the estimates, at which A is taken.
-            T_linear, linear_positions_m: Those for the rest of H: by default the estimates, or (FEJ) the first ones.
+        The calibration (9,) counts by its intrinsics. A is taken at the estimates, the rest at the linear ones: by
+        default the same, or (FEJ) the first ones.
         """
         sensor, q = self.sensor_at(parameters), se3.apply(T_cam_world, positions_m)
         A, q_linear = sensor.jacobian(q), q

@@ -66,12 +66,7 @@ def stereo_motions(sequence: Sequence, frames: int, std_px: float = 0.2) -> Iter
 
 
 def missing_velocities(sequence: Sequence, odometry: Array | None = None) -> tuple[str, ...]:
-    """Return the kind of velocities, ``linear`` or ``angular``, that were never filled in: 0, while images say other.
-
-    Args:
-        sequence: Recording, with velocities that are partly measured.
-        odometry: (T, 6) its `stereo_odometry`, if it is known.
-    """
+    """Return the kind of velocities, ``linear`` or ``angular``, that were never filled in: 0, while images move."""
     zero = ~sequence.measured_axes.reshape(2, 3).any(axis=1)
     if not zero.any():
         return ()

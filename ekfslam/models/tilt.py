@@ -25,15 +25,9 @@ _LEAST_SPEED_M_S, _MOST_ACROSS, _MOST_SAMPLES = 2.0, 0.2, 300
 
 
 def first_tilt(sequence: Sequence, noise: Noise, bias: TwistBias) -> Array | None:
-    """Return roll and pitch at the first frame, and their standard deviations: (2, 2), rad.
+    """Return roll and pitch at the first frame, and their standard deviations: (2, 2), rad; None: too rarely along x.
 
-    Args:
-        sequence: Recording with level velocities.
-        noise: White noise of the velocities; ``tilt_rad`` is the standard deviation of roll and pitch before.
-        bias: Slow errors of the velocities.
-
-    Returns:
-        None if the vehicle does not drive along its x axis for most of the time.
+    ``tilt_rad`` of the noise is the standard deviation of both before; ``bias`` are slow errors of the velocities.
     """
     twist, tau_s = sequence.twist, np.diff(sequence.time_s, prepend=sequence.time_s[:1])
     forward, across = np.abs(twist[:, 0]), np.abs(twist[:, 1])

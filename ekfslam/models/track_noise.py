@@ -3,10 +3,7 @@
 With rows ``z_k``, the motion ``T_k`` between two frames, ``B_k = dh/dz``, white errors n (covariance Sigma) and steps w
 of a walk (covariance W), the residual of a track over one frame is
 
-    r_k = z_k - h(z_(k-1); T_k) = n_k - B_k n_(k-1) + w_k.
-
-Successive residuals share ``n_k``. Steps of a walk share nothing, and steps that persist have the other sign:
-
+    r_k = z_k - h(z_(k-1); T_k) = n_k - B_k n_(k-1) + w_k,   hence
     Sigma = -E r_k (B_(k+1)^-1 r_(k+1))^T,    W = E r_k r_k^T - Sigma - B_k Sigma B_k^T.
 
 Each motion is fitted to the same tracks and takes a part of each row, its leverage p, with it. Hence residuals are

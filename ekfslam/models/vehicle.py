@@ -50,12 +50,7 @@ def with_vehicle(std: Array, measured: BoolArray, step_s: float) -> Array:
 
 
 def slow_slip(measured: BoolArray, twist: Array, least_m_s: float) -> dict[str, float]:
-    """Return settings of the block `TwistBias` for the linear velocities (T, 6) that are not measured.
-
-    Args:
-        measured: (6,) axes that are measured.
-        least_m_s: Least bias.
-    """
+    """Return settings of the block `TwistBias` for the linear velocities (T, 6) that are not measured."""
     speed = float(np.sqrt((np.where(measured, twist, 0.0)[:, :3] ** 2).sum(axis=1).mean()))
     up, lateral = up_axis(measured), max(least_m_s, _SLOW_SLIP * speed)
     axes = np.flatnonzero(~measured[:3]).tolist() if measured[:3].any() else []

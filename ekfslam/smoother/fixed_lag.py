@@ -86,10 +86,8 @@ class FixedLag:
     def marginal(self, e: Estimate, log: Log, rows: IntArray) -> Marginal | None:
         """Return the estimate of the last frame given the window; None: it was given up, and begins again there.
 
-        Args:
-            e: Filter after its update.
-            log: Its log since frame ``first``, with the landmarks of ``rows`` (M,) in the whole log.
-            rows: Ascending; they contain `landmarks` and the active ones.
+        The log begins at frame ``first`` with the landmarks of ``rows`` (M,) in the whole log, ascending; they contain
+        `landmarks` and the active ones.
         """
         if self.prior is None:
             self._begin()
@@ -186,15 +184,9 @@ class FixedLag:
 
 
 class WindowProblem(BatchProblem):
-    """The factors of a window's log after its prior.
+    """The factors of a window's log after its prior; ``known`` (n,) are the landmarks of the prior.
 
-    Args:
-        window: The window, with its prior.
-        log: Log since its first frame.
-        rows: (M,) rows of the log's landmarks in the whole log, ascending.
-
-    Attributes:
-        known: (n,) landmarks of the prior.
+    ``rows`` (M,) are the rows of the log's landmarks in the whole log, ascending.
     """
 
     def __init__(self, window: FixedLag, log: Log, rows: IntArray) -> None:

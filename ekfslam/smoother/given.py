@@ -41,16 +41,7 @@ class Given:
 
 
 def compared(found: Posterior, frame: IntArray, T_world_imu: Array) -> Given:
-    """Compare a trajectory with the posterior of the same recording.
-
-    Args:
-        found: The posterior.
-        frame: (n,) increasing frames; the first one must be 0.
-        T_world_imu: (n, 4, 4) poses of the body in a world of their own.
-
-    Raises:
-        PosteriorError: There are fewer than three poses, or none of the first frame.
-    """
+    """Compare a trajectory (n, 4, 4), in a world of its own, at increasing frames from 0 on with the posterior."""
     if len(frame) < _LEAST or frame[0] != 0:
         raise PosteriorError(f"expected {_LEAST} poses or more from the first frame on, found {len(frame)}")
     ours = found.T_world_imu

@@ -24,11 +24,7 @@ Robust = Callable[[Array], tuple[Array, Array]]
 def moved_in_image(sensor: Sensor, before: Array, after: Array, positions_m: Array, by: Array) -> Array:
     """Return landmarks (n, 3) moved linearly in the image (x/z, y/z, 1/z) of a camera that moves, too, eq. (7').
 
-    Args:
-        sensor: Sensor of the landmarks.
-        before, after: (n, 4, 4) cameras, from world.
-        positions_m: (n, 3) landmarks.
-        by: (n, 3) change of the points in the camera, to first order. Those without an image change by it.
+    ``by`` (n, 3) is the change of the points in the camera, to first order. Those without an image change by it.
     """
     q = se3.apply(before, positions_m)
     w = 1.0 / np.where(is_in_image(sensor, q, 0.0), q[:, 2], 1.0)
@@ -44,14 +40,10 @@ def settled(
 ) -> State:
     """Return a state with every landmark moved to where it fits best, given all cameras.
 
-    Steps are those of Gauss and Newton, reweighted, for each landmark; only those that lower its cost are taken. With
-    landmarks settled, steps of the whole problem are far longer.
-    Source: Jeong, Nister, Steedly, Szeliski, Kweon, "Pushing the envelope of modern methods for bundle adjustment",
-    PAMI 2012.
-
-    Args:
-        robust: Cost and weight of whitened residuals.
-        least_gain: Landmarks whose step promises to lower the cost by less stay.
+    Steps are those of Gauss and Newton, reweighted (``robust``: cost and weight of whitened residuals), for each
+    landmark; only those that lower its cost are taken, and none that promises less than ``least_gain``. With landmarks
+    settled, steps of the whole problem are far longer. Source: Jeong, Nister, Steedly, Szeliski, Kweon, "Pushing the
+    envelope of modern methods for bundle adjustment", PAMI 2012.
     """
     sight = part = observations.at(state)
     if not sight.in_view(min_depth_m).all():

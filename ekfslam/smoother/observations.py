@@ -183,14 +183,7 @@ class ObservationFactors:
         return found
 
     def _whitened(self, which: IntArray, H_x: Array, H_before: Array | None, H_m: Array, r: Array) -> Factor:
-        """Return the factor of single observations (n,), or of differences.
-
-        Args:
-            which: (n,) numbers in the log.
-            H_x: (n, d, seen) Jacobians by the blocks of the frame of each observation.
-            H_before: (n, d, seen) those of differences by the blocks of the frame before.
-            H_m, r: (n, d, 3), (n, d).
-        """
+        """Return the factor of single observations (n,), or of differences with ``H_before`` by the frame before."""
         log, u, scale = self._log, self._unknowns, 1.0 / np.sqrt(self._log.variance[which])
         observed, wide = u.drive_columns < H_x.shape[-1], scale[..., None]
         drive = u.drive_columns[observed]

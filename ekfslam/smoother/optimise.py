@@ -73,11 +73,9 @@ def maximise(
 ) -> Maximum:
     """Find the maximum a posteriori of all factors, by Levenberg-Marquardt with iteratively reweighted factors.
 
-    A landmark that fits better at its first triangulation starts from there. Source: Triggs, McLauchlan, Hartley,
-    Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000, section 4.
-
-    Raises:
-        IllPosedError: Something is undetermined, or a landmark is behind a camera that saw it; names the ids.
+    A landmark that fits better at its first triangulation starts from there. An `IllPosedError` names what is
+    undetermined, or landmarks behind a camera that saw them. Source: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle
+    adjustment - a modern synthesis", 2000, section 4.
     """
     here = evaluate(problem, better_start(problem, start, config, min_depth_m), config, min_depth_m)
     assert here is not None
@@ -114,8 +112,7 @@ def maximise(
 def better_start(problem: BatchProblem, state: State, config: PosteriorConfig, min_depth_m: float) -> State:
     """Return the state with every landmark at its position or its initialisation, whichever fits better.
 
-    Raises:
-        IllPosedError: A landmark is behind a camera that saw it in both places; names the ids.
+    An `IllPosedError` names landmarks that are behind a camera that saw them in both places.
     """
     log = problem.log
 

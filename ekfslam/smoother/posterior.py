@@ -98,11 +98,7 @@ class Posterior(Shown):
         return self.information.landmark_covariances()
 
     def block_covariance(self, name: str) -> Array:
-        """Return the marginal covariance of a further state block: of each frame (T, n, n), or of the drive (n, n).
-
-        Raises:
-            PosteriorError: There is no such block.
-        """
+        """Return the marginal covariance of a further state block: of each frame (T, n, n), or of the drive (n, n)."""
         u, of = self.problem.unknowns, self.information
         for blocks, find, first in (
             (u.aux, of.aux_covariances, 0),
@@ -128,11 +124,7 @@ class Posterior(Shown):
         return InertialStates(velocity, gyro_bias, accel_bias, covariance)
 
     def rows_of(self, ids: ArrayLike) -> IntArray:
-        """Return the rows (n,) of landmarks given by their ids; a track that was split has the row of its last piece.
-
-        Raises:
-            PosteriorError: There is no landmark of such an id.
-        """
+        """Return the rows (n,) of landmarks given by their ids; a track that was split has that of its last piece."""
         row = {landmark: i for i, landmark in enumerate(self.id.tolist())}
         wanted = np.atleast_1d(np.asarray(ids)).tolist()
         unknown = [landmark for landmark in wanted if landmark not in row]
@@ -141,11 +133,7 @@ class Posterior(Shown):
         return np.array([row[landmark] for landmark in wanted], dtype=np.int64)
 
     def joint_covariance(self, frames: ArrayLike = (), landmarks: ArrayLike = ()) -> Array:
-        """Return the covariance (6a+3b, 6a+3b) of a poses and b landmarks, given by frame and by row, in that order.
-
-        Raises:
-            PosteriorError: There is no such frame or landmark.
-        """
+        """Return the covariance (6a+3b, 6a+3b) of a poses and b landmarks, given by frame and by row, in that order."""
         frame, width = _checked("frame", frames, len(self.T_world_imu)), self.problem.unknowns.width
         landmark = _checked("landmark row", landmarks, len(self.id))
         P = self.information.covariance(frames=frame, landmarks=landmark)
@@ -176,15 +164,10 @@ class Posterior(Shown):
     def information_matrix(self) -> tuple[sp.csc_array, dict[str, Array]]:
         """Return the sparse joint information matrix (n, n): the inverse of the joint covariance of all unknowns.
 
-        Columns are those of poses, further blocks of the frames, blocks of the drive, and landmarks. Components of the
-        first frame that are known for certain have no column.
-
-        Returns:
-            The matrix, and for each column (n,): ``kind`` (``pose``, ``landmark`` or the name of a state block),
-            ``frame`` (-1: none), ``id`` of the landmark (-1: none), ``axis`` within its block.
-
-        Raises:
-            PosteriorError: The first pose is known for certain in a direction that is no axis of ``xi``.
+        Columns are those of poses, further blocks of the frames, blocks of the drive, and landmarks; for each (n,) a
+        second result has ``kind`` (``pose``, ``landmark`` or the name of a state block), ``frame`` (-1: none), ``id``
+        of the landmark (-1: none), ``axis`` within its block. Components of the first frame that are known for certain
+        have no column; a `PosteriorError` is raised if such a direction is no axis of ``xi``.
         """
         problem, frames = self.problem, len(self.T_world_imu)
         is_map = self.linearisation == "map"
@@ -245,11 +228,7 @@ def is_inertial(result: Result) -> bool:
 
 
 def model_of_result(result: Result) -> Model:
-    """Return the model of a full run.
-
-    Raises:
-        PosteriorError: The run had a state block or noise that this version no longer has.
-    """
+    """Return the model of a full run; raise `PosteriorError` if it had a block or noise that no longer exists."""
     assert result.log is not None
     stored, log = _config_of(result), result.log
     retired = [f"state block {name}" for name in sorted({*result.config.get("blocks", {})} - {*stored.blocks})]
@@ -332,18 +311,10 @@ def posterior_of_log(
     min_depth_m: float = FilterConfig.min_depth_m,
     name: str = "posterior",
 ) -> Posterior:
-    """Return the posterior of the log of a filter with any model.
+    """Return the posterior of the log of a filter with any model, see `posterior`.
 
-    Args:
-        log, model: Record and model of the filter.
-        positions_m: (M, 3) the filter's last estimates of the landmarks of the log, to start from.
-        config: Linearisation and kernel.
-        min_depth_m: Least depth of a landmark in view.
-        name: Name for the progress bar.
-
-    Raises:
-        IllPosedError: Something is undetermined; lists landmark ids or frames.
-        FilterError: A matrix is singular.
+    ``positions_m`` (M, 3) are the filter's last estimates of the landmarks of the log, to start from; ``name`` is for
+    the progress bar.
     """
     config = config or PosteriorConfig()
     problem = BatchProblem(log, model)

@@ -60,10 +60,8 @@ class Prior:
     ) -> tuple[Prior, Array]:
         """Return the prior ``N(delta, P)`` of errors at a frame of a state, and the zeta of that state.
 
-        Args:
-            rows, landmarks: (n,) rows of its landmarks in the filter's log and in the state.
-            delta, P: (p,), (p, p) of the errors of (frame, further blocks, drive, landmarks in world).
-            min_depth_m: Depth below which a landmark is behind the camera.
+        Errors (p,) are those of (frame, further blocks, drive, landmarks in world). ``rows`` and ``landmarks`` (n,) are
+        the rows of its landmarks in the filter's log and in the state.
         """
         T, shared, aux = state.T_imu_world[frame], state.shared[frame], state.aux[frame]
         T_cam_imu = model.sensor.T_cam_imu

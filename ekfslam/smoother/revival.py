@@ -38,12 +38,8 @@ class MapRevival:
     def neighbours(self, log: Log, returning: IntArray, candidates: IntArray) -> tuple[IntArray, IntArray]:
         """Return the ``config.revive`` candidates that were seen nearest in time to returning landmarks.
 
-        Args:
-            log: Everything so far.
-            returning, candidates: (a,), (b,) rows of the log, disjoint.
-
-        Returns:
-            Rows (c,) and, in frames, their distances (c,) from the nearest sighting of a returning landmark.
+        All are rows of the log. The second result are their distances (c,), in frames, from the nearest sighting of a
+        returning landmark.
         """
         role = np.zeros(log.landmarks, dtype=np.int64)
         role[returning], role[candidates] = 1, 2
@@ -61,15 +57,9 @@ class MapRevival:
         return chosen, nearest[chosen]
 
     def marginal(self, log: Log, positions_m: Array, landmarks: IntArray) -> Marginal:
-        """Return mean and covariance of the last frame's blocks and of some landmarks, given everything in the log.
+        """Return mean and covariance of the last frame's blocks and of landmarks, given everything in the log.
 
-        Args:
-            log: Everything so far, the prediction to the current frame included.
-            positions_m: (M, 3) the filter's last estimates of all landmarks.
-            landmarks: (n,) rows of the log.
-
-        Raises:
-            IllPosedError: Something is undetermined; names landmark ids or frames.
+        ``positions_m`` (M, 3) are the filter's last estimates of all landmarks, ``landmarks`` rows of the log.
         """
         problem = BatchProblem(log, self._model)
         if is_frozen_exactly(self._config):

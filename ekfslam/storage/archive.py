@@ -82,11 +82,7 @@ class Archive(Shown):
 
 
 def write_archive(path: str | Path, sequence: Sequence | Archive, results: Mapping[str, Result]) -> None:
-    """Write the results (mode to `Result`) of one sequence to an HDF5 file, as a whole, replacing an old one.
-
-    Raises:
-        ArchiveError: The file cannot be written, or its content could not be read again (NaN, say).
-    """
+    """Write the results (mode to `Result`) of one sequence to an HDF5 file, as a whole, replacing an old one."""
     files.write(path, archive_image(sequence, results))
 
 
@@ -130,15 +126,8 @@ def add_result(
 ) -> None:
     """Add the result of one more mode to an archive, replacing an older one of that mode.
 
-    The archive is rewritten as a whole. Two processes that add to it at the same time both succeed.
-
-    Args:
-        path, result: The archive, and the result to add.
-        of: Run of the archive that the result was made from, which must still be there.
-        beside: Further files to write with it, see `ekfslam.files.write_all`.
-
-    Raises:
-        ArchiveError: The archive cannot be read or written, or no longer holds the run.
+    The archive is rewritten as a whole. Two processes that add to it at the same time both succeed. It must still hold
+    the run ``of`` that the result was made from. Files ``beside`` are written with it, see `ekfslam.files.write_all`.
     """
     with files.alone(path):
         archive = read_archive(path)
@@ -152,12 +141,7 @@ def add_result(
 
 
 def read_archive(path: str | Path) -> Archive:
-    """Read an archive.
-
-    Raises:
-        ArchiveError: The file is missing, truncated, no ekfslam archive or of a newer format version, or an item in it
-            is missing or malformed; the message names file and item.
-    """
+    """Read an archive; an `ArchiveError` names file and item if it is damaged, malformed, or newer."""
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         sequence = {"noise": None, **_sequence_fields(h5file), "source": str(hdf5.attribute(h5file, "source"))}
         modes = hdf5.subgroup(h5file, "runs")
@@ -165,11 +149,7 @@ def read_archive(path: str | Path) -> Archive:
 
 
 def open_result(path: str | Path, mode: str) -> Result:
-    """Read the result of one mode, without the rest of the archive.
-
-    Raises:
-        ArchiveError: As `read_archive`, or the archive has no such mode.
-    """
+    """Read the result of one mode, without the rest of the archive."""
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         modes = tuple(hdf5.subgroup(h5file, "runs"))
         if mode not in modes:

@@ -111,17 +111,7 @@ def trajectory_of(result: Result) -> Poses:
 
 
 def true_trajectory(archive: Archive, place: str, format: str) -> Poses:
-    """Return the true poses of an archive, one a frame of known pose.
-
-    Args:
-        archive: The archive.
-        place: Its path, for messages.
-        format: Format to be written.
-
-    Raises:
-        ArchiveError: There is no true pose, or the format has none; or frames lack one and the format is ``kitti``,
-            which has no stamps.
-    """
+    """Return the true poses of an archive, one a frame of known pose; raise `ArchiveError` if it has none."""
     truth, frames = archive.truth, len(archive.time_s)
     if EXPORTS[format].poses is None:
         raise ArchiveError(f"{place}: the truth is written as tum, kitti or bag, not as {format}")
@@ -155,9 +145,6 @@ def euroc_text(result: Result) -> str:
     """Return the states of an inertial result as the ground truth of EuRoC has them: a csv that `attach_truth` reads.
 
     Stamps are ns; a float holds those since 1970 to 0.2 us. Velocities are along world.
-
-    Raises:
-        NoInertialError: Other inputs moved the poses.
     """
     velocity, states = result.velocity_world_m_s, result.inertial
     assert states is not None
@@ -175,9 +162,6 @@ def ply_bytes(result: Result) -> bytes:
     """Return the landmarks with their covariances as a point cloud (PLY, binary, little endian).
 
     Colours run from blue (1 cm and less) to red (10 m and more) with the logarithm of the largest standard deviation.
-
-    Raises:
-        ArchiveError: An id has no place in a double.
     """
     landmarks = result.landmarks
     if len(landmarks) and landmarks.id.max() > 1 << 53:
@@ -263,13 +247,6 @@ def information_bytes(result: Result, found: Posterior | None = None) -> bytes:
     """Return the joint information matrix of a full run as a file for `scipy.sparse.load_npz`, without pickle.
 
     Further arrays ``kind``, ``frame``, ``id`` and ``axis`` name each column, see `Posterior.information_matrix`.
-
-    Args:
-        result: A result of mode ``full``.
-        found: Its posterior, if it is known already.
-
-    Raises:
-        PosteriorError: The result has no log, or there is no such matrix.
     """
     matrix, named = (found or posterior(result)).information_matrix()
     texts = {name: value.astype(np.bytes_) if value.dtype.kind == "U" else value for name, value in named.items()}

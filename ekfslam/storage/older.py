@@ -43,10 +43,7 @@ def former(version: int) -> Mapping[type, Layout]:
 
 
 def completed(record: type, found: dict[str, Any], version: int) -> dict[str, Any]:
-    """Return the fields of a record with the fields that a release of this format version did not write.
-
-    A field that this version should have stays missing.
-    """
+    """Return the fields of a record with those that a release of this format version did not write, but no others."""
     if record is Log and "tau_s" in found:
         found.setdefault("doubt", np.ones(len(found["tau_s"])))  # early releases of version 6 lack it
     if record is not Log or version > 5:

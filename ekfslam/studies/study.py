@@ -189,11 +189,10 @@ def filter_config(level: Loop, variant: str) -> FilterConfig:
 
 
 def run_one(study: Study, level: str, run: int) -> dict[str, dict[str, NDArray]]:
-    """Simulate one realisation and run all variants on it.
+    """Simulate one realisation and run all variants on it; return variant to field to value, as in `VARIANT_LAYOUT`.
 
-    Returns:
-        Variant to field to value, shaped as in `VARIANT_LAYOUT`. Values are NaN at frame 0, whose true pose is drawn
-        and not part of a recording, and from the frame at which a filter stops.
+    Values are NaN at frame 0, whose true pose is drawn and not part of a recording, and from the frame at which a
+    filter stops.
     """
     world = realisation(study, level, run)
     with ONE_RUN_AT_A_TIME, one_thread(), np.errstate(all="ignore"):
@@ -327,19 +326,10 @@ class StudyArchive(Shown):
 
 
 def run_study(study: Study, path: str | Path, executor: Executor, progress: bool = True) -> StudyArchive:
-    """Run everything that the archive at ``path`` does not hold; see `run_missing` for interruptions.
-
-    A larger number of runs extends a study.
-
-    Args:
-        study: The study.
-        path: Archive, made if missing, as is its folder.
-        executor: Executor of the runs, see `open_executor`.
-        progress: Whether to show a progress bar on a terminal.
+    """Run everything that the archive at ``path`` does not hold, see `run_missing`; a larger number of runs extends it.
 
     Raises:
-        ArchiveError: ``path`` holds another study (the message names the difference), is no archive of a study, or
-            cannot be written.
+        ArchiveError: ``path`` holds another study (the message names the difference), or cannot be written.
         WriteError: Another study writes there.
     """
     path = Path(path)
@@ -414,11 +404,7 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
 
 
 def read_study(path: str | Path) -> StudyArchive:
-    """Read the archive of a study, finished or not.
-
-    Raises:
-        ArchiveError: The file is missing or damaged, or holds something else.
-    """
+    """Read the archive of a study, finished or not."""
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         parameters = hdf5.json_table(h5file, "study")
         try:

@@ -110,11 +110,7 @@ class Recording:
 
     @cached_property
     def content(self) -> str:
-        """Everything that decides its numbers: digests of its files or the name of the world, and its preparation.
-
-        Raises:
-            UnknownFormatError: A file is missing.
-        """
+        """Everything that decides its numbers: digests of its files or the name of the world, and its preparation."""
         files = {name: getattr(self, name) for name in ("velocities", "calibration", "imu", "imu_noise")}
         further = {name: path and _digest(Path(path)) for name, path in files.items()}
         further |= {"frames": self.frames, "velocity_frame": self.velocity_frame, "topics": " ".join(self.topics)}
@@ -161,11 +157,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A product of recordings, modes, variants, seeds and settings to run.
-
-    Raises:
-        ConfigError: There is nothing to run, too much, or something unknown.
-    """
+    """A product of recordings, modes, variants, seeds and settings to run."""
 
     recordings: tuple[Recording, ...]  # the recordings
     modes: tuple[str, ...] = ("full",)  # modes, variants: names in `MODES` and `VARIANTS`
@@ -227,11 +219,7 @@ class Sweep:
 
     @staticmethod
     def from_toml(path: str | Path) -> Sweep:
-        """Read a sweep from a file; paths in it are relative to its folder.
-
-        Raises:
-            ConfigError: The file is missing, is not TOML, or holds something unknown.
-        """
+        """Read a sweep from a file; paths in it are relative to its folder."""
         try:
             require_file(path, is_text=True)
             return _parsed(tomllib.loads(Path(path).read_text(encoding="utf-8")), Path(path).parent)

@@ -125,11 +125,7 @@ def table_image(table: SweepTable) -> bytes:
 
 
 def write_table(path: str | Path, table: SweepTable) -> list[Path]:
-    """Write a table as HDF5, and as Parquet if ``pyarrow`` is installed; return the paths.
-
-    Raises:
-        WriteError: A file cannot be written.
-    """
+    """Write a table as HDF5, and as Parquet if ``pyarrow`` is installed; return the paths."""
     path = Path(path)
     contents: dict[Path, str | bytes] = {path: table_image(table)}
     with suppress(ImportError):
@@ -144,11 +140,7 @@ def write_table(path: str | Path, table: SweepTable) -> list[Path]:
 
 
 def read_table(path: str | Path) -> SweepTable:
-    """Read the table of a sweep.
-
-    Raises:
-        ArchiveError: The file is missing or damaged, or holds something else.
-    """
+    """Read the table of a sweep."""
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         group = hdf5.subgroup(h5file, "table")
         columns = hdf5.read_fields(group, _layout({name: group[name] for name in group if name != _ROW}))

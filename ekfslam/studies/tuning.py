@@ -315,10 +315,7 @@ class Likelihood:
 def estimates_of(start: dict[str, float], free: list[str], peak: Peak, found: VelocityNoise) -> tuple[Estimate, ...]:
     """Return all parameters with their standard errors: likelihood and differences, alone and combined.
 
-    Args:
-        start: Parameters at the start, by name.
-        free: Names of the parameters that the likelihood has searched, with its maximum ``peak``.
-        found: Noise of the velocities by their differences.
+    ``start`` has the parameters at the start; the likelihood has searched the ``free`` ones, with its maximum ``peak``.
     """
     pairs = zip(found.sigma.tolist(), found.sigma_error.tolist(), strict=True)
     differences = dict(zip(PARAMETERS, pairs, strict=False))
@@ -373,10 +370,7 @@ def sandwich(H: Array, scores: Array) -> Array:
 
 
 def with_differences(x: Array, C: Array, names: list[str], found: VelocityNoise) -> tuple[Array, Array]:
-    """Combine logarithms (n,) of parameters, with covariance (n, n), with the differences of the velocities.
-
-    Both are taken as independent.
-    """
+    """Combine logarithms (n,) of parameters, with covariance (n, n), with the differences of the velocities."""
     at, value, variance = [], [], []
     for name, sigma, error in zip(PARAMETERS, found.sigma, found.sigma_error, strict=False):
         if name in names and sigma > 0 and np.isfinite(error):
@@ -419,10 +413,7 @@ def filter_reports(sequence: Sequence, noise: Noise, config: Config) -> list[Fra
 def without_rejected(
     sequence: Sequence, noise: Noise, config: Config, reasons: tuple[int, ...] = _WRONG
 ) -> tuple[Sequence, int]:
-    """Remove the observations that a filter rejects for some of its reasons, and count them.
-
-    A split track continues under a new id and counts as one more.
-    """
+    """Remove the observations that a filter rejects for some reasons, and count them; a split track is one more."""
     reports = filter_reports(sequence, noise, config)
     tracks = sequence.observations
     # Reports are in the order of the observations: by frame and, within a frame, by id.

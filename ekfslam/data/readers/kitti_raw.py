@@ -111,7 +111,7 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray", lateral: Lateral = "
 
 
 def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> ImageRecording | None:
-    """Open the rectified images of a sync drive, with velocities and truth; None without images. Frame k is packet k."""
+    """Open the rectified images of a sync drive, with velocities and truth; None without images."""
     pair = next((pair for pair in CAMERAS if (folder / f"image_{CAMERAS[pair][0]}" / "data").is_dir()), None)
     if pair is None:
         return None

@@ -128,20 +128,15 @@ class StateBlock:
     ) -> tuple[Array, Array]:
         """Return velocities (..., 6) and their derivative (..., 6, body), after this block has turned them.
 
-        Args:
-            twist, by: Velocities and derivative before.
-            values: Estimates of all blocks; the pose is the one before the interval.
-            R_linear: (..., 3, 3) rotation of that pose at which its error is linearised.
-            layout: Columns of the blocks.
+        Values are estimates of all blocks, the pose the one before the interval; its error is linearised at the
+        rotation R_linear (..., 3, 3).
         """
         return twist, by
 
     def camera_share(self, way_m: Array, is_difference: BoolArray) -> Array | None:
         """Return the share of the value (6,) that moves the camera: ``exp((share value)^) T_imu_world``.
 
-        Args:
-            way_m: (...) way driven since the frame before, for each observation.
-            is_difference: (...) whether it is a difference from the frame before, eq. (10).
+        An observation (...) may be a difference from the frame before, eq. (10), ``way_m`` (...) ago.
         """
         return None
 
@@ -168,10 +163,7 @@ class StateBlock:
 
 
 class Layout(dict[str, slice]):
-    """Columns of the blocks in a covariance: blocks that observations depend on come first.
-
-    Args:
-        blocks: Blocks in any order, the pose first; seen ones move to the front.
+    """Columns of the blocks in a covariance: blocks that observations depend on come first; the pose must be the first.
 
     Attributes:
         body: Number of columns of all blocks.

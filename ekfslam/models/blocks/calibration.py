@@ -78,10 +78,7 @@ class Calibration(StateBlock):
     def camera_by(self, parameters: Array, T_cam_imu: Array, twist: Array) -> Array:
         """Return the derivative (..., 6, size) of the error of the camera in world, eq. (9), by the free parameters.
 
-        Args:
-            parameters: (9,).
-            T_cam_imu: (4, 4) extrinsics with the parameters applied.
-            twist: (..., 6) velocities of the IMU.
+        ``T_cam_imu`` (4, 4) has the parameters (9,) applied; ``twist`` (..., 6) are velocities of the IMU.
         """
         by = np.zeros((*twist.shape, 9))
         by[..., _EXTRINSIC] = se3.left_jacobian(parameters[_EXTRINSIC])

@@ -86,13 +86,9 @@ class Process(ABC):
 
     @abstractmethod
     def step(self, values: Values, interval: Interval | Intervals, T_linear: Array, first_estimates: bool) -> Step:
-        """Return the step over an interval.
+        """Return the step over an interval; the pose's error before it is linearised at ``T_linear`` (..., 4, 4).
 
-        Args:
-            values: Estimates (see the contract).
-            interval: The inputs.
-            T_linear: (..., 4, 4) pose at which the pose's error before the step is linearised.
-            first_estimates: Whether Phi leads from there (FEJ) and not from the estimate.
+        With ``first_estimates`` Phi leads from there (FEJ) and not from the estimate.
         """
 
     @abstractmethod
@@ -119,10 +115,7 @@ class Process(ABC):
         return None
 
     def measured(self, interval: Interval, is_first: bool) -> Measured | None:
-        """Return the measurements of blocks that the inputs of an interval make; None: they are no measurements.
-
-        In the first interval `start` uses them.
-        """
+        """Return the measurements of blocks by the inputs of an interval; None: they are none, see `start`."""
         return None
 
     def referred(self, measured: Measured, values: Values, interval: Interval) -> Measured:

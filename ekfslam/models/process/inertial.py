@@ -125,9 +125,6 @@ class Inertial(Process):
         """Return means of linear velocities over an interval as velocities before it: less the change by the samples.
 
         That change depends on the state by the length of the interval only, which is left out.
-
-        Raises:
-            ConfigError: Something else than linear velocities is measured.
         """
         if (measured.axis > 2).any():
             raise ConfigError("beside inertial samples, only linear velocities can be measured: v_x, v_y, v_z")

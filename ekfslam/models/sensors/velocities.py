@@ -19,9 +19,6 @@ class VelocitySource:
 
     Each measures the mean velocity of the interval between frames that its stamp lies in, ``(t[k-1], t[k]]``. The state
     holds it in the block `Twist`, or in the block `Velocity` of inertial samples, which takes linear axes only.
-
-    Raises:
-        ConfigError: An unknown axis, stamps that do not ascend, or sizes that do not fit.
     """
 
     time_s: Array  # (n,) ascending stamps, on the clock of the recording

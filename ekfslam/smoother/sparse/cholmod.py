@@ -17,12 +17,7 @@ from ekfslam.smoother.sparse import solvers
 
 
 class NotPositiveDefiniteError(EkfslamError):
-    """The matrix to be factorised is singular or indefinite.
-
-    Args:
-        shape: Shape of the matrix.
-        block, row: Block and row, in the order of the matrix, of the pivot that is not positive.
-    """
+    """The matrix is singular or indefinite: the pivot of a block and row (of the matrix) is not positive."""
 
     def __init__(self, shape: tuple[int, int], block: int, row: int) -> None:
         self.block, self.row = block, row
@@ -93,13 +88,8 @@ class BlockPattern:
 class SparseCholesky:
     """``A[permutation][:, permutation] = L L^T`` of a symmetric positive definite matrix A (n, n) made of blocks.
 
-    Args:
-        pattern: Pattern of A.
-        matrix: Its permuted lower triangle, from `BlockPattern.assemble`.
-        like: Factorisation of another matrix with this pattern, whose symbolic analysis is used again.
-
-    Raises:
-        NotPositiveDefiniteError: A is singular or indefinite.
+    ``matrix`` is its permuted lower triangle, from `BlockPattern.assemble`. The symbolic analysis of ``like`` is used
+    again. Raise `NotPositiveDefiniteError` if A is singular or indefinite.
     """
 
     def __init__(self, pattern: BlockPattern, matrix: sp.csc_matrix, like: SparseCholesky | None = None) -> None:

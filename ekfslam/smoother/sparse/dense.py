@@ -16,17 +16,9 @@ from ekfslam.smoother.sparse.factors import GROUPS, LinearSystem
 
 
 class DenseInformation:
-    """The Gaussian of a `LinearSystem` whose prior may cover landmarks, too; see `JointInformation`.
+    """The Gaussian of a `LinearSystem` whose prior may cover landmarks (n,) ``known``, too; see `JointInformation`.
 
-    Args:
-        system: All factors; ``first.B`` and ``first.zeta`` are over (frame, aux, drive, landmarks with a prior).
-        known: (n,) landmarks with a prior.
-
-    Attributes:
-        zeta, eps, aux, drive, d, gain: As of `JointInformation`.
-
-    Raises:
-        IllPosedError: Something is undetermined.
+    ``first.B`` and ``first.zeta`` are over (frame, aux, drive, landmarks with a prior).
     """
 
     def __init__(self, system: LinearSystem, known: IntArray) -> None:

@@ -183,10 +183,8 @@ class LinearSystem:
     def information_matrix(self) -> tuple[sp.csc_array, IntArray]:
         """Return the information matrix (n, n) of ``eps, aux, drive, d``, and which of these (n,) are its columns.
 
-        Components of the first frame that are known for certain (a zero row of B) have no column.
-
-        Raises:
-            PosteriorError: The first frame is known for certain in a direction that is no axis.
+        Components of the first frame that are known for certain (a zero row of B) have no column. Raise
+        `PosteriorError` if such a direction is no axis.
         """
         J, B = self.rows_without_prior()[0], self.first.B
         known = np.abs(B).max(axis=1) > 0

@@ -267,11 +267,7 @@ class JointInformation:
 
 
 def _cholesky_of_landmarks(H_mm: Array, ids: IntArray) -> Array:
-    """Return the Cholesky factors (M, 3, 3) of the landmarks' own information.
-
-    Raises:
-        IllPosedError: Some are singular to working precision; names them.
-    """
+    """Return the Cholesky factors (M, 3, 3) of the landmarks' own information; name those that are singular."""
     undefined = ~np.isfinite(H_mm).all(axis=(1, 2))
     if undefined.any():
         raise IllPosedError("landmarks with infinite or undefined information", ids[undefined])

@@ -56,11 +56,7 @@ class SelectedInverse:
         self._offset = concatenated_ranges(np.zeros(nb, dtype=np.int64), height)[leads]
 
     def blocks(self, i: ArrayLike, j: ArrayLike) -> Array:
-        """Return blocks (n, s_i, s_j) of the inverse, for blocks i and j (n,) of A, each of one size.
-
-        Raises:
-            MissingBlockError: A pair lies outside the pattern of the factor.
-        """
+        """Return blocks (n, s_i, s_j) of the inverse in the pattern, for blocks i and j (n,) of A, each of one size."""
         i, j = np.asarray(i, dtype=np.int64), np.asarray(j, dtype=np.int64)
         s_i, s_j = (int(self._sizes[some[:1]].sum()) for some in (i, j))
         low, high = np.minimum(self._rank[i], self._rank[j]), np.maximum(self._rank[i], self._rank[j])
@@ -81,11 +77,7 @@ class SelectedInverse:
 
 
 def selected_inverse(L: sp.csc_array) -> sp.csc_array:
-    """Return the entries of ``(L L^T)^-1`` in the pattern of L (n, n), a `SparseCholesky.factor`.
-
-    Raises:
-        PatternError: The rows of a supernode are not among those of its parent, as of a factor with dropped entries.
-    """
+    """Return the entries of ``(L L^T)^-1`` in the pattern of L (n, n), a `SparseCholesky.factor`."""
     tree = _supernodes(L)
     in_factor = np.triu(np.ones((max(tree.width), max(tree.height)), dtype=bool))
     result = np.empty_like(L.data)

@@ -63,11 +63,7 @@ class Analysis(Protocol):
         """Return a fill-reducing, postordered permutation (n,) of a pattern, given as its lower triangle."""
 
     def factorise(self, matrix: sp.csc_matrix) -> Factor:
-        """Factorise a matrix.
-
-        Raises:
-            PivotError: The matrix is singular or indefinite.
-        """
+        """Factorise a matrix; raise `PivotError` if it is singular or indefinite."""
 
 
 class Cholmod04:
