@@ -6,9 +6,9 @@
    monocular SLAM with map reuse", RA-L 2017, without the scale.
 3. The joint maximum a posteriori of the window, by the factors of the smoother.
 
-The mean is that of the window. The covariance is the broad prior of the window: the filter processes the window itself,
-and would use it twice if it started with the marginal. So the covariance is too large in the first frames, and right
-after the window.
+The mean is that of the window. The filter processes the window itself, and would use it twice if it started with the
+marginal. The prior alone is so broad that the first frames throw the mean away again. So the covariance has the prior
+and a sixteenth of the window's information: too large in the first frames, and right after the window.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from ekfslam.smoother.problem import BatchProblem
 # Ends of windows, s; standard deviation before the window of the velocity, and of the tilt over that which the bias of
 # the accelerometer leaves after it.
 _ENDS_S, _LONG_S, _SPEED_M_S, _TILT_FACTOR = (1.0, 1.5, 2.0, 3.0), 1.0, 0.5, 3.0
+_SHARE = 1.0 / 16.0  # of the information of the window that the first covariance has
 _LEAST_MOTIONS, _LEAST_POINTS, _OFF_M_S2, _MOST_COST = 5, 10, 0.3, 3.0
 _PASSES = 4
 
@@ -174,5 +175,14 @@ def _smoothed(
         f"{np.linalg.norm(u):.2f} m/s, |g| {first.free_m_s2:.2f} m/s^2 if free, gyroscope bias "
         f"({', '.join(f'{x:.3g}' for x in gyro_bias)}) rad/s"
     )
-    P = prior.covariance(T[:3, :3], tilt_rad, _SPEED_M_S)
+    own = problem.unknowns.places(started.process.columns)
+    marginal = found.information.state_covariances[0][np.ix_(own, own)]
+    P = _with_share(prior.covariance(T[:3, :3], tilt_rad, _SPEED_M_S), marginal)
     return InertialStart(T, u, gyro_bias, accel_bias, P, text)
+
+
+def _with_share(prior: Array, marginal: Array) -> Array:
+    """Return the covariance of a prior and of a share of what a marginal knows beyond it; directions may be certain."""
+    prior, marginal = prior / (1.0 - _SHARE), marginal / _SHARE
+    P = prior - prior @ np.linalg.pinv(prior + marginal, hermitian=True) @ prior
+    return np.asarray((P + P.T) / 2)

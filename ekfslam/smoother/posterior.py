@@ -117,8 +117,7 @@ class Posterior(Shown):
         process, u = self.problem.model.process, self.problem.unknowns
         if not isinstance(process, Inertial):
             return None
-        place = {column: i for i, column in enumerate((*u.frame_columns, *u.aux_columns))}
-        own = [place[column] for column in process.columns]
+        own = u.places(process.columns)
         covariance = self.information.state_covariances[:, own][:, :, own]
         velocity, gyro_bias, accel_bias = (self.values[name] for name in process.own[1:])
         return InertialStates(velocity, gyro_bias, accel_bias, covariance)

@@ -65,6 +65,12 @@ class Unknowns:
         if covariance[np.ix_(first, self.drive_columns)].any():
             raise PosteriorError("the prior couples blocks of the drive with blocks of the first frame")
 
+    def places(self, columns: IntArray) -> IntArray:
+        """Return the places, in the columns of a frame and its further blocks, of some columns of the layout."""
+        own = np.concatenate([self.frame_columns, self.aux_columns])
+        order = np.argsort(own)
+        return np.asarray(order[np.searchsorted(own[order], columns)])
+
     def first_frame(self, zeta: Array) -> FirstFrame:
         """Return the prior of the first frame, linearised at zeta (w+a,)."""
         B = self.B.copy()
