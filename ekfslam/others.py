@@ -14,7 +14,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from ekfslam.data.noise import Noise
 from ekfslam.data.observations import Truth
 from ekfslam.data.readers.poses import FIRST_IMAGE, Poses, nearest, truth_of_frames
 from ekfslam.data.readers.registry import Source, expected, read_as
-from ekfslam.data.readers.tum import COVARIANCE_ENDING, covariances_beside
+from ekfslam.data.readers.tum import COVARIANCE_ENDING, covariance_path, covariances_beside
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.trajectory import Moving, Trajectory, left_error_covariance
 from ekfslam.errors import ConfigError, TruthError, UnknownFormatError
@@ -47,21 +47,23 @@ _SHOWN = 3  # stretches in messages
 class Others:
     """Trajectories to compare with.
 
-    Args:
-        files: Path or trajectory by name. ``{name}`` in a path is the name of the recording, ``{seed}`` the seed.
-        frame: Moving frame of the poses in files: body or left camera. None: left camera for KITTI, else body.
-        world: ``first`` moves each trajectory so that its first pose is that of the recording (the true one, or that
-            of our runs); if accelerations show the vertical, only in yaw and position. ``given`` moves none.
-
     Raises:
         ConfigError: A name is that of a mode, empty, or has a slash or a dot.
     """
 
+    # Path or trajectory by name. ``{name}`` in a path is the name of the recording, ``{seed}`` the seed.
     files: Mapping[str, Trajectory | str | Path] = dataclasses.field(default_factory=dict)
-    frame: Moving | None = None
+    frame: Moving | None = None  # moving frame of poses in files; None: left camera for KITTI, else body
+    # "first" moves each trajectory so that its first pose is that of the recording (the true one, or that of our runs);
+    # if accelerations show the vertical, only in yaw and position. "given" moves none.
     world: World = "first"
 
     def __post_init__(self) -> None:
+        for what, value, known in (("frame", self.frame or "body", Moving), ("world", self.world, World)):
+            if value not in get_args(known):
+                raise ConfigError(
+                    f"{what} of trajectories must be one of {', '.join(get_args(known))}, found {value!r}"
+                )
         for name in self.files:
             if not name or name != printable(name) or set(name) & set("/.") or name in (*MODES, "truth"):
                 raise ConfigError(f"a trajectory cannot have the name {name!r}: modes and paths have such names")
@@ -93,13 +95,12 @@ class Others:
         }
         return dataclasses.replace(self, files=filled)
 
-    def require_distinct(self, recordings: int) -> None:
-        """Raise a `ConfigError` if a trajectory would be compared with several recordings."""
+    def require_distinct(self, recordings: int, seeds: int = 1) -> None:
+        """Raise a `ConfigError` if a trajectory would be compared with several recordings or seeds."""
         for name, path in self.files.items():
-            if recordings > 1 and NAME not in str(path):
-                raise ConfigError(
-                    f"{name}: one trajectory for {recordings} recordings; write {NAME} in place of their name in {path}"
-                )
+            for count, of, key in ((recordings, "recordings", NAME), (seeds, "seeds", SEED)):
+                if count > 1 and key not in str(path):
+                    raise ConfigError(f"{name}: one trajectory for {count} {of}; write {key} for them in {path}")
 
     def results(self, recording: Sequence | Archive, like: Result | None = None) -> dict[str, Result]:
         """Return each trajectory as a result; ``like`` is one of our runs.
@@ -110,6 +111,17 @@ class Others:
             DataError: A file is malformed; the subclass says how.
         """
         return {name: _result(recording, name, given, self, like) for name, given in self.files.items()}
+
+
+NO_OTHERS = Others()
+
+
+def files_of(given: Trajectory | str | Path) -> list[Path]:
+    """Return the files of a trajectory that exist: its poses and covariances."""
+    if isinstance(given, Trajectory):
+        return []
+    path = Path(given)
+    return [p for p in (path, covariance_path(path), path.with_suffix(COVARIANCE_ENDING)) if p.exists()]
 
 
 def placed_poses(recording: Sequence | Archive, poses: Poses, name: str) -> Truth:

@@ -18,7 +18,7 @@ from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.trajectory import Trajectory
-from ekfslam.errors import EkfslamError, FilterError, IllPosedError, PosteriorError
+from ekfslam.errors import ArchiveError, EkfslamError, FilterError, IllPosedError, PosteriorError
 from ekfslam.evaluation.brief import ATE, brief, brief_rows
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations, verdict_on
 from ekfslam.evaluation.summary import compare_table, summarise_all
@@ -31,6 +31,7 @@ from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import archive_image, open_result, read_archive, require_same_origin
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME, completed, open_executor
+from ekfslam.studies.sweep_table import SweepTable
 from ekfslam.timings import Timings
 
 if TYPE_CHECKING:
@@ -207,6 +208,26 @@ def compare_into(
             said += f"\n{comparison.table}\n{details(comparison.results)}"
     listed = f": {', '.join(path.name for path in paths)}" if verbose else f" ({count(len(paths), 'file')})"
     return f"{notes}\n{said}\nwritten to {folder}{listed}"
+
+
+# Figures of merit of the table of a paper.
+PAPER = ("ate_m", "ate_aligned_m", "rpe_10_m_m", "rpe_10_m_deg", "t_rel_percent", "pose_nees_with_truth_noise_mean")
+
+
+def compared_table(folders: Iterable[Path]) -> SweepTable:
+    """Return the summaries that `compare_into` wrote into some folders as a table, one row a recording and mode.
+
+    Raises:
+        ArchiveError: A summary is missing or damaged.
+    """
+    rows = []
+    for folder in folders:
+        try:
+            modes = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["modes"]
+            rows += [{"recording": folder.name, "mode": mode, **figures} for mode, figures in modes.items()]
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+            raise ArchiveError(f"{folder / 'summary.json'}: no summary of compare ({error})") from None
+    return SweepTable.of_rows(rows, ("recording", "mode"), len(rows), {"mode": "estimator"})
 
 
 def details(results: Mapping[str, Result]) -> str:

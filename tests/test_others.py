@@ -160,5 +160,5 @@ def test_a_covariance_that_is_none_is_named_by_file_and_line(world, full, tmp_pa
 
 def test_one_trajectory_is_not_compared_with_two_recordings(capsys, files):
     assert main(["compare", "builtin:city?frames=9", "builtin:loop?frames=9", "--with", str(files / "mine.txt")]) == 2
-    assert "write {name} in place of their name" in capsys.readouterr().err
+    assert "write {name} for them" in capsys.readouterr().err
     assert Others.parse(["orb_{name}.txt"]).named("loop").files == {"orb": "orb_loop.txt"}

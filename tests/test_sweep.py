@@ -24,9 +24,10 @@ from ekfslam.errors import ArchiveError, ConfigError, WriteError
 from ekfslam.evaluation.summary import KEYS, summarise
 from ekfslam.figures.sweep import plot_sweep
 from ekfslam.runner import run
+from ekfslam.storage.exports import export
 from ekfslam.studies import sweep as sweeps
 from ekfslam.studies.executors import SerialExecutor, open_executor
-from ekfslam.studies.sweep import Recording, Sweep, run_sweep
+from ekfslam.studies.sweep import Recording, Sweep, Task, run_sweep, run_task
 from ekfslam.studies.sweep_table import SweepTable, read_table, table_image
 
 CLOCK = ("ms_per_frame_median", "ms_per_frame_max", "total_s")  # of the wall: never the same twice
@@ -498,3 +499,64 @@ def test_contents_of_folders_and_of_files_that_a_description_names_decide_a_run(
             image.write_bytes(content)
             found.add(Recording(str(data), "images").content)
     assert len(found) == 4
+
+
+def without_noise(sequence, seed):
+    return dataclasses.replace(sequence, noise=None)
+
+
+UNKNOWN = {
+    "filter": {"gate_probability": [0.9], "iterations": [2], "retire": ["never"], "variant": ["standard"], "lag": [0]},
+    "hygiene": {"min_observations": [3]},
+    "posterior": {"linearisation": ["filtered"]},
+}
+
+
+@pytest.mark.parametrize("table", UNKNOWN)
+def test_dead_reckoning_depends_on_no_setting_that_it_is_said_not_to_know(table):
+    recording = Recording("builtin:city?frames=12", "city", prepare=without_noise)
+    base = Task(recording, None, "", "dead-reckoning", {}, {})
+    expected = run_task(base)["run"]["figures"]
+    counted = [name not in CLOCK for name in KEYS]
+    for key, (value,) in UNKNOWN[table].items():
+        task = Task(recording, None, "", "dead-reckoning", {table: {key: value}}, {})
+        assert task.run_key == base.run_key and task.key != base.key
+        found = run_task(task)["run"]["figures"]
+        np.testing.assert_array_equal(found[counted], expected[counted])
+
+
+@pytest.mark.parametrize("known", [{"noise": {"sigma_v_m_s": 0.3}}, {"filter": {"initial_position_std_m": 0.1}}])
+def test_dead_reckoning_runs_again_for_settings_that_it_knows(known):
+    recording = Recording("builtin:city?frames=12", "city")
+    base, task = (Task(recording, None, "", "dead-reckoning", overrides, {}) for overrides in ({}, known))
+    assert task.run_key != base.run_key
+    assert not np.array_equal(run_task(task)["run"]["figures"], run_task(base)["run"]["figures"], equal_nan=True)
+
+
+def test_equal_runs_of_dead_reckoning_run_once_and_fill_all_their_rows(tmp_path, monkeypatch):
+    ran = []
+    monkeypatch.setattr(sweeps, "run", lambda sequence, mode, *rest: ran.append(mode) or run(sequence, mode, *rest))
+    recording = Recording("builtin:city?frames=12", "city")
+    sweep = Sweep((recording,), ("dead-reckoning", "full"), settings={"filter.gate_probability": (0.9, 0.99, 0.999)})
+    with open_executor("serial") as executor:
+        table = run_sweep(sweep, tmp_path / "sweep.h5", executor)
+        assert sorted(ran) == ["dead-reckoning", "full", "full", "full"]
+        ate = table.where("mode", "dead-reckoning").column("ate_m")
+        assert len(ate) == 3 and len(set(ate.tolist())) == 1
+        assert len(run_sweep(sweep, tmp_path / "sweep.h5", executor)) == 6 and len(ran) == 4
+
+
+def test_a_trajectory_of_another_program_is_a_row_of_every_recording_and_seed(tmp_path):
+    for seed in (0, 1):
+        world = open_sequence(f"builtin:city?frames=12&seed={seed}")
+        export(run(world), tmp_path / f"city_{seed}.tum", "tum")
+    text = 'recordings = [{data = "builtin:city?frames=12", name = "city"}]\nseeds = [0, 1]\n'
+    (tmp_path / "study.toml").write_text(text + '[with]\nmine = "{name}_{seed}.tum"\n')
+    assert main(["sweep", str(tmp_path / "study.toml"), "--executor", "serial", "--out", str(tmp_path)]) == 0
+    table = read_table(tmp_path / "sweep.h5")
+    assert table.column("mode").tolist() == ["full", "mine"] * 2
+    ours, theirs = (table.where("mode", mode).column("pose_nees_mean") for mode in ("full", "mine"))
+    np.testing.assert_allclose(theirs, ours, rtol=1e-9)
+    (tmp_path / "study.toml").write_text(text + '[with]\nmine = "{name}.tum"\n')
+    with pytest.raises(ConfigError, match="one trajectory for 2 seeds"):
+        Sweep.from_toml(tmp_path / "study.toml")

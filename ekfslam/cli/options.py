@@ -14,6 +14,7 @@ from ekfslam.data.trajectory import Moving
 from ekfslam.errors import WriteError
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.summary import compare_table, summarise_all
+from ekfslam.evaluation.tables import WRITERS
 from ekfslam.filters.result import Result
 from ekfslam.frontend.opening import open_sequence
 from ekfslam.others import Others, World
@@ -41,6 +42,13 @@ def _stretch(text: str) -> slice:
 def _setting(text: str) -> tuple[str, float]:
     key, _, value = text.partition("=")
     return key, float(value)  # argparse reports a ValueError
+
+
+def table_file(text: str) -> Path:
+    """Return the path of a table, whose ending must be that of a format."""
+    if Path(text).suffix not in WRITERS:
+        raise argparse.ArgumentTypeError(f"{text!r} does not end in one of {', '.join(WRITERS)}")
+    return Path(text)
 
 
 # Shared arguments: name, and how argparse declares it.
@@ -142,6 +150,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     },
     **{flag: {"action": _Retired, "nargs": 0, "help": argparse.SUPPRESS} for flag in RETIRED},
 }
+TABLE_WORDS = f"write the table of a paper, by the ending of FILE: {', '.join(WRITERS)}"
 OTHERS = ("--with", "--with-frame", "--with-world")
 EXECUTOR = ("--workers", "--executor")
 PLACES = (

@@ -1,4 +1,4 @@
-"""Markdown tables, and the numbers in their cells.
+"""Tables in Markdown, LaTeX and CSV, and the numbers in their cells.
 
 print(markdown_table(["set", "ATE [m]"], [["0027", number(3.972, ".2f")], ["0022", number(None)]]))
 
@@ -10,7 +10,12 @@ print(markdown_table(["set", "ATE [m]"], [["0027", number(3.972, ".2f")], ["0022
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import csv
+import io
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 MISSING = "-"
 
@@ -57,3 +62,140 @@ def plus_minus(value: str, error: str) -> str:
 def document(*blocks: str) -> str:
     """Return headings, paragraphs and tables as the text of a file, with blank lines between them."""
     return "\n\n".join(block.strip("\n") for block in blocks) + "\n"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a `Grid`."""
+
+    heading: str  # with the unit
+    values: Sequence[str | float | None]  # text or number of each row; None or NaN if missing
+    errors: Sequence[float | None] = ()  # standard error of each number; none if empty
+    is_compared: bool = False  # the lowest number of a group of rows is the best
+    is_mixed: bool = False  # numbers are of different kinds, each with its own decimals
+    decimals: int | None = None  # None: see `places`
+
+    @property
+    def is_text(self) -> bool:
+        return any(isinstance(value, str) for value in self.values)
+
+    @property
+    def places(self) -> int:
+        """Number of decimals: those of the median number in three digits, none of whole numbers."""
+        sizes = sorted(abs(x) for x in self.values if isinstance(x, int | float) and math.isfinite(x) and x)
+        if self.decimals is not None or not sizes or all(float(x).is_integer() for x in sizes):
+            return self.decimals or 0
+        return min(max(2 - math.floor(math.log10(sizes[len(sizes) // 2])), 0), 6)
+
+    @property
+    def cells(self) -> list[tuple[str, str]]:
+        """Number and standard error of each row as text."""
+        spec = ".3g" if self.is_mixed else f".{self.places}f"
+        errors = self.errors or [None] * len(self.values)
+        return [(_cell(x, spec), _cell(e, spec)) for x, e in zip(self.values, errors, strict=True)]
+
+
+def _cell(value: str | float | None, spec: str) -> str:
+    if isinstance(value, str):
+        return value
+    return MISSING if value is None or not math.isfinite(value) else format(value, spec)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table to write as Markdown, LaTeX or CSV."""
+
+    columns: Sequence[Column]  # text before numbers
+    groups: Sequence[Any] = ()  # group of each row, of which the best number is bold; empty: all are one group
+    notes: Sequence[str] = ()  # below the table
+
+    def text(self, ending: str) -> str:
+        """Return the table as a file with an ending of `WRITERS`."""
+        return WRITERS[ending](self)
+
+    @property
+    def best(self) -> set[tuple[int, int]]:
+        """Column and row of each cell that is the best of its group; equal ones all are."""
+        found = set()
+        groups = self.groups or [0] * len(self.columns[0].values)
+        for c, column in enumerate(self.columns):
+            texts = [text for text, _ in column.cells]
+            for group in dict.fromkeys(groups) if column.is_compared else ():
+                rows = [r for r, own in enumerate(groups) if own == group and texts[r] != MISSING]
+                least = min((float(texts[r]) for r in rows), default=0.0)
+                best = {(c, r) for r in rows if float(texts[r]) == least}
+                found |= best if len(best) < len(rows) else set()
+        return found
+
+
+def _texts(grid: Grid, bold: Callable[[str], str], sign: str, escape: Callable[[str], str]) -> list[list[str]]:
+    """Return the cells of each row, with errors and the best in bold."""
+    columns, best = [], grid.best
+    for c, column in enumerate(grid.columns):
+        cells = []
+        for r, (text, error) in enumerate(column.cells):
+            shown = bold(text) if (c, r) in best else escape(text)
+            cells.append(shown if error == MISSING else f"{shown}{sign}{error}")
+        columns.append(cells)
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _left(grid: Grid) -> int:
+    return next((c for c, column in enumerate(grid.columns) if not column.is_text), len(grid.columns))
+
+
+def markdown_text(grid: Grid) -> str:
+    """Return a grid as Markdown that is also legible on a terminal."""
+    rows = _texts(grid, lambda text: f"**{text}**", " ± ", str)
+    headings = [column.heading for column in grid.columns]
+    return document(markdown_table(headings, rows, left=_left(grid), padded=True), *grid.notes)
+
+
+def latex_text(grid: Grid) -> str:
+    """Return a grid as a tabular of booktabs; notes are comments. Equal texts of successive rows are written once."""
+    rows = _texts(grid, lambda text: rf"\textbf{{{text}}}", r" $\pm$ ", latex)
+    heads = [latex(column.heading) for column in grid.columns]
+    lines = [rf"\begin{{tabular}}{{{''.join('l' if c.is_text else 'r' for c in grid.columns)}}}", r"\toprule"]
+    lines += [f"{' & '.join(heads)} \\\\", r"\midrule"]
+    widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+    former = None
+    for r, row in enumerate(rows):
+        group = grid.groups[r] if grid.groups else None
+        if r and group != former:
+            lines.append(r"\addlinespace")
+        elif r and grid.groups and row[0] == rows[r - 1][0] and _left(grid) > 1:
+            row = ["", *row[1:]]
+        former = group
+        cells = (
+            f"{cell:<{w}}" if column.is_text else f"{cell:>{w}}"
+            for cell, w, column in zip(row, widths, grid.columns, strict=True)
+        )
+        lines.append(f"{' & '.join(cells)} \\\\")
+    lines += [r"\bottomrule", r"\end{tabular}"]
+    return "\n".join([*(f"% {line}" for note in grid.notes for line in note.splitlines() if line), *lines]) + "\n"
+
+
+def csv_text(grid: Grid) -> str:
+    """Return a grid as comma-separated values: numbers in full, a column of standard errors after theirs."""
+    columns: dict[str, Sequence[str | float | None]] = {}
+    for column in grid.columns:
+        columns[column.heading] = column.values
+        if column.errors:
+            columns[f"{column.heading}, standard error"] = column.errors
+    writer = csv.writer(out := io.StringIO(), lineterminator="\n")
+    writer.writerow(columns)
+    for row in zip(*columns.values(), strict=True):
+        writer.writerow("" if x is None or x != x else x if isinstance(x, str) else repr(x) for x in row)
+    return out.getvalue()
+
+
+WRITERS: Mapping[str, Callable[[Grid], str]] = {".md": markdown_text, ".tex": latex_text, ".csv": csv_text}
+_LATEX = {c: rf"\{c}" for c in "&%$#_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}"}
+_LATEX |= {"^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
+_LATEX |= {"±": r"$\pm$", "\N{DEGREE SIGN}": r"$^\circ$", "\n": " "}
+
+
+def latex(text: str) -> str:
+    """Return a text with the characters escaped that mean something to LaTeX."""
+    found = "".join(_LATEX.get(c, c) for c in text)
+    return f"{{}}{found}" if found[:1] in ("[", "*") else found  # after a line break they would be its argument

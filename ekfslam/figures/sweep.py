@@ -10,17 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array
-from ekfslam.evaluation.metrics import METRICS
 from ekfslam.figures.series import LOG_RATIO
 from ekfslam.figures.style import BAND_ALPHA, SERIES, legend_of, log_axis, styled
-from ekfslam.studies.sweep_table import SweepTable
+from ekfslam.studies.sweep_table import SweepTable, spoken, words_of
 
 _MARKERS = "os^Dv<>P"
 _MOST_LINES, _MOST_PANELS = 24, 24
 _PANELS_A_ROW = 3
-# Units by the endings of settings, longer ones first.
-_UNITS = {"rad_s": "rad/s", "m_s2": "m/s^2", "m_s": "m/s", "px": "px", "deg": "deg", "rad": "rad", "hz": "Hz"}
-_UNITS |= {"ms": "ms", "m": "m", "s": "s"}
 
 
 @styled
@@ -77,7 +73,7 @@ def _draw_panel(
         here = np.isfinite(y) & np.isfinite(place)
         at, mean, low, high = _over_seeds(place[here], y[here])
         style = SERIES[i % len(SERIES)]
-        label = ", ".join(f"{value:g}" if isinstance(value, float) else str(value) for value in choice)
+        label = ", ".join("-" if value is None else spoken(value) for value in choice)
         ax.plot(at, mean, marker=_MARKERS[i % len(_MARKERS)], label=label or figure, **style)
         if (high > low).any():
             ax.fill_between(at, low, high, color=style["color"], alpha=BAND_ALPHA, linewidth=0)
@@ -86,15 +82,6 @@ def _draw_panel(
     shown = table.column(figure)[np.isfinite(table.column(figure))]
     if len(shown) and shown.min() > 0 and shown.max() > LOG_RATIO * shown.min():
         log_axis(ax, (1.0, 2.0, 5.0))
-
-
-def words_of(column: str) -> str:
-    """Return a column in words with its unit: the heading of a metric, or a setting whose name ends with its unit."""
-    if column in METRICS:
-        return METRICS[column].heading
-    unit = next((ending for ending in _UNITS if column.endswith(f"_{ending}")), None)
-    name = column if unit is None else f"{column.removesuffix(f'_{unit}')} [{_UNITS[unit]}]"
-    return name.replace("_", " ").replace(".", " ")
 
 
 def _over_seeds(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:

@@ -12,6 +12,7 @@ from ekfslam.arrays import Array
 from ekfslam.evaluation.consistency import average_over_runs, chi2_bounds, nanmean
 from ekfslam.evaluation.tables import document, markdown_table, plus_minus, significant
 from ekfslam.studies.study import LABELS, TEXTBOOK, StudyArchive
+from ekfslam.studies.sweep_table import SweepTable
 
 BOUND_PROBABILITY = 0.999
 
@@ -23,6 +24,8 @@ _NEES = {
     "landmark_nees": (3, "landmark (3)"),
 }
 _RATIOS = {"joint_nees_per_dof": "joint / dof (1)", "nis_per_dof": "NIS / dof (1)"}
+_RMSE = {"position_rmse_m": "RMSE [m]", "rotation_rmse_deg": "RMSE [deg]"}
+FIGURES = (*_NEES, *_RATIOS, *_RMSE)  # of `study_runs`
 
 
 def summarise_study(archive: StudyArchive) -> dict[str, Any]:
@@ -39,6 +42,29 @@ def summarise_study(archive: StudyArchive) -> dict[str, Any]:
     return {"study": archive.study.parameters, "bound_probability": BOUND_PROBABILITY, "levels": levels}
 
 
+def study_runs(archive: StudyArchive) -> SweepTable:
+    """Return the averages over time of every finished run, one row a level, run and variant."""
+    rows = []
+    for level in archive.data:
+        for variant, values in archive.finished(level).items():
+            found = {name: nanmean(values[name], axis=1) for name in (*_NEES, "joint_nees_per_dof")}
+            found["nis_per_dof"] = _nis_per_dof(values)
+            for name, unit, scale in (("position", "m", 1.0), ("rotation", "deg", np.degrees(1.0))):
+                squares = np.sum(values[f"{name}_error"] ** 2, axis=-1)
+                found[f"{name}_rmse_{unit}"] = scale * np.sqrt(nanmean(squares, axis=1))
+            for i, run in enumerate(np.flatnonzero(archive.done[level]).tolist()):
+                facts = {"recording": level, "variant": LABELS[variant], "seed": run}
+                rows.append({**facts, **{name: float(x[i]) for name, x in found.items()}})
+    headings = {name: heading for name, (_, heading) in _NEES.items()} | _RATIOS | _RMSE | {"recording": "level"}
+    return SweepTable.of_rows(rows, ("recording", "variant", "seed"), len(rows), headings)
+
+
+def _nis_per_dof(values: Mapping[str, NDArray]) -> Array:
+    """Return the sum of NIS over the sum of degrees of freedom of each run (runs,)."""
+    dof = values["nis_dof"].sum(axis=1)
+    return np.where(dof > 0, np.nansum(values["nis"], axis=1) / np.maximum(dof, 1), np.nan)
+
+
 def _summarise(values: Mapping[str, NDArray]) -> dict[str, Any]:
     """Return the figures of merit of one variant from its fields (runs, ...)."""
     out: dict[str, Any] = {}
@@ -46,9 +72,8 @@ def _summarise(values: Mapping[str, NDArray]) -> dict[str, Any]:
         average = average_over_runs(nanmean(values[field], axis=1))
         bounds = [float(b) for b in chi2_bounds(dof, BOUND_PROBABILITY, max(average["runs"], 1))]
         out[field] = {**average, "expected": dof, "bounds": bounds}
-    dof_total = values["nis_dof"].sum(axis=1)
-    per_dof = np.where(dof_total > 0, np.nansum(values["nis"], axis=1) / np.maximum(dof_total, 1), np.nan)
-    for name, per_run in zip(_RATIOS, (nanmean(values["joint_nees_per_dof"], axis=1), per_dof), strict=True):
+    ratios = (nanmean(values["joint_nees_per_dof"], axis=1), _nis_per_dof(values))
+    for name, per_run in zip(_RATIOS, ratios, strict=True):
         out[name] = {**average_over_runs(per_run), "expected": 1}
     out["position_rmse_m"] = _rms(values["position_error"])
     rotation = _rms(values["rotation_error"])

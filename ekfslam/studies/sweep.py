@@ -38,14 +38,17 @@ from ekfslam.filters.result import Result
 from ekfslam.frontend.opening import open_sequence
 from ekfslam.limits import DEFAULT_GB, limit_gb, reading_up_to, require_file
 from ekfslam.names import printable
+from ekfslam.others import NO_OTHERS, Others, files_of
 from ekfslam.runner import run, versions
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME
 from ekfslam.studies.journal import Journal, Key, Record, flat, run_missing
-from ekfslam.studies.sweep_table import SweepTable, read_table, write_table
+from ekfslam.studies.sweep_table import PREDICTION, SweepTable, is_known_to_prediction, read_table, write_table
 
 MOST_RUNS = 100_000
 _ERROR_BYTES = 400
 _KEYS = {"recordings": list, "modes": list, "variants": list, "seeds": list, "settings": dict, "cases": dict}
+_KEYS |= {"with": dict, "with_frame": str, "with_world": str}
+_KINDS = {list: "list", dict: "table", str: "text"}
 _FILES = ("data", "truth", "velocities", "calibration", "imu", "imu_noise")  # of a recording
 # Arguments of `open_sequence`.
 _READ_AS = (
@@ -139,6 +142,7 @@ class Task:
     mode: str
     overrides: Mapping[str, Mapping[str, Any]]
     columns: Mapping[str, Column]
+    others: Others = NO_OTHERS  # the trajectory that takes the place of a run, under the name of the mode
 
     @cached_property
     def config(self) -> Config:
@@ -147,11 +151,24 @@ class Task:
     @cached_property
     def key(self) -> str:
         """Digest of everything that decides its numbers, as 64 hexadecimal digits."""
-        facts: list[Any] = [self.recording.content, self.mode, dataclasses.asdict(self.config), versions(), _program()]
+        return self._key(dataclasses.asdict(self.config))
+
+    @cached_property
+    def run_key(self) -> str:
+        """Digest of the settings that its mode knows. Tasks with the same one have the same numbers, and run once."""
+        settings = dict(flat(dataclasses.asdict(self.config)))
+        if self.mode == PREDICTION and not self.columns:
+            settings = {name: value for name, value in settings.items() if is_known_to_prediction(name)}
+        return self._key(settings)
+
+    def _key(self, settings: Mapping[str, Any]) -> str:
+        facts: list[Any] = [self.recording.content, self.mode, settings, versions(), _program()]
         if self.recording.prepare is not None:
             facts.append(self.seed)
         if self.columns:
             facts.append({name: _source(column) for name, column in self.columns.items()})
+        for path in self.others.files.values():
+            facts += [*map(_digest, files_of(path)), self.others.frame, self.others.world]
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
@@ -169,6 +186,7 @@ class Sweep:
     cases: Mapping[str, Case] = dataclasses.field(default_factory=dict)
     # Further figures of merit by name, with the restrictions of `Recording.prepare`.
     columns: Mapping[str, Column] = dataclasses.field(default_factory=dict)
+    others: Others = NO_OTHERS
 
     def __post_init__(self) -> None:
         modes = (*self.modes, *(case.mode for case in self.cases.values() if case.mode))
@@ -182,6 +200,8 @@ class Sweep:
             if name in _TAKEN or not name or set(name) & set("./"):
                 raise ConfigError(f"a column of a sweep cannot have the name {name!r}")
         seeded = sum(len(self._seeds_of(recording)) for recording in self.recordings)
+        seeds = max((len(self._seeds_of(recording)) for recording in self.recordings), default=1)
+        self.others.require_distinct(len(self.recordings), seeds)
         ways = sum(1 if case.mode else len(self.modes) for case in self._cases.values())
         count = seeded * ways * len(self.variants) * math.prod(len(values) for _, values in flat(self.settings))
         if not 1 <= count <= MOST_RUNS:
@@ -189,7 +209,7 @@ class Sweep:
         names = [recording.name for recording in self.recordings]
         if len(set(names)) < len(names):
             raise ConfigError(f"recordings of a sweep need different names, found {', '.join(names)}")
-        if len({task.key for task in self.tasks}) < count:
+        if len({task.key for task in self.tasks}) < count + seeded * len(self.others.files):
             raise ConfigError("a sweep holds the same run twice: a value or recording stands in it twice")
 
     @property
@@ -215,7 +235,13 @@ class Sweep:
                 overrides.setdefault(table, {}).update(own)
             modes = (case.mode,) if case.mode else self.modes
             found += [Task(recording.with_seed(seed), seed, name, mode, overrides, self.columns) for mode in modes]
-        return tuple(found)
+        for recording, seed in seeded:
+            own, named = recording.with_seed(seed), self.others.named(recording.name, seed)
+            for name, path in named.files.items():
+                only = dataclasses.replace(named, files={name: path})
+                found.append(Task(own, seed, "", name, {}, self.columns, only))
+        order = {(recording.with_seed(seed), seed): place for place, (recording, seed) in enumerate(seeded)}
+        return tuple(sorted(found, key=lambda task: order[task.recording, task.seed]))
 
     @staticmethod
     def from_toml(path: str | Path) -> Sweep:
@@ -241,6 +267,9 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
     path = Path(path)
     tasks = {(task.key, 0): task for task in sweep.tasks}
     done: dict[Key, Mapping[str, NDArray]] = {}
+    twins: dict[str, list[Key]] = {}
+    for key, task in tasks.items():
+        twins.setdefault(task.run_key, []).append(key)
 
     def keep(key: Key, record: Record) -> None:
         if key not in tasks:
@@ -248,7 +277,8 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
                 f"{path} holds runs of another study, of other recordings or of another build; move it away or "
                 "choose another folder"
             )
-        done[key] = record["run"]
+        for twin in twins[tasks[key].run_key]:
+            done[twin] = record["run"]
 
     def save() -> None:
         if done:
@@ -259,7 +289,7 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
         if path.exists():
             for row in read_table(path).rows():
                 keep((row["key"], 0), _record(sweep.columns, row, row["error"]))
-        missing = {key: task for key, task in tasks.items() if key not in done}
+        missing = {key: tasks[key] for key, *_ in twins.values() if key not in done}
         limit = limit_gb()
         run_missing(
             journal, missing, lambda task: executor.submit(run_task, task, limit), keep, save, "sweep", progress
@@ -273,9 +303,11 @@ def run_task(task: Task, read_gb: float = DEFAULT_GB) -> Record:
         with ONE_RUN_AT_A_TIME, reading_up_to(read_gb):
             sequence = _opened(task.recording, task.seed, task.config.front_end)
             sequence = with_truth_noise(sequence, task.config.truth)
-            result = run(sequence, task.mode, task.config)  # type: ignore[arg-type]
+            theirs = task.others.results(sequence)
+            result = theirs.get(task.mode) or run(sequence, task.mode, task.config)  # type: ignore[arg-type]
             figures: dict[str, Any] = dict(summarise(sequence, result))
-            figures |= {name: column(sequence, result) for name, column in task.columns.items()}
+            if not task.others.files:
+                figures |= {name: column(sequence, result) for name, column in task.columns.items()}
         return _record(task.columns, figures)
     except EkfslamError as error:
         return _record(task.columns, {}, printable(str(error)))
@@ -307,6 +339,8 @@ def _table(sweep: Sweep, done: Mapping[Key, Mapping[str, NDArray]]) -> SweepTabl
             continue
         settings = dataclasses.asdict(task.config)
         settings.pop("tuning")  # a record of the past
+        if task.others.files:
+            settings = dict.fromkeys(dict(flat(settings)))
         case = {"case": task.case} if sweep.cases else {}
         facts = {"recording": task.recording.name, "seed": task.seed, **case, "mode": task.mode, **dict(flat(settings))}
         figures = dict(zip((*KEYS, *sweep.columns), record["figures"].tolist(), strict=True))
@@ -333,7 +367,7 @@ def _parsed(found: Mapping[str, Any], folder: Path) -> Sweep:
             raise ConfigError(f"unknown key {key!r}; known: {', '.join(_KEYS)}")
     for key, kind in _KEYS.items():
         if not isinstance(found.get(key, kind()), kind):
-            raise ConfigError(f"{key} must be a {'list' if kind is list else 'table'}, found {found[key]!r}")
+            raise ConfigError(f"{key} must be a {_KINDS[kind]}, found {found[key]!r}")
     settings = dict(flat(found.get("settings", {})))
     for name, value in settings.items():
         if "." not in name:
@@ -342,7 +376,15 @@ def _parsed(found: Mapping[str, Any], folder: Path) -> Sweep:
     given: dict[str, Any] = {key: tuple(found[key]) for key in ("modes", "variants", "seeds") if key in found}
     recordings = tuple(_recording(entry, folder) for entry in found.get("recordings", []))
     cases = {printable(name): _case(name, case) for name, case in found.get("cases", {}).items()}
-    return Sweep(recordings, settings=settings, cases=cases, **given)
+    for name, path in found.get("with", {}).items():
+        if not isinstance(path, str):
+            raise ConfigError(f"with.{name} must be a path, found {path!r}")
+    others = Others(
+        {name: str(folder / path) for name, path in found.get("with", {}).items()},
+        found.get("with_frame"),
+        found.get("with_world", "first"),
+    )
+    return Sweep(recordings, settings=settings, cases=cases, others=others, **given)
 
 
 def _case(name: str, found: Any) -> Case:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 
 from ekfslam import files, hdf5
 from ekfslam.errors import ArchiveError, ConfigError
+from ekfslam.evaluation.metrics import METRICS
+from ekfslam.evaluation.paired import paired_grid
 from ekfslam.evaluation.summary import KEYS
-from ekfslam.evaluation.tables import document, markdown_table, significant
+from ekfslam.evaluation.tables import MISSING, Column, Grid, document, markdown_text
 from ekfslam.names import printable
 from ekfslam.runner import versions
 from ekfslam.stored import TEXTS, Check, Item
@@ -40,6 +42,23 @@ SHOWN = (
 )
 
 
+_DRAWS = ("recording", "seed")  # columns over which estimators and settings are compared
+PREDICTION = "dead-reckoning"
+# Settings that dead reckoning knows of the joint filter; of the other tables it knows all but these.
+_OF_PREDICTION = ("initial_position_std_m", "initial_rotation_std_rad", "relative_frames")
+_NOT_OF_PREDICTION = ("hygiene", "posterior", "tuning")
+_TIMES = ("ms_per_frame_median", "ms_per_frame_max", "total_s")
+# Units by the endings of settings, longer ones first.
+_UNITS = {"rad_s": "rad/s", "m_s2": "m/s^2", "m_s": "m/s", "px": "px", "deg": "deg", "rad": "rad", "hz": "Hz"}
+_UNITS |= {"ms": "ms", "m": "m", "s": "s"}
+
+
+def is_known_to_prediction(setting: str) -> bool:
+    """Return whether dead reckoning may depend on a setting, by its dotted name."""
+    table, _, key = setting.partition(".")
+    return key in _OF_PREDICTION if table == "filter" else table not in _NOT_OF_PREDICTION
+
+
 @dataclass(frozen=True)
 class SweepTable:
     """The results of a sweep. Methods raise a `ConfigError` for an unknown column."""
@@ -48,12 +67,15 @@ class SweepTable:
     columns: Mapping[str, NDArray]
     swept: tuple[str, ...]  # names of the columns that distinguish the runs
     asked: int  # number of runs of the complete sweep
+    headings: Mapping[str, str] = field(default_factory=dict)  # of columns that are neither metrics nor settings
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
 
     @staticmethod
-    def of_rows(rows: Sequence[Mapping[str, Any]], swept: tuple[str, ...], asked: int) -> SweepTable:
+    def of_rows(
+        rows: Sequence[Mapping[str, Any]], swept: tuple[str, ...], asked: int, headings: Mapping[str, str] | None = None
+    ) -> SweepTable:
         """Make a table of rows. A column of numbers and truth values holds floats, any other holds text."""
         columns: dict[str, NDArray] = {}
         for name in dict.fromkeys(name for row in rows for name in row):
@@ -62,7 +84,7 @@ class SweepTable:
                 columns[name] = np.array([np.nan if value is None else float(value) for value in values])
             else:
                 columns[name] = np.array(["" if value is None else str(value) for value in values], dtype=object)
-        return SweepTable(columns, swept, asked)
+        return SweepTable(columns, swept, asked, headings or {})
 
     def column(self, name: str) -> NDArray:
         """Return a column by name."""
@@ -74,20 +96,21 @@ class SweepTable:
         """Split the table by the values in some columns, in the order of their first rows."""
         rows: dict[tuple[Any, ...], list[int]] = {}
         for row, values in enumerate(zip(*(self.column(name).tolist() for name in names), strict=True)):
-            rows.setdefault(values, []).append(row)
+            key = tuple(None if value != value else value for value in values)  # NaN would differ from itself
+            rows.setdefault(key, []).append(row)
         return {values: self._only(chosen) for values, chosen in rows.items()}
 
     def where(self, name: str, *values: str) -> SweepTable:
         """Return the rows with one of the values in a column, formatted as in `markdown`; each must occur in it."""
-        spoken = [_spoken(value) for value in self.column(name).tolist()]
+        found = [spoken(value) for value in self.column(name).tolist()]
         for value in values:
-            if value not in spoken:
-                raise ConfigError(f"the column {name} has no {value!r}; it has {', '.join(dict.fromkeys(spoken))}")
-        return self._only([row for row, value in enumerate(spoken) if value in values])
+            if value not in found:
+                raise ConfigError(f"the column {name} has no {value!r}; it has {', '.join(dict.fromkeys(found))}")
+        return self._only([row for row, value in enumerate(found) if value in values])
 
     def _only(self, rows: Sequence[int]) -> SweepTable:
         columns = {name: values[np.asarray(rows, dtype=int)] for name, values in self.columns.items()}
-        return SweepTable(columns, self.swept, len(rows))
+        return replace(self, columns=columns, asked=len(rows))
 
     def rows(self, *names: str) -> list[dict[str, Any]]:
         """Return some columns (default: all) row by row as plain values, ready for JSON; None for NaN."""
@@ -97,20 +120,129 @@ class SweepTable:
             for i in range(len(self))
         ]
 
+    @property
+    def told(self) -> list[str]:
+        """Names of the swept columns in which the runs differ, or the first one."""
+        values = {name: {*map(spoken, self.column(name).tolist())} - {MISSING} for name in self.swept}
+        return [name for name, found in values.items() if len(found) > 1] or [self.swept[0]]
+
+    @property
+    def choices(self) -> list[str]:
+        """Names of the columns that tell estimators and settings apart, not recordings and seeds."""
+        return [name for name in self.told if name not in _DRAWS]
+
+    def _shown(self, figures: Sequence[str]) -> list[str]:
+        """Return the columns of which there is a value."""
+        columns = {name: self.column(name) for name in figures}
+        return [name for name, x in columns.items() if x.dtype.kind != "f" or np.isfinite(x).any()]
+
+    def grid(self, figures: Sequence[str] = SHOWN) -> Grid:
+        """Return some figures of all runs, the best of a recording and seed in bold."""
+        texts = [Column(self.words(name), [spoken(x) for x in self.column(name).tolist()]) for name in self.told]
+        numbers = [self._column(name, self.column(name).tolist()) for name in self._shown(figures)]
+        groups = list(zip(*(self.column(name).tolist() for name in _DRAWS if name in self.columns), strict=True))
+        return Grid([*texts, *numbers], [tuple(map(spoken, group)) for group in groups], [self._head(self.told)])
+
+    def means(self, figures: Sequence[str] = SHOWN, over: Sequence[str] = ("seed",)) -> Grid:
+        """Return mean and standard error of some figures over seeds (or recordings, too), and their number of runs.
+
+        The first figure also has median and worst.
+        """
+        names, kept = [name for name in self.told if name not in over], self._without_repeats()
+        parts = kept.groups(*names) if names else {(): kept}
+        texts = [Column(self.words(name), [spoken(key[i]) for key in parts]) for i, name in enumerate(names)]
+        numbers = [Column("runs", [len(part) for part in parts.values()])]
+        for place, name in enumerate(name for name in self._shown(figures) if self.column(name).dtype.kind == "f"):
+            values = [x[np.isfinite(x)] for x in (part.column(name) for part in parts.values())]
+            mean, median, worst = (
+                [float(pick(x)) if len(x) else None for x in values] for pick in (np.mean, np.median, np.max)
+            )
+            errors = [float(x.std(ddof=1) / np.sqrt(len(x))) if len(x) > 1 else None for x in values]
+            numbers.append(one := self._column(name, mean, errors))
+            further = {} if place else {"median": median, "worst": worst}
+            numbers += [Column(heading, x, decimals=one.places) for heading, x in further.items()]
+        groups = [key[names.index("recording")] if "recording" in names else "" for key in parts]
+        words = f"± is the standard error over {' and '.join(f'{name}s' for name in over)}"
+        return Grid([*texts, *numbers], groups, [f"{words}; {self._head(self.told)}"])
+
+    def tests(self, figures: Sequence[str] = SHOWN) -> tuple[Grid | None, tuple[str, ...]]:
+        """Return paired tests of estimators and settings over recordings and seeds, see `paired_grid`."""
+        found: dict[str, dict[str, dict[Any, float]]] = {}
+        names = [name for name in self._shown(figures) if self.column(name).dtype.kind == "f" and name not in _TIMES]
+        for choice, part in self._without_repeats().groups(*self.choices).items() if self.choices else ():
+            keys = list(zip(*(part.column(name).tolist() for name in _DRAWS if name in self.columns), strict=True))
+            keys = [tuple(map(spoken, key)) for key in keys]
+            label = ", ".join(map(spoken, choice))
+            for name in names:
+                values = dict(zip(keys, part.column(name).tolist(), strict=True))
+                found.setdefault(self.words(name), {})[label] = values
+        return paired_grid(found)
+
+    def paper(self, ending: str, figures: Sequence[str] = SHOWN) -> str:
+        """Return the table of a paper as a file with an ending of `WRITERS`, and paired tests of the choices.
+
+        Means over seeds if there are several, else over recordings below the single runs.
+        """
+        grid = self.means(figures) if self._is_repeated("seed") else self.grid(figures)
+        tests, said = self.tests(figures)
+        further = [] if tests is None else [markdown_text(tests)]
+        if ending == ".md" and self._is_repeated("recording"):
+            further.insert(0, markdown_text(self.means(figures, _DRAWS)))
+        return replace(grid, notes=[*grid.notes, *(further or said)]).text(ending)
+
+    def _is_repeated(self, name: str) -> bool:
+        return name in self.told and len(set(self.column(name).tolist())) > 1
+
+    def words(self, name: str) -> str:
+        """Return the heading of a column, with its unit."""
+        return self.headings.get(name) or words_of(name)
+
+    def _column(self, name: str, values: Sequence[str | float | None], errors: Sequence[float | None] = ()) -> Column:
+        heading = self.words(name)  # errors have a unit there, NEES and NIS their expected value
+        return Column(heading, values, errors, is_compared="[" in heading and name not in _TIMES)
+
+    def _without_repeats(self) -> SweepTable:
+        """Return the table with equal runs of dead reckoning once, without the settings that it does not know."""
+        columns, modes = {name: x.copy() for name, x in self.columns.items()}, self.columns.get("mode", np.zeros(0))
+        rows = np.flatnonzero(modes == PREDICTION)
+        for name in self.told if len(rows) else ():
+            if not is_known_to_prediction(name):
+                columns[name][rows] = np.nan if columns[name].dtype.kind == "f" else ""
+        facts = [
+            x for name, x in columns.items() if name != "key" and name not in _TIMES and is_known_to_prediction(name)
+        ]
+        repeated, seen = set(rows.tolist()), set[str]()
+        for row in rows.tolist():
+            if (text := str([x[row] for x in facts])) not in seen:
+                seen.add(text)
+                repeated.remove(row)
+        return replace(self, columns=columns)._only([row for row in range(len(self)) if row not in repeated])
+
+    def _head(self, told: Sequence[str]) -> str:
+        """Return the number of runs, and the errors of those without a result."""
+        errors = self.columns.get("error", np.zeros(len(self), dtype="U1")).tolist()
+        failed = [(row, text) for row, text in enumerate(errors) if text]
+        rows = {row: ", ".join(spoken(self.column(name)[row]) for name in told) for row, _ in failed}
+        lines = "\n".join(f"- {rows[row]}: {text}" for row, text in failed)
+        return f"{len(self)} of {self.asked} runs" + (f", {len(failed)} without a result:\n\n{lines}" if failed else "")
+
     def markdown(self, figures: Sequence[str] = SHOWN) -> str:
-        """Return a Markdown table of the swept columns and of some figures of merit, with the errors."""
-        told = [name for name in self.swept if len(set(self.column(name).tolist())) > 1] or list(self.swept[:1])
-        shown = [
-            name for name in figures if self.column(name).dtype.kind != "f" or np.isfinite(self.column(name)).any()
-        ]
-        rows = [
-            [*(_spoken(self.column(name)[i]) for name in told), *(_figure(self.column(name)[i]) for name in shown)]
-            for i in range(len(self))
-        ]
-        failed = [(row, text) for row, text in enumerate(self.columns.get("error", [])) if text]
-        lines = "\n".join(f"- {', '.join(rows[row][: len(told)])}: {text}" for row, text in failed)
-        head = f"{len(self)} of {self.asked} runs" + (f", {len(failed)} without a result:\n\n{lines}" if failed else "")
-        return document(markdown_table([*told, *shown], rows, left=len(told), padded=True), head)
+        """Return some figures of merit of all runs as Markdown, with their means over seeds and paired tests."""
+        tests, said = self.tests(figures)
+        means = [markdown_text(self.means(figures))] if self._is_repeated("seed") else []
+        further = [*means, *([] if tests is None else [markdown_text(tests)])]
+        if means and tests is None:
+            further += said
+        return document(markdown_text(self.grid(figures)), *further)
+
+
+def words_of(column: str) -> str:
+    """Return a column in words with its unit: the heading of a metric, or a setting whose name ends with its unit."""
+    if column in METRICS:
+        return METRICS[column].heading
+    unit = next((ending for ending in _UNITS if column.endswith(f"_{ending}")), None)
+    name = column if unit is None else f"{column.removesuffix(f'_{unit}')} [{_UNITS[unit]}]"
+    return name.replace("_", " ").replace(".", " ")
 
 
 def table_image(table: SweepTable) -> bytes:
@@ -161,13 +293,8 @@ def _layout(columns: Mapping[str, Any]) -> list[Item]:
     ]
 
 
-def _spoken(value: Any) -> str:
+def spoken(value: Any) -> str:
+    """Return a setting as text; a dash if it has none."""
     if isinstance(value, float):
-        return "-" if np.isnan(value) else f"{value:g}"
-    return str(value)
-
-
-def _figure(value: Any) -> str:
-    if isinstance(value, float):
-        return significant(value if np.isfinite(value) else None)
-    return str(value)
+        return MISSING if np.isnan(value) else f"{value:g}"
+    return MISSING if value in (None, "") else str(value)

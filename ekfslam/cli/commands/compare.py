@@ -13,17 +13,19 @@ from ekfslam.cli.options import (
     DEFAULT_DATA,
     EXECUTOR,
     OTHERS,
+    TABLE_WORDS,
     configured,
     declare,
     declare_run,
     open_data,
     others_of,
     print_warnings,
+    table_file,
 )
 from ekfslam.config import MODES
 from ekfslam.errors import ConfigError
 from ekfslam.names import components
-from ekfslam.reports import compare_all
+from ekfslam.reports import PAPER, compare_all, compared_table
 from ekfslam.storage.archive import require_same_origin
 from ekfslam.studies.executors import open_executor
 from ekfslam.timings import Timings
@@ -33,7 +35,7 @@ EXAMPLES = (
     "compare 0027.npz --truth poses/07.txt --out results/local",
     "compare drives/*.mat --workers 8 --no-figures",
     "compare a.mat b.mat --modes dead-reckoning full --sigma-v 0.5 --sigma-w 0.05",
-    "compare drives/*.mat --with 'orb=theirs/{name}.txt' --with-frame camera",
+    "compare drives/*.mat --with 'orb=theirs/{name}.txt' --with-frame camera --table paper.tex",
 )
 
 
@@ -41,6 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "data", nargs="*", default=[DEFAULT_DATA])
     declare_modes(parser, MODES)
     declare(parser, "--out", default=Path("results/local"), help="default: %(default)s")
+    parser.add_argument("--table", type=table_file, metavar="FILE", help=TABLE_WORDS)
+    parser.add_argument(
+        "--columns", nargs="+", default=list(PAPER), metavar="KEY", help=f"figures in it (default: {' '.join(PAPER)})"
+    )
     declare(parser, "--no-figures", "--verbose", "--timings", *OTHERS, *EXECUTOR)
     declare_run(parser)
 
@@ -73,5 +79,9 @@ def command(options: argparse.Namespace) -> None:
     with open_executor(where, workers) as executor:
         for said in compare_all(recordings, executor, options.modes, config, **chosen):
             print(said)
+    if options.table:
+        table = compared_table(folders)
+        files.write(options.table, table.paper(options.table.suffix, options.columns))
+        print(f"table written to {options.table}")
     if options.timings:
         print(timings.table)

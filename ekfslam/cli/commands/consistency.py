@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ekfslam.cli.options import EXECUTOR, declare
+from ekfslam import files
+from ekfslam.cli.options import EXECUTOR, TABLE_WORDS, declare, table_file
 from ekfslam.reports import check_consistency
 from ekfslam.studies.study import COMPARED, LEVELS, STUDY_VARIANTS, Study
+from ekfslam.studies.summary import FIGURES, study_runs
 
 EXAMPLES = (
     "consistency --runs 20",
@@ -35,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"{', '.join(STUDY_VARIANTS)} (default: {' '.join(COMPARED)}); textbook: standard with landmarks in xyz",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all runs (default: %(default)s)")
+    parser.add_argument("--table", type=table_file, metavar="FILE", help=TABLE_WORDS)
     declare(parser, *EXECUTOR)
     resumes = "default: %(default)s; an interrupted study there resumes"
     declare(parser, "--out", default=Path("results/local/consistency"), help=resumes)
@@ -45,3 +48,6 @@ def command(options: argparse.Namespace) -> None:
     study = Study(levels, tuple(options.variants), options.runs, options.seed)
     report = check_consistency(study, options.out, options.executor, options.workers)
     print(f"{report.table}\nwritten to {options.out}: {', '.join(path.name for path in report.paths)}")
+    if options.table:
+        files.write(options.table, study_runs(report.archive).paper(options.table.suffix, FIGURES))
+        print(f"table written to {options.table}")

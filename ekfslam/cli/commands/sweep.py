@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from ekfslam import files
-from ekfslam.cli.options import EXECUTOR, declare
+from ekfslam.cli.options import EXECUTOR, OTHERS, TABLE_WORDS, declare, table_file
 from ekfslam.errors import ConfigError
 from ekfslam.figures.style import pngs
 from ekfslam.figures.sweep import plot_sweep
+from ekfslam.others import Others
 from ekfslam.studies.executors import open_executor
 from ekfslam.studies.sweep import Sweep, run_sweep
 from ekfslam.studies.sweep_table import SHOWN, SweepTable, read_table
@@ -17,6 +19,7 @@ from ekfslam.studies.sweep_table import SHOWN, SweepTable, read_table
 EXAMPLES = (
     "sweep study.toml",
     "sweep study.toml --executor tls://scheduler:8786 --out results/local/all",
+    "sweep study.toml --table paper.tex",
     "sweep --table --out results/local/all --figures ate_m nis_per_dof",
     "sweep --table --out results/local/all --only mode=full --plot ate_m noise.sigma_px",
 )
@@ -24,7 +27,8 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("study", nargs="?", type=Path, metavar="STUDY.toml", help="recordings, modes, variants, ...")
-    parser.add_argument("--table", action="store_true", help="run nothing: show the table in --out")
+    words = f"{TABLE_WORDS}; without STUDY.toml of the runs in --out, and without FILE it is shown only"
+    parser.add_argument("--table", nargs="?", type=table_file, const=None, default=False, metavar="FILE", help=words)
     parser.add_argument(
         "--figures",
         nargs="+",
@@ -49,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("FIGURE", "SETTING"),
         help="draw a column against another, a panel for each recording; may be given several times",
     )
-    declare(parser, *EXECUTOR)
+    declare(parser, *OTHERS, *EXECUTOR)
     resumes = "default: %(default)s; an interrupted sweep there resumes"
     declare(parser, "--out", default=Path("results/local/sweep"), help=resumes)
 
@@ -63,16 +67,23 @@ def _chosen(text: str) -> tuple[str, str]:
 
 def command(options: argparse.Namespace) -> None:
     path = options.out / "sweep.h5"
-    if options.table:
-        table = read_table(path)
-    elif options.study is None:
+    if options.study is None and options.table is False:
         raise ConfigError("sweep needs a STUDY.toml, or --table")
+    if options.table is None or options.study is None:
+        table = read_table(path)
     else:
-        sweep = Sweep.from_toml(options.study)
+        sweep = _with_others(Sweep.from_toml(options.study), options)
         files.require_writable(path)
         with open_executor(options.executor, options.workers) as executor:
             table = run_sweep(sweep, path, executor)
     _show(options, table)
+
+
+def _with_others(sweep: Sweep, options: argparse.Namespace) -> Sweep:
+    """Return a sweep with the trajectories of the command line in place of those of its file, if there are any."""
+    if not options.others:
+        return sweep
+    return replace(sweep, others=Others.parse(options.others, options.with_frame, options.with_world))
 
 
 def _show(options: argparse.Namespace, table: SweepTable) -> None:
@@ -90,6 +101,12 @@ def _show(options: argparse.Namespace, table: SweepTable) -> None:
         print(shown)
         raise ConfigError(f"{error}; --only chooses runs") from None
     contents = {options.out / "sweep.md": shown, **pngs(options.out, figures)}
+    if options.table:
+        contents[options.table] = table.paper(options.table.suffix, options.figures)
     files.write_all(contents)
     held = [path.name for path in sorted(options.out.glob("sweep.[hp]*"))]
-    print(f"{shown}\nin {options.out}: {', '.join([*held, *(path.name for path in contents)])}")
+    print(
+        f"{shown}\nin {options.out}: {', '.join([*held, *(path.name for path in contents if path != options.table)])}"
+    )
+    if options.table:
+        print(f"table written to {options.table}")

@@ -1,0 +1,156 @@
+"""Tables of papers: means, paired tests, and files of LaTeX, Markdown and CSV."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import re
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from ekfslam.cli import main
+from ekfslam.evaluation.paired import paired_grid, paired_test
+from ekfslam.evaluation.tables import Column, Grid, latex
+from ekfslam.studies.study import LEVELS, Study, StudyArchive, run_one
+from ekfslam.studies.summary import FIGURES, study_runs, summarise_study
+from ekfslam.studies.sweep_table import SweepTable
+
+RNG = np.random.default_rng(0)
+GRID = Grid(
+    [
+        Column("set_1", ["a & b", "a & b", "[c]"]),
+        Column("filter", ["full", "mine", "full"]),
+        Column("ATE [m]", [0.0123, 0.0456, None], [0.001, 0.002, None], is_compared=True),
+        Column("frames", [100, 20, 3]),
+    ],
+    ["a", "a", "c"],
+    ["50 % of 3 runs"],
+)
+
+
+def test_latex_escapes_aligns_and_sets_the_best_of_a_group_in_bold():
+    assert GRID.text(".tex") == (
+        "% 50 % of 3 runs\n"
+        "\\begin{tabular}{llrr}\n\\toprule\n"
+        "set\\_1 & filter & ATE [m] & frames \\\\\n\\midrule\n"
+        "a \\& b & full   & \\textbf{0.0123} $\\pm$ 0.0010 &    100 \\\\\n"
+        "       & mine   &          0.0456 $\\pm$ 0.0020 &     20 \\\\\n"
+        "\\addlinespace\n"
+        "{}[c]  & full   &                            - &      3 \\\\\n"
+        "\\bottomrule\n\\end{tabular}\n"
+    )
+
+
+def test_no_character_of_a_name_means_anything_to_latex():
+    assert latex("\\a{b} 5% $x_1^2$ #~&<|>") == (
+        r"\textbackslash{}a\{b\} 5\% \$x\_1\textasciicircum{}2\$ \#\textasciitilde{}\&"
+        r"\textless{}\textbar{}\textgreater{}"
+    )
+
+
+def test_markdown_has_the_same_cells():
+    lines = GRID.text(".md").splitlines()
+    assert lines[2] == "| a & b | full   | **0.0123** ± 0.0010 |    100 |"
+    assert lines[-1] == "50 % of 3 runs"
+
+
+def test_csv_keeps_every_digit_and_has_a_column_of_errors():
+    head, first, _, last = csv.reader(io.StringIO(GRID.text(".csv")))
+    assert head == ["set_1", "filter", "ATE [m]", "ATE [m], standard error", "frames"]
+    assert first == ["a & b", "full", "0.0123", "0.001", "100"] and last == ["[c]", "full", "", "", "3"]
+
+
+def test_equal_numbers_as_shown_are_both_the_best_and_a_single_one_is_not():
+    column = Column("ATE [m]", [1.0001, 1.0002, 2.0, 5.0], is_compared=True)
+    assert Grid([column], ["a", "a", "a", "b"]).best == {(0, 0), (0, 1)}
+
+
+def test_paired_tests_are_those_of_scipy_on_complete_pairs():
+    a, b = RNG.normal(1.0, 0.3, (2, 9))
+    a[4] = np.nan
+    found, kept = paired_test(a, b), np.isfinite(a)
+    assert found.n == 8 and found.mean == pytest.approx(np.mean(b[kept] - a[kept]))
+    assert found.error == pytest.approx(stats.sem(b[kept] - a[kept]))
+    assert found.p_t == pytest.approx(stats.ttest_rel(a[kept], b[kept]).pvalue)
+    assert found.p_wilcoxon == pytest.approx(stats.wilcoxon(a[kept], b[kept]).pvalue)
+
+
+def test_too_few_pairs_are_said_and_not_tested():
+    choices = {"full": {k: 1.0 * k for k in range(5)}, "mine": {k: 2.0 * k for k in range(4)}}
+    grid, said = paired_grid({"ATE [m]": choices})
+    assert grid is None
+    assert said == ("not enough pairs for a test of full and mine: 4 pairs, 6 are needed (ATE [m])",)
+
+
+def test_equal_values_have_no_p_value():
+    found = paired_test(np.ones(7), np.ones(7))
+    assert found.mean == found.error == 0.0 and np.isnan([found.p_t, found.p_wilcoxon]).all()
+
+
+@pytest.fixture(scope="module")
+def table():
+    """Two modes and two gates on two drives with four seeds; dead reckoning does not know the gate."""
+    rows = []
+    for recording in ("a", "b"):
+        for seed in range(4):
+            of_seed = dict(zip(("dead-reckoning", "full"), RNG.uniform(1.0, 2.0, 2), strict=True))
+            for gate in (0.99, 0.999):
+                for mode, ate in of_seed.items():
+                    ate_m = ate + (gate if mode == "full" else 0.0)
+                    facts = {"recording": recording, "mode": mode, "seed": seed, "filter.gate_probability": gate}
+                    rows.append({**facts, "ate_m": ate_m, "total_s": RNG.uniform()})
+    return SweepTable.of_rows(rows, ("recording", "mode", "seed", "filter.gate_probability"), len(rows))
+
+
+def test_means_have_standard_errors_median_and_worst_over_seeds(table):
+    grid = table.means(["ate_m"])
+    found = {column.heading: column for column in grid.columns}
+    assert found["mode"].values == ["dead-reckoning", "full", "full"] * 2
+    of_a = table.where("recording", "a").where("mode", "full").where("filter.gate_probability", "0.99").column("ate_m")
+    ate = found["ATE [m], unaligned"]
+    assert ate.values[1] == pytest.approx(of_a.mean()) and ate.errors[1] == pytest.approx(stats.sem(of_a))
+    assert found["median"].values[1] == pytest.approx(np.median(of_a)) and found["worst"].values[1] == of_a.max()
+    assert found["runs"].values == [4] * 6
+
+
+def test_dead_reckoning_has_one_row_without_the_setting_that_it_does_not_know(table):
+    grid = table.means(["ate_m"])
+    assert grid.columns[2].values == ["-", "0.99", "0.999"] * 2
+
+
+def test_settings_are_paired_by_recording_and_seed(table):
+    tests, said = table.tests(["ate_m", "total_s"])
+    assert said == ()
+    first, second, pairs = (tests.columns[i].values for i in (1, 2, 3))
+    place = list(zip(first, second, strict=True)).index(("full, 0.99", "full, 0.999"))
+    assert pairs == [8, 8, 8] and tests.columns[4].values[place] == pytest.approx(0.009)
+
+
+def test_compare_writes_the_table_of_several_recordings(tmp_path, capsys):
+    drives = [f"builtin:{name}?frames=8" for name in ("city", "loop")]
+    arguments = ["--modes", "dead-reckoning", "full", "--no-figures", "--out", str(tmp_path), "--executor", "serial"]
+    path = tmp_path / "paper.tex"
+    assert main(["compare", *drives, *arguments, "--table", str(path)]) == 0
+    text = path.read_text()
+    assert "recording & estimator & ATE [m], unaligned & " in text and text.count("\\addlinespace") == 1
+    assert text.count("\\textbf{") >= 4 and "not enough pairs" in text
+    with pytest.raises(SystemExit):
+        main(["compare", *drives, *arguments, "--table", str(tmp_path / "paper.doc")])
+    assert "does not end in one of .md, .tex, .csv" in capsys.readouterr().err
+
+
+def test_a_study_has_means_over_runs_and_paired_tests():
+    world = dataclasses.replace(LEVELS["low"], frames=12, landmarks=30)
+    study = Study({"short": world}, ("invariant", "standard"), runs=2)
+    archive = StudyArchive.empty(study)
+    for run in range(2):
+        archive.put(("short", run), run_one(study, "short", run))
+    table = study_runs(archive)
+    text = table.paper(".md", FIGURES)
+    assert re.search(r"\| variant +\| runs \| +pose NEES \(6\) \| median \| worst \|", text)
+    assert "not enough pairs for a test of invariant and standard: 2 pairs" in text
+    means = [x["mean"] for x in (summarise_study(archive)["levels"]["short"]["standard"][k] for k in FIGURES[:6])]
+    assert [table.where("variant", "standard").column(k).mean() for k in FIGURES[:6]] == pytest.approx(means)
