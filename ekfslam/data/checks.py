@@ -31,9 +31,7 @@ def frozen(array: NDArray) -> NDArray:
 def require_shape(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> None:
     """Raise `ShapeError` unless ``value`` has ``shape``, where None stands for any length."""
     found = np.shape(value)
-    if len(found) != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, found, strict=True)
-    ):
+    if len(found) != len(shape) or any(want not in (None, got) for want, got in zip(shape, found, strict=True)):
         wanted = " x ".join("n" if size is None else str(size) for size in shape)
         raise ShapeError(f"expected shape {wanted}, found {' x '.join(map(str, found)) or 'a scalar'}", field=name)
 
@@ -45,9 +43,8 @@ def require_finite(value: Array, name: str, largest: float = LARGEST) -> None:
         bad = np.argwhere(~small)
         index = tuple(int(i) for i in bad[0])
         kind = f"larger than {largest:g}" if np.isfinite(np.asarray(value)[index]) else "NaN or infinite"
-        raise NonFiniteError(
-            f"{len(bad)} values are {kind}, the first is {value[index]}", field=name, index=_position(index)
-        )
+        message = f"{len(bad)} values are {kind}, the first is {value[index]}"
+        raise NonFiniteError(message, field=name, index=_position(index))
 
 
 def require_rigid(T: Array, name: str, error: type[DataError]) -> None:

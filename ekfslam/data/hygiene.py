@@ -69,10 +69,8 @@ class HygieneReport:
     def counts(self) -> dict[str, int]:
         """Number of findings by rule, and of all dropped observations."""
         found = np.bincount(self.rule, minlength=len(RULES)).tolist()
-        return {
-            "dropped by hygiene": self.dropped,
-            **{f"hygiene: {name}": count for name, count in zip(RULES, found, strict=True)},
-        }
+        by_rule = {f"hygiene: {name}": count for name, count in zip(RULES, found, strict=True)}
+        return {"dropped by hygiene": self.dropped, **by_rule}
 
     def lines(self, config: Mapping[str, Any]) -> tuple[str, ...]:
         """Return one line a rule: its findings, or that ``config`` (``[hygiene]``) switches it off."""

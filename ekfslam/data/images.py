@@ -96,9 +96,8 @@ class PairCalibration:
 def baseline_doubt(baseline_m: float) -> str:
     """Return a warning about a baseline that is hardly in metres; empty without one."""
     if baseline_m > LARGEST_BASELINE_M:
-        return (
-            f"the baseline is {baseline_m:.6g} m: the calibration looks as if it were in mm ({baseline_m / 1e3:.4g} m)"
-        )
+        in_mm = f"as if it were in mm ({baseline_m / 1e3:.4g} m)"
+        return f"the baseline is {baseline_m:.6g} m: the calibration looks {in_mm}"
     if 0 < baseline_m < LEAST_BASELINE_M:
         return f"the baseline is {1e3 * baseline_m:.4g} mm: the calibration looks as if it were not in metres"
     return ""

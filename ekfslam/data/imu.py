@@ -43,17 +43,15 @@ def attach_inertial(recording: Recording, path: str | Path, noise: str | Path | 
     source = Source.at(path)
     rows: InertialRows | None = read_as(source, "inertial")
     if rows is None:
-        raise UnknownFormatError(
-            f"{path}: no inertial samples ({source.problem or 'unknown content'}); {expected('inertial')}"
-        )
+        problem = source.problem or "unknown content"
+        raise UnknownFormatError(f"{path}: no inertial samples ({problem}); {expected('inertial')}")
     rows = _with_chain(rows, Path(path), _lacks_extrinsics(recording))
     if noise is not None:
         rows = replace(rows, noise=_stated(noise), notes=tuple(note for note in rows.notes if _DROPPED not in note))
     if rows.T_cam_imu is None and _lacks_extrinsics(recording):
-        message = (
-            "no file states T_cam_imu, from the inertial unit to the left camera; put camchain-imucam.yaml of Kalibr"
-        )
-        raise ExtrinsicsError(f"{message} beside {path}, or T_cam_imu into the calibration", source=recording.source)
+        message = "no file states T_cam_imu, from the inertial unit to the left camera"
+        remedy = f"put camchain-imucam.yaml of Kalibr beside {path}, or T_cam_imu into the calibration"
+        raise ExtrinsicsError(f"{message}; {remedy}", source=recording.source)
     return with_rows(recording, rows)
 
 

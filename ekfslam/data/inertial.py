@@ -119,25 +119,20 @@ def inertial_notes(samples: InertialSamples, source: str = "") -> tuple[str, ...
             raise DataError(f"{message}; {remedy}", source=source, field="accelerometer")
     notes = []
     if not _GRAVITY[0] <= quiet_f <= _GRAVITY[1]:
-        notes.append(
-            f"The mean specific force at the quietest second is {quiet_f:.3g} m/s^2, expected 9.81: check the units of "
-            "the accelerometer."
-        )
+        found = f"The mean specific force at the quietest second is {quiet_f:.3g} m/s^2, expected 9.81"
+        notes.append(f"{found}: check the units of the accelerometer.")
     if (fast := int((gyro > _FASTEST).sum())) > 0:
         notes.append(f"{fast} angular rates exceed {_FASTEST:g} rad/s: spikes, or a unit other than rad/s.")
-    if _is_slow(turned := _turned_by_gravity(samples)):
-        notes.append(
-            f"Gravity in the samples turns {1 / turned:.0f} times slower than the angular rates say: they look like "
-            "deg/s, multiply by pi / 180."
-        )
+    if 0.5 / 57.3 < (turned := _turned_by_gravity(samples)) < 2.0 / 57.3:
+        slow = f"Gravity in the samples turns {1 / turned:.0f} times slower than the angular rates say"
+        notes.append(f"{slow}: they look like deg/s, multiply by pi / 180.")
     if 1.0 / samples.step_s < _SLOWEST_HZ:
         rate = f"The inertial unit has {1.0 / samples.step_s:.3g} Hz"
         notes.append(f"{rate}: below {_SLOWEST_HZ:g} Hz fast motion is integrated poorly.")
-    gaps, longest_s = samples.gaps
-    if gaps:
-        notes.append(
-            f"The inertial samples have {gaps} gaps of more than three steps; the longest is {longest_s:.3g} s."
-        )
+    count, longest_s = samples.gaps
+    if count:
+        gaps = f"{count} gaps of more than three steps; the longest is {longest_s:.3g} s"
+        notes.append(f"The inertial samples have {gaps}.")
     return tuple(notes)
 
 
@@ -168,10 +163,6 @@ def _turned_by_gravity(samples: InertialSamples) -> float:
     # Slow turns do not tell: noise hides them.
     error = np.sqrt(((df - factor * expected) ** 2).sum() / (3 * len(df)) / power) if power > 0 else np.inf
     return factor if error < 0.3 * abs(factor) else np.nan
-
-
-def _is_slow(factor: float) -> bool:
-    return bool(0.5 / 57.3 < factor < 2.0 / 57.3)
 
 
 def covered_frames(samples: InertialSamples, time_s: Array, source: str) -> tuple[int, int]:

@@ -263,10 +263,8 @@ def _require_cover(samples: Input, begin_s: float, end_s: float) -> None:
         return
     reach = _median_step(samples.time_s)
     if begin_s < first - reach or end_s > last + reach:
-        raise LostDataError(
-            f"there are no samples from {begin_s:.3f} to {end_s:.3f} s, only from {first:.3f} to {last:.3f} s",
-            field="inputs",
-        )
+        spans = f"from {begin_s:.3f} to {end_s:.3f} s, only from {first:.3f} to {last:.3f} s"
+        raise LostDataError(f"there are no samples {spans}", field="inputs")
 
 
 def _freeze(record: Input, *names: str) -> None:

@@ -111,8 +111,6 @@ def known_intervals(attributes: Mapping[str, str | int | float], twist: Array) -
 
 def interpolation_notes(twist: Array) -> tuple[str, ...]:
     """Return one sentence for each stretch of interpolated velocities."""
-    return tuple(
-        f"The velocities of intervals {begin} to {end} are interpolated, and so probably are true poses there: no NEES "
-        "is taken of them."
-        for begin, end in stretches(interpolated_intervals(twist))
-    )
+    rest = "are interpolated, and so probably are true poses there: no NEES is taken of them."
+    spans = stretches(interpolated_intervals(twist))
+    return tuple(f"The velocities of intervals {begin} to {end} {rest}" for begin, end in spans)

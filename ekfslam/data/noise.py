@@ -118,9 +118,8 @@ class Noise:
         """The part that belongs to tracks; None where pixel noise is white."""
         if self.track_first_px is None or self.track_walk_px is None:
             return None
-        return TrackError(
-            np.asarray(self.track_first_px), np.asarray(self.track_walk_px), self.track_flow_px, self.track_parallax
-        )
+        first, walk = np.asarray(self.track_first_px), np.asarray(self.track_walk_px)
+        return TrackError(first, walk, self.track_flow_px, self.track_parallax)
 
     @property
     def velocity_std(self) -> Array:

@@ -54,11 +54,9 @@ class Observations:
         frame = np.asarray(self.frame, dtype=np.int64).ravel()
         landmark = np.asarray(self.landmark, dtype=np.int64).ravel()
         pixels = np.asarray(self.pixels_px, dtype=float)
-        if not len(frame) == len(landmark) == len(pixels) or pixels.shape not in _shapes(len(frame)):
-            raise ShapeError(
-                f"{len(frame)} frames, {len(landmark)} landmarks and pixels of shape {pixels.shape} do not agree",
-                field="observations",
-            )
+        if not len(frame) == len(landmark) == len(pixels) or pixels.shape not in ((len(frame), 4), (len(frame), 2)):
+            found = f"{len(frame)} frames, {len(landmark)} landmarks and pixels of shape {pixels.shape}"
+            raise ShapeError(f"{found} do not agree", field="observations")
         order = np.lexsort((landmark, frame))
         for name, value in (("frame", frame), ("landmark", landmark), ("pixels_px", pixels)):
             object.__setattr__(self, name, frozen(value[order]))
@@ -90,10 +88,6 @@ class Observations:
         """Return the observations of frames ``begin`` to ``end - 1``, which count from 0 again."""
         seen = slice(*np.searchsorted(self.frame, (begin, end)))
         return Observations(self.frame[seen] - begin, self.landmark[seen], self.pixels_px[seen])
-
-
-def _shapes(count: int) -> tuple[tuple[int, int], ...]:
-    return (count, 4), (count, 2)
 
 
 @dataclass(frozen=True)

@@ -109,14 +109,11 @@ def attach_truth(sequence: Sequence, path: Path) -> Sequence:
     truth = truth_of_frames(sequence.time_s, poses, int(sequence.attributes.get(FIRST_IMAGE, 0)))
     frames, known, count = len(sequence), len(truth.frame), len(poses.T_world_imu)
     if known < MIN_COVERAGE * frames:
-        spans = ""
+        message = f"{count} poses give truth to {known} of the {frames} frames of {sequence.source}"
+        message += f"; at least {MIN_COVERAGE:.0%} are needed"
         if poses.time_s is not None:
-            spans = f"; its stamps are {_span(poses.time_s)}, the sequence's {_span(sequence.time_s)}"
-        raise TruthError(
-            f"{count} poses give truth to {known} of the {frames} frames of {sequence.source}; "
-            f"at least {MIN_COVERAGE:.0%} are needed{spans}",
-            source=str(path),
-        )
+            message += f"; its stamps are {_span(poses.time_s)}, the sequence's {_span(sequence.time_s)}"
+        raise TruthError(message, source=str(path))
     note = f"Truth of {known} of {frames} frames from {path.name}"
     note += f"; {count - known} of its {count} poses are not used." if known < count else "."
     return dataclasses.replace(

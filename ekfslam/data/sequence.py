@@ -105,12 +105,10 @@ class Sequence(Once, Shown):
         notes: tuple[str, ...] = (),
         attributes: Mapping[str, str | int | float] | None = None,
     ) -> None:
-        given: dict[str, object] = {"name": printable(name), "source": source}
-        given |= {"time_s": frozen(np.asarray(time_s, dtype=float))}
-        given |= {"camera": camera, "observations": observations, "truth": truth, "noise": noise, "notes": notes}
-        given |= {"attributes": {} if attributes is None else attributes}
-        if observations.is_monocular:
-            given["camera"] = replace(camera, baseline_m=0.0)
+        given: dict[str, object] = {"name": printable(name), "source": source, "notes": notes}
+        given |= {"time_s": frozen(np.asarray(time_s, dtype=float)), "attributes": attributes or {}}
+        given |= {"camera": replace(camera, baseline_m=0.0) if observations.is_monocular else camera}
+        given |= {"observations": observations, "truth": truth, "noise": noise}
         for field_name, value in given.items():
             object.__setattr__(self, field_name, value)
         with spelled_as_in(source):

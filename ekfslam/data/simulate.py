@@ -101,10 +101,8 @@ class Loop(Drive):
         super().__post_init__()
         least = ROAD_HALF_WIDTH_M - 0.2 * self.radius_m
         if self.landmark_offset_m < least:
-            raise ConfigError(
-                f"{self.name}: landmark_offset_m leaves no room beside the road: must be at least {least:g} where "
-                f"radius_m is {self.radius_m:g}, found {self.landmark_offset_m:g}"
-            )
+            must = f"must be at least {least:g} where radius_m is {self.radius_m:g}, found {self.landmark_offset_m:g}"
+            raise ConfigError(f"{self.name}: landmark_offset_m leaves no room beside the road: {must}")
 
     @property
     def in_view(self) -> float:
@@ -186,7 +184,7 @@ def _drive(world: Loop | City, rng: np.random.Generator) -> tuple[Array, Array, 
     else:
         (distance_m, yaw_rad), wavelength_m = _drive_streets(time_s, rng), 150.0
     twist = _twists(time_s, distance_m, yaw_rad, wavelength_m, rng)
-    T_imu_world = _integrate(twist, np.diff(time_s))
+    T_imu_world = motion.integrate(np.eye(4), twist, np.diff(time_s))
     if isinstance(world, Loop):
         points_m = _around_ring(world, rng)
     else:
@@ -232,26 +230,15 @@ def _twists(time_s: Array, distance_m: Array, yaw_rad: Array, wavelength_m: floa
     amplitude = _UNEVENNESS * rng.standard_normal((len(harmonics), 4)) / np.sqrt(len(harmonics))
     waves = np.sin(2 * np.pi / wavelength_m * distance_m[:, None] * harmonics) @ amplitude
     x_axis, y_axis, z_axis = np.eye(3)
-    R_world_imu = (
-        se3.so3_exp(yaw_rad[:, None] * z_axis)
-        @ se3.so3_exp(waves[:, :1] * y_axis)
-        @ se3.so3_exp(waves[:, 1:2] * x_axis)
-    )
+    turns = (yaw_rad[:, None] * z_axis, waves[:, :1] * y_axis, waves[:, 1:2] * x_axis)
+    yaw, pitch, roll = (se3.so3_exp(turn) for turn in turns)
+    R_world_imu = yaw @ pitch @ roll
     tau = np.diff(time_s)[:, None]
     speed = np.diff(distance_m)[:, None] / tau
     v = speed * np.concatenate([np.ones_like(speed), waves[1:, 2:]], axis=-1)
     w = se3.so3_log(np.swapaxes(R_world_imu[:-1], -1, -2) @ R_world_imu[1:]) / tau
     twist = np.concatenate([v, w], axis=-1)
     return np.concatenate([twist[:1], twist])  # the first sample drives an interval before the recording
-
-
-def _integrate(twist: Array, tau_s: Array) -> Array:
-    """Return ``T_imu_world`` (T, 4, 4) by eq. (1), from velocities (T, 6) and intervals (T-1,)."""
-    T = np.empty((len(twist), 4, 4))
-    T[0] = np.eye(4)
-    for k, E in enumerate(motion.increment(twist[1:], tau_s), start=1):
-        T[k] = E @ T[k - 1]
-    return T
 
 
 def _around_ring(world: Loop, rng: np.random.Generator) -> Array:
@@ -279,14 +266,8 @@ def _line_streets(world: City, distance_m: Array, yaw_rad: Array, position_m: Ar
     building = (s / 17.0).astype(int)
     facade_m = rng.uniform(7.0, 19.5, (int(path_s[-1] / 17.0) + 1, 2))[building, side]
     kind = rng.choice(3, count, p=[0.6, 0.2, 0.2])
-    lateral = np.choose(
-        kind,
-        [
-            facade_m + rng.uniform(0.0, 0.5, count),
-            rng.uniform(ROAD_HALF_WIDTH_M, facade_m),
-            rng.uniform(ROAD_HALF_WIDTH_M, 7.0, count),
-        ],
-    )
+    aside = [facade_m + rng.uniform(0.0, 0.5, count), rng.uniform(ROAD_HALF_WIDTH_M, facade_m)]
+    lateral = np.choose(kind, [*aside, rng.uniform(ROAD_HALF_WIDTH_M, 7.0, count)])
     height = np.choose(kind, [rng.uniform(0.0, 8.0, count), rng.uniform(0.0, 3.0, count), rng.uniform(0, 0.15, count)])
 
     yaw = np.interp(s, path_s, path_yaw)

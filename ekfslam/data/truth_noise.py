@@ -33,14 +33,10 @@ class TruthNoise:
     @property
     def text(self) -> str:
         """Return all values in one line, angles in degrees."""
-        roll, pitch, yaw, attitude = (
-            f"{math.degrees(value):.3g}"
-            for value in (self.first_roll_rad, self.first_pitch_rad, self.first_yaw_rad, self.attitude_rad)
-        )
-        text = (
-            f"first pose {roll}, {pitch}, {yaw} deg (roll, pitch, yaw), {self.first_position_m:.3g} m; each pose "
-            f"{self.position_m:.3g} m, {attitude} deg, stamps {1e3 * self.stamp_s:.3g} ms"
-        )
+        angles = (self.first_roll_rad, self.first_pitch_rad, self.first_yaw_rad, self.attitude_rad)
+        roll, pitch, yaw, attitude = (f"{math.degrees(angle):.3g}" for angle in angles)
+        text = f"first pose {roll}, {pitch}, {yaw} deg (roll, pitch, yaw), {self.first_position_m:.3g} m"
+        text += f"; each pose {self.position_m:.3g} m, {attitude} deg, stamps {1e3 * self.stamp_s:.3g} ms"
         tilt, turn = (f"{math.degrees(value):.3g} deg" for value in (self.world_tilt_rad, self.turn_rad))
         drift = f"{self.drift_m_sqrt_s:.3g} m/sqrt(s)"
         slow = [(self.world_tilt_rad, f"world tilt {tilt}"), (self.turn_rad, f"body turned {turn}")]

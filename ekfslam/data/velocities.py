@@ -107,9 +107,8 @@ def _of_recording(recording: Sequence | ImageRecording, path: str) -> VelocitySa
     if "checksum_sha256" in recording.attributes:
         attributes["velocities_sha256"] = recording.attributes["checksum_sha256"]
     notes = tuple(f"{recording.name}: {note}" for note in recording.notes if "velocit" in note)
-    return VelocitySamples(
-        path, recording.time_s, twist, recording.velocity_frame, recording.T_cam_imu, dict(attributes), notes
-    )
+    frame, T_cam_imu = recording.velocity_frame, recording.T_cam_imu
+    return VelocitySamples(path, recording.time_s, twist, frame, T_cam_imu, dict(attributes), notes)
 
 
 def _on_clock_of(found: VelocitySamples, time_s: Array, source: str) -> VelocitySamples:
@@ -118,11 +117,9 @@ def _on_clock_of(found: VelocitySamples, time_s: Array, source: str) -> Velocity
         return found
     step = _step(time_s)
     if min(abs(time_s[0]), abs(found.time_s[0])) > step:
-        raise LostDataError(
-            f"samples from {found.time_s[0]:.3f} to {found.time_s[-1]:.3f} s have no time in common with {source}, "
-            f"{time_s[0]:.3f} to {time_s[-1]:.3f} s",
-            source=found.source,
-        )
+        spans = [f"{stamps[0]:.3f} to {stamps[-1]:.3f} s" for stamps in (found.time_s, time_s)]
+        message = f"samples from {spans[0]} have no time in common with {source}, {spans[1]}"
+        raise LostDataError(message, source=found.source)
     note = f"Stamps of {found.source} are on another clock: its first sample is taken as that of the first frame."
     shifted = found.time_s - (found.time_s[0] - time_s[0])
     return replace(found, time_s=shifted, notes=(*found.notes, note))

@@ -70,10 +70,8 @@ class Recording:
             if getattr(self, key) > 1:
                 raise ConfigError(f"{self.name}: {key} must be in [0, 1], found {getattr(self, key)}")
         if self.frames * max(self.in_view, 1.0) > _MOST_IN_VIEW:
-            raise ConfigError(
-                f"{self.name}: {self.frames} frames of about {self.in_view:.0f} landmarks are too many, at most "
-                f"{_MOST_IN_VIEW} together"
-            )
+            found = f"{self.frames} frames of about {self.in_view:.0f} landmarks"
+            raise ConfigError(f"{self.name}: {found} are too many, at most {_MOST_IN_VIEW} together")
 
     @property
     def in_view(self) -> float:

@@ -217,10 +217,8 @@ def rejection_causes(result: Result, rejected: Mapping[str, float], causes: Sequ
 def smoother_causes(smoother: SmootherAgreement | None) -> Iterator[Cause]:
     """Yield the alarm of failed linearisation."""
     if smoother is not None and smoother.size > _SMOOTHER:
-        text = (
-            f"filter and smoother differ {smoother.size:.1f}x more than their covariances allow: failed linearisation"
-        )
-        yield Cause("smoother", (), smoother.size, text, _REMEDY["smoother"])
+        text = f"filter and smoother differ {smoother.size:.1f}x more than their covariances allow"
+        yield Cause("smoother", (), smoother.size, f"{text}: failed linearisation", _REMEDY["smoother"])
 
 
 def _mean(factors: Array) -> float:

@@ -76,9 +76,8 @@ def measured_truth(truth: Truth, interpolated: BoolArray, time_s: Array) -> Trut
         first_m = float(np.hypot(noise.first_position_m, GAP_STD[0] * invented_s))
         noise = dataclasses.replace(noise, first_position_m=first_m)
     motion = None if motion is None else TrueMotion(*(value[kept] for value in vars(motion).values()))
-    return dataclasses.replace(
-        truth, frame=truth.frame[kept], T_world_imu=truth.T_world_imu[kept], noise=noise, motion=motion
-    )
+    frame, T_world_imu = truth.frame[kept], truth.T_world_imu[kept]
+    return dataclasses.replace(truth, frame=frame, T_world_imu=T_world_imu, noise=noise, motion=motion)
 
 
 def interpolated_frames(truth: Truth, frames: int) -> BoolArray:
@@ -179,9 +178,8 @@ def pose_nees_apart(result: Result, truth: Truth) -> tuple[IntArray, Array] | No
         return None
     error, covariance = pose_errors(result, truth, with_truth_noise=True)
     frame, kept = truth.frame, np.ones(len(truth.frame), dtype=bool)
-    covariance = covariance + drift_covariance(
-        TruthNoise(drift_m_sqrt_s=drift), result.time_s[frame] - result.time_s[0]
-    )
+    lapse_s = result.time_s[frame] - result.time_s[0]
+    covariance = covariance + drift_covariance(TruthNoise(drift_m_sqrt_s=drift), lapse_s)
     T = result.T_world_imu
     for doubt in doubts:
         kept &= (frame <= doubt.begin) | (frame > doubt.end)

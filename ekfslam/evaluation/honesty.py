@@ -129,11 +129,9 @@ class Honesty:
                 ["variance of single ones, without the gate's cut", f"{self.tracks.scale:.3g}", "1"],
             ]
         rows += [[f"rejected: {name}", percent(share), ""] for name, share in self.rejected.items()]
-        return (
-            rows
-            if self.smoother is None
-            else [*rows, ["filter less smoother, deviations", f"{self.smoother.size:.3g}", "1"]]
-        )
+        if self.smoother is not None:
+            rows.append(["filter less smoother, deviations", f"{self.smoother.size:.3g}", "1"])
+        return rows
 
     @property
     def table(self) -> str:

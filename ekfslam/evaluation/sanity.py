@@ -62,11 +62,8 @@ class _Remedy(NamedTuple):
 
     def undo(self, C: Array, u: Array, tau: Array) -> tuple[Array, Array, Array]:
         """Return the right extrinsics (4, 4), velocities (n, 6) and intervals (n,)."""
-        return (
-            self.camera(C),
-            np.hstack([u[:, :3] @ self.axes, u[:, 3:] @ self.axes]) * self.velocities,
-            self.seconds * tau,
-        )
+        turned = np.hstack([u[:, :3] @ self.axes, u[:, 3:] @ self.axes])
+        return self.camera(C), turned * self.velocities, self.seconds * tau
 
     @property
     def shrinks(self) -> BoolArray:

@@ -218,10 +218,8 @@ def in_words(compared: Comparison | None, time_s: Array) -> tuple[str, ...]:
         begin_s, end_s = time_s[[one.begin, one.end]] - time_s[0]
         offset = f"{one.offset:+.2g} m" if one.axis < 3 else f"{np.degrees(one.offset):+.2g} deg"
         others = " and ".join(name for i, name in enumerate(SOURCES) if i != one.source)
-        lines.append(
-            f"{SOURCES[one.source]} alone from {begin_s:.1f} to {end_s:.1f} s: {AXES[one.axis]} {offset} in "
-            f"{STRETCH_S:g} s against {others}, {one.sigmas:.0f} standard errors"
-        )
+        against = f"{AXES[one.axis]} {offset} in {STRETCH_S:g} s against {others}, {one.sigmas:.0f} standard errors"
+        lines.append(f"{SOURCES[one.source]} alone from {begin_s:.1f} to {end_s:.1f} s: {against}")
     if compared.drift_m_sqrt_s:
         found = f"the truth drifts by about {compared.drift_m_sqrt_s:.2g} m/sqrt(s) against velocities and vision"
         lines.append(f"{found}: see drift_m_sqrt_s of [truth]")

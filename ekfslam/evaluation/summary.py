@@ -86,6 +86,5 @@ def merit_rows(summaries: Iterable[Mapping[str, Any]]) -> list[list[str]]:
 def definitions(summaries: Iterable[Mapping[str, Any]]) -> list[tuple[str, str]]:
     """Return heading and definition of the rows of `merit_rows` whose heading does not say all."""
     found = {key for summary in summaries for key, value in summary.items() if value is not None}
-    return [
-        (metric.heading, metric.definition) for key, metric in METRICS.items() if key in found and metric.definition
-    ]
+    named = (metric for key, metric in METRICS.items() if key in found and metric.definition)
+    return [(metric.heading, metric.definition) for metric in named]

@@ -33,7 +33,7 @@ def markdown_table(
     texts, rule = [], []
     for line in lines:
         cells = (
-            f"{cell:<{w}}" if i < left else f"{cell:>{w}}" for i, (cell, w) in enumerate(zip(line, widths, strict=True))
+            cell.ljust(w) if i < left else cell.rjust(w) for i, (cell, w) in enumerate(zip(line, widths, strict=True))
         )
         texts.append(f"|{'|'.join(f' {cell} ' if cell else ' ' for cell in cells)}|")
     for i, width in enumerate(widths):

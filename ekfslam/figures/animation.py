@@ -22,18 +22,7 @@ from ekfslam import files
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.errors import ConfigError
-from ekfslam.figures.maps import (
-    SIGMAS,
-    diagonal,
-    draw_dots,
-    ellipse_axes,
-    ellipses,
-    legend_below,
-    map_axes,
-    map_of,
-    position_covariance,
-    spread,
-)
+from ekfslam.figures import maps
 from ekfslam.figures.style import LANDMARK_COLOR, TRUTH, line_of, style_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.progress import progress
@@ -78,7 +67,7 @@ def animated(results: Mapping[str, Result], truth: Truth | None, pictures: int) 
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     still = canvas.copy_from_bbox(figure.bbox)
-    for k in spread(frames, pictures):
+    for k in maps.spread(frames, pictures):
         canvas.restore_region(still)
         for update in updates:
             for artist in update(int(k)):
@@ -89,16 +78,16 @@ def animated(results: Mapping[str, Result], truth: Truth | None, pictures: int) 
 @styled
 def _still_map(results: Mapping[str, Result], truth: Truth | None, updates: list[Update]) -> Figure:
     """Return a map without its moving parts, and append the functions that move them to a frame."""
-    mapper = map_of(results)
-    figure, ax, _ = map_axes(results, truth, mapper.landmarks.position_m[:, :2])
+    mapper = maps.map_of(results)
+    figure, ax, _ = maps.map_axes(results, truth, mapper.landmarks.position_m[:, :2])
     figure.set_dpi(_DPI)
     updates.append(_landmarks(ax, mapper))
     if truth is not None and len(truth.frame):
         ax.plot(*truth.T_world_imu[:, :2, 3].T, **TRUTH, alpha=0.35, label="truth")
     updates.extend(_vehicle(ax, mode, result) for mode, result in results.items())
     updates.append(_clock(ax, mapper))
-    legend_below(figure, ax)
-    ax.set_title(f"{mapper.sequence_name}: {SIGMAS:g}-sigma ellipses")
+    maps.legend_below(figure, ax)
+    ax.set_title(f"{mapper.sequence_name}: {maps.SIGMAS:g}-sigma ellipses")
     return figure
 
 
@@ -106,10 +95,10 @@ def _landmarks(ax: Axes, mapper: Result) -> Update:
     """Return the update of landmarks: dots of all seen so far, ellipses of all in view."""
     landmarks = mapper.landmarks
     points = landmarks.position_m[:, :2]
-    dots = draw_dots(ax, points, f"landmarks of {mapper.mode}", alpha=0.6, animated=True)
+    dots = maps.draw_dots(ax, points, f"landmarks of {mapper.mode}", alpha=0.6, animated=True)
     dots.set_markersize(1.5 * dots.get_markersize())
-    axes = ellipse_axes(landmarks.covariance[:, :2, :2])
-    fits = axes[0] < 0.1 * diagonal(ax)
+    axes = maps.ellipse_axes(landmarks.covariance[:, :2, :2])
+    fits = axes[0] < 0.1 * maps.diagonal(ax)
 
     def update(k: int) -> Iterable[Artist]:
         seen = landmarks.first_frame <= k
@@ -125,7 +114,7 @@ def _vehicle(ax: Axes, mode: str, result: Result) -> Update:
     xy, forward, color = result.T_world_imu[:, :2, 3], result.T_world_imu[:, :2, 0], style_of(mode)["color"]
     (line,) = ax.plot(*xy.T, **line_of(mode), label=mode, animated=True)  # without data, arrows have no direction
     arrow = ax.quiver(*xy[0], *forward[0], color=color, angles="xy", scale=18, width=0.006, zorder=5, animated=True)
-    axes = ellipse_axes(position_covariance(result.T_world_imu, result.covariance))
+    axes = maps.ellipse_axes(maps.position_covariance(result.T_world_imu, result.covariance))
 
     def update(k: int) -> Iterable[Artist]:
         line.set_data(*xy[: k + 1].T)
@@ -139,7 +128,7 @@ def _vehicle(ax: Axes, mode: str, result: Result) -> Update:
 def _ellipses(ax: Axes, rows: IntArray, centres: Array, axes: tuple[Array, Array, Array], color: str) -> Artist:
     """Return ellipses that can be drawn without being added to the axes, where they would pile up."""
     long, short, angle = (values[rows] for values in axes)
-    found = ellipses(ax, centres[rows], (long, short, angle), color, linewidths=0.8)
+    found = maps.ellipses(ax, centres[rows], (long, short, angle), color, linewidths=0.8)
     found.axes = ax
     found.set_figure(ax.get_figure())  # type: ignore[arg-type]
     found.set_clip_box(ax.bbox)

@@ -8,16 +8,7 @@ from matplotlib.figure import Figure
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.tables import MISSING
-from ekfslam.figures import registry
-from ekfslam.figures.maps import (
-    SIGMAS,
-    add_ellipses,
-    add_pose_ellipses,
-    draw_dots,
-    draw_paths,
-    look_from_above,
-    position_covariance,
-)
+from ekfslam.figures import maps, registry
 from ekfslam.figures.style import LANDMARK_COLOR, arrange, legend_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.smoother.sparse.information import JointInformation
@@ -42,15 +33,15 @@ def plot_map_before_and_after(full: Result, smoothed: Result, truth: Truth | Non
     figure = Figure(figsize=(10.0, 4.6 * aspect + 1.5))
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     for ax, result, title in ((axes[0], full, "filter"), (axes[1], smoothed, "posterior")):
-        look_from_above(ax, low, high)
+        maps.look_from_above(ax, low, high)
         landmarks = result.landmarks
         inside = ((landmarks.position_m[:, :2] > low) & (landmarks.position_m[:, :2] < high)).all(axis=1)
         xy, covariance = landmarks.position_m[inside, :2], landmarks.covariance[inside, :2, :2]
-        add_ellipses(ax, xy, covariance, LANDMARK_COLOR, 0.3, alpha=0.7, linewidths=0.6)
-        draw_dots(ax, xy, f"landmark, {SIGMAS:g} sigma", markeredgewidth=1.0)
-        draw_paths(ax, {result.mode: result}, truth)
-        add_pose_ellipses(ax, result, _POSES)
-        of_poses = _median_std(position_covariance(result.T_world_imu, result.covariance))
+        maps.add_ellipses(ax, xy, covariance, LANDMARK_COLOR, 0.3, alpha=0.7, linewidths=0.6)
+        maps.draw_dots(ax, xy, f"landmark, {maps.SIGMAS:g} sigma", markeredgewidth=1.0)
+        maps.draw_paths(ax, {result.mode: result}, truth)
+        maps.add_pose_ellipses(ax, result, _POSES)
+        of_poses = _median_std(maps.position_covariance(result.T_world_imu, result.covariance))
         medians = f"position {of_poses} m, landmark {_median_std(covariance)} m"
         ax.set_title(f"{title}, median standard deviations:\n{medians}")
     axes[0].set_ylabel("y [m]")

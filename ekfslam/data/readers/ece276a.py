@@ -31,10 +31,8 @@ _EXTRINSICS_NOTES: dict[Extrinsics, str] = {
     "corrected": (
         "The stored cam_T_imu = [R, t] holds the camera's position t in the IMU frame; T_cam_imu = [R, -R t] is used."
     ),
-    "as-stored": (
-        "The stored cam_T_imu = [R, t] is used as T_cam_imu, as in the report, although t is the camera's position in "
-        "the IMU frame."
-    ),
+    "as-stored": "The stored cam_T_imu = [R, t] is used as T_cam_imu, as in the report, although t is the camera's "
+    "position in the IMU frame.",
 }
 _LATER_NOTE = (
     "The stored imu_T_cam is a pose in an IMU frame forward, right, down, while the velocities are forward, left, up: "

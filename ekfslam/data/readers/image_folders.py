@@ -57,10 +57,7 @@ def open_folder(path: Path, calibration: str | None = None) -> ImageRecording:
         calibration = str(folder / _text(values, "calibration", file))
     described = read_pair(calibration or file)
     left, right = images_of_sides(*(folder / name for name in _folders(values, folder, file)))
-    alone = [
-        image.stem for side, other in ((left, right), (right, left)) for key, image in side.items() if key not in other
-    ]
-    if alone:
+    if alone := [image.stem for key, image in [*left.items(), *right.items()] if (key in left) != (key in right)]:
         raise LostDataError(f"{len(alone)} images have no partner, the first is {alone[0]}", source=str(folder))
     load, notes = pair_files(list(left.values()), [right[key] for key in left], bits=_bits(values, file))
     notes += () if "velocities" in values else ("There are no velocities.",)

@@ -134,12 +134,9 @@ def _stamps_of(path: Path, packets: dict[int, Path]) -> tuple[IntArray, BoolArra
         raise ShapeError(message, source=str(path))
     lost = np.setdiff1d(np.flatnonzero(stamped), list(packets))
     if len(lost):
-        raise LostDataError(
-            f"{len(lost)} packets are missing although {path.name} has their stamps; "
-            f"the first is {lost[0]:010d}.txt, line {lost[0] + 1}",
-            source=str(path.parent / "data"),
-            index=int(lost[0]),
-        )
+        message = f"{len(lost)} packets are missing although {path.name} has their stamps"
+        message += f"; the first is {lost[0]:010d}.txt, line {lost[0] + 1}"
+        raise LostDataError(message, source=str(path.parent / "data"), index=int(lost[0]))
     _require_repairable(stamped, path)
     return stamp_ns, stamped
 
@@ -171,11 +168,9 @@ def _require_repairable(stamped: BoolArray, path: Path) -> None:
     longest = int(np.argmax(np.diff(known)))
     run, empty = int(known[longest + 1] - known[longest] - 1), int((~stamped).sum())
     if run > MAX_EMPTY_RUN or empty > max(1, MAX_EMPTY_SHARE * len(stamped)):
-        raise LostDataError(
-            f"{empty} of {len(stamped)} lines are empty, {run} in a row from here; at most {MAX_EMPTY_RUN} in a row "
-            f"and {MAX_EMPTY_SHARE:.0%} of all can be interpolated",
-            **line_of(path, int(known[longest]) + 2),
-        )
+        most = f"at most {MAX_EMPTY_RUN} in a row and {MAX_EMPTY_SHARE:.0%} of all can be interpolated"
+        message = f"{empty} of {len(stamped)} lines are empty, {run} in a row from here; {most}"
+        raise LostDataError(message, **line_of(path, int(known[longest]) + 2))
 
 
 def _interpolated(values: Array, known: BoolArray) -> Array:

@@ -192,9 +192,8 @@ def images_of_sides(left: Path, right: Path) -> tuple[dict[str, Path], dict[str,
     if {path.stem for path in found[0]} == {path.stem for path in found[1]}:
         in_left, in_right = ({path.stem: path for path in images} for images in found)
     else:
-        in_left, in_right = (
-            {_SIDES[side].sub("*", path.stem, count=1): path for path in images} for side, images in enumerate(found)
-        )
+        sides = zip(_SIDES, found, strict=True)
+        in_left, in_right = ({side.sub("*", path.stem, count=1): path for path in images} for side, images in sides)
     return in_left, in_right
 
 
@@ -255,10 +254,8 @@ def pair_stamps(left_ns: IntArray, right_ns: IntArray, source: str) -> tuple[Int
     most = max(len(left_ns), len(right_ns))
     if len(left) < min(LEAST_PAIRED * most, most - FEW):
         apart_ms = np.median(np.abs(right_ns[nearest(right_ns, left_ns)] - left_ns)) / 1e6
-        message = (
-            f"only {len(left)} of {len(left_ns)} left and {len(right_ns)} right images have the same stamp within "
-            f"{_TOLERANCE_NS / 1e6:g} ms; nearest stamps are {apart_ms:.3g} ms apart (median)"
-        )
+        message = f"only {len(left)} of {len(left_ns)} left and {len(right_ns)} right images have the same stamp within"
+        message += f" {_TOLERANCE_NS / 1e6:g} ms; nearest stamps are {apart_ms:.3g} ms apart (median)"
         raise LostDataError(message, source=source)
     alone = len(left_ns) + len(right_ns) - 2 * len(left)
     notes = [f"{alone} images without a partner are left out."] if alone else []
