@@ -96,11 +96,7 @@ def _make_folder(folder: Path) -> list[Path]:
 
 @contextmanager
 def alone(path: str | Path) -> Iterator[None]:
-    """Lock the folder of a path, so that callers change files in it one after the other.
-
-    Raises:
-        WriteError: There is no such folder.
-    """
+    """Lock the folder of a path, so that callers change files in it in turn; `WriteError` if there is none."""
     parent = _target(path).parent
     if fcntl is None and parent.is_dir():
         yield

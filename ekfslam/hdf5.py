@@ -45,10 +45,7 @@ NONE: Coordinates = MappingProxyType({})
 
 
 def image(format: str, version: int, fill: Callable[[h5py.File], None]) -> bytes:
-    """Return the bytes of a new file of a format and version, for `ekfslam.files.write`; ``fill`` writes the rest.
-
-    The file is made in memory, since libhdf5 crashes the interpreter if a disk is full.
-    """
+    """Return the bytes of a new file that ``fill`` writes, in memory: libhdf5 crashes on a full disk."""
     content = io.BytesIO()
     # HDF5's own image of an open file will not do: until 2.0 the checksum of its first block is wrong.
     with h5py.File(content, "w", libver="v110") as h5file:

@@ -1,7 +1,4 @@
-"""Limits on the size of files, checked before any content is allocated, decompressed or read.
-
-A file of some kilobytes can claim gigabytes. Readers take the sizes that its headers claim from a `Budget`.
-"""
+"""Limits on the sizes that headers of files claim, checked before any content is allocated, decompressed or read."""
 
 from __future__ import annotations
 

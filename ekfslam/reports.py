@@ -289,7 +289,6 @@ class ConsistencyReport(Shown):
     paths: list[Path]  # files written
 
     def card(self) -> Card:
-        """Return the card that ``repr`` and a notebook show."""
         facts = {"written": ", ".join(path.name for path in self.paths)}
         return Card(self.archive.card().title, facts, ("print(report.table)", "report.archive"))
 

@@ -19,10 +19,7 @@ def modes_of(text: str) -> list[str]:
 
 
 def joined_modes(arguments: Iterable[str]) -> list[str]:
-    """Return arguments in which modes after ``--mode`` or ``--modes`` are one word, separated by commas.
-
-    So a recording may follow them.
-    """
+    """Return arguments with modes after ``--mode`` or ``--modes`` as one word, so that a recording may follow."""
     found: list[str] = []
     is_open = False
     for argument in arguments:

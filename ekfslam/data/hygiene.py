@@ -126,10 +126,7 @@ class _Cleaning:
 
 
 def clean_tracks(sequence: Sequence, noise: Noise, config: HygieneConfig) -> tuple[Observations, HygieneReport]:
-    """Return the tracks that the rules of ``config`` leave, and the report; limits are multiples of the noise.
-
-    Tracks of one camera have no disparities: of the rules only repeated frames, jumps and lengths apply to them.
-    """
+    """Return the tracks that the rules of ``config`` leave, and the report; one camera has no disparities."""
     if sequence.camera.is_monocular:
         config = replace(config, reused_id_sigma=0.0, min_disparity_sigma=0.0, max_row_mismatch_sigma=0.0)
         config = replace(config, max_depth_error=0.0, disparity_jump_sigma=0.0, moving=False)

@@ -147,10 +147,7 @@ def _at_rest(values: Array, step_s: float) -> float:
 
 
 def _turned_by_gravity(samples: InertialSamples) -> float:
-    """Return the rate at which the specific force turns over that which the gyroscope says; NaN if it hardly turns.
-
-    Over means of half a second, ``df/dt = -w x f`` plus the change of acceleration, which averages out.
-    """
+    """Return the turn rate of the specific force over the gyroscope's, by ``df/dt = -w x f``; NaN at rest."""
     n = max(1, round(0.5 / samples.step_s))
     count = len(samples.time_s) // n
     w, f = (x[: n * count].reshape(count, n, 3).mean(axis=1) for x in (samples.gyro_rad_s, samples.accel_m_s2))

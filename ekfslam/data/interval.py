@@ -11,10 +11,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 
 @dataclass(frozen=True)
 class Interval:
-    """The inputs that lead from one frame to the next, in pieces with one row of inputs each.
-
-    A row is a velocity ``[v; w]``, constant during the piece, or the mean inertial sample ``[w; f]`` of the piece.
-    """
+    """Inputs from one frame to the next, in pieces: velocities ``[v; w]`` or mean inertial samples ``[w; f]``."""
 
     tau_s: float
     dt_s: Array  # (n,) durations of the pieces, in order of time; their sum is tau_s to rounding

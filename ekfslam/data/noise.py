@@ -67,10 +67,7 @@ class TrackError:
         return self.walk_std**2 * (1.0 + flow / self.flow_px**2 + (parallax[:, None] / self.parallax) ** 2)
 
     def absolute_variance(self, age: IntArray) -> Array:
-        """Return the variances (n, 3) of observations without a predecessor in the frame before, by age (n,) in frames.
-
-        A track that missed a frame is matched again: its error is drawn from the spread of tracks of that age.
-        """
+        """Return variances (n, 3) of observations that follow none: the spread of tracks of this age (n,)."""
         return self.first_std**2 + age[:, None] * self.walk_std**2
 
 

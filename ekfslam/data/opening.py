@@ -55,12 +55,7 @@ def open_images(
     topics: Iterable[str] = (),
     calibration: str | Path | None = None,
 ) -> ImageRecording | None:
-    """Open a recording of stereo images; None: no reader finds images there. For arguments see `ekfslam.open_sequence`.
-
-    Raises:
-        UnknownFormatError: A file of the recording is missing or damaged.
-        DataError: A field is missing or malformed.
-    """
+    """Open a recording of stereo images; None: no reader finds images there. See `ekfslam.open_sequence`."""
     return _images(_placed(Source.at(source, lateral=lateral), topics, calibration))
 
 

@@ -1,7 +1,4 @@
-"""The validated recording that every reader returns and every filter takes.
-
-The constructor of `Sequence` checks every field and raises a `DataError` that names source, field and index.
-"""
+"""The validated recording that readers return and filters take: `Sequence` checks all its fields."""
 
 from __future__ import annotations
 
@@ -128,7 +125,6 @@ class Sequence(Once, Shown):
         return len(self.time_s)
 
     def card(self) -> Card:
-        """Return the content of ``repr`` and of the table in a notebook."""
         seconds, seen = float(self.time_s[-1] - self.time_s[0]), self.observations
         per_frame = figure(len(seen) / len(self))
         facts = {

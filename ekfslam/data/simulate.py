@@ -59,10 +59,7 @@ class Drive(Recording):
 
 @dataclass(frozen=True)
 class City(Drive):
-    """Streets between crossings, left, left, right, right and so on, with a stop in every third.
-
-    No landmark id ever comes back: each unbroken run of observations of a physical point is a track with its own id.
-    """
+    """Streets between crossings with a stop in every third; each unbroken track has its own id."""
 
     name: str = "city"
     sigma_px: float = 0.7
@@ -222,10 +219,7 @@ def _drive_streets(time_s: Array, rng: np.random.Generator) -> tuple[Array, Arra
 
 
 def _twists(time_s: Array, distance_m: Array, yaw_rad: Array, wavelength_m: float, rng: np.random.Generator) -> Array:
-    """Return true velocities (T, 6) of the drive on an uneven road, whose waves repeat every ``wavelength_m``.
-
-    Unevenness depends on the place, not on the time, so that a vehicle that stands stands still.
-    """
+    """Return true velocities (T, 6) of the drive on an uneven road, whose waves depend on the place alone."""
     harmonics = np.arange(1, 4)
     amplitude = _UNEVENNESS * rng.standard_normal((len(harmonics), 4)) / np.sqrt(len(harmonics))
     waves = np.sin(2 * np.pi / wavelength_m * distance_m[:, None] * harmonics) @ amplitude

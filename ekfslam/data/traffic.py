@@ -118,11 +118,7 @@ def _disparity_rows(rows: Array) -> Array:
 
 
 def velocity_prior(sequence: Sequence, frames: IntArray, noise: Noise) -> Prior:
-    """Return the prior of x over the intervals that lead to successive frames (m,).
-
-    Velocities have white noise and walk. All intervals share the drift of vision and, if velocities are level, the
-    unknown pitch, which turns forward into upward.
-    """
+    """Return the prior of x over the intervals that lead to frames (m,): white noise, walk, shared drift and pitch."""
     assert noise.twist_walk_std is not None and noise.track_error is not None
     twist = sequence.twist[frames]
     std = np.hypot(noise.velocity_std, np.where(sequence.interpolated[frames, None], noise.gap_std, 0.0))

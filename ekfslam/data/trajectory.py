@@ -52,10 +52,7 @@ class Trajectory:
 
 
 def from_left_error(time_s: Array, T_world_imu: Array, covariance: Array) -> Trajectory:
-    """Return a trajectory with covariances (F, 6, 6) of ``xi`` in ``T_imu_world = exp(xi^) T_hat``.
-
-    To first order ``[d; w] = -diag(R, R) xi`` with the rotation R of ``T_world_imu``.
-    """
+    """Return a trajectory with covariances (F, 6, 6) of ``xi``: to first order ``[d; w] = -diag(R, R) xi``."""
     R = np.zeros_like(covariance)
     R[:, :3, :3] = R[:, 3:, 3:] = T_world_imu[:, :3, :3]
     return Trajectory(time_s, T_world_imu, R @ covariance @ np.swapaxes(R, 1, 2))

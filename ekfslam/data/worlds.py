@@ -134,10 +134,7 @@ def _inside(view: View, pixels: Array) -> BoolArray:
 
 
 def outlier_shifts(world: Recording, view: View, pixels: Array, rng: np.random.Generator) -> Array:
-    """Return displacements of pixels (K, 4): 0, or for an outlier a jump in both images and a wrong disparity.
-
-    Rows stay matched and disparities positive, as after a stereo matcher.
-    """
+    """Return displacements of pixels (K, 4): 0, or of outliers, which keep rows and a positive disparity."""
     shifts = np.zeros_like(pixels)
     wrong = np.flatnonzero(rng.random(len(pixels)) < world.outlier_fraction)
     z = pixels[wrong]
@@ -171,10 +168,7 @@ def track_ids(frame: IntArray, point: IntArray) -> IntArray:
 def observed(
     world: Recording, view: View, T_imu_world: Array, points_m: Array, rng: np.random.Generator, ids_last: bool
 ) -> tuple[Observations, IntArray, Array]:
-    """Return what the tracker sees of points (N, 3), ids (M,) of all landmarks seen, and their positions (M, 3).
-
-    Ids that do not last are those of unbroken tracks.
-    """
+    """Return what the tracker sees of points (N, 3), and ids (M,) and positions (M, 3) of what is seen."""
     frame, point, pixels = visible(world, view, T_imu_world, points_m)
     kept = tracked(world, frame, point, len(points_m), rng)
     frame, point, pixels = frame[kept], point[kept], pixels[kept]

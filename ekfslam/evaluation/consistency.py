@@ -26,11 +26,7 @@ from ekfslam.models.noise import GAP_STD
 
 
 def pose_error(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
-    """Return the pose error ``xi = log(T_imu_world_true T_imu_world_est^-1)`` (..., 6), m and rad.
-
-    It serves every variant: the right-invariant error of ``T_world_imu`` is ``-Ad(T_world_imu_est) xi``, and NEES is
-    the same in all linear coordinates.
-    """
+    """Return the pose error ``xi = log(T_imu_world_true T_imu_world_est^-1)`` (..., 6), m and rad, of every variant."""
     return se3.log(se3.inverse(T_world_imu_true) @ T_world_imu_est)
 
 
@@ -47,11 +43,7 @@ def world_axes_std(T_world_imu: Array, covariance: Array) -> Array:
 
 
 def nees(error: Array, covariance: Array) -> Array:
-    """Return the normalised estimation error squared ``e^T P^-1 e`` (...) of (..., n) and (..., n, n).
-
-    NaN if P is not positive definite to rounding, such as that of a known first pose. The correlation matrix decides,
-    so units do not matter.
-    """
+    """Return the NEES ``e^T P^-1 e`` (...) of (..., n) and (..., n, n); NaN if P is singular to rounding."""
     size = error.shape[-1]
     std = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     scale = np.where(std > 0, std, 1.0)
@@ -191,11 +183,7 @@ def pose_nees_apart(result: Result, truth: Truth) -> tuple[IntArray, Array] | No
 
 
 def pose_nees_by_axis(result: Result, truth: Truth) -> Array:
-    """Return squared errors divided by their variances (n, 6), truth noise included; 1 expected on each axis.
-
-    Axes are x, y, z of world for the position, those of the IMU for the rotation. NaN if the estimate's own variance
-    is 0.
-    """
+    """Return squared errors over variances (n, 6): position along axes of world, rotation along the IMU's."""
     error, covariance = pose_errors(result, truth, with_truth_noise=True)
     R = np.tile(np.eye(6), (len(error), 1, 1))
     R[:, :3, :3] = truth.T_world_imu[:, :3, :3]

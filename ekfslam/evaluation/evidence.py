@@ -194,10 +194,7 @@ def measures_velocities(result: Result) -> bool:
 
 
 def vision_share(result: Result) -> Array | None:
-    """Return the share (6,) of the pose's variance by velocities alone that vision removes; None if it is unknown.
-
-    It is 1 without velocities. With blocks for errors that all tracks share, the errors of single ones decide little.
-    """
+    """Return the share (6,) of the pose's variance by velocities that vision removes; None: unknown."""
     log = result.log
     seen = (
         name for name, block in OPTIONAL_BLOCKS.items() if block.is_seen and name in result.config.get("blocks", {})

@@ -179,10 +179,7 @@ def judge(
     truth: Truth | None = None,
     interpolated: BoolArray | None = None,
 ) -> Honesty:
-    """Judge the covariance of a run by its innovations, and by its posterior and its truth if they are given.
-
-    ``skipped`` is the reason for a missing posterior. Frames after ``interpolated`` (T,) intervals are not compared.
-    """
+    """Judge the covariance of a run by its innovations, and by its posterior and its truth if they are given."""
     rejected = evidence.rejected_shares(result)
     smoother = None if smoothed is None else evidence.smoother_agreement(result, smoothed)
     missing, innovation = _missing_innovations(result), result.innovation

@@ -63,10 +63,7 @@ def free_pose_errors(result: Result, truth: Truth) -> tuple[Array, Array]:
 
 
 def inertial_errors(result: Result, truth: Truth) -> tuple[Array, Array] | None:
-    """Return the errors (n, 15) of pose, velocity and biases, and their covariance; None without true motion.
-
-    Poses are those of `free_pose_errors`; velocities are along the axes of the IMU, so no alignment changes them.
-    """
+    """Return errors (n, 15) of pose, velocity (IMU axes) and biases, and their covariance, if truth has them."""
     states, motion, frame = result.inertial, truth.motion, truth.frame
     if states is None or motion is None or not len(frame):
         return None

@@ -177,10 +177,7 @@ def _unfilled(sequence: Sequence) -> list[str]:
 
 
 def _inspect_flow(sequence: Sequence, tau: Array) -> tuple[list[str], list[str], bool]:
-    """Return how well velocities predict the flow of tracks, the likely mistake, and whether they explain the flow.
-
-    Velocities, or their running means, explain the flow if they predict it better than standing still does.
-    """
+    """Return how well velocities predict the flow, the likely mistake, and whether they beat standing still."""
     earlier, later = _pairs(sequence)
     if len(earlier) < _LEAST_PAIRS or sequence.camera.is_monocular:  # a flow needs depths
         return [], [], True

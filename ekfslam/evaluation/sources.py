@@ -64,10 +64,7 @@ class Comparison(NamedTuple):
 
 
 def visual_motion(sequence: Sequence) -> tuple[Array, BoolArray]:
-    """Return velocities (T, 6) by the tracks alone, and whether each has enough points that agree (T,).
-
-    The others are the measured ones. Robust Gauss-Newton starts at the measured velocities, for all frames at once.
-    """
+    """Return velocities (T, 6) by robust Gauss-Newton on tracks, and whether each has enough points that agree (T,)."""
     o, C, frames = sequence.observations, sequence.T_cam_imu, len(sequence)
     earlier, later = adjacent(o)
     rows = rectified_rows(o.pixels_px, np.ones(4))[0]

@@ -94,10 +94,7 @@ def _fitted(c: Array, C: Array, x: Array) -> tuple[float, float, float]:
 
 
 def grown_by(result: Result, found: tuple[Systematic, ...], vision: Array) -> tuple[Array, Array]:
-    """Return the factors (6,) of standard deviations that errors of the velocities would need, and of the camera.
-
-    The pose follows the camera by the share ``vision`` (6,), see `ekfslam.evaluation.evidence.vision_share`.
-    """
+    """Return factors (6,) of deviations that velocities would need, and the camera, whose share is ``vision``."""
     assert result.log is not None
     if not found:
         return np.ones(6), np.ones(6)

@@ -36,10 +36,7 @@ def align_se3(points: Array, reference: Array) -> Array:
 
 
 def align_yaw(points: Array, reference: Array) -> Array:
-    """Return the transform (4, 4) of least squared distances that turns about z alone: the vertical is known.
-
-    Four degrees of freedom, as an inertial unit leaves them; points are (n, 3). Points on one vertical are not turned.
-    """
+    """Return the transform (4, 4) of points (n, 3) with least squared distances that turns about z alone."""
     centre, reference_centre = points.mean(axis=0), reference.mean(axis=0)
     p, q = (points - centre)[:, :2], (reference - reference_centre)[:, :2]
     yaw = np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum())

@@ -22,10 +22,7 @@ _BINS = 60  # of the time axis, in which rejections are counted
 
 @styled
 def plot_check(result: Result, found: Honesty) -> Figure:
-    """Draw six panels: NIS, rejections, autocorrelation along tracks and of shared innovations, and these over time.
-
-    The result needs whitened innovations, and the judgement of `ekfslam.evaluation.honesty.judge`.
-    """
+    """Draw six panels: NIS, rejections, autocorrelation along tracks and of shared innovations, and these over time."""
     assert found.shared is not None and found.tracks is not None
     figure = Figure(figsize=(11.0, 9.6))
     panels = figure.subplots(3, 2)

@@ -65,10 +65,7 @@ def plot_map(results: Mapping[str, Result], truth: Truth | None = None) -> Figur
 
 @registry.figure("landmarks_{mode}", needs={"landmarks"})
 def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
-    """Draw landmarks from above (x, y of world, metres): from initialisation to final estimate, over the trajectory.
-
-    The view holds the trajectory and the bulk of the final landmarks; the legend counts landmarks outside it.
-    """
+    """Draw landmarks from above (x, y of world, metres): from initialisation to final estimate, over the trajectory."""
     landmarks = result.landmarks
     start, end = landmarks.initial_position_m[:, :2], landmarks.position_m[:, :2]
     figure, ax, outside = map_axes({result.mode: result}, None, end)
@@ -175,10 +172,7 @@ def draw_dots(ax: Axes, xy: Array, label: str, color: str = LANDMARK_COLOR, **st
 
 
 def ellipse_axes(covariance: Array, sigmas: float = SIGMAS) -> tuple[Array, Array, Array]:
-    """Return both axes and the direction of the ellipses ``e^T P^-1 e = sigmas^2`` of covariances (..., 2, 2).
-
-    The longer axis (...), the shorter one (...), and the angle of the longer one from x in degrees (...).
-    """
+    """Return axes (longer first) and direction (degrees) of ellipses ``e^T P^-1 e = sigmas^2`` of P (..., 2, 2)."""
     values, vectors = np.linalg.eigh(covariance)
     lengths = 2.0 * sigmas * np.sqrt(np.maximum(values, 0.0))
     angle = np.degrees(np.arctan2(vectors[..., 1, 1], vectors[..., 0, 1]))
@@ -223,10 +217,7 @@ def _outside_text(outside: BoolArray) -> str:
 
 
 def legend_below(figure: Figure, ax: Axes, keep_size: bool = False) -> None:
-    """Add a legend below a map, with marks of start and end if they are drawn, and fit the figure around both.
-
-    With ``keep_size`` the axes become lower instead.
-    """
+    """Add a legend below a map and fit the figure around both; ``keep_size`` lowers the axes instead."""
     marks = []
     if any(line.get_marker() == "X" for line in ax.lines):
         look: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": ""}

@@ -85,11 +85,7 @@ def draw_posterior_figures(
 
 
 def block_patterns(information: JointInformation) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray], int]:
-    """Return rows and columns of the blocks of the information matrix, of its Cholesky factor, and their number.
-
-    Of the information matrix those in the lower triangle: frames (seen, then hidden), drive, landmarks. Those of the
-    factor in the order of elimination.
-    """
+    """Return rows and columns of the blocks of the information matrix and of its Cholesky factor, and counts."""
     s, factor = information.structure, information.factor
     before, eliminated = s.first["landmarks"], np.flatnonzero(~s.is_kept)
     count = before + len(s.ids)

@@ -86,10 +86,7 @@ def plot_nis(results: Mapping[str, Result]) -> Figure:
 
 @registry.figure("parameters", needs={"parameters"})
 def plot_parameters(full: Result) -> Figure:
-    """Draw the estimated parameters (calibration, roll and pitch) over time with 3-sigma bands.
-
-    Dashed lines are the 3-sigma bounds of the prior. A parameter whose band still fills them was not observed.
-    """
+    """Draw the estimated parameters over time with 3-sigma bands; dashed lines are the 3-sigma bounds of the prior."""
     drawn, color = series.parameters(full), style_of(full.mode)["color"]
     if full.parameters is None or not drawn:
         raise ValueError("there are no parameters to show")

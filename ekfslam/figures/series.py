@@ -71,11 +71,7 @@ class Series:
 
 
 def draw_series(ax: Axes, series: Series, band: str, line: Style, levels: Style = EXPECTED, label: str = "_") -> None:
-    """Draw a curve, its bounds and levels with labelled axes.
-
-    ``band`` colours the bounds of an estimate; those of expected values are grey. Legends leave out a ``label`` that
-    begins with ``_``.
-    """
+    """Draw a curve, its bounds (``band`` colours those of an estimate) and levels with labelled axes."""
     if series.low is not None and series.high is not None:
         if series.bounds_expectation:
             words = f"{100 * PROBABILITY:g} % chi-square bounds"

@@ -185,10 +185,7 @@ def arrange(
     top: float = 0.3,
     gaps: tuple[float, float] = (0.7, 0.3),
 ) -> None:
-    """Place a grid of axes at fixed margins and gaps (between columns, between rows), and their labels; inches.
-
-    A layout that measures every text (Matplotlib's constrained one) takes as long as drawing does.
-    """
+    """Place a grid of axes at fixed margins and gaps (inches), and their labels: constrained layout is slow."""
     figure.set_layout_engine("none")
     size = figure.get_size_inches()
     for ax in figure.axes:
@@ -211,10 +208,7 @@ def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
 
 
 def png(figure: Figure, packed: bool = False) -> bytes:
-    """Return a figure as a PNG file at `DPI`.
-
-    ``packed`` takes a palette of 256 colours: a third of the size without a visible difference, but twice the time.
-    """
+    """Return a figure as a PNG at `DPI`; ``packed`` (256 colours): a third of the size, twice the time."""
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()

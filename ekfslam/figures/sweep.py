@@ -21,11 +21,7 @@ _PANELS_A_ROW = 3
 
 @styled
 def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
-    """Draw a column of figures of merit against a setting: one line for each choice of the others, means over seeds.
-
-    Every recording has a panel, at most 24 of 24 lines. Bands are the range over seeds. The title counts runs without
-    it.
-    """
+    """Draw figures of merit against a setting: a line (mean over seeds, with range) for each choice of the others."""
     y, x = table.column(figure), table.column(setting)
     if y.dtype.kind != "f":
         raise ValueError(f"{figure} is no number")

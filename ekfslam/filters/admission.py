@@ -74,10 +74,7 @@ class Admission:
         return max(self.newest.values())
 
     def has_jumped(self, kind: Kind, t: float, time_s: float | None) -> bool:
-        """Return whether a message stamped t is one of many in a row whose stamps agree, far from all others.
-
-        ``time_s`` is the stamp of the last processed image; None before the first.
-        """
+        """Return whether a message stamped t is one of many in a row whose stamps agree, far from all others."""
         newest = self.newest_s
         # An older stamp is just out of order unless the filter is past it, or has not begun.
         is_behind = t < newest - self.jump_s and (time_s is None or t <= time_s)

@@ -117,10 +117,7 @@ def doubted(e: Estimate, doubt: float) -> Gaussian:
 
 
 def _jump(e: Estimate) -> Array:
-    """Return the motion (6,) from the predicted pose to that of a rig that moves as in the interval before.
-
-    It is in units of the noise of the inputs, ``Q^-1/2``; NaN if there was no interval before.
-    """
+    """Return the motion (6,) to the pose of a rig that moves as before, in deviations of the inputs; NaN at first."""
     if e.motion.last is None:
         return np.full(6, np.nan)
     moved, tau_s = e.motion.last

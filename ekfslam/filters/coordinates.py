@@ -85,10 +85,7 @@ def points_in(T_cam_world: Array, positions_m: Array, T_linear: Array, linear_po
 def change_in_view(
     slot: IntArray, columns: IntArray, before: CameraPoints, after: CameraPoints, in_image: BoolArray, turned: Array
 ) -> Change:
-    """Return ``M`` and ``B`` of eq. (7') for landmarks before and after a correction, and the view's body columns.
-
-    ``turned`` (6, 6) is D of eq. (7'); ``in_image`` (n,) says which landmarks count by their images.
-    """
+    """Return ``M`` and ``B`` of eq. (7') and the view's body columns; ``turned`` (6, 6) is D there."""
     # The image is its own inverse: its derivative at an image is the inverse of that at the point.
     J = image_jacobian(np.where(in_image[:, None], before.q, _AHEAD))
     J_inverse_after = image_jacobian(image(np.where(in_image[:, None], after.q, _AHEAD)))

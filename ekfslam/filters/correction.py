@@ -191,10 +191,7 @@ def _motion(e: Estimate, seen: Projected, some: IntArray) -> Array:
 
 
 def _corrected_twist(e: Estimate, frame: int, tried: Projection) -> Array:
-    """Return the velocity (6,) at this frame as corrected by its observations, for eq. (9).
-
-    With the measured velocity a time offset would be estimated far too small: its noise is in the innovations, too.
-    """
+    """Return the velocity (6,) as corrected, eq. (9): the noise of the measured one is in the innovations."""
     correction = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot]).done.correction
     after = e.model.retract(e.values, correction)
     return e.model.process.imu_twist({"pose": e.motion.T_departed}, after, e.motion.interval)

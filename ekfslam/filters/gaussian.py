@@ -102,10 +102,7 @@ class Solution:
         return Conditioned(correction, float(self.white @ self.white), self.log_det)
 
     def given_others(self, which: IntArray) -> Array:
-        """Return ``V^1/2 (S^-1)_ii V^1/2`` (j, d, d) for some landmarks (j,).
-
-        The innovation of landmark i given those of all *others* has covariance ``((S^-1)_ii)^-1``.
-        """
+        """Return ``V^1/2 (S^-1)_ii V^1/2`` (j, d, d): ``((S^-1)_ii)^-1`` is the covariance given *others*."""
         k, d = self.shape
         columns = self._whitened(which).T.reshape(len(which), d, k * d)
         std = np.sqrt(self.variance.reshape(k, d)[which])

@@ -74,10 +74,7 @@ def in_words(values: Array, std: Array, unit: str) -> str:
 
 
 def velocity_world(T_world_imu: Array, states: InertialStates) -> tuple[Array, Array]:
-    """Return velocities ``v = R u`` (T, 3) along the axes of world, m/s, and their covariance (T, 3, 3).
-
-    To first order their error is ``R (u^ theta + du)``, with the rotation error ``theta`` of the pose.
-    """
+    """Return ``v = R u`` (T, 3) along world axes, m/s, and the covariance of its error ``R (u^ theta + du)``."""
     R, u = T_world_imu[:, :3, :3], states.velocity_m_s
     J = np.concatenate([se3.skew(u), np.broadcast_to(np.eye(3), R.shape)], axis=2)
     P = states.covariance[:, 3:9, 3:9]

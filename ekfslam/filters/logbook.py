@@ -136,10 +136,7 @@ class LogBook:
         )
 
     def started(self, ids: IntArray, positions_m: Array, *views: tuple[int, Array, Array]) -> IntArray:
-        """Add landmarks (n,) and the views that initialised them, and return their rows in the log.
-
-        Each view is a frame, rows (n, d) and variances (n, d).
-        """
+        """Add landmarks (n,) with views (frame, rows, variances) that initialised them; return rows of the log."""
         at = self.entered(ids, positions_m)
         for step, rows, variance in views:
             self.observed(step, Accepted(at, np.full(len(ids), -1), np.hstack([rows, variance, positions_m])))

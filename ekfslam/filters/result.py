@@ -209,10 +209,7 @@ class PosePairs:
 
 
 class View:
-    """A method of `Result` that a higher module provides, ``module:name`` of a function of the result.
-
-    It is found at its first use, like an entry point, so that results import neither figures nor files.
-    """
+    """A method of `Result` in a higher module, ``module:name``, found at first use: results import no figures."""
 
     def __init__(self, function: str) -> None:
         self.function = function
@@ -289,7 +286,6 @@ class Result(Shown):
                 raise NonFiniteResultError(self.mode, name, int(np.argwhere(is_wrong)[0][0]))
 
     def card(self) -> Card:
-        """Return the card that ``repr`` and a notebook show."""
         last = zip("xyz", self.T_world_imu[-1, :3, 3], self.position_std_world_m[-1], strict=True)
         innovation, dof = self.innovation, int(self.innovation.dof.sum())
         facts = self.brief
@@ -324,10 +320,7 @@ class Result(Shown):
 
     @property
     def brief(self) -> dict[str, str]:
-        """Size, last standard deviations, share of the observations used, and time, in words by heading.
-
-        The standard deviation of the position is the root of the sum over its axes; the heading turns about z of world.
-        """
+        """Size, last standard deviations (position: root of the sum), share of observations, and time."""
         way_m = float(np.linalg.norm(np.diff(self.T_world_imu[:, :3, 3], axis=0), axis=1).sum())
         seconds, total_s = float(self.time_s[-1] - self.time_s[0]), float(self.ms_per_frame.sum()) / 1e3
         position_m = np.sqrt(max(float(np.trace(self.position_covariance_world[-1])), 0.0))

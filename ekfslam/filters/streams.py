@@ -121,10 +121,7 @@ class Velocities:
 
 
 class Samples(Velocities):
-    """Inertial samples ``[w; f]`` (6,), linear between stamps.
-
-    An interval is a gap if steps are longer than ``gap_s`` or than three times the median of the last steps.
-    """
+    """Inertial samples ``[w; f]`` (6,), linear between stamps; gaps exceed ``gap_s``, or three median steps."""
 
     def __init__(self, gap_s: float) -> None:
         super().__init__(gap_s)

@@ -51,10 +51,7 @@ class Standard:
         return np.asarray(se3.left_jacobian(se3.log(after @ se3.inverse(before))), dtype=float)
 
     def change(self, T_cam_world: Array, by: Array, slot: IntArray, moved_m: Array) -> Change:
-        """Return the change of landmark errors in xyz by a correction that moved them by ``moved_m`` (n, 3): none.
-
-        The camera (4, 4) before the correction has an error with the derivative ``by`` (6, seen).
-        """
+        """Return the change of landmark errors in xyz by ``moved_m`` (n, 3), ``by`` (6, seen) of the camera: none."""
         return Change(slot, np.empty(0, dtype=np.int64), np.empty((len(moved_m), 3, 0)))
 
     def transport(

@@ -14,10 +14,7 @@ _BUCKETS = 12, 4  # columns and rows of the grid over which new features are spr
 
 
 def corners(image: Image, free: BoolArray, spacing: int) -> Array:
-    """Return corners (n, 2), strongest first, ``spacing`` px apart at pixels that are ``free`` (height, width).
-
-    Their strength is the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994).
-    """
+    """Return corners (n, 2), strongest (Shi and Tomasi, CVPR 1994) first, ``spacing`` px apart at ``free`` pixels."""
     cv2 = opencv()
     response = cv2.cornerMinEigenVal(image, _BLOCK)
     largest = cv2.dilate(response, np.ones((spacing + 1, spacing + 1), np.uint8))

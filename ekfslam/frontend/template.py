@@ -83,10 +83,7 @@ class Templates(Rows):
         return Templates(T, solver.astype(np.float32))
 
     def align(self, image: Float32Array, pixels: Array, scale: Array) -> tuple[Array, Array]:
-        """Align features from predicted pixels (n, 2) to their patches, scaled (n,) relative to first sight.
-
-        Return their pixels (n, 2), and the weighted correlation (n,) with the patch there; -1 if alignment fails.
-        """
+        """Align features from pixels (n, 2) to patches scaled (n,); return pixels and correlations, or -1."""
         pixels, active = pixels.copy(), np.arange(len(pixels))
         fails = np.zeros(len(pixels), dtype=bool)
         for _ in range(_ITERATIONS):

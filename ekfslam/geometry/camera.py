@@ -25,10 +25,7 @@ DEPTH_FROM_PX, MOTION_FROM_PX, FLOW_FROM_PX = 0.5, 1.0, 2.0
 
 @dataclass(frozen=True)
 class StereoCamera:
-    """Intrinsics of a rectified stereo pair: focal lengths and principal point in pixels, baseline in metres.
-
-    One camera alone has a baseline of 0.
-    """
+    """Intrinsics of a rectified stereo pair: focal lengths and principal point, px; baseline, m, 0 for one camera."""
 
     fu_px: float
     fv_px: float
@@ -54,10 +51,7 @@ class StereoCamera:
 
 
 def project(camera: StereoCamera, q: Array) -> Array:
-    """Return ``z = M pi(q)`` with ``pi(q) = q / q_z``, eq. (3): (..., 3) m to (..., 4) px.
-
-    The caller masks points with ``q_z <= 0``, which are behind the camera.
-    """
+    """Return ``z = M pi(q)``, ``pi(q) = q / q_z``, eq. (3), (..., 3) m to (..., 4) px; callers mask ``q_z <= 0``."""
     q_homogeneous = np.concatenate([q, np.ones((*q.shape[:-1], 1))], axis=-1)
     return (q_homogeneous / q[..., 2:3]) @ camera.matrix.T
 
@@ -88,10 +82,7 @@ def rectified_jacobian(camera: StereoCamera, q: Array) -> Array:
 
 
 def triangulate(camera: StereoCamera, rows_px: Array) -> Array:
-    """Point (..., 3) m that projects onto rectified rows (..., 3) px exactly: the report's ``z = fu b / (uL - uR)``.
-
-    The disparity ``uL - uR`` must be positive; the caller masks what is not.
-    """
+    """Return the point (..., 3) m of rectified rows (..., 3) px with positive disparity: ``z = fu b / (uL - uR)``."""
     z = camera.fu_px * camera.baseline_m / (rows_px[..., 0] - rows_px[..., 2])
     x = (rows_px[..., 0] - camera.cu_px) / camera.fu_px * z
     y = (rows_px[..., 1] - camera.cv_px) / camera.fv_px * z

@@ -40,10 +40,7 @@ def twist_jacobian(twist: Array, tau_s: Array | float) -> Array:
 
 
 def process_noise(twist: Array, tau_s: Array | float, twist_std: Array) -> Array:
-    """Return ``Q = G W G^T`` with G of `twist_jacobian`, eq. (2): (..., 6) to (..., 6, 6).
-
-    ``W`` is the diagonal of the squares of ``twist_std`` (..., 6), m/s and rad/s per sample.
-    """
+    """Return ``Q = G W G^T`` (..., 6, 6), eq. (2), with W of ``twist_std`` (..., 6), m/s and rad/s per sample."""
     return process_noise_by(twist_jacobian(np.asarray(twist, dtype=float), tau_s), twist_std)
 
 
@@ -93,11 +90,7 @@ def turned_by(twist: Array) -> Array:
 
 
 def world_axes_covariance(T_world_imu: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return covariances (T, 3, 3) of position (m^2) and rotation error (rad^2) along world axes, from that of ``xi``.
-
-    As ``T_world_imu = T_hat exp(-xi)``, an error ``xi = [rho; theta]`` moves the IMU by ``-R rho`` and turns it by
-    ``-R theta`` in world, to first order.
-    """
+    """Return covariances (T, 3, 3) of ``-R rho`` (m^2) and ``-R theta`` (rad^2), the errors along world axes."""
     R = T_world_imu[:, :3, :3]
     R_transposed = np.swapaxes(R, 1, 2)
     return R @ covariance[:, :3, :3] @ R_transposed, R @ covariance[:, 3:, 3:] @ R_transposed

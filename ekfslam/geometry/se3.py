@@ -105,10 +105,7 @@ def so3_left_jacobian_inverse(theta: Array) -> Array:
 
 
 def so3_log(R: Array) -> Array:
-    """Return the rotation vector (rad, angle in [0, pi]) of a rotation matrix: (..., 3, 3) to (..., 3).
-
-    It goes through the unit quaternion built on its largest component, which stays accurate for every angle.
-    """
+    """Return the rotation vector (rad, angle in [0, pi]) of (..., 3, 3), accurate for every angle."""
     R = np.asarray(R, dtype=float)
     # Row c of `candidates` is 4 q_c q (components w, x, y, z); the row of the largest |q_c| is well conditioned.
     d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]

@@ -152,10 +152,7 @@ def align_in_numpy(
 def sampled_motion(
     camera: StereoCamera, before_px: Array, now_px: Array, generator: np.random.Generator, samples: int, limit_px: float
 ) -> Array:
-    """Return the motion (4, 4) of three random points with which most points agree, up to ``limit_px`` (RANSAC).
-
-    Fewer than three points give the identity. Source: Fischler and Bolles, CACM 1981; Umeyama, PAMI 1991.
-    """
+    """Return the motion (4, 4) of three random points with which most agree (Fischler, Bolles, CACM 1981)."""
     count = len(before_px)
     if count < 3:
         return np.eye(4)

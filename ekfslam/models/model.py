@@ -146,10 +146,7 @@ class Model:
         return self.widened(values, self.process.step(values, interval, T_linear, first_estimates))
 
     def coordinates_after(self, step: Transition, departed: Array) -> Array:
-        """Return the coordinates (body,) after a step, given those before it.
-
-        Those of the pose count from its prediction: they start at 0. Those of other moved blocks are their values.
-        """
+        """Return coordinates (body,) after a step: 0 for the pose, values for other moved blocks, else as before."""
         coordinates = departed.copy()
         for name in self.process.own:
             coordinates[self.layout[name]] = 0.0 if name == "pose" else step.values[name]

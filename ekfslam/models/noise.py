@@ -220,11 +220,7 @@ def automatic_noise(found: VelocityNoise, velocity_frame: VelocityFrame = "imu",
 
 
 def shared_errors(found: VelocityNoise | None, checked: bool = False) -> dict[str, dict[str, float]]:
-    """Return tables ``[blocks.<name>]`` of the errors that all samples or all tracks of a recording share.
-
-    They come from `StateBlock.automatic`, given the noise of measured velocities, or None, and whether tracks are
-    checked.
-    """
+    """Return tables ``[blocks.<name>]`` of errors that all samples or tracks share, by `StateBlock.automatic`."""
     white_std, is_clean = (None, False) if found is None else (found.sigma, found.carries_motion)
     tables = {name: block.automatic(white_std, is_clean, checked) for name, block in OPTIONAL_BLOCKS.items()}
     return {name: table for name, table in tables.items() if table is not None}

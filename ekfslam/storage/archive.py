@@ -70,7 +70,6 @@ class Archive(Shown):
     results: Mapping[str, Result]  # mode to result, in the order of writing
 
     def card(self) -> Card:
-        """Return the card that ``repr`` and a notebook show."""
         facts = {mode: count(len(result.landmarks), "landmark") for mode, result in self.results.items()}
         title = f"{self.name}, {count(len(self.time_s), 'frame')}, {count(len(facts), 'run')}"
         return Card(title, facts, tuple(f"archive.results[{mode!r}]" for mode in list(facts)[:1]))

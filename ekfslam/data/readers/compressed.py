@@ -26,10 +26,7 @@ _CHUNK = 6  # MCAP
 
 
 def require_room(path: Path) -> None:
-    """Raise an `UnknownFormatError` if a bag claims more memory or disk than may be read of a file.
-
-    Files that are compressed as a whole go to the temporary disk; chunks are in memory one at a time.
-    """
+    """Raise an `UnknownFormatError` if a bag claims more memory, or temporary disk, than may be read of a file."""
     lines = read_lines(path / "metadata.yaml", "") if (path / "metadata.yaml").is_file() else []
     by_message = any(re.fullmatch(r"\s*compression_mode:\s*[\"']?message[\"']?\s*", line, re.I) for line in lines)
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:

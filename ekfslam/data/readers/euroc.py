@@ -44,10 +44,7 @@ _PLACES = ("data.csv", *(f"{above}{folder}/data.csv" for above in ("", "mav0/") 
 
 
 def open_euroc(folder: Path, calibration: str | None = None) -> ImageRecording:
-    """Open images, calibration, inertial samples and truth of a recording, as far as there are any.
-
-    The body is the inertial unit. Frames that its samples do not cover are left out.
-    """
+    """Open images, calibration, samples and truth of a recording; frames without samples are left out."""
     mav = _mav(folder) or folder
     left, right = (_images(mav / name) for name in CAMERAS)
     # An image whose partner is known to be missing is no sign of another clock.
@@ -173,11 +170,7 @@ def find_euroc_truth(folder: Path) -> Path | None:
 
 
 def read_euroc(path: Path) -> Poses:
-    """Read the poses ``T_R_S`` of the body (the IMU) in the reference frame, from a csv or the csv of a folder.
-
-    The header must name eight columns, as EuRoC (stamps in ns, quaternions w first), OpenVINS or evo do. Velocities and
-    biases are read if it names them as EuRoC does.
-    """
+    """Read the poses ``T_R_S`` of the IMU in the reference frame, from a csv that names them, or that of a folder."""
     path = find_euroc_truth(path) or path
     lines = read_lines(path, f"expected {TRUTH.expected}")
     number, _ = next(iter(rows_of(lines, comment=None)), (1, ""))

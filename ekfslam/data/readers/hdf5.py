@@ -108,10 +108,7 @@ def read_sequence(path: str | Path) -> Sequence:
 
 
 def write_sequence_group(h5file: h5py.Group, sequence: Any, whole: bool = False) -> None:
-    """Write ``/sequence`` and ``/truth`` of a `Sequence`, or of a record with its fields, below an open file or group.
-
-    Observations and inputs are written only if ``whole``.
-    """
+    """Write ``/sequence`` and ``/truth`` of a record below a group; observations and inputs only if ``whole``."""
     has_twist = sequence.velocities is not None if isinstance(sequence, Sequence) else sequence.twist is not None
     hdf5.write_fields(h5file, _SEQUENCE if has_twist else _UNDRIVEN, sequence)
     hdf5.write_fields(h5file, _NOTES, {"notes": hdf5.fixed_texts(sequence.notes)})

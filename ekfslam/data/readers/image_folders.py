@@ -47,10 +47,7 @@ _BARE: dict[str, Any] = {"times": "times.txt"}  # of a folder without its own fi
 
 
 def open_folder(path: Path, calibration: str | None = None) -> ImageRecording:
-    """Open the images that a calibration describes, see this module. Without ``T_cam_imu`` the body is the left camera.
-
-    A ``calibration`` for `calibrations.read_pair` takes precedence; the folder may then lack its own.
-    """
+    """Open the images that ``calibration`` or the folder's own describes; the body may be the left camera."""
     file = _file_of(path)
     folder, values = file.parent, (_BARE if calibration and not file.is_file() else read_toml(file))
     if calibration is None and "calibration" in values:

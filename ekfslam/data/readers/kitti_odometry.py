@@ -28,11 +28,7 @@ _LABELS = ("P0", "P1")
 
 
 def open_kitti_odometry(folder: Path) -> ImageRecording:
-    """Open a sequence of the benchmark, or a run of its images: rectified pairs and stamps, without velocities.
-
-    Image n has line n of ``times.txt``, or the file begins at the first image, see `_first_line`. The body is the left
-    camera.
-    """
+    """Open a sequence of the benchmark, or a run of its images; the body is the left camera."""
     names = find_pair(folder)
     lacking = _lacking(folder, names)
     if lacking or names is None:
@@ -71,10 +67,7 @@ def open_kitti_odometry(folder: Path) -> ImageRecording:
 
 
 def _first_line(times_s: Array, first: int, frames: int) -> int:
-    """Return the line of the first image: its number, or 0 if the file was cut there, too.
-
-    It was if it has as many lines as there are images, or begins at their first stamp: whole files begin at 0 s.
-    """
+    """Return the line of the first image: its number, or 0 if the file was cut, too (whole ones begin at 0 s)."""
     if first and len(times_s) > 1:
         step_s = float(np.median(np.diff(times_s)))
         if step_s > 0 and times_s[0] > 0.5 * step_s and abs(times_s[0] / step_s - first) < 0.05 * first + 0.5:

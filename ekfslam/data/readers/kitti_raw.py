@@ -51,10 +51,7 @@ class KittiRaw:
     attributes: dict[str, str]
 
     def sequence(self, observations: Observations | None = None) -> Sequence:
-        """Return the drive as a `Sequence`, with tracks from elsewhere, or with none for dead reckoning.
-
-        Tracks are in the rectified images of the stereo pair; their frame is the number of the packet.
-        """
+        """Return the drive as a `Sequence`, with tracks in the rectified images from elsewhere, or with none."""
         none = Observations(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4)))
         sequence = Sequence(
             name=self.folder.resolve().name,

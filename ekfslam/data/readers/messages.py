@@ -44,10 +44,7 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 
 
 class Bag:
-    """An open bag: a file, or a folder with ``metadata.yaml``; raises `MissingPackageError` without rosbags.
-
-    Topics that are ``named`` take precedence over all others of their types, in this order.
-    """
+    """An open bag: a file, or a folder with ``metadata.yaml``; ``named`` topics are preferred, in this order."""
 
     def __init__(self, path: Path, named: tuple[str, ...] = ()) -> None:
         try:

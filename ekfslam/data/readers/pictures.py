@@ -54,10 +54,7 @@ def read_gray(path: Path, size: tuple[int, int] | None = None, bits: int = 16) -
 
 
 def decode_gray(content: bytes, source: str, size: tuple[int, int] | None = None, bits: int = 16) -> Image:
-    """Return the pixels (height, width) uint8 of the bytes of an image file; ``source`` names it in messages.
-
-    ``size`` is the required width and height. Of values of 16 bits, ``bits`` are used: the upper eight of these remain.
-    """
+    """Return the pixels (height, width) uint8 of an image file; of 16 bits, the upper eight of ``bits``."""
     with _opened(io.BytesIO(content), source) as image:
         width, height = image.size
         Budget(source).take(4 * width * height, "the image")
@@ -167,10 +164,7 @@ def _natural(name: str) -> tuple[Any, ...]:
 
 
 def find_pair(folder: Path) -> tuple[str, str] | None:
-    """Return the folders of left and right images in a folder, by their usual names; None if there are none.
-
-    Both are ``.`` if the images themselves are in the folder, with sides in their names: ``left_0001 right_0001``.
-    """
+    """Return the folders of left and right images in a folder, both ``.`` if it is the folder itself, or None."""
     for pair in PAIRS:
         if all((folder / name).is_dir() for name in pair):
             return pair
@@ -179,10 +173,7 @@ def find_pair(folder: Path) -> tuple[str, str] | None:
 
 
 def images_of_sides(left: Path, right: Path) -> tuple[dict[str, Path], dict[str, Path]]:
-    """Return the images of two folders, or of one, by the part of their names that both sides share.
-
-    ``left_0001`` and ``right_0001``, ``0001_l`` and ``0001_r`` are pairs, as are equal names in two folders.
-    """
+    """Return the images of two folders, or of one, by the part of their names that both sides share."""
     found = [images_in(folder) for folder in (left, right)]
     if left.resolve() == right.resolve():
         found = [tuple(p for p in images if side_of(p.stem) == side) for side, images in enumerate(found)]

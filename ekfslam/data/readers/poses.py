@@ -50,10 +50,7 @@ def stamped_poses(table: Table) -> Poses:
 
 
 def velocities_of(time_s: Array, T_world_body: Array) -> tuple[Array, Array, str]:
-    """Return stamps (N-1,) and velocities (N-1, 6) between successive poses, in the body, and a note.
-
-    The velocity of an interval is a constant twist, stamped at its middle.
-    """
+    """Return stamps (N-1,) amid intervals, and twists (N-1, 6) between successive poses, in the body, and a note."""
     step = np.diff(time_s)
     twist = se3.log(se3.inverse(T_world_body[:-1]) @ T_world_body[1:]) / step[:, None]
     note = (

@@ -48,10 +48,7 @@ def read_trajectory(path: str | Path, *, frame: Moving = "body") -> Trajectory:
 
 
 def covariances_beside(path: Path, time_s: Array) -> Array | None:
-    """Return the covariances (n, 6, 6) of poses from the file beside theirs, see `read_trajectory`; None without one.
-
-    ``mine.tum`` may have ``mine.cov.txt`` as well as ``mine.tum.cov.txt``.
-    """
+    """Return the covariances (n, 6, 6) of ``mine.cov.txt`` or ``mine.tum.cov.txt`` beside ``mine.tum``, if any."""
     places = (covariance_path(path), path.with_suffix(COVARIANCE_ENDING))
     beside = next((place for place in places if place.is_file() and place != path), None)
     if beside is None:

@@ -101,10 +101,7 @@ class Process(ABC):
 
     @abstractmethod
     def imu_twist(self, before: Values, after: Values, interval: Interval | Intervals) -> Array:
-        """Return ``[v; w]`` (..., 6) of the IMU at the frame after an interval, given corrected estimates.
-
-        A time offset of the images counts by it, eq. (9).
-        """
+        """Return ``[v; w]`` (..., 6) of the IMU at the frame after an interval, by corrected estimates, for eq. (9)."""
 
     @abstractmethod
     def way_m(self, values: Values, interval: Interval | Intervals) -> Array:
