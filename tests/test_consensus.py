@@ -13,6 +13,7 @@ from ekfslam.config import Config
 from ekfslam.data.inputs import InertialNoise
 from ekfslam.data.interval import Interval
 from ekfslam.data.simulate import builtin
+from ekfslam.engine import choice
 from ekfslam.evaluation.consistency import pose_nees
 from ekfslam.filters.consensus import DOUBT, agreeing, refined
 from ekfslam.filters.gates import threshold
@@ -85,7 +86,11 @@ def test_gross_landmarks_alone_do_not_open_a_frame(seed):
     assert all(report.doubt == 1.0 for report in reports)
 
 
-def test_traffic_that_most_landmarks_follow_does_not_reject_the_velocity():
+@pytest.mark.parametrize(
+    "engine",
+    ["reference", pytest.param("engine", marks=pytest.mark.skipif(bool(choice.MISSING), reason="not built"))],
+)
+def test_traffic_that_most_landmarks_follow_does_not_reject_the_velocity(engine):
     """All landmarks of a frame move along by the same distance, while the velocities go on as before."""
     world = builtin("city?frames=16&max_tracks=30&sigma_v_m_s=0.05&sigma_w_rad_s=0.005")
     T_cam_imu, camera, pixels = world.T_cam_imu, world.camera, world.observations.pixels_px.copy()
@@ -96,7 +101,7 @@ def test_traffic_that_most_landmarks_follow_does_not_reject_the_velocity():
     v = camera.fv_px * q[:, 1] / q[:, 2] + camera.cv_px
     pixels[of_frame] = np.column_stack([u, v, u - camera.fu_px * camera.baseline_m / q[:, 2], v])
     observations = dataclasses.replace(world.observations, pixels_px=pixels)
-    _, reports = filtered(dataclasses.replace(world, observations=observations))
+    _, reports = filtered(dataclasses.replace(world, observations=observations), engine=engine)
     assert (reports[WILD].reason == 0).sum() > 5
     assert all(report.doubt == 1.0 for report in reports)
 
