@@ -154,6 +154,8 @@ def test_velocities_and_samples_are_not_mixed(problem):
         live.predict(np.zeros(6), 0.0)
     with pytest.raises(ConfigError, match="no state block 'twist'"):
         live.block("twist")
+    with pytest.raises(ConfigError, match="no state block"):
+        live.block(np.zeros(3))
     sequence = problem.sequence
     velocities = LiveEKF.from_rig(sequence.camera, sequence.T_cam_imu, sequence.noise)
     with pytest.raises(ConfigError, match="call predict"):

@@ -263,7 +263,7 @@ class LiveEKF:
         """Return value and covariance of a state block at a stamp, such as ``velocity``, see `pose`."""
         with self.lock:
             layout = self.ekf.model.layout
-            if name not in layout:
+            if not isinstance(name, str) or name not in layout:
                 raise ConfigError(f"no state block {name!r}; known: {', '.join(layout)}")
             _, then, _ = self._at(t)
             at = layout[name]
