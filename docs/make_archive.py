@@ -98,11 +98,18 @@ def _tree(doc: str | None) -> str:
 
 
 def _meanings(record: type) -> dict[str, str]:
-    """Return what the docstring of a class of records says of each field."""
+    """Return what a class of records says of each field, in its docstring or in a comment above or beside it."""
     args = inspect.cleandoc(record.__doc__ or "").partition("Args:")[2].partition("\n\n")[0]
     found: dict[str, str] = {}
     for names, words in re.findall(r"(?m)^ {4}([\w, ]+): ((?:.|\n {8})*)", args):
         found |= dict.fromkeys(names.split(", "), " ".join(words.replace("``", "`").split()).rstrip("."))
+    fields = r"(?m)((?:^    # .*\n)*)^    (\w+): [^#\n]*(?:\n(?:        .*|    \)))*(?:# (.*))?$"
+    for above, name, beside in re.findall(fields, inspect.getsource(record)):
+        words = " ".join([*(line.strip(" #") for line in above.splitlines()), beside]).strip().rstrip(".")
+        names, _, rest = words.partition(": ")
+        is_of_several = rest and name in names.split(", ")
+        if words:
+            found |= dict.fromkeys(names.split(", "), rest) if is_of_several else {name: words}
     return found
 
 

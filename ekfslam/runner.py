@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import platform
 from collections.abc import Mapping
-from importlib.metadata import version
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-import scipy
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import MODES, Config, Mode
@@ -33,6 +30,7 @@ from ekfslam.geometry import se3
 from ekfslam.models.process.inertial import Inertial
 from ekfslam.models.sensors.velocities import Both, VelocitySource
 from ekfslam.progress import progress
+from ekfslam.provenance import provenance
 from ekfslam.resolve import Problem, resolve
 from ekfslam.smoother.fixed_lag import FixedLag
 from ekfslam.smoother.posterior import smooth
@@ -197,16 +195,5 @@ def _result(problem: Problem, mode: Mode, estimate: _Estimate) -> Result:
         inertial=estimate.inertial,
         pairs=estimate.pairs,
         whitened=whitened,
-        attributes={**sequence.attributes, **account, **versions()},
+        attributes={**sequence.attributes, **account, **provenance()},
     )
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of the software that computes results, as attributes ``version_<name>``."""
-    return {
-        "version_ekfslam": version("ekfslam"),
-        "version_python": platform.python_version(),
-        "version_numpy": np.__version__,
-        "version_scipy": scipy.__version__,
-        "version_h5py": version("h5py"),
-    }

@@ -30,7 +30,7 @@ ROOMS: tuple[tuple[str, ...], ...] = (
     ("storage",),
     ("evaluation",),
     ("resolve",),
-    ("runner", "live_stereo"),
+    ("provenance", "runner", "live_stereo"),
     ("given", "others"),
     ("studies",),
     ("figures",),

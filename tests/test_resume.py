@@ -14,7 +14,7 @@ from support.studies import short
 
 from ekfslam.cli import main
 from ekfslam.errors import ArchiveError
-from ekfslam.runner import versions
+from ekfslam.provenance import versions
 from ekfslam.studies import study as montecarlo
 from ekfslam.studies.executors import SerialExecutor
 from ekfslam.studies.journal import Journal, framed

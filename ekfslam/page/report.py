@@ -28,7 +28,7 @@ from ekfslam.evaluation.tables import MISSING
 from ekfslam.names import components, printable
 from ekfslam.others import Others
 from ekfslam.page.content import PART, Run, Section, plotted, remarks_of, sections_of, told_apart
-from ekfslam.runner import versions
+from ekfslam.provenance import versions
 from ekfslam.shown import count
 from ekfslam.storage.archive import Archive, read_archive
 

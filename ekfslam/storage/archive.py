@@ -4,7 +4,7 @@
     /sequence, /truth       as in `ekfslam.data.readers.hdf5`, without the observations
     /runs/<mode>            fields of `Result`; attributes config (JSON), counts (JSON), noise_<field of `Noise`>; and
                             format_version if an older release wrote it
-        attributes          seed, input checksum, versions of the software, as attributes
+        attributes          seed, input checksum, versions, commit, engine build and platform, as attributes
         <field>             fields of the record in this field of `Result`
 
 docs/archive.md lists all fields, `ekfslam.stored` explains how records declare them, and `ekfslam.hdf5` describes all

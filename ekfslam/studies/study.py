@@ -39,7 +39,7 @@ from ekfslam.filters.result import ERROR_CONVENTION
 from ekfslam.geometry import se3
 from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.sensors.stereo import Rig
-from ekfslam.runner import versions
+from ekfslam.provenance import provenance, versions
 from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.fixed_lag import FixedLag
 from ekfslam.stored import COUNTS, FLAGS, NUMBERS_OR_NONE, Check, Item, Shape, fixed_length
@@ -390,7 +390,7 @@ def write_study(path: str | Path, archive: StudyArchive) -> None:
     def fill(h5file: h5py.File) -> None:
         # The seed is text: it may be larger than any integer of HDF5.
         facts = {"error_convention": ERROR_CONVENTION, "study": json.dumps(study.parameters), "seed": str(study.seed)}
-        hdf5.write_attributes(h5file, {**facts, **versions()})
+        hdf5.write_attributes(h5file, {**facts, **provenance()})
         for level, world in study.levels.items():
             group = h5file.create_group(f"levels/{level}")
             hdf5.write_attributes(group, {"world": json.dumps(dataclasses.asdict(world))})

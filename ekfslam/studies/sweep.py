@@ -39,7 +39,8 @@ from ekfslam.frontend.opening import open_sequence
 from ekfslam.limits import DEFAULT_GB, limit_gb, reading_up_to, require_file
 from ekfslam.names import printable
 from ekfslam.others import NO_OTHERS, Others, files_of
-from ekfslam.runner import run, versions
+from ekfslam.provenance import versions
+from ekfslam.runner import run
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME
 from ekfslam.studies.journal import Journal, Key, Record, flat, run_missing
 from ekfslam.studies.sweep_table import PREDICTION, SweepTable, is_known_to_prediction, read_table, write_table

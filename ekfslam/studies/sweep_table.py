@@ -25,7 +25,7 @@ from ekfslam.evaluation.paired import paired_grid
 from ekfslam.evaluation.summary import KEYS
 from ekfslam.evaluation.tables import MISSING, Column, Grid, document, markdown_text
 from ekfslam.names import printable
-from ekfslam.runner import versions
+from ekfslam.provenance import in_words, provenance
 from ekfslam.stored import TEXTS, Check, Item
 
 FORMAT, FORMAT_VERSION = "ekfslam-sweep", 1
@@ -188,7 +188,7 @@ class SweepTable:
         further = [] if tests is None else [markdown_text(tests)]
         if ending == ".md" and self._is_repeated("recording"):
             further.insert(0, markdown_text(self.means(figures, _DRAWS)))
-        return replace(grid, notes=[*grid.notes, *(further or said)]).text(ending)
+        return replace(grid, notes=[in_words(provenance()), *grid.notes, *(further or said)]).text(ending)
 
     def _is_repeated(self, name: str) -> bool:
         return name in self.told and len(set(self.column(name).tolist())) > 1
@@ -249,7 +249,7 @@ def table_image(table: SweepTable) -> bytes:
     """Return a table as an HDF5 file."""
 
     def fill(h5file: h5py.File) -> None:
-        hdf5.write_attributes(h5file, {"swept": json.dumps(table.swept), "runs": table.asked, **versions()})
+        hdf5.write_attributes(h5file, {"swept": json.dumps(table.swept), "runs": table.asked, **provenance()})
         columns = {name: x if x.dtype.kind == "f" else hdf5.fixed_texts(x) for name, x in table.columns.items()}
         hdf5.write_fields(h5file.create_group("table", track_order=True), _layout(columns), columns)
 

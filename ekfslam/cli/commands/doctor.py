@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from threadpoolctl import threadpool_info
 
 from ekfslam.engine.choice import MISSING
-from ekfslam.runner import versions
+from ekfslam.provenance import versions
 from ekfslam.smoother.sparse import solvers
 
 EXAMPLES = ("doctor",)

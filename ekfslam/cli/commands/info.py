@@ -17,6 +17,7 @@ from ekfslam.evaluation.consistency import interpolated_frames
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.sources import compare_sources, in_words
 from ekfslam.evaluation.truth import with_truth_noise
+from ekfslam.provenance import in_words as made_by
 from ekfslam.reports import details
 from ekfslam.resolve import noise_of_velocities, resolve
 from ekfslam.storage.archive import FORMAT as ARCHIVE_FORMAT
@@ -49,6 +50,11 @@ def _print_archive(path: str) -> None:
     print(f"{path}: archive of {archive.name}, {len(archive.time_s)} frames, from {archive.source}")
     print(table(archive, None, archive.results))
     print(details(archive.results))
+    made: dict[str, list[str]] = {}
+    for mode, result in archive.results.items():
+        made.setdefault(made_by(result.attributes), []).append(mode)
+    for words, modes in made.items():
+        print(f"{', '.join(modes)}: made by {words or 'another program'}")
     for mode, result in archive.results.items():
         for remark in result.remarks:
             print(f"{mode}: note: {remark}")
