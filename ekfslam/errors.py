@@ -41,6 +41,10 @@ class WriteError(ArchiveError):
     """A file cannot be written; an older one of its name is unchanged."""
 
 
+class WorkerError(EkfslamError):
+    """A process that worked for a study or a comparison has died; everything that was finished is kept."""
+
+
 class DataError(EkfslamError):
     """A data set is malformed.
 

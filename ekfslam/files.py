@@ -1,17 +1,19 @@
 """Atomic writing: a file is written as a whole or not at all.
 
 The complete content goes to a file next to the target, to the disk (fsync), and replaces the target by renaming. A full
-disk, a limit or a kill leaves the older file unchanged. Windows has no locks of folders: callers do not wait for each
-other there, and unfinished files of killed processes stay.
+disk, a limit or a kill leaves the older file unchanged. Windows has no such locks: callers neither wait for each other
+nor are told of each other there, and unfinished files of killed processes stay.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import os
 import stat
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from ekfslam.errors import WriteError
@@ -22,7 +24,9 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 _PREFIX, _SUFFIX = ".ekfslam.", ".tmp"  # names of unfinished files, with the number of the process between
+_LOCK = ".lock"  # ending of the locks of claims
 _counter = itertools.count()
+_claims: set[tuple[Path, int]] = set()  # files claimed by this process, and the threads
 
 
 def write(path: str | Path, content: str | bytes) -> None:
@@ -114,11 +118,11 @@ def alone(path: str | Path) -> Iterator[None]:
 
 
 @contextmanager
-def claimed(path: str | Path) -> Iterator[None]:
-    """Claim a file for one writer, from reading to the end of writing. An empty file is removed at the end.
+def held(path: str | Path) -> Iterator[None]:
+    """Lock a file itself for one writer, from reading to the end of writing. An empty file is removed at the end.
 
     Raises:
-        WriteError: Another process or thread has claimed it, or it cannot be written.
+        WriteError: Another process or thread holds it, or it cannot be written.
     """
     path = Path(path)
     try:
@@ -132,27 +136,94 @@ def claimed(path: str | Path) -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):
-            if path.stat().st_size == 0:
+            if path.stat().st_size == 0 and os.path.samestat(path.stat(), os.fstat(file)):  # not that of a successor
                 path.unlink()
         os.close(file)
 
 
-def _locked(path: Path) -> int:
+@contextmanager
+def claimed(*writes: str | Path | None, reads: Iterable[str | Path] = ()) -> Iterator[None]:
+    """Claim files until the end of a command: those it writes for it alone, those it reads against writers.
+
+    A claim is a lock of a hidden file beside the target. It ends with its process, however that ends. Claims of one
+    thread nest. A file that is missing, or whose folder is protected, is read without a claim.
+
+    Raises:
+        WriteError: Another process or thread uses a file, or its folder cannot be written.
+    """
+    wanted: dict[Path, tuple[str | Path, bool]] = {_target(path): (path, False) for path in writes if path is not None}
+    for path in reads:
+        with suppress(OSError, ValueError):
+            if (target := Path(path).resolve()).is_file():
+                wanted.setdefault(target, (path, True))
+    with ExitStack() as stack:
+        for target, (path, is_read) in sorted(wanted.items()):
+            if fcntl is not None and (target, threading.get_ident()) not in _claims:
+                _claim(stack, target, path, is_read)
+        yield
+
+
+def _claim(stack: ExitStack, target: Path, path: str | Path, is_read: bool) -> None:
+    """Claim one file until the end of a stack."""
+    lock = target.with_name(f"{_PREFIX}{_short(target.name)}{_LOCK}")
+    try:
+        for folder in _make_folder(target.parent):
+            stack.callback(_remove_folder, folder)
+        file = _locked(lock, is_read)
+    except BlockingIOError:
+        raise WriteError(
+            f"{path}: another command is writing or reading it; wait for its end, or choose another output"
+        ) from None
+    except OSError as error:
+        if is_read:
+            return
+        raise WriteError(f"{path}: cannot be written: {error.strerror or error}") from None
+    _claims.add((target, threading.get_ident()))
+    stack.callback(_release, lock, target, file)
+
+
+def _release(lock: Path, target: Path, file: int) -> None:
+    """End a claim, and remove its lock file unless others hold it."""
+    _claims.discard((target, threading.get_ident()))
+    with suppress(OSError):
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock.unlink()
+    os.close(file)
+
+
+def _remove_folder(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()  # only empty ones can be
+
+
+def _short(name: str) -> str:
+    """Return a name, or a digest of one that leaves no room for an ending."""
+    name_bytes = os.fsencode(name)
+    return name if len(name_bytes) < 200 else hashlib.sha256(name_bytes).hexdigest()
+
+
+def _locked(path: Path, is_shared: bool = False) -> int:
     """Open and lock a file; `BlockingIOError` if somebody else has."""
+    how = 0 if fcntl is None else (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except PermissionError:
+            if not path.exists():
+                raise
+            file = os.open(path, os.O_RDONLY)  # left by another user; may be locked all the same
         try:
             if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(file, how)
             if fcntl is None or os.path.samestat(os.fstat(file), path.stat()):
                 return file
         except FileNotFoundError:
             pass  # its owner has removed it in between: a new one is free
         except OSError as error:
-            os.close(file)
             if isinstance(error, BlockingIOError):
+                os.close(file)
                 raise
-            return os.open(path, os.O_RDONLY)  # a file system without locks: no caller is told
+            return file  # a file system without locks: no caller is told
         os.close(file)
 
 
@@ -197,16 +268,18 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove unfinished files of dead processes."""
+    """Remove unfinished files and locks of dead processes."""
     if fcntl is None:  # os.kill(process, 0) would interrupt the process there
         return
-    for scrap in folder.glob(f"{_PREFIX}*{_SUFFIX}"):
+    for scrap in folder.glob(f"{_PREFIX}*"):
         number = scrap.name.removeprefix(_PREFIX).partition(".")[0]
-        if not number.isdigit() or _is_alive(int(number)):
+        is_dead = scrap.suffix == _SUFFIX and number.isdigit() and not _is_alive(int(number))
+        if not is_dead and scrap.suffix != _LOCK:
             continue
         with suppress(OSError), scrap.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held: its writer lives on another machine
-            scrap.unlink(missing_ok=True)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held: its writer lives, perhaps on another machine
+            if os.path.samestat(os.fstat(file.fileno()), scrap.stat()):
+                scrap.unlink(missing_ok=True)
 
 
 def _is_alive(process: int) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +24,7 @@ from ekfslam.evaluation.brief import ATE, brief, brief_rows
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations, verdict_on
 from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.evaluation.truth import with_truth_noise
-from ekfslam.figures.older import older_figures, remove_figures
+from ekfslam.figures.older import FIGURES, WAY, marked, older_figures, remove_figures, require_own
 from ekfslam.filters.result import Result
 from ekfslam.others import Others
 from ekfslam.runner import run
@@ -91,9 +92,13 @@ class Comparison(Shown):
         All are written or none. Figures of an earlier run are removed.
 
         Raises:
-            WriteError: The folder cannot be written, or holds another recording and ``force`` is false.
+            WriteError: The folder cannot be written, another command writes or reads its archive, or it holds another
+                recording or its figures and ``force`` is false.
         """
-        directory, timings = Path(directory), timings or Timings()
+        with _claimed(Path(directory)):
+            return self._write(Path(directory), force, figures, timings or Timings())
+
+    def _write(self, directory: Path, force: bool, figures: bool, timings: Timings) -> list[Path]:
         archive, summary, table = (directory / name for name in ("archive.h5", "summary.json", "summary.md"))
         if not force:
             require_same_origin(archive, self.sequence)
@@ -108,9 +113,12 @@ class Comparison(Shown):
                 from ekfslam.figures.run import draw_figures
                 from ekfslam.figures.style import pngs
             with timings.part("figures"):
-                contents |= pngs(directory, draw_figures(self.results, self.sequence.truth, self.sequence.interpolated))
+                drawn = draw_figures(self.results, self.sequence.truth, self.sequence.interpolated)
+                contents |= marked(pngs(directory, drawn), [archive])
+            if not force:
+                require_own(contents, [archive])
         with timings.part("archive"):
-            older = older_figures(directory)
+            older = older_figures(archive)
             files.write_all(contents)
             remove_figures(older, contents)
         return list(contents)
@@ -199,8 +207,9 @@ def compare_into(
     """
     timings = timings or Timings()
     others = None if others is None else others.named(folder.name)
-    comparison = compare(sequence, modes, config, timings, others)
-    paths = comparison.save(folder, force, figures, timings)
+    with _claimed(folder):
+        comparison = compare(sequence, modes, config, timings, others)
+        paths = comparison.save(folder, force, figures, timings)
     notes = "".join(f"{sequence.name}: {note}\n" for note in sequence.notes)
     with timings.part("evaluation"):
         said = brief(sequence, comparison.results, comparison.skipped, folder / "archive.h5")
@@ -208,6 +217,11 @@ def compare_into(
             said += f"\n{comparison.table}\n{details(comparison.results)}"
     listed = f": {', '.join(path.name for path in paths)}" if verbose else f" ({count(len(paths), 'file')})"
     return f"{notes}\n{said}\nwritten to {folder}{listed}"
+
+
+def _claimed(folder: Path) -> AbstractContextManager[None]:
+    """Claim the files of a comparison."""
+    return files.claimed(folder / "archive.h5", folder / "summary.json", folder / FIGURES)
 
 
 # Figures of merit of the table of a paper.
@@ -313,12 +327,13 @@ def check_consistency(
     from ekfslam.studies.summary import study_table, summarise_study
 
     archive_path, summary_path, table_path = _targets(Path(directory), "study.h5", "summary.json", "table.md")
-    with open_executor(executor, workers) as opened:
-        archive = run_study(study, archive_path, opened)
-    summary = summarise_study(archive)
-    figures = pngs(directory, draw_study_figures(archive))
-    contents = {summary_path: _json(summary), table_path: study_table(summary), **figures}
-    files.write_all(contents)
+    with files.claimed(archive_path, summary_path):
+        with open_executor(executor, workers) as opened:
+            archive = run_study(study, archive_path, opened)
+        summary = summarise_study(archive)
+        figures = pngs(directory, draw_study_figures(archive))
+        contents = {summary_path: _json(summary), table_path: study_table(summary), **figures}
+        files.write_all(contents)
     return ConsistencyReport(archive, summary, [archive_path, *contents])
 
 
@@ -341,16 +356,23 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
 
     folder = Path(archive).parent if directory is None else Path(directory)
     values, table, figure = _targets(folder, "check.json", "check.md", "check.png")
-    result = open_result(archive, mode)
-    require_innovations(result)
-    recorded = read_archive(archive)
-    smoothed, skipped = None, ""
-    try:
-        smoothed = posterior(result)
-    except PosteriorError as error:
-        skipped = str(error)
-    found = judge(result, smoothed, skipped, recorded.truth, recorded.interpolated)
-    files.write_all({values: _json(found.values), table: found.table, figure: png(plot_check(result, found))})
+    with files.claimed(values, reads=[archive]):
+        require_own([figure], [Path(archive)], WAY)
+        result = open_result(archive, mode)
+        require_innovations(result)
+        recorded = read_archive(archive)
+        smoothed, skipped = None, ""
+        try:
+            smoothed = posterior(result)
+        except PosteriorError as error:
+            skipped = str(error)
+        found = judge(result, smoothed, skipped, recorded.truth, recorded.interpolated)
+        written: dict[Path, str | bytes] = {
+            values: _json(found.values),
+            table: found.table,
+            figure: png(plot_check(result, found)),
+        }
+        files.write_all(marked(written, [Path(archive)]))
     return Check(found, [values, table, figure])
 
 

@@ -1,8 +1,9 @@
 """Command line: every subcommand is a thin call of the function of the same name in Python.
 
 Each file of `ekfslam.cli.commands` is a subcommand. The first line of its docstring is its summary, ``EXAMPLES`` are
-calls of it, ``add_arguments(parser)`` declares its arguments, ``command(options)`` runs it. Only the called one is
-imported, so help and mistyped names answer at once.
+calls of it, ``add_arguments(parser)`` declares its arguments, ``command(options)`` runs it. ``claims(options)`` is a
+context that claims the files which it reads and writes. Only the called one is imported, so help and mistyped names
+answer at once.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from collections.abc import Sequence as SequenceType
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def main(arguments: SequenceType[str] | None = None) -> int:
     options = _parser(given[:1]).parse_args(given)
     _prepare_output()
     try:
-        with reading_up_to(options.read_limit), _notes_on_one_line():
+        with reading_up_to(options.read_limit), _notes_on_one_line(), options.claims(options):
             options.command(options)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -79,7 +80,7 @@ def _parser(called: SequenceType[str]) -> argparse.ArgumentParser:
 
 def _declare(parser: argparse.ArgumentParser, name: str) -> None:
     module = importlib.import_module(f"{commands.__name__}.{name}")
-    parser.set_defaults(command=module.command)
+    parser.set_defaults(command=module.command, claims=getattr(module, "claims", nullcontext))
     parser.epilog = "examples:\n" + "\n".join(f"  ekfslam {example}" for example in module.EXAMPLES)
     parser.add_argument(
         "--read-limit",

@@ -23,6 +23,7 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.errors import ConfigError
 from ekfslam.figures import maps
+from ekfslam.figures.older import marked
 from ekfslam.figures.style import LANDMARK_COLOR, TRUTH, line_of, style_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.progress import progress
@@ -41,11 +42,13 @@ def write_animation(
     *,
     pictures: int = 200,
     per_second: int = 20,
+    shown: Path | None = None,
 ) -> None:
     """Write a drive as a moving map from above, ``.gif``, or ``.mp4``, which needs the program ffmpeg.
 
     A landmark appears in the frame of its first observation, at its last estimate: archives hold no earlier ones.
-    ``pictures`` is their largest number, spread over the drive; ``per_second`` their rate.
+    ``pictures`` is their largest number, spread over the drive; ``per_second`` their rate. ``shown``
+    is the archive that the file names as its source.
     """
     path = Path(path)
     if path.suffix not in FORMATS:
@@ -56,7 +59,8 @@ def write_animation(
         raise ConfigError(f"{path}: mp4 needs the program ffmpeg, which is not installed; gif does not")
     files.require_writable(path)
     drawn = progress(animated(results, truth, pictures), "animate", "picture", total=pictures)
-    files.write_all({path: (_mp4 if path.suffix == ".mp4" else _gif)(drawn, per_second)})
+    moving = (_mp4 if path.suffix == ".mp4" else _gif)(drawn, per_second)
+    files.write_all(marked({path: moving}, [] if shown is None else [shown]))
 
 
 def animated(results: Mapping[str, Result], truth: Truth | None, pictures: int) -> Iterator[Image.Image]:

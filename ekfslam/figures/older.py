@@ -1,31 +1,120 @@
-"""Figures of earlier runs, found and removed without Matplotlib, whose import takes longer than a short run."""
+"""Pictures and pages of archives: marks that name the archives shown, without Matplotlib, whose import takes long.
+
+A mark is a piece of the file that programs skip: a chunk of PNG, a comment of SVG, PDF and HTML, a free box of MP4,
+the rest of a GIF. It holds paths relative to the folder of the file, so that a folder of results may be moved.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+import re
+import struct
+import zlib
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from urllib.parse import quote, unquote
+
+from ekfslam.errors import WriteError
 
 MADE_BY = "ekfslam"  # in every figure
+FIGURES = "*.png"  # the name by which commands claim all figures of a folder
+WAY = "--out chooses another place"
+WAYS = f"{WAY}, --force replaces it"
+_PICTURES = (".png", ".svg", ".pdf")
+_KEPT = ("report.html", "drive.gif", "drive.mp4")  # files under other names are records of the user
+_MARK = re.compile(rb"ekfslam_shows:([A-Za-z0-9_.~%/:,]*);")
 
 
-def older_figures(directory: Path) -> list[Path]:
-    """Return the figures in a folder that `ekfslam.figures.style.png` has made."""
-    found: list[Path] = []
-    pictures = sorted(directory.glob("*.png"))
-    if not pictures:
+def marked(contents: Mapping[Path, str | bytes], archives: Iterable[Path]) -> dict[Path, str | bytes]:
+    """Return contents of files by path; pictures and pages among them name the archives that they show."""
+    archives, found = tuple(archives), dict(contents)
+    if not archives:
         return found
+    for path, content in contents.items():
+        data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+        names = ",".join(quote(_seen_from(path, archive)).replace("-", "%2D") for archive in archives)
+        found[path] = _with_mark(data, path.suffix, f"ekfslam_shows:{names};".encode())
+    return found
+
+
+def _seen_from(path: Path, archive: Path) -> str:
+    """Return the path of an archive relative to the folder of a file."""
+    target, folder = archive.resolve(), path.parent.resolve()
+    try:
+        return os.path.relpath(target, folder)
+    except ValueError:  # on another drive of Windows
+        return str(target)
+
+
+def _with_mark(data: bytes, suffix: str, mark: bytes) -> bytes:
+    if suffix == ".png":
+        chunk = b"tEXtSource\0" + mark
+        return (
+            data[:-12] + struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[-12:]
+        )
+    if suffix == ".mp4":
+        return data + struct.pack(">I", len(mark) + 8) + b"free" + mark
+    if suffix == ".pdf":
+        return data + b"%" + mark + b"\n"
+    if suffix == ".gif":
+        return data + mark  # after its last block
+    return data + b"<!-- " + mark + b" -->\n" if suffix in (".svg", ".html") else data
+
+
+def archives_in(path: Path) -> set[Path]:
+    """Return the archives that a picture or page names, none if it is missing or has no mark."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return set()
+    marks = _MARK.findall(data)
+    return {path.parent / unquote(name.decode()) for name in marks[-1].split(b",")} if marks else set()
+
+
+def require_own(paths: Iterable[Path], archives: Iterable[Path], ways: str = WAYS) -> None:
+    """Raise a `WriteError` if a picture or page shows an archive that is still there and not among some."""
+    own = {archive.resolve() for archive in archives}
+    for path in paths:
+        others = [archive for archive in archives_in(path) if archive.is_file() and archive.resolve() not in own]
+        if others:
+            raise WriteError(f"{path}: shows {min(others)}, another archive; {ways}")
+
+
+def pictures_of(archives: Iterable[Path], folder: Path) -> list[Path]:
+    """Return the pictures in a folder that show these archives and no other."""
+    own = {archive.resolve() for archive in archives}
+    places = [path for suffix in _PICTURES for path in folder.glob(f"*{suffix}")]
+    return [path for path in sorted(places) if own and {other.resolve() for other in archives_in(path)} == own]
+
+
+def older_figures(archive: Path) -> list[Path]:
+    """Return the pictures and the page in the folder of an archive that show it alone.
+
+    Figures of older releases have no marks. They are among them if the folder has no other archive.
+    """
+    folder, own = archive.parent, {archive.resolve()}
+    found = pictures_of(own, folder)
+    kept = [folder / name for name in _KEPT]
+    found += [path for path in kept if {other.resolve() for other in archives_in(path)} == own]
+    if archive.exists() and all(path == archive for path in folder.glob("*.h5")):
+        found += [path for path in folder.glob("*.png") if not archives_in(path) and _is_figure(path)]
+    return found
+
+
+def _is_figure(path: Path) -> bool:
+    """Return whether `ekfslam.figures.style.png` has made a picture."""
     from PIL import Image
 
-    for path in pictures:
-        with suppress(OSError, ValueError, SyntaxError), Image.open(path) as picture:
-            if picture.info.get("Software") == MADE_BY:
-                found.append(path)
-    return found
+    with suppress(OSError, ValueError, SyntaxError), Image.open(path) as picture:
+        return picture.info.get("Software") == MADE_BY
+    return False
 
 
 def remove_figures(older: Iterable[Path], new: Iterable[Path]) -> None:
     """Remove older figures that no new ones replace, and with ``check.png`` its verdict."""
     for path in set(older) - set(new):
-        for suffix in (".png", ".md", ".json") if path.name == "check.png" else (".png",):
-            path.with_suffix(suffix).unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+        if path.name == "check.png":
+            for suffix in (".md", ".json"):
+                path.with_suffix(suffix).unlink(missing_ok=True)

@@ -13,6 +13,7 @@ from ekfslam.figures.style import LANDMARK_COLOR, arrange, legend_of, styled
 from ekfslam.filters.result import Result
 from ekfslam.smoother.sparse.information import JointInformation
 
+POSTERIOR_FIGURES = ("map_before_and_after", "sparsity")
 _POSES = 16  # with an ellipse
 _CELLS = 500  # across a picture of a sparsity pattern
 
@@ -80,8 +81,8 @@ def draw_posterior_figures(
     before: Result, after: Result, information: JointInformation, truth: Truth | None = None
 ) -> dict[str, Figure]:
     """Draw ``map_before_and_after`` and ``sparsity``; return them by name."""
-    drawn = plot_map_before_and_after(before, after, truth)
-    return {"map_before_and_after": drawn, "sparsity": plot_sparsity(information)}
+    drawn = (plot_map_before_and_after(before, after, truth), plot_sparsity(information))
+    return dict(zip(POSTERIOR_FIGURES, drawn, strict=True))
 
 
 def block_patterns(information: JointInformation) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray], int]:

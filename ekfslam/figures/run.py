@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from ekfslam import files
 from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.brief import ATE, brief_rows
 from ekfslam.figures import maps as maps  # registers figures, as the next one does
 from ekfslam.figures import posterior as posterior
 from ekfslam.figures import registry, series
+from ekfslam.figures.older import marked, pictures_of, remove_figures, require_own
 from ekfslam.figures.series import BAND_SIGMAS, draw_series
-from ekfslam.figures.style import PRIOR, TRUTH, ZERO, Format, arrange, legend_of, line_of, save_all, share_x, style_of
+from ekfslam.figures.style import PRIOR, TRUTH, ZERO, Format, arrange, legend_of, line_of, pngs, share_x, style_of
 from ekfslam.filters.result import Result
 
 
@@ -163,6 +166,29 @@ def save_figures(
     truth: Truth | None = None,
     interpolated: BoolArray | None = None,
     format: Format = "png",
+    *,
+    shown: Path | None = None,
+    force: bool = True,
 ) -> list[Path]:
-    """Write the figures of `draw_figures` into a folder, which is made if missing; return their paths."""
-    return save_all(directory, draw_figures(results, truth, interpolated), format=format)
+    """Write the figures of `draw_figures` into a folder, which is made if missing; return their paths.
+
+    The figures name the archive ``shown``, and its older figures of other names are removed.
+
+    Raises:
+        WriteError: A figure there shows another archive, and ``force`` is false.
+    """
+    contents = pngs(directory, draw_figures(results, truth, interpolated), format=format)
+    shows = [] if shown is None else [shown]
+    if not force:
+        require_own(contents, shows)
+    stale = [
+        path for path in pictures_of(shows, Path(directory)) if path.suffix == f".{format}" and _is_drawn(path.stem)
+    ]
+    files.write_all(marked(contents, shows))
+    remove_figures(stale, contents)
+    return list(contents)
+
+
+def _is_drawn(stem: str) -> bool:
+    """Return whether a name is that of a registered figure, whatever the mode."""
+    return any(fnmatchcase(stem, name.replace("{mode}", "*")) for name in registry.FIGURES)

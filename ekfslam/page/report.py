@@ -25,6 +25,7 @@ from ekfslam.evaluation.brief import brief_rows
 from ekfslam.evaluation.evidence import BLIND
 from ekfslam.evaluation.summary import definitions, error_in_words, merit_rows
 from ekfslam.evaluation.tables import MISSING
+from ekfslam.figures.older import marked
 from ekfslam.names import components, printable
 from ekfslam.others import Others
 from ekfslam.page.content import PART, Run, Section, plotted, remarks_of, sections_of, told_apart
@@ -66,7 +67,8 @@ def write_report(
         ConfigError, TruthError: A trajectory cannot be compared, see `ekfslam.others`.
     """
     files.require_writable(path)
-    files.write_all({Path(path): report_page(_joined(read_archives(archives), Others.of(others)), title)})
+    page = report_page(_joined(read_archives(archives), Others.of(others)), title)
+    files.write_all(marked({Path(path): page}, map(Path, archives)))
     return Path(path)
 
 

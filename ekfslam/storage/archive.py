@@ -82,7 +82,9 @@ class Archive(Shown):
 
 def write_archive(path: str | Path, sequence: Sequence | Archive, results: Mapping[str, Result]) -> None:
     """Write the results (mode to `Result`) of one sequence to an HDF5 file, as a whole, replacing an old one."""
-    files.write(path, archive_image(sequence, results))
+    image = archive_image(sequence, results)
+    with files.alone(path):
+        files.write(path, image)
 
 
 def archive_image(sequence: Sequence | Archive, results: Mapping[str, Result]) -> bytes:

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-from ekfslam.errors import ConfigError
+from ekfslam.errors import ConfigError, WorkerError
 
 _MOST_WORKERS = 1024
 IN_FLIGHT = 256  # tasks handed to an executor at a time
+
+# Kinds of executors, and the words for the loss of a worker.
+_DASK = "the cluster has lost its scheduler or a run has killed several workers, perhaps for memory; mend the cluster"
+_LOST = {
+    "processes": "a worker was killed or could not start, most often for memory; choose fewer --workers",
+    "serial": "a run was cancelled",
+    "mpi": "a rank of MPI has died, perhaps for memory; start fewer ranks on a machine",
+    "tls": _DASK,
+    "dask": _DASK,
+}
 
 # BLAS threads are limited for the process as a whole: a worker that runs several threads (Dask) takes turns.
 ONE_RUN_AT_A_TIME = threading.Lock()
@@ -34,11 +45,15 @@ def completed(tasks: Iterable[Task], submit: Callable[[Task], Future[Outcome]]) 
                 return
             # Do not wait while there is more to submit: an executor in this process has finished by now.
             finished, _ = wait(pending, timeout=None if task is None else 0, return_when=FIRST_COMPLETED)
-            for future in finished:
+            for future in sorted(finished, key=_has_failed):  # an error ends the work, so it comes last
                 yield pending.pop(future), future.result()
     finally:
         for future in pending:
             future.cancel()
+
+
+def _has_failed(future: Future[Any]) -> bool:
+    return future.cancelled() or future.exception() is not None
 
 
 class SerialExecutor(Executor):
@@ -66,31 +81,63 @@ def open_executor(spec: str = "processes", workers: int | None = None) -> Iterat
 
     Raises:
         ConfigError: The executor is unknown, not installed or not reachable, or ``workers`` is out of range.
+        WorkerError: A worker, or the scheduler of a cluster, has died in the meantime.
     """
     if workers is not None and not 1 <= workers <= _MOST_WORKERS:
         raise ConfigError(f"workers must be at least 1 and at most {_MOST_WORKERS}, found {workers}")
-    if spec == "serial":
+    kind = next((kind for kind in _LOST if spec == kind or spec.startswith(f"{kind}://")), None)
+    if kind is None:
+        known = "processes, serial, tls://HOST:PORT, dask://HOST:PORT, mpi"
+        raise ConfigError(f"unknown executor {spec!r}; known: {known}")
+    try:
+        with _opened(kind, spec, workers) as executor:
+            yield executor
+    except Exception as error:
+        if not _is_of_executor(error):
+            raise
+        raise WorkerError(
+            f"executor {spec}: {_LOST[kind]}. What is finished is kept: give the same command again"
+        ) from None
+
+
+def _is_of_executor(error: Exception) -> bool:
+    """Return whether an error is one of an executor that has lost a worker, and not one of a task."""
+    of_dask = any(kind.__module__.startswith("distributed.") for kind in type(error).__mro__)
+    return of_dask or isinstance(error, BrokenExecutor | CancelledError)
+
+
+@contextmanager
+def _opened(kind: str, spec: str, workers: int | None) -> Iterator[Executor]:
+    if kind == "serial":
         yield SerialExecutor()
-    elif spec == "processes":
+    elif kind == "processes":
         import multiprocessing
         from concurrent.futures import ProcessPoolExecutor
 
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(workers or os.cpu_count(), context, _end_with_parent) as processes:
             yield processes
-    elif spec == "mpi":
+    elif kind == "mpi":
         try:
             from mpi4py.futures import MPIPoolExecutor
         except (ImportError, RuntimeError) as error:  # RuntimeError: there is no MPI library to load
             raise _missing(spec, error) from None
         with MPIPoolExecutor(max_workers=workers) as ranks:
             yield ranks
-    elif spec.startswith(("dask://", "tls://")):
-        with _dask_client(spec) as client, client.get_executor() as cluster:
-            yield cluster
     else:
-        known = "processes, serial, tls://HOST:PORT, dask://HOST:PORT, mpi"
-        raise ConfigError(f"unknown executor {spec!r}; known: {known}")
+        with _dask_client(spec) as client, client.get_executor() as cluster, _quiet("distributed.client"):
+            yield cluster
+
+
+@contextmanager
+def _quiet(logger: str) -> Iterator[None]:
+    """Let a package log nothing: the loss of a cluster is one named error, not many tracebacks."""
+    found = logging.getLogger(logger)
+    before, found.disabled = found.disabled, True
+    try:
+        yield
+    finally:
+        found.disabled = before
 
 
 def _dask_client(spec: str) -> Any:

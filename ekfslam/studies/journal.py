@@ -90,7 +90,7 @@ class Journal:
         Raises:
             WriteError: Another study or sweep writes there.
         """
-        return files.claimed(self.path)
+        return files.held(self.path)
 
     def entries(self) -> Iterator[tuple[Key, Record]]:
         """Yield key and record of each run, up to the first incomplete entry.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     declare(parser, "--no-figures", "--verbose", "--timings", *OTHERS, *EXECUTOR)
     declare_run(parser)
+
+
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return files.claimed(options.table)
 
 
 def command(options: argparse.Namespace) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from ekfslam import files
@@ -41,6 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, *EXECUTOR)
     resumes = "default: %(default)s; an interrupted study there resumes"
     declare(parser, "--out", default=Path("results/local/consistency"), help=resumes)
+
+
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return files.claimed(options.table)
 
 
 def command(options: argparse.Namespace) -> None:

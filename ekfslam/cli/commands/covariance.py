@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import get_args
 
@@ -31,6 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="archive to write")
     declare_run(parser)
+
+
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return files.claimed(options.out, options.out.with_suffix(".txt"))
 
 
 def command(options: argparse.Namespace) -> None:

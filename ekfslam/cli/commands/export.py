@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import get_args
 
@@ -47,6 +48,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return files.claimed(options.out, reads=[options.archive])
+
+
 def command(options: argparse.Namespace) -> None:
     archive = read_archive(options.archive)
     modes = list(archive.results)
@@ -61,9 +66,10 @@ def command(options: argparse.Namespace) -> None:
         data = open_result(options.archive, mode)
         data = data if export.poses is None else trajectory_of(data)
     written = contents(data, path, options.format, options.frame)
-    for place in written:
-        require_ours(options, place, lambda path: is_export(path, options.format))
-    files.write_all(written)
+    with files.claimed(*written):
+        for place in written:
+            require_ours(options, place, lambda path: is_export(path, options.format))
+        files.write_all(written)
     found = f"{len(data.trajectory.time_s)} poses" if isinstance(data, Poses) else export.words
     beside = "".join(f", their covariances to {place}" for place in written if place != path)
     print(f"{found} written to {path}{beside}")

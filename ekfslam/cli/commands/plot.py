@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import get_args
 
 from ekfslam import files
 from ekfslam.cli.options import declare, require_ours
 from ekfslam.errors import ArchiveError
+from ekfslam.figures.older import FIGURES
 from ekfslam.figures.run import save_figures
 from ekfslam.figures.style import Format
 from ekfslam.figures.viewer import is_viewer_file, show_archive, write_viewer_file
@@ -36,6 +38,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    written = _directory(options) / FIGURES if options.viewer is None else options.viewer
+    return files.claimed(None if written == _OPENED else written, reads=[options.archive])
+
+
+def _directory(options: argparse.Namespace) -> Path:
+    return Path(options.out or options.archive.parent)
+
+
 def command(options: argparse.Namespace) -> None:
     archive = read_archive(options.archive)
     if not archive.results:
@@ -48,7 +59,8 @@ def command(options: argparse.Namespace) -> None:
         write_viewer_file(archive, options.viewer)
         print(options.viewer)
         return
-    directory = options.out or options.archive.parent
+    directory = _directory(options)
     files.require_writable(directory / f"map.{options.format}")
-    for path in save_figures(directory, archive.results, archive.truth, archive.interpolated, options.format):
+    drawn = (archive.results, archive.truth, archive.interpolated, options.format)
+    for path in save_figures(directory, *drawn, shown=options.archive, force=options.force):
         print(path)

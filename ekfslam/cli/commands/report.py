@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager
 from pathlib import Path
 
+from ekfslam import files
 from ekfslam.cli.options import OTHERS, declare, others_of, require_ours
+from ekfslam.figures.older import require_own
 from ekfslam.page.report import is_report, write_report
 
 EXAMPLES = (
@@ -22,7 +25,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--title", default="", metavar="TEXT", help="heading; default: the names of the recordings")
 
 
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return files.claimed(_target(options), reads=options.archive)
+
+
+def _target(options: argparse.Namespace) -> Path:
+    return Path(options.out or options.archive[0].parent / "report.html")
+
+
 def command(options: argparse.Namespace) -> None:
-    path = options.out or options.archive[0].parent / "report.html"
+    path = _target(options)
     require_ours(options, path, is_report)
+    if not options.force:
+        require_own([path], options.archive)
     print(write_report(options.archive, path, options.title, others_of(options)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from ekfslam import files
@@ -29,6 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare_run(parser)
 
 
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return files.claimed(options.out)
+
+
 def command(options: argparse.Namespace) -> None:
     config, timings = configured(options), Timings()
     with timings.part("reading"):
@@ -40,7 +45,7 @@ def command(options: argparse.Namespace) -> None:
         print_warnings(sequence)
     results = run_modes(sequence, options.modes, config, timings)
     with timings.part("archive"):
-        older = [] if _is_shared(options.out) else older_figures(options.out.parent)
+        older = older_figures(options.out)
         files.write_all({options.out: archive_image(sequence, results)})
         remove_figures(older, ())
     with timings.part("evaluation"):
@@ -51,8 +56,3 @@ def command(options: argparse.Namespace) -> None:
     print(f"written to {options.out}")
     if options.timings:
         print(timings.table)
-
-
-def _is_shared(archive: Path) -> bool:
-    """Return whether figures in the folder of an archive may belong to another one."""
-    return not archive.exists() or any(path != archive for path in archive.parent.glob("*.h5"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from ekfslam import files
@@ -18,6 +19,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("world", nargs="?", default=DEFAULT_DATA, metavar="WORLD", help=f"default: {DEFAULT_DATA}")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="recording to write")
     declare(parser, "--force")
+
+
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return files.claimed(options.out)
 
 
 def command(options: argparse.Namespace) -> None:

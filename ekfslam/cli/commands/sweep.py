@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,6 +64,10 @@ def _chosen(text: str) -> tuple[str, str]:
     if not separator:
         raise argparse.ArgumentTypeError(f"{text!r} is not COLUMN=VALUE")
     return name, value
+
+
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return files.claimed(options.out / "sweep.h5", options.table or None)
 
 
 def command(options: argparse.Namespace) -> None:

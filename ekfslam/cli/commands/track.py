@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from ekfslam import files
@@ -25,6 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "--force", *PLACES)
     declare(parser, "--config", help="settings in a table [front_end]")
     parser.add_argument("--features", type=int, metavar="N", help="features wanted in a frame")
+
+
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return files.claimed(options.out, options.out.with_suffix(".png"))
 
 
 def command(options: argparse.Namespace) -> None:

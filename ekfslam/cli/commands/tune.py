@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import get_args
 
@@ -30,6 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="auto: sigmas of the automatic model; white: of white noise alone (default: as configured)",
     )
     parser.add_argument("--drift", action="store_true", help="search the drift of the tracks, too")
+
+
+def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
+    return files.claimed(options.out)
 
 
 def command(options: argparse.Namespace) -> None:
