@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -29,6 +29,7 @@ Linearisation = Literal["map", "filtered"]
 NoiseModel = Literal["auto", "tuned", "white"]
 Kernel = Literal["huber", "cauchy", "none"]
 BlockSetting = float | int | str | bool
+Made = TypeVar("Made")
 
 MODES: tuple[Mode, ...] = get_args(Mode)
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
@@ -418,14 +419,7 @@ class Config:
         Raises:
             ConfigError: The file is missing, is not TOML, or holds something unknown.
         """
-        try:
-            require_file(path, is_text=True)
-            text = Path(path).read_text(encoding="utf-8")
-            return Config().with_overrides(tomllib.loads(text))
-        except UnknownFormatError as error:  # names the file
-            raise ConfigError(str(error)) from None
-        except (OSError, ValueError, RecursionError, ConfigError) as error:  # ValueError: no UTF-8, no TOML
-            raise ConfigError(f"{path}: {error}") from None
+        return of_toml(path, Config().with_overrides)
 
     @staticmethod
     def from_stored(tables: Mapping[str, Mapping[str, Any]]) -> Config:
@@ -433,6 +427,17 @@ class Config:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RetiredSettingWarning)
             return Config().with_overrides(tables)
+
+
+def of_toml(path: str | Path, made: Callable[[dict[str, Any]], Made]) -> Made:
+    """Return what is made of the content of a TOML file; every `ConfigError` names the file."""
+    try:
+        require_file(path, is_text=True)
+        return made(tomllib.loads(Path(path).read_text(encoding="utf-8")))
+    except UnknownFormatError as error:  # names the file
+        raise ConfigError(str(error)) from None
+    except (OSError, ValueError, RecursionError, ConfigError) as error:  # ValueError: no UTF-8, no TOML
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def require_setting(name: str, value: object, is_scale: bool = False) -> None:

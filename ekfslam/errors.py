@@ -114,11 +114,9 @@ class NoInertialError(FilterError):
 
 
 class InnovationError(FilterError):
-    """The innovation covariance S is not positive definite.
+    """The innovation covariance S of a frame is not positive definite.
 
-    Args:
-        frame: Frame of the failed update.
-        ids: Landmarks whose blocks of S are not positive definite; all observed ones if only the whole of S is not.
+    ``ids`` are the landmarks whose blocks of S are not; all observed ones if only the whole of S is not.
     """
 
     def __init__(self, frame: int, ids: Iterable[int]) -> None:
@@ -130,13 +128,7 @@ class InnovationError(FilterError):
 
 
 class NonFiniteResultError(FilterError):
-    """An estimate or a covariance has become NaN or infinite: there is no result.
-
-    Args:
-        mode: Mode of the run.
-        what: Name of the quantity.
-        index: Index of its first entry that is not finite, such as the frame.
-    """
+    """An estimate or a covariance has become NaN or infinite, first at an ``index`` such as the frame: no result."""
 
     def __init__(self, mode: str, what: str, index: int) -> None:
         self.mode, self.what, self.index = mode, what, index
@@ -150,13 +142,7 @@ class RetiredSettingWarning(UserWarning):
 
 
 class LateError(EkfslamError):
-    """A message or a query has a stamp that the filter has already passed.
-
-    Args:
-        what: ``velocity``, ``image`` or ``pose``.
-        stamp_s: Its stamp.
-        least_s: Stamp that it must be later than; None before the first image is processed.
-    """
+    """A message or a query (velocity, image, pose) has a stamp that the filter has passed: it is at ``least_s``."""
 
     def __init__(self, what: str, stamp_s: float, least_s: float | None) -> None:
         self.what, self.stamp_s, self.least_s = what, stamp_s, least_s
@@ -188,12 +174,7 @@ class PosteriorError(EkfslamError):
 
 
 class IllPosedError(PosteriorError):
-    """The rows of a posterior leave something undetermined.
-
-    Args:
-        what: Undetermined quantity in words.
-        ids: Undetermined landmarks or frames.
-    """
+    """The rows of a posterior leave something undetermined, of the landmarks or frames ``ids``."""
 
     def __init__(self, what: str, ids: Iterable[int]) -> None:
         self.ids = tuple(int(i) for i in ids)

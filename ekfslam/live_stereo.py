@@ -14,7 +14,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from queue import Empty, Queue
 from typing import Any, Self
 
@@ -42,16 +41,6 @@ MOST_TRACKED = 600  # frames that wait for the filter: half a minute at 20 Hz
 MOST_INPUTS = 100_000  # that wait for the first frames
 # Memory stays bounded: landmarks leave, none comes back from the log, no frame is linearised again.
 _BOUNDED = {"retire": "unseen", "retire_after": 10, "dormant": 0, "revive": -1, "lag": 0}
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """Tracks of a frame."""
-
-    time_s: float  # stamp
-    ids: IntArray  # ids, pixels_px: (n,) ids and (n, 4) pixels
-    pixels_px: Array
-    twist: Array  # (6,) mean velocity of the IMU since the frame before, by vision alone
 
 
 class Learner:
@@ -117,17 +106,17 @@ class Learner:
                 if len(row):
                     self._feed(live, t, row)
 
-    def filter(self, found: Tracked) -> None:
-        """Process the tracks of a later frame."""
+    def filter(self, t: float, ids: IntArray, pixels: Array, twist: Array) -> None:
+        """Process the tracks of a later frame, with the mean velocity (6,) of the IMU before it by vision alone."""
         live, problem = self.live, self.problem
         assert live is not None and problem is not None
         # Rules of `ekfslam.data.hygiene` that need one frame alone.
-        pixels, std, rules = found.pixels_px, problem.model.noise.pixel_std_px, problem.config.hygiene
+        std, rules = problem.model.noise.pixel_std_px, problem.config.hygiene
         least = 1.0 if rules.min_disparity_sigma is None else rules.min_disparity_sigma
         good = (pixels[:, 0] - pixels[:, 2] > least * np.hypot(std[0], std[2])) | (least <= 0)
         if rules.max_row_mismatch_sigma:
             good &= np.abs(pixels[:, 1] - pixels[:, 3]) <= rules.max_row_mismatch_sigma * np.hypot(std[1], std[3])
-        self._update(live, found.time_s, found.ids[good], pixels[good], found.twist)
+        self._update(live, t, ids[good], pixels[good], twist)
 
     def _update(self, live: LiveEKF, t: float, ids: IntArray, pixels: Array, twist: Array) -> None:
         if not (live.is_inertial or self._uses_velocities):
@@ -163,11 +152,6 @@ class Line:
         self._pairs: Queue[tuple[Image, Image, float] | None] = Queue()
         self._jobs: Queue[Callable[[], None] | None] = Queue()
         self._threads: list[threading.Thread] = []
-
-    @property
-    def is_running(self) -> bool:
-        """Whether the threads run."""
-        return bool(self._threads)
 
     def start(self) -> None:
         """Start both threads."""
@@ -358,9 +342,9 @@ class LiveStereo:
             if seen.T_now_before is not None and before is not None:
                 T = self._tracking.T_cam_imu
                 twist = -se3.log(se3.inverse(T) @ seen.T_now_before @ T) / (t - before)
-            found = Tracked(t, *self._tracking.last(), twist)
+            ids, pixels = self._tracking.last()
             self._tracking.forget()
-            self._line.do(lambda: learner.filter(found))
+            self._line.do(lambda: learner.filter(t, ids, pixels, twist))
 
     def _moved(self, begin: float, end: float) -> Array | None:
         """Return the motion (4, 4) of the IMU between two frames by measured velocities; None: there are none."""
@@ -379,17 +363,8 @@ class LiveStereo:
             self._first = list(time_s[-1:])
             self._tracking.forget()
             return
-        recording = ImageRecording(
-            "live",
-            "live",
-            time_s,
-            self._calibration,
-            _not_kept,
-            self._T_left_imu,
-            twist,
-            self._velocity_frame,
-            inertial=samples,
-        )
+        pair, T, frame = self._calibration, self._T_left_imu, self._velocity_frame
+        recording = ImageRecording("live", "live", time_s, pair, _not_kept, T, twist, frame, inertial=samples)
         sequence, _ = self._tracking.sequence(recording)
         self._tracking.forget()
         self._first = None

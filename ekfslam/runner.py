@@ -79,7 +79,8 @@ def run(
         suspicions = sequence.once(inspect_sequence).warnings
         problem = resolve(sequence, config, mode)
     with timings.part(mode), one_thread():
-        estimate = _joint(problem, _sources(problem, further)) if mode == "full" else _dead_reckoned(problem, mode)
+        sources = further if problem.beside is None else problem.beside.along(further)
+        estimate = _joint(problem, sources) if mode == "full" else _dead_reckoned(problem, mode)
     with timings.part("evaluation"):
         result = _result(problem, mode, estimate)
         compared = compare_sources(sequence) if mode == "full" and not suspicions else None
@@ -109,11 +110,6 @@ def _judged(problem: Problem) -> tuple[IntArray, IntArray] | None:
     """Return the pairs of frames whose relative pose is compared with the truth, if requested."""
     truth, reach = problem.sequence.truth, problem.config.filter.relative_frames
     return relative_pairs(truth, reach) if truth is not None and reach else None
-
-
-def _sources(problem: Problem, further: VelocitySource | None) -> VelocitySource | Both | None:
-    """Return the velocities that are measured beside the inputs of the process."""
-    return further if problem.beside is None else problem.beside.along(further)
 
 
 def _joint(problem: Problem, further: VelocitySource | Both | None) -> _Estimate:

@@ -21,6 +21,7 @@ from ekfslam.others import Others, World
 from ekfslam.storage.archive import Archive
 
 DEFAULT_DATA = "builtin:city"
+_READINGS = ("corrected", "as-stored")
 
 # Flags without effect, accepted with a note.
 RETIRED = {"--resume": "runs start from the beginning; sweeps and studies resume"}
@@ -51,15 +52,27 @@ def table_file(text: str) -> Path:
     return Path(text)
 
 
+def _file(words: str, metavar: str = "FILE") -> dict[str, Any]:
+    return {"type": Path, "metavar": metavar, "help": words}
+
+
+def _switch(words: str) -> dict[str, Any]:
+    return {"action": "store_true", "help": words}
+
+
+def _choice(names: tuple[str, ...], default: str, words: str) -> dict[str, Any]:
+    return {"choices": names, "default": default, "help": f"{words} (default: %(default)s)"}
+
+
 # Shared arguments: name, and how argparse declares it.
 _SHARED: dict[str, dict[str, Any]] = {
     "data": {"nargs": "?", "default": DEFAULT_DATA, "metavar": "DATA", "help": f"default: {DEFAULT_DATA}"},
-    "archive": {"type": Path, "metavar": "ARCHIVE", "help": "as written by run or compare"},
-    "--out": {"type": Path, "metavar": "DIR", "help": "default: the folder of the archive"},
-    "--timings": {"action": "store_true", "help": "print the CPU and wall-clock time of each part"},
-    "--force": {"action": "store_true", "help": "overwrite the output even if it holds something else"},
-    "--verbose": {"action": "store_true", "help": "print all figures of merit, counts and estimated parameters"},
-    "--no-figures": {"action": "store_true", "help": "draw no figures, which saves time"},
+    "archive": _file("as written by run or compare", "ARCHIVE"),
+    "--out": _file("default: the folder of the archive", "DIR"),
+    "--timings": _switch("print the CPU and wall-clock time of each part"),
+    "--force": _switch("overwrite the output even if it holds something else"),
+    "--verbose": _switch("print all figures of merit, counts and estimated parameters"),
+    "--no-figures": _switch("draw no figures, which saves time"),
     "--workers": {"type": int, "metavar": "N", "help": "processes (default: one per core)"},
     "--executor": {
         "default": "processes",
@@ -68,55 +81,37 @@ _SHARED: dict[str, dict[str, Any]] = {
         "configuration distributed.comm.tls), dask://HOST:PORT (without certificates: anyone who reaches that port "
         "runs programs as you; for private networks only), or mpi",
     },
-    "--truth": {"type": Path, "metavar": "FILE", "help": "true poses: KITTI odometry or TUM text"},
-    "--velocities": {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "velocities from elsewhere: text of time vx vy vz wx wy wz (s, m/s, rad/s), or another recording",
-    },
+    "--truth": _file("true poses: KITTI odometry or TUM text"),
+    "--velocities": _file(
+        "velocities from elsewhere: text of time vx vy vz wx wy wz (s, m/s, rad/s), or another recording"
+    ),
     "--velocity-frame": {
         "choices": ("imu", "level"),
         "help": "frame of --velocities (default: as the file says, otherwise imu)",
     },
-    "--imu": {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "inertial samples from elsewhere: csv of timestamp w_x w_y w_z a_x a_y a_z (ns, rad/s, m/s^2), imu0 "
-        "of EuRoC, or a bag",
-    },
-    "--imu-noise": {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "sensor.yaml or imu.yaml with the noise densities of inertial samples (default: the one beside them)",
-    },
+    "--imu": _file(
+        "inertial samples from elsewhere: csv of timestamp w_x w_y w_z a_x a_y a_z (ns, rad/s, m/s^2), imu0 of EuRoC, "
+        "or a bag"
+    ),
+    "--imu-noise": _file(
+        "sensor.yaml or imu.yaml with the noise densities of inertial samples (default: the one beside them)"
+    ),
     "--topics": {
         "nargs": "+",
         "default": [],
         "metavar": "TOPIC",
         "help": "topics of a bag: LEFT RIGHT [ODOMETRY] [IMU] (default: chosen by CameraInfo and names)",
     },
-    "--calibration": {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "calibration of the pair: chain of Kalibr or OpenVINS, left.yaml of ROS, OpenCV, ORB-SLAM, "
-        "calibration.toml (bags without CameraInfo need one)",
-    },
-    "--lateral": {
-        "choices": ("corrected", "as-stored"),
-        "default": "corrected",
-        "help": "sign of the lateral velocity of KITTI, stored positive to the right (default: %(default)s)",
-    },
-    "--camera": {
-        "choices": ("both", "left"),
-        "default": "both",
-        "help": "left: the left camera alone, with the scale of inertial samples or velocities (default: %(default)s)",
-    },
+    "--calibration": _file(
+        "calibration of the pair: chain of Kalibr or OpenVINS, left.yaml of ROS, OpenCV, ORB-SLAM, calibration.toml "
+        "(bags without CameraInfo need one)"
+    ),
+    "--lateral": _choice(_READINGS, "corrected", "sign of the lateral velocity of KITTI, stored positive to the right"),
+    "--camera": _choice(
+        ("both", "left"), "both", "left: the left camera alone, with the scale of inertial samples or velocities"
+    ),
     "--frames": {"type": _stretch, "metavar": "A:B", "help": "frames A to B - 1 only, like a slice in Python"},
-    "--extrinsics": {
-        "choices": ("corrected", "as-stored"),
-        "default": "corrected",
-        "help": "how to read cam_T_imu of .npz recordings (default: %(default)s)",
-    },
+    "--extrinsics": _choice(_READINGS, "corrected", "how to read cam_T_imu of .npz recordings"),
     "--truth-noise": {
         "nargs": "+",
         "type": _setting,
@@ -137,32 +132,23 @@ _SHARED: dict[str, dict[str, Any]] = {
         "choices": get_args(Moving),
         "help": "moving frame of the poses of --with: body or left camera (default: camera for KITTI, otherwise body)",
     },
-    "--with-world": {
-        "choices": get_args(World),
-        "default": "first",
-        "help": "first: move them so that their first pose is the recording's; given: leave their world "
-        "(default: %(default)s)",
-    },
-    "--config": {
-        "type": Path,
-        "metavar": "FILE.toml",
-        "help": "tables [noise], [hygiene], [filter], [calibration], [posterior], [truth]; `tune` writes such a file",
-    },
+    "--with-world": _choice(
+        get_args(World),
+        "first",
+        "first: move them so that their first pose is the recording's; given: leave their world",
+    ),
+    "--config": _file(
+        "tables [noise], [hygiene], [filter], [calibration], [posterior], [truth]; `tune` writes such a file",
+        "FILE.toml",
+    ),
     **{flag: {"action": _Retired, "nargs": 0, "help": argparse.SUPPRESS} for flag in RETIRED},
 }
 TABLE_WORDS = f"write the table of a paper, by the ending of FILE: {', '.join(WRITERS)}"
 OTHERS = ("--with", "--with-frame", "--with-world")
 EXECUTOR = ("--workers", "--executor")
-PLACES = (
-    "--truth",
-    "--velocities",
-    "--velocity-frame",
-    "--imu",
-    "--imu-noise",
-    "--topics",
-    "--calibration",
-    "--lateral",
-)  # parts of a recording in other files
+_INPUTS = ("--velocities", "--velocity-frame", "--imu", "--imu-noise")
+PLACES = ("--truth", *_INPUTS, "--topics", "--calibration", "--lateral")  # parts of a recording in other files
+_READ_AS = (*PLACES, "--camera", "--extrinsics")  # arguments of `open_sequence`
 DATA = (*PLACES, "--camera", "--frames", "--extrinsics", "--truth-noise")
 
 # Flags that override a setting, the table and key of it, and how argparse declares the flag.
@@ -220,20 +206,8 @@ def config_file(options: argparse.Namespace) -> Config:
 
 def open_data(options: argparse.Namespace, data: str) -> Sequence:
     """Open a recording as the options of `DATA` say."""
-    sequence = open_sequence(
-        data,
-        extrinsics=options.extrinsics,
-        lateral=options.lateral,
-        truth=options.truth,
-        velocities=options.velocities,
-        velocity_frame=options.velocity_frame,
-        imu=options.imu,
-        imu_noise=options.imu_noise,
-        topics=options.topics,
-        calibration=options.calibration,
-        camera=options.camera,
-        front_end=config_file(options).front_end,
-    )
+    given = {name: getattr(options, name) for name in (flag[2:].replace("-", "_") for flag in _READ_AS)}
+    sequence = open_sequence(data, front_end=config_file(options).front_end, **given)
     return sequence if options.frames is None else sequence[options.frames]
 
 

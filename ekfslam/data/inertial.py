@@ -1,7 +1,4 @@
-"""Inertial samples as files have them: units and stamps are checked, and brought into order.
-
-Mistakes that nothing can repair are errors that say what to do; doubtful findings become notes of the recording.
-"""
+"""Inertial samples as files have them: units and stamps are checked; mistakes are errors, doubts are notes."""
 
 from __future__ import annotations
 

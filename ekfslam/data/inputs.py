@@ -200,10 +200,7 @@ class InertialSamples:
         return linear(self.time_s, np.hstack([self.gyro_rad_s, self.accel_m_s2]), time_s)
 
     def interval(self, begin_s: float, end_s: float) -> Interval:
-        """Return the mean samples ``[w; f]`` between successive stamps, linear to both ends of the interval.
-
-        It is a gap if a step is more than three times the median. Raise `LostDataError` as `Velocities.interval`.
-        """
+        """Return the mean samples ``[w; f]`` between stamps, linear to both ends; gaps exceed three medians."""
         _require_cover(self, begin_s, end_s)
         begin = max(int(np.searchsorted(self.time_s, begin_s, side="right")) - 1, 0)
         part = slice(begin, int(np.searchsorted(self.time_s, end_s)) + 1)

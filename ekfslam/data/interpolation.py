@@ -1,8 +1,4 @@
-"""Stretches of a recording that were never measured: where a unit had a gap, and a line was drawn across it.
-
-OXTS units (KITTI) fill gaps of velocities and poses so. In the first second of 2011_09_30_drive_0020 the true poses
-move by 10.5 m/s and the velocities are 11.5 m/s.
-"""
+"""Stretches of velocities and poses that were never measured: a unit (OXTS) had a gap and drew a line across it."""
 
 from __future__ import annotations
 

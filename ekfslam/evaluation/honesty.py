@@ -1,7 +1,4 @@
-"""`judge`: one verdict on the covariance of a run, with its causes and the next step, from all evidence of the run.
-
-A full run is judged by its innovations. Other modes and older archives keep none: only NIS and truth remain.
-"""
+"""`judge`: one verdict on the covariance of a run, with its causes and the next step, from all evidence of the run."""
 
 from __future__ import annotations
 

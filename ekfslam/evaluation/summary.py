@@ -17,6 +17,8 @@ from ekfslam.storage.archive import Archive
 
 _LEAST_POSES = 10  # for a statement on the errors of a trajectory
 KEYS = METRICS.keys()  # of a summary, in the order of the table
+_HONESTY = ("pose_nees_with_truth_noise_mean", "nis_per_dof")
+KEY_FIGURES = ("ate_m", "ate_aligned_m", "t_rel_percent", *_HONESTY, "landmark_rmse_m")  # of many runs
 
 
 def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, Value]:

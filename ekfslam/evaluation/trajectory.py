@@ -1,7 +1,4 @@
-"""Errors of a trajectory and of a map against ground truth.
-
-Trajectories are stacks of poses ``T_world_imu`` (n, 4, 4), estimate and truth at the same n instants.
-"""
+"""Errors of a map and of trajectories ``T_world_imu`` (n, 4, 4) against truth at the same n instants."""
 
 from __future__ import annotations
 
@@ -23,10 +20,7 @@ PATH_TOLERANCE = 0.1  # largest relative difference of the path of a pair from t
 
 
 def align_se3(points: Array, reference: Array) -> Array:
-    """Return the rigid transform (4, 4) from points (n, 3) to their reference (n, 3) with least squared distances.
-
-    Umeyama's method without scale. Points on a line leave the rotation about it undetermined; any optimum is returned.
-    """
+    """Return the rigid transform (4, 4) of points (n, 3) with least squared distances to others (Umeyama)."""
     centre, reference_centre = points.mean(axis=0), reference.mean(axis=0)
     U, _, Vt = np.linalg.svd((reference - reference_centre).T @ (points - centre))
     # The optimal orthogonal matrix may be a reflection; flipping the weakest direction gives the optimal rotation.
@@ -45,10 +39,7 @@ def align_yaw(points: Array, reference: Array) -> Array:
 
 
 def absolute_trajectory_error(T_est: Array, T_true: Array, align: bool, by: Callable[..., Array] = align_se3) -> float:
-    """Return the ATE, the root mean square of the position errors in metres, without or after an alignment.
-
-    Sturm et al., *A Benchmark for the Evaluation of RGB-D SLAM Systems*, IROS 2012. Scale is never aligned.
-    """
+    """Return the ATE, root mean square of position errors, m, aligned or not, never scaled (Sturm, IROS 2012)."""
     estimate, truth = T_est[:, :3, 3], T_true[:, :3, 3]
     if align:
         estimate = se3.apply(by(estimate, truth), estimate)

@@ -1,7 +1,4 @@
-"""The table of series: each curve over a run with its unit, its bounds and its expected value.
-
-Figures draw them by `draw_series`; `ekfslam.page` packs them for its script.
-"""
+"""The table of series: each curve over a run with unit, bounds and expected value, for figures and pages."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Velocity and biases of an inertial unit, as a filter or the smoother estimates them, and the direction of gravity.
-
-Errors are those of eq. (12): ``xi`` of the pose, and additive ones of the velocity in the IMU frame and of the biases.
-"""
+"""Velocity and biases of an inertial unit, as a filter or the smoother estimates them, with the errors of eq. (12)."""
 
 from __future__ import annotations
 

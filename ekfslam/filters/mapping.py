@@ -1,7 +1,4 @@
-"""Mapping-only, the report's second half: poses as given, every landmark its own 3x3 EKF.
-
-Equals the joint filter with a certain first pose and exact velocities (P_xx(0) = 0, W = 0).
-"""
+"""Mapping-only, the report's second half: poses as given (P_xx(0) = 0, W = 0), every landmark its own 3x3 EKF."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def predict(e: Estimate, interval: Interval, also: Measured | None, at_rest: Mea
     """
     model, process = e.model, e.model.process
     if also is not None:
-        if not process.has_velocity:
+        if not process.velocity:
             raise ConfigError("velocities of further sensors need the twist in the state: set twist_walk_std")
         also = process.referred(also, e.values, interval)
     extra = [some for some in (also, at_rest) if some is not None]

@@ -14,11 +14,7 @@ _RETURN_PX = 0.7  # largest error of a feature that is tracked there and back
 
 
 def flow(source: Image, target: Image, pixels: Array, guess: Array, levels: int) -> tuple[Array, BoolArray]:
-    """Return features (n, 2) of the source in the target, by pyramidal Lucas-Kanade, and whether (n,) they were found.
-
-    J.-Y. Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001. ``guess`` (n, 2) are predicted
-    pixels; one level of the pyramid is the image alone.
-    """
+    """Return features (n, 2) of the source in the target from a ``guess``, and which are found (Bouguet 2001)."""
     if not len(pixels):
         return np.empty((0, 2)), np.empty(0, dtype=bool)
     cv2 = opencv()

@@ -40,10 +40,7 @@ _L, _R = slice(0, 2), slice(2, 4)  # pixels of the left and the right image
 
 @dataclass(frozen=True)
 class Seen:
-    """Reported features of a frame: ids (n,) of tracks, and pixels (n, 2) without the correction of the right camera.
-
-    ``T_now_before`` (4, 4) is the motion of the camera since the frame before; None in the first frame.
-    """
+    """Reported features of a frame (ids, pixels as seen), and the motion (4, 4) of the camera before it, if known."""
 
     id: IntArray
     left: Array

@@ -23,11 +23,7 @@ _EYE = np.eye(3)
 
 
 def phis(theta_squared: Array) -> tuple[Array, ...]:
-    """Return ``(phi_0, ..., phi_5)`` at ``theta^2`` (any shape).
-
-    For small theta they come from the series of the last two by ``phi_k = 1/k! - theta^2 phi_{k+2}``, for others from
-    cosine and sine by the same recurrence reversed.
-    """
+    """Return ``(phi_0, ..., phi_5)`` at ``theta^2``, by ``phi_k = 1/k! - theta^2 phi_{k+2}`` and series."""
     x = np.asarray(theta_squared, dtype=float)
     if x.shape == (1, 1):
         return _phis_of_one(x.item())

@@ -23,7 +23,7 @@ from ekfslam.data.trajectory import Trajectory
 from ekfslam.errors import ArchiveError
 from ekfslam.evaluation.brief import brief_rows
 from ekfslam.evaluation.evidence import BLIND
-from ekfslam.evaluation.summary import definitions, error_in_words, merit_rows
+from ekfslam.evaluation.summary import KEY_FIGURES, definitions, error_in_words, merit_rows
 from ekfslam.evaluation.tables import MISSING
 from ekfslam.figures.older import marked
 from ekfslam.names import components, printable
@@ -38,14 +38,6 @@ _GENERATOR = '<meta name="generator" content="ekfslam report">'
 _JUDGED = (
     "Verdicts on <i>full</i> are by innovations, without truth; <code>ekfslam check</code> adds the smoother. "
     "Where there is truth, it has a verdict of its own; one drive is one sample."
-)
-_KEY_FIGURES = (
-    "ate_m",
-    "ate_aligned_m",
-    "t_rel_percent",
-    "pose_nees_with_truth_noise_mean",
-    "nis_per_dof",
-    "landmark_rmse_m",
 )
 _MOST_CARDS = 4  # of more runs, only those judged by innovations have a card
 
@@ -243,23 +235,19 @@ def _detail(run: Run) -> str:
 
 def _configuration(config: Mapping[str, Any]) -> str:
     """Return settings that differ from the defaults, then all of them."""
-    default, changed, all_of_it = Config(), {}, {}
-    for table, settings in config.items():
-        if not isinstance(settings, Mapping):
-            continue
-        for key, value in settings.items():
-            name = f"{table}.{key}"
-            all_of_it[name] = value
-            if value != getattr(getattr(default, table, None), key, value):
-                changed[name] = value
-    own = _pairs(changed) if changed else "<p>Every setting has its default.</p>"
-    return f"{own}<details><summary>all settings</summary>{_pairs(all_of_it)}</details>"
+    tables = {table: settings for table, settings in config.items() if isinstance(settings, Mapping)}
+    found = [(table, key, value) for table, settings in tables.items() for key, value in settings.items()]
+    default = Config()
+    changed = [one for one in found if one[2] != getattr(getattr(default, one[0], None), *one[1:])]
+    own, every = (_pairs({f"{table}.{key}": value for table, key, value in some}) for some in (changed, found))
+    own = own or "<p>Every setting has its default.</p>"
+    return f"{own}<details><summary>all settings</summary>{every}</details>"
 
 
 def _overview(sections: Sequence[Section]) -> str:
     """Return a table of all runs."""
     runs = [(i, section, run) for i, section in enumerate(sections) for run in section.runs]
-    columns = merit_rows({key: run.summary[key] for key in _KEY_FIGURES} for _, _, run in runs)
+    columns = merit_rows({key: run.summary[key] for key in KEY_FIGURES} for _, _, run in runs)
     rows = []
     for row, (i, section, run) in enumerate(runs, 1):
         link = f'<a href="#recording-{i}">{escape(section.name)}</a>, {escape(run.label)}'

@@ -107,11 +107,7 @@ class FixedLag:
         return marginal
 
     def cross(self, step: int) -> Array | None:
-        """Return ``cov(xi_j, xi_k)`` (6, 6) of the pose at a step j and the last one; None: j is out of the window.
-
-        Estimates of a filter are conditional means, so the errors of its estimates at j and k have the cross-covariance
-        of both poses given everything up to k.
-        """
+        """Return ``cov(xi_j, xi_k)`` (6, 6) of poses as reported at a step j and the last; None: j has left."""
         if self._solution is None or not self._begins <= step:
             return None
         last, w = len(self._solution.eps) - 1, self.unknowns.width
@@ -184,10 +180,7 @@ class FixedLag:
 
 
 class WindowProblem(BatchProblem):
-    """The factors of a window's log after its prior; ``known`` (n,) are the landmarks of the prior.
-
-    ``rows`` (M,) are the rows of the log's landmarks in the whole log, ascending.
-    """
+    """Factors of a window after its prior of landmarks ``known`` (n,); ``rows`` (M,) are in the whole log."""
 
     def __init__(self, window: FixedLag, log: Log, rows: IntArray) -> None:
         assert window.prior is not None

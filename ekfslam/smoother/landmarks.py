@@ -22,10 +22,7 @@ Robust = Callable[[Array], tuple[Array, Array]]
 
 
 def moved_in_image(sensor: Sensor, before: Array, after: Array, positions_m: Array, by: Array) -> Array:
-    """Return landmarks (n, 3) moved linearly in the image (x/z, y/z, 1/z) of a camera that moves, too, eq. (7').
-
-    ``by`` (n, 3) is the change of the points in the camera, to first order. Those without an image change by it.
-    """
+    """Return landmarks (n, 3) moved ``by`` (n, 3), linearly in the image of a moving camera, eq. (7'), if any."""
     q = se3.apply(before, positions_m)
     w = 1.0 / np.where(is_in_image(sensor, q, 0.0), q[:, 2], 1.0)
     ratio = 1.0 - w * by[:, 2]

@@ -1,7 +1,4 @@
-"""Factors of the observations of landmarks, at any state or as the filter linearised them.
-
-An observation whose track walks is a *difference* from the observation before, eq. (10): it touches two frames.
-"""
+"""Factors of observations, at any state or as filtered; a difference, eq. (10), touches two frames."""
 
 from __future__ import annotations
 

@@ -110,10 +110,7 @@ def maximise(
 
 
 def better_start(problem: BatchProblem, state: State, config: PosteriorConfig, min_depth_m: float) -> State:
-    """Return the state with every landmark at its position or its initialisation, whichever fits better.
-
-    An `IllPosedError` names landmarks that are behind a camera that saw them in both places.
-    """
+    """Return the state with landmarks where they fit better, position or initialisation, or an `IllPosedError`."""
     log = problem.log
 
     def costs(positions_m: Array) -> Array:

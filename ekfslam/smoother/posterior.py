@@ -310,11 +310,7 @@ def posterior_of_log(
     min_depth_m: float = FilterConfig.min_depth_m,
     name: str = "posterior",
 ) -> Posterior:
-    """Return the posterior of the log of a filter with any model, see `posterior`.
-
-    ``positions_m`` (M, 3) are the filter's last estimates of the landmarks of the log, to start from; ``name`` is for
-    the progress bar.
-    """
+    """Return the posterior of the log of a filter with any model, from ``positions_m`` (M, 3), see `posterior`."""
     config = config or PosteriorConfig()
     problem = BatchProblem(log, model)
     costs: tuple[float, ...]

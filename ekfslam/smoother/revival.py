@@ -36,11 +36,7 @@ class MapRevival:
         self._last: State | None = None
 
     def neighbours(self, log: Log, returning: IntArray, candidates: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the ``config.revive`` candidates that were seen nearest in time to returning landmarks.
-
-        All are rows of the log. The second result are their distances (c,), in frames, from the nearest sighting of a
-        returning landmark.
-        """
+        """Return the ``config.revive`` candidates seen nearest to returning landmarks, and distances in frames."""
         role = np.zeros(log.landmarks, dtype=np.int64)
         role[returning], role[candidates] = 1, 2
         role_seen = role[log.landmark]
@@ -57,10 +53,7 @@ class MapRevival:
         return chosen, nearest[chosen]
 
     def marginal(self, log: Log, positions_m: Array, landmarks: IntArray) -> Marginal:
-        """Return mean and covariance of the last frame's blocks and of landmarks, given everything in the log.
-
-        ``positions_m`` (M, 3) are the filter's last estimates of all landmarks, ``landmarks`` rows of the log.
-        """
+        """Return mean and covariance of the last frame's blocks and of landmarks (rows), given the whole log."""
         problem = BatchProblem(log, self._model)
         if is_frozen_exactly(self._config):
             information = JointInformation(problem.as_filtered())
@@ -99,10 +92,7 @@ def filter_covariance(
     landmarks: IntArray,
     by: Array,
 ) -> Array:
-    """Return the covariance (body+3n, body+3n) of the last frame and of landmarks (n,) in the columns of the filter.
-
-    Views are functions ``z = Y x`` of their frames, with Y = ``by`` (T, 6, seen).
-    """
+    """Return the covariance (body+3n, body+3n) of the last frame and landmarks (n,), with views ``z = by x``."""
     layout, n = model.layout, len(landmarks)
     frames = [last, last - 1] if PreviousView.name in layout and last else [last]
     P = information.covariance(frames=frames, aux=[last], drive=[0], landmarks=landmarks)

@@ -101,10 +101,7 @@ def archive_image(sequence: Sequence | Archive, results: Mapping[str, Result]) -
 
 
 def require_same_origin(path: str | Path, sequence: Sequence) -> None:
-    """Raise a `WriteError` unless a path is free or holds an archive of the same recording.
-
-    Recordings are the same if their checksums agree. Without checksums their sources and attributes must agree.
-    """
+    """Raise a `WriteError` unless a path is free or has the same recording, by checksum or source."""
     if files.is_free(path):
         return
     try:

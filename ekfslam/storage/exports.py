@@ -74,11 +74,7 @@ def export(result: Result, path: str | Path, format: str, *, frame: Moving | Non
 def contents(
     data: Result | Poses, path: str | Path, format: str, frame: Moving | None = None
 ) -> dict[Path, str | bytes]:
-    """Return the contents of the files of an export by path, see `export`.
-
-    The covariances of ``poses.txt`` in the format ``tum`` are in ``poses.cov.txt``: a stamp, and the 21 columns of
-    `ekfslam.data.readers.tum.read_trajectory`.
-    """
+    """Return the contents of the files of an `export` by path; those of ``tum`` include ``poses.cov.txt``."""
     path, made = Path(path), EXPORTS[format]
     if not isinstance(data, Poses):
         if frame is not None:
@@ -142,10 +138,7 @@ def csv_text(result: Result, table: str = "trajectory") -> str:
 
 
 def euroc_text(result: Result) -> str:
-    """Return the states of an inertial result as the ground truth of EuRoC has them: a csv that `attach_truth` reads.
-
-    Stamps are ns; a float holds those since 1970 to 0.2 us. Velocities are along world.
-    """
+    """Return inertial states as EuRoC's csv of ground truth: ns (to 0.2 us since 1970), velocities along world."""
     velocity, states = result.velocity_world_m_s, result.inertial
     assert states is not None
     quaternion = position_and_quaternion(result.T_world_imu)[:, [6, 3, 4, 5]]
@@ -159,10 +152,7 @@ def euroc_text(result: Result) -> str:
 
 
 def ply_bytes(result: Result) -> bytes:
-    """Return the landmarks with their covariances as a point cloud (PLY, binary, little endian).
-
-    Colours run from blue (1 cm and less) to red (10 m and more) with the logarithm of the largest standard deviation.
-    """
+    """Return the landmarks with covariances as a point cloud (PLY), from blue (to 1 cm) to red (from 10 m)."""
     landmarks = result.landmarks
     if len(landmarks) and landmarks.id.max() > 1 << 53:
         raise ArchiveError(f"{result.sequence_name}: landmark id {landmarks.id.max()} is too large for PLY")
@@ -244,10 +234,7 @@ def _triangulated(result: Result, log: Log) -> tuple[Array, Array]:
 
 
 def information_bytes(result: Result, found: Posterior | None = None) -> bytes:
-    """Return the joint information matrix of a full run as a file for `scipy.sparse.load_npz`, without pickle.
-
-    Further arrays ``kind``, ``frame``, ``id`` and ``axis`` name each column, see `Posterior.information_matrix`.
-    """
+    """Return `Posterior.information_matrix` and its columns as a file for `scipy.sparse.load_npz`, without pickle."""
     matrix, named = (found or posterior(result)).information_matrix()
     texts = {name: value.astype(np.bytes_) if value.dtype.kind == "U" else value for name, value in named.items()}
     arrays: dict[str, Any] = {name: getattr(matrix, name) for name in ("indices", "indptr", "shape", "data")}

@@ -47,11 +47,7 @@ def covariance_text(trajectory: Trajectory) -> str | None:
 
 
 def kitti_text(trajectory: Trajectory) -> str:
-    """Return lines of the upper 3x4 part of each pose, by rows.
-
-    Poses of the left camera are relative to the first of them, as the benchmark defines them. Those of the body are in
-    world.
-    """
+    """Return lines of the upper 3x4 part of each pose, by rows; of the camera, relative to the first one."""
     T = trajectory.T_world
     if trajectory.moving == "camera" and len(T):
         T = se3.inverse(T[0]) @ T

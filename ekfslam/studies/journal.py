@@ -85,19 +85,11 @@ class Journal:
         self._heading = json.dumps(study, sort_keys=True).encode()
 
     def claimed(self) -> AbstractContextManager[None]:
-        """Claim journal and archive, from reading to the end of writing.
-
-        Raises:
-            WriteError: Another study or sweep writes there.
-        """
+        """Claim journal and archive, from reading to the end of writing; `WriteError` if another study writes there."""
         return files.held(self.path)
 
     def entries(self) -> Iterator[tuple[Key, Record]]:
-        """Yield key and record of each run, up to the first incomplete entry.
-
-        Raises:
-            ArchiveError: The journal belongs to another study, or an entry is no run of this one.
-        """
+        """Yield key and record of each complete run; raise `ArchiveError` if one is of another study."""
         found = _read(self.path)
         if next(found, self._heading) != self._heading:
             raise ArchiveError(f"{self.path} holds runs of another study; move it away or choose another folder")
@@ -121,11 +113,7 @@ class Journal:
         return record
 
     def append(self, key: Key, record: Record) -> None:
-        """Append a run and wait until it is on the disk.
-
-        Raises:
-            WriteError: The disk is full.
-        """
+        """Append a run and wait until it is on the disk; `WriteError` if that is full."""
         parts = [
             np.asarray(record[variant][name], dtype=value.dtype).tobytes()
             for variant, fields in self.blank(key[0]).items()

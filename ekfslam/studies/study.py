@@ -167,10 +167,7 @@ class Study(Shown):
 
 
 def realisation(study: Study, level: str, run: int) -> Loop:
-    """Return the world of one run: the level with a seed from the study's seed, the level's name and the run.
-
-    Landmarks and road surface depend on the seed, so a mean over runs is also a mean over worlds.
-    """
+    """Return the world of one run, whose seed is of the study's seed, the level's name and the run."""
     source = np.random.SeedSequence(entropy=study.seed, spawn_key=(crc32(level.encode()), run))
     return dataclasses.replace(study.levels[level], seed=int(source.generate_state(1, np.uint64)[0] >> 1))
 
@@ -189,11 +186,7 @@ def filter_config(level: Loop, variant: str) -> FilterConfig:
 
 
 def run_one(study: Study, level: str, run: int) -> dict[str, dict[str, NDArray]]:
-    """Simulate one realisation and run all variants on it; return variant to field to value, as in `VARIANT_LAYOUT`.
-
-    Values are NaN at frame 0, whose true pose is drawn and not part of a recording, and from the frame at which a
-    filter stops.
-    """
+    """Simulate one run; return variant to field to value (`VARIANT_LAYOUT`): NaN at frame 0 and after a stop."""
     world = realisation(study, level, run)
     with ONE_RUN_AT_A_TIME, one_thread(), np.errstate(all="ignore"):
         sequence = simulate(world)

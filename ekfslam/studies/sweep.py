@@ -28,10 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ekfslam
-from ekfslam.config import MODES, VARIANTS, Config, FrontEndConfig
+from ekfslam.config import MODES, VARIANTS, Config, FrontEndConfig, of_toml
 from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.sequence import Sequence, stretch
-from ekfslam.errors import ArchiveError, ConfigError, EkfslamError, UnknownFormatError
+from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
 from ekfslam.evaluation.summary import KEYS, summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.filters.result import Result
@@ -52,17 +52,7 @@ _KEYS |= {"with": dict, "with_frame": str, "with_world": str}
 _KINDS = {list: "list", dict: "table", str: "text"}
 _FILES = ("data", "truth", "velocities", "calibration", "imu", "imu_noise")  # of a recording
 # Arguments of `open_sequence`.
-_READ_AS = (
-    "truth",
-    "extrinsics",
-    "lateral",
-    "velocities",
-    "velocity_frame",
-    "topics",
-    "calibration",
-    "imu",
-    "imu_noise",
-)
+_READ_AS = ("truth", "extrinsics", "lateral", "velocities", "velocity_frame", "topics", *_FILES[3:])
 _RECORDING_KEYS = ("data", "name", "frames", *_READ_AS)
 _TAKEN = ("key", "recording", "seed", "case", "mode", "error", "run", *KEYS)  # names of columns
 
@@ -247,13 +237,7 @@ class Sweep:
     @staticmethod
     def from_toml(path: str | Path) -> Sweep:
         """Read a sweep from a file; paths in it are relative to its folder."""
-        try:
-            require_file(path, is_text=True)
-            return _parsed(tomllib.loads(Path(path).read_text(encoding="utf-8")), Path(path).parent)
-        except UnknownFormatError as error:  # names the file
-            raise ConfigError(str(error)) from None
-        except (OSError, ValueError, RecursionError, ConfigError) as error:  # ValueError: no UTF-8, no TOML
-            raise ConfigError(f"{path}: {error}") from None
+        return of_toml(path, lambda found: _parsed(found, Path(path).parent))
 
 
 def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool = True) -> SweepTable:

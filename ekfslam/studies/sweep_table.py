@@ -22,7 +22,7 @@ from ekfslam import files, hdf5
 from ekfslam.errors import ArchiveError, ConfigError
 from ekfslam.evaluation.metrics import METRICS
 from ekfslam.evaluation.paired import paired_grid
-from ekfslam.evaluation.summary import KEYS
+from ekfslam.evaluation.summary import KEY_FIGURES, KEYS
 from ekfslam.evaluation.tables import MISSING, Column, Grid, document, markdown_text
 from ekfslam.names import printable
 from ekfslam.provenance import in_words, provenance
@@ -31,15 +31,7 @@ from ekfslam.stored import TEXTS, Check, Item
 FORMAT, FORMAT_VERSION = "ekfslam-sweep", 1
 _RUNS, _ROW = "runs", "run"  # the length that all columns share, and its dimension
 _ANY_NUMBER = Check("f", "be numbers", lambda value, _: np.ones(value.shape, dtype=bool))  # a limit may be infinite
-SHOWN = (
-    "ate_m",
-    "ate_aligned_m",
-    "t_rel_percent",
-    "pose_nees_with_truth_noise_mean",
-    "nis_per_dof",
-    "landmark_rmse_m",
-    "total_s",
-)
+SHOWN = (*KEY_FIGURES, "total_s")
 
 
 _DRAWS = ("recording", "seed")  # columns over which estimators and settings are compared
@@ -144,10 +136,7 @@ class SweepTable:
         return Grid([*texts, *numbers], [tuple(map(spoken, group)) for group in groups], [self._head(self.told)])
 
     def means(self, figures: Sequence[str] = SHOWN, over: Sequence[str] = ("seed",)) -> Grid:
-        """Return mean and standard error of some figures over seeds (or recordings, too), and their number of runs.
-
-        The first figure also has median and worst.
-        """
+        """Return mean and standard error of figures over seeds or recordings (first: median, worst), and counts."""
         names, kept = [name for name in self.told if name not in over], self._without_repeats()
         parts = kept.groups(*names) if names else {(): kept}
         texts = [Column(self.words(name), [spoken(key[i]) for key in parts]) for i, name in enumerate(names)]

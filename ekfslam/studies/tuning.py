@@ -67,10 +67,7 @@ _BELOW_FLOOR = "below the errors of the motion that are assumed anyway; not refi
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of a parameter of `PARAMETERS` by likelihood and differences combined, with its standard error.
-
-    ``likely`` and ``likely_error`` come from the likelihood alone, None without a search or a maximum.
-    """
+    """Estimate of a parameter of `PARAMETERS` with its error, combined and by likelihood (if searched)."""
 
     name: str
     value: float
@@ -250,10 +247,7 @@ class Likelihood:
         return with_drift(noise, value["drift"]) if "drift" in value else noise
 
     def judged(self, x: Array) -> Callable[[Array], Array]:
-        """Return a function for the terms of log L, without the observations that are rejected at x.
-
-        The terms are one per frame, and last the sum over the rejected observations.
-        """
+        """Return the terms of log L as a function: of each frame, and last of the observations rejected at x."""
         noise = self.noise(x)
         # With velocities that say little, a wrong match is one that other matches contradict.
         noise = dataclasses.replace(noise, twist_std=_LOOSE * noise.twist_std, motion_std=_LOOSE * noise.motion_std)
@@ -313,10 +307,7 @@ class Likelihood:
 
 
 def estimates_of(start: dict[str, float], free: list[str], peak: Peak, found: VelocityNoise) -> tuple[Estimate, ...]:
-    """Return all parameters with their standard errors: likelihood and differences, alone and combined.
-
-    ``start`` has the parameters at the start; the likelihood has searched the ``free`` ones, with its maximum ``peak``.
-    """
+    """Return all parameters with errors: by likelihood (``free`` ones, at their ``peak``), differences, both."""
     pairs = zip(found.sigma.tolist(), found.sigma_error.tolist(), strict=True)
     differences = dict(zip(PARAMETERS, pairs, strict=False))
     at_peak = dict(zip(free, np.exp(peak.x).tolist(), strict=True))

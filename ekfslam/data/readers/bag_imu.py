@@ -141,10 +141,7 @@ def imu_of_bag(path: Path) -> InertialRows | None:
 def velocities_of_unit(
     velocities: VelocitySamples, T_imu_base: Array | None, frame: str
 ) -> tuple[VelocitySamples | None, str]:
-    """Return velocities of another body, such as wheels, as those of the inertial unit, and a note.
-
-    ``v_imu = R v + t x R w`` with ``T_imu_base = [R, t]``; None if that is not known.
-    """
+    """Return velocities of a body such as wheels as the unit's, ``R v + t x R w`` with ``T_imu_base``, and a note."""
     if T_imu_base is None:
         return None, f"Velocities are not used: /tf_static does not connect their frame and {printable(frame)}."
     R, t = T_imu_base[:3, :3], T_imu_base[:3, 3]

@@ -1,7 +1,4 @@
-"""Sizes of compressed parts of bags, found before anything is decompressed into memory or to the disk.
-
-A part states its size, but may lie: so it is decompressed piece by piece, and dropped, until the budget is spent.
-"""
+"""Sizes of compressed parts of bags, found piece by piece within the budget before anything is kept."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The course data from 2025 on: a pickled dictionary in .npy, with velocities and two cameras in an IMU frame.
-
-It has tracks (``features``), or images in a second file (``dataset02_imgs.npy`` for ``dataset02.npy``).
-"""
+"""The course data from 2025 on: a pickled dictionary in .npy, with tracks or, in ``dataset02_imgs.npy``, images."""
 
 from __future__ import annotations
 

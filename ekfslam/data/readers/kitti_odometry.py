@@ -1,7 +1,4 @@
-"""The KITTI odometry benchmark: folders of rectified stereo images, and text files of true poses (12 numbers a frame).
-
-A folder has ``image_0 image_1`` (gray) or ``image_2 image_3`` (colour), ``calib.txt`` and ``times.txt``.
-"""
+"""The KITTI odometry benchmark: folders of rectified pairs with ``calib.txt times.txt``, and poses (12 numbers)."""
 
 from __future__ import annotations
 

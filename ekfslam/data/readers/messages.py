@@ -1,7 +1,4 @@
-"""Messages of ROS 1 and ROS 2 bags, and MCAP, by the package rosbags.
-
-Only types of the distributions that rosbags knows are read: of definitions in a bag, rosbags would make code.
-"""
+"""Messages of ROS 1 and ROS 2 bags, and MCAP, by rosbags; only known types: it makes code of others."""
 
 from __future__ import annotations
 

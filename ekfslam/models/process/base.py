@@ -72,7 +72,7 @@ class Process(ABC):
         takes: Kind of the inputs.
         started: Names of the walking blocks that the first inputs start, see `start`.
         estimates_velocity: Whether the inputs measure velocities in the state.
-        has_velocity: Whether a velocity is in the state, so that further sensors can measure it.
+        velocity: Name of the block of the velocity, which further sensors can measure; "" if it is not in the state.
         measures_departure: Whether these measure the state before the step, see `referred`; else that of the interval.
     """
 
@@ -81,7 +81,7 @@ class Process(ABC):
     takes: type[Velocities] | type[InertialSamples] = Velocities
     started: tuple[str, ...] = ()
     estimates_velocity: bool = False
-    has_velocity: bool = False
+    velocity: str = ""
     measures_departure: bool = False
 
     @abstractmethod
@@ -121,7 +121,14 @@ class Process(ABC):
 
     def jacobian(self, measured: Measured) -> Array:
         """Return H (n, body) of measurements by all blocks, which are vectors: ``value = H x + noise``."""
-        raise NotImplementedError(f"{type(self).__name__} has nothing that further sensors could measure")
+        if not self.velocity:
+            raise NotImplementedError(f"{type(self).__name__} has nothing that further sensors could measure")
+        H = np.zeros((len(measured.axis), self.layout.body))
+        H[np.arange(len(H)), self.layout[self.velocity].start + measured.axis] = 1.0
+        for block in self.layout.coupled("velocity"):
+            if (J := block.velocity_offset()) is not None:
+                H[:, self.layout[block.name]] = np.where(measured.is_biased[:, None], J[measured.axis], 0.0)
+        return H
 
     @property
     def columns(self) -> IntArray:

@@ -50,7 +50,8 @@ class Inertial(Process):
 
     own = ("pose", Velocity.name, GyroBias.name, AccelBias.name)
     takes = InertialSamples
-    has_velocity = measures_departure = True
+    velocity = Velocity.name
+    measures_departure = True
 
     @cached_property
     def _g(self) -> Array:
@@ -135,14 +136,6 @@ class Inertial(Process):
             after, g = back @ (u + dt * (sample[3:] - accel_bias + g)), back @ g
             change, u = change + 0.5 * dt * (u + after - 2.0 * first), after
         return replace(measured, value=measured.value - (change / interval.tau_s)[measured.axis])
-
-    def jacobian(self, measured: Measured) -> Array:
-        H = np.zeros((len(measured.axis), self.layout.body))
-        H[np.arange(len(H)), self.layout[Velocity.name].start + measured.axis] = 1.0
-        for block in self.layout.coupled("velocity"):
-            if (J := block.velocity_offset()) is not None:
-                H[:, self.layout[block.name]] = np.where(measured.is_biased[:, None], J[measured.axis], 0.0)
-        return H
 
     def way_m(self, values: Values, interval: Interval | Intervals) -> Array:
         """Return the way at the speed before the interval."""

@@ -126,7 +126,8 @@ class VelocityWalk(VelocityInputs):
     """The velocity is the block `Twist`, which walks; the inputs measure it, or only start it."""
 
     started = (Twist.name,)
-    estimates_velocity = has_velocity = True
+    velocity = Twist.name
+    estimates_velocity = True
 
     @property
     def _depends_on_blocks(self) -> bool:
@@ -158,13 +159,6 @@ class VelocityWalk(VelocityInputs):
             return None
         everything = np.ones(6, dtype=bool)
         return Measured(np.arange(6), mean_velocity(interval), self.noise.twist_std, everything)
-
-    def jacobian(self, measured: Measured) -> Array:
-        H = np.zeros((len(measured.axis), self.layout.body))
-        H[np.arange(len(H)), self.layout[Twist.name].start + measured.axis] = 1.0
-        for block, J in self._offsets:
-            H[:, self.layout[block.name]] = np.where(measured.is_biased[:, None], J[measured.axis], 0.0)
-        return H
 
 
 def mean_velocity(interval: Interval | Intervals) -> Array:

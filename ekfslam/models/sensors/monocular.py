@@ -17,10 +17,7 @@ NEAREST_M = 0.1  # nearer points are those of a turn that is taken for a motion
 
 @dataclass(frozen=True)
 class Monocular:
-    """One camera as a `DelayedSensor`, such as the left one of a rig: of pixels (n, 4) or (n, 2) it takes (uL, vL).
-
-    Scale comes from velocities or inertial samples.
-    """
+    """One camera as a `DelayedSensor`: of pixels (n, 4) or (n, 2) it takes (uL, vL). Scale comes from other inputs."""
 
     camera: StereoCamera  # intrinsics; the baseline is not used
     T_cam_imu: Array  # (4, 4) extrinsics

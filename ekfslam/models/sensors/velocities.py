@@ -9,8 +9,7 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.errors import ConfigError
 from ekfslam.models.process import Measured
-
-AXES = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
+from ekfslam.models.vehicle import AXES
 
 
 @dataclass(frozen=True)

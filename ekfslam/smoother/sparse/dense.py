@@ -1,7 +1,4 @@
-"""The Gaussian of a small system in dense form: that of a window, whose prior couples its first frame and landmarks.
-
-Landmarks without a prior are eliminated by their Schur complements; all other unknowns are one dense matrix.
-"""
+"""The Gaussian of a window in dense form; landmarks without a prior are eliminated by their Schur complements."""
 
 from __future__ import annotations
 
@@ -16,10 +13,7 @@ from ekfslam.smoother.sparse.factors import GROUPS, LinearSystem
 
 
 class DenseInformation:
-    """The Gaussian of a `LinearSystem` whose prior may cover landmarks (n,) ``known``, too; see `JointInformation`.
-
-    ``first.B`` and ``first.zeta`` are over (frame, aux, drive, landmarks with a prior).
-    """
+    """The Gaussian of a `LinearSystem` whose prior ``first`` is of (frame, aux, drive, landmarks (n,) ``known``)."""
 
     def __init__(self, system: LinearSystem, known: IntArray) -> None:
         self._start, self._sizes, counts = system.start, system.sizes, system.counts

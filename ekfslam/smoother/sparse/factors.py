@@ -72,10 +72,7 @@ def concatenated(factors: Sequence[Factor]) -> Factor:
 
 @dataclass(frozen=True)
 class FirstFrame:
-    """Prior of the first frame: ``(eps_0, aux_0) = B zeta`` with ``zeta ~ N(-zeta_hat, I)``.
-
-    Unknowns of the first frame count in units of their prior, so that its covariance ``B B^T`` may be singular.
-    """
+    """Prior of the first frame, ``(eps_0, aux_0) = B zeta`` with ``zeta ~ N(-zeta_hat, I)``; B may be singular."""
 
     B: Array  # (w+a, w+a) root of the covariance
     zeta: Array  # (w+a,) where the system is linearised

@@ -185,10 +185,7 @@ class JointInformation:
         return self._selected.blocks(own, own)[0] if self.structure.counts["drive"] else np.empty((0, 0))
 
     def landmark_covariances(self) -> Array:
-        """Return the marginal covariances (M, 3, 3) of all landmarks, by selected inversion.
-
-        That of an eliminated landmark is ``L^-T (I + sum_kl Y_k Z_kl Y_l^T) L^-1`` over its pairs k and l.
-        """
+        """Return marginals (M, 3, 3) of landmarks, eliminated: ``L^-T (I + sum_kl Y_k Z_kl Y_l^T) L^-1``."""
         s = self.structure
         half = np.zeros_like(self._L_inverse)
         for coupling in s.couplings:

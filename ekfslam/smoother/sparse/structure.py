@@ -68,10 +68,7 @@ class Product:
 
 @dataclass(frozen=True)
 class Coupling:
-    """Couples of unknowns that eliminated landmarks connect, and the pairs (landmark, unknown) that do it.
-
-    Couples are sorted by their numbers of pairs, so that many can be summed in one matrix product.
-    """
+    """Couples of unknowns that eliminated landmarks connect, sorted by number of pairs (landmark, unknown)."""
 
     row: str  # row, column: groups of the unknowns
     column: str
