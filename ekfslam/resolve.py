@@ -40,6 +40,7 @@ from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import MEASURED_KINDS, TWIST_STD, WITHOUT_TRACKS, WITHOUT_VELOCITIES, YAW_STD_PX, Sequence
 from ekfslam.engine.choice import in_words
 from ekfslam.errors import ConfigError, InnovationError, ScaleError
+from ekfslam.filters.result import UNUSED
 from ekfslam.filters.stretches import run_stretches, stretches_of, thinned
 from ekfslam.geometry import se3
 from ekfslam.inertial.motion import in_motion
@@ -155,6 +156,8 @@ def resolve(
     noise, hygiene = noise_of(sequence, config), None
     if text := odometry_text(sequence.measured_axes, noise.twist_std):
         account["odometry"] = text
+    if mode in ("full", "smoothed") and sequence.inertial is not None and not is_inertial(sequence):
+        account[UNUSED] = "inertial samples are not used: velocities over level ground take precedence over them"
     if is_automatic(sequence, config):
         account |= found_attributes(noise_of_velocities(sequence))
     if mode != "dead-reckoning":
@@ -199,10 +202,12 @@ class _Apart:
 
     sequence: Sequence
     config: Config
-    source: VelocitySource
+    source: VelocitySource | None  # None: angular velocities alone
 
     def added_to(self, problem: Problem) -> Problem:
         """Return the problem of the recording alone with the source, and its noise in words."""
+        if self.source is None:
+            return problem
         std = ", ".join(f"{axis} {std:.3g}" for axis, std in zip(self.source.axes, self.source.std, strict=True))
         account = {**problem.account, "beside": f"velocities are measured beside inertial samples: {std} m/s"}
         return dataclasses.replace(problem, beside=self.source, account=account)
@@ -215,8 +220,10 @@ def _apart(sequence: Sequence, config: Config) -> _Apart | None:
     that they have without samples, and their slow bias as a block. Interpolated ones are left out.
     """
     axes = np.flatnonzero(sequence.measured_axes[:3])
-    if sequence.inertial is None or not len(axes) or sequence.velocity_frame != "imu":
+    if sequence.inertial is None or not sequence.has_velocities or sequence.velocity_frame != "imu":
         return None
+    if not len(axes):
+        return _Apart(sequence.once(_without_velocities), config, None)
     wheels = sequence.once(_without_samples)
     std, found = noise_of(wheels, config).velocity_std[axes], noise_of_velocities(wheels, config)
     std = np.where(std > 0, std, automatic_noise(found).velocity_std[axes])

@@ -15,7 +15,7 @@ from ekfslam.data.noise import Noise
 from ekfslam.errors import LostDataError
 from ekfslam.geometry import se3
 from ekfslam.geometry.preintegration import gammas, increments
-from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
+from ekfslam.models.blocks import AccelBias, GyroBias, ImuScale, Velocity
 from ekfslam.models.build import model_of
 from ekfslam.models.process.inertial import inertial
 from ekfslam.models.sensors.stereo import Rig
@@ -266,3 +266,51 @@ def test_the_rate_at_the_image_is_that_of_the_samples_there():
     found = model().process.imu_twist(before, before, INTERVAL)
     np.testing.assert_allclose(found[:3], U)
     np.testing.assert_allclose(found[3:], wave(np.array([0.3021]))[0, :3] - BIAS[:3], atol=2e-4)
+
+
+SCALE = 0.02 * np.random.default_rng(3).normal(size=15)
+
+
+@functools.cache
+def scaled_process():
+    blocks = (Velocity(), GyroBias(), AccelBias(), ImuScale())
+    rig = Rig(CAMERA, T_CAM_IMU, NOISE)
+    return model_of(rig, NOISE, np.eye(4), np.eye(6), None, blocks, make_process=inertial(DENSITIES)).process
+
+
+@pytest.mark.parametrize("T", [POSES["random 1"], POSES["near pi 2"]])
+def test_a_step_with_matrices_of_the_unit_has_the_derivative_of_central_differences(T):
+    process = scaled_process()
+    step = process.step({**values(T), "imu_scale": SCALE}, INTERVAL, T, False)
+
+    def after(x):
+        found = process.step({**values(T), "imu_scale": SCALE + x}, INTERVAL, T, False)
+        return np.concatenate([error_of(found.values, step.values), found.imu_twist])
+
+    by = central(after, 15)
+    np.testing.assert_allclose(step.Phi[:, process.layout["imu_scale"]], by[:15], atol=1e-8 * 20)
+    assert np.linalg.norm(by[18:, :9]) > 1.0  # the rate at the image is that of the corrected samples
+
+
+def test_a_step_with_matrices_of_the_unit_is_one_of_corrected_samples():
+    D_g, D_a = SCALE[:9].reshape(3, 3), np.zeros((3, 3))
+    D_a[np.tril_indices(3)] = SCALE[9:]
+    corrected = np.hstack([INTERVAL.inputs[:, :3] @ (np.eye(3) + D_g).T, INTERVAL.inputs[:, 3:] @ (np.eye(3) + D_a).T])
+    T = POSES["random 0"]
+    found = scaled_process().step({**values(T), "imu_scale": SCALE}, INTERVAL, T, False)
+    expected = model().process.step(values(T), dataclasses.replace(INTERVAL, inputs=corrected), T, False)
+    for name, value in expected.values.items():
+        np.testing.assert_allclose(found.values[name], value, atol=1e-12)
+    np.testing.assert_allclose(found.imu_twist, expected.imu_twist, atol=1e-12)
+
+
+def test_the_residual_with_matrices_of_the_unit_has_the_derivative_of_central_differences():
+    process, before, after = scaled_process(), states(0), states(1)
+
+    def error(x):
+        matrices = np.broadcast_to(SCALE + x, (2, 15))
+        return process.residual(before, {**after, "imu_scale": matrices}, ALL).error.ravel()
+
+    found = process.residual(before, {**after, "imu_scale": np.broadcast_to(SCALE, (2, 15))}, ALL)
+    by_scale = found.by_after[..., process.layout["imu_scale"]].reshape(-1, 15)
+    np.testing.assert_allclose(by_scale, central(error, 15), atol=1e-7)

@@ -11,9 +11,11 @@ from support.gauge import gauge_directions
 
 import ekfslam
 from ekfslam.data.room import Room, simulate_room
+from ekfslam.errors import ConfigError
 from ekfslam.evaluation.consistency import nees, pose_error
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
+from ekfslam.models.build import blocks_and_process
 from ekfslam.resolve import resolve
 from ekfslam.smoother.posterior import smooth
 
@@ -123,3 +125,55 @@ def test_stamps_that_are_late_are_found():
     config = ekfslam.Config().with_overrides({"calibration": {"time_s": 0.01, "rotation_deg": 0.3}})
     found = ekfslam.run(dataclasses.replace(sequence, inputs=(samples,)), "full", config).parameters
     assert found.value[-1, found.name.index("time offset")] == pytest.approx(-0.005, abs=3e-4)
+
+
+def spoiled(sequence, seed):
+    """A recording whose unit has matrices with errors of 1 %, and these errors (15,)."""
+    D = 0.01 * np.random.default_rng(seed).normal(size=15)
+    M_g, M_a = np.eye(3) + D[:9].reshape(3, 3), np.eye(3)
+    M_a[np.tril_indices(3)] += D[9:]
+    samples = sequence.inertial
+    gyro, accel = (np.linalg.solve(M, x.T).T for M, x in ((M_g, samples.gyro_rad_s), (M_a, samples.accel_m_s2)))
+    return dataclasses.replace(sequence, inputs=(dataclasses.replace(samples, gyro_rad_s=gyro, accel_m_s2=accel),)), D
+
+
+SCALED = ekfslam.Config(blocks={"imu_scale": {}})
+
+
+@pytest.mark.slow
+def test_scale_and_misalignment_of_the_unit_are_found_and_leave_errors_as_the_covariance_says():
+    of_poses, of_matrices = [], []
+    for seed in range(2):
+        sequence, D = spoiled(simulate_room(Room(frames=110, seed=seed)), seed)
+        result = ekfslam.run(sequence, "full", SCALED)
+        at = [i for i, name in enumerate(result.parameters.name) if name.startswith(("gyroscope", "accelerometer"))]
+        error, P = pose_error(result.T_world_imu, sequence.truth.T_world_imu)[1:], result.covariance[1:]
+        of_poses.append(nees(error, P + 1e-14 * np.eye(6)).mean())
+        of_matrices.append((((D - result.parameters.value[-1, at]) / result.parameters.std[-1, at]) ** 2).sum())
+        assert result.parameters.std[-1, at].max() < 0.005
+    assert 2.0 < np.mean(of_poses) < 12.0 and 6.0 < np.mean(of_matrices) < 27.0
+
+
+def test_engine_and_reference_filter_agree_on_matrices_of_the_unit():
+    sequence, _ = spoiled(room(20), 0)
+    config = SCALED.with_overrides({"calibration": {"time_s": 0.01}})
+    found = [
+        ekfslam.run(sequence, "full", config.with_overrides({"filter": {"engine": e}})) for e in ("auto", "reference")
+    ]
+    np.testing.assert_allclose(found[0].T_world_imu, found[1].T_world_imu, atol=1e-9)
+    np.testing.assert_allclose(found[0].parameters.value, found[1].parameters.value, atol=1e-9)
+
+
+def test_frozen_steps_with_matrices_of_the_unit_have_the_state_of_the_filter_as_solution():
+    sequence, _ = spoiled(room(), 0)
+    config = dataclasses.replace(FILTER, variant="standard", landmark_coordinates="xyz", retire="never")
+    model = resolve(sequence, SCALED.with_overrides({"filter": {"landmark_coordinates": "xyz"}})).model
+    ekf = JointEKF(model, config)
+    for _ in run_filter(ekf, sequence, range(25)):
+        pass
+    assert_equal_to_frozen_rows(ekf)
+
+
+def test_matrices_of_the_unit_need_samples():
+    with pytest.raises(ConfigError, match="imu_scale needs inertial samples"):
+        blocks_and_process(SCALED.blocks, None)

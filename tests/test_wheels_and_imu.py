@@ -103,6 +103,17 @@ def test_axes_that_are_not_measured_are_not_used():
     assert found.beside.axes == ("v_x",) and found.beside.value.shape == (19, 1)
 
 
+def test_level_velocities_take_precedence_over_samples_and_a_remark_says_so():
+    result = ekfslam.run(dataclasses.replace(with_wheels(room(20)), velocity_frame="level"), "full")
+    assert result.inertial is None and any("inertial samples are not used" in each for each in result.remarks)
+
+
+def test_angular_velocities_alone_are_left_to_the_gyroscope():
+    world = with_wheels(room(20))
+    result = ekfslam.run(dataclasses.replace(world, twist=world.twist * [0, 0, 0, 1, 1, 1]), "full")
+    np.testing.assert_array_equal(result.T_world_imu, ekfslam.run(room(20), "full").T_world_imu)
+
+
 def test_noise_and_slow_bias_of_velocities_are_found_if_nothing_states_them():
     world = dataclasses.replace(with_wheels(room(60)), noise=None)
     found = resolve(world)

@@ -270,7 +270,7 @@ def _blocks(model: Model, places: dict[str, tuple[slice, tuple[int, ...]]]) -> l
 def process_of(model: Model) -> dict[str, Any] | None:
     """Return the process as data; None: it is a class of Python alone."""
     process = model.process
-    if type(process) is Inertial:
+    if type(process) is Inertial and not process.has_scale:
         densities = {name: float(value) for name, value in vars(process.noise).items()}
         return {"kind": "inertial", **densities, "gravity_m_s2": process.gravity_m_s2}
     if type(process) not in (VelocityInputs, VelocityWalk):

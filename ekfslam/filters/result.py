@@ -55,6 +55,7 @@ LINEAR_FROM_PX = 0.1
 _LAST_STD = "std of last position, heading"
 # Attribute with the doubts about a recording and a run, see `ekfslam.evaluation.sanity`.
 SANITY, SANITY_SEPARATOR = "sanity", " | "
+UNUSED = "unused_inputs"  # attribute: why inputs of the recording are not used
 # Attributes of a trajectory of another program: its file, frames without a pose of their own, whether it knows the
 # vertical; see `ekfslam.others`.
 OTHER, OTHER_MISSING, OTHER_LEVEL = "other", "other_missing", "other_level"
@@ -453,5 +454,6 @@ class Result(Shown):
                 f"pixel noise of {finest_px:.2g} px is less than the errors of linearisation: the filter's covariances "
                 "are too small, those of the mode smoothed hold"
             )
+        remarks += [str(self.attributes[UNUSED])] if UNUSED in self.attributes else []
         kept = str(self.attributes.get(SANITY, ""))
         return (*remarks, *(kept.split(SANITY_SEPARATOR) if kept else ()))

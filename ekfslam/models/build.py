@@ -15,6 +15,7 @@ from ekfslam.errors import ConfigError
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.models.blocks import OPTIONAL_BLOCKS, Anchor, Calibration, Pose, PreviousView, StateBlock, Twist, Up, View
 from ekfslam.models.blocks.calibration import prior_std
+from ekfslam.models.blocks.imu_scale import ImuScale
 from ekfslam.models.model import Model
 from ekfslam.models.process import INERTIAL_BLOCKS, MakeProcess
 from ekfslam.models.process.inertial import GRAVITY_M_S2, inertial
@@ -108,6 +109,8 @@ def blocks_and_process(
 ) -> tuple[tuple[StateBlock, ...], MakeProcess]:
     """Return the blocks of the tables ``[blocks.<name>]``, and the process: inertial if densities are given."""
     if densities is None:
+        if ImuScale.name in tables:
+            raise ConfigError(f"blocks.{ImuScale.name} needs inertial samples that move the state")
         return optional_blocks(tables), velocities
     tables = {name: {} for name in INERTIAL_BLOCKS} | dict(tables)
     return optional_blocks(tables, OPTIONAL_BLOCKS | INERTIAL_BLOCKS), inertial(densities, gravity_m_s2)

@@ -15,7 +15,7 @@ from ekfslam.arrays import Array
 from ekfslam.data.inputs import InertialNoise, InertialSamples
 from ekfslam.data.sequence import Sequence
 from ekfslam.geometry import se3
-from ekfslam.models.blocks import AccelBias, GyroBias, StateBlock, Velocity
+from ekfslam.models.blocks import AccelBias, GyroBias, ImuScale, StateBlock, Velocity
 from ekfslam.models.model import Model
 
 TILT_RAD = 0.3  # prior standard deviation before the accelerometer has seen gravity, each axis
@@ -68,6 +68,7 @@ class FirstPrior:
     gyro_bias_std_rad_s: float  # gyro_bias_std_rad_s, accel_bias_std_m_s2: of the biases, each axis, whose means are 0
     accel_bias_std_m_s2: float
     gravity_m_s2: float  # magnitude of gravity
+    accel_scale_std: float = 0.0  # of the entries of the accelerometer's matrix, see `ImuScale`
 
     @staticmethod
     def of(T_world_imu: Array, model: Model, gravity_m_s2: float) -> FirstPrior:
@@ -77,7 +78,10 @@ class FirstPrior:
             [pose.prior_covariance()[0, 0], pose.prior_covariance()[3, 3]]
             + [block.prior_covariance()[0, 0] for block in (gyro, accel)]
         ).tolist()
-        return FirstPrior(T_world_imu, position, heading, gyro_std, accel_std, gravity_m_s2)
+        scale = 0.0
+        if ImuScale.name in model.layout:
+            scale = float(np.sqrt(model.layout.block(ImuScale.name).prior_covariance()[9:, 9:].max()))
+        return FirstPrior(T_world_imu, position, heading, gyro_std, accel_std, gravity_m_s2, scale)
 
     def levelled(self, up: Array) -> Array:
         """Return ``T_imu_world`` (4, 4), turned least so that a unit vector (3,) of the IMU frame is up in world."""
@@ -114,7 +118,7 @@ def at_rest(
     H, residual = np.zeros((6, 15)), np.concatenate([mean[:3], f - (g + longer) * up])
     H[:3, DBG], H[3:, DBA], H[3:, THETA] = np.eye(3), np.eye(3), -se3.skew(g * up)
     R = np.diag(np.repeat(variance, 3))
-    R[3:, 3:] += longer**2 * np.eye(3)
+    R[3:, 3:] += (longer**2 + (prior.accel_scale_std * g) ** 2) * np.eye(3)
     K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
     found, I_KH = K @ residual, np.eye(15) - K @ H
     P = I_KH @ P @ I_KH.T + K @ R @ K.T

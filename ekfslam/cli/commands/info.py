@@ -17,6 +17,7 @@ from ekfslam.evaluation.consistency import interpolated_frames
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.sources import compare_sources, in_words
 from ekfslam.evaluation.truth import with_truth_noise
+from ekfslam.filters.result import UNUSED
 from ekfslam.provenance import in_words as made_by
 from ekfslam.reports import details
 from ekfslam.resolve import noise_of_velocities, resolve
@@ -115,6 +116,8 @@ def _print_findings(sequence: Sequence) -> None:
     for name in ("odometry", "beside"):
         if name in problem.account:
             print(f"{name:13s} {problem.account[name]}")
+    if UNUSED in problem.account:
+        print(f"warning       {problem.account[UNUSED]}")
     if "inertial_start" in problem.account:
         print(f"densities     {problem.account['inertial_noise']}")
         print(f"start         {problem.account['inertial_start']}")

@@ -3,6 +3,7 @@
 from ekfslam.models.blocks.base import OPTIONAL_BLOCKS, Layout, StateBlock, Values, optional_block
 from ekfslam.models.blocks.calibration import Calibration
 from ekfslam.models.blocks.camera_jitter import CameraJitter
+from ekfslam.models.blocks.imu_scale import ImuScale
 from ekfslam.models.blocks.inertial import AccelBias, GyroBias, Velocity
 from ekfslam.models.blocks.pose import Pose
 from ekfslam.models.blocks.twist import Twist
@@ -18,6 +19,7 @@ __all__ = [
     "Calibration",
     "CameraJitter",
     "GyroBias",
+    "ImuScale",
     "Layout",
     "Pose",
     "PreviousView",
