@@ -52,7 +52,6 @@ from ekfslam.models.model import Model
 from ekfslam.models.noise import (
     CAMERA_ROTATION_DEG,
     MIN_DISPARITY_SIGMA,
-    MONOCULAR_PIXEL_STD_PX,
     VELOCITY_STD,
     VelocityNoise,
     automatic_noise,
@@ -142,7 +141,7 @@ def resolve(
     Dead reckoning needs no clean tracks; only the joint filter needs the track scale. ``blocks`` are state blocks in
     addition to those of the configuration and the automatic model.
     """
-    config = _with_white_tracks(sequence, config or Config())
+    config = config or Config()
     if mode in ("full", "smoothed") and (apart := _apart(sequence, config)) is not None:
         return apart.added_to(resolve(apart.sequence, apart.config, mode, blocks))
     sequence = recording = sequence.once(with_odometry)
@@ -163,10 +162,8 @@ def resolve(
     if mode != "dead-reckoning":
         sequence, hygiene = _cleaned(sequence, config, noise)
     if is_inertial(sequence):
-        if mode in ("full", "smoothed") and _has_open_scale(sequence, config):
-            config = config.with_overrides({"noise": {"track_scale": PERSISTENCE}})
-            noise = noise_of(sequence, config)
-        config, text = with_densities(sequence, config, mode in ("full", "smoothed"))
+        config, text = _with_inertial_noise(sequence, config, mode in ("full", "smoothed"))
+        noise = noise_of(sequence, config)
         account |= {"inertial_noise": text, **{f"inertial_{key}": x for key, x in vars(densities_of(config)).items()}}
     model = _model(sequence, config, noise, blocks)
     if is_inertial(sequence):
@@ -270,12 +267,6 @@ def with_odometry(sequence: Sequence) -> Sequence:
     return dataclasses.replace(sequence, attributes={**sequence.attributes, "velocities": kind}).with_velocities(twist)
 
 
-def _with_white_tracks(sequence: Sequence, config: Config) -> Config:
-    """Return a configuration with white errors of tracks for one camera: the model of walking ones is that of a rig."""
-    is_open = sequence.camera.is_monocular and config.noise.drift is None
-    return config.with_overrides({"noise": {"drift": 0.0}}) if is_open else config
-
-
 def _require_scale(sequence: Sequence) -> None:
     """Raise `ScaleError` if nothing tells the scale of a recording of one camera."""
     if sequence.inertial is None and not sequence.measured_axes[:3].any():
@@ -317,7 +308,7 @@ def settings_of(sequence: Sequence, config: Config) -> Config:
     if config.calibration.disparity_px is None and (yaw_px := sequence.attributes.get(YAW_STD_PX)) is not None:
         config = config.with_overrides({"calibration": {"disparity_px": float(yaw_px)}})
     tables = shared_errors(found, sequence.has_checked_tracks)
-    if is_white:
+    if is_white or sequence.camera.is_monocular:
         tables = {name: table for name, table in tables.items() if OPTIONAL_BLOCKS[name].coupling == "velocity"}
     if found is not None and not found.measured.all():
         bias = tables[TwistBias.name]
@@ -334,8 +325,6 @@ def noise_of(sequence: Sequence, config: Config) -> Noise:
         stated = automatic_noise(found, sequence.velocity_frame, sequence.has_checked_tracks)
     else:
         stated = sequence.noise or Noise.isotropic(0.05, 0.001, 1.0)
-    if sequence.camera.is_monocular and sequence.noise is None:
-        stated = dataclasses.replace(stated, pixel_std_px=np.full(4, MONOCULAR_PIXEL_STD_PX))
     if not sequence.has_velocities:
         stated = vision_noise(stated, sequence.twist)
     if is_inertial(sequence):
@@ -461,11 +450,22 @@ def _model(sequence: Sequence, config: Config, noise: Noise, blocks: SequenceTyp
     )
 
 
-def with_densities(sequence: Sequence, config: Config, is_searched: bool = True) -> tuple[Config, str]:
+def _with_inertial_noise(sequence: Sequence, config: Config, is_searched: bool) -> tuple[Config, str]:
+    """Return a configuration with track scale and densities of an inertial recording, and where these come from."""
+    by_frame = config
+    if is_searched and _has_open_scale(sequence, config):
+        config = config.with_overrides({"noise": {"track_scale": PERSISTENCE}})
+    # Innovations of one camera see its errors from one frame to the next: larger ones would hide those of the unit.
+    searched = by_frame if sequence.camera.is_monocular else config
+    return with_densities(sequence, config, searched if is_searched else None)
+
+
+def with_densities(sequence: Sequence, config: Config, searched: Config | None) -> tuple[Config, str]:
     """Return a configuration with the densities of an inertial unit, and where they come from.
 
     They are the configuration's, else those that the recording states. If it states none, or its samples are noisier by
-    far, those are searched by which innovations are likeliest (`ekfslam.inertial.noise`).
+    far, those are taken by which innovations are likeliest (`ekfslam.inertial.noise`), with the other settings of
+    ``searched`` if it is given.
     """
     samples, given = sequence.inertial, vars(config.inertial)
     assert samples is not None
@@ -475,8 +475,8 @@ def with_densities(sequence: Sequence, config: Config, is_searched: bool = True)
     found = None
     if samples.noise is not None and not is_refuted(samples):
         found = Densities(samples.noise, "as stated")
-    elif is_searched:
-        found = _likeliest_densities(sequence, config)
+    elif searched is not None:
+        found = _likeliest_densities(sequence, searched)
     if found is None:
         found = Densities(from_differences(samples), "from differences of samples: no stretch shows them otherwise")
     return config.with_overrides({"inertial": {name: getattr(found.noise, name) for name in missing}}), found.text

@@ -15,6 +15,7 @@ from ekfslam.errors import CalibrationError, ConfigError, ScaleError, ShapeError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.filters.standing import STILL_PX, moved_px
+from ekfslam.geometry import se3
 from ekfslam.geometry.camera import T_CAM_BODY, StereoCamera
 from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
 from ekfslam.models.build import model_of
@@ -105,6 +106,60 @@ def test_a_room_has_one_camera_or_two():
 def test_one_camera_in_motion_from_the_first_frame_on_is_refused():
     with pytest.raises(ScaleError, match="begin at rest"):
         ekfslam.run(room(100)[60:])
+
+
+# --- errors of tracks that walk ---------------------------------------------------------------------------------------
+
+
+def walking(sequence, step_px=0.2, seed=0):
+    """The recording with errors of tracks that walk, and without a statement of its noise."""
+    o, rng = sequence.observations, np.random.default_rng(seed)
+    steps = step_px * rng.normal(size=(len(sequence), len(o.ids), 2))
+    error = np.cumsum(steps, axis=0)[o.frame, np.searchsorted(o.ids, o.landmark)]
+    return replace(sequence, observations=replace(o, pixels_px=o.pixels_px + error), noise=None)
+
+
+def test_errors_of_tracks_that_walk_are_the_same_in_both_filters():
+    results = []
+    for engine in ("engine", "reference"):
+        config = ekfslam.Config().with_overrides({"filter": {"engine": engine}, "noise": {"drift": 0.2}})
+        config = config.with_overrides({"inertial": vars(DENSITIES)})
+        results.append(ekfslam.run(walking(room(60, sigma_px=0.05)), config=config))
+    one, other = results
+    assert one.noise.track_walk_px is not None and one.counts["accepted"] > 100
+    np.testing.assert_allclose(one.T_world_imu, other.T_world_imu, atol=1e-8)
+    np.testing.assert_allclose(one.covariance, other.covariance, atol=1e-10)
+
+
+@pytest.mark.parametrize("engine", ["engine", "reference"])
+def test_a_first_depth_has_the_error_that_both_views_of_a_track_share(engine):
+    noise = replace(
+        ekfslam.Noise.isotropic(1e-7, 1e-7, 1.0),
+        track_first_px=np.full(3, 0.3),
+        track_walk_px=np.full(3, 0.5),
+        track_flow_px=20.0,
+    )
+    sensor = Monocular(ONE, T_CAM_BODY, noise)
+    config = FilterConfig(gate_probability=1.0, engine=engine)
+    ekf = JointEKF(model_of(sensor, noise, np.eye(4), 1e-14 * np.eye(6)), config)
+    points = np.array([[4.0, 0.3, 0.2], [5.0, -0.8, 0.1], [4.5, 0.5, -0.4]])  # ahead, left, up
+    cameras = [T_CAM_BODY @ se3.inverse(se3.transform(np.eye(3), np.array([0.0, 0.1 * k, 0.0]))) for k in range(4)]
+    views = [sensor.predict(se3.apply(W, points)) for W in cameras]
+    for k, rows in enumerate(views):
+        if k:
+            ekf.predict(np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]), 1.0)
+        ekf.update(k, np.arange(3), rows)
+        if len(ekf.ids):
+            break
+    assert k > 1 and len(ekf.ids) == 3
+    found = ekf.landmarks()
+    for i, at in zip(ekf.ids, found.position_m, strict=True):
+        J = np.vstack([sensor.jacobian(se3.apply(W, at[None]))[0] @ W[:3, :3] for W in (cameras[0], cameras[k])])
+        square = ((views[k] - views[0])[i] / k) ** 2
+        step = k * 0.25 * (1.0 + (0.65 * square + 0.35 * square.sum()) / 400.0)
+        V = np.block([[0.09 * np.eye(2), 0.09 * np.eye(2)], [0.09 * np.eye(2), 0.09 * np.eye(2) + np.diag(step)]])
+        expected = np.linalg.inv(J.T @ np.linalg.inv(V) @ J)
+        np.testing.assert_allclose(found.covariance[list(ekf.ids).index(i)], expected, rtol=1e-3, atol=1e-9)
 
 
 # --- standing still ---------------------------------------------------------------------------------------------------

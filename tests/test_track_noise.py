@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ekfslam.config import Config
-from ekfslam.data.sequence import Observations, Sequence
+from ekfslam.data.room import Room, simulate_room
+from ekfslam.data.sequence import Observations, Sequence, of_left_camera
 from ekfslam.data.simulate import builtin
 from ekfslam.evaluation.sanity import inspect_result
 from ekfslam.evaluation.trajectory import absolute_trajectory_error
@@ -193,3 +194,31 @@ def test_a_large_share_of_moving_tracks_is_a_symptom():
     moving = {**result.counts, "rejected: moving": len(sequence.observations) // 3}
     (line,) = inspect_result(sequence, dataclasses.replace(result, counts=moving), ())
     assert "dropped as moving" in line and "traffic, or" in line
+
+
+# --- one camera -------------------------------------------------------------------------------------------------------
+
+
+def of_one_camera(*errors, **changes):
+    return of_left_camera(seen(CAMERA, *errors, frames=120, **changes))
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_white_errors_of_one_camera_are_found(moves):
+    found = track_noise(of_one_camera(0.5, 0.0, moves=moves))
+    assert found.is_white and found.sigma_px == pytest.approx(0.5, rel=0.1)
+
+
+def test_white_errors_of_one_camera_are_found_beside_motion_that_changes():
+    sigma = [track_noise(simulate_room(Room(frames=100, cameras=1, seed=seed))).sigma_px for seed in range(2)]
+    assert np.mean(sigma) == pytest.approx(1.0, rel=0.12)
+
+
+@pytest.mark.parametrize("persists", [0.0, 0.6])
+def test_errors_of_one_camera_that_walk_are_not_white(persists):
+    found = track_noise(of_one_camera(0.0, 0.1, persists=persists))
+    assert not found.is_white and "walk" in found.text
+
+
+def test_few_tracks_of_one_camera_tell_nothing():
+    assert track_noise(of_one_camera(0.5, 0.0, tracks=6)) is None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -56,15 +56,20 @@ class TrackError:
     # Way of the camera, as a share of the depth, at which the variance of the walk has doubled.
     parallax: float = np.inf
 
-    def step_variance(self, motion_px: Array, parallax: Array) -> Array:
-        """Return the variances (n, 3) of differences from the frame before.
+    def step_variance(self, motion_px: Array, parallax: Array, frames: int = 1) -> Array:
+        """Return the variances (n, d) of differences from the frame before, or from one some frames before.
 
-        The error of a row grows with its own motion (n, 3) px, and with the share `ACROSS` of the others'; ``parallax``
-        (n,) is the way of the camera over the depth.
+        The error of a row grows with its own motion (n, d) px, and with the share `ACROSS` of the others'; ``parallax``
+        (n,) is the way of the camera over the depth. Over several frames the motion is taken as even.
         """
-        square = np.asarray(motion_px) ** 2
+        square = (np.asarray(motion_px) / frames) ** 2
         flow = (1.0 - ACROSS) * square + ACROSS * square.sum(axis=1, keepdims=True)
-        return self.walk_std**2 * (1.0 + flow / self.flow_px**2 + (parallax[:, None] / self.parallax) ** 2)
+        way = parallax[:, None] / frames
+        return frames * self.walk_std**2 * (1.0 + flow / self.flow_px**2 + (way / self.parallax) ** 2)
+
+    def of_rows(self, dimension: int) -> TrackError:
+        """Return the error of the first rows of a sensor: those of one camera are (u, v)."""
+        return replace(self, first_std=self.first_std[:dimension], walk_std=self.walk_std[:dimension])
 
     def absolute_variance(self, age: IntArray) -> Array:
         """Return variances (n, 3) of observations that follow none: the spread of tracks of this age (n,)."""

@@ -176,7 +176,7 @@ nb::object report_of(const Report& report, const Filter& filter) {
     packed.add(taken.imu_twist);
     packed.add_beside({&taken.rows, &taken.variance, &taken.position_m});
     if (count) packed.add_beside({&begun.rows, &begun.variance, &begun.position_m});
-    packed.add(begun.rows_before);
+    if (begun.step_before >= 0) packed.add_beside({&begun.rows_before, &begun.variance_before});
     packed.add(innovations.score);
     packed.add(innovations.information);
     packed.add_beside({&innovations.alone, &innovations.apart});

@@ -30,7 +30,10 @@ struct Tried {
 };
 
 // Whether tracks are tested for motion: if they have errors, from the second frame on.
-bool judges_motion(const Estimate& e) { return e.track_error && e.motion.tau_s > 0; }
+// For one camera a wrong depth looks like a motion along the way.
+bool judges_motion(const Estimate& e) {
+    return e.track_error && e.motion.tau_s > 0 && e.sensor.type == Sensor::rig;
+}
 
 // The last step of the rig in world.
 Vector3 last_step(const Estimate& e) {

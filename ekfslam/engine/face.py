@@ -50,7 +50,7 @@ class Engine:
         self._places = _places(model.layout.blocks, model.initial_values())
         self._numbers = max(at.stop for at, _ in self._places.values())
         self._camera = [block for block in model.layout.blocks if block.coupling == "camera"]
-        error = model.track_error
+        error = model.noise.track_error
         self.filter = Filter(
             _blocks(model, self._places),
             _sensor(model.sensor),

@@ -24,7 +24,7 @@ struct Begun {
     Ids ids;
     Matrix position_m, rows, variance;  // (3, j), (d, j), (d, j)
     Index step_before = -1;             // of a first view that waited for this one, with rows (d, j); -1: there is none
-    Matrix rows_before;
+    Matrix rows_before, variance_before;
 };
 
 // What a frame did: everything that the log, the books on retired landmarks, and `FrameReport` take in.

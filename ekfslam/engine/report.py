@@ -42,9 +42,9 @@ class Report(NamedTuple):
     updated: Array  # updated, updated_coordinates: after the correction, before new landmarks start
     updated_coordinates: Array
     begun: IntArray  # (j,) ids of new landmarks
-    # step_before, rows_before: Frame of the log and rows of their first view that waited for this one; -1: none.
+    # step_before, before: Frame of the log, rows and variances of a first view that waited for this one; -1: none.
     step_before: int
-    rows_before: Array
+    before: Array
     values: Array  # values, coordinates, imu_twist: at the end
     coordinates: Array
     imu_twist: Array
@@ -102,7 +102,7 @@ def report(found: tuple[Any, ...], values: int, body: int, dimension: int) -> Re
     flat, updated, linear = real(values), real(values), real(values)
     coordinates, updated_coordinates, linear_coordinates = real(body), real(body), real(body)
     imu_twist, linear_twist, numbers = real(6), real(6), parts.rows(logged, 2 * d + 3)
-    rows_before = parts.rows(begun if step_before >= 0 else 0, d)
+    before = parts.rows(begun if step_before >= 0 else 0, 2 * d)
     score, information, white = real(6), parts.rows(6, 6), parts.rows(whitened, 2 * d)
     return Report(
         [parts.gone(*part) for part in gone],
@@ -124,7 +124,7 @@ def report(found: tuple[Any, ...], values: int, body: int, dimension: int) -> Re
         updated_coordinates,
         begun_ids,
         step_before,
-        rows_before,
+        before,
         flat,
         coordinates,
         imu_twist,

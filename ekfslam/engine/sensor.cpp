@@ -84,12 +84,13 @@ Sensor::Triangulated Sensor::triangulate(const Vector3& rows_anchor, const Vecto
     return {0.5 * (origin + s * a + t * b), sine_square > least * least && s > NEAREST_M && t > NEAREST_M};
 }
 
-Vector3 TrackError::step_variance(const Vector3& motion_px, double parallax_seen) const {
-    const Vector3 square = motion_px.cwiseAbs2();
+Vector3 TrackError::step_variance(const Vector3& motion_px, double parallax_seen, Index frames) const {
+    const auto count = static_cast<double>(frames);
+    const Vector3 square = (motion_px / count).cwiseAbs2();
     const Vector3 flow = (1.0 - ACROSS) * square + Vector3::Constant(ACROSS * square.sum());
-    const double by_parallax = parallax_seen / parallax;
+    const double by_parallax = parallax_seen / count / parallax;
     const Vector3 growth = flow / (flow_px * flow_px) + Vector3::Constant(1.0 + by_parallax * by_parallax);
-    return walk_std.cwiseAbs2().cwiseProduct(growth);
+    return count * walk_std.cwiseAbs2().cwiseProduct(growth);
 }
 
 Vector3 TrackError::absolute_variance(Index age) const {

@@ -60,8 +60,8 @@ struct TrackError {
     Vector3 first_std = Vector3::Zero(), walk_std = Vector3::Zero();
     double flow_px = std::numeric_limits<double>::infinity(), parallax = std::numeric_limits<double>::infinity();
 
-    // Of a difference from the frame before: motion of the rows, and way of the camera over the depth.
-    Vector3 step_variance(const Vector3& motion_px, double parallax_seen) const;
+    // Of a difference from some frames before: motion of the rows, and way of the camera over the depth.
+    Vector3 step_variance(const Vector3& motion_px, double parallax_seen, Index frames = 1) const;
     // Of an observation without a predecessor in the frame before, by the age of the track in frames.
     Vector3 absolute_variance(Index age) const;
 };

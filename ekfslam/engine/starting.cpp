@@ -11,6 +11,9 @@ namespace ekfslam {
 
 namespace {
 
+// Standard deviation of a first depth by the noise of two views, as a share of the depth, up to which they are enough.
+constexpr double LARGEST_DEPTH_ERROR = 0.1;
+
 Matrix4 view_of(const Estimate& e) {
     return e.columns.view >= 0 ? e.values.view() : camera_pose(e, e.values, e.imu_twist, false);
 }
@@ -85,23 +88,47 @@ struct Pair {
     ByViews by_views;  // Q^T H_x
     Vector4 residual;  // Q^T r
     Matrix3 R_inverse;
+    Vector4 variance;  // of the rows of both views
 };
 
 Vector3 padded(const Matrix& rows, Index i) { return {rows(0, i), rows(1, i), 0.0}; }
 
-void split(const Estimate& e, const Matrix4& anchor, const Matrix4& view, Pair& pair) {
+// Variances of the rows of both views. If tracks have errors, the second ones are those of a difference.
+Vector4 variances(const Estimate& e, const Matrix4& anchor, const Matrix4& view, const Pair& pair, Index frames) {
+    Vector4 out;
+    if (e.track_error) {
+        const double way_m = se3::translation(view * se3::inverse(anchor)).norm();
+        const double depth_m = std::max(se3::apply(view, pair.position).z(), e.config.min_depth_m);
+        const Vector3 step = e.track_error->step_variance(pair.now - pair.then, way_m / depth_m, frames);
+        out << e.track_error->absolute_variance(0).head<2>(), step.head<2>();
+    } else {
+        out << e.sensor.variance_px2.head<2>(), e.sensor.variance_px2.head<2>();
+    }
+    return out;
+}
+
+void split(const Estimate& e, const Matrix4& anchor, const Matrix4& view, Index frames, Pair& pair) {
     Matrix43 H_m;
     ByViews H_x = ByViews::Zero();
     Vector4 r;
     for (const Index part : {0, 1}) {
         const Matrix4& W = part == 0 ? anchor : view;
         const Vector3 q = se3::apply(W, pair.position), rows = part == 0 ? pair.then : pair.now;
-        const Eigen::Array2d scale = e.sensor.variance_px2.head<2>().array().rsqrt();
-        const Eigen::Matrix<double, 2, 3> A = scale.matrix().asDiagonal() * e.sensor.jacobian(q).topRows<2>();
+        const Eigen::Matrix<double, 2, 3> A = e.sensor.jacobian(q).topRows<2>();
         H_m.middleRows<2>(2 * part) = A * se3::rotation(W);
         H_x.block<2, 6>(2 * part, 6 * part) = A * se3::by_frame(q);
-        r.segment<2>(2 * part) = scale * (rows - e.sensor.predict(q)).head<2>().array();
+        r.segment<2>(2 * part) = (rows - e.sensor.predict(q)).head<2>();
     }
+    if (e.track_error) {  // eq. (10)
+        H_m.bottomRows<2>() -= H_m.topRows<2>();
+        H_x.bottomRows<2>() -= H_x.topRows<2>();
+        r.tail<2>() -= r.head<2>();
+    }
+    pair.variance = variances(e, anchor, view, pair, frames);
+    const Vector4 scale = pair.variance.array().rsqrt();
+    H_m = scale.asDiagonal() * H_m;
+    H_x = scale.asDiagonal() * H_x;
+    r = scale.asDiagonal() * r;
     const Eigen::HouseholderQR<Matrix43> qr(H_m);
     const Matrix4 Q = qr.householderQ();
     pair.R_inverse = Matrix3((Q.transpose() * H_m).topRows<3>().triangularView<Eigen::Upper>()).inverse();
@@ -127,7 +154,7 @@ void initialise(Estimate& e, Index frame, const Ids& ids, const std::vector<Pair
     Matrix G = Matrix::Zero(lead.width, 3 * k);
     std::vector<Matrix3> covariance;
     Ids started;
-    for (Matrix* rows : {&out.rows_before, &out.rows}) rows->resize(2, k);
+    for (Matrix* rows : {&out.rows_before, &out.rows, &out.variance_before, &out.variance}) rows->resize(2, k);
     out.position_m.resize(3, k);
     for (Index j = 0; j < k; ++j) {
         const Pair& pair = pairs[j];
@@ -138,10 +165,11 @@ void initialise(Estimate& e, Index frame, const Ids& ids, const std::vector<Pair
         started.push_back(ids[pair.which]);
         out.rows_before.col(j) = pair.then.head<2>();
         out.rows.col(j) = pair.now.head<2>();
+        out.variance_before.col(j) = pair.variance.head<2>();
+        out.variance.col(j) = pair.variance.tail<2>();
         out.position_m.col(j) = pair.position + pair.R_inverse * pair.residual.head<3>();
         out.which[pair.which] = true;
     }
-    out.variance = e.sensor.variance(k);
     e.gaussian.augment(G, covariance);
     enter(e, frame, started, out.position_m, out.rows, 2);
 }
@@ -159,14 +187,16 @@ Started Waiting::start(Estimate& e, Index frame, const Ids& ids, const Matrix& r
     for (Index i = 0; i < rows.cols(); ++i) {
         const auto found = std::find(ids_.begin(), ids_.end(), ids[i]);
         if (found == ids_.end()) continue;
-        Pair pair{i, padded(rows_, found - ids_.begin()), padded(rows, i), {}, {}, {}, {}};
+        Pair pair{i, padded(rows_, found - ids_.begin()), padded(rows, i), {}, {}, {}, {}, {}};
         const auto seen = e.sensor.triangulate(pair.then, pair.now, view * se3::inverse(anchor));
         if (!seen.is_ready) continue;
         pair.position = se3::apply(se3::inverse(view), seen.q);
-        split(e, anchor, view, pair);
+        split(e, anchor, view, e.step - step_, pair);
         const Matrix H = rest(e, {pair});
         const double S = (H * P.topLeftCorner(e.columns.body, e.columns.body) * H.transpose())(0, 0) + 1.0;
         if (!(S > 0)) throw Error("the covariance of two views is not positive definite");
+        const double depth_std_m = (view.block<1, 3>(2, 0) * pair.R_inverse).norm();
+        if (depth_std_m > LARGEST_DEPTH_ERROR * seen.q.z()) continue;
         if (pair.residual[3] * pair.residual[3] / S <= e.config.waiting_gate) inside.push_back(pair);
     }
     if (!inside.empty()) {

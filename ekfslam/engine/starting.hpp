@@ -11,7 +11,7 @@ struct Started {
     Matrix position_m;        // (3, j)
     Matrix rows, variance;    // (d, j) in this frame
     Index step_before = -1;   // of the anchor, where two views start a landmark
-    Matrix rows_before;       // (d, j) at the anchor
+    Matrix rows_before, variance_before;  // (d, j) at the anchor
 };
 
 // Append landmarks for new tracks with rows (d, n) to table and covariance. The caller's log gives them `log_row` and

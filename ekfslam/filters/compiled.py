@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
@@ -56,9 +58,10 @@ def update(
         begun = observed[known:]
         log.entered(found.begun, begun.numbers[:, -3:])
         if waited:
-            d = e.sensor.dimension
-            numbers = np.hstack([found.rows_before, begun.numbers[:, d:]])
+            numbers = np.hstack([found.before, begun.numbers[:, -3:]])
             log.observed(found.step_before, Accepted(begun.landmark, begun.previous, numbers))
+            if e.model.track_error is not None:  # the second view counts by its difference from the first
+                begun = replace(begun, previous=log.last(len(begun.landmark)))
             log.observed(e.step, begun)
         retired.start_again(found.begun)
     e.values, e.coordinates, e.imu_twist = engine.named(found.values), found.coordinates, found.imu_twist

@@ -14,7 +14,7 @@ from ekfslam.filters.innovations import FrameInnovations, innovations_of
 from ekfslam.filters.observing import observe
 from ekfslam.filters.retraction import carried_back, parts, retracted
 from ekfslam.models.observer import Projected
-from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, MOVING
+from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, MOVING, DelayedSensor
 
 # Largest variance of an innovation, in those of the measurement, at which linearising still means anything.
 _MOST_BLURRED = 1e8
@@ -181,8 +181,11 @@ def _gate_by_others(
 
 
 def _judges_motion(e: Estimate) -> bool:
-    """Return whether tracks are tested for motion: if they have errors, from the second frame on."""
-    return e.model.track_error is not None and e.motion.tau_s > 0
+    """Return whether tracks are tested for motion: if they have errors, from the second frame on.
+
+    For one camera a wrong depth looks like a motion along the way.
+    """
+    return e.model.track_error is not None and e.motion.tau_s > 0 and not isinstance(e.sensor, DelayedSensor)
 
 
 def _motion(e: Estimate, seen: Projected, some: IntArray) -> Array:

@@ -135,11 +135,17 @@ class LogBook:
             T_linear_before=before,
         )
 
-    def started(self, ids: IntArray, positions_m: Array, *views: tuple[int, Array, Array]) -> IntArray:
-        """Add landmarks (n,) with views (frame, rows, variances) that initialised them; return rows of the log."""
-        at = self.entered(ids, positions_m)
+    def started(
+        self, ids: IntArray, positions_m: Array, *views: tuple[int, Array, Array], follows: bool = False
+    ) -> IntArray:
+        """Add landmarks (n,) with views (frame, rows, variances) that initialised them; return rows of the log.
+
+        If ``follows``, a second view counts by its difference from the first.
+        """
+        at, previous = self.entered(ids, positions_m), np.full(len(ids), -1)
         for step, rows, variance in views:
-            self.observed(step, Accepted(at, np.full(len(ids), -1), np.hstack([rows, variance, positions_m])))
+            self.observed(step, Accepted(at, previous, np.hstack([rows, variance, positions_m])))
+            previous = self.last(len(ids)) if follows else previous
         return at
 
     def entered(self, ids: IntArray, positions_m: Array) -> IntArray:

@@ -23,6 +23,9 @@ from ekfslam.geometry import se3
 from ekfslam.models.blocks import Anchor
 from ekfslam.models.sensors.base import DelayedSensor
 
+# Standard deviation of a first depth by the noise of two views, as a share of the depth, up to which they are enough.
+LARGEST_DEPTH_ERROR = 0.1
+
 
 def start(e: Estimate, log: LogBook, frame: int, ids: IntArray, rows: Array) -> BoolArray:
     """Append new landmarks with their full cross-covariance, eq. (5), given tracks (n,) that are not in the state.
@@ -55,7 +58,7 @@ class Waiting:
     def start(self, e: Estimate, log: LogBook, frame: int, ids: IntArray, rows: Array) -> BoolArray:
         """Append the landmarks that two views initialise; arguments and result as of the function `start`."""
         which, then, position = self._triangulated(e, ids, rows)
-        H_x, H_m, r = self._views(e, position, then, rows[which])
+        H_x, H_m, r, variance = self._views(e, position, then, rows[which])
         Q, R = np.linalg.qr(H_m, mode="complete")
         R_inverse = np.linalg.inv(R[:, :3])
         by_state, by_rows = Q.swapaxes(1, 2) @ H_x, (Q.swapaxes(1, 2) @ r[..., None])[..., 0]
@@ -64,6 +67,12 @@ class Waiting:
         S = rest_H @ e.gaussian.body_covariance[:seen, :seen] @ rest_H.swapaxes(1, 2) + np.eye(rest_H.shape[1])
         gate = gates.threshold(self._gate_probability, rest_H.shape[1])
         inside = gates.normalised_squares(S, rest_r, e.step, ids[which]) <= gate
+        T_cam_world = present(e).T_cam_world
+        depth_m, depth_std_m = (
+            se3.apply(T_cam_world, position)[:, 2],
+            np.linalg.norm(T_cam_world[2, :3] @ R_inverse, axis=1),
+        )
+        inside &= depth_std_m <= LARGEST_DEPTH_ERROR * depth_m
 
         started = np.zeros(len(ids), dtype=bool)
         started[which[inside]] = True
@@ -71,8 +80,8 @@ class Waiting:
             now, then, R_inverse = rows[started], then[inside], R_inverse[inside]
             position = position[inside] + (R_inverse @ by_rows[inside, :3, None])[..., 0]
             e.gaussian.augment(-R_inverse @ by_state[inside, :3], R_inverse @ R_inverse.swapaxes(1, 2))
-            variance = e.sensor.variance(now)
-            _append(e, log, frame, ids[started], position, now, (self._step, then, variance), (e.step, now, variance))
+            before, after = np.hsplit(variance[inside], 2)
+            _append(e, log, frame, ids[started], position, now, (self._step, then, before), (e.step, now, after))
             H, residual = np.zeros((rest_r[inside].size, e.gaussian.body)), rest_r[inside].ravel()
             H[:, :seen] = rest_H[inside].reshape(-1, seen)
             solution = e.gaussian.solve_body(H, residual, np.ones(len(residual)), e.step)
@@ -90,21 +99,32 @@ class Waiting:
         q, is_ready = self._sensor.triangulate(then, rows[which], T_now_anchor)
         return which[is_ready], then[is_ready], se3.apply(se3.inverse(T_cam_world), q)[is_ready]
 
-    def _views(self, e: Estimate, position: Array, then: Array, rows_now: Array) -> tuple[Array, Array, Array]:
-        """Return whitened H_x (k, 2d, seen), H_m (k, 2d, 3) and r (k, 2d) of both views."""
+    def _views(self, e: Estimate, position: Array, then: Array, rows_now: Array) -> tuple[Array, Array, Array, Array]:
+        """Return whitened H_x (k, 2d, seen), H_m (k, 2d, 3) and r (k, 2d) of the two views, and variances (k, 2d).
+
+        If tracks have errors, the second view counts by its difference from the first.
+        """
         observer, now, W = e.model.observer, present(e), e.values[Anchor.name]
+        error, parameters = e.model.track_error, observer.parameters(e.values)
         by_anchor = np.zeros_like(now.by)
         by_anchor[:, e.model.layout[Anchor.name]] = np.eye(6)
         anchor = Present(W, e.variant.linear(W, self._W_linear), by_anchor)
-        H_x, H_m, r = [], [], []
+        both = []
         for camera, rows in ((anchor, then), (now, rows_now)):
-            parameters = observer.parameters(e.values)
             seen = observer.project(parameters, camera.T_cam_world, position, camera.T_linear, position)
-            scale = 1.0 / np.sqrt(e.sensor.variance(rows))
-            H_x.append(scale[..., None] * observer.by_body(seen, camera.by))
-            H_m.append(scale[..., None] * seen.H_m)
-            r.append(scale * (rows - seen.z))
-        return np.concatenate(H_x, axis=1), np.concatenate(H_m, axis=1), np.concatenate(r, axis=1)
+            both.append((observer.by_body(seen, camera.by), seen.H_m, rows - seen.z))
+        first, second = both
+        if error is None:
+            variance = np.hstack([e.sensor.variance(then), e.sensor.variance(rows_now)])
+        else:
+            second = second[0] - first[0], second[1] - first[1], second[2] - first[2]
+            way_m = np.linalg.norm((now.T_cam_world @ se3.inverse(W))[:3, 3])
+            depth_m = np.maximum(se3.apply(now.T_cam_world, position)[:, 2], e.config.min_depth_m)
+            step = error.step_variance(rows_now - then, way_m / depth_m, e.step - self._step)
+            variance = np.hstack([error.absolute_variance(np.zeros(len(then), dtype=np.int64)), step])
+        scale = 1.0 / np.sqrt(variance)
+        H_x, H_m, r = (np.concatenate(parts, axis=1) for parts in zip(first, second, strict=True))
+        return scale[..., None] * H_x, scale[..., None] * H_m, scale * r, variance
 
     def _move_on(self, e: Estimate, ids: IntArray, rows: Array) -> None:
         """Keep the tracks (n,) without a landmark that wait already; if none is left or patience ends, start again."""
@@ -136,7 +156,7 @@ def _append(
         first_frame=fresh + frame,
         last_frame=fresh + frame,
         observations=fresh + len(views),
-        log_row=log.started(ids, positions, *views),
+        log_row=log.started(ids, positions, *views, follows=e.model.track_error is not None),
         first_step=fresh + e.step,
         position_m=positions,
         initial_m=positions,

@@ -9,6 +9,7 @@ import numpy as np
 
 from ekfslam.config import FilterConfig
 from ekfslam.data.sequence import Observations, Sequence
+from ekfslam.filters import gates
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.models.model import Model
@@ -35,7 +36,8 @@ def run_stretches(model: Model, config: FilterConfig, sequence: Sequence, stretc
     A rejected observation has the log-density of one at the gate: otherwise a noise that is too small would be the
     likelier the more it rejects.
     """
-    found, config = [], dataclasses.replace(config, lag=0)
+    found, config, d = [], dataclasses.replace(config, lag=0), model.sensor.dimension
+    gate = gates.threshold(config.gate_probability, d)
     with one_thread():
         for frames in stretches:
             # Without a revival: what comes back within a stretch starts again.
@@ -43,7 +45,7 @@ def run_stretches(model: Model, config: FilterConfig, sequence: Sequence, stretc
             nis, dof = sum(report.nis for report in reports), sum(report.dof for report in reports)
             density = sum(report.log_likelihood for report in reports)
             rejected = sum(int((report.reason == GATE).sum()) for report in reports)
-            at_gate = 0.5 * (config.gate + (-2.0 * density - nis) * 3 / max(dof, 1))
+            at_gate = 0.5 * (gate + (-2.0 * density - nis) * d / max(dof, 1))
             found.append(Stretch(nis, dof, density - rejected * at_gate))
     return found
 

@@ -69,7 +69,8 @@ class Model:
     @cached_property
     def track_error(self) -> TrackError | None:
         """Error of tracks; None if the sensor's noise is white."""
-        return self.noise.track_error
+        error = self.noise.track_error
+        return None if error is None else error.of_rows(self.sensor.dimension)
 
     @cached_property
     def wandering(self) -> tuple[StateBlock, ...]:

@@ -38,8 +38,6 @@ CAMERA_ROTATION_DEG = 0.4
 # Errors of KLT tracks (u, v, disparity) at landmark initialisation and their walk from frame to frame, which
 # `track_scale` multiplies (`ekfslam.data.noise.TrackError`). White pixel noise only sets the limits of hygiene.
 PIXEL_STD_PX = 0.7
-# White noise of tracks of one camera, whose walk has no model yet: it is more than the noise from frame to frame.
-MONOCULAR_PIXEL_STD_PX = 1.0
 TRACK_FIRST_PX = np.array([0.1, 0.1, 1.0])
 TRACK_WALK_PX = np.array([0.08, 0.08, 0.06])
 TRACK_FLOW_PX = 3.0

@@ -9,6 +9,13 @@ of a walk (covariance W), the residual of a track over one frame is
 Each motion is fitted to the same tracks and takes a part of each row, its leverage p, with it. Hence residuals are
 divided by ``sqrt(1 - p)``. The errors are those of a jackknife over parts of the recording. Every second stretch is
 enough if errors clearly persist there.
+
+Tracks of *one camera* have no depths. Their flow ``r_k = p_k + n_k - n_(k-1) + w_k``, less that of a motion before a
+plane, has a part p_k of the depths, which changes smoothly. Second differences of it, D, have variances c_0 and, from
+one frame to the next, covariances c_1, each for one row,
+
+    c_0 = 20 sigma^2 + 6 w^2,  c_1 = -15 sigma^2 - 4 w^2,
+    sigma^2 = -(2 c_0 + 3 c_1) / 5,  w^2 = (c_0 - 20 sigma^2) / 6.
 """
 
 from __future__ import annotations
@@ -27,6 +34,7 @@ from ekfslam.models.noise import with_error
 
 _STRETCH, _MOST_STRETCHES = 8, 12  # intervals, count
 _LEAST_POINTS, _LEAST_PAIRS = 6, 100  # of an interval, of the recording
+_LONG_STRETCH, _LEAST_FLOWS = 30, 10  # intervals, tracks: of one camera
 _BLOCKS, _SURE = 12, 3.0  # of the jackknife; standard errors
 # A first motion needs some limit in pixels; from there on all limits are multiples of the scatter that is found.
 _SAMPLES, _START_PX, _LEAST_PX = 200, 2.0, 1e-3
@@ -39,12 +47,12 @@ _COORDINATES = np.array([1.0, 2.0, 1.0]) / 3.0  # weights of the variances of ro
 
 @dataclass(frozen=True)
 class TrackNoise:
-    """White errors of tracks and steps of their walk, rows ``(uL, v, uR)``."""
+    """White errors of tracks and steps of their walk, rows ``(uL, v, uR)``, or ``(u, v)`` of one camera."""
 
-    white: Array  # (3,) variances of white errors, px^2; negative if steps persist
-    white_error: Array  # (3,) their standard errors
-    step: Array  # (3,) variances of the walk from one frame to the next, px^2
-    step_error: Array  # (3,) their standard errors
+    white: Array  # (d,) variances of white errors, px^2; negative if steps persist
+    white_error: Array  # (d,) their standard errors
+    step: Array  # (d,) variances of the walk from one frame to the next, px^2
+    step_error: Array  # (d,) their standard errors
     length: int  # frames of the track of a typical observation
 
     @property
@@ -60,13 +68,17 @@ class TrackNoise:
 
     @property
     def sigma_px(self) -> float:
-        """Standard deviation of a pixel coordinate; the row v is the mean of two."""
-        return max(float(self.white @ _COORDINATES), 0.0) ** 0.5
+        """Standard deviation of a pixel coordinate; the row v of a rig is the mean of two."""
+        return max(float(self.white @ self._coordinates), 0.0) ** 0.5
 
     @property
     def sigma_error_px(self) -> float:
         """Standard error of `sigma_px`, if its rows err alike."""
-        return float(self.white_error @ _COORDINATES) / (2.0 * max(self.sigma_px, _LEAST_PX))
+        return float(self.white_error @ self._coordinates) / (2.0 * max(self.sigma_px, _LEAST_PX))
+
+    @property
+    def _coordinates(self) -> Array:
+        return _COORDINATES if len(self.white) == len(_COORDINATES) else np.full(2, 0.5)
 
     @property
     def text(self) -> str:
@@ -104,6 +116,8 @@ class _Fit:
 
 def track_noise(sequence: Sequence) -> TrackNoise | None:
     """Return the noise of tracks from stretches of a recording; None: too few tracks."""
+    if sequence.camera.is_monocular:
+        return _of_one_camera(sequence)
     intervals = len(sequence) - 1
     count = min(max(1, intervals // _STRETCH), _MOST_STRETCHES)
     begins = (np.arange(count) * (intervals / count)).astype(int)
@@ -195,3 +209,68 @@ def _length(sequence: Sequence) -> int:
     """Return the median over observations of the number of observations of their track."""
     count = np.bincount(np.searchsorted(sequence.observations.ids, sequence.observations.landmark))
     return int(np.median(np.repeat(count, count)))
+
+
+# --- one camera -------------------------------------------------------------------------------------------------------
+
+
+def _of_one_camera(sequence: Sequence) -> TrackNoise | None:
+    """Return the noise of tracks of one camera; None: too few tracks."""
+    frames = len(sequence) - 1
+    count = min(max(1, frames // _LONG_STRETCH), _MOST_STRETCHES)
+    parts: list[tuple[Array, Array]] = []
+    for begin in (np.arange(count) * (frames / count)).astype(int).tolist():
+        flows = [_flow(sequence, k) for k in range(begin + 1, min(begin + _LONG_STRETCH, frames) + 1)]
+        for _ in range(2):
+            flows = [_common(a, b, np.subtract) for a, b in pairwise(flows)]
+        if not any(len(ids) for ids, _ in flows):
+            continue
+        scatter = _scatter(np.concatenate([D for _, D in flows]))
+        good = [(np.abs(D) < _OUTLIER * scatter).all(axis=1) for _, D in flows]
+        flows = [(ids[some], D[some]) for (ids, D), some in zip(flows, good, strict=True)]
+        pairs = [(a[1] ** 2, _common(a, b, np.multiply)[1]) for a, b in pairwise(flows)]
+        parts += [(square, product) for square, product in pairs if len(product)]
+    if sum(len(product) for _, product in parts) < _LEAST_PAIRS:
+        return None
+    blocks = np.array_split(np.arange(len(parts)), min(_BLOCKS, len(parts)))
+    left_out = np.array([_of_second_differences([p for i, p in enumerate(parts) if i not in some]) for some in blocks])
+    white_error, step_error = np.sqrt((len(blocks) - 1) * left_out.var(axis=0))
+    white, step = _of_second_differences(parts)
+    return TrackNoise(white, white_error, step, step_error, _length(sequence))
+
+
+def _of_second_differences(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Return the variances (2,) of white errors and of steps by squares of D and products of successive ones."""
+    if not parts:
+        return np.zeros(2), np.zeros(2)
+    square, product = (np.concatenate(some).mean(axis=0) for some in zip(*parts, strict=True))
+    white = -(2.0 * square + 3.0 * product) / 5.0
+    return white, (square - 20.0 * white) / 6.0
+
+
+def _common(a: tuple[IntArray, Array], b: tuple[IntArray, Array], of: np.ufunc) -> tuple[IntArray, Array]:
+    """Return the ids that two parts share, and a function of the values (n, 2) of the second and the first."""
+    ids, i, j = np.intersect1d(a[0], b[0], assume_unique=True, return_indices=True)
+    return ids, of(b[1][j], a[1][i])
+
+
+def _flow(sequence: Sequence, k: int) -> tuple[IntArray, Array]:
+    """Return the ids (n,) and flows (n, 2) px from frame k - 1 to k, less that of a motion before a plane across."""
+    (ids, before), (ids_now, now) = sequence.observations.at(k - 1), sequence.observations.at(k)
+    ids, i, j = np.intersect1d(ids, ids_now, assume_unique=True, return_indices=True)
+    if len(ids) < _LEAST_FLOWS:
+        return ids[:0], np.empty((0, 2))
+    camera, middle, flow = sequence.camera, 0.5 * (before[i] + now[j]), now[j] - before[i]
+    focal = np.array([camera.fu_px, camera.fv_px])
+    x, y = ((middle - [camera.cu_px, camera.cv_px]) / focal).T
+    one, none = np.ones_like(x), np.zeros_like(x)
+    by_u, by_v = [one, none, -x, x * y, -1.0 - x**2, y], [none, one, -y, 1.0 + y**2, -x * y, -x]
+    A = np.stack([np.column_stack(by_u), np.column_stack(by_v)], axis=1) * focal[:, None]
+    weight, p, share = np.ones(len(ids)), np.zeros(6), np.ones((len(ids), 2))
+    for _ in range(_FITS):
+        inverse = np.linalg.pinv(np.einsum("n,nij,nik->jk", weight, A, A))
+        p = inverse @ np.einsum("n,nij,ni->j", weight, A, flow)
+        r = flow - A @ p
+        weight = 1.0 / (1.0 + (r**2).sum(axis=1) / (_KERNEL * _scatter(r).max()) ** 2)
+    share = 1.0 - weight[:, None] * np.einsum("nij,jk,nik->ni", A, inverse, A)
+    return ids, r / np.sqrt(share.clip(_LEAST_SHARE))
