@@ -221,6 +221,17 @@ def test_tracks_that_wait_are_those_before_an_error(engine):
 
 
 @pytest.mark.skipif(bool(choice.MISSING), reason="no engine")
+def test_an_error_after_any_number_of_frames_changes_no_bit_of_the_engine():
+    problem = resolve(builtin("city?frames=44&max_tracks=8&outlier_fraction=0.1"))
+    ekf, clean = filter_of(problem, "engine"), filter_of(problem, "engine")
+    for k, _ in enumerate(zip(*(run_filter(each, problem.sequence) for each in (ekf, clean)), strict=True)):
+        if k in {0, 1, 30, 31, 32, 33, 43}:
+            with pytest.raises(ValueError, match="distinct"):
+                ekf.engine.filter.update(k, np.array([1, 1]), np.ones((2, 4)), False, None)
+    assert_equal(numbers(ekf), numbers(clean))
+
+
+@pytest.mark.skipif(bool(choice.MISSING), reason="no engine")
 def test_a_second_thread_in_one_filter_is_refused_and_the_filter_stays_whole():
     problem = problem_of("plain")
     ekf, clean = filter_of(problem, "engine"), filter_of(problem, "engine")

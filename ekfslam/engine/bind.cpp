@@ -1,17 +1,11 @@
 // The Python module `ekfslam.engine._engine`.
-#include <nanobind/eigen/dense.h>
-#include <nanobind/nanobind.h>
-
 #include "alignment.hpp"
-#include "bind_gates.hpp"
-#include "bind_gaussian.hpp"
 #include "binding.hpp"
 #include "blas.hpp"
 #include "lapack.hpp"
-#include "types.hpp"
 
-namespace nb = nanobind;
 using namespace ekfslam;
+using namespace ekfslam::binding;
 
 namespace {
 
@@ -52,10 +46,10 @@ NB_MODULE(_engine, module) {
     }
     bind_gaussian(module);
     bind_gates(module);
-    binding::bind_filter(module);
-    module.def("cholesky", &cholesky, nb::arg("P"), "Return the lower Cholesky factor of a covariance.");
-    module.def("align", &aligned, nb::arg("camera"), nb::arg("before_px"), nb::arg("now_px"), nb::arg("T_now_before"),
-               nb::arg("std_px"), nb::arg("scale"), "Align two frames of a stereo rig.");
+    bind_filter(module);
+    module.def("cholesky", &cholesky, arg("P"), "Return the lower Cholesky factor of a covariance.");
+    module.def("align", &aligned, arg("camera"), arg("before_px"), arg("now_px"), arg("T_now_before"), arg("std_px"),
+               arg("scale"), "Align two frames of a stereo rig.");
     module.def(
         "flops", [] { return blas::flops(); },
         "Return the number of floating point operations of BLAS and LAPACK in this thread so far.");

@@ -10,8 +10,6 @@ namespace ekfslam::binding {
 
 namespace {
 
-using nb::arg;
-
 Kind kind_of(const std::string& name) {
     const std::pair<const char*, Kind> kinds[] = {{"vector", Kind::vector},
                                                   {"pose", Kind::pose},
@@ -40,16 +38,7 @@ std::vector<Block> blocks_of(const nb::list& given) {
     return blocks;
 }
 
-constexpr Index MOST_CONSIDERED = 10000, MOST_COLUMNS = 10000;
-
-void require_range(const std::string& name, Index first, Index size, Index count) {
-    if (first >= 0 && size >= 0 && first <= count && size <= count - first) return;
-    throw nb::value_error((name + " must be among " + std::to_string(count)).c_str());
-}
-
-void require(bool holds, const std::string& what) {
-    if (!holds) throw nb::value_error(what.c_str());
-}
+constexpr Index MOST_COLUMNS = 10000;
 
 // The value of a kind of block has so many numbers.
 Index value_size(const Block& block) {
@@ -367,6 +356,11 @@ void bind_reading(nb::class_<Shared>& bound) {
 }
 
 }  // namespace
+
+void Shared::undo() {
+    filter = *saved;
+    for (const auto& again : since) again(filter);
+}
 
 void refuse() {
     const nb::object type = nb::module_::import_("ekfslam.errors").attr("FilterError");

@@ -1,39 +1,19 @@
 // Gates and consensus in Python, as submodule `gates`: stacks have the landmark first, as those of the reference
 // filter.
-#include "bind_gates.hpp"
-
-#include <nanobind/eigen/dense.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/function.h>
-#include <nanobind/stl/tuple.h>
-#include <nanobind/stl/vector.h>
 
-#include <tuple>
-
+#include "binding.hpp"
 #include "consensus.hpp"
 
-namespace nb = nanobind;
-
-namespace ekfslam {
+namespace ekfslam::binding {
 namespace {
 
-using Stack = nb::ndarray<const double, nb::ndim<3>, nb::c_contig>;
-using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
-
-// Symmetric blocks (k, d, d).
+// Blocks (k, d, d).
 template <class Block>
 std::vector<Block> blocks_of(const Stack& stack, const RowMajor& like) {
-    const auto k = static_cast<Index>(stack.shape(0)), d = static_cast<Index>(stack.shape(1));
-    if (k != like.rows() || d != like.cols() || d > 3 || stack.shape(2) != stack.shape(1)) {
-        throw nb::value_error("blocks (k, d, d), d at most 3, do not fit to rows (k, d)");
-    }
-    std::vector<Block> blocks;
-    for (Index i = 0; i < k; ++i) blocks.push_back(Eigen::Map<const Matrix>(stack.data() + i * d * d, d, d));
-    return blocks;
-}
-
-void require(bool holds, const char* what) {
-    if (!holds) throw nb::value_error(what);
+    require(static_cast<Index>(stack.shape(0)) == like.rows() && like.cols() <= 3,
+            "blocks (k, d, d), d at most 3, do not fit to rows (k, d)");
+    return binding::blocks_of<Block>(stack, like.cols(), like.cols());
 }
 
 void require_joint(const Matrix& S, const RowMajor& residual, Index count) {
@@ -74,4 +54,4 @@ void bind_gates(nb::module_& m) {
     });
 }
 
-}  // namespace ekfslam
+}  // namespace ekfslam::binding

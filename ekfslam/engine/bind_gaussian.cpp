@@ -1,73 +1,19 @@
 // The covariance in Python: arrays are copies, and stacks have the landmark first, as those of the reference filter.
-#include "bind_gaussian.hpp"
-
-#include <nanobind/eigen/dense.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/tuple.h>
-#include <nanobind/stl/vector.h>
-
-#include <atomic>
+#include "binding.hpp"
 
 #if defined(__GLIBC__)
 #include <malloc.h>
 #endif
 
-#include "gaussian.hpp"
-
-namespace nb = nanobind;
-
-namespace ekfslam {
+namespace ekfslam::binding {
 
 namespace {
-using Stack = nb::ndarray<const double, nb::ndim<3>, nb::c_contig>;
-using NumPy = nb::ndarray<nb::numpy, double>;
-using Flags = std::vector<bool>;
-using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
-
-constexpr Index MOST_CONSIDERED = 10000;
-
-NumPy array(std::vector<double> numbers, std::vector<std::size_t> shape) {
-    auto* kept = new std::vector<double>(std::move(numbers));
-    nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<double>*>(p); });
-    return NumPy(kept->data(), shape.size(), shape.data(), owner);
-}
-
-// (k, r, c) of matrices (r, c).
-template <class Some>
-NumPy stacked(const std::vector<Some>& blocks, Index rows, Index columns) {
-    std::vector<double> numbers;
-    for (const Some& block : blocks) {
-        const RowMajor rowwise = block;
-        numbers.insert(numbers.end(), rowwise.data(), rowwise.data() + rowwise.size());
-    }
-    return array(std::move(numbers),
-                 {blocks.size(), static_cast<std::size_t>(rows), static_cast<std::size_t>(columns)});
-}
 
 // One column for each row of the blocks: (c, k r) of (k, r, c).
 Matrix columns_of(const Stack& blocks) {
     const Index rows = static_cast<Index>(blocks.shape(0) * blocks.shape(1)),
                 columns = static_cast<Index>(blocks.shape(2));
     return Eigen::Map<const Matrix>(blocks.data(), columns, rows);
-}
-
-template <class Block>
-std::vector<Block> blocks_of(const Stack& stack) {
-    if (static_cast<Index>(stack.shape(1)) != Block::RowsAtCompileTime ||
-        static_cast<Index>(stack.shape(2)) != Block::ColsAtCompileTime)
-        throw nb::value_error("a stack of blocks of another shape");
-    std::vector<Block> blocks;
-    for (std::size_t i = 0; i < stack.shape(0); ++i)
-        blocks.push_back(
-            Eigen::Map<
-                const Eigen::Matrix<double, Block::RowsAtCompileTime, Block::ColsAtCompileTime, Eigen::RowMajor>>(
-                stack.data() + i * stack.shape(1) * stack.shape(2)));
-    return blocks;
-}
-
-void require(bool holds, const char* what) {
-    if (!holds) throw nb::value_error(what);
 }
 
 // The covariance of Python. Projections and solutions of another one, or of one that has changed since, are refused.
@@ -149,7 +95,7 @@ void bind_projection(nb::module_& m) {
                 const Projection& at = self.value;
                 std::vector<Matrix> blocks;
                 for (Index i = 0; i < at.rows.count(); ++i) blocks.push_back(at.own_variance(i));
-                return stacked(blocks, at.rows.dimension(), at.rows.dimension());
+                return binding::blocks(blocks, at.rows.dimension());
             },
             nb::rv_policy::move);
     nb::class_<HeldSolution>(m, "Solution")
@@ -201,7 +147,7 @@ void bind_updates(nb::class_<Held>& bound) {
                  const Solution& solution = from.of(self);
                  const Index d = solution.at.rows.dimension();
                  require_slots(which, rows_in(solution));
-                 return stacked(self.value.given_others(solution, which), d, d);
+                 return blocks(self.value.given_others(solution, which), d);
              })
         .def("information",
              [](const Held& self, const HeldSolution& from, const Matrix& J) {
@@ -232,7 +178,7 @@ void augment(Gaussian& P, const Stack& G, const Stack& covariance) {
     const Matrix columns = columns_of(G);
     require(G.shape(1) == 3 && G.shape(0) == covariance.shape(0), "one G (3, lead) and covariance for each landmark");
     require(columns.rows() == P.lead().width, "G must have the width of the leading columns");
-    P.augment(columns, blocks_of<Matrix3>(covariance));
+    P.augment(columns, blocks_of<Matrix3>(covariance, 3, 3));
 }
 
 void transform_body(Gaussian& P, Index at, const Matrix& A) {
@@ -246,7 +192,8 @@ void transform_body(Gaussian& P, Index at, const Matrix& A) {
 void transform_landmarks(Gaussian& P, const Slots& slots, const std::optional<Stack>& M, const Stack& B, Index at) {
     require_slots(slots, P.landmarks(), false);
     require(B.shape(0) == slots.size() && (!M || M->shape(0) == slots.size()), "one M and B for each landmark");
-    P.transform_landmarks(slots, M ? blocks_of<Matrix3>(*M) : std::vector<Matrix3>(), blocks_of<Matrix36>(B), at);
+    P.transform_landmarks(slots, M ? blocks_of<Matrix3>(*M, 3, 3) : std::vector<Matrix3>(),
+                          blocks_of<Matrix36>(B, 3, 6), at);
 }
 
 void require_flags(const Gaussian& P, const Flags& flags) {
@@ -260,15 +207,15 @@ void replace(Gaussian& P, const Matrix& by) {
 
 void clone(Gaussian& P, Index source, Index size, Index to) {
     const Index body = P.columns().body, first = to - body;
-    require(source >= 0 && size >= 0 && source <= body && size <= body - source, "columns of the body");
-    require(first >= 0 && first <= P.considered() && size <= P.considered() - first, "considered columns");
+    require_range("columns of the body", source, size, body);
+    require_range("considered columns", first, size, P.considered());
     P.clone(source, size, to);
 }
 
 void bind_changes(nb::class_<Held>& bound) {
     bound.def("propagate", changing(&propagate))
         .def("close_view", changing(+[](Gaussian& P) { P.close_view(); }))
-        .def("open_view", changing(&open_view), nb::arg("Y"), nb::arg("Yd") = nb::none())
+        .def("open_view", changing(&open_view), arg("Y"), arg("Yd") = nb::none())
         .def("hold_anchor", changing(+[](Gaussian& P) {
                  require(P.columns().anchor >= 0, "there is no anchor");
                  P.hold_anchor();
@@ -325,8 +272,7 @@ void bind_gaussian(nb::module_& m) {
             [](Held* self, const Matrix& P, Index view, Index previous, Index anchor, std::vector<Index> front) {
                 new (self) Held(made(P, view, previous, anchor, front));
             },
-            nb::arg("P"), nb::arg("view") = -1, nb::arg("previous") = -1, nb::arg("anchor") = -1,
-            nb::arg("front") = std::vector<Index>())
+            arg("P"), arg("view") = -1, arg("previous") = -1, arg("anchor") = -1, arg("front") = std::vector<Index>())
         .def("__copy__", [](const Held& self) { return Held(self.value); })
         .def("__deepcopy__", [](const Held& self, const nb::object&) { return Held(self.value); })
         .def_prop_ro("lead",
@@ -345,10 +291,10 @@ void bind_gaussian(nb::module_& m) {
              })
         .def("landmark_blocks", [](const Held& self, const Slots& slots) {
             require_slots(slots, self.value.landmarks());
-            return stacked(self.value.landmark_blocks(slots), 3, 3);
+            return blocks(self.value.landmark_blocks(slots));
         });
     bind_updates(bound);
     bind_changes(bound);
 }
 
-}  // namespace ekfslam
+}  // namespace ekfslam::binding

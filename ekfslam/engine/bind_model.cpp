@@ -4,13 +4,9 @@
 #include "retraction.hpp"
 #include "se3.hpp"
 
-namespace ekfslam {
+namespace ekfslam::binding {
 
 namespace {
-
-using namespace binding;
-
-using nb::arg;
 
 void require_correction(const Estimate& e, const Vector& correction) {
     const Index size = e.columns.body + e.gaussian.considered() + 3 * e.table.size();
@@ -98,4 +94,4 @@ void bind_model(nb::module_& module) {
     module.def("lead", reading(&lead_of), arg("filter"));
 }
 
-}  // namespace ekfslam
+}  // namespace ekfslam::binding

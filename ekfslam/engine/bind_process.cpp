@@ -8,8 +8,7 @@ namespace ekfslam::binding {
 namespace {
 
 void require_vector(const Block& block) {
-    if (block.kind == Kind::vector && block.value_size == block.size) return;
-    throw nb::value_error(("block " + block.name + " must be a vector").c_str());
+    require(block.kind == Kind::vector && block.value_size == block.size, "block " + block.name + " must be a vector");
 }
 
 Law law_of(const nb::dict& from, const Block& block) {
@@ -21,7 +20,7 @@ Law law_of(const nb::dict& from, const Block& block) {
     law.share = share == "one" ? Law::one : share == "way" ? Law::way : Law::none;
     law.offset = get<Matrix>(from, "offset");
     if (law.offset.cols() != 0) require_shape("offset", law.offset, 6, block.size);
-    if (law.turns && block.kind != Kind::direction) throw nb::value_error("only a direction turns velocities");
+    require(!law.turns || block.kind == Kind::direction, "only a direction turns velocities");
     if (law.transition == Law::stays) return law;
     require_vector(block);
     law.std = get<Vector>(from, "std");
@@ -36,7 +35,7 @@ Law law_of(const nb::dict& from, const Block& block) {
 
 Place place_of(const Filter& filter, const char* name, Index size) {
     const Block* block = filter.e.block(name);
-    if (!block || block->size != size) throw nb::value_error((std::string(name) + " is no block of it").c_str());
+    require(block && block->size == size, std::string(name) + " is no block of it");
     require_vector(*block);
     return {block->at, block->value_at};
 }
@@ -57,36 +56,31 @@ Inertial inertial_of(const Filter& filter, const nb::dict& from) {
 }
 
 void set_process(Filter& filter, const nb::list& laws, const nb::dict& settings) {
-    if (laws.size() != filter.e.blocks.size()) throw nb::value_error("laws must have one item for each block");
-    const Block* pose = filter.e.block("pose");
-    if (!pose || pose->at != 0 || pose->kind != Kind::pose) throw nb::value_error("the first block must be the pose");
+    require(laws.size() == filter.e.blocks.size(), "laws must have one item for each block");
     Process process;
-    for (std::size_t i = 0; i < laws.size(); ++i)
+    for (std::size_t i = 0; i < laws.size(); ++i) {
         process.laws.push_back(law_of(nb::cast<nb::dict>(laws[i]), filter.e.blocks[i]));
-    for (const Law& law : process.laws)
-        if (law.share != Law::none &&
-            !filter.e.blocks[static_cast<std::size_t>(&law - process.laws.data())].moves_camera)
-            throw nb::value_error("only a block that moves the camera has a share");
-    const std::string kind = get<std::string>(settings, "kind");
-    if (kind == "inertial") {
-        process.inertial = inertial_of(filter, settings);
-    } else if (kind == "velocities") {
-        process.velocities = velocities_of(filter, settings);
-    } else {
-        throw nb::value_error(("unknown kind of a process: " + kind).c_str());
+        require(process.laws[i].share == Law::none || filter.e.blocks[i].moves_camera,
+                "only a block that moves the camera has a share");
     }
+    const std::string kind = get<std::string>(settings, "kind");
+    require(kind == "inertial" || kind == "velocities", "unknown kind of a process: " + kind);
+    if (kind == "inertial")
+        process.inertial = inertial_of(filter, settings);
+    else
+        process.velocities = velocities_of(filter, settings);
     filter.process = process;
 }
 
 nb::dict predict(Filter& filter, double tau_s, const Vector& dt_s, const Matrix& inputs, bool is_gap, double doubt) {
-    if (!filter.process) throw nb::value_error("predictions of this filter come from Python");
+    require(filter.process.has_value(), "predictions of this filter come from Python");
     whole(filter);
     require_shape("inputs", inputs, dt_s.size(), 6);
     require_finite("inputs", inputs);
     require_finite("dt_s", dt_s);
-    if (dt_s.size() == 0 || !(dt_s.array() >= 0.0).all()) throw nb::value_error("dt_s must be durations, at least one");
-    if (!std::isfinite(tau_s) || tau_s < 0.0) throw nb::value_error("tau_s must be a duration");
-    if (!std::isfinite(doubt) || doubt <= 0.0) throw nb::value_error("doubt must be positive");
+    require(dt_s.size() > 0 && (dt_s.array() >= 0.0).all(), "dt_s must be durations, at least one");
+    require(std::isfinite(tau_s) && tau_s >= 0.0, "tau_s must be a duration");
+    require(std::isfinite(doubt) && doubt > 0.0, "doubt must be positive");
     const Departed departed = guarded(filter, filter.e.step + 1, [&] {
         return ekfslam::predict(filter.e, *filter.process, {tau_s, dt_s, inputs, is_gap, doubt});
     });
@@ -108,7 +102,6 @@ nb::dict predict(Filter& filter, double tau_s, const Vector& dt_s, const Matrix&
 }  // namespace
 
 void bind_process(nb::class_<Shared>& bound) {
-    using nb::arg;
     bound.def("set_process", changing(&set_process), arg("laws"), arg("settings"))
         .def("predict", changing(&predict), arg("tau_s"), arg("dt_s"), arg("inputs"), arg("is_gap"), arg("doubt"));
 }

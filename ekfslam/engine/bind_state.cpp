@@ -49,20 +49,29 @@ Slots slots_of(const Integers& values, Index count) {
     return {values.data(), values.data() + values.size()};
 }
 
+void require(bool holds, const std::string& what) {
+    if (!holds) throw nb::value_error(what.c_str());
+}
+
+void require_range(const std::string& name, Index first, Index size, Index count) {
+    require(first >= 0 && size >= 0 && first <= count && size <= count - first,
+            name + " must be among " + std::to_string(count));
+}
+
 void require_shape(const char* name, const Eigen::Ref<const Matrix>& found, Index rows, Index columns) {
     if (found.rows() == rows && found.cols() == columns) return;
-    const std::string wanted = std::to_string(rows) + ", " + std::to_string(columns);
-    const std::string has = std::to_string(found.rows()) + ", " + std::to_string(found.cols());
-    throw nb::value_error((std::string(name) + " must have the shape (" + wanted + "), found (" + has + ")").c_str());
+    const auto of = [](Index r, Index c) { return "(" + std::to_string(r) + ", " + std::to_string(c) + ")"; };
+    require(false, std::string(name) + " must have the shape " + of(rows, columns) + ", found " +
+                       of(found.rows(), found.cols()));
 }
 
 void require_finite(const char* name, const Eigen::Ref<const Matrix>& found) {
-    if (!found.allFinite()) throw nb::value_error((std::string(name) + " must be finite").c_str());
+    require(found.allFinite(), std::string(name) + " must be finite");
 }
 
 void require_covariance(const Eigen::Ref<const Matrix>& P) {
     require_finite("P", P);
-    if ((P.diagonal().array() < 0.0).any()) throw nb::value_error("P must have no negative variance");
+    require(!(P.diagonal().array() < 0.0).any(), "P must have no negative variance");
 }
 
 nb::object array(Vector values) {
@@ -80,13 +89,16 @@ nb::object rows(Matrix values) {
     return owned(std::move(values), {columns, rows});
 }
 
-nb::object blocks(const std::vector<Matrix3>& values) {
+template <class Block>
+nb::object stacked(const std::vector<Block>& values, Index size) {
     std::vector<double> flat;
-    flat.reserve(9 * values.size());
-    for (const Matrix3& block : values) flat.insert(flat.end(), block.data(), block.data() + 9);
-    const std::size_t count = values.size();
-    return owned(std::move(flat), {count, 3, 3});
+    flat.reserve(values.size() * static_cast<std::size_t>(size * size));
+    for (const Block& block : values) flat.insert(flat.end(), block.data(), block.data() + size * size);
+    const std::size_t count = values.size(), d = static_cast<std::size_t>(size);
+    return owned(std::move(flat), {count, d, d});
 }
+nb::object blocks(const std::vector<Matrix3>& values) { return stacked(values, 3); }
+nb::object blocks(const std::vector<Matrix>& values, Index size) { return stacked(values, size); }
 
 nb::dict table_of(const Table& table) {
     nb::dict out;
@@ -100,8 +112,8 @@ Table table_from(const nb::dict& from, Index dimension) {
     for (const Column& column : COLUMNS) table.*column.values = ids_of(get<Integers>(from, column.name));
     const Index count = table.size(), heights[] = {3, 3, 2, dimension};
     for (const Column& column : COLUMNS)
-        if (static_cast<Index>((table.*column.values).size()) != count)
-            throw nb::value_error((std::string(column.name) + " must have one number a landmark").c_str());
+        require(static_cast<Index>((table.*column.values).size()) == count,
+                std::string(column.name) + " must have one number a landmark");
     for (std::size_t i = 0; i < 4; ++i) {
         const Matrix given = get<Matrix>(from, BLOCKS[i].name);
         require_shape(BLOCKS[i].name, given, count, heights[i]);

@@ -12,21 +12,27 @@
 #include <nanobind/stl/vector.h>
 
 #include <atomic>
+#include <functional>
+#include <type_traits>
 
 #include "filter.hpp"
-
-namespace ekfslam {
-
-// Adds what tests compare: SE(3), cameras, rows, corrections.
-void bind_model(nanobind::module_& module);
-
-}  // namespace ekfslam
 
 namespace ekfslam::binding {
 
 namespace nb = nanobind;
 
+using nb::arg;
 using Integers = Eigen::Matrix<std::int64_t, Eigen::Dynamic, 1>;
+using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+using Stack = nb::ndarray<const double, nb::ndim<3>, nb::c_contig>;  // the landmark first
+
+// `Filter`, its predictions, and what tests compare: the covariance, gates and consensus, observations.
+struct Shared;
+void bind_filter(nb::module_& module);
+void bind_process(nb::class_<Shared>& bound);
+void bind_gaussian(nb::module_& module);
+void bind_gates(nb::module_& module);
+void bind_model(nb::module_& module);
 
 // The entry of a dictionary.
 template <class T>
@@ -42,23 +48,40 @@ std::vector<T> listed(const Eigen::Matrix<T, Eigen::Dynamic, 1>& values) {
 inline Ids ids_of(const Integers& values) { return listed<std::int64_t>(values); }
 Slots slots_of(const Integers& values, Index count);  // checked: from 0 to count - 1
 
-// Adds `Filter` to the module, and its predictions.
-void bind_filter(nb::module_& module);
-struct Shared;
-void bind_process(nb::class_<Shared>& bound);
+constexpr Index MOST_CONSIDERED = 10000;
 
-// Throws ValueError that names the array.
+// Throw ValueError in these words, or one that names the array.
+void require(bool holds, const std::string& what);
+void require_range(const std::string& name, Index first, Index size, Index count);
 void require_shape(const char* name, const Eigen::Ref<const Matrix>& found, Index rows, Index columns);
 void require_finite(const char* name, const Eigen::Ref<const Matrix>& found);
 void require_covariance(const Eigen::Ref<const Matrix>& P);
 
-// The filter of Python: one call at a time, and a call that fails leaves it as it was.
+// The filter of Python: one call at a time, and a call that fails leaves it as it was. A copy of the filter before each
+// call would cost a twentieth of a frame, and far more with many dormant landmarks: one in a while has to do, and
+// after a failure the calls since then are repeated.
 struct Shared {
     Filter filter;
+    std::optional<Filter> saved;
+    std::vector<std::function<void(Filter&)>> since;
+    std::size_t kept = 0;  // numbers in the arguments of these calls
     mutable std::atomic<bool> is_busy{false};
 
     explicit Shared(Filter made) : filter(std::move(made)) {}
+    void undo();  // restores the filter as it was after the last call
+    void forget() { saved.reset(), since.clear(), kept = 0; }
 };
+
+// Numbers that it takes to keep an argument of a call; an object of Python is not kept.
+constexpr std::size_t MOST_KEPT = 64000;
+template <class Argument>
+std::size_t numbers_of(const Argument& argument) {
+    if constexpr (std::is_base_of_v<nb::handle, Argument>)
+        return argument.is_none() ? 0 : MOST_KEPT;
+    else if constexpr (std::is_base_of_v<Eigen::EigenBase<Argument>, Argument>)
+        return static_cast<std::size_t>(argument.size());
+    return 0;
+}
 
 // Raises `FilterError`: the filter is in use by another thread.
 [[noreturn]] void refuse();
@@ -110,12 +133,27 @@ template <class Result, class... Arguments>
 auto changing(Result (*verb)(Filter&, Arguments...)) {
     return [verb](Shared& shared, Arguments... arguments) -> Result {
         const Hold hold(shared);
-        Filter& filter = shared.filter;
-        Filter::State before = filter.state();
+        if (!shared.saved) shared.saved = shared.filter;
+        shared.kept += ((MOST_KEPT / 64) + ... + numbers_of(arguments));
+        const bool is_kept = shared.kept < MOST_KEPT;
+        std::function<void(Filter&)> again;
+        if (is_kept) {
+            again = [verb, some = std::tuple<std::decay_t<Arguments>...>(arguments...)](Filter& filter) {
+                std::apply([&](const auto&... one) { verb(filter, one...); }, some);
+            };
+        }
+        const auto keep = [&] { is_kept ? shared.since.push_back(std::move(again)) : shared.forget(); };
         try {
-            return verb(filter, std::forward<Arguments>(arguments)...);
+            if constexpr (std::is_void_v<Result>) {
+                verb(shared.filter, std::forward<Arguments>(arguments)...);
+                keep();
+            } else {
+                Result result = verb(shared.filter, std::forward<Arguments>(arguments)...);
+                keep();
+                return result;
+            }
         } catch (...) {
-            filter.restore(std::move(before));
+            shared.undo();
             throw;
         }
     };
@@ -126,6 +164,18 @@ nb::object array(Vector values);
 nb::object array(Ids values);
 nb::object rows(Matrix values);
 nb::object blocks(const std::vector<Matrix3>& values);  // (k, 3, 3), symmetric
+nb::object blocks(const std::vector<Matrix>& values, Index size);
+
+// Blocks of a stack (k, r, c).
+template <class Block>
+std::vector<Block> blocks_of(const Stack& stack, Index rows, Index columns) {
+    const auto r = static_cast<Index>(stack.shape(1)), c = static_cast<Index>(stack.shape(2));
+    require(r == rows && c == columns, "a stack of blocks of another shape");
+    std::vector<Block> blocks;
+    for (std::size_t i = 0; i < stack.shape(0); ++i)
+        blocks.push_back(Eigen::Map<const RowMajor>(stack.data() + static_cast<Index>(i) * r * c, r, c));
+    return blocks;
+}
 
 nb::dict table_of(const Table& table);
 Table table_from(const nb::dict& from, Index dimension);

@@ -30,13 +30,15 @@ void Dormant::append(const std::vector<Index>& at, const Matrix& K_new, const st
         Matrix larger(std::max(after, 2 * room), std::max(after, 2 * room));
         larger.topLeftCorner(before, before) = S_.topLeftCorner(before, before);
         S_ = std::move(larger);
+        squares_.conservativeResize(S_.rows(), WAITING);
+        sign_.conservativeResize(WAITING);
     }
     S_.block(before, 0, after - before, after).setZero();
     for (std::size_t i = 0; i < S_new.size(); ++i) {
         const Index own = before + static_cast<Index>(3 * i);
         S_.block<3, 3>(own, own) = S_new[i];
     }
-    squares_.conservativeResizeLike(Matrix::Zero(after, squares_.cols()));
+    squares_.block(before, 0, after - before, waiting_).setZero();
 }
 
 void Dormant::keep(const std::vector<Index>& which) {
@@ -49,16 +51,16 @@ void Dormant::keep(const std::vector<Index>& which) {
     const Index n = static_cast<Index>(own.size());
     for (Index j = 0; j < n; ++j)  // in place: they ascend
         for (Index i = j; i < n; ++i) S_(i, j) = S_(own[static_cast<std::size_t>(i)], own[static_cast<std::size_t>(j)]);
-    squares_ = Matrix(squares_(own, Eigen::all));
+    for (Index j = 0; j < waiting_; ++j)
+        for (Index i = 0; i < n; ++i) squares_(i, j) = squares_(own[static_cast<std::size_t>(i)], j);
 }
 
 void Dormant::add(const Matrix& A, double sign) {
-    const Index before = squares_.cols(), more = A.cols();
-    squares_.conservativeResize(A.rows(), before + more);
-    squares_.rightCols(more) = A;
-    sign_.conservativeResize(before + more);
-    sign_.tail(more).setConstant(sign);
-    if (before + more > WAITING) fold();
+    if (waiting_ + A.cols() > WAITING) fold();
+    if (A.cols() > WAITING) return square(A, sign);
+    squares_.block(0, waiting_, A.rows(), A.cols()) = A;
+    sign_.segment(waiting_, A.cols()).setConstant(sign);
+    waiting_ += A.cols();
 }
 
 void Dormant::turn(Index which, const Matrix3& M) {
@@ -69,7 +71,8 @@ void Dormant::turn(Index which, const Matrix3& M) {
     before = (M * before).eval();
     after = (after * M.transpose()).eval();
     S = (M * Matrix3(S.selfadjointView<Eigen::Lower>()) * M.transpose()).eval();
-    squares_.middleRows(own, 3) = (M * squares_.middleRows(own, 3)).eval();
+    auto squares = squares_.block(own, 0, 3, waiting_);
+    squares = (M * squares).eval();
     cross.middleCols(own, 3) = (cross.middleCols(own, 3) * M.transpose()).eval();
 }
 
@@ -80,27 +83,29 @@ Matrix Dormant::rows(const std::vector<Index>& own) const {
         S.row(i).head(row) = S_.row(row).head(row);
         S.row(i).tail(K.cols() - row) = S_.col(row).segment(row, K.cols() - row).transpose();
     }
-    const Matrix left = squares_(own, Eigen::all) * sign_.asDiagonal();
-    blas::multiply('N', 'T', 1.0, left, squares_, 1.0, S);
+    const Matrix left = squares()(own, Eigen::all) * sign_.head(waiting_).asDiagonal();
+    blas::multiply('N', 'T', 1.0, left, squares(), 1.0, S);
     return S;
 }
 
 Matrix3 Dormant::block(Index which) const {
-    const auto squares = squares_.middleRows(3 * which, 3);
+    const auto squares = squares_.block(3 * which, 0, 3, waiting_);
     const Matrix3 S = S_.block<3, 3>(3 * which, 3 * which).selfadjointView<Eigen::Lower>();
-    return S + squares * sign_.asDiagonal() * squares.transpose();
+    return S + squares * sign_.head(waiting_).asDiagonal() * squares.transpose();
 }
 
 void Dormant::fold() {
-    auto S = S_.topLeftCorner(K.cols(), K.cols());
     for (double sign : {1.0, -1.0}) {
         std::vector<Index> which;
-        for (Index j = 0; j < sign_.size(); ++j)
+        for (Index j = 0; j < waiting_; ++j)
             if (sign_(j) == sign) which.push_back(j);
-        if (!which.empty()) blas::square('N', sign, squares_(Eigen::all, which), 1.0, S);
+        square(squares()(Eigen::all, which), sign);
     }
-    squares_.resize(K.cols(), 0);
-    sign_.resize(0);
+    waiting_ = 0;
+}
+
+void Dormant::square(const Matrix& A, double sign) {
+    blas::square('N', sign, A, 1.0, S_.topLeftCorner(K.cols(), K.cols()));
 }
 
 }  // namespace ekfslam

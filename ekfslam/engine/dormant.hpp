@@ -36,9 +36,12 @@ class Dormant {
 
    private:
     void fold();
+    void square(const Matrix& A, double sign);
+    auto squares() const { return squares_.topLeftCorner(K.cols(), waiting_); }
     Matrix S_{0, 0};        // its lower triangle, with room for more
-    Matrix squares_{0, 0};  // S is this much more, or less, than S_: U diag(sign) U^T
+    Matrix squares_{0, 0};  // S is this much more, or less, than S_: U diag(sign) U^T, with room for more
     Vector sign_;
+    Index waiting_ = 0;  // columns of U
 };
 
 // Columns (3n) of landmarks.

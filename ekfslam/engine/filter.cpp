@@ -40,13 +40,6 @@ bool has_blocks_of_camera(const Estimate& e) {
 Filter::Filter(Estimate estimate, std::int64_t landmark, std::int64_t observation)
     : e(std::move(estimate)), next_landmark(landmark), next_observation(observation) {}
 
-void Filter::restore(State before) {
-    e = std::move(before.e);
-    waiting = std::move(before.waiting);
-    next_landmark = before.next_landmark;
-    next_observation = before.next_observation;
-}
-
 Report Filter::update(Index frame, const Ids& ids, const Matrix& measured) {
     Retired out = rest(frame, ids);
     Report report = take(frame, ids, measured);

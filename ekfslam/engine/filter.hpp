@@ -58,15 +58,6 @@ class Filter {
     // Replace mean and covariance: Values::flat, (body), (3, n), (body + 3n). Considered columns become zero.
     void adopt(const Vector& values, const Vector& coordinates, const Matrix& position_m, const Matrix& P);
 
-    // What a frame changes, to be restored if it fails; `moving` grows at the end of a frame alone.
-    struct State {
-        Estimate e;
-        Waiting waiting;
-        std::int64_t next_landmark, next_observation;
-    };
-    State state() const { return {e, waiting, next_landmark, next_observation}; }
-    void restore(State before);
-
     Estimate e;
     std::optional<Process> process;           // none: predictions come from Python
     Uniform uniform;                          // of Python: `numpy.random.default_rng(frame).random`
