@@ -37,14 +37,8 @@ def write(path: str | Path, content: str | bytes) -> None:
 def write_all(contents: Mapping[Path, str | bytes], make_folders: bool = True) -> None:
     """Write files that belong together: all are on the disk before the first one replaces an older file.
 
-    Older files keep their permissions. A symbolic link stays, and its target is written.
-
-    Args:
-        contents: Contents by path; text is encoded in UTF-8.
-        make_folders: Whether to make missing folders; they are removed again if writing fails.
-
-    Raises:
-        WriteError: A target is a folder, a device or protected, its folder is missing, or the disk is full.
+    Older files keep their permissions. A symbolic link stays, and its target is written. Missing folders are made if
+    asked for, and removed again if writing fails. Raise a `WriteError` if a target cannot be written.
     """
     unfinished: dict[Path, Path] = {}
     made: list[Path] = []

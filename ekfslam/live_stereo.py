@@ -44,16 +44,7 @@ _BOUNDED = {"retire": "unseen", "retire_after": 10, "dormant": 0, "revive": -1, 
 
 
 class Learner:
-    """The filter behind the tracker, which the first frames configure.
-
-    Args:
-        config: Settings; automatic ones are resolved.
-        window: Arguments of `LiveEKF`.
-
-    Attributes:
-        live, problem: Filter and resolved problem; None until then.
-        kind: Kind of the inputs; None before the first.
-    """
+    """The filter behind the tracker, which the first frames configure; ``live`` and ``problem`` are None until then."""
 
     def __init__(self, config: Config, window: dict[str, Any]) -> None:
         self.live: LiveEKF | None = None
@@ -137,13 +128,8 @@ class Learner:
 class Line:
     """Two threads behind each other: one tracks pairs of images, one does jobs of the filter.
 
-    Args:
-        track: Function that tracks a pair.
-        most_pairs: Number of pairs that may wait.
-
-    Attributes:
-        errors: Errors of the threads that nobody has seen yet.
-        skipped: Number of pairs that were displaced, or whose tracks the filter could not take.
+    At most ``most_pairs`` wait. ``errors`` are those of the threads that nobody has seen yet, ``skipped`` counts pairs
+    that were displaced, or whose tracks the filter could not take.
     """
 
     def __init__(self, track: Callable[[Image, Image, float], None], most_pairs: int) -> None:

@@ -51,12 +51,7 @@ class InertialRows:
 
 
 def samples_of(rows: InertialRows) -> tuple[InertialSamples, tuple[str, ...]]:
-    """Return the samples on the clock of the images, and notes; repeated stamps are dropped, densities of 0 not stated.
-
-    Raises:
-        StampError: A stamp goes back, and the rows are not to be sorted.
-        DataError: There are less than two samples, or the units cannot be right.
-    """
+    """Return the samples on the clock of the images, without repeated stamps and densities of 0, and notes."""
     rows, notes = in_order(rows)
     if len(rows.time_ns) < 2:
         raise ShapeError(f"there are {len(rows.time_ns)} inertial samples, two are needed", source=rows.source)

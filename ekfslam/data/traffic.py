@@ -163,10 +163,8 @@ def _solved(
 ) -> tuple[Array, Array, Array, Array]:
     """Solve for all x (m, 6), c and e (n, 3); return also the covariance (n, 2, 2) of c and de/dc (n, 2).
 
-    Args:
-        products: (k, 10, 10) ``rows^T rows`` of single intervals, weighted.
-        interval, track: (k,) their index among intervals and tracks.
-        site: (n, 3, 3) information of c and e beside the rows, and (n, 3) information vector.
+    ``products`` (k, 10, 10) are weighted ``rows^T rows`` of single intervals and tracks, ``site`` has the information
+    (n, 3, 3) of c and e beside them, and its vector.
     """
     m, n = len(prior.vector), len(site[0])
     of_interval, of_track = _summed(products, interval, m), _summed(products, track, n)

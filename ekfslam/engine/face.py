@@ -32,15 +32,7 @@ _KINDS = (np.zeros((), dtype=bool), np.ones((), dtype=bool))
 
 
 class Engine:
-    """Mean and covariance of a joint filter in C++.
-
-    Args:
-        model, config: Model and resolved settings, see `ekfslam.engine.choice`.
-
-    Attributes:
-        filter: `Filter` of the compiled module.
-        predicts: Whether predictions are made in C++, too.
-    """
+    """Mean and covariance of a joint filter in C++, the compiled ``filter``, which may make predictions, too."""
 
     def __init__(self, model: Model, config: FilterConfig) -> None:
         from ekfslam.engine._engine import Filter

@@ -50,17 +50,11 @@ class Alone(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Result of `compare_sources`.
+    """Result of `compare_sources`."""
 
-    Args:
-        std: (3, 6) standard deviation of each source over one stretch, m and rad along the axes of the IMU.
-        alone: Sources that stand alone, the surest first.
-        drift_m_sqrt_s: Random walk of the true position, mean of the axes; 0 within two standard errors.
-    """
-
-    std: Array
-    alone: tuple[Alone, ...]
-    drift_m_sqrt_s: float
+    std: Array  # (3, 6) standard deviation of each source over one stretch, m and rad along the axes of the IMU
+    alone: tuple[Alone, ...]  # sources that stand alone, the surest first
+    drift_m_sqrt_s: float  # random walk of the true position, mean of the axes; 0 within two standard errors
 
 
 def visual_motion(sequence: Sequence) -> tuple[Array, BoolArray]:

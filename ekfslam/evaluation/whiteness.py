@@ -69,12 +69,8 @@ def ratio_error(values: Array, dof: IntArray, lags: int) -> float:
 def gated_scale(mean: float, dimension: int, probability: float) -> float:
     """Return the ratio s of variances to the stated ones, at most 100, from the squares that passed a gate.
 
-    Squares are s times chi-square. The gate cuts off large ones, so that their mean understates s.
-
-    Args:
-        mean: Mean of the accepted squares, divided by their dimension.
-        dimension: Degrees of freedom of one square.
-        probability: Probability of the gate; 1 without a gate.
+    Squares are s times chi-square of a ``dimension``. The gate cuts off large ones, so their ``mean``, divided by it,
+    understates s.
     """
     if probability >= 1.0 or mean <= 0:
         return mean

@@ -153,16 +153,10 @@ def _settled(
     rounds: int,
     begin: BoolArray | None,
 ) -> _Settled | None:
-    """Solve eq. (6) under a covariance for the landmarks (k,) that agree; None: there are none.
+    """Solve eq. (6) for landmarks (k,) with rows (k, d) that agree; None: there are none.
 
-    Args:
-        e: Estimate at the prediction.
-        gaussian: Its covariance.
-        frame: Frame index, which also seeds the samples.
-        slot, measured: (k,), (k, d) landmarks and their rows.
-        gate: Threshold for one landmark.
-        rounds: Number of linearisations at most.
-        begin: (k,) landmarks that agree to begin with; None: they are found from samples.
+    They are found from samples, seeded by the frame, or are those of ``begin``; ``gate`` is the threshold for one,
+    ``rounds`` the number of linearisations at most.
     """
     _, rows = observe(e, e.mean, slot, measured)
     some, found = np.arange(len(slot)), None

@@ -22,17 +22,9 @@ _PIECES = 32  # samples after which a prediction is kept
 
 
 class Driven:
-    """A joint filter that processes images in order.
+    """A joint filter that processes images in order, and drops inputs that it needs no more.
 
-    Args:
-        ekf: New filter.
-        inputs: Inputs; those that are not needed any more are dropped.
-        history_s, log_frames, counts: See `ekfslam.filters.live.LiveEKF`.
-
-    Attributes:
-        time_s: Stamp of the last image; None before the first.
-        used_s: Stamp of the inputs that led to it: older ones come too late.
-        history: Estimates after the last images.
+    ``time_s`` is the stamp of the last image, ``used_s`` that of the inputs that led to it: older ones come too late.
     """
 
     def __init__(
@@ -99,12 +91,7 @@ class History:
             self._inputs.join(self._kept[0][0])
 
     def at(self, t: float) -> tuple[Estimate, bool]:
-        """Return the estimate without landmarks at a stamp, and whether its inputs were extrapolated.
-
-        Raises:
-            LateError: The stamp is before all images that are kept, or there are none.
-            MissingVelocityError: There are no inputs.
-        """
+        """Return the estimate without landmarks at a stamp, and whether it is extrapolated; `LateError` if too old."""
         at = bisect_right(self._past, t, key=lambda past: past[0]) - 1
         if at < 0:
             raise LateError("pose", t, self._past[0][0] if self._past else None)

@@ -59,17 +59,10 @@ def most_given_others(left: Rows, S: Array) -> Array:
 def agrees_with_others(left: Rows, C: Array) -> tuple[Array, BoolArray]:
     """Return ``e_i^T C_i^-1 e_i`` (k,), the normalised square of each landmark's innovation given all others.
 
-    With ``C_i = V (S^-1)_ii V`` and ``e_i = r_i - H_i (xi, d)``, what the correction leaves, the innovation of
-    landmark i given all *others* is ``V C_i^-1 e_i`` with covariance ``V C_i^-1 V``: nothing has to be computed once
-    for each landmark left out.
-
-    Args:
-        left: Rows with the residuals that the correction leaves.
-        C: (k, d, d) in units of the rows' standard deviations, from `Solution.given_others`.
-
-    Returns:
-        The squares, and whether (k,) a landmark can be judged. If C is only rounding, the others say nothing about the
-        landmark, and its square is 0.
+    With ``C_i = V (S^-1)_ii V`` (`Solution.given_others`) and ``e_i = r_i - H_i (xi, d)``, what the correction leaves,
+    the innovation of landmark i given all *others* is ``V C_i^-1 e_i`` with covariance ``V C_i^-1 V``: nothing has to
+    be computed once for each landmark left out. The second result is whether (k,) a landmark can be judged: if C is
+    only rounding, the others say nothing about it.
     """
     share, axes = np.linalg.eigh(C)
     judged = share[:, 0] > LEAST_SHARE
@@ -90,17 +83,10 @@ def moves_along(
     """Return which landmarks (k,) travel with the rig or against it, by their whole tracks so far.
 
     A landmark that moves by a share b of the rig's step between two frames has innovations of mean ``b h``, with h the
-    derivative of its rows by a motion of the landmark, times that step. Over a track ``N = sum h^T S^-1 r`` and
-    ``D = sum h^T S^-1 h`` estimate b as N / D with standard deviation ``D^-1/2``. Per-frame gates never see it: the
-    pose gives way first. It moves if b exceeds ``moving_sigma`` standard deviations, and ``moving_share``.
-
-    Args:
-        table: Table of all landmarks; the evidence in it grows.
-        slot: (k,) the landmarks.
-        evidence: (k,), (k,) terms that this frame adds to N and D.
-        squares: (k,) normalised innovations squared; gross outliers count as at the gate.
-        gate: Threshold of the gate.
-        config: Settings of the filter.
+    derivative of its rows by a motion of the landmark, times that step. Over a track ``N = sum h^T S^-1 r`` and ``D =
+    sum h^T S^-1 h`` estimate b as N / D with standard deviation ``D^-1/2``. Per-frame gates never see it: the pose
+    gives way first. It moves if b exceeds ``moving_sigma`` standard deviations, and ``moving_share``. The ``evidence``
+    is what this frame adds to N and D; outliers in ``squares`` count as at the gate.
     """
     along, information = evidence
     clip = np.sqrt(np.minimum(1.0, gate / np.maximum(squares, 1e-12)))

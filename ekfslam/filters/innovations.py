@@ -40,14 +40,7 @@ class FrameInnovations:
 
 
 def innovations_of(solution: Solution, landmark: IntArray, rows: Rows, S: Array, left: Array) -> FrameInnovations:
-    """Return the innovations of one frame.
-
-    Args:
-        landmark: (k,) row of each landmark in the log.
-        rows: Accepted rows, with eq. (6) solved for them.
-        S: (k, d, d) innovation covariance of each landmark by itself.
-        left: (k, d) residuals that the correction leaves.
-    """
+    """Return the innovations of a frame: rows of landmarks (k,), S (k, d, d), and residuals ``left`` (k, d)."""
     if not len(landmark):
         return FrameInnovations.none(rows.residual.shape[1])
     k, d = rows.residual.shape

@@ -61,23 +61,16 @@ class Relinearised(Protocol):
 
 
 class Retired:
-    """Landmarks that have left the state.
-
-    Attributes:
-        row_of: Rows in the log of landmarks that may come back, by id.
-        revived: Ids of retired landmarks that were seen again and came back.
-        reappeared: Ids of retired landmarks that were seen again and initialised as new ones.
-        moving: Ids of tracks that were found to move; they are not used again.
-    """
+    """Landmarks that have left the state."""
 
     def __init__(self) -> None:
         self._parts: list[Landmarks] = []
         self._rows: list[IntArray] = []
-        self.row_of: dict[int, int] = {}
+        self.row_of: dict[int, int] = {}  # rows in the log of landmarks that may come back, by id
         self._verdicts: dict[int, tuple[int, Array]] = {}  # misses and evidence of moving, by row
-        self.revived: list[int] = []
-        self.reappeared: list[int] = []
-        self.moving: set[int] = set()
+        self.revived: list[int] = []  # ids of retired landmarks that were seen again and came back
+        self.reappeared: list[int] = []  # those that were initialised as new ones
+        self.moving: set[int] = set()  # ids of tracks that were found to move; they are not used again
         self._dropped = 0
         self._rows_before: dict[int, int | None] = {}  # entries of `row_of` that have changed since `mark`
 
@@ -153,14 +146,7 @@ class Retired:
     def fetch(
         self, table: LandmarkTable, known: Landmarks, log: Log, ids: list[int], revival: Revival, frame: int
     ) -> None:
-        """Put returning landmarks back into the table, and the neighbours that will probably be seen next.
-
-        Args:
-            known: All landmarks, in the order of the log.
-            ids: Landmarks that were seen again.
-            revival: Source of the neighbours.
-            frame: Present frame.
-        """
+        """Put returning landmarks back into the table, and neighbours that will probably be seen next."""
         returning = np.array([self.row_of[i] for i in ids])
         retired = np.fromiter(self.row_of.values(), dtype=np.int64, count=len(self.row_of))
         neighbours, distance = revival.neighbours(log, returning, np.setdiff1d(retired, returning))

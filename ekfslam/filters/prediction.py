@@ -35,14 +35,7 @@ class Prediction:
 def predict(e: Estimate, interval: Interval, also: Measured | None, at_rest: Measured | None = None) -> Prediction:
     """Predict over an interval: clones and walking blocks, then measurements of blocks, then the process.
 
-    Args:
-        e: Estimate that changes.
-        interval: Inputs.
-        also: Measurements by further sensors.
-        at_rest: Rows of a rig that stood in the frame before, see `ekfslam.filters.standing`.
-
-    Raises:
-        ConfigError: Measurements by further sensors of a velocity that is not in the state.
+    ``also`` are measurements by further sensors; ``at_rest`` rows of a rig that stood, see `ekfslam.filters.standing`.
     """
     model, process = e.model, e.model.process
     if also is not None:

@@ -18,12 +18,7 @@ _POSE = slice(0, 6)
 
 
 class References:
-    """Cross-covariances of pairs of reported poses, recorded while a filter runs.
-
-    Args:
-        estimate: Filter before its first frame; it gets the columns that the pairs need.
-        first, second: (n,) earlier and later frame of each pair.
-    """
+    """Cross-covariances of pairs of reported poses, ``first`` before ``second``, recorded while a new filter runs."""
 
     def __init__(self, estimate: JointEKF, first: IntArray, second: IntArray) -> None:
         self._gaussian, self._window, self._first, self._second = estimate.gaussian, estimate.window, first, second

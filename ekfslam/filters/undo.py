@@ -35,11 +35,9 @@ class OneAtATime:
 def all_or_nothing(
     e: Estimate, log: LogBook, retired: Retired, parts: Iterable[object | None], changes_engine: bool
 ) -> Iterator[None]:
-    """Restore state, covariance, log and counts of a filter if an error is raised inside.
+    """Restore state, covariance, log, counts and further parts of a filter if an error is raised inside.
 
-    Args:
-        parts: Further parts of it that replace their attributes.
-        changes_engine: Whether several calls of the engine follow; one alone changes all or nothing.
+    ``changes_engine`` says that several calls of the engine follow; one alone changes all or nothing.
     """
     before, engine = dict(vars(e)), e.engine
     copies = {"values": dict(e.values), "coordinates": e.coordinates.copy()}

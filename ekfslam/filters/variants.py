@@ -24,15 +24,11 @@ class Standard:
 
     Known weakness: Jacobians at changing linearisation points give information about directions that no measurement
     observes (origin and rotation of the world). The heading becomes overconfident first.
-
-    Attributes:
-        first_estimates: Whether Jacobians are taken at first estimates.
-        is_frozen_exactly: See the function of this name; for landmarks in xyz.
     """
 
     name = "standard"
-    first_estimates = False
-    is_frozen_exactly = True
+    first_estimates = False  # whether Jacobians are taken at first estimates
+    is_frozen_exactly = True  # for landmarks in xyz, see the function of this name
 
     def linear(self, estimate: Array, first: Array) -> Array:
         """Return the linearisation point of a pose or of landmarks, given estimate and first estimate."""

@@ -10,12 +10,7 @@ from ekfslam.arrays import Array
 
 
 def radtan(xy: Array, coefficients: Sequence[float]) -> Array:
-    """Radial and tangential distortion (Brown 1966) of normalised coordinates (..., 2), ``q / q_z``.
-
-    Args:
-        xy: Undistorted.
-        coefficients: ``(k1, k2, p1, p2[, k3[, k4, k5, k6]])``, in the order of OpenCV.
-    """
+    """Distort (..., 2) radially and tangentially (Brown 1966) by ``(k1, k2, p1, p2[, k3[, k4, k5, k6]])`` as OpenCV."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *(0.0,) * (8 - len(coefficients)))
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -27,12 +22,7 @@ def radtan(xy: Array, coefficients: Sequence[float]) -> Array:
 
 
 def equidistant(xy: Array, coefficients: Sequence[float]) -> Array:
-    """Fisheye distortion (Kannala and Brandt, PAMI 2006) of normalised coordinates (..., 2).
-
-    Args:
-        xy: Undistorted.
-        coefficients: ``(k1, k2, k3, k4)`` of ``theta (1 + k1 theta^2 + ...)``.
-    """
+    """Distort (..., 2) as a fisheye (Kannala and Brandt, PAMI 2006): ``theta (1 + k1 theta^2 + ... + k4 theta^8)``."""
     r = np.linalg.norm(xy, axis=-1, keepdims=True)
     theta = np.arctan(r)
     t2 = theta * theta

@@ -36,20 +36,13 @@ class Transition:
 
 @dataclass(frozen=True)
 class Model:
-    """The blocks of the state, their process, the sensor of landmarks, and all noise.
-
-    Args:
-        blocks: Blocks of the state, the pose first.
-        make_process: Maker of the process that moves them.
-        joint_prior: (body, body) covariance before the first frame, in the columns of ``layout``; None: blocks are
-            independent of each other, with the covariances that they state.
-    """
+    """The blocks of the state, their process, the sensor of landmarks, and all noise."""
 
     sensor: Sensor
     noise: Noise
-    blocks: tuple[StateBlock, ...]
-    make_process: MakeProcess = velocities
-    joint_prior: Array | None = None
+    blocks: tuple[StateBlock, ...]  # the pose first
+    make_process: MakeProcess = velocities  # maker of the process that moves them
+    joint_prior: Array | None = None  # (body, body) covariance before the first frame; None: that of each block
 
     @cached_property
     def layout(self) -> Layout:

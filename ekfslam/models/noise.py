@@ -63,26 +63,17 @@ _DIFFERS = 3.0  # standard errors by which an axis must differ from the others f
 
 @dataclass(frozen=True)
 class VelocityNoise:
-    """Noise of velocities as their differences show it.
+    """Noise of velocities as their differences show it, linear (m/s) and angular (rad/s)."""
 
-    Args:
-        sigma: (2,) white noise per sample of the linear (m/s) and the angular velocities (rad/s): the median of the
-            axes that are measured.
-        sigma_error: (2,) standard errors (jackknife over 20 stretches); 0 if no noise is seen.
-        limit: (2,) upper limits of sigma with a confidence of 95 %.
-        walk: (2,) change of the true velocities per sample, root mean square.
-        sampling: (6,) noise of taking a sample for the mean over its interval, each axis.
-        measured: (6,) whether an axis is measured.
-        axes: (6,) white noise of each axis, 0 if it is not measured. By default ``sigma``.
-    """
-
-    sigma: Array
-    sigma_error: Array
-    limit: Array
-    walk: Array
+    sigma: Array  # (2,) white noise per sample: the median of the axes that are measured
+    sigma_error: Array  # (2,) standard errors (jackknife over 20 stretches); 0 if no noise is seen
+    limit: Array  # (2,) upper limits of sigma with a confidence of 95 %
+    walk: Array  # (2,) change of the true velocities per sample, root mean square
+    # (6,) noise of taking a sample for the mean over its interval, each axis.
     sampling: Array = field(default_factory=lambda: np.zeros(6))
-    measured: BoolArray = field(default_factory=lambda: np.ones(6, dtype=bool))
-    axes: Array = field(default=None)  # type: ignore[arg-type]  # filled in
+    measured: BoolArray = field(default_factory=lambda: np.ones(6, dtype=bool))  # (6,) whether an axis is measured
+    # (6,) white noise of each axis, 0 if it is not measured; by default ``sigma``, filled in.
+    axes: Array = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         if self.axes is None:

@@ -104,11 +104,8 @@ class Observer:
     def camera(self, moment: Moment, is_difference: BoolArray | bool = False) -> Camera:
         """Return the camera ``C D exp(o^)`` of a moment and its derivative, eq. (9) and (11).
 
-        ``C = exp(c^) T_cam_imu`` has the calibration, D leads to the exposure, o is the sum of the shares of blocks.
-
-        Args:
-            moment: Of one frame, or of several ones (...).
-            is_difference: (...) whether a difference of observations sees it, eq. (10), or a single one.
+        ``C = exp(c^) T_cam_imu`` has the calibration, D leads to the exposure, o is the sum of the shares of blocks. A
+        difference of observations (...), eq. (10), may see another one than a single observation.
         """
         C, CD, offset, shares = self._parts(moment, is_difference)
         T, layout = CD, self.layout
@@ -210,14 +207,8 @@ class Observer:
     ) -> tuple[Array, Array, Array]:
         """Return positions (n, 3) of new landmarks, G (n, 3, seen), and the measurement's part (n, 3, 3), eq. (5).
 
-        Rows stay the same, ``H_z z + H_i x + H_m d = 0``.
-
-        Args:
-            parameters, T_cam_world: (9,) calibration and (4, 4) camera of the first observations.
-            T_linear: (4, 4) camera at which G is taken: the same, or (FEJ) the predicted one.
-            by: (6, seen) derivative of the camera's error.
-            q: (n, 3) points of `inverted`.
-            variance: (n, 3) variance of the rows.
+        Rows stay the same, ``H_z z + H_i x + H_m d = 0``. G is taken at ``T_linear``: the camera, or (FEJ) the
+        predicted one. ``by`` (6, seen) is the derivative of the camera's error, q (n, 3) are points of `inverted`.
         """
         positions = se3.apply(se3.inverse(T_cam_world), q)
         here = self.project(parameters, T_cam_world, positions)

@@ -36,12 +36,7 @@ _SEARCH, _MOST_STEPS, _SHARES = PosteriorConfig(kernel="none"), 6, (1.0, 0.5, 0.
 
 
 class FixedLag:
-    """The last frames of a filter.
-
-    Args:
-        model, config: Model and settings of the filter; ``config.lag`` is n.
-        gain: A step of the search is the last one if it lowers half the sum of squares by no more: by default by what a
-            third of a standard deviation does.
+    """The last n = ``config.lag`` frames of a filter; a search ends with a step of less ``gain`` in the cost.
 
     Attributes:
         prior, unknowns: Gaussian at the first frame of the window (None: not begun), and its unknowns.

@@ -24,12 +24,9 @@ _AT_ONCE = 20_000  # observations that are linearised as filtered: those of a lo
 
 
 class ObservationFactors:
-    """Factors of a log that concern landmarks.
+    """Factors of a log that concern landmarks, first seen in ``first_frame`` (M,) at ``first_position_m``.
 
-    Attributes:
-        first_frame: (M,) frame of each landmark's first observation.
-        first_position_m: (M, 3) its initialisation.
-        prior_weight: Reciprocal of the standard deviation of a weak prior of landmarks there; 0: none.
+    A weak prior of landmarks there has the standard deviation 1 / ``prior_weight``; 0: none.
     """
 
     def __init__(self, log: Log, model: Model, unknowns: Unknowns) -> None:

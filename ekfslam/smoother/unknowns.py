@@ -33,16 +33,13 @@ class State:
 class Unknowns:
     """Blocks of a model in the groups of `ekfslam.smoother.sparse.factors`.
 
-    Args:
-        initial_covariance: Covariance before the first frame: of all blocks (body, body), or of the pose (6, 6).
-        mean: (body,) coordinates before the first frame.
+    Covariance and ``mean`` (body,) are those before the first frame; that of the pose alone may be given.
 
     Attributes:
         shared, aux, of_drive: Blocks of ``frames`` (without the pose), of ``aux`` and of ``drive``.
         frame_columns, aux_columns, drive_columns: Their columns in the model's layout, the pose's included.
         width: Number of columns of a frame.
-        shared_mean, aux_mean: (w-6,), (a,) prior means of the first frame's blocks.
-        drive_covariance: (g, g) prior covariance of the drive's blocks.
+        shared_mean, aux_mean, drive_covariance: (w-6,), (a,) prior means in the first frame; (g, g) of the drive.
         B: (w+a, w+a) root of the first frame's covariance, see `FirstFrame`.
     """
 

@@ -83,16 +83,7 @@ class Observed:
 
 
 class Sight:
-    """Observations at a state, linearised by views and landmarks.
-
-    Args:
-        views: Cameras of all frames.
-        batches: Kinds of observations.
-        positions_m: (M, 3) landmarks.
-
-    Attributes:
-        residuals: Whitened residuals (n, d) of each kind.
-    """
+    """Kinds of observations at cameras and landmarks (M, 3) of a state, and their whitened ``residuals`` (n, d)."""
 
     def __init__(self, views: Views, batches: Sequence[Observed], positions_m: Array) -> None:
         self.views, self.batches, self.residuals = views, batches, []

@@ -58,9 +58,6 @@ def bag_bytes(trajectory: Trajectory) -> bytes:
     """Return a bag (MCAP, ROS 2) of ``nav_msgs/Odometry`` with covariances, topic ``/ekfslam/odometry``.
 
     Positions are in the frame ``map``. The twist is unknown: its variances are 1e6.
-
-    Raises:
-        MissingPackageError: rosbags is not installed.
     """
     try:
         from rosbags import rosbag2

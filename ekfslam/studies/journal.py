@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ekfslam import files
 from ekfslam.errors import ArchiveError, WriteError
-from ekfslam.progress import progress as with_progress
+from ekfslam.progress import progress
 from ekfslam.studies.executors import completed
 
 _LENGTH, _DIGEST = 8, 32  # bytes before an entry
@@ -37,33 +37,20 @@ def run_missing(
     keep: Callable[[Key, Record], None],
     save: Callable[[], None],
     label: str,
-    progress: bool = True,
 ) -> None:
     """Run the tasks that the journal does not hold, and save the archive at the end or when an exception interrupts.
 
-    After a kill, the next call finds the finished runs in the journal. It is removed once they are saved.
-
-    Args:
-        journal: File of finished runs.
-        tasks: Runs that the archive does not hold.
-        submit: Function that hands a task to an executor.
-        keep: Function that adds the record of a run to the archive.
-        save: Function that writes the archive.
-        label, progress: Name in the progress bar, and whether to show one on a terminal.
-
-    Raises:
-        ArchiveError: The journal belongs to another study or is damaged; nothing is changed then.
-        WriteError: Journal or archive cannot be written.
+    After a kill, the next call finds the finished runs in the journal. It is removed once they are saved. ``submit``
+    hands a task to an executor, ``keep`` adds the record of a run to the archive, ``save`` writes it. Raise an
+    `ArchiveError` if the journal is of another study or damaged; nothing is changed then.
     """
     held = dict(journal.entries())
     for key, record in held.items():
         keep(key, record)
     missing = [key for key in tasks if key not in held]
-    finished: Iterable[tuple[Key, Record]] = completed(missing, lambda key: submit(tasks[key]))
-    if progress:
-        finished = with_progress(finished, label, "run", total=len(missing))
+    finished = completed(missing, lambda key: submit(tasks[key]))
     try:
-        for key, record in finished:
+        for key, record in progress(finished, label, "run", total=len(missing)):
             journal.append(key, record)
             keep(key, record)
     finally:
@@ -74,10 +61,7 @@ def run_missing(
 class Journal:
     """File of finished runs that an archive does not hold yet.
 
-    Args:
-        archive: Path of the archive.
-        study: Everything that decides the numbers, ready for JSON. It is the first entry of the file.
-        blank: Function from a level to an empty record, which defines fields, shapes and types.
+    It begins with everything that decides the numbers of the ``study``. ``blank`` makes an empty record of a level.
     """
 
     def __init__(self, archive: Path, study: Any, blank: Callable[[str], Record]) -> None:

@@ -318,12 +318,10 @@ class StudyArchive(Shown):
         self.done[level][run] = True
 
 
-def run_study(study: Study, path: str | Path, executor: Executor, progress: bool = True) -> StudyArchive:
+def run_study(study: Study, path: str | Path, executor: Executor) -> StudyArchive:
     """Run everything that the archive at ``path`` does not hold, see `run_missing`; a larger number of runs extends it.
 
-    Raises:
-        ArchiveError: ``path`` holds another study (the message names the difference), or cannot be written.
-        WriteError: Another study writes there.
+    Raise an `ArchiveError` if it is of another study; the message names the difference.
     """
     path = Path(path)
     archive = StudyArchive.empty(study)
@@ -350,7 +348,7 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
             for level in study.levels
             if not archive.done[level][run]
         }
-        run_missing(journal, tasks, lambda task: executor.submit(run_one, *task), keep, save, "consistency", progress)
+        run_missing(journal, tasks, lambda task: executor.submit(run_one, *task), keep, save, "consistency")
     return archive
 
 

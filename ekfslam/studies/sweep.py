@@ -240,7 +240,7 @@ class Sweep:
         return of_toml(path, lambda found: _parsed(found, Path(path).parent))
 
 
-def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool = True) -> SweepTable:
+def run_sweep(sweep: Sweep, path: str | Path, executor: Executor) -> SweepTable:
     """Run every task that the table at ``path`` does not hold, and write the table; see `run_missing`.
 
     A run that a filter cannot finish is a row with an error and no figures.
@@ -276,9 +276,7 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
                 keep((row["key"], 0), _record(sweep.columns, row, row["error"]))
         missing = {key: tasks[key] for key, *_ in twins.values() if key not in done}
         limit = limit_gb()
-        run_missing(
-            journal, missing, lambda task: executor.submit(run_task, task, limit), keep, save, "sweep", progress
-        )
+        run_missing(journal, missing, lambda task: executor.submit(run_task, task, limit), keep, save, "sweep")
     return _table(sweep, done)
 
 

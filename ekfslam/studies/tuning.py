@@ -342,14 +342,10 @@ def estimates_of(start: dict[str, float], free: list[str], peak: Peak, found: Ve
 def sandwich(H: Array, scores: Array) -> Array:
     """Return the covariance (n, n) of a maximum-likelihood estimate under a model that need not be right.
 
-    With A = -H and J the covariance of the gradient it is ``A^-1 J A^-1`` (Huber 1967; White, "Maximum likelihood
-    estimation of misspecified models", Econometrica 50, 1982), scaled up where its diagonal is less than that of
-    ``A^-1``. J is the scatter of the gradients of blocks of 10 frames. It misses longer correlations, and errors that
-    all frames share.
-
-    Args:
-        H: (n, n) Hessian, negative definite.
-        scores: (n, T) gradient of the log-likelihood of each frame.
+    With A = -H (n, n) and J the covariance of the gradient it is ``A^-1 J A^-1`` (Huber 1967; White, "Maximum
+    likelihood estimation of misspecified models", Econometrica 50, 1982), scaled up where its diagonal is less than
+    that of ``A^-1``. J is the scatter of the gradients ``scores`` (n, T) of blocks of 10 frames. It misses longer
+    correlations, and errors that all frames share.
     """
     inverse = np.linalg.inv(-H)
     centred = scores - scores.mean(axis=1, keepdims=True)

@@ -38,13 +38,7 @@ from ekfslam.names import printable
 
 
 class BagPairs:
-    """Load pairs of images from a bag, which is opened at the first call.
-
-    Args:
-        topics: Topics of the left and the right images.
-        places: (T, 2) time of writing and stamp, ns, of the left and the right images.
-        size, bits: Required width and height; used bits of images of 16 bits, see `decode_gray`.
-    """
+    """Load pairs of images from a bag, opened at the first call; ``places`` (T, 2): time of writing and stamp, ns."""
 
     def __init__(
         self,
@@ -82,11 +76,8 @@ def open_bag(path: Path, topics: tuple[str, ...] = (), calibration: str | None =
     The CameraInfo of the right camera has a baseline in P. Topics with ``rect`` in their last part are rectified images
     with the camera P; others are as the lens sees them, with K, D and R. The body is the inertial unit if
     ``/tf_static``, or a chain of Kalibr beside the bag, connects it to the camera; else the frame of the velocities. If
-    nothing connects that to the camera either, the body is the left camera.
-
-    Args:
-        topics: Topics to use: left and right images, velocities, inertial samples; those of other types are chosen.
-        calibration: File for `calibrations.read_pair` in place of CameraInfo.
+    nothing connects that to the camera either, the body is the left camera. ``topics`` and a ``calibration`` file take
+    precedence.
     """
     with contextlib.closing(Bag(path, topics)) as bag, spelled_as_in(str(path)):
         pair = pair_of(bag, calibration)

@@ -102,12 +102,7 @@ def lens_of(name: str, coefficients: Array, key: str) -> Distortion:
 
 
 def read_pair(path: str | Path) -> PairFile:
-    """Read the calibration of a pair from a file, or from the files of a folder.
-
-    Raises:
-        UnknownFormatError: The file is missing or of unknown content.
-        DataError: A key is missing or malformed.
-    """
+    """Read the calibration of a pair from a file, or from the files of a folder; a `DataError` names a wrong key."""
     path = Path(path)
     if path.is_dir():
         path = _in_folder(path)

@@ -54,12 +54,7 @@ class _Columns(NamedTuple):
 
 
 def read_imu(place: Path) -> InertialRows:
-    """Read the samples of a text file, or of a folder ``imu0`` of EuRoC, with the densities beside them.
-
-    Raises:
-        UnknownFormatError: The file is missing or no text, or its header names other columns.
-        DataError: A line is malformed, or the stamps have an impossible rate.
-    """
+    """Read the samples of a text file, or of a folder ``imu0`` of EuRoC, with the densities beside them."""
     path = next((place / name for name in _PLACES if (place / name).is_file()), place)
     lines = read_lines(path, f"expected {EXPECTED}")
     rows = [(n, words) for n, line in enumerate(lines, 1) if (words := _words(line.split("#")[0]))]

@@ -75,17 +75,7 @@ def is_kitti_raw(folder: Path) -> bool:
 
 
 def open_kitti_raw(folder: str | Path, pair: Pair = "gray", lateral: Lateral = "corrected") -> KittiRaw:
-    """Read a drive folder and its calibration.
-
-    Args:
-        folder: Drive folder, such as ``2011_09_30/2011_09_30_drive_0027_sync``.
-        pair: ``gray`` (image_00, image_01) or ``color`` (image_02, image_03).
-        lateral: Sign of the lateral velocity, see `with_lateral`.
-
-    Raises:
-        UnknownFormatError: A file or folder is missing or is not text.
-        DataError: A line is malformed or inconsistent.
-    """
+    """Read a drive folder such as ``2011_09_30/2011_09_30_drive_0027_sync``, with the ``pair`` gray or color."""
     if pair not in CAMERAS:
         raise ConfigError(f"pair must be one of {', '.join(CAMERAS)}, found {pair!r}")
     folder = Path(folder)

@@ -111,10 +111,7 @@ def pair_files(
 ) -> tuple[PairFiles, tuple[str, ...]]:
     """Return the loader of pairs of images, and notes on them. Sizes are read from the headers of all files.
 
-    Args:
-        left, right: Files of each frame.
-        size: Width and height as calibrated; by default those of the first image. Others raise `CalibrationError`.
-        bits: Used bits of images of 16 bits; by default those of the largest value in all files.
+    All must have ``size``, by default that of the first image. ``bits`` are by default those of the largest value.
     """
     whose, deep = ("the calibration" if size else str(left[0])), []
     for path in (*left, *right):

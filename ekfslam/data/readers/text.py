@@ -102,12 +102,7 @@ def parse_table(
 ) -> Table:
     """Return all rows of numbers; there may be none.
 
-    Args:
-        lines, path: Lines of a file, and its name in messages.
-        columns: Number of columns; that of the first row by default.
-        used: Number of columns that are read; the others may hold anything.
-        separator, comment: By default blanks, and ``#``; None: there are no comments.
-        converters, error: See `parse_numbers`.
+    Rows have ``columns`` numbers, by default those of the first one; the first ``used`` are read. See `parse_numbers`.
     """
     values: list[list[float]] = []
     numbers: list[int] = []

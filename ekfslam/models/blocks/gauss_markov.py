@@ -18,14 +18,11 @@ class GaussMarkov(StateBlock):
 
     ``l`` is the time or way between two frames, L the time or way after which a share 1/e is left (Maybeck, "Stochastic
     Models, Estimation, and Control" 1, 1979, section 4.11). Every setting of a subclass is positive.
-
-    Attributes:
-        least_way_m: Way between two frames that counts at least.
     """
 
     per_frame = True
     laws: ClassVar = {"transition": "gauss_markov", "lengths": "scales"}
-    least_way_m: ClassVar[float] = 0.0
+    least_way_m: ClassVar[float] = 0.0  # way between two frames that counts at least
 
     def __post_init__(self) -> None:
         for key, value in vars(self).items():

@@ -64,25 +64,16 @@ class Measured:
 
 
 class Process(ABC):
-    """A process model for one layout.
+    """A process model for one layout."""
 
-    Attributes:
-        own: Names of the blocks that it moves, the pose first, in the order of the columns of ``Phi`` and ``Q``.
-        layout: Columns of all blocks.
-        takes: Kind of the inputs.
-        started: Names of the walking blocks that the first inputs start, see `start`.
-        estimates_velocity: Whether the inputs measure velocities in the state.
-        velocity: Name of the block of the velocity, which further sensors can measure; "" if it is not in the state.
-        measures_departure: Whether these measure the state before the step, see `referred`; else that of the interval.
-    """
-
+    # Names of the blocks that it moves, the pose first, in the order of the columns of ``Phi`` and ``Q``.
     own: tuple[str, ...] = ("pose",)
-    layout: Layout
-    takes: type[Velocities] | type[InertialSamples] = Velocities
-    started: tuple[str, ...] = ()
-    estimates_velocity: bool = False
-    velocity: str = ""
-    measures_departure: bool = False
+    layout: Layout  # columns of all blocks
+    takes: type[Velocities] | type[InertialSamples] = Velocities  # kind of the inputs
+    started: tuple[str, ...] = ()  # names of the walking blocks that the first inputs start, see `start`
+    estimates_velocity: bool = False  # whether the inputs measure velocities in the state
+    velocity: str = ""  # name of the block of the velocity, which further sensors can measure, if it is in the state
+    measures_departure: bool = False  # whether these measure the state before the step, see `referred`
 
     @abstractmethod
     def step(self, values: Values, interval: Interval | Intervals, T_linear: Array, first_estimates: bool) -> Step:

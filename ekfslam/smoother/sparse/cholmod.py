@@ -28,16 +28,11 @@ class NotPositiveDefiniteError(EkfslamError):
 
 
 class BlockPattern:
-    """Pattern of a symmetric matrix A made of blocks, laid out in a fill-reducing order.
+    """Pattern of a symmetric matrix A of blocks (columns of each: ``sizes``), laid out in a fill-reducing order.
 
-    Args:
-        sizes: (b,) columns of each block of A, positive.
-        places: Sets of blocks in the lower triangle: (n, 2) row and column of each, and the shape of all blocks of the
-            set. A place may occur several times. Every diagonal block occurs.
-
-    Attributes:
-        order: (b,) blocks in that order.
-        permutation: (n,) rows of A in that order: those of each block in turn.
+    Sets of blocks in the lower triangle have ``places`` (n, 2), row and column of each, and one shape. A place may
+    occur several times. Every diagonal block occurs. ``order`` (b,) are the blocks in the fill-reducing order,
+    ``permutation`` (n,) the rows of A in it: those of each block in turn.
     """
 
     def __init__(self, sizes: IntArray, places: Sequence[tuple[IntArray, tuple[int, int]]]) -> None:

@@ -32,24 +32,18 @@ _UNDETERMINED = {
 
 
 class JointInformation:
-    """The Gaussian that a `LinearSystem` describes, factorised.
+    """The Gaussian that a `LinearSystem` describes, factorised; an `IllPosedError` names what is undetermined.
 
     Args:
         system: All factors.
         damping: Levenberg-Marquardt: added to the diagonal. Not in proportion to it: that crawls along the flat
             directions of a trajectory.
         like: A solution of another system with the same structure, whose analysis is used again.
-        structure: Structure of the system; by default that of ``like``, or a new one.
 
     Attributes:
-        factor: Factorisation of the reduced matrix.
         zeta: (w+a,) mean of the first frame in units of its prior.
         eps, aux, drive, d: Means of the unknowns: (T, w), (T, a), (g,), and (M, 3) of the landmarks.
-        gain: Decrease of half the sum of squares from the linearisation point to the mean.
-        cost: Half the sum of squares at the mean.
-
-    Raises:
-        IllPosedError: Something is undetermined; names landmark ids or frames.
+        gain, cost: Decrease of half the sum of squares from the linearisation point to the mean, and that at the mean.
     """
 
     structure: Structure

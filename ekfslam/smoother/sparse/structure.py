@@ -90,25 +90,18 @@ class Coupling:
 
 
 class Structure:
-    """Blocks of the normal equations of a system.
+    """Blocks of the normal equations of a system; an `IllPosedError` names landmarks without an observation.
 
-    Args:
-        system: Any linearisation.
-        eliminate_up_to: Landmarks observed from at most so many frames are eliminated; None: see `MOST_COUPLED`.
+    Landmarks observed from at most ``eliminate_up_to`` frames are eliminated; None: see `MOST_COUPLED`.
 
     Attributes:
         pairs: For each reduced group, landmark and unknown (p, 2) of the pairs that factors couple, by unknown.
         is_kept, kept: Whether (M,) a landmark is kept for CHOLMOD, and the numbers of kept ones.
-        first: First reduced block of each group.
-        block_sizes, start: Columns of each reduced block; the first of them, and the number of all.
-        views: Number of views of a frame.
+        first, block_sizes, start: First reduced block of each group; columns of each block; the first of them, and all.
         batches: Constraints of the factors; `normal_equations` adds their products.
         products, couplings: Terms of the normal equations, and of the elimination.
         kept_pairs: For each reduced group, numbers of the pairs with kept landmarks.
         pattern: Pattern of the reduced matrix. Its sets: groups, products, couplings, kept pairs.
-
-    Raises:
-        IllPosedError: Landmarks without an observation; names them.
     """
 
     def __init__(self, system: LinearSystem, eliminate_up_to: int | None = None) -> None:
