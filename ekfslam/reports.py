@@ -85,20 +85,26 @@ class Comparison(Shown):
         return compare_table(self.summary) + "".join(f"\n{line}\n" for line in lines)
 
     def save(
-        self, directory: str | Path, force: bool = False, figures: bool = True, timings: Timings | None = None
+        self,
+        directory: str | Path,
+        force: bool = False,
+        figures: bool = True,
+        timings: Timings | None = None,
+        width: str = "",
     ) -> list[Path]:
         """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures into a folder; return their paths.
 
-        All are written or none. Figures of an earlier run are removed.
+        All are written or none. Figures of an earlier run are removed. With a ``width`` (``column``, ``page`` or
+        inches) the figures are those of a paper, as PDF, with ``captions.md``.
 
         Raises:
             WriteError: The folder cannot be written, another command writes or reads its archive, or it holds another
                 recording or its figures and ``force`` is false.
         """
         with _claimed(Path(directory)):
-            return self._write(Path(directory), force, figures, timings or Timings())
+            return self._write(Path(directory), force, figures, timings or Timings(), width)
 
-    def _write(self, directory: Path, force: bool, figures: bool, timings: Timings) -> list[Path]:
+    def _write(self, directory: Path, force: bool, figures: bool, timings: Timings, width: str) -> list[Path]:
         archive, summary, table = (directory / name for name in ("archive.h5", "summary.json", "summary.md"))
         if not force:
             require_same_origin(archive, self.sequence)
@@ -110,11 +116,16 @@ class Comparison(Shown):
             contents |= {table: self.table + (f"\nThe reader notes:\n\n{notes}" if notes else "")}
         if figures:
             with timings.part("imports"):
+                from ekfslam.figures.paper import draw_paper, paper_contents, width_of
                 from ekfslam.figures.run import draw_figures
                 from ekfslam.figures.style import pngs
             with timings.part("figures"):
-                drawn = draw_figures(self.results, self.sequence.truth, self.sequence.interpolated)
-                contents |= marked(pngs(directory, drawn), [archive])
+                of = (self.results, self.sequence.truth, self.sequence.interpolated)
+                if width:
+                    drawn = paper_contents(directory, draw_paper(*of, width_of(width)), "pdf")
+                else:
+                    drawn = pngs(directory, draw_figures(*of))
+                contents |= marked(drawn, [archive])
             if not force:
                 require_own(contents, [archive])
         with timings.part("archive"):
@@ -198,6 +209,7 @@ def compare_into(
     verbose: bool = False,
     timings: Timings | None = None,
     others: Others | None = None,
+    width: str = "",
 ) -> str:
     """Save `compare` into a folder, and return the text for a terminal: notes of the reader, `brief`, folder written.
 
@@ -209,7 +221,7 @@ def compare_into(
     others = None if others is None else others.named(folder.name)
     with _claimed(folder):
         comparison = compare(sequence, modes, config, timings, others)
-        paths = comparison.save(folder, force, figures, timings)
+        paths = comparison.save(folder, force, figures, timings, width)
     notes = "".join(f"{sequence.name}: {note}\n" for note in sequence.notes)
     with timings.part("evaluation"):
         said = brief(sequence, comparison.results, comparison.skipped, folder / "archive.h5")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -11,16 +12,21 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from support.helpers import synthetic_result, synthetic_sequence
+from support.running import WHOLE
 
+from ekfslam.cli import main
 from ekfslam.figures import series
 from ekfslam.figures.maps import ellipse_axes, plot_landmark_arrows, plot_map
+from ekfslam.figures.paper import WIDTHS, draw_paper, width_of
 from ekfslam.figures.run import draw_figures, plot_errors, plot_nis, plot_parameters, save_figures
 from ekfslam.figures.views import plot_trajectory
 from ekfslam.filters.result import Parameters, Result
 from ekfslam.geometry import se3
 from ekfslam.geometry.motion import world_axes_covariance
+from ekfslam.storage.archive import write_archive
 
 MODES = ("dead-reckoning", "mapping-only", "full")
 
@@ -254,6 +260,11 @@ def test_no_text_is_cut_or_lies_on_another(sequence, results, modes, scale):
     runs["full"] = dataclasses.replace(runs["full"], parameters=parameters)
     drawn = draw_figures(runs, sequence.truth) | {"trajectory": plot_trajectory(runs["full"], sequence.truth)}
     assert {"map", "side", "errors", "nis", "parameters", "landmarks_full"} <= set(drawn)
+    require_legible(drawn)
+
+
+def require_legible(drawn: dict[str, Figure]) -> None:
+    """Fail if a text of a figure is cut or lies on another."""
     for name, figure in drawn.items():
         all_of_it = figure.get_size_inches() * figure.dpi
         found = boxes(figure)
@@ -261,6 +272,38 @@ def test_no_text_is_cut_or_lies_on_another(sequence, results, modes, scale):
             assert (low > -1.0).all() and (high < all_of_it + 1.0).all(), f"{name}: {text!r} is cut"
             for other, (begin, end) in found[:i]:
                 assert not ((low < end) & (begin < high)).all(), f"{name}: {text!r} lies on {other!r}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", ["column", "page"] if WHOLE else ["column"])
+def test_figures_of_papers_have_their_width_and_letters_of_eight_points(sequence, results, width):
+    drawn = {name: one.figure for name, one in draw_paper(results, sequence.truth, None, width_of(width)).items()}
+    assert {"map", "side", "errors", "errors_full", "nees", "nis"} <= drawn.keys()
+    require_legible(drawn)
+    for figure in drawn.values():
+        assert figure.get_figwidth() == WIDTHS[width]
+        assert {text.get_fontsize() for text in figure.findobj(Text) if text.get_text()} == {8.0}
+        assert not [text for text in (figure._suptitle, *(ax.title for ax in figure.axes)) if text and text.get_text()]
+
+
+def test_figures_of_papers_tell_estimators_apart_in_grey(sequence, results):
+    (upper, _) = draw_paper(results, sequence.truth, None, 3.5)["errors"].figure.axes
+    looks = [(line.get_marker(), line.get_linestyle()) for line in upper.lines]
+    assert len(set(looks)) == len(looks) > 1
+
+
+@pytest.mark.slow
+def test_plot_writes_figures_of_papers_with_captions_as_pdf(sequence, results, tmp_path, capsys):
+    write_archive(tmp_path / "a.h5", sequence, {"full": results["full"]})
+    arguments = ["plot", str(tmp_path / "a.h5"), "--format", "pdf", "--width"]
+    assert main([*arguments, "3.25"]) == 0
+    names = {path.name for path in tmp_path.glob("*.pdf")}
+    assert {"map.pdf", "errors_full.pdf", "nees.pdf"} <= names
+    assert re.search(rb"/MediaBox \[ 0 0 234 ", (tmp_path / "map.pdf").read_bytes())
+    captions = (tmp_path / "captions.md").read_text()
+    assert "**nees**: Pose NEES on" in captions and "6 expected" in captions
+    assert main([*arguments, "wide"]) == 2
+    assert "a width of figures is column, page, or 2.5 to 20 inches" in capsys.readouterr().err
 
 
 def test_drawing_leaves_no_global_state_behind(sequence, results):

@@ -67,6 +67,11 @@ def _choice(names: tuple[str, ...], default: str, words: str) -> dict[str, Any]:
 # Shared arguments: name, and how argparse declares it.
 _SHARED: dict[str, dict[str, Any]] = {
     "data": {"nargs": "?", "default": DEFAULT_DATA, "metavar": "DATA", "help": f"default: {DEFAULT_DATA}"},
+    "--width": {
+        "default": "",
+        "metavar": "WIDTH",
+        "help": "draw the figures of a paper: column (3.5 inches), page (7.16), or inches; captions in captions.md",
+    },
     "archive": _file("as written by run or compare", "ARCHIVE"),
     "--out": _file("default: the folder of the archive", "DIR"),
     "--timings": _switch("print the CPU and wall-clock time of each part"),

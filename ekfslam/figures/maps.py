@@ -122,8 +122,8 @@ def spread(length: int, count: int) -> IntArray:
     return np.unique(np.linspace(0, length - 1, count).astype(int))
 
 
-def map_axes(results: Mapping[str, Result], truth: Truth | None, points: Array) -> tuple[Figure, Axes, BoolArray]:
-    """Return a new figure with axes around all paths and the bulk of points (n, 2), and a mask of points outside."""
+def view_of(results: Mapping[str, Result], truth: Truth | None, points: Array) -> tuple[Array, Array, BoolArray]:
+    """Return two corners around all paths and the bulk of points (n, 2), and a mask of points outside."""
     paths = [result.T_world_imu[:, :2, 3] for result in results.values()]
     if truth is not None:
         paths.append(truth.T_world_imu[:, :2, 3])
@@ -132,7 +132,12 @@ def map_axes(results: Mapping[str, Result], truth: Truth | None, points: Array) 
     # A straight or standing trajectory must not make an infinitely thin picture.
     margin = 0.05 * (high - low) + 0.02 * (high - low).max() + 1e-3
     low, high = low - margin, high + margin
-    outside = np.any((points < low) | (points > high), axis=1)
+    return low, high, np.any((points < low) | (points > high), axis=1)
+
+
+def map_axes(results: Mapping[str, Result], truth: Truth | None, points: Array) -> tuple[Figure, Axes, BoolArray]:
+    """Return a new figure with axes for `view_of`, and its mask of points outside."""
+    low, high, outside = view_of(results, truth, points)
     aspect = (high[1] - low[1]) / (high[0] - low[0])
     width = min(8.0, 7.0 / aspect)
     # Room for labels, title and legend around axes of the right shape.

@@ -29,13 +29,7 @@ def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolA
     Each mode has a column with its own scales. Modes with equal trajectories (mapping-only and dead reckoning) share a
     column. NEES is of the frames that no ``interpolated`` interval (T,) leads to.
     """
-    columns: dict[str, Result] = {}
-    for mode, result in results.items():
-        twin = next((m for m, r in columns.items() if np.array_equal(r.T_world_imu, result.T_world_imu)), None)
-        if twin is None:
-            columns[mode] = result
-        else:
-            columns[f"{twin}, {mode}"] = columns.pop(twin)
+    columns = different(results)
     figure = Figure(figsize=(4.4 * len(columns) + 0.4, 8.8))
     axes = figure.subplots(6, len(columns), squeeze=False)
     for column, (title, result) in zip(axes.T, columns.items(), strict=True):
@@ -49,6 +43,16 @@ def plot_errors(results: Mapping[str, Result], truth: Truth, interpolated: BoolA
     figure.suptitle(f"{name}:{break_}estimate minus truth, world axes")
     arrange(figure, left=0.8, top=1.25 if len(columns) == 1 else 1.05, gaps=(0.8, 0.13))
     return figure
+
+
+def different(results: Mapping[str, Result]) -> dict[str, Result]:
+    """Return results with different trajectories, by the names of all modes that have them."""
+    found: dict[str, Result] = {}
+    for mode, result in results.items():
+        twin = next((m for m, r in found.items() if np.array_equal(r.T_world_imu, result.T_world_imu)), None)
+        name = mode if twin is None else f"{twin}, {mode}"
+        found[name] = result if twin is None else found.pop(twin)
+    return found
 
 
 def _ate_words(result: Result, truth: Truth) -> str:

@@ -100,6 +100,17 @@ def errors(result: Result, truth: Truth) -> list[Series]:
     return found if result.has_covariance else [dataclasses.replace(one, low=None, high=None) for one in found]
 
 
+def error_lengths(result: Result, truth: Truth) -> tuple[Series, Series]:
+    """Return the lengths of the position error, m, and of the rotation error, degrees."""
+    found = errors(result, truth)
+    lengths = [np.linalg.norm([one.y for one in part], axis=0) for part in (found[:3], found[3:])]
+    names = ("position", "m"), ("rotation", "deg")
+    position, rotation = (
+        Series(*name, found[0].x, y, is_positive=True) for name, y in zip(names, lengths, strict=True)
+    )
+    return position, rotation
+
+
 def inertial(result: Result, truth: Truth | None = None) -> list[tuple[Series, Series | None]]:
     """Return velocity, biases and tilt of an inertial unit with 3-sigma bounds, three axes each, with true series.
 

@@ -207,9 +207,9 @@ def log_axis(ax: Axes, ticks: tuple[float, ...]) -> None:
     ax.yaxis.set_minor_formatter(NullFormatter())
 
 
-def png(figure: Figure, packed: bool = False) -> bytes:
-    """Return a figure as a PNG at `DPI`; ``packed`` (256 colours): a third of the size, twice the time."""
-    figure.set_dpi(DPI)
+def png(figure: Figure, packed: bool = False, dpi: int = DPI) -> bytes:
+    """Return a figure as a PNG; ``packed`` (256 colours): a third of the size, twice the time."""
+    figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     content, made_by = BytesIO(), PngInfo()
@@ -220,7 +220,7 @@ def png(figure: Figure, packed: bool = False) -> bytes:
         # Means (kmeans) then give large areas their exact colour: the grey of bounds must not turn blue.
         picture = picture.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
     # Level 3 takes two thirds of the time of the default, for files of the same size.
-    picture.save(content, "PNG", dpi=(DPI, DPI), optimize=packed, compress_level=3, pnginfo=made_by)
+    picture.save(content, "PNG", dpi=(dpi, dpi), optimize=packed, compress_level=3, pnginfo=made_by)
     return content.getvalue()
 
 
@@ -234,11 +234,11 @@ def vector(figure: Figure, format: Literal["svg", "pdf"]) -> bytes:
 
 
 def pngs(
-    directory: str | Path, figures: Mapping[str, Figure], packed: bool = False, format: Format = "png"
+    directory: str | Path, figures: Mapping[str, Figure], packed: bool = False, format: Format = "png", dpi: int = DPI
 ) -> dict[Path, str | bytes]:
     """Return figures as files ``<name>.<format>`` of a folder, for `ekfslam.files.write_all`."""
     paths = [Path(directory) / f"{name}.{format}" for name in components(figures)]
-    drawn = (png(figure, packed) if format == "png" else vector(figure, format) for figure in figures.values())
+    drawn = (png(figure, packed, dpi) if format == "png" else vector(figure, format) for figure in figures.values())
     return dict(zip(paths, drawn, strict=True))
 
 

@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--columns", nargs="+", default=list(PAPER), metavar="KEY", help=f"figures in it (default: {' '.join(PAPER)})"
     )
-    declare(parser, "--no-figures", "--verbose", "--timings", *OTHERS, *EXECUTOR)
+    declare(parser, "--no-figures", "--width", "--verbose", "--timings", *OTHERS, *EXECUTOR)
     declare_run(parser)
 
 
@@ -61,6 +61,10 @@ def command(options: argparse.Namespace) -> None:
     for flag in ("truth", "timings"):
         if getattr(options, flag) and len(options.data) > 1:
             raise ConfigError(f"--{flag} belongs to one recording, but several are given; compare them one by one")
+    if options.width:
+        from ekfslam.figures.paper import width_of  # imports Matplotlib
+
+        width_of(options.width)
     timings, others = Timings(), others_of(options, len(options.data))
     # Read everything first: a mistyped last name should not cost the first hour.
     with timings.part("reading"):
@@ -78,7 +82,7 @@ def command(options: argparse.Namespace) -> None:
     where = "serial" if len(recordings) == 1 and options.executor == "processes" else options.executor
     workers = options.workers or min(len(recordings), os.cpu_count() or 1)
     chosen: dict[str, Any] = {"force": options.force, "figures": not options.no_figures, "verbose": options.verbose}
-    chosen["others"] = others
+    chosen |= {"others": others, "width": options.width}
     if where == "serial":  # the clock is that of this process
         chosen["timings"] = timings
     with open_executor(where, workers) as executor:

@@ -10,7 +10,8 @@ from typing import get_args
 from ekfslam import files
 from ekfslam.cli.options import declare, require_ours
 from ekfslam.errors import ArchiveError
-from ekfslam.figures.older import FIGURES
+from ekfslam.figures.older import FIGURES, marked, require_own
+from ekfslam.figures.paper import draw_paper, paper_contents, width_of
 from ekfslam.figures.run import save_figures
 from ekfslam.figures.style import Format
 from ekfslam.figures.viewer import is_viewer_file, show_archive, write_viewer_file
@@ -20,6 +21,7 @@ _OPENED = Path()  # no file: the viewer is opened
 EXAMPLES = (
     "plot city.h5",
     "plot city.h5 --out figures --format pdf",
+    "plot city.h5 --out figures --format pdf --width column",
     "plot city.h5 --viewer",
     "plot city.h5 --viewer city.rrd",
 )
@@ -28,6 +30,7 @@ EXAMPLES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare(parser, "archive", "--out", "--force")
     parser.add_argument("--format", choices=get_args(Format), default="png", help="default: %(default)s")
+    declare(parser, "--width")
     parser.add_argument(
         "--viewer",
         nargs="?",
@@ -61,6 +64,13 @@ def command(options: argparse.Namespace) -> None:
         return
     directory = _directory(options)
     files.require_writable(directory / f"map.{options.format}")
-    drawn = (archive.results, archive.truth, archive.interpolated, options.format)
-    for path in save_figures(directory, *drawn, shown=options.archive, force=options.force):
+    drawn = (archive.results, archive.truth, archive.interpolated)
+    if options.width:
+        contents = paper_contents(directory, draw_paper(*drawn, width_of(options.width)), options.format)
+        if not options.force:
+            require_own(contents, [options.archive])
+        files.write_all(marked(contents, [options.archive]))
+        print("\n".join(map(str, contents)))
+        return
+    for path in save_figures(directory, *drawn, options.format, shown=options.archive, force=options.force):
         print(path)
