@@ -13,7 +13,7 @@ from scipy import stats
 
 from ekfslam.cli import main
 from ekfslam.evaluation.paired import paired_grid, paired_test
-from ekfslam.evaluation.tables import Column, Grid, latex
+from ekfslam.evaluation.tables import Column, Grid, is_table, latex
 from ekfslam.studies.study import LEVELS, Study, StudyArchive, run_one
 from ekfslam.studies.summary import FIGURES, study_runs, summarise_study
 from ekfslam.studies.sweep_table import SweepTable
@@ -137,9 +137,12 @@ def test_compare_writes_the_table_of_several_recordings(tmp_path, capsys):
     text = path.read_text()
     assert "recording & estimator & ATE [m], unaligned & " in text and text.count("\\addlinespace") == 1
     assert text.count("\\textbf{") >= 4 and "not enough pairs" in text
-    with pytest.raises(SystemExit):
-        main(["compare", *drives, *arguments, "--table", str(tmp_path / "paper.doc")])
-    assert "does not end in one of .md, .tex, .csv" in capsys.readouterr().err
+    for name, words in (("paper.doc", "does not end in one of .md, .tex, .csv"), ("thesis.tex", "is no table of")):
+        (tmp_path / name).write_text("\\documentclass{article}")
+        with pytest.raises(SystemExit):
+            main(["compare", *drives, *arguments, "--table", str(tmp_path / name)])
+        assert words in capsys.readouterr().err
+    assert is_table(path)
 
 
 def test_a_study_has_means_over_runs_and_paired_tests():

@@ -14,7 +14,7 @@ from ekfslam.data.trajectory import Moving
 from ekfslam.errors import WriteError
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.summary import compare_table, summarise_all
-from ekfslam.evaluation.tables import WRITERS
+from ekfslam.evaluation.tables import WRITERS, is_table
 from ekfslam.filters.result import Result
 from ekfslam.frontend.opening import open_sequence
 from ekfslam.others import Others, World
@@ -49,6 +49,8 @@ def table_file(text: str) -> Path:
     """Return the path of a table, whose ending must be that of a format."""
     if Path(text).suffix not in WRITERS:
         raise argparse.ArgumentTypeError(f"{text!r} does not end in one of {', '.join(WRITERS)}")
+    if not files.is_free(Path(text)) and not is_table(Path(text)):
+        raise argparse.ArgumentTypeError(f"{text} exists, and is no table of this program; choose another name")
     return Path(text)
 
 

@@ -15,6 +15,7 @@ import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 MISSING = "-"
@@ -189,6 +190,18 @@ def csv_text(grid: Grid) -> str:
     return out.getvalue()
 
 
+def is_table(path: Path) -> bool:
+    """Return whether a file looks like an earlier table of `WRITERS`, by its beginning or its note."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return False
+    first = text.partition("\n")[0]
+    by_ending = {".tex": first.startswith(MADE_BY), ".md": f"\n\n{MADE_BY[2:]}" in text, ".csv": first.count(",") > 1}
+    return by_ending.get(path.suffix, False)
+
+
+MADE_BY = "% ekfslam "  # beginning of a table in LaTeX, whose first note names the program
 WRITERS: Mapping[str, Callable[[Grid], str]] = {".md": markdown_text, ".tex": latex_text, ".csv": csv_text}
 _LATEX = {c: rf"\{c}" for c in "&%$#_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}"}
 _LATEX |= {"^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
