@@ -86,6 +86,9 @@ def _is_covariance(P: Array, _: Sizes) -> BoolArray:
 
 NUMBERS = Check("f", "be finite", _in(-LARGEST, LARGEST))
 NUMBERS_OR_NONE = Check("f", "be finite or NaN", lambda value, _: ~(np.abs(value) > LARGEST))
+NOT_NEGATIVE_OR_NONE = Check(
+    "f", "be finite and not negative, or NaN", lambda value, _: ~((value < 0) | (value > LARGEST))
+)
 NOT_NEGATIVE = Check("f", "be finite and not negative", _in(0, LARGEST))
 POSITIVE = Check("f", "be finite and positive", _in(1 / LARGEST, LARGEST))
 ASCENDING = Check("f", "be finite and ascend", _ascends)

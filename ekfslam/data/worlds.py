@@ -13,6 +13,7 @@ from ekfslam.data.observations import Observations
 from ekfslam.errors import ConfigError
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera, project
+from ekfslam.names import printable
 
 BORDER_PX = 5.0  # wide enough for the noise not to push a pixel out of the image
 OUTLIER_SHIFT_PX = (5.0, 40.0)
@@ -36,7 +37,19 @@ _MOST = {
     "initial_position_std_m": 1e4,
     "initial_rotation_std_rad": 10.0,
 }
+_KINDS = {"str": str, "int": int, "float": float}
 _MOST_IN_VIEW = 20_000_000  # landmarks times frames
+
+
+def require_kind(name: str, key: str, value: object, kind: type) -> None:
+    """Raise a `ConfigError` if a setting is no printable text, no whole number, or no number, as its kind says."""
+    if kind is str:
+        fits = isinstance(value, str) and value == printable(value)
+    else:
+        fits = isinstance(value, int | np.integer | (float | np.floating if kind is float else int))
+    if not fits or isinstance(value, bool):
+        words = {str: "a printable text", int: "a whole number", float: "a number"}[kind]
+        raise ConfigError(f"{printable(str(name))}: {key} must be {words}, found {value!r}")
 
 
 @dataclass(frozen=True)
@@ -57,6 +70,8 @@ class Recording:
     outlier_fraction: float = 0.0  # share of observations that are grossly displaced
 
     def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            require_kind(self.name, field.name, getattr(self, field.name), _KINDS[str(field.type)])
         for key, value in numbers_of(self).items():
             most = _MOST.get(key, _LARGEST)
             if not (value == 0 or _LEAST <= value <= most):

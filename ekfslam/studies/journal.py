@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ekfslam import files
 from ekfslam.errors import ArchiveError, WriteError
+from ekfslam.names import printable
 from ekfslam.progress import progress
 from ekfslam.studies.executors import completed
 
@@ -74,14 +75,18 @@ class Journal:
 
     def entries(self) -> Iterator[tuple[Key, Record]]:
         """Yield key and record of each complete run; raise `ArchiveError` if one is of another study."""
-        found = _read(self.path)
+        found, seen = _read(self.path), dict[Key, bytes]()
         if next(found, self._heading) != self._heading:
             raise ArchiveError(f"{self.path} holds runs of another study; move it away or choose another folder")
         for entry in found:
             try:
                 heading, _, content = entry.partition(b"\n")
                 level, run = json.loads(heading)
-                yield (str(level), int(run)), self._filled(level, content)
+                if not (type(level) is str and type(run) is int and run >= 0):
+                    raise ValueError(f"{printable(repr([level, run]))} is no run")
+                if seen.setdefault((level, run), content) != content:
+                    raise ValueError(f"run {run} of {printable(level)} is there twice")
+                yield (level, run), self._filled(level, content)
             except (ValueError, TypeError, LookupError, RecursionError) as error:
                 raise ArchiveError(f"{self.path}: damaged ({error})") from None
 
@@ -90,6 +95,8 @@ class Journal:
         for fields in record.values():
             for value in fields.values():
                 part = np.frombuffer(content, value.dtype, value.size, at)
+                if value.dtype == bool and (part.view(np.uint8) > 1).any():
+                    raise ValueError("a truth value is neither 0 nor 1")
                 value[...] = part.reshape(value.shape)
                 at += part.nbytes
         if at != len(content):

@@ -31,6 +31,7 @@ from ekfslam.arrays import Array, BoolArray
 from ekfslam.config import VARIANTS, Config, FilterConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import Loop, simulate
+from ekfslam.data.worlds import require_kind
 from ekfslam.errors import ArchiveError, ConfigError, FilterError
 from ekfslam.evaluation.consistency import nanmean, nees, pose_error
 from ekfslam.filters.joint import JointEKF
@@ -42,7 +43,7 @@ from ekfslam.models.sensors.stereo import Rig
 from ekfslam.provenance import provenance, versions
 from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.fixed_lag import FixedLag
-from ekfslam.stored import COUNTS, FLAGS, NUMBERS_OR_NONE, Check, Item, Shape, fixed_length
+from ekfslam.stored import COUNTS, FLAGS, NOT_NEGATIVE_OR_NONE, NUMBERS_OR_NONE, Check, Item, Shape, fixed_length
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME
 from ekfslam.studies.journal import Journal, Key, Record, flat, run_missing
 
@@ -89,7 +90,7 @@ LEVEL_LAYOUT = (
 )
 
 
-def _field(name: str, shape: Shape, units: str, meaning: str, check: Check = NUMBERS_OR_NONE) -> Item:
+def _field(name: str, shape: Shape, units: str, meaning: str, check: Check = NOT_NEGATIVE_OR_NONE) -> Item:
     """Return the data set of a value per run; the shape is that of one run."""
     return Item(name, name, ("runs", *shape), units, meaning, check)
 
@@ -103,8 +104,8 @@ VARIANT_LAYOUT = (
     _field("joint_nees_per_dof", ("J",), "1", "xi and all landmarks, divided by 6 + 3n"),
     _field("nis", ("T",), "1", "innovations of the frame"),
     _field("nis_dof", ("T",), "1", "degrees of freedom of nis", COUNTS),
-    _field("position_error", ("T", "xyz"), "m", "estimate minus truth, world axes"),
-    _field("rotation_error", ("T", "xyz"), "rad", "log(R_estimate R_truth^T), world axes"),
+    _field("position_error", ("T", "xyz"), "m", "estimate minus truth, world axes", NUMBERS_OR_NONE),
+    _field("rotation_error", ("T", "xyz"), "rad", "log(R_estimate R_truth^T), world axes", NUMBERS_OR_NONE),
     _field("three_sigma", ("T", "error"), "m (0-2), rad (3-5)", "bounds of position and rotation error, world axes"),
     _field("diverged", (), "1", "stopped with an error, not finite, or left the ring altogether", FLAGS),
 )
@@ -138,6 +139,8 @@ class Study(Shown):
     def __post_init__(self) -> None:
         object.__setattr__(self, "levels", dict(self.levels))  # a mapping proxy could not be sent to a worker
         object.__setattr__(self, "variants", tuple(self.variants))
+        for key in ("runs", "seed"):
+            require_kind("study", key, getattr(self, key), int)
         for variant in self.variants:
             if variant not in STUDY_VARIANTS:
                 raise ConfigError(f"unknown variant {variant!r} of a study; known: {', '.join(STUDY_VARIANTS)}")
@@ -331,6 +334,8 @@ def run_study(study: Study, path: str | Path, executor: Executor) -> StudyArchiv
     )
 
     def keep(key: Key, record: Record) -> None:
+        for variant, fields in record.items():
+            _require_run(f"{path}: {variant} of run {key[1]} at {key[0]}", fields)
         if key[1] < study.runs:  # the journal may be one of a longer study
             archive.put(key, record)
 
@@ -352,6 +357,15 @@ def run_study(study: Study, path: str | Path, executor: Executor) -> StudyArchiv
     return archive
 
 
+def _require_run(place: str, record: Mapping[str, NDArray]) -> None:
+    """Raise an `ArchiveError` if the record of a run holds what an archive would not."""
+    for item in VARIANT_LAYOUT:
+        if not np.all(item.check.holds(record[item.name], {})):
+            raise ArchiveError(f"{place}: {item.name} must {item.check.words}")
+    if not (record["diverged"] or np.isfinite(record["position_error"][-1]).all()):
+        raise ArchiveError(f"{place}: it did not diverge, but has no last position")
+
+
 def _take_over(archive: StudyArchive, path: Path) -> None:
     """Copy the finished runs of an earlier archive; raise an `ArchiveError` if it is of another study."""
     old = read_study(path)
@@ -371,7 +385,10 @@ def _take_over(archive: StudyArchive, path: Path) -> None:
         )
     for level, done in old.done.items():
         for run in np.flatnonzero(done).tolist():
-            archive.put((level, run), {v: {f: x[run] for f, x in of.items()} for v, of in old.data[level].items()})
+            record = {v: {f: x[run] for f, x in of.items()} for v, of in old.data[level].items()}
+            for variant, fields in record.items():
+                _require_run(f"{path}: {variant} of run {run} at {level}", fields)
+            archive.put((level, run), record)
 
 
 def write_study(path: str | Path, archive: StudyArchive) -> None:

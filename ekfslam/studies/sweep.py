@@ -43,7 +43,14 @@ from ekfslam.provenance import versions
 from ekfslam.runner import run
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME
 from ekfslam.studies.journal import Journal, Key, Record, flat, run_missing
-from ekfslam.studies.sweep_table import PREDICTION, SweepTable, is_known_to_prediction, read_table, write_table
+from ekfslam.studies.sweep_table import (
+    PREDICTION,
+    SweepTable,
+    is_known_to_prediction,
+    read_table,
+    require_figures,
+    write_table,
+)
 
 MOST_RUNS = 100_000
 _ERROR_BYTES = 400
@@ -262,6 +269,7 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor) -> SweepTable:
                 f"{path} holds runs of another study, of other recordings or of another build; move it away or "
                 "choose another folder"
             )
+        _require_row(f"{path}: run {key[0]}", record["run"], is_own=not tasks[key].others.files)
         for twin in twins[tasks[key].run_key]:
             done[twin] = record["run"]
 
@@ -294,6 +302,19 @@ def run_task(task: Task, read_gb: float = DEFAULT_GB) -> Record:
         return _record(task.columns, figures)
     except EkfslamError as error:
         return _record(task.columns, {}, printable(str(error)))
+
+
+def _require_row(place: str, run: Mapping[str, NDArray], is_own: bool) -> None:
+    """Raise an `ArchiveError` if the figures or the error of a run are none that `run_task` returns."""
+    error, figures = run["error"].item().decode(errors="replace"), run["figures"]
+    for key, value in zip(KEYS, figures, strict=False):  # columns of a program follow
+        require_figures(f"{place}: {key}", key, value)
+    if error != printable(error):
+        raise ArchiveError(f"{place}: its error cannot be printed")
+    if error and not np.isnan(figures).all():
+        raise ArchiveError(f"{place}: has figures of merit, and the error {error!r}")
+    if is_own and not error and np.isnan(figures).all():
+        raise ArchiveError(f"{place}: has neither figures of merit nor an error")
 
 
 def _record(columns: Mapping[str, Column], figures: Mapping[str, Any], error: str = "") -> Record:

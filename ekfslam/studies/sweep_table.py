@@ -264,15 +264,40 @@ def read_table(path: str | Path) -> SweepTable:
     """Read the table of a sweep."""
     with hdf5.opened(path, FORMAT, FORMAT_VERSION) as h5file:
         group = hdf5.subgroup(h5file, "table")
+        for name in group:
+            if not isinstance(group[name], h5py.Dataset):
+                raise ArchiveError(f"{path}: table/{name} is no column")
         columns = hdf5.read_fields(group, _layout({name: group[name] for name in group if name != _ROW}))
         for name, values in columns.items():
             if values.dtype.kind != "f":
                 columns[name] = np.array([printable(text) for text in hdf5.texts(values)], dtype=object)
-        swept = json.loads(str(hdf5.attribute(h5file, "swept")))
+        swept, asked = json.loads(str(hdf5.attribute(h5file, "swept"))), hdf5.attribute(h5file, "runs")
+        if not (isinstance(swept, list) and all(isinstance(name, str) for name in swept)):
+            raise ArchiveError(f"{path}: attribute swept is no list of columns")
+        if not (type(asked) is int and asked >= 0):
+            raise ArchiveError(f"{path}: attribute runs is no count")
         missing = [name for name in ("key", "error", *swept, *KEYS) if name not in columns]
         if missing:
             raise ArchiveError(f"{path}: table/{missing[0]} is missing")
-        return SweepTable(columns, tuple(swept), int(hdf5.attribute(h5file, "runs")))
+        for name in ("key", "error", *KEYS):
+            if (columns[name].dtype.kind == "f") != (name in KEYS):
+                raise ArchiveError(f"{path}: table/{name} must be {'numbers' if name in KEYS else 'text'}")
+            if name in KEYS:
+                require_figures(f"{path}: table/{name}", name, columns[name])
+        if len(set(columns["key"])) < len(columns["key"]):
+            raise ArchiveError(f"{path}: table/key holds a run twice")
+        return SweepTable(columns, tuple(swept), asked)
+
+
+def require_figures(place: str, key: str, values: NDArray) -> None:
+    """Raise an `ArchiveError` if values of a metric are infinite, or one of this package is negative or no count."""
+    metric, values = METRICS[key], values[~np.isnan(values)]
+    own = getattr(metric.compute, "func", metric.compute).__module__.startswith("ekfslam.")  # a partial has `func`
+    least = 0.0 if own else -np.inf
+    if not ((values >= least) & (values < np.inf)).all():
+        raise ArchiveError(f"{place} must be finite{' and not negative' if own else ''}")
+    if metric.fmt == "d" and (values % 1).any():
+        raise ArchiveError(f"{place} must be whole numbers")
 
 
 def _layout(columns: Mapping[str, Any]) -> list[Item]:
