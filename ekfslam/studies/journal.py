@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -42,16 +42,19 @@ def run_missing(
     """Run the tasks that the journal does not hold, and save the archive at the end or when an exception interrupts.
 
     After a kill, the next call finds the finished runs in the journal. It is removed once they are saved. ``submit``
-    hands a task to an executor, ``keep`` adds the record of a run to the archive, ``save`` writes it. Raise an
-    `ArchiveError` if the journal is of another study or damaged; nothing is changed then.
+    hands a task to an executor, ``keep`` adds the record of a run to the archive, ``save`` writes it. Without a
+    ``label`` there is no progress bar. Raise an `ArchiveError` if the journal is of another study or damaged; nothing
+    is changed then.
     """
     held = dict(journal.entries())
     for key, record in held.items():
         keep(key, record)
     missing = [key for key in tasks if key not in held]
-    finished = completed(missing, lambda key: submit(tasks[key]))
+    finished: Iterable[tuple[Key, Record]] = completed(missing, lambda key: submit(tasks[key]))
+    if label:
+        finished = progress(finished, label, "run", total=len(missing))
     try:
-        for key, record in progress(finished, label, "run", total=len(missing)):
+        for key, record in finished:
             journal.append(key, record)
             keep(key, record)
     finally:

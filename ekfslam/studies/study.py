@@ -321,7 +321,7 @@ class StudyArchive(Shown):
         self.done[level][run] = True
 
 
-def run_study(study: Study, path: str | Path, executor: Executor) -> StudyArchive:
+def run_study(study: Study, path: str | Path, executor: Executor, progress: bool = True) -> StudyArchive:
     """Run everything that the archive at ``path`` does not hold, see `run_missing`; a larger number of runs extends it.
 
     Raise an `ArchiveError` if it is of another study; the message names the difference.
@@ -353,7 +353,8 @@ def run_study(study: Study, path: str | Path, executor: Executor) -> StudyArchiv
             for level in study.levels
             if not archive.done[level][run]
         }
-        run_missing(journal, tasks, lambda task: executor.submit(run_one, *task), keep, save, "consistency")
+        label = "consistency" if progress else ""
+        run_missing(journal, tasks, lambda task: executor.submit(run_one, *task), keep, save, label)
     return archive
 
 

@@ -247,7 +247,7 @@ class Sweep:
         return of_toml(path, lambda found: _parsed(found, Path(path).parent))
 
 
-def run_sweep(sweep: Sweep, path: str | Path, executor: Executor) -> SweepTable:
+def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool = True) -> SweepTable:
     """Run every task that the table at ``path`` does not hold, and write the table; see `run_missing`.
 
     A run that a filter cannot finish is a row with an error and no figures.
@@ -284,7 +284,8 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor) -> SweepTable:
                 keep((row["key"], 0), _record(sweep.columns, row, row["error"]))
         missing = {key: tasks[key] for key, *_ in twins.values() if key not in done}
         limit = limit_gb()
-        run_missing(journal, missing, lambda task: executor.submit(run_task, task, limit), keep, save, "sweep")
+        label = "sweep" if progress else ""
+        run_missing(journal, missing, lambda task: executor.submit(run_task, task, limit), keep, save, label)
     return _table(sweep, done)
 
 
