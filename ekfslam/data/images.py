@@ -66,16 +66,8 @@ class PairCalibration:
 
     def __post_init__(self) -> None:
         for name in ("K_left", "K_right"):
-            K = np.asarray(getattr(self, name), dtype=float)
-            require_shape(K, (3, 3), name)
-            require_finite(K, name, 1e7)
-            if min(K[0, 0], K[1, 1]) < _LEAST_FOCAL_PX or (K[2] != (0, 0, 1)).any() or K[1, 0] != 0:
-                raise CalibrationError("not an intrinsic matrix: upper triangular, positive focal lengths", field=name)
-            object.__setattr__(self, name, frozen(K))
-        size = tuple(int(side) for side in self.size)
-        if len(size) != 2 or not all(0 < side < _LARGEST_SIDE_PX for side in size):
-            raise CalibrationError(f"expected width and height of an image, found {self.size}", field="size")
-        object.__setattr__(self, "size", size)
+            object.__setattr__(self, name, _checked_intrinsics(getattr(self, name), name))
+        object.__setattr__(self, "size", _checked_size(self.size))
         object.__setattr__(self, "T_right_left", checked_pose(self.T_right_left, "T_right_left"))
         if not np.linalg.norm(self.T_right_left[:3, 3]) > 0:
             raise CalibrationError("the two cameras are at the same place", field="T_right_left")
@@ -91,6 +83,35 @@ class PairCalibration:
             and T[0, 3] < 0
             and bool(np.abs(T - side_by_side(-T[0, 3])).max() < 1e-9)
         )
+
+
+@dataclass(frozen=True)
+class LensCalibration:
+    """Calibration of one camera; raise a `DataError` if it is impossible."""
+
+    K: Array  # (3, 3) intrinsic matrix, px
+    size: tuple[int, int]  # width and height of the images, px
+    distortion: Distortion = field(default_factory=Distortion)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "K", _checked_intrinsics(self.K, "K"))
+        object.__setattr__(self, "size", _checked_size(self.size))
+
+
+def _checked_intrinsics(matrix: Array, name: str) -> Array:
+    K = np.asarray(matrix, dtype=float)
+    require_shape(K, (3, 3), name)
+    require_finite(K, name, 1e7)
+    if min(K[0, 0], K[1, 1]) < _LEAST_FOCAL_PX or (K[2] != (0, 0, 1)).any() or K[1, 0] != 0:
+        raise CalibrationError("not an intrinsic matrix: upper triangular, positive focal lengths", field=name)
+    return frozen(K)
+
+
+def _checked_size(given: tuple[int, int]) -> tuple[int, ...]:
+    size = tuple(int(side) for side in given)
+    if len(size) != 2 or not all(0 < side < _LARGEST_SIDE_PX for side in size):
+        raise CalibrationError(f"expected width and height of an image, found {given}", field="size")
+    return size
 
 
 def baseline_doubt(baseline_m: float) -> str:
@@ -110,13 +131,13 @@ def side_by_side(baseline_m: float) -> Array:
 
 @dataclass(frozen=True)
 class ImageRecording:
-    """One recording of stereo images, with or without body velocities and inertial samples.
+    """One recording of images of a pair or of one camera, with or without body velocities and inertial samples.
 
     Args:
         name, source, time_s, velocity_frame, truth, noise, notes, attributes: See `ekfslam.Sequence`.
-        calibration: Calibration of the pair.
-        load: Function that returns the left and right image of frame k as (height, width) uint8, in any order. It
-            raises `UnknownFormatError` or `DataError`.
+        calibration: Calibration of the pair, or of the one camera.
+        load: Function that returns the images of frame k, left and right or one, as (height, width) uint8, in any
+            order. It raises `UnknownFormatError` or `DataError`.
         T_cam_imu: (4, 4) IMU to the optical frame of the left camera before rectification.
         twist: (T, 6) measured velocities ``[v; w]``, ``twist[k]`` drives ``(t[k-1], t[k]]``; None if there are none.
         inertial: Samples of a gyroscope and an accelerometer; None if there are none.
@@ -125,8 +146,8 @@ class ImageRecording:
     name: str
     source: str
     time_s: Array
-    calibration: PairCalibration
-    load: Callable[[int], tuple[Image, Image]]
+    calibration: PairCalibration | LensCalibration
+    load: Callable[[int], tuple[Image, ...]]
     T_cam_imu: Array
     twist: Array | None = None
     velocity_frame: VelocityFrame = "imu"
@@ -147,12 +168,28 @@ class ImageRecording:
             if self.truth is not None:
                 validate_truth(self.truth, len(self.time_s))
         object.__setattr__(self, "name", printable(self.name))
-        doubt = baseline_doubt(float(np.linalg.norm(self.calibration.T_right_left[:3, 3])))
+        doubt = baseline_doubt(self.baseline_m)
         if doubt and doubt not in self.notes:
             object.__setattr__(self, "notes", (doubt, *self.notes))
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance of the cameras; 0 if there is one."""
+        of_one = isinstance(self.calibration, LensCalibration)
+        return 0.0 if of_one else float(np.linalg.norm(self.calibration.T_right_left[:3, 3]))  # type: ignore[union-attr]
+
+    @property
+    def of_left_camera(self) -> ImageRecording:
+        """The images of the left camera alone."""
+        pair = self.calibration
+        if isinstance(pair, LensCalibration):
+            return self
+        lens = LensCalibration(pair.K_left, pair.size, pair.distortion_left)
+        notes = (*self.notes, "The left camera alone is used.")
+        return replace(self, calibration=lens, load=_Left(self.load), notes=notes)
 
     def __getitem__(self, frames: slice) -> ImageRecording:
         """Return a stretch of successive frames, as a recording whose frames count from 0."""
@@ -170,8 +207,18 @@ class ImageRecording:
 class _Later:
     """Load images that begin at a later frame."""
 
-    load: Callable[[int], tuple[Image, Image]]
+    load: Callable[[int], tuple[Image, ...]]
     begin: int
 
-    def __call__(self, frame: int) -> tuple[Image, Image]:
+    def __call__(self, frame: int) -> tuple[Image, ...]:
         return self.load(self.begin + frame)
+
+
+@dataclass(frozen=True)
+class _Left:
+    """Load left images alone."""
+
+    load: Callable[[int], tuple[Image, ...]]
+
+    def __call__(self, frame: int) -> tuple[Image, ...]:
+        return self.load(frame)[:1]

@@ -8,10 +8,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from ekfslam.data.images import Image, ImageRecording
+from ekfslam.data.images import Image, ImageRecording, LensCalibration
 from ekfslam.data.sequence import Sequence
 from ekfslam.figures.style import BAND_ALPHA, BLUE, GREY, SERIES, ZERO, styled
-from ekfslam.frontend.rectify import rectification
+from ekfslam.frontend.rectify import rectification, undistortion
 from ekfslam.frontend.track import TrackReport
 
 _SHOWN = 3  # frames
@@ -22,8 +22,9 @@ _DEPTHS_M = (3.0, 60.0)
 
 @styled
 def plot_tracks(recording: ImageRecording, sequence: Sequence, report: TrackReport) -> Figure:
-    """Draw left images with tracks, track lengths, losses by reason, and the rotation of the right camera."""
-    rectified = rectification(recording.calibration)
+    """Draw left images with tracks, track lengths, losses by reason, and the rotation of a right camera."""
+    calibration, is_one = recording.calibration, sequence.camera.is_monocular
+    rectified = undistortion(calibration) if isinstance(calibration, LensCalibration) else rectification(calibration)
     frames = np.unique(np.linspace(min(_TRAIL, len(sequence) - 1), len(sequence) - 1, _SHOWN).round().astype(int))
     height, width = rectified.apply(*recording.load(0))[0].shape
     each = 9.0 * height / width + 0.25
@@ -33,14 +34,17 @@ def plot_tracks(recording: ImageRecording, sequence: Sequence, report: TrackRepo
     for i, frame in enumerate(frames.tolist()):
         panels.append(figure.add_subplot(grid[i]))
         _draw_frame(panels[-1], rectified.apply(*recording.load(frame))[0], sequence, frame)
-    bar = figure.colorbar(panels[0].collections[-1], ax=panels, label="depth [m]", shrink=0.6, aspect=30, pad=0.01)
-    bar.ax.minorticks_off()
-    bar.ax.set_yticks([3, 5, 10, 20, 40, 60], labels=["3", "5", "10", "20", "40", "60"])
-    row = grid[-1].subgridspec(1, 3, width_ratios=(1.0, 1.0, 1.6))
-    lower = [figure.add_subplot(row[i]) for i in range(3)]
+    if not is_one:
+        bar = figure.colorbar(panels[0].collections[-1], ax=panels, label="depth [m]", shrink=0.6, aspect=30, pad=0.01)
+        bar.ax.minorticks_off()
+        bar.ax.set_yticks([3, 5, 10, 20, 40, 60], labels=["3", "5", "10", "20", "40", "60"])
+    widths = (1.0, 1.0) if is_one else (1.0, 1.0, 1.6)
+    row = grid[-1].subgridspec(1, len(widths), width_ratios=widths)
+    lower = [figure.add_subplot(row[i]) for i in range(len(widths))]
     _lengths(lower[0], report)
     _losses(lower[1], report)
-    _rotation(lower[2], sequence, report)
+    if not is_one:
+        _rotation(lower[2], sequence, report)
     return figure
 
 
@@ -49,7 +53,9 @@ def _draw_frame(ax: Axes, image: Image, sequence: Sequence, frame: int) -> None:
     observations, camera = sequence.observations, sequence.camera
     ids, pixels = observations.at(frame)
     ax.imshow(image, cmap="gray", vmin=0, vmax=255)
-    depth = camera.fu_px * camera.baseline_m / np.maximum(pixels[:, 0] - pixels[:, 2], 1e-3)
+    is_one = camera.is_monocular
+    disparity = np.ones(len(pixels)) if is_one else np.maximum(pixels[:, 0] - pixels[:, 2], 1e-3)
+    depth = np.full(len(pixels), _DEPTHS_M[0]) if is_one else camera.fu_px * camera.baseline_m / disparity
     before = (observations.frame >= frame - _TRAIL) & (observations.frame <= frame)
     before &= np.isin(observations.landmark, ids)
     trails = [observations.pixels_px[before & (observations.landmark == track), :2] for track in ids]

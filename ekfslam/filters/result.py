@@ -447,7 +447,11 @@ class Result(Shown):
         """Warnings about the run, one sentence each."""
         remarks = []
         if self.mode != "dead-reckoning" and not self.is_other and not len(self.landmarks):
-            remarks.append("not one observation was used: the trajectory is that of dead reckoning")
+            is_waiting = self.camera.is_monocular and self.counts.get("rejected: waiting", 0) > 0
+            why = "no track of the one camera saw the parallax of a landmark, as if it rested or turned in place"
+            remarks.append(
+                why if is_waiting else "not one observation was used: the trajectory is that of dead reckoning"
+            )
         finest_px = float(np.min(self.noise.pixel_std_px))
         if self.mode == "full" and self.noise.track_first_px is None and finest_px < LINEAR_FROM_PX:
             remarks.append(

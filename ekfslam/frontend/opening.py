@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -43,7 +43,7 @@ def open_sequence(
         imu, imu_noise: Files of inertial samples and of their noise densities, see `attach_inertial`.
         topics: Topics of a bag: left and right images, velocities, inertial samples. Others are chosen automatically.
         calibration: Calibration of the pair in place of the recording's own, see `read_pair`.
-        camera: ``left`` takes the left camera of a stereo recording alone; images are tracked in both before.
+        camera: ``left`` takes the left camera of a stereo recording alone.
         front_end: Settings of tracking; None for the defaults.
 
     Raises:
@@ -53,7 +53,7 @@ def open_sequence(
         MissingPackageError: There are images, but OpenCV is not installed.
         DataError: A field is missing or malformed; the subclass says how.
     """
-    _require("velocity_frame", velocity_frame, "velocities", velocities)
+    _require(camera, "velocity_frame", velocity_frame, "velocities", velocities)
     recording = open_recording(source, extrinsics=extrinsics, lateral=lateral, topics=topics, calibration=calibration)
 
     def with_inputs(one: Recording) -> Recording:
@@ -62,21 +62,17 @@ def open_sequence(
         return with_inertial_files(one, imu, imu_noise)
 
     if isinstance(recording, Sequence):
-        return _choice_of(camera)(with_inputs(recording if truth is None else attach_truth(recording, Path(truth))))
+        recording = of_left_camera(recording) if camera == "left" else recording
+        return with_inputs(recording if truth is None else attach_truth(recording, Path(truth)))
     from ekfslam.frontend.track import track
 
-    tracked = _choice_of(camera)(track(with_inputs(recording), front_end)[0])
+    tracked = track(with_inputs(recording.of_left_camera if camera == "left" else recording), front_end)[0]
     return tracked if truth is None else attach_truth(tracked, Path(truth))
 
 
-def _choice_of(camera: Camera) -> Callable[[Sequence], Sequence]:
-    """Return the function that leaves the tracks of these cameras."""
+def _require(camera: str, name: str, value: object, needed: str, other: object) -> None:
     if camera not in get_args(Camera):
         raise ConfigError(f"camera (--camera) must be one of {', '.join(get_args(Camera))}, found {camera!r}")
-    return of_left_camera if camera == "left" else lambda sequence: sequence
-
-
-def _require(name: str, value: object, needed: str, other: object) -> None:
     if value is not None and other is None:
         flag = f"--{name.replace('_', '-')}"
         raise ConfigError(f"{name} ({flag}) is given without {needed} (--{needed})")

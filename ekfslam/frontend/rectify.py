@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekfslam.arrays import Array, BoolArray, Float32Array
-from ekfslam.data.images import Distortion, Image, PairCalibration
+from ekfslam.data.images import Distortion, Image, LensCalibration, PairCalibration
 from ekfslam.errors import CalibrationError
 from ekfslam.frontend.opencv import opencv
 from ekfslam.geometry import se3
@@ -19,23 +19,33 @@ _LEAST_COSINE = 0.5  # between the optical axes, and between them and the plane 
 
 @dataclass(frozen=True)
 class Rectification:
-    """Warp of the images of a pair."""
+    """Warp of the images of a pair, or of one camera."""
 
     camera: StereoCamera  # rectified pair
     T_rectified_left: Array  # (4, 4) left optical frame to that of the rectified left camera: a rotation
-    # Pixels (height, width, 2) float32 to read from the left and the right image; None leaves them as they are.
-    maps: tuple[Float32Array, Float32Array] | None
+    # Pixels (height, width, 2) float32 to read from each image; None leaves them as they are.
+    maps: tuple[Float32Array, ...] | None
     # Masks (height, width) of the rectified pixels that show something; None for all.
-    valid: tuple[BoolArray, BoolArray] | None
+    valid: tuple[BoolArray, ...] | None
 
-    def apply(self, left: Image, right: Image) -> tuple[Image, Image]:
+    def apply(self, *images: Image) -> tuple[Image, ...]:
         """Return the rectified images."""
         if self.maps is None:
-            return left, right
-        cv2 = opencv()
-        pairs = zip((left, right), self.maps, strict=True)
-        left, right = (cv2.remap(image, m[..., 0], m[..., 1], cv2.INTER_LINEAR) for image, m in pairs)
-        return left, right
+            return images
+        cv2, pairs = opencv(), zip(images, self.maps, strict=True)
+        return tuple(cv2.remap(image, m[..., 0], m[..., 1], cv2.INTER_LINEAR) for image, m in pairs)
+
+
+def undistortion(calibration: LensCalibration) -> Rectification:
+    """Return the warp of one camera into a pinhole with the same focal lengths and principal point."""
+    K, (width, height) = calibration.K, calibration.size
+    camera = StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    if calibration.distortion.model == "none" and K[0, 1] == 0:
+        return Rectification(camera, np.eye(4), None, None)
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    x, y = (u - camera.cu_px) / camera.fu_px, (v - camera.cv_px) / camera.fv_px
+    pixels = _image(np.stack([x, y, np.ones(u.shape)], axis=-1), K, calibration.distortion).astype(np.float32)
+    return Rectification(camera, np.eye(4), (pixels,), (_shows(pixels, calibration.size),))
 
 
 def rectification(calibration: PairCalibration) -> Rectification:

@@ -57,7 +57,7 @@ class Tracker:
     """
 
     def __init__(
-        self, camera: StereoCamera, config: FrontEndConfig, valid: tuple[BoolArray, BoolArray] | None = None
+        self, camera: StereoCamera, config: FrontEndConfig, valid: tuple[BoolArray, ...] | None = None
     ) -> None:
         self.camera, self.config = camera, config
         self._valid = None if valid is None else tuple(eroded(mask, _BORDER) for mask in valid)

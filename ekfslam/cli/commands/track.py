@@ -21,9 +21,11 @@ EXAMPLES = ("track sequences/06 --out 06.h5", "track sequences/06 --truth poses/
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("data", metavar="SOURCE", help="folder with stereo images and their calibration")
+    parser.add_argument(
+        "data", metavar="SOURCE", help="folder with images of a pair or of one camera, and their calibration"
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.h5", help="recording to write")
-    declare(parser, "--force", *PLACES)
+    declare(parser, "--force", *PLACES, "--camera")
     declare(parser, "--config", help="settings in a table [front_end]")
     parser.add_argument("--features", type=int, metavar="N", help="features wanted in a frame")
 
@@ -39,7 +41,8 @@ def command(options: argparse.Namespace) -> None:
         options.data, lateral=options.lateral, topics=options.topics, calibration=options.calibration
     )
     if recording is None:
-        raise UnknownFormatError(f"{options.data}: there are no stereo images that a source knows")
+        raise UnknownFormatError(f"{options.data}: there are no images that a source knows")
+    recording = recording.of_left_camera if options.camera == "left" else recording
     if options.velocities is not None:
         frame, lateral = options.velocity_frame, options.lateral
         recording = attach_velocities(recording, options.velocities, velocity_frame=frame, lateral=lateral)

@@ -19,7 +19,7 @@ import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.data.checks import require_finite, require_rigid, require_shape, spelled_as_in
-from ekfslam.data.images import Distortion, DistortionModel, PairCalibration, side_by_side
+from ekfslam.data.images import Distortion, DistortionModel, LensCalibration, PairCalibration, side_by_side
 from ekfslam.data.readers.imu_yaml import chain_of, find_chain, late_s, pose_of
 from ekfslam.data.readers.pictures import other_side, side_of
 from ekfslam.data.readers.text import read_lines
@@ -62,7 +62,7 @@ class PairFile:
     """Calibration of a pair as files have it."""
 
     left: CameraFile
-    right: CameraFile
+    right: CameraFile | None  # None: of one camera
     T_right_left: Array  # (4, 4) left to right optical frame
     files: tuple[Path, ...]  # files that were read
     T_cam_imu: Array | None = None  # (4, 4) IMU to left optical frame; None if it is not stated
@@ -70,10 +70,10 @@ class PairFile:
     topics: tuple[str, str] | None = None  # topics of left and right images that the files name
     late_s: float = 0.0  # stamp of an inertial sample less that of an image of the same instant
 
-    def pair(self, size: Size | None = None) -> PairCalibration:
+    def pair(self, size: Size | None = None) -> PairCalibration | LensCalibration:
         """Return the calibration for images of a size, by default the stated one; raise `CalibrationError` if none."""
         source = str(self.files[0])
-        for camera in (self.left, self.right):
+        for camera in (self.left, self.right or self.left):
             size = size or camera.size
             if camera.size is not None and camera.size != size:
                 found = f"the images have {size} pixels" if size else ""
@@ -81,6 +81,8 @@ class PairFile:
         if size is None:
             raise CalibrationError("the size of the images is not stated", source=source, field="size")
         with spelled_as_in(source):
+            if self.right is None:
+                return LensCalibration(self.left.K, size, self.left.lens)
             return PairCalibration(self.left.K, self.right.K, size, self.T_right_left, self.left.lens, self.right.lens)
 
 
@@ -137,6 +139,9 @@ def _toml(file: Path) -> PairFile:
     values = read_toml(file)
     left = _toml_camera(values, "left_camera")
     right = _toml_camera(values, "right_camera") if "right_camera" in values else left
+    T_cam_imu = _numbers(values["T_cam_imu"], (4, 4), "T_cam_imu") if "T_cam_imu" in values else None
+    if "left" in values and not values.keys() & {"right", "right_camera", "T_right_left", "baseline_m"}:
+        return PairFile(left, None, np.eye(4), (file,), T_cam_imu)
     if ("T_right_left" in values) == ("baseline_m" in values):
         raise CalibrationError("expected either T_right_left or baseline_m", field="T_right_left")
     if "baseline_m" in values:
@@ -146,7 +151,6 @@ def _toml(file: Path) -> PairFile:
         T_right_left = side_by_side(baseline)
     else:
         T_right_left = _numbers(values["T_right_left"], (4, 4), "T_right_left")
-    T_cam_imu = _numbers(values["T_cam_imu"], (4, 4), "T_cam_imu") if "T_cam_imu" in values else None
     return PairFile(left, right, T_right_left, (file,), T_cam_imu)
 
 
@@ -234,8 +238,11 @@ def _euroc(read: Calibration) -> PairFile:
 
 
 def read_euroc_pair(*paths: Path) -> PairFile:
-    """Read ``sensor.yaml`` of the left and of the right camera of EuRoC, with ``T_BS``."""
+    """Read ``sensor.yaml`` of the left and of the right camera of EuRoC, or of one camera, with ``T_BS``."""
     reads = [read_yaml(path) for path in paths]
+    if len(reads) == 1:
+        camera = _kalibr_camera(reads[0], "", "distortion_coefficients")
+        return PairFile(camera, None, np.eye(4), paths, se3.inverse(pose_of(reads[0], "T_BS")))
     left, right = (_kalibr_camera(read, "", "distortion_coefficients") for read in reads)
     T_left, T_right = (se3.inverse(pose_of(read, "T_BS")) for read in reads)
     if left.size != right.size:

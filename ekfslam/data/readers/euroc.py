@@ -46,15 +46,11 @@ _PLACES = ("data.csv", *(f"{above}{folder}/data.csv" for above in ("", "mav0/") 
 def open_euroc(folder: Path, calibration: str | None = None) -> ImageRecording:
     """Open images, calibration, samples and truth of a recording; frames without samples are left out."""
     mav = _mav(folder) or folder
-    left, right = (_images(mav / name) for name in CAMERAS)
-    # An image whose partner is known to be missing is no sign of another clock.
-    left, right = left.without(right.missing_ns), right.without(left.missing_ns)
-    in_left, in_right, alone = pair_stamps(left.time_ns, right.time_ns, str(mav))
-    rig, imu = _calibration(mav, calibration), _inertial(mav)
-    time_s = left.time_ns[in_left] / 1e9
-    files = ([left.files[i] for i in in_left], [right.files[i] for i in in_right])
+    cameras = [name for name in CAMERAS if (mav / name / "data.csv").is_file()]
+    rig, imu = _calibration(mav, calibration, len(cameras) == 1), _inertial(mav)
+    time_ns, files, found_notes = _frames(mav, cameras)
     load, deep = pair_files(*files, rig.left.size)
-    notes = (*left.notes, *right.notes, *alone, *deep, *rig.notes)
+    time_s, notes = time_ns / 1e9, (*found_notes, *deep, *rig.notes)
     truth, found = None, find_euroc_truth(mav)
     if found is not None:
         truth = truth_of_frames(time_s, read_euroc(found))
@@ -71,7 +67,7 @@ def open_euroc(folder: Path, calibration: str | None = None) -> ImageRecording:
         notes=("There are no velocities and no inertial samples.", *notes),
         attributes={
             "reader": IMAGES.name,
-            "checksum_sha256": checksum(*(mav / name / "data.csv" for name in CAMERAS), *rig.files),
+            "checksum_sha256": checksum(*(mav / name / "data.csv" for name in cameras), *rig.files),
             **({CALIBRATION: checksum(*rig.files)} if calibration else {}),
         },
     )
@@ -83,6 +79,19 @@ def open_euroc(folder: Path, calibration: str | None = None) -> ImageRecording:
     rows, T_body_imu = imu
     T_cam_imu = None if T_body_imu is None else rig.T_cam_imu @ T_body_imu
     return with_rows(recording, replace(rows, late_s=rig.late_s, T_cam_imu=T_cam_imu))
+
+
+def _frames(mav: Path, cameras: list[str]) -> tuple[IntArray, tuple[list[Path], list[Path] | None], tuple[str, ...]]:
+    """Return stamps (T,) of frames, files of left and right images, or of one camera, and notes."""
+    if len(cameras) == 1:
+        images = _images(mav / cameras[0])
+        return images.time_ns, (images.files, None), (*images.notes, "There is one camera.")
+    left, right = (_images(mav / name) for name in cameras)
+    # An image whose partner is known to be missing is no sign of another clock.
+    left, right = left.without(right.missing_ns), right.without(left.missing_ns)
+    in_left, in_right, alone = pair_stamps(left.time_ns, right.time_ns, str(mav))
+    files = [left.files[i] for i in in_left], [right.files[i] for i in in_right]
+    return left.time_ns[in_left], files, (*left.notes, *right.notes, *alone)
 
 
 def _inertial(mav: Path) -> tuple[InertialRows, Array | None] | None:
@@ -150,14 +159,15 @@ def _images(camera: Path) -> _Images:
     return _Images(next(as_ns), [found[stamp] for stamp in stamps], next(as_ns), notes)
 
 
-def _calibration(mav: Path, given: str | None) -> PairFile:
-    """Return the calibration of the pair and of the body: of a given file, ``sensor.yaml``, or a chain of Kalibr."""
+def _calibration(mav: Path, given: str | None, is_one: bool) -> PairFile:
+    """Return the calibration of camera(s) and body: of a given file, ``sensor.yaml``, or a chain of Kalibr."""
     own = mav / CAMERAS[0] / "sensor.yaml"
     places = (place / sub for place in (mav, mav.parent) for sub in ("dso", "."))
     chain = given or (None if own.is_file() else find_chain(*places))
     if chain is None:
-        return read_euroc_pair(own, mav / CAMERAS[1] / "sensor.yaml")
+        return read_euroc_pair(own, *([] if is_one else [mav / CAMERAS[1] / "sensor.yaml"]))
     found = read_pair(chain)
+    found = replace(found, right=None) if is_one else found
     notes = (f"The calibration is that of {found.files[0].name}.", *found.notes) if given else found.notes
     if found.T_cam_imu is None:
         notes += (f"{found.files[0].name} states no T_cam_imu. {BODY_IS_CAMERA}",)

@@ -19,7 +19,8 @@
 
     [right_camera]                      # optional: as the left one
 
-In place of the tables and the transforms, ``calibration = "camchain.yaml"`` names a file of another program, see
+Without ``right``, ``T_right_left`` and ``baseline_m`` it is one camera, whose images are in ``left``. In place of the
+tables and the transforms, ``calibration = "camchain.yaml"`` names a file of another program, see
 `calibrations`.
 """
 
@@ -35,7 +36,7 @@ from ekfslam.data.checks import spelled_as_in
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.readers.calibrations import read_pair, read_toml
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
-from ekfslam.data.readers.pictures import find_pair, images_of_sides, pair_files
+from ekfslam.data.readers.pictures import find_pair, images_in, images_of_sides, pair_files
 from ekfslam.data.readers.registry import CALIBRATION, Reader, Source
 from ekfslam.data.readers.text import first_row, parse_table, read_lines
 from ekfslam.data.velocities import attach_velocities
@@ -53,10 +54,8 @@ def open_folder(path: Path, calibration: str | None = None) -> ImageRecording:
     if calibration is None and "calibration" in values:
         calibration = str(folder / _text(values, "calibration", file))
     described = read_pair(calibration or file)
-    left, right = images_of_sides(*(folder / name for name in _folders(values, folder, file)))
-    if alone := [image.stem for key, image in [*left.items(), *right.items()] if (key in left) != (key in right)]:
-        raise LostDataError(f"{len(alone)} images have no partner, the first is {alone[0]}", source=str(folder))
-    load, notes = pair_files(list(left.values()), [right[key] for key in left], bits=_bits(values, file))
+    left, right = _files(values, folder, file, described.right is None)
+    load, notes = pair_files(left, right, bits=_bits(values, file))
     notes += () if "velocities" in values else ("There are no velocities.",)
     notes += () if described.T_cam_imu is not None else (f"There is no T_cam_imu. {BODY_IS_CAMERA}",)
     attributes = {"checksum_sha256": checksum(file)} if file.is_file() else {}
@@ -91,6 +90,16 @@ def _folders(values: dict[str, Any], folder: Path, file: Path) -> tuple[str, str
         message = "expected the names of the folders of images; there are none with usual names, such as left and right"
         raise CalibrationError(message, source=str(file), field="left")
     return found
+
+
+def _files(values: dict[str, Any], folder: Path, file: Path, is_one: bool) -> tuple[list[Path], list[Path] | None]:
+    """Return the files of left and right images, or of one camera."""
+    if is_one:
+        return list(images_in(folder / _text(values, "left", file))), None
+    left, right = images_of_sides(*(folder / name for name in _folders(values, folder, file)))
+    if alone := [image.stem for key, image in [*left.items(), *right.items()] if (key in left) != (key in right)]:
+        raise LostDataError(f"{len(alone)} images have no partner, the first is {alone[0]}", source=str(folder))
+    return list(left.values()), [right[key] for key in left]
 
 
 def _bits(values: dict[str, Any], file: Path) -> int | None:

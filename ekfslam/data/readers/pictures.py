@@ -94,27 +94,27 @@ def _opened(file: Path | io.BytesIO, source: str) -> Iterator[Pillow.Image]:
 
 @dataclass(frozen=True)
 class PairFiles:
-    """Load pairs of images of one width and height from the files of each frame; see `read_gray` for ``bits``."""
+    """Load images of one width and height from the files of each frame; see `read_gray` for ``bits``."""
 
     left: Sequence[Path]
-    right: Sequence[Path]
+    right: Sequence[Path] | None  # None: of one camera
     size: tuple[int, int]
     bits: int = 16
 
-    def __call__(self, frame: int) -> tuple[Image, Image]:
-        left, right = (read_gray(files[frame], self.size, self.bits) for files in (self.left, self.right))
-        return left, right
+    def __call__(self, frame: int) -> tuple[Image, ...]:
+        sides = (self.left,) if self.right is None else (self.left, self.right)
+        return tuple(read_gray(files[frame], self.size, self.bits) for files in sides)
 
 
 def pair_files(
-    left: Sequence[Path], right: Sequence[Path], size: tuple[int, int] | None = None, bits: int | None = None
+    left: Sequence[Path], right: Sequence[Path] | None, size: tuple[int, int] | None = None, bits: int | None = None
 ) -> tuple[PairFiles, tuple[str, ...]]:
     """Return the loader of pairs of images, and notes on them. Sizes are read from the headers of all files.
 
     All must have ``size``, by default that of the first image. ``bits`` are by default those of the largest value.
     """
     whose, deep = ("the calibration" if size else str(left[0])), []
-    for path in (*left, *right):
+    for path in (*left, *(right or ())):
         require_file(path)
         with _opened(path, str(path)) as image:
             size = size or image.size
