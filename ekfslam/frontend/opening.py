@@ -48,8 +48,7 @@ def open_sequence(
 
     Raises:
         UnknownFormatError: The file is missing, empty, damaged or of unknown content, or there is no such world.
-        ConfigError: An argument means nothing for this format, or lacks the one that it belongs to.
-        ArchiveError: A newer release wrote the file.
+        ConfigError, ArchiveError: An argument means nothing here, or lacks another; a newer release wrote the file.
         MissingPackageError: There are images, but OpenCV is not installed.
         DataError: A field is missing or malformed; the subclass says how.
     """
