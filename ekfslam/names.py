@@ -29,3 +29,12 @@ def components(names: Iterable[str]) -> list[str]:
         taken.add(distinct.casefold())
         found.append(distinct)
     return found
+
+
+def without_common_ends(names: Iterable[str], between: str = "_") -> list[str]:
+    """Return different names without the words at both ends that all of them have; a single one stays."""
+    words = [name.split(between) for name in names]
+    for end in (0, -1):
+        while len(words) > 1 and min(map(len, words)) > 1 and len({name[end] for name in words}) == 1:
+            words = [name[1:] if end == 0 else name[:-1] for name in words]
+    return [between.join(name) for name in words]

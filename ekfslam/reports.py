@@ -26,6 +26,7 @@ from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.older import FIGURES, WAY, marked, older_figures, remove_figures, require_own
 from ekfslam.filters.result import Result
+from ekfslam.names import without_common_ends
 from ekfslam.others import Others
 from ekfslam.runner import run
 from ekfslam.shown import Card, Shown, count
@@ -243,14 +244,17 @@ PAPER = ("ate_m", "ate_aligned_m", "rpe_10_m_m", "rpe_10_m_deg", "t_rel_percent"
 def compared_table(folders: Iterable[Path]) -> SweepTable:
     """Return the summaries that `compare_into` wrote into some folders as a table, one row a recording and mode.
 
+    Names of recordings are without the words at their ends that all have.
+
     Raises:
         ArchiveError: A summary is missing or damaged.
     """
-    rows = []
-    for folder in folders:
+    folders, rows = list(folders), []
+    names = without_common_ends([folder.name for folder in folders])
+    for folder, name in zip(folders, names, strict=True):
         try:
             modes = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["modes"]
-            rows += [{"recording": folder.name, "mode": mode, **figures} for mode, figures in modes.items()]
+            rows += [{"recording": name, "mode": mode, **figures} for mode, figures in modes.items()]
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise ArchiveError(f"{folder / 'summary.json'}: no summary of compare ({error})") from None
     return SweepTable.of_rows(rows, ("recording", "mode"), len(rows), {"mode": "estimator"})

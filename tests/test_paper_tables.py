@@ -14,6 +14,7 @@ from scipy import stats
 from ekfslam.cli import main
 from ekfslam.evaluation.paired import paired_grid, paired_test
 from ekfslam.evaluation.tables import Column, Grid, is_table, latex
+from ekfslam.names import without_common_ends
 from ekfslam.studies.study import LEVELS, Study, StudyArchive, run_one
 from ekfslam.studies.summary import FIGURES, study_runs, summarise_study
 from ekfslam.studies.sweep_table import SweepTable
@@ -82,7 +83,7 @@ def test_too_few_pairs_are_said_and_not_tested():
     choices = {"full": {k: 1.0 * k for k in range(5)}, "mine": {k: 2.0 * k for k in range(4)}}
     grid, said = paired_grid({"ATE [m]": choices})
     assert grid is None
-    assert said == ("not enough pairs for a test of full and mine: 4 pairs, 6 are needed (ATE [m])",)
+    assert said == ("4 pairs are not enough for a test, 6 are needed: full and mine",)
 
 
 def test_equal_values_have_no_p_value():
@@ -135,8 +136,9 @@ def test_compare_writes_the_table_of_several_recordings(tmp_path, capsys):
     path = tmp_path / "paper.tex"
     assert main(["compare", *drives, *arguments, "--table", str(path)]) == 0
     text = path.read_text()
-    assert "recording & estimator & ATE [m], unaligned & " in text and text.count("\\addlinespace") == 1
-    assert text.count("\\textbf{") >= 4 and "not enough pairs" in text
+    assert "recording & estimator & ATE [m], unaligned & " in text and text.count("\\addlinespace") == 2
+    assert re.search(r"\nmean +& dead-reckoning & +0\.2\d+ \$\\pm\$ 0\.\d+ &", text)
+    assert text.count("\\textbf{") >= 4 and "not enough for a test" in text
     for name, words in (("paper.doc", "does not end in one of .md, .tex, .csv"), ("thesis.tex", "is no table of")):
         (tmp_path / name).write_text("\\documentclass{article}")
         with pytest.raises(SystemExit):
@@ -154,6 +156,20 @@ def test_a_study_has_means_over_runs_and_paired_tests():
     table = study_runs(archive)
     text = table.paper(".md", FIGURES)
     assert re.search(r"\| variant +\| runs \| +pose NEES \(6\) \| median \| worst \|", text)
-    assert "not enough pairs for a test of invariant and standard: 2 pairs" in text
+    assert "2 pairs are not enough for a test, 6 are needed: invariant and standard" in text
     means = [x["mean"] for x in (summarise_study(archive)["levels"]["short"]["standard"][k] for k in FIGURES[:6])]
     assert [table.where("variant", "standard").column(k).mean() for k in FIGURES[:6]] == pytest.approx(means)
+
+
+def test_a_mean_of_fewer_values_than_runs_says_so(table):
+    columns = {**table.columns, "ate_m": np.where(np.arange(len(table)) == 1, np.nan, table.column("ate_m"))}
+    notes = dataclasses.replace(table, columns=columns).means(["ate_m"]).notes
+    assert "ATE [m], unaligned is missing in 1 run;" in notes[0]
+    assert "missing" not in table.means(["ate_m"]).notes[0]
+
+
+def test_names_lose_the_words_at_both_ends_that_all_have():
+    names = ["2011_09_26_drive_0001_KLT", "2011_09_30_drive_0001_KLT"]
+    assert without_common_ends(names) == ["26", "30"] == without_common_ends(["a_26_b", "a_30_b"])
+    assert without_common_ends(["city", "loop"]) == ["city", "loop"] and without_common_ends(["a_b"]) == ["a_b"]
+    assert without_common_ends(["a_b", "a_b_c"]) == ["b", "b_c"]

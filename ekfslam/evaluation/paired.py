@@ -56,7 +56,7 @@ def paired_grid(
     Args:
         figures: Heading of the figure, name of the choice, and recording with seed, to the value.
     """
-    rows, tested, short = list[tuple[str, str, str]](), list[Paired](), dict[str, list[str]]()
+    rows, tested, short = list[tuple[str, str, str]](), list[Paired](), dict[int, list[str]]()
     for heading, choices in figures.items():
         names = list(choices)
         pairs = list(combinations(names, 2)) if len(names) <= _MOST_CHOICES else [(names[0], n) for n in names[1:]]
@@ -66,13 +66,13 @@ def paired_grid(
             found = paired_test(a, b)
             if found is None:
                 n = int((np.isfinite(a) & np.isfinite(b)).sum())
-                short.setdefault(f"{first} and {second}: {n} pairs", []).append(heading)
+                short.setdefault(n, []).append(f"{first} and {second}")
             else:
                 rows.append((heading, first, second))
                 tested.append(found)
     said = tuple(
-        f"not enough pairs for a test of {said}, {LEAST_PAIRS} are needed ({', '.join(headings)})"
-        for said, headings in short.items()
+        f"{n} pairs are not enough for a test, {LEAST_PAIRS} are needed: {', '.join(dict.fromkeys(names))}"
+        for n, names in short.items()
     )
     if not rows:
         return None, said

@@ -14,7 +14,7 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +109,19 @@ class Grid:
     columns: Sequence[Column]  # text before numbers
     groups: Sequence[Any] = ()  # group of each row, of which the best number is bold; empty: all are one group
     notes: Sequence[str] = ()  # below the table
+
+    def above(self, other: Grid, label: str) -> Grid:
+        """Return the grid with the columns of the same headings of another one below, as the group ``label``."""
+        below, rows = {column.heading: column for column in other.columns}, len(other.columns[0].values)
+        columns, count = [], len(self.columns[0].values)
+        for column in self.columns:
+            more = below.get(column.heading, Column("", [label] * rows))
+            errors = [*(column.errors or [None] * count), *(more.errors or [None] * rows)]
+            values = [*column.values, *more.values]
+            is_bare = not column.errors and not more.errors
+            columns.append(replace(column, values=values, errors=() if is_bare else errors, decimals=column.places))
+        groups = [*(self.groups or [""] * count), *[label] * rows]
+        return replace(self, columns=columns, groups=groups, notes=[*self.notes, *other.notes[:1]])
 
     def text(self, ending: str) -> str:
         """Return the table as a file with an ending of `WRITERS`."""

@@ -24,6 +24,7 @@ from ekfslam.figures.series import Series
 from ekfslam.figures.style import GREY, LANDMARK_COLOR, RUN_COLORS, style_of
 from ekfslam.filters.result import Landmarks, Result
 from ekfslam.geometry.motion import world_axes_covariance
+from ekfslam.names import without_common_ends
 from ekfslam.storage.archive import Archive
 
 POINTS = 1500  # of a series; longer ones are thinned evenly
@@ -118,10 +119,7 @@ def _runs(archives: Mapping[str, Archive]) -> Iterator[Run]:
 
 def told_apart(labels: Sequence[str]) -> list[str]:
     """Return labels without common parts at both ends, cut to the shortest ends that differ."""
-    parts = [label.split(PART) for label in labels]
-    for end in (0, -1):
-        while min(map(len, parts)) > 1 and len({part[end] for part in parts}) == 1:
-            parts = [part[1:] if end == 0 else part[:-1] for part in parts]
+    parts = [label.split(PART) for label in without_common_ends(labels, PART)]
     shortened = ([part[-length:] for part in parts] for length in range(1, max(map(len, parts)) + 1))
     ends = next(ends for ends in shortened if len(set(map(tuple, ends))) == len(set(map(tuple, parts))))
     return [PART.join(end) for end in ends]

@@ -26,6 +26,7 @@ from ekfslam.evaluation.summary import KEY_FIGURES, KEYS
 from ekfslam.evaluation.tables import MISSING, Column, Grid, document, markdown_text
 from ekfslam.names import printable
 from ekfslam.provenance import in_words, provenance
+from ekfslam.shown import count
 from ekfslam.stored import TEXTS, Check, Item
 
 FORMAT, FORMAT_VERSION = "ekfslam-sweep", 1
@@ -141,7 +142,8 @@ class SweepTable:
         parts = kept.groups(*names) if names else {(): kept}
         texts = [Column(self.words(name), [spoken(key[i]) for key in parts]) for i, name in enumerate(names)]
         numbers = [Column("runs", [len(part) for part in parts.values()])]
-        for place, name in enumerate(name for name in self._shown(figures) if self.column(name).dtype.kind == "f"):
+        shown = [name for name in self._shown(figures) if self.column(name).dtype.kind == "f"]
+        for place, name in enumerate(shown):
             values = [x[np.isfinite(x)] for x in (part.column(name) for part in parts.values())]
             mean, median, worst = (
                 [float(pick(x)) if len(x) else None for x in values] for pick in (np.mean, np.median, np.max)
@@ -151,8 +153,15 @@ class SweepTable:
             further = {} if place else {"median": median, "worst": worst}
             numbers += [Column(heading, x, decimals=one.places) for heading, x in further.items()]
         groups = [key[names.index("recording")] if "recording" in names else "" for key in parts]
-        words = f"± is the standard error over {' and '.join(f'{name}s' for name in over)}"
-        return Grid([*texts, *numbers], groups, [f"{words}; {self._head(self.told)}"])
+        words = f"± is the standard error over {' and '.join(f'{name}s' for name in over if name in self.told)}"
+        known = {name: [int(np.isfinite(part.column(name)).sum()) for part in parts.values()] for name in shown}
+        lacking = {name: [len(p) - n for n, p in zip(known[name], parts.values(), strict=True) if n] for name in shown}
+        gaps = [
+            f"{self.words(name)} is missing in {count(sum(found), 'run')}"
+            for name, found in lacking.items()
+            if any(found)
+        ]
+        return Grid([*texts, *numbers], groups, ["; ".join([words, *gaps, self._head(self.told)])])
 
     def tests(self, figures: Sequence[str] = SHOWN) -> tuple[Grid | None, tuple[str, ...]]:
         """Return paired tests of estimators and settings over recordings and seeds, see `paired_grid`."""
@@ -170,14 +179,14 @@ class SweepTable:
     def paper(self, ending: str, figures: Sequence[str] = SHOWN) -> str:
         """Return the table of a paper as a file with an ending of `WRITERS`, and paired tests of the choices.
 
-        Means over seeds if there are several, else over recordings below the single runs.
+        Rows are means over seeds if there are several, else single runs; below are means over all recordings.
         """
         grid = self.means(figures) if self._is_repeated("seed") else self.grid(figures)
+        if self._is_repeated("recording"):
+            grid = grid.above(self.means(figures, _DRAWS), "mean")
         tests, said = self.tests(figures)
-        further = [] if tests is None else [markdown_text(tests)]
-        if ending == ".md" and self._is_repeated("recording"):
-            further.insert(0, markdown_text(self.means(figures, _DRAWS)))
-        return replace(grid, notes=[in_words(provenance()), *grid.notes, *(further or said)]).text(ending)
+        further = said if tests is None else [markdown_text(tests)]
+        return replace(grid, notes=[in_words(provenance()), *grid.notes, *further]).text(ending)
 
     def _is_repeated(self, name: str) -> bool:
         return name in self.told and len(set(self.column(name).tolist())) > 1
