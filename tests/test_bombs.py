@@ -8,11 +8,13 @@ import pickle
 import re
 import sqlite3
 import struct
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.bags import stereo, write
+from support.images import write_plain
 from support.npy import npy_fields, write_npy
 
 from ekfslam import open_images, open_sequence
@@ -124,6 +126,48 @@ def test_bags_of_usual_sizes_are_read_within_a_small_limit(tmp_path, kind):
     path = write(tmp_path, stereo(), kind)
     with reading_up_to(0.01):
         assert open_images(path) is not None
+
+
+def test_a_jpeg_of_thousands_of_scans_is_refused_before_they_are_decoded(tmp_path):
+    from PIL import Image as Pillow
+
+    from ekfslam.data.readers.pictures import read_gray
+
+    path = tmp_path / "a.jpg"
+    Pillow.fromarray(np.zeros((500, 500), np.uint8)).save(path, progressive=True)
+    assert read_gray(path).shape == (500, 500)
+    content = path.read_bytes()
+    last = content.rindex(b"\xff\xda")
+    path.write_bytes(content[:last] + content[last:-2] * 3000 + b"\xff\xd9")  # 28 s at 2000 x 2000 pixels
+    with pytest.raises(UnknownFormatError, match=r"a\.jpg: the image with all its scans claims .* --read-limit"):
+        read_gray(path)
+
+
+@pytest.mark.parametrize("comment", [b"#" + b"x" * 3_000_000, b"# x\n" * 500_000])
+def test_comments_of_a_pgm_without_an_end_are_not_read(tmp_path, comment):
+    from ekfslam.data.readers.pictures import pair_files, read_gray
+
+    path = tmp_path / "a.pgm"
+    path.write_bytes(b"P5 " + comment + b"\n1 1 255\n0")  # 1.2 us a byte
+    before = time.process_time()
+    for read in (read_gray, lambda path: pair_files([path], [path])):
+        with pytest.raises(UnknownFormatError, match=r"a\.pgm: not a readable image"):
+            read(path)
+    assert time.process_time() - before < 1.0
+
+
+@pytest.mark.parametrize("key", ["T_right_left", "T_cam_imu", "intrinsics", "distortion"])
+@pytest.mark.parametrize(
+    "value", ["[[1], [2, 3]]", "[1, [2]]", "[true, 1, 1, 1]", "['1', '1', '1', '1']", "[[], 1]", "{ a = 1 }", "nan"]
+)
+def test_lists_in_a_calibration_that_are_no_numbers_are_a_named_error(tmp_path, key, value):
+    folder = write_plain(tmp_path)
+    calibration = folder / "calibration.toml"
+    lines = [line for line in calibration.read_text().splitlines() if not line.startswith(f"{key} ")]
+    at = lines.index("[left_camera]") + 1 if key in ("intrinsics", "distortion") else 0
+    calibration.write_text("\n".join([*lines[:at], f"{key} = {value}", *lines[at:]]))
+    with pytest.raises(EkfslamError, match=rf"calibration\.toml: .*{key}"):
+        open_images(folder)
 
 
 @pytest.mark.parametrize("suffix", ["png", "tiff", "pgm"])

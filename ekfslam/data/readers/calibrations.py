@@ -169,7 +169,10 @@ def _toml_camera(values: dict[str, Any], name: str) -> CameraFile:
 def _numbers(value: Any, shape: tuple[int | None, ...], name: str) -> Array:
     """Return an array of finite numbers of a shape; None stands for any length."""
     try:
-        found = np.asarray(value, dtype=float)
+        entries = np.asarray(value, dtype=object)
+        if not {type(entry) for entry in entries.flat} <= {int, float}:  # no truth values, texts or ragged lists
+            raise TypeError
+        found = entries.astype(float)
         require_shape(found, shape, name)
         require_finite(found, name)
     except (TypeError, ValueError, OverflowError, DataError):

@@ -44,6 +44,7 @@ _SIDES = tuple(
 )
 _TOLERANCE_NS = 5_000_000  # cameras that are not triggered together are no stereo pair
 _EXACT_NS = 1_000_000  # rounding of stamps that are the same
+_HEAD = 1 << 16  # bytes that hold the header of any PPM
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM")  # PPM includes pgm
 
 
@@ -57,7 +58,9 @@ def decode_gray(content: bytes, source: str, size: tuple[int, int] | None = None
     """Return the pixels (height, width) uint8 of an image file; of 16 bits, the upper eight of ``bits``."""
     with _opened(io.BytesIO(content), source) as image:
         width, height = image.size
-        Budget(source).take(4 * width * height, "the image")
+        # Each scan of a progressive JPEG passes over all pixels.
+        scans = content.count(b"\xff\xda") if image.format == "JPEG" else 0
+        Budget(source).take(max(4, scans) * width * height, "the image with all its scans" if scans else "the image")
         if size is not None and image.size != size:
             message = f"the image has {width} x {height} pixels, the calibration {size[0]} x {size[1]}"
             raise CalibrationError(message, source=source)
@@ -81,13 +84,25 @@ def _is_deep(image: Pillow.Image) -> bool:
     return image.mode.startswith("I")
 
 
+def _head_of(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_HEAD)
+
+
 @contextmanager
 def _opened(file: Path | io.BytesIO, source: str) -> Iterator[Pillow.Image]:
     from PIL import Image as Pillow
 
     try:
+        head = file.getvalue()[:_HEAD] if isinstance(file, io.BytesIO) else _head_of(file)
+        if head.startswith(b"P"):  # Pillow reads comments byte by byte, without an end
+            Pillow.open(io.BytesIO(head), formats=_FORMATS).close()
         with Pillow.open(file, formats=_FORMATS) as image:
             yield image
+    except Pillow.UnidentifiedImageError:
+        raise UnknownFormatError(
+            f"{source}: not a readable image (damaged, or none of {', '.join(_FORMATS)})"
+        ) from None
     except (OSError, ValueError, SyntaxError, Pillow.DecompressionBombError) as error:
         raise UnknownFormatError(f"{source}: not a readable image ({error})") from None
 
