@@ -48,11 +48,18 @@ void Dormant::keep(const std::vector<Index>& which) {
     slot = kept;
     K = Matrix(K(Eigen::all, own));
     cross = Matrix(cross(Eigen::all, own));
-    const Index n = static_cast<Index>(own.size());
-    for (Index j = 0; j < n; ++j)  // in place: they ascend
-        for (Index i = j; i < n; ++i) S_(i, j) = S_(own[static_cast<std::size_t>(i)], own[static_cast<std::size_t>(j)]);
-    for (Index j = 0; j < waiting_; ++j)
-        for (Index i = 0; i < n; ++i) squares_(i, j) = squares_(own[static_cast<std::size_t>(i)], j);
+    const auto n = static_cast<Index>(own.size());
+    std::vector<Index> end(own.size());  // of neighbours that stay neighbours
+    for (std::size_t i = own.size(); i-- > 0;) {
+        const bool is_last = i + 1 == own.size() || own[i + 1] != own[i] + 1;
+        end[i] = is_last ? static_cast<Index>(i) + 1 : end[i + 1];
+    }
+    const auto move = [&](const double* from, double* to, Index begin) {  // in place: they ascend
+        for (Index i = begin; i < n; i = end[static_cast<std::size_t>(i)])
+            std::copy_n(from + own[static_cast<std::size_t>(i)], end[static_cast<std::size_t>(i)] - i, to + i);
+    };
+    for (Index j = 0; j < n; ++j) move(S_.col(own[static_cast<std::size_t>(j)]).data(), S_.col(j).data(), j);
+    for (Index j = 0; j < waiting_; ++j) move(squares_.col(j).data(), squares_.col(j).data(), 0);
 }
 
 void Dormant::add(const Matrix& A, double sign) {

@@ -78,13 +78,13 @@ void Gaussian::transform_promoted(const std::vector<Change>& changes, Index view
         columns_e = P_ep.middleCols<3>(change.own);
     }
     blas::multiply('N', 'N', 1.0, B, P_AA_.block(view, 0, 6, p), 0.0, own);
-    for (Index j = 0; j < p; ++j)
+    for (Index j = 0; j < p; ++j)  // the lower triangle
         for (const Change& change : changes) {
+            if (change.own + 2 < j) continue;
             const Vector3 column = P_AA_.block<3, 1>(change.own, j);
             P_AA_.block<3, 1>(change.own, j) = change.M * column + own.block<3, 1>(change.own, j);
         }
-    own = P_AA_.topLeftCorner(p, p);
-    P_AA_.topLeftCorner(p, p) = 0.5 * (own + own.transpose());
+    blas::mirror(P_AA_.topLeftCorner(p, p));
     P_AA_.topRightCorner(p, n - p) = P_AA_.bottomLeftCorner(n - p, p).transpose();
     root_.reset();
     if (!dormant_.size()) return;
