@@ -12,8 +12,9 @@ from ekfslam.cli import main
 from ekfslam.data.observations import Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.data.trajectory import Trajectory
-from ekfslam.errors import TruthError
+from ekfslam.errors import PosteriorError, TruthError
 from ekfslam.geometry import se3
+from ekfslam.smoother.given import compared
 from ekfslam.storage.exports import export
 
 FRAMES = 60
@@ -63,6 +64,46 @@ def test_the_covariance_is_true_for_estimates_that_are_worse(worlds, estimate):
         naive.append(found[-1] * min(scale) ** 2)
     assert 4.0 < np.mean(found) < 9.0 and max(found) < 15.0
     assert np.mean(naive) > 15.0  # the marginals of the best estimate alone
+
+
+@dataclasses.dataclass
+class Best:
+    """The part of a posterior that a given trajectory is compared with."""
+
+    T_world_imu: np.ndarray
+    pose_covariance: np.ndarray
+
+
+def test_poses_and_factors_of_a_given_trajectory_are_those_of_the_definition():
+    rng, key = np.random.default_rng(3), np.array([0, 2, 3, 6])
+    ours = [se3.exp(rng.normal(size=6))]
+    for _ in range(7):
+        ours.append(ours[-1] @ se3.exp(rng.normal(size=6) * 0.3))
+    root = rng.normal(size=(8, 6, 6)) * 0.1
+    root[0] = 0.0
+    best = Best(np.array(ours), root @ root.swapaxes(1, 2))
+    error = [se3.exp(rng.normal(size=6) * 0.05 * (k > 0)) for k in key]
+    elsewhere = se3.exp(np.array([3.0, -1.0, 2.0, 0.5, 2.0, -1.0]))
+    given = compared(best, key, np.array([elsewhere @ ours[k] @ e for k, e in zip(key, error, strict=True)]))
+    before = [0, 0, 1, 2, 2, 2, 3, 3]  # the given pose that a frame goes on from
+    expected = [ours[key[i]] @ error[i] @ se3.inverse(ours[key[i]]) @ T for i, T in zip(before, ours, strict=True)]
+    np.testing.assert_allclose(given.T_world_imu, expected, atol=1e-12)
+    L = [np.linalg.cholesky(P) for P in best.pose_covariance[1:]]
+    y = [np.linalg.solve(L[k - 1], se3.log(e)) for k, e in zip(key[1:], error[1:], strict=True)]
+    M = sum(np.outer(one, one) for one in y) / len(y)
+    np.testing.assert_array_equal(given.G[0], np.eye(6))
+    for k in range(1, 8):
+        P = given.G[k] @ best.pose_covariance[k] @ given.G[k].T
+        np.testing.assert_allclose(P, L[k - 1] @ (np.eye(6) + M) @ L[k - 1].T, rtol=1e-9, atol=1e-12)
+    theirs, own = (sum(np.linalg.norm(np.diff([T[k][:3, 3] for k in key], axis=0), axis=1)) for T in (expected, ours))
+    assert given.length == pytest.approx(theirs / own)
+
+
+@pytest.mark.parametrize("frame", [[0, 1], [1, 2, 3]])
+def test_too_few_poses_or_none_of_the_first_frame_are_named(frame):
+    best = Best(np.array([np.eye(4)] * 4), np.array([np.eye(6)] * 4))
+    with pytest.raises(PosteriorError, match=f"from the first frame on, found {len(frame)}"):
+        compared(best, np.array(frame), np.array([np.eye(4)] * len(frame)))
 
 
 def test_the_best_estimate_keeps_its_covariance_in_any_frame(worlds):

@@ -192,6 +192,15 @@ def test_a_clock_that_has_jumped_is_named_and_reset_starts_again(late, shift_s):
     assert live.counts.resets == 1
 
 
+def test_a_clock_of_images_alone_that_has_jumped_is_named():
+    live, named = sent(new(), messages(30)), []
+    for i in range(12):
+        with pytest.raises(ClockError) as error:
+            live.update(*view(0.1 * i), 1e6 + 0.1 * i)
+        named.append("call reset()" in str(error.value))
+    assert named == [False] * 9 + [True] * 3
+
+
 def test_a_wrong_first_stamp_does_not_freeze_the_filter():
     live = new(late="count")
     live.predict(twist(0.0), 5e8)

@@ -189,29 +189,31 @@ def test_traffic_before_resting_tracks_is_no_motion():
 DENSITIES = ekfslam.InertialNoise(1.7e-4, 2e-3, 2e-5, 3e-3)
 
 
-def filmed(speed_m_s=0.0, depth_m=5.0, turning_rad_s=0.0, traffic=0, frames=40, sigma_px=0.3, seed=0):
+def filmed(speed_m_s=0.0, depth_m=5.0, turning_rad_s=0.0, traffic=0, frames=40, panned=False):
     """A recording of a level camera that moves to its right, at 20 Hz, before points at a depth of 90 to 110 %.
 
-    The gyroscope turns, the images do not. Some points drive by; others are as fast as the camera.
+    The gyroscope turns to the left, and the images if they are panned. Points of the traffic drive by.
     """
-    rng, time_s = np.random.default_rng(seed), 0.05 * np.arange(frames)
+    rng, time_s = np.random.default_rng(0), 0.05 * np.arange(frames)
     y, x = rng.uniform(-0.4, 0.4, (2, 40)) * depth_m
     z = depth_m * rng.uniform(0.9, 1.1, 40)
     x = x - speed_m_s * time_s[:, None] + np.where(np.arange(40) < traffic, 2.0 * time_s[:, None], 0.0)
-    pixels = np.stack([320.0 + 400.0 * x / z, 240.0 + 410.0 * y / z + 0.0 * x], axis=-1)
+    angle = panned * turning_rad_s * time_s[:, None]
+    x, z = np.cos(angle) * x + np.sin(angle) * z, np.cos(angle) * z - np.sin(angle) * x
+    pixels = np.stack([320.0 + 400.0 * x / z, 240.0 + 410.0 * y / z], axis=-1)
     stamps = 0.005 * np.arange(-4, 10 * frames + 4)
-    turn, up = (np.tile([0.0, 0.0, z], (len(stamps), 1)) for z in (turning_rad_s, 9.81))
+    turn, up = (np.tile([0.0, 0.0, rate], (len(stamps), 1)) for rate in (turning_rad_s, 9.81))
     imu = ekfslam.InertialSamples(stamps, turn, up, DENSITIES)
     return ekfslam.Sequence.from_tracks(
-        time_s, pixels + sigma_px * rng.normal(size=pixels.shape), ONE, imu=imu, T_cam_imu=T_CAM_BODY
+        time_s, pixels + 0.3 * rng.normal(size=pixels.shape), ONE, imu=imu, T_cam_imu=T_CAM_BODY
     )
 
 
-def outcome(sequence, first_m_s=(0.0, 0.0, 0.0)):
+def outcome(sequence, first_m_s=(0.0, 0.0, 0.0), gyro_bias_std=1e-3):
     """Numbers of frames at rest and of contradicted ones, and the last velocity with its standard deviation."""
     noise = ekfslam.Noise.isotropic(0.1, 0.1, 0.5)
     sensor = Monocular(sequence.camera, sequence.T_cam_imu, noise)
-    blocks = Velocity(first_m_s=np.array(first_m_s)), GyroBias(std_rad_s=1e-3), AccelBias()
+    blocks = Velocity(first_m_s=np.array(first_m_s)), GyroBias(std_rad_s=gyro_bias_std), AccelBias()
     first = np.eye(4), np.diag([1e-6] * 3 + [1e-4] * 3)
     ekf = JointEKF(model_of(sensor, noise, *first, None, blocks, make_process=inertial(DENSITIES)), FilterConfig())
     standing = [frame.report.standing for frame in run_filter(ekf, sequence)]
@@ -238,6 +240,12 @@ def test_a_slow_camera_is_not_taken_for_one_at_rest(speed_m_s, depth_m):
 
 def test_a_gyroscope_that_turns_contradicts_images_at_rest():
     assert outcome(filmed(turning_rad_s=0.05))[0] == 0
+
+
+@pytest.mark.parametrize("turning_rad_s", [0.02, -0.02])
+def test_a_camera_that_pans_as_its_gyroscope_says_is_at_rest(turning_rad_s):
+    at_rest, contradicted, velocity, _ = outcome(filmed(turning_rad_s=turning_rad_s, panned=True), gyro_bias_std=1e-5)
+    assert at_rest > 25 and contradicted == 0 and np.abs(velocity).max() < 0.01
 
 
 def test_a_camera_that_surely_moves_is_not_stopped_by_a_scene_that_moves_along():
