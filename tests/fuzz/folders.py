@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image
+from rosbags import rosbag1, rosbag2
 from support.bags import KINDS, stereo
 from support.bags import write as write_bag
 from support.images import write_course, write_euroc, write_plain, write_raw_images
@@ -36,6 +37,8 @@ def folders() -> dict[str, tuple[Files, str]]:
         "npy": lambda place: write_npy(place / "dataset00.npy", npy_fields(builtin("loop?frames=7"))),
         "room": _room,
         **{kind: lambda place, kind=kind: write_bag(place, stereo(), kind) for kind in KINDS},
+        **{f"ros1 {name}": lambda place, name=name: _compressed(place, True, name) for name in ("BZ2", "LZ4")},
+        **{f"ros2 {name}": lambda place, name=name: _compressed(place, False, name) for name in ("FILE", "MESSAGE")},
     }
     for name, write in writers.items():
         with tempfile.TemporaryDirectory() as place:
@@ -55,6 +58,25 @@ def _room(place: Path) -> Path:
     (place / "calib.txt").write_text(f"P0: {P.format(0)}\nP1: {P.format(-300 * BASELINE_M)}\n")
     (place / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
     return place
+
+
+def _compressed(place: Path, is_ros1: bool, name: str) -> Path:
+    """A bag that its writer compresses: in chunks, as a whole, or each message."""
+
+    class Compressed(rosbag1.Writer if is_ros1 else rosbag2.Writer):
+        def __init__(self, path: Path, **more: object) -> None:
+            super().__init__(path, **more)
+            if is_ros1:
+                self.set_compression(self.CompressionFormat[name])
+            else:
+                self.set_compression(rosbag2.CompressionMode[name], rosbag2.CompressionFormat.ZSTD)
+
+    module, writer = (rosbag1, rosbag1.Writer) if is_ros1 else (rosbag2, rosbag2.Writer)
+    module.Writer = Compressed
+    try:
+        return write_bag(place, stereo(), "ros1" if is_ros1 else "ros2")
+    finally:
+        module.Writer = writer
 
 
 def png(pixels: np.ndarray) -> bytes:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import crafted
 import h5py
 import numpy as np
 import scipy.io
@@ -41,6 +42,7 @@ class Case:
 
     files: dict[str, bytes]
     arguments: list[str]
+    program: Callable[[], str] | None = None  # in place of the command; it returns what is wrong
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ class Valid:
     archives: dict[str, bytes]
     texts: dict[str, bytes]
     folders: dict[str, tuple[Files, str]]
+    journals: dict[str, tuple[str, bytes, list[str]]]
 
     @staticmethod
     def prepared() -> Valid:
@@ -72,6 +75,7 @@ class Valid:
                 {"full": full, "both": Path(archive).read_bytes(), "study": (place / "study.h5").read_bytes()},
                 {"kitti": _kitti(), "tum": _tum(), "euroc": _euroc()},
                 folders(),
+                crafted.journals(),
             )
 
 
@@ -353,7 +357,7 @@ def _odd_number(text: bytes, rng: np.random.Generator) -> bytes:
 def files_of_folders(valid: Valid, rng: np.random.Generator) -> Case:
     """A folder of images, packets or a bag, of which some files are changed, missing, doubled or of another place."""
     whole, path = valid.folders[_pick(rng, valid.folders)]
-    files = dict(whole)
+    files = crafted.text_of(whole, rng, mutated) if rng.random() < 0.5 else dict(whole)
     for _ in range(int(rng.integers(1, 4))):
         names = sorted(files)
         texts = [name for name in names if is_text(name)]
@@ -452,9 +456,25 @@ def command_lines(valid: Valid, rng: np.random.Generator) -> Case:
     return Case({**files, "c.toml": QUICK.encode()}, arguments)
 
 
+def pickles(valid: Valid, rng: np.random.Generator) -> Case:
+    return Case({"dataset00.npy": crafted.pickled(ODD, rng)}, _use(rng, "dataset00.npy"))
+
+
+def checkpoints(valid: Valid, rng: np.random.Generator) -> Case:
+    """The journal of a sweep or study that was killed, changed with right digests."""
+    name, content, command = valid.journals[_pick(rng, valid.journals)]
+    content = mutated(content, rng) if rng.random() < 0.2 else crafted.forged(content, ODD, rng)
+    return Case({name: content, "s.toml": crafted.SWEEP.encode()}, command)
+
+
+def streams(valid: Valid, rng: np.random.Generator) -> Case:
+    return Case({}, ["live"], crafted.Stream(ODD, spoilt, rng))
+
+
 GENERATORS: tuple[Callable[[Valid, np.random.Generator], Case], ...] = (
     *(bytes_of_recordings, bytes_of_archives, fields_of_recordings, items_of_hdf5),
     *(settings, truths, worlds, drives, command_lines, files_of_folders, sweeps, velocities),
+    *(pickles, checkpoints, streams),
 )
 
 

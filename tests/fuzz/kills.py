@@ -1,7 +1,8 @@
 """Kills at random moments: ``python tests/fuzz/kills.py --kills 50``.
 
-Each command is started, killed and started again until it has been killed so often; whenever it ends by itself, what
-it has written must be, bit for bit, what an undisturbed run writes, and nothing else may lie beside it.
+Each command is started, killed and started again until it has been killed so often; in a third of the starts a second
+one runs in the same folder. Whenever one ends by itself, what it has written must be, bit for bit, what an undisturbed
+run writes, and nothing else may lie beside it. A second one may be refused, if it says so.
 """
 
 from __future__ import annotations
@@ -23,7 +24,11 @@ COMMANDS = {
     "compare": ["compare", WORLD, "--out", "."],
     "study": ["consistency", "--runs", "4", "--variants", "invariant", "--executor", "serial", "--out", "."],
     "posterior": ["posterior", "full.h5"],
+    "sweep": ["sweep", "s.toml", "--executor", "processes", "--workers", "2", "--out", "."],
+    "workers": ["consistency", "--runs", "4", "--variants", "invariant", "--workers", "2", "--out", "."],
 }
+SWEEP = 'recordings = ["builtin:city?frames=40"]\nmodes = ["full", "smoothed"]\nseeds = [0, 1, 2]\n'
+REFUSED = "another run is writing there"
 
 
 def archives(folder: Path) -> dict[str, bytes]:
@@ -39,8 +44,36 @@ def archives(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def start(arguments: list[str], folder: Path) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-m", "ekfslam", *arguments], cwd=folder, stdout=subprocess.DEVNULL)
+def start(arguments: list[str], folder: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "ekfslam", *arguments]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def disturbed(arguments: list[str], folder: Path, longest: float, rng: np.random.Generator) -> tuple[int, int]:
+    """Start one run or two, kill them at a random moment, and return the numbers of kills and of ends."""
+    end, running, codes = time.monotonic() + rng.uniform(0.5, longest), [start(arguments, folder)], []
+    if rng.random() < 1 / 3:
+        time.sleep(rng.uniform(0.0, 0.5 * longest) * rng.integers(2))
+        running.append(start(arguments, folder))
+    for process in [running[i] for i in rng.permutation(len(running))]:
+        try:
+            process.wait(timeout=max(end - time.monotonic(), 0.01))
+        except subprocess.TimeoutExpired:
+            process.kill()
+        words = process.communicate()[1]
+        codes.append(process.returncode)
+        is_refused = process.returncode == 2 and REFUSED in words and len(running) == 2
+        assert process.returncode in (0, -signal.SIGKILL) or is_refused, (arguments, process.returncode, words)
+    return codes.count(-signal.SIGKILL), codes.count(0)
+
+
+def fresh(path: Path, name: str) -> Path:
+    """Return a new folder with the files that a command reads."""
+    path.mkdir()
+    (path / "s.toml").write_text(SWEEP)
+    if name == "posterior":
+        assert start(["run", WORLD, "--out", "full.h5"], path).wait() == 0
+    return path
 
 
 def main() -> None:
@@ -53,40 +86,25 @@ def main() -> None:
     for name in options.commands:
         arguments = COMMANDS[name]
         with tempfile.TemporaryDirectory() as place:
-
-            def fresh(folder: str, place: str = place, name: str = name) -> Path:
-                path = Path(place) / folder
-                path.mkdir()
-                if name == "posterior":
-                    assert start(["run", WORLD, "--out", "full.h5"], path).wait() == 0
-                return path
-
-            whole = fresh("whole")
-            begin = time.monotonic()
+            whole, begin = fresh(Path(place) / "whole", name), time.monotonic()
             assert start(arguments, whole).wait() == 0
             longest, expected = time.monotonic() - begin, archives(whole)
             beside = sorted(str(path.relative_to(whole)) for path in whole.rglob("*"))
-            kills = ended = rounds = 0
-            folder = fresh("0")
+            kills = ends = rounds = 0
+            folder = fresh(Path(place) / "0", name)
             while kills < options.kills:
-                process = start(arguments, folder)
-                try:
-                    code = process.wait(timeout=rng.uniform(0.5, longest))
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    code = process.wait()
-                if code == -signal.SIGKILL:
-                    kills += 1
+                killed, ended = disturbed(arguments, folder, longest, rng)
+                kills, ends = kills + killed, ends + ended
+                if not ended:
                     continue
-                assert code == 0, (name, code)
-                ended += 1
                 assert archives(folder) == expected, name
-                assert sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) == beside, name
+                if not killed:
+                    assert sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) == beside, name
                 rounds += 1
-                folder = fresh(str(rounds))
+                folder = fresh(Path(place) / str(rounds), name)
             assert start(arguments, folder).wait() == 0
             assert archives(folder) == expected, name
-            print(f"{name}: {kills} kills, {ended + 1} ends, all with the same bits and nothing else", flush=True)
+            print(f"{name}: {kills} kills, {ends + 1} ends, all with the same bits and nothing else", flush=True)
 
 
 if __name__ == "__main__":
