@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-whole check lint docs archive-page lower-bounds sanitize wheel results setup engine clean
+.PHONY: demo test test-whole check lint docs archive-page lower-bounds mutants sanitize wheel results setup engine clean
 
 demo: engine
 	$(BIN)/ekfslam compare builtin:city --out results/local
@@ -36,7 +36,14 @@ docs: $(VENV)/.docs
 lower-bounds:
 	PYTHON="$(PYTHON)" sh .ci/lower-bounds
 
-# The engine's tests with the sanitizers of the compiler, which find wrong addresses and undefined behaviour.
+# Mutants of some files against some tests, by default of the live inputs: make mutants FILES=... TESTS=... COUNT=200
+FILES ?= ekfslam/filters/door.py ekfslam/filters/streams.py ekfslam/filters/live.py
+TESTS ?= tests/test_door.py tests/test_streams.py tests/test_live.py tests/test_live_robust.py
+COUNT ?= 60
+mutants: engine
+	$(BIN)/python tests/mutants.py $(FILES) --tests $(TESTS) --count $(COUNT)
+
+# The engine with the sanitizers of the compiler, which find wrong addresses and undefined behaviour.
 sanitize: $(READY)
 	VENV="$(VENV)" sh .ci/sanitize
 

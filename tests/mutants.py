@@ -194,10 +194,13 @@ def judged(file: Path, tree: ast.Module, tests: list[str]) -> str:
     return "survives" if tested(["-x", *tests], []) == 0 else "killed"
 
 
-def tests_of(file: Path, node: Any, found: dict[str, Any]) -> list[str]:
-    """Return the tests that run a node, the fastest first."""
-    lines = {(str(file), line) for line in range(node.lineno, node.lineno + 1)}
-    tests = [test for test, seen in found["lines"].items() if lines & {(name, line) for name, line in seen}]
+def tests_of(file: Path, node: Any, in_function: bool, found: dict[str, Any]) -> list[str]:
+    """Return the tests that run a node, the fastest first; those that run the file, if an import runs the node."""
+    tests = [
+        test
+        for test, seen in found["lines"].items()
+        if any(name == str(file) and (line == node.lineno or not in_function) for name, line in seen)
+    ]
     return sorted(tests, key=found["seconds"].get)[:40]
 
 
@@ -220,8 +223,10 @@ def main() -> None:
     random.Random(options.seed).shuffle(drawn)
     counts = collections.Counter[str]()
     for file, path, which in drawn[: options.count]:
-        nearest = next(node for n in range(len(path), 0, -1) if hasattr(node := at(trees[file], path[:n]), "lineno"))
-        tests, (tree, words) = tests_of(file, nearest, found), mutated(trees[file], path, which)
+        above = [at(trees[file], path[:n]) for n in range(len(path), 0, -1)]
+        nearest = next(node for node in above if hasattr(node, "lineno"))
+        in_function = any(isinstance(node, ast.FunctionDef | ast.Lambda) for node in above)
+        tests, (tree, words) = tests_of(file, nearest, in_function, found), mutated(trees[file], path, which)
         verdict = forked(lambda f=file, t=tree, some=tests: judged(f, t, some), options.seconds) if tests else "not run"
         counts[verdict] += 1
         if verdict != "killed":

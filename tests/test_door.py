@@ -108,6 +108,26 @@ def test_observations_keep_their_order_and_each_sensor_has_its_width():
         checked_observations(rig, [2, -1], np.ones((2, 4)))
 
 
+class Own(Rig):
+    """A sensor of the user's, whose rows are what the class says."""
+
+    wrong = np.nan
+
+    def rows(self, measured):
+        return np.full((len(measured), 3), self.wrong) if np.isscalar(self.wrong) else self.wrong
+
+
+@pytest.mark.parametrize(("wrong", "is_right"), [(1.0, True), (np.nan, False), (np.ones((2, 2)), False)])
+def test_observations_of_an_own_sensor_are_judged_by_their_rows(monkeypatch, wrong, is_right):
+    monkeypatch.setattr(Own, "wrong", wrong)
+    sensor, given = Own(CAMERA, EXTRINSICS, NOISE), ([4, 2], np.ones((2, 7)))
+    if is_right:
+        assert checked_observations(sensor, *given)[1].shape == (2, 7)
+    else:
+        with pytest.raises(DataError, match="as rows"):
+            checked_observations(sensor, *given)
+
+
 def test_numbers_are_copied_and_bounded():
     given = np.ones(3)
     assert checked_numbers(given, "x") is not given

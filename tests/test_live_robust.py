@@ -237,7 +237,19 @@ def test_a_backlog_is_refused_by_name():
     for i in range(1000):
         early.predict(twist(i * STEP_S), i * STEP_S)
     early.update(*view(0.0), 999 * STEP_S)
-    assert early.counts.refused == 0 and early.counts.unused > 700 and early.counts.taken_in == 1
+    assert early.counts.refused == 0 and early.counts.taken_in == 1
+    assert early.counts.unused == 8 * 101  # a half of those that wait, each time
+    assert new(backlog=1).backlog == 1
+
+
+def test_images_without_velocities_wait_up_to_a_bound(monkeypatch):
+    monkeypatch.setattr("ekfslam.filters.live.MOST_IMAGES", 3)
+    live = new()
+    for i in range(3):
+        live.update(*view(0.1 * i), 0.1 * i)
+    with pytest.raises(BacklogError, match="too many images wait"):
+        live.update(*view(0.3), 0.3)
+    assert (live.counts.images, live.counts.refused) == (3, 1)
 
 
 def naive(live, log, t):

@@ -99,7 +99,7 @@ Sensor sensor_of(const nb::dict& from) {
     sensor.T_cam_imu = get<Matrix4>(from, "T_cam_imu");
     sensor.variance_px2 = get<Vector3>(from, "variance_px2");
     sensor.parallax_rad = get<double>(from, "parallax_rad");
-    sensor.patience = get<Index>(from, "patience");
+    sensor.patience = whole_number("patience", get<Index>(from, "patience"));
     const double* numbers[] = {&sensor.fu_px,
                                &sensor.fv_px,
                                &sensor.cu_px,
@@ -139,9 +139,9 @@ Config config_of(const nb::dict& from) {
     config.moving_sigma = get<double>(from, "moving_sigma");
     config.moving_share = get<double>(from, "moving_share");
     config.estimates_velocity = get<bool>(from, "estimates_velocity");
-    config.retire_after = get<Index>(from, "retire_after");
-    config.misses_to_split = get<Index>(from, "misses_to_split");
-    config.dormant = get<Index>(from, "dormant");
+    config.retire_after = whole_number("retire_after", get<Index>(from, "retire_after"));
+    config.misses_to_split = whole_number("misses_to_split", get<Index>(from, "misses_to_split"));
+    config.dormant = whole_number("dormant", get<Index>(from, "dormant"));
     config.input_gate = get<double>(from, "input_gate");
     config.doubt = get<double>(from, "doubt");
     for (const double number : {config.gate, config.gate_probability, config.waiting_gate, config.min_depth_m,
@@ -274,6 +274,7 @@ nb::tuple look_again(Filter& filter, const Vector6& imu_twist) {
 nb::object update(Filter& filter, Index frame, const Integers& ids, const Matrix& measured, bool is_rested,
                   const nb::object& twist_after) {
     whole(filter);
+    whole_number("frame", frame);
     const Ids seen = ids_of(ids);
     const Matrix columns = measured.transpose();
     if (std::unordered_set<std::int64_t>(seen.begin(), seen.end()).size() != seen.size())
@@ -401,7 +402,7 @@ void bind_filter(nb::module_& module) {
         .def("arrive", changing(&arrive), arg("values"), arg("coordinates"), arg("imu_twist"), arg("Phi"), arg("Q"),
              arg("T_departed"), arg("T_predicted"), arg("noise"), arg("numbers"), arg("last").none(), arg("shares"))
         .def("rest", changing(+[](Filter& filter, Index frame, const Integers& ids) {
-                 return retired_of(whole(filter).rest(frame, ids_of(ids)));
+                 return retired_of(whole(filter).rest(whole_number("frame", frame), ids_of(ids)));
              }),
              arg("frame"), arg("ids"))
         .def("update", changing(&update), arg("frame"), arg("ids"), arg("measured"), arg("is_rested"),

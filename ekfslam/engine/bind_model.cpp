@@ -48,8 +48,8 @@ nb::tuple observe_after(const Filter& filter, const Vector& correction, const In
 std::vector<bool> start_from(Filter& filter, Index frame, const Integers& ids, const Matrix& rows_seen) {
     const bool is_rig = whole(filter).e.sensor.type == Sensor::rig;
     const Matrix columns = rows_for(filter.e, ids.size(), rows_seen);
-    return (is_rig ? start(filter.e, frame, ids_of(ids), columns)
-                   : filter.waiting.start(filter.e, frame, ids_of(ids), columns))
+    return (is_rig ? start(filter.e, whole_number("frame", frame), ids_of(ids), columns)
+                   : filter.waiting.start(filter.e, whole_number("frame", frame), ids_of(ids), columns))
         .which;
 }
 

@@ -53,6 +53,12 @@ void require(bool holds, const std::string& what) {
     if (!holds) throw nb::value_error(what.c_str());
 }
 
+Index whole_number(const std::string& name, Index value) {
+    constexpr Index largest = Index{1} << 60;
+    require(value >= -largest && value <= largest, name + " must be at most 2^60");
+    return value;
+}
+
 void require_range(const std::string& name, Index first, Index size, Index count) {
     require(first >= 0 && size >= 0 && first <= count && size <= count - first,
             name + " must be among " + std::to_string(count));
@@ -110,6 +116,9 @@ nb::dict table_of(const Table& table) {
 Table table_from(const nb::dict& from, Index dimension) {
     Table table;
     for (const Column& column : COLUMNS) table.*column.values = ids_of(get<Integers>(from, column.name));
+    for (const Column& column : COLUMNS)
+        for (const std::int64_t value : table.*column.values)
+            if (column.values != &Table::id) whole_number(column.name, value);
     const Index count = table.size(), heights[] = {3, 3, 2, dimension};
     for (const Column& column : COLUMNS)
         require(static_cast<Index>((table.*column.values).size()) == count,

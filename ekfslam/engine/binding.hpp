@@ -52,6 +52,8 @@ constexpr Index MOST_CONSIDERED = 10000;
 
 // Throw ValueError in these words, or one that names the array.
 void require(bool holds, const std::string& what);
+// Numbers of frames, steps and landmarks: differences of two of them fit into 64 bits.
+Index whole_number(const std::string& name, Index value);
 void require_range(const std::string& name, Index first, Index size, Index count);
 void require_shape(const char* name, const Eigen::Ref<const Matrix>& found, Index rows, Index columns);
 void require_finite(const char* name, const Eigen::Ref<const Matrix>& found);
