@@ -102,7 +102,7 @@ def alone(path: str | Path) -> Iterator[None]:
     try:
         folder = os.open(parent, os.O_RDONLY)
     except OSError as error:
-        raise WriteError(f"{path}: {error.strerror or error}") from None
+        raise WriteError(f"{path}: cannot be written: {error.strerror or error}") from None
     try:
         with suppress(OSError):  # some file systems have no locks: then no caller waits
             fcntl.flock(folder, fcntl.LOCK_EX)

@@ -153,20 +153,17 @@ def simulate(world: World, rng: np.random.Generator | None = None) -> Sequence:
     measured_twist = twist + stated.twist_std * noise.standard_normal(twist.shape)
 
     observations, ids, position_m = observed(world, _VIEW, T_imu_world, points_m, noise, isinstance(world, Loop))
+    known = np.arange(first_known, world.frames)
+    truth = Truth(known, se3.inverse(T_imu_world)[first_known:], ids, position_m)
     return Sequence(
-        name=world.name,
-        source=f"builtin:{world.name}",
-        time_s=time_s,
+        world.name,
+        f"builtin:{world.name}",
+        time_s,
         twist=measured_twist,
         camera=CAMERA,
         T_cam_imu=T_CAM_IMU,
         observations=observations,
-        truth=Truth(
-            frame=np.arange(first_known, world.frames),
-            T_world_imu=se3.inverse(T_imu_world)[first_known:],
-            landmark=ids,
-            position_m=position_m,
-        ),
+        truth=truth,
         noise=stated,
         attributes={"world": world.name, **numbers_of(world)},
     )

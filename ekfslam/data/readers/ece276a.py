@@ -75,18 +75,8 @@ def read_ece276a(path: Path, extrinsics: Extrinsics = "corrected", lateral: Late
             if extrinsics == "corrected":
                 T_cam_imu[:3, 3] = -stored[:3, :3] @ stored[:3, 3]
             how, sign = _EXTRINSICS_NOTES[extrinsics], LATERAL_NOTES[lateral]
-        return recorded_tracks(
-            path,
-            READER.name,
-            time_s=time_s,
-            twist=twist,
-            camera=camera,
-            T_cam_imu=T_cam_imu,
-            observations=observations,
-            velocity_frame="level",
-            notes=(how, LEVEL_VELOCITIES_NOTE, sign, *found),
-            attributes=choices,
-        )
+        notes = (how, LEVEL_VELOCITIES_NOTE, sign, *found)
+        return recorded_tracks(path, READER.name, time_s, twist, camera, T_cam_imu, observations, notes, choices)
 
 
 def stamps_of(fields: Mapping[str, NDArray], name: str) -> Array:

@@ -51,18 +51,8 @@ def read_ece276a_npy(path: Path) -> Sequence:
             raise ShapeError("this field is missing: the recording has images only, see `track`", field="features")
         features = require_numbers(fields, "features", (4, None, len(time_s)), finite=False)
         observations, found = flat_observations(features, frame_axis=2, field="features")
-        return recorded_tracks(
-            path,
-            READER.name,
-            time_s=time_s,
-            twist=twist,
-            camera=camera,
-            T_cam_imu=T_cam_imu,
-            observations=observations,
-            velocity_frame="level",
-            notes=(*_NOTES, *found),
-            attributes=_LATERAL,
-        )
+        notes = (*_NOTES, *found)
+        return recorded_tracks(path, READER.name, time_s, twist, camera, T_cam_imu, observations, notes, _LATERAL)
 
 
 def open_ece276a_images(path: Path) -> ImageRecording | None:
@@ -82,22 +72,18 @@ def open_ece276a_images(path: Path) -> ImageRecording | None:
         size = _require_alike(left, right)
     with spelled_as_in(str(recording), {"K_left": "K_l", "K_right": "K_r", "T_right_left": "extR_T_imu"}):
         calibration = PairCalibration(K_left, K_right, size, T_right_left)
+    facts = {"checksum_sha256": checksum(recording), "reader": "ece276a_npy_images", **_LATERAL}
     return ImageRecording(
-        name=recording.stem,
-        source=str(recording),
-        time_s=time_s,
-        calibration=calibration,
-        load=lambda frame: (left[frame], right[frame]),
-        T_cam_imu=T_cam_imu,
-        twist=twist,
-        velocity_frame="level",
+        recording.stem,
+        str(recording),
+        time_s,
+        calibration,
+        lambda frame: (left[frame], right[frame]),
+        T_cam_imu,
+        twist,
+        "level",
         notes=(*_NOTES, *interpolation_notes(twist)),
-        attributes={
-            "checksum_sha256": checksum(recording),
-            "reader": "ece276a_npy_images",
-            **_LATERAL,
-            **interpolation_attributes(twist),
-        },
+        attributes={**facts, **interpolation_attributes(twist)},
     )
 
 

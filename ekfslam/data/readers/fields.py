@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
 from ekfslam.data.checks import require_finite, require_shape
+from ekfslam.data.inputs import VelocityFrame
 from ekfslam.data.interpolation import interpolation_attributes, interpolation_notes
 from ekfslam.data.observations import Observations
 from ekfslam.data.readers.registry import Lateral
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.tracks import inspect_tracks
 from ekfslam.errors import ShapeError
+from ekfslam.geometry.camera import StereoCamera
 
 BODY_IS_CAMERA = "The body is the left camera, with axes forward, left and up."
 LATERAL_NOTES: dict[Lateral, str] = {
@@ -73,25 +75,28 @@ def with_lateral(level_twist: Array, lateral: Lateral) -> Array:
 def recorded_tracks(
     path: Path,
     reader: str,
-    *,
+    time_s: Array,
     twist: Array,
+    camera: StereoCamera,
+    T_cam_imu: Array,
     observations: Observations,
     notes: tuple[str, ...],
     attributes: Mapping[str, str],
-    **fields: Any,
+    velocity_frame: VelocityFrame = "level",
+    **truth_and_noise: Any,
 ) -> Sequence:
     """Return a recording of one file, with notes on its velocities and tracks and its checksum among the attributes."""
+    facts = {"checksum_sha256": checksum(path), "reader": reader, **attributes, **interpolation_attributes(twist)}
     return Sequence(
-        name=path.stem,
-        source=str(path),
+        path.stem,
+        str(path),
+        time_s,
         twist=twist,
+        camera=camera,
+        T_cam_imu=T_cam_imu,
         observations=observations,
+        velocity_frame=velocity_frame,
         notes=(*notes, *interpolation_notes(twist), *inspect_tracks(observations, twist).notes),
-        attributes={
-            "checksum_sha256": checksum(path),
-            "reader": reader,
-            **attributes,
-            **interpolation_attributes(twist),
-        },
-        **fields,
+        attributes=facts,
+        **truth_and_noise,
     )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ekfslam.arrays import Array
 from ekfslam.data.checks import spelled_as_in
+from ekfslam.data.inputs import VelocityFrame
 from ekfslam.data.observations import flat_observations
 from ekfslam.data.readers.fields import LATERAL_NOTES, recorded_tracks, require_numbers, with_lateral
 from ekfslam.data.readers.matfile import parse_mat
@@ -54,20 +55,11 @@ def read_utias(path: Path, lateral: Lateral = "corrected") -> Sequence:
             twist = with_lateral(twist, lateral)
             notes = (*notes, LEVEL_VELOCITIES_NOTE, LATERAL_NOTES[lateral])
             attributes["lateral"] = lateral
-        return recorded_tracks(
-            path,
-            READER.name,
-            time_s=t[:, 0],
-            twist=twist,
-            camera=StereoCamera(fu, fv, cu, cv, b),
-            T_cam_imu=se3.transform(C, -C @ rho),
-            observations=observations,
-            truth=_truth(fields, se3.transform(se3.so3_exp(theta), r), tracks=pixels.shape[2]),
-            noise=noise,
-            velocity_frame="level" if noise is None else "imu",
-            notes=notes,
-            attributes=attributes,
-        )
+        rig = StereoCamera(fu, fv, cu, cv, b), se3.transform(C, -C @ rho)
+        truth = _truth(fields, se3.transform(se3.so3_exp(theta), r), tracks=pixels.shape[2])
+        frame: VelocityFrame = "level" if noise is None else "imu"
+        given = (*rig, observations, notes, attributes, frame)
+        return recorded_tracks(path, READER.name, t[:, 0], twist, *given, truth=truth, noise=noise)
 
 
 def _load(path: Path) -> dict[str, NDArray]:
