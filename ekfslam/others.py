@@ -29,6 +29,7 @@ from ekfslam.data.readers.tum import COVARIANCE_ENDING, covariance_path, covaria
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.trajectory import Moving, Trajectory, left_error_covariance
 from ekfslam.errors import ConfigError, TruthError, UnknownFormatError
+from ekfslam.evaluation.consistency import chi2_bounds, nees, pose_error
 from ekfslam.evaluation.sanity import sanity_attributes
 from ekfslam.evaluation.trajectory import align_yaw
 from ekfslam.filters.result import OTHER, OTHER_LEVEL, OTHER_MISSING, Innovation, Landmarks, Rejections, Result
@@ -41,6 +42,8 @@ World = Literal["first", "given"]
 NAME, SEED = "{name}", "{seed}"  # in a path, replaced by the recording's name and by the seed
 LEAST_POSES = 3
 _SHOWN = 3  # stretches in messages
+_SAME_WORLD = 0.998  # two-sided probability, so that 99.9 % of the first poses in the same world agree
+_ROUNDING = 1e-3  # m and rad, of first poses without an uncertainty
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,8 @@ class Others:
     files: Mapping[str, Trajectory | str | Path] = dataclasses.field(default_factory=dict)
     frame: Moving | None = None  # moving frame of poses in files; None: left camera for KITTI, else body
     # "first" moves each trajectory so that its first pose is that of the recording (the true one, or that of our runs);
-    # if accelerations show the vertical, only in yaw and position. "given" moves none.
+    # if accelerations show the vertical, only in yaw and position. A first pose that is there already, within its
+    # covariance, stays. "given" moves none.
     world: World = "first"
 
     def __post_init__(self) -> None:
@@ -148,7 +152,12 @@ def _result(
         np.arange(len(placed.frame)) if poses.time_s is None else nearest(poses.time_s, recording.time_s[placed.frame])
     )
     start, is_level = _start(recording, int(placed.frame[0]), like), _is_level(recording, like)
-    T, moved = _moved(placed.T_world_imu, start if how.world == "first" else None, is_level)
+    first = None if covariance is None else covariance[row[0]]
+    if how.world == "given" or _agrees(placed.T_world_imu[0], start, first):
+        start = None
+    T, moved = _moved(placed.T_world_imu, start, is_level)
+    if moved and first is not None and first.any():
+        moved += "; its first covariance is not 0: for NEES take --with-world given"
     P = np.zeros((frames, 6, 6))
     if covariance is not None:
         P = covariance[row][np.clip(np.searchsorted(placed.frame, np.arange(frames), side="right") - 1, 0, None)]
@@ -213,6 +222,14 @@ def _start(recording: Sequence | Archive, frame: int, like: Result | None) -> Ar
     if like is not None:
         return like.T_world_imu[frame]
     return recording.initial_T_world_imu if isinstance(recording, Sequence) and frame == 0 else None
+
+
+def _agrees(T: Array, start: Array | None, covariance: Array | None) -> bool:
+    """Return whether a first pose is at ``start`` within its covariance, so that both have the same world."""
+    if start is None or covariance is None:
+        return False
+    with_rounding = covariance + _ROUNDING**2 * np.eye(6)
+    return bool(nees(pose_error(T, start), with_rounding) <= chi2_bounds(6, _SAME_WORLD)[1])
 
 
 def _is_level(recording: Sequence | Archive, like: Result | None) -> bool:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import ekfslam
 from ekfslam.cli import main
 from ekfslam.data.simulate import builtin
+from ekfslam.data.trajectory import from_left_error
 from ekfslam.errors import ConfigError, ShapeError, TruthError, UnknownFormatError
 from ekfslam.evaluation.summary import summarise
 from ekfslam.evaluation.truth import estimated
@@ -83,6 +86,20 @@ def test_a_world_of_its_own_is_moved_to_the_first_pose_unless_it_shall_stay(worl
     assert kept["moved"]["ate_m"] > 1.0
     assert kept["moved"]["ate_aligned_m"] == pytest.approx(found["ours"]["ate_aligned_m"], rel=1e-6)
     assert "moved by" in " ".join(Others({"moved": moved}).results(world, full)["moved"].remarks)
+
+
+def test_a_first_pose_that_agrees_within_its_covariance_stays_where_it_is():
+    """The first tilt of an inertial unit is uncertain: moved to the true heading, its NEES would be another one."""
+    room = ekfslam.open_sequence("builtin:room?frames=40")
+    ours = ekfslam.run(room)
+    poses = from_left_error(ours.time_s, ours.T_world_imu, ours.covariance)
+    found = figures(room, ours, {"mine": poses, "alone": dataclasses.replace(poses, covariance=None)})
+    for key in ("ate_m", "ate_aligned_4dof_m", "pose_nees_mean"):
+        assert found["mine"][key] == pytest.approx(found["ours"][key], rel=1e-6), key
+    assert found["alone"]["ate_aligned_4dof_m"] == pytest.approx(found["ours"]["ate_aligned_4dof_m"], rel=1e-6)
+    off = dataclasses.replace(poses, T_world=WORLD @ poses.T_world)
+    (_, said) = Others({"off": off}).results(room, ours)["off"].remarks
+    assert "its tilt kept; its first covariance is not 0" in said
 
 
 def test_frames_without_a_pose_are_named_and_count_in_no_figure(world, full, files):
