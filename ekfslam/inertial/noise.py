@@ -28,8 +28,8 @@ _REFUTED = 1.5
 _STRETCH_S, _LEAST_S, _MOST, _TRACKS = 10.0, 1.5, 3, 30
 # Length of the one stretch of a single camera, which starts where the recording does: at rest.
 _FIRST_S = 15.0
-# Factors as powers of 2: their bound, and the standard deviations of their prior.
-_BOUND, _SPREAD = 6.0, np.array([1.5, 1.5, 0.8])
+# Factors as powers of 2: their bound, and the standard deviation of their prior.
+_BOUND, _SPREAD = 6.0, 1.5
 # Walks of biases over white noise, of units that state both: per root of a second.
 _WALK = (0.1, 0.5)
 # Walks of biases of one camera's unit that states none, at most: 4 times those of data sheets of small units.
@@ -96,8 +96,10 @@ def likeliest_densities(sequence: Sequence, config: FilterConfig, begun: Begun) 
     stretches = list(_begun_stretches(sequence, upper, begun))
     if not stretches:
         return None
-    search = _Search(config, base, (middle[0], middle[1], 0.0), stretches)
-    # One short stretch of one camera does not tell walks of biases from errors of its tracks.
+    # Vibration is rectified, so biases walk with it: half as many powers of 2 as the accelerometer's noise. One short
+    # stretch of one camera does not tell walks of biases from errors of its tracks.
+    walks = 0.0 if is_monocular else round(0.5 * middle[1], 3)
+    search = _Search(config, base, (middle[0], middle[1], walks), stretches)
     at = search.best(has_walks=not is_monocular)
     if stated is not None and not search.gains((0.0, 0.0, 0.0), at):
         return Densities(stated, "as stated: no others are clearly likelier")
@@ -179,7 +181,7 @@ class _Search:
         """Return the likeliest factors: by steps along one axis after the other, then by parabolas."""
         at = self._climbed(self.middle, 2.0, (0, 1))
         at = self._climbed(at, 2.0, (2,)) if has_walks else at
-        at = self._climbed(at, 1.0, (0, 1))
+        at = self._climbed(at, 1.0, (0, 1, 2) if has_walks else (0, 1))
         return self._vertex(self._vertex(at, 0), 1)
 
     def _climbed(self, at: Factors, step: float, axes: tuple[int, ...]) -> Factors:
