@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-whole check lint docs archive-page lower-bounds mutants sanitize wheel results setup engine clean
+.PHONY: demo test test-whole check lint docs archive-page audit lower-bounds mutants sanitize wheel results setup engine clean
 
 demo: engine
 	$(BIN)/ekfslam compare builtin:city --out results/local
@@ -31,6 +31,10 @@ lint: $(READY)
 docs: $(VENV)/.docs
 	OPENBLAS_NUM_THREADS=1 NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "open build/site/index.html"
+
+# Licences of the dependencies against a stated list, and their known vulnerabilities if the network can be reached.
+audit: $(READY)
+	VENV="$(VENV)" sh .ci/audit
 
 # Part of the tests, in an environment of its own with the oldest versions that pyproject.toml allows.
 lower-bounds:

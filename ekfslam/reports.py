@@ -25,6 +25,7 @@ from ekfslam.evaluation.honesty import Honesty, judge, require_innovations, verd
 from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.older import FIGURES, WAY, marked, older_figures, remove_figures, require_own
+from ekfslam.filters.loop import one_thread
 from ekfslam.filters.result import Result
 from ekfslam.names import without_common_ends
 from ekfslam.others import Others
@@ -136,6 +137,7 @@ class Comparison(Shown):
         return list(contents)
 
 
+@one_thread()
 def compare(
     sequence: Sequence,
     modes: Iterable[Mode] = MODES,

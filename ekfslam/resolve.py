@@ -40,6 +40,7 @@ from ekfslam.data.noise import Noise
 from ekfslam.data.sequence import MEASURED_KINDS, TWIST_STD, WITHOUT_TRACKS, WITHOUT_VELOCITIES, YAW_STD_PX, Sequence
 from ekfslam.engine.choice import in_words
 from ekfslam.errors import ConfigError, InnovationError, ScaleError
+from ekfslam.filters.loop import one_thread
 from ekfslam.filters.result import UNUSED
 from ekfslam.filters.stretches import run_stretches, stretches_of, thinned
 from ekfslam.geometry import se3
@@ -133,6 +134,7 @@ class Problem:
         return tuple(f"{name}: {line}" for name, table in tables.items() if (line := _settings(table)))
 
 
+@one_thread()
 def resolve(
     sequence: Sequence, config: Config | None = None, mode: Mode = "full", blocks: SequenceType[StateBlock] = ()
 ) -> Problem:

@@ -39,6 +39,7 @@ from ekfslam.stored import empty
 from ekfslam.timings import Timings
 
 
+@one_thread()
 @solvable()
 def run(
     sequence: Sequence,
@@ -78,7 +79,7 @@ def run(
     with timings.part("automatic model"):
         suspicions = sequence.once(inspect_sequence).warnings
         problem = resolve(sequence, config, mode)
-    with timings.part(mode), one_thread():
+    with timings.part(mode):
         sources = further if problem.beside is None else problem.beside.along(further)
         estimate = _joint(problem, sources) if mode == "full" else _dead_reckoned(problem, mode)
     with timings.part("evaluation"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from time import perf_counter
 from typing import NamedTuple
 
@@ -26,9 +26,14 @@ class Frame(NamedTuple):
     ms: float
 
 
-def one_thread() -> AbstractContextManager[object]:
-    """Limit BLAS to one thread: for small dense matrices a second one costs three times what it saves."""
-    return threadpool_limits(1, user_api="blas")
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Limit BLAS to one thread; also a decorator.
+
+    For small dense matrices a second one costs three times what it saves. Their number changes the last bits.
+    """
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 @contextmanager

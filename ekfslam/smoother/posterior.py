@@ -24,7 +24,7 @@ from ekfslam.data.inputs import InertialNoise
 from ekfslam.errors import PosteriorError
 from ekfslam.filters.inertial_states import InertialStates
 from ekfslam.filters.log import Log
-from ekfslam.filters.loop import solvable
+from ekfslam.filters.loop import one_thread, solvable
 from ekfslam.filters.result import Innovation, PosePairs, Rejections, Result
 from ekfslam.geometry import se3
 from ekfslam.models.build import blocks_and_process, model_of, sensor_of
@@ -301,6 +301,7 @@ def _config_of(result: Result) -> Config:
     return Config.from_stored({**result.config, "filter": settings})
 
 
+@one_thread()
 @solvable()
 def posterior_of_log(
     log: Log,
@@ -338,6 +339,7 @@ def posterior_of_log(
     )
 
 
+@one_thread()
 @solvable()
 def smooth(result: Result, config: PosteriorConfig | None = None, found: Posterior | None = None) -> Result:
     """Return the posterior of a full run as a `Result`: smoothed trajectory, map, and all their marginals.

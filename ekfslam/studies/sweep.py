@@ -34,6 +34,7 @@ from ekfslam.data.sequence import Sequence, stretch
 from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
 from ekfslam.evaluation.summary import KEYS, summarise
 from ekfslam.evaluation.truth import with_truth_noise
+from ekfslam.filters.loop import one_thread
 from ekfslam.filters.result import Result
 from ekfslam.frontend.opening import open_sequence
 from ekfslam.limits import DEFAULT_GB, limit_gb, reading_up_to, require_file
@@ -289,6 +290,7 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
     return _table(sweep, done)
 
 
+@one_thread()
 def run_task(task: Task, read_gb: float = DEFAULT_GB) -> Record:
     """Run one task, with a limit on the size of files, and return its figures of merit or its error."""
     try:

@@ -154,6 +154,7 @@ def toml_heading(sequence: str) -> str:
     return f"# Noise of {printable(sequence)} as `ekfslam tune` found it; give this file to --config."
 
 
+@one_thread()
 @solvable()
 def tune(
     sequence: Sequence, config: Config | None = None, *, drift: bool = False, observations: int = 15_000
@@ -182,8 +183,7 @@ def tune(
     found = noise_of_velocities(sequence)
     start, free = _start(base, found, drift)
     parts, gated, ungated = parts_of(sequence, config, base, observations)
-    with one_thread():
-        peak = Likelihood(parts, base, free, gated, ungated, found.measured).climb(start, f"{sequence.name}: tuning")
+    peak = Likelihood(parts, base, free, gated, ungated, found.measured).climb(start, f"{sequence.name}: tuning")
     estimates, frames = estimates_of(start, free, peak, found), sum(len(part) for part in parts)
     return TunedNoise(
         sequence.name, model, estimates, found, peak.log_likelihood, frames, peak.runs, converged=peak.converged
