@@ -8,6 +8,7 @@ import threading
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from ekfslam.config import Config
 from ekfslam.data.interval import Interval
@@ -205,6 +206,32 @@ def test_an_error_of_the_users_own_process_changes_nothing(engine, call):
             each.update(FRAMES, *problem.sequence.observations.at(FRAMES))
         go_on(each, problem, range(FRAMES + (call == "update"), FRAMES + 3))
     assert_equal(numbers(ekf), numbers(clean))
+
+
+class Watching(VelocityInputs):
+    """A process that notes the threads of BLAS."""
+
+    threads = frozenset()
+
+    def step(self, *arguments):
+        Watching.threads = blas_threads()
+        return super().step(*arguments)
+
+
+def blas_threads():
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_frame_has_one_thread_of_blas_and_gives_the_others_back(engine):
+    problem = problem_of("plain")
+    model = dataclasses.replace(problem.model, make_process=lambda layout, noise: Watching(layout, noise.process))
+    ekf = filter_of(dataclasses.replace(problem, model=model), engine)
+    with threadpool_limits(2, user_api="blas"):
+        before = blas_threads()
+        drive(ekf, problem, range(2))
+        assert blas_threads() == before
+    assert Watching.threads == {1}
 
 
 @pytest.mark.parametrize("engine", ENGINES)

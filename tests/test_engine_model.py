@@ -39,7 +39,7 @@ every_place = pytest.mark.parametrize("T", PLACES.values(), ids=PLACES.keys())
 class NoLog:
     """A log that forgets."""
 
-    def started(self, ids, positions_m, *views):
+    def started(self, ids, positions_m, *views, follows):
         return np.zeros(len(ids), dtype=np.int64)
 
     def last(self, count):

@@ -76,8 +76,11 @@ class Engine:
 
     def named(self, flat: Array, names: Iterable[str] | None = None) -> dict[str, Array]:
         """Return the values of blocks by name, of all or of some."""
-        places = ((name, *self._places[name]) for name in (self._places if names is None else names))
-        return {name: flat[at].reshape(shape) for name, at, shape in places}
+        found = {}
+        for name in self._places if names is None else names:
+            at, shape = self._places[name]
+            found[name] = flat[at] if len(shape) == 1 else flat[at].reshape(shape)
+        return found
 
     @property
     def values(self) -> dict[str, Array]:

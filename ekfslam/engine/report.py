@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
 
 from ekfslam.arrays import Array, IntArray
 
@@ -50,73 +54,50 @@ class Report(NamedTuple):
     imu_twist: Array
 
 
-class _Parts:
-    """Reads arrays of whole and of real numbers from their beginning."""
+def _cut(flat: NDArray[Any], sizes: Iterable[int]) -> list[NDArray[Any]]:
+    """Return parts of an array of the given sizes, from its beginning."""
+    ends = list(accumulate(sizes, initial=0))
+    return [flat[begin:end] for begin, end in pairwise(ends)]
 
-    def __init__(self, arrays: tuple[IntArray, Array]) -> None:
-        self._whole, self._real = arrays
-        self._whole_at = self._real_at = 0
 
-    def whole(self, count: int) -> IntArray:
-        begin = self._whole_at
-        self._whole_at = end = begin + count
-        return self._whole[begin:end]
-
-    def real(self, count: int) -> Array:
-        begin = self._real_at
-        self._real_at = end = begin + count
-        return self._real[begin:end]
-
-    def rows(self, count: int, width: int) -> Array:
-        return self.real(count * width).reshape(count, width)
-
-    def gone(self, count: int, may_return: bool) -> Gone:
-        columns: dict[str, Array | IntArray] = dict(zip(_RETIRED, self.whole(6 * count).reshape(6, count), strict=True))
-        numbers = self.rows(count, 8)
-        columns["position_m"], columns["initial_m"], columns["evidence"] = (
-            numbers[:, :3],
-            numbers[:, 3:6],
-            numbers[:, 6:],
-        )
-        return Gone(columns, self.real(9 * count).reshape(count, 3, 3), may_return)
+def _gone(whole: IntArray, real: Array, count: int, may_return: bool) -> Gone:
+    """Return the landmarks (k) at the beginning of both arrays."""
+    columns: dict[str, Array | IntArray] = dict(zip(_RETIRED, whole[: 6 * count].reshape(6, count), strict=True))
+    numbers = real[: 8 * count].reshape(count, 8)
+    columns["position_m"], columns["initial_m"], columns["evidence"] = numbers[:, :3], numbers[:, 3:6], numbers[:, 6:]
+    return Gone(columns, real[8 * count : 17 * count].reshape(count, 3, 3), may_return)
 
 
 def retired(found: tuple[Any, ...] | None) -> Gone | None:
     """Return the landmarks that retired, of `Filter.rest`; None: there are none."""
-    return None if found is None else _Parts(found[0]).gone(*found[1])
+    return None if found is None else _gone(*found[0], *found[1])
 
 
 def report(found: tuple[Any, ...], values: int, body: int, dimension: int) -> Report:
     """Return what a frame did, of `Filter.update`, given the lengths of values, coordinates and rows."""
-    arrays, (split, moving, begun, whitened, seen, taken), gone, step_before, nis, log_det, dof, doubt = found
-    parts, d = _Parts(arrays), dimension
-    whole, real, logged = parts.whole, parts.real, taken + begun
-    split, moving, begun_ids, whitened_rows, reason = (
-        whole(split),
-        whole(moving),
-        whole(begun),
-        whole(whitened),
-        whole(seen),
+    (whole, real), (split, moving, begun, whitened, seen, taken), gone, step_before, nis, log_det, dof, doubt = found
+    d, logged, waited = dimension, taken + begun, begun if step_before >= 0 else 0
+    splits, movings, begun_ids, whitened_rows, reason, landmark, previous, whole = _cut(
+        whole, (split, moving, begun, whitened, seen, logged, logged, len(whole))
     )
-    landmark, previous = whole(logged), whole(logged)
-    flat, updated, linear = real(values), real(values), real(values)
-    coordinates, updated_coordinates, linear_coordinates = real(body), real(body), real(body)
-    imu_twist, linear_twist, numbers = real(6), real(6), parts.rows(logged, 2 * d + 3)
-    before = parts.rows(begun if step_before >= 0 else 0, 2 * d)
-    score, information, white = real(6), parts.rows(6, 6), parts.rows(whitened, 2 * d)
+    sizes = [values] * 3 + [body] * 3 + [6, 6, logged * (2 * d + 3), waited * 2 * d, 6, 36, whitened * 2 * d, len(real)]
+    flat, updated, linear, coordinates, updated_coordinates, linear_coordinates, *others = _cut(real, sizes)
+    imu_twist, linear_twist, numbers, before, score, information, white, real = others
+    white = white.reshape(whitened, 2 * d)
+    first = [0, *accumulate(count for count, _ in gone)]
     return Report(
-        [parts.gone(*part) for part in gone],
+        [_gone(whole[6 * at :], real[17 * at :], *part) for at, part in zip(first, gone, strict=False)],
         reason,
         nis,
         log_det,
         dof,
         doubt,
-        split,
-        moving,
-        (whitened_rows, white[:, :d], white[:, d:], score, information),
+        splits,
+        movings,
+        (whitened_rows, white[:, :d], white[:, d:], score, information.reshape(6, 6)),
         landmark,
         previous,
-        numbers,
+        numbers.reshape(logged, 2 * d + 3),
         linear,
         linear_coordinates,
         linear_twist,
@@ -124,7 +105,7 @@ def report(found: tuple[Any, ...], values: int, body: int, dimension: int) -> Re
         updated_coordinates,
         begun_ids,
         step_before,
-        before,
+        before.reshape(waited, 2 * d),
         flat,
         coordinates,
         imu_twist,

@@ -95,13 +95,15 @@ def checked_observations(sensor: Sensor, ids: Any, measured: Any) -> tuple[IntAr
     widths = _WIDTHS.get(type(sensor))
     if not numbers.size and not len(landmark):
         return landmark, np.empty((0, 4))
-    require_shape(numbers, (len(landmark), None), "pixels")
+    if numbers.ndim != 2 or len(numbers) != len(landmark):
+        require_shape(numbers, (len(landmark), None), "pixels")
     if widths is not None and numbers.shape[1] not in widths:
         wanted = " or ".join(map(str, widths))
         raise ShapeError(f"expected {wanted} numbers an observation, found {numbers.shape[1]}", field="pixels")
     ascending = np.sort(landmark)
-    if len(landmark) > 1 and not np.diff(ascending).all():
-        twice = ascending[np.flatnonzero(np.diff(ascending) == 0)[0]]
+    is_twice = ascending[1:] == ascending[:-1]
+    if is_twice.any():
+        twice = ascending[1:][is_twice][0]
         raise DuplicateObservationError(f"landmark {twice} is observed twice", field="ids")
     if widths is None:
         rows = np.asarray(sensor.rows(numbers), dtype=float)
@@ -121,9 +123,8 @@ def _checked_ids(ids: Any) -> IntArray:
     require_shape(found, (None,), "ids")
     if found.dtype.kind not in "iuf" or (found.dtype.kind == "f" and not (found == np.floor(found)).all()):
         raise DataError(f"expected whole numbers, found {found.dtype}", field="ids")
-    bad = np.flatnonzero((found < 0) | (found > LARGEST_ID))
-    if len(bad):
-        at = int(bad[0])
+    if found.size and (found.min() < 0 or found.max() > LARGEST_ID):
+        at = int(np.flatnonzero((found < 0) | (found > LARGEST_ID))[0])
         raise DataError(f"{found[at]} is negative or larger than {LARGEST_ID}", field="ids", index=at)
     return found.astype(np.int64)
 
@@ -139,6 +140,8 @@ def _plain(value: Any, name: str) -> np.ndarray:
 
 
 def _has_booleans(value: Any) -> bool:
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind == "b"
     if isinstance(value, list | tuple):
         return any(map(_has_booleans, value))
     return isinstance(value, bool | np.bool_) or getattr(getattr(value, "dtype", None), "kind", "") == "b"

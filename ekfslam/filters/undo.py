@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
+from functools import cache
 from threading import Lock
 from typing import Any
+
+from threadpoolctl import LibController, ThreadpoolController
 
 from ekfslam.errors import FilterError
 from ekfslam.filters.estimate import Estimate
@@ -14,17 +17,31 @@ from ekfslam.filters.lifecycle import Retired
 from ekfslam.filters.logbook import LogBook
 
 
+@cache
+def _blas() -> list[LibController]:
+    """Return the BLAS libraries in use; a look-up takes half a frame."""
+    return list(ThreadpoolController().select(user_api="blas").lib_controllers)
+
+
 class OneAtATime:
-    """A lock that does not wait; a copy is a new one."""
+    """A lock that does not wait, and one thread of BLAS inside; a copy is a new one.
+
+    For matrices this small a second thread costs several times what it saves, and far more on a busy machine.
+    """
 
     def __init__(self) -> None:
-        self._lock = Lock()
+        self._lock, self._lowered = Lock(), list[tuple[LibController, int]]()
 
     def __enter__(self) -> None:
         if not self._lock.acquire(blocking=False):
             raise FilterError("the filter is in use by another thread")
+        self._lowered = [(one, threads) for one in _blas() if (threads := one.get_num_threads()) != 1]
+        for one, _ in self._lowered:
+            one.set_num_threads(1)
 
     def __exit__(self, *_: object) -> None:
+        for one, threads in self._lowered:
+            one.set_num_threads(threads)
         self._lock.release()
 
     def __reduce__(self) -> tuple[type[OneAtATime], tuple[()]]:
