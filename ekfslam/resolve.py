@@ -506,12 +506,12 @@ def first_state(sequence: Sequence, config: Config, model: Model) -> InertialSta
     is_monocular = sequence.camera.is_monocular
     if (rest := rest_of(sequence) or (rest_of(sequence, is_loose=True) if is_monocular else None)) is not None:
         return at_rest(samples, *rest, prior, densities_of(config))
-    if is_monocular:
-        raise ScaleError(
-            f"{sequence.name}: the rig of one camera moves from the first frame on, so that scale and velocity are not "
-            "known: begin at rest (half a second), or give the tracks of both cameras"
-        )
     start, refused = in_motion(sequence, model, prior, config.filter)
+    if is_monocular and start is None:
+        raise ScaleError(
+            f"{sequence.name}: the rig of one camera moves from the first frame on, and its scale and velocity are not "
+            f"found ({refused}): begin at rest (half a second) or where it accelerates, or give both cameras"
+        )
     return start or unknown(samples, float(sequence.time_s[0]), prior, refused or "in motion")
 
 

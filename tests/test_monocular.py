@@ -10,15 +10,18 @@ from support.frozen import assert_equal_to_frozen_rows
 import ekfslam
 from ekfslam.config import FilterConfig
 from ekfslam.data.room import CAMERA, Room, simulate_room
-from ekfslam.data.sequence import of_left_camera
+from ekfslam.data.sequence import Observations, of_left_camera
 from ekfslam.errors import CalibrationError, ConfigError, ScaleError, ShapeError
+from ekfslam.evaluation.inertial import inertial_nees
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.filters.standing import STILL_PX, moved_px
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import T_CAM_BODY, StereoCamera
+from ekfslam.inertial.bearings import by_bearings
 from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
 from ekfslam.models.build import model_of
+from ekfslam.models.inertial_start import FirstPrior
 from ekfslam.models.process.inertial import inertial
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.resolve import resolve
@@ -103,9 +106,36 @@ def test_a_room_has_one_camera_or_two():
         Room(cameras=3)
 
 
-def test_one_camera_in_motion_from_the_first_frame_on_is_refused():
-    with pytest.raises(ScaleError, match="begin at rest"):
-        ekfslam.run(room(100)[60:])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_one_camera_in_motion_from_the_first_frame_on_is_honest(seed):
+    sequence = room(160, seed, max_range_m=10.0)[60:]
+    result = ekfslam.run(sequence, config=ekfslam.Config().with_overrides({"filter": {"engine": "auto"}}))
+    assert "in motion, from one camera" in result.attributes["inertial_start"]
+    found = inertial_nees(result, sequence.truth)["all"]
+    assert np.nanmedian(found[20:]) < 30.0 and np.nanmax(found[1:]) < 60.0
+    p, q = (T[:, :3, 3] - T[:, :3, 3].mean(axis=0) for T in (result.T_world_imu, sequence.truth.T_world_imu))
+    assert np.linalg.norm(p) / np.linalg.norm(q) == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.slow
+def test_velocity_gravity_and_gyroscope_bias_follow_from_tracks_of_one_camera():
+    sequence = simulate_room(Room(frames=90, seed=7, cameras=1, max_range_m=10.0, sigma_px=0.2))[60:]
+    truth = sequence.truth
+    R = truth.T_world_imu[0, :3, :3]
+    found = by_bearings(sequence, 30, 0.2, FirstPrior(np.eye(4), 0.0, 0.0, 0.05, 0.1, 9.81))
+    np.testing.assert_allclose(found.velocity_m_s, R.T @ truth.motion.velocity_m_s[0], atol=0.05)
+    np.testing.assert_allclose(found.gyro_bias_rad_s, truth.motion.gyro_bias_rad_s[0], atol=2e-3)
+    assert found.up @ R[2] > np.cos(np.deg2rad(1.0))
+
+
+def test_one_camera_in_motion_with_few_tracks_is_refused():
+    sequence = room(100)[60:]
+    o = sequence.observations
+    few = np.isin(o.landmark, o.at(0)[0][:5])
+    few = Observations(o.frame[few], o.landmark[few], o.pixels_px[few])
+    with pytest.raises(ScaleError, match=r"only \d tracks .* begin at rest"):
+        ekfslam.run(replace(sequence, observations=few))
 
 
 # --- errors of tracks that walk ---------------------------------------------------------------------------------------

@@ -1,10 +1,12 @@
-"""First state of the inertial process in motion, from a window of a stereo rig.
+"""First state of the inertial process in motion, from a window of a stereo rig or of one camera.
 
 1. Gyroscope bias: rotations of stereo motion against integrated samples.
 2. First velocity and gravity, which are linear in displacements, then with the magnitude of gravity known. They are the
    displacements of stereo motion given the rotations of the gyroscope. Source: Mur-Artal and Tardos, "Visual-inertial
    monocular SLAM with map reuse", RA-L 2017, without the scale.
 3. The joint maximum a posteriori of the window, by the factors of the smoother.
+
+For one camera `ekfslam.inertial.bearings` gives the first two, over two or three seconds.
 
 The mean is that of the window. The filter processes the window itself, and would use it twice if it started with the
 marginal. The prior alone is so broad that the first frames throw the mean away again. So the covariance has the prior
@@ -14,7 +16,6 @@ and a sixteenth of the window's information: too large in the first frames, and 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,8 +27,9 @@ from ekfslam.errors import EkfslamError
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter, solvable
 from ekfslam.geometry import se3
-from ekfslam.geometry.preintegration import BG, LONGEST_S, PHI, Increment, increments
+from ekfslam.geometry.preintegration import BG, PHI, Increment
 from ekfslam.geometry.stereo_motion import Alignment
+from ekfslam.inertial.bearings import Guess, RefusedWindowError, by_bearings, integrated
 from ekfslam.models.blocks import AccelBias, GyroBias, Velocity
 from ekfslam.models.inertial_start import FirstPrior, InertialStart
 from ekfslam.models.model import Model
@@ -40,6 +42,9 @@ from ekfslam.smoother.problem import BatchProblem
 _ENDS_S, _LONG_S, _SPEED_M_S, _TILT_FACTOR = (1.0, 1.5, 2.0, 3.0), 1.0, 0.5, 3.0
 _SHARE = 1.0 / 16.0  # of the information of the window that the first covariance has
 _LEAST_MOTIONS, _LEAST_POINTS, _OFF_M_S2, _MOST_COST = 5, 10, 0.3, 3.0
+# Of one camera, where a wrong scale costs less. Good windows cost 1 by white errors of tracks, and less by walking ones,
+# since these are stated as they add up.
+_MOST_COST_OF_ONE = 1.5
 _PASSES = 4
 
 
@@ -47,51 +52,38 @@ def in_motion(
     sequence: Sequence, model: Model, prior: FirstPrior, config: FilterConfig
 ) -> tuple[InertialStart | None, str]:
     """Return the state at the first frame, from the first window that serves, and why earlier ones do not."""
-    since = sequence.time_s - sequence.time_s[0]
+    since, std_px = sequence.time_s - sequence.time_s[0], float(np.mean(model.noise.pixel_std_px))
     last = int(np.searchsorted(since, _ENDS_S[-1], "right"))
-    motions = dict(stereo_motions(sequence, last, float(np.mean(model.noise.pixel_std_px))))
+    is_one = sequence.camera.is_monocular
+    motions = {} if is_one else dict(stereo_motions(sequence, last, std_px))
     refused: list[str] = []
-    for end_s in _ENDS_S:
+    for end_s in _ENDS_S[2:] if is_one else _ENDS_S:
         end = int(np.searchsorted(since, end_s, "right"))
         if refused and since[end - 1] < end_s - 0.5:  # the recording ends before
             break
         inside = {k: motion for k, motion in motions.items() if end_s - _LONG_S - 1e-9 <= since[k - 1] and k < end}
         name = f"{since[min(inside, default=1) - 1]:.1f} to {since[end - 1]:.1f} s"
         try:
-            start = _smoothed(sequence, model, prior, config, _linear(sequence, prior, inside), end)
-            return dataclasses.replace(start, text=f"in motion, from stereo over {name}: {start.text}"), "; ".join(
-                refused
-            )
-        except _RefusedError as error:
+            first = by_bearings(sequence, end, std_px, prior) if is_one else _linear(sequence, prior, inside)
+            start = _smoothed(sequence, model, prior, config, first, end)
+            text = f"in motion, from {'one camera' if is_one else 'stereo'} over {name}: {start.text}"
+            return dataclasses.replace(start, text=text), "; ".join(refused)
+        except RefusedWindowError as error:
             refused.append(f"{name}: {error}")
     return None, "; ".join(refused)
 
 
-class _RefusedError(Exception):
-    """A window does not serve."""
-
-
-@dataclass(frozen=True)
-class _Linear:
-    """First velocity, direction up, gyroscope bias, in the first IMU frame; magnitude of gravity if it is free."""
-
-    velocity_m_s: Array
-    up: Array
-    gyro_bias_rad_s: Array
-    free_m_s2: float
-
-
-def _linear(sequence: Sequence, prior: FirstPrior, motions: dict[int, Alignment]) -> _Linear:
+def _linear(sequence: Sequence, prior: FirstPrior, motions: dict[int, Alignment]) -> Guess:
     """Solve for the first velocity and gravity by the motions (by frame) of a window."""
     motions = {k: motion for k, motion in motions.items() if len(motion.residual_px) >= _LEAST_POINTS}
     if len(motions) < _LEAST_MOTIONS:
-        raise _RefusedError(f"only {len(motions)} motions of at least {_LEAST_POINTS} points")
+        raise RefusedWindowError(f"only {len(motions)} motions of at least {_LEAST_POINTS} points")
     C = sequence.T_cam_imu
     bias: Array = np.zeros(3)
     intervals = [sequence.interval(k, InertialSamples) for k in range(1, max(motions) + 1)]
     Ad = se3.adjoint(C)
     for _ in range(2):
-        parts = [_integrated(interval.dt_s, interval.inputs, bias) for interval in intervals]
+        parts = [integrated(interval.dt_s, interval.inputs, bias) for interval in intervals]
         A, b = 1e-12 * np.eye(3), np.zeros(3)
         for k, motion in motions.items():
             theta, by_theta = _against(motion, C, parts[k - 1])[3:], Ad.T @ motion.information @ Ad
@@ -99,10 +91,10 @@ def _linear(sequence: Sequence, prior: FirstPrior, motions: dict[int, Alignment]
             J = parts[k - 1].Phi[PHI, BG]
             A, b = A + J.T @ W @ J, b + J.T @ W @ theta
         bias = bias + np.linalg.solve(A, b).astype(float)
-    rows, values = _displacements(C, motions, [_integrated(i.dt_s, i.inputs, bias) for i in intervals])
+    rows, values = _displacements(C, motions, [integrated(i.dt_s, i.inputs, bias) for i in intervals])
     free, *_ = np.linalg.lstsq(rows, values, rcond=None)
     if abs(np.linalg.norm(free[3:]) - prior.gravity_m_s2) > _OFF_M_S2:
-        raise _RefusedError(f"gravity comes out as {np.linalg.norm(free[3:]):.2f} m/s^2")
+        raise RefusedWindowError(f"gravity comes out as {np.linalg.norm(free[3:]):.2f} m/s^2")
     v: Array = free[:3].astype(float)
     g: Array = free[3:].astype(float)
     for _ in range(_PASSES):
@@ -110,13 +102,8 @@ def _linear(sequence: Sequence, prior: FirstPrior, motions: dict[int, Alignment]
         tangent = np.linalg.svd(g[None])[2][1:].T
         x, *_ = np.linalg.lstsq(np.hstack([rows[:, :3], rows[:, 3:] @ tangent]), values - rows[:, 3:] @ g, rcond=None)
         v, g = x[:3].astype(float), g + tangent @ x[3:]
-    return _Linear(v, -g / np.linalg.norm(g), bias, float(np.linalg.norm(free[3:])))
-
-
-def _integrated(dt_s: Array, inputs: Array, gyro_bias: Array) -> Increment:
-    parts = np.ceil(dt_s / LONGEST_S).astype(int)
-    inputs, dt_s = np.repeat(inputs, parts, axis=0), np.repeat(dt_s / parts, parts)
-    return increments(dt_s, inputs[:, :3] - gyro_bias, inputs[:, 3:], np.zeros(15)).total()
+    text = f"|g| {np.linalg.norm(free[3:]):.2f} m/s^2 if free, "
+    return Guess(v, -g / np.linalg.norm(g), bias, text)
 
 
 def _against(motion: Alignment, T_cam_imu: Array, part: Increment) -> Array:
@@ -146,7 +133,7 @@ def _displacements(T_cam_imu: Array, motions: dict[int, Alignment], parts: list[
 
 
 def _smoothed(
-    sequence: Sequence, model: Model, prior: FirstPrior, config: FilterConfig, first: _Linear, end: int
+    sequence: Sequence, model: Model, prior: FirstPrior, config: FilterConfig, first: Guess, end: int
 ) -> InertialStart:
     """Return the start at the maximum a posteriori of the frames before ``end``."""
     T = prior.levelled(first.up)
@@ -164,17 +151,14 @@ def _smoothed(
             state = problem.filtered_state(ekf.landmarks().position_m)
             found = maximise(problem, state, PosteriorConfig(), config.min_depth_m, range(MOST_ITERATIONS))
     except EkfslamError as error:
-        raise _RefusedError(str(error)) from None
-    cost = 2.0 * found.costs[-1] / max(3 * log.observations - 3 * log.landmarks, 1)
-    if cost > _MOST_COST:
-        raise _RefusedError(f"observations err by {np.sqrt(cost):.1f} standard deviations")
+        raise RefusedWindowError(str(error)) from None
+    cost = 2.0 * found.costs[-1] / max(log.rows.size - 3 * log.landmarks, 1)
+    if cost > (_MOST_COST_OF_ONE if sequence.camera.is_monocular else _MOST_COST):
+        raise RefusedWindowError(f"observations err by {np.sqrt(cost):.1f} standard deviations")
     values = problem.unknowns.values(found.state)
     u, gyro_bias, accel_bias = (values[name][0] for name in (Velocity.name, GyroBias.name, AccelBias.name))
     T = prior.levelled(found.state.T_imu_world[0, :3, 2])
-    text = (
-        f"{np.linalg.norm(u):.2f} m/s, |g| {first.free_m_s2:.2f} m/s^2 if free, gyroscope bias "
-        f"({', '.join(f'{x:.3g}' for x in gyro_bias)}) rad/s"
-    )
+    text = f"{np.linalg.norm(u):.2f} m/s, {first.text}gyroscope bias ({', '.join(f'{x:.3g}' for x in gyro_bias)}) rad/s"
     own = problem.unknowns.places(started.process.columns)
     marginal = found.information.state_covariances[0][np.ix_(own, own)]
     P = _with_share(prior.covariance(T[:3, :3], tilt_rad, _SPEED_M_S), marginal)
