@@ -42,8 +42,8 @@ from ekfslam.smoother.problem import BatchProblem
 _ENDS_S, _LONG_S, _SPEED_M_S, _TILT_FACTOR = (1.0, 1.5, 2.0, 3.0), 1.0, 0.5, 3.0
 _SHARE = 1.0 / 16.0  # of the information of the window that the first covariance has
 _LEAST_MOTIONS, _LEAST_POINTS, _OFF_M_S2, _MOST_COST = 5, 10, 0.3, 3.0
-# Of one camera, where a wrong scale costs less. Good windows cost 1 by white errors of tracks, and less by walking ones,
-# since these are stated as they add up.
+# Of one camera, where a wrong scale costs less. Good windows cost 1 by white errors of tracks, and less by walking
+# ones, since these are stated as they add up.
 _MOST_COST_OF_ONE = 1.5
 _PASSES = 4
 
