@@ -70,7 +70,7 @@ def opened(
             found = plain(h5file.attrs.get("format"))
             if found != format:
                 names = ", ".join(list(h5file)[:9])
-                raise error(f"{path}: an HDF5 file of format {found!r} with [{names}]; expected format {format!r}")
+                raise error(f"{path}: an HDF5 file of format {found!r} with [{names}]; expected {_named(format)}")
             if version_of(h5file) > version:
                 raise ArchiveError(
                     f"{path}: has format version {version_of(h5file)}, this release reads up to version {version}"
@@ -79,7 +79,11 @@ def opened(
     except UnknownFormatError as problem:
         raise error(str(problem)) from None
     except _DAMAGE as problem:
-        raise error(f"{path}: damaged or no HDF5 file ({problem}); expected format {format!r}") from None
+        raise error(f"{path}: damaged or no HDF5 file ({problem}); expected {_named(format)}") from None
+
+
+def _named(format: str) -> str:
+    return f"format {format!r}" + (", as `ekfslam run` writes it" if format == "ekfslam-archive" else "")
 
 
 def _reading(path: str | Path) -> h5py.File:

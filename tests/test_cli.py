@@ -321,3 +321,20 @@ def test_doctor_names_what_is_missing_and_what_installs_it(capsys, monkeypatch):
     out = capsys.readouterr().out
     assert "engine" in out and "ros           ROS 1, ROS 2 and MCAP bags: rosbags 1.2\n" in out
     assert "lacks opencv: pip install 'ekfslam[images]'" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["comapre"], "did you mean compare?"),
+        (["compare", "--sigmav", "3"], "did you mean --sigma-v?"),
+        (["compare", "--mode", "ful"], "did you mean full?"),
+        (["export", "a.h5", "--format", "tumm"], "did you mean tum?"),
+        (["report"], "required: ARCHIVE (ekfslam report --help shows all)"),
+    ],
+)
+def test_a_typing_error_is_one_line_with_the_nearest_known_name(arguments, meant, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and said.count("\n") == 1 and meant in said

@@ -29,7 +29,7 @@ from support.kitti_raw import write_drive
 from support.npy import Runs, write_npy
 from support.recordings import HEADER
 
-from ekfslam import open_images, open_kitti_raw
+from ekfslam import attach_truth, open_images, open_kitti_raw, open_sequence
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import (
@@ -371,3 +371,18 @@ def test_images_of_the_course_data_run_nothing(course, tmp_path):
     with pytest.raises(UnknownFormatError, match="neither array nor container"):
         open_images(course)
     assert not (tmp_path / "ran").exists()
+
+
+def test_an_unknown_source_says_what_is_there(tmp_path):
+    (tmp_path / "sequences").mkdir()
+    with pytest.raises(UnknownFormatError, match="it is a directory with sequences"):
+        open_sequence(tmp_path)
+    (tmp_path / "06.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, encoding="utf-8")
+    with pytest.raises(UnknownFormatError, match="holds poses alone, which --truth"):
+        open_sequence(tmp_path / "06.txt")
+
+
+def test_truth_is_attached_from_a_name(tmp_path):
+    (tmp_path / "06.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, encoding="utf-8")
+    sequence = open_sequence("builtin:city?frames=3")
+    assert len(attach_truth(sequence, str(tmp_path / "06.txt")).truth.frame) == 3

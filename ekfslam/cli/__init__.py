@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import argparse
 import ast
+import difflib
 import importlib
 import os
 import pkgutil
+import re
 import sys
 import warnings
 from collections.abc import Iterator
 from collections.abc import Sequence as SequenceType
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from ekfslam import __version__
 from ekfslam.cli import commands
@@ -35,7 +37,9 @@ def main(arguments: SequenceType[str] | None = None) -> int:
         from ekfslam.cli.modes import joined_modes
 
         given = joined_modes(given)
-    options = _parser(given[:1]).parse_args(given)
+    options, unknown = _parser(given[:1]).parse_known_args(given)
+    if unknown:
+        options.refuse(f"unrecognized arguments: {' '.join(unknown)}")
     _prepare_output()
     try:
         with reading_up_to(options.read_limit), _notes_on_one_line(), options.claims(options):
@@ -54,9 +58,24 @@ def main(arguments: SequenceType[str] | None = None) -> int:
     return 0
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, with the nearest name that is known and the call that shows all."""
+
+    def error(self, message: str) -> NoReturn:
+        wrong = re.search(r"(?:invalid choice: |unknown mode |unrecognized arguments: )'?([\w-]+)", message)
+        known = re.findall(r"[\w-]+", message.partition("choose from" if "choose from" in message else "known:")[2])
+        near = (
+            difflib.get_close_matches(wrong[1], known or re.findall(r"--[\w-]+", self.format_usage()), 1)
+            if wrong
+            else []
+        )
+        meant = f"; did you mean {near[0]}?" if near else ""
+        self.exit(2, f"{self.prog}: error: {message}{meant} ({self.prog} --help shows all)\n")
+
+
 def _parser(called: SequenceType[str]) -> argparse.ArgumentParser:
     """Return the parser of all subcommands; only the called one knows its arguments."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="ekfslam",
         description="Visual-inertial EKF-SLAM: dead reckoning, independent landmark mapping, and full joint SLAM.",
         epilog="DATA is a recording (ECE 276A .npz, UTIAS .mat, ekfslam .h5) or a simulated world: "
@@ -80,7 +99,8 @@ def _parser(called: SequenceType[str]) -> argparse.ArgumentParser:
 
 def _declare(parser: argparse.ArgumentParser, name: str) -> None:
     module = importlib.import_module(f"{commands.__name__}.{name}")
-    parser.set_defaults(command=module.command, claims=getattr(module, "claims", nullcontext))
+    claims = getattr(module, "claims", nullcontext)
+    parser.set_defaults(command=module.command, claims=claims, refuse=parser.error)
     parser.epilog = "examples:\n" + "\n".join(f"  ekfslam {example}" for example in module.EXAMPLES)
     parser.add_argument(
         "--read-limit",

@@ -11,12 +11,13 @@ from ekfslam.arrays import Array
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.readers.fields import checksum
 from ekfslam.data.readers.poses import FIRST_IMAGE, Poses, truth_of_frames
-from ekfslam.data.readers.registry import CALIBRATION, Extrinsics, Lateral, Source, expected, read_as
+from ekfslam.data.readers.registry import CALIBRATION, Extrinsics, Lateral, Source, expected, read_as, readers
 from ekfslam.data.readers.text import read_lines, rows_of
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ConfigError, TruthError, UnknownFormatError
 
 MIN_COVERAGE = 0.9  # a file that knows fewer of the frames belongs to another recording
+MOST_LISTED = 8  # names of a folder in a message
 
 
 def open_recording(
@@ -38,14 +39,26 @@ def open_recording(
         return images
     sequence: Sequence | None = read_as(place, "tracks")
     if sequence is None:
-        problem = f"cannot be read ({place.problem})" if place.problem else "unknown content"
-        problem = problem if place.head or place.problem else "empty file"
-        raise UnknownFormatError(f"{place.place}: {problem}; {expected('tracks', 'images')}")
+        raise UnknownFormatError(f"{place.place}: {_why_unknown(place)}")
     for name, (choice, _) in choices.items():
         # A file of our own has been read before: it keeps the choice made then.
         if choice != "corrected" and choice != sequence.attributes.get(name):
             raise ConfigError(f"{source}: {name} {choice!r} mean nothing for this format")
     return sequence
+
+
+def _why_unknown(place: Source) -> str:
+    """Return why a source is no recording, and what could be meant."""
+    path, formats = Path(place.place), expected("tracks", "images")
+    if path.is_dir():
+        names = sorted(entry.name for entry in path.iterdir())
+        content = ", ".join(names[:MOST_LISTED]) + (", ..." if len(names) > MOST_LISTED else "") if names else "nothing"
+        return f"cannot be read (it is a directory with {content}); {formats}"
+    if place.problem:
+        return f"cannot be read ({place.problem}); {formats}"
+    if any(reader.recognises(place) for reader in readers("truth")):
+        return f"holds poses alone, which --truth and `ekfslam covariance --trajectory` read; {formats}"
+    return f"{'unknown content' if place.head else 'empty file'}; {formats}"
 
 
 def open_images(
@@ -78,7 +91,7 @@ def _images(place: Source) -> ImageRecording | None:
     return images
 
 
-def attach_truth(sequence: Sequence, path: Path) -> Sequence:
+def attach_truth(sequence: Sequence, path: str | Path) -> Sequence:
     """Replace the truth of a sequence by the poses of a file or folder.
 
     The content decides the format: KITTI odometry or KITTI-360, TUM, the csv of EuRoC or a folder with it, or a drive
@@ -95,6 +108,7 @@ def attach_truth(sequence: Sequence, path: Path) -> Sequence:
         TruthError: A line is malformed or not a rigid transform, or less than 90 % of the frames are covered.
         DataError: A line holds NaN, the stamps do not increase, or a drive folder is malformed.
     """
+    path = Path(path)
     poses: Poses | None = read_as(Source.at(path), "truth", sequence)
     if poses is None:
         formats = expected("truth")

@@ -56,7 +56,7 @@ def next_step(found: Honesty, archive: Any) -> str:
     if named is None:
         return f"ekfslam report {archive} draws map, errors and consistency"
     if not named.remedy:
-        return f"ekfslam check {archive} shows more: {named.text}"
+        return f"{named.text} (ekfslam check {archive} shows more)"
     others = f" ({len(defects) - 1} more: ekfslam check {archive})" if len(defects) > 1 else ""
     return f"{named.text}; {named.remedy}{others}"
 

@@ -52,7 +52,8 @@ _REMEDY = {
     "delay": "correct the stamps, or let [calibration] time_s estimate it",
     "shared drift": "use [blocks.twist_bias] for velocities, [blocks.vision_drift] for tracks",
     "tracks": "leave out [noise] sigma_px, so that the errors of tracks are found",
-    "motion": "mask what moves, or leave out [noise] sigma_px, so that tracks are tested for motion",
+    "motion": "mask what moves",
+    "white": ", or leave out [noise] sigma_px, so that tracks are tested for motion",
     "smoother": "use the mode 'smoothed', or filter.lag = 10",
 }
 
@@ -151,7 +152,7 @@ def _track_causes(result: Result, tracks: TrackInnovations, rejected: Mapping[st
         is_uneven = float(tracks.persistence.min()) < 0.5 * float(tracks.persistence.max())
         if rejected.get("gate", 0.0) > _LEAST_OUTLIERS and is_uneven:
             text += ", and many are rejected: things move, or tracks slip"
-            yield Cause("motion", where, grown, text, _REMEDY["motion"])
+            yield Cause("motion", where, grown, text, _REMEDY["motion"] + (_REMEDY["white"] if is_white else ""))
         else:
             yield Cause("tracks", where, grown, text, remedy)
         return
@@ -208,7 +209,7 @@ def rejection_causes(result: Result, rejected: Mapping[str, float], causes: Sequ
     elif doubted and not is_noise:
         yield Cause("velocities", (), np.nan, f"{text}: wild samples, which the filter does not use")
     if gate > _LEAST_OUTLIERS and not is_noise:
-        yield Cause("outliers", (), np.nan, f"the gates reject {percent(gate)} of the observations: outliers")
+        yield Cause("outliers", (), np.nan, f"the gates reject {percent(gate)} of the observations as outliers")
     if moving > _LEAST_MOVING:
         text = f"{percent(moving)} of the observations are rejected as moving: traffic, or another noise than stated"
         yield Cause("moving", (), np.nan, text, "compare with the noise that `ekfslam info` finds")

@@ -72,7 +72,10 @@ class Honesty:
         true, by = self.true_factor, "NIS" if self.shared is None else "innovations"
         if np.isnan(true):
             return self._by_innovations(by)
-        nees = f"pose NEES {self.truth.nees:.3g}, {POSE_DOF} expected" if self.truth is not None else ""
+        nees = ""
+        if self.truth is not None:
+            usual = f"{POSE_DOF} expected on average, {self.truth.low:.1f} to {self.truth.high:.1f} in one drive"
+            nees = f"pose NEES {self.truth.nees:.3g}; {usual}"
         if not self.causes:
             if true == 1.0:
                 known = "the truth of one drive" if self.nis is None else f"{by} and the truth of one drive"

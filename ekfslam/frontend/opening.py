@@ -62,11 +62,11 @@ def open_sequence(
 
     if isinstance(recording, Sequence):
         recording = of_left_camera(recording) if camera == "left" else recording
-        return with_inputs(recording if truth is None else attach_truth(recording, Path(truth)))
+        return with_inputs(recording if truth is None else attach_truth(recording, truth))
     from ekfslam.frontend.track import track
 
     tracked = track(with_inputs(recording.of_left_camera if camera == "left" else recording), front_end)[0]
-    return tracked if truth is None else attach_truth(tracked, Path(truth))
+    return tracked if truth is None else attach_truth(tracked, truth)
 
 
 def _require(camera: str, name: str, value: object, needed: str, other: object) -> None:
