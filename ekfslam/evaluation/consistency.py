@@ -24,6 +24,8 @@ from ekfslam.geometry import se3
 from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.noise import GAP_STD
 
+_ROUNDING = 1e-18  # of variances: 1e-9 of standard deviations
+
 
 def pose_error(T_world_imu_est: Array, T_world_imu_true: Array) -> Array:
     """Return the pose error ``xi = log(T_imu_world_true T_imu_world_est^-1)`` (..., 6), m and rad, of every variant."""
@@ -189,8 +191,13 @@ def pose_nees_by_axis(result: Result, truth: Truth) -> Array:
     R[:, :3, :3] = truth.T_world_imu[:, :3, :3]
     error = (R @ error[..., None])[..., 0]
     variance, own = (np.einsum("nij,njk,nik->ni", R, of, R) for of in (covariance, result.covariance[truth.frame]))
-    is_uncertain = own > 0
+    is_uncertain = above_rounding(own)
     return np.where(is_uncertain, error**2 / np.where(is_uncertain, variance, 1.0), np.nan)
+
+
+def above_rounding(variance: Array) -> BoolArray:
+    """Return which variances (n, axes) are no mere rounding of a known value, beside the largest of their axis."""
+    return np.asarray(variance > _ROUNDING * variance.max(axis=0, initial=0.0))
 
 
 def average_over_runs(per_run: Array) -> dict[str, Any]:

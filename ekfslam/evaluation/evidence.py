@@ -16,7 +16,14 @@ import numpy as np
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import WITHOUT_VELOCITIES, Truth
 from ekfslam.evaluation import whiteness
-from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_error, pose_nees, pose_nees_apart
+from ekfslam.evaluation.consistency import (
+    above_rounding,
+    chi2_bounds,
+    measured_truth,
+    pose_error,
+    pose_nees,
+    pose_nees_apart,
+)
 from ekfslam.evaluation.tables import plus_minus
 from ekfslam.evaluation.truth import estimated
 from ekfslam.filters.result import REASONS, Result, WhitenedInnovations
@@ -219,7 +226,7 @@ def smoother_agreement(result: Result, smoothed: Posterior) -> SmootherAgreement
     turned = se3.adjoint(se3.exp(-difference))
     after = turned @ smoothed.pose_covariance @ turned.swapaxes(1, 2)
     variance, gain = (np.diagonal(P, axis1=1, axis2=2) for P in (result.covariance, result.covariance - after))
-    gained = gain > _LEAST_GAIN * np.where(variance > 0, variance, np.inf)
+    gained = above_rounding(variance) & (gain > _LEAST_GAIN * variance)
     with np.errstate(invalid="ignore", divide="ignore"):
         std = np.sqrt(np.where(gained, difference**2 / gain, 0.0).sum(axis=0) / gained.sum(axis=0))
     return SmootherAgreement(std, int(gained.any(axis=1).sum()))

@@ -33,9 +33,20 @@ def seconds(stamp: Any) -> float:
 
 
 def twist_of(message: Any) -> Array:
-    """Velocities (6,) of a TwistStamped."""
+    """Return the velocities (6,) of a TwistStamped."""
     linear, angular = message.twist.linear, message.twist.angular
     return np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
+
+
+def filled(out: Any, stamp: Any, T_world_imu: Array, covariance: Array) -> Any:
+    """Fill a PoseWithCovarianceStamped with a pose and the covariance (6, 6) of its ``xi``, and return it."""
+    out.header.stamp, out.header.frame_id = stamp, "map"
+    place, turn = out.pose.pose.position, out.pose.pose.orientation
+    place.x, place.y, place.z = T_world_imu[:3, 3].tolist()
+    turn.x, turn.y, turn.z, turn.w = Rotation.from_matrix(T_world_imu[:3, :3]).as_quat().tolist()
+    R = np.kron(np.eye(2), T_world_imu[:3, :3])
+    out.pose.covariance = (R @ covariance @ R.T).ravel().tolist()
+    return out
 
 
 def tracks_of(message: Any) -> tuple[IntArray, Array]:
@@ -43,12 +54,6 @@ def tracks_of(message: Any) -> tuple[IntArray, Array]:
     points = np.frombuffer(bytes(message.data), TRACK)
     pixels = np.stack([points[name] for name in ("uL", "vL", "uR", "vR")], axis=-1)
     return points["id"].astype(np.int64), pixels.astype(float)
-
-
-def in_map_frame(T_world_imu: Array, covariance: Array) -> Array:
-    """Covariance (6, 6) of ``xi`` as ROS wants it."""
-    R = np.kron(np.eye(2), T_world_imu[:3, :3])
-    return np.asarray(R @ covariance @ R.T)
 
 
 class Slam:
@@ -77,13 +82,7 @@ class Slam:
         if self.live.time_s is None:
             return
         _, T, covariance, _ = self.live.pose(seconds(message.header.stamp))
-        out = self._message()
-        out.header.stamp, out.header.frame_id = message.header.stamp, "map"
-        place, turn = out.pose.pose.position, out.pose.pose.orientation
-        place.x, place.y, place.z = T[:3, 3].tolist()
-        turn.x, turn.y, turn.z, turn.w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
-        out.pose.covariance = in_map_frame(T, covariance).ravel().tolist()
-        self._publisher.publish(out)
+        self._publisher.publish(filled(self._message(), message.header.stamp, T, covariance))
 
 
 def main() -> None:

@@ -6,7 +6,7 @@
 - ``/pose`` (geometry_msgs/PoseWithCovarianceStamped): at every pair, along the axes of the map.
 
 Callbacks may run in several threads (`MultiThreadedExecutor`). If a clock jumps, as when a bag is played again, the
-node starts again.
+node starts again. It needs `ros2_node.py` beside it.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ import sys
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from ros2_node import filled, seconds, twist_of
 
 from ekfslam import LiveStereo
-from ekfslam.arrays import Array
 from ekfslam.data.images import Image, PairCalibration, side_by_side
 from ekfslam.data.inputs import InertialNoise
 from ekfslam.errors import ClockError, EkfslamError
@@ -27,11 +26,6 @@ from ekfslam.errors import ClockError, EkfslamError
 T_CAM_IMU = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 IMU_NOISE = InertialNoise(gyro=2e-4, accel=2e-3, gyro_walk=2e-5, accel_walk=3e-3)
 PAIR_S = 0.005
-
-
-def seconds(stamp: Any) -> float:
-    """Return the seconds of a builtin_interfaces/Time."""
-    return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def grey(message: Any) -> Image:
@@ -49,12 +43,6 @@ def calibration_of(info: Any) -> PairCalibration:
     """Return the calibration of a rectified pair by the CameraInfo of its right camera."""
     P = np.array(info.p, dtype=float).reshape(3, 4)
     return PairCalibration(P[:, :3], P[:, :3], (info.width, info.height), side_by_side(-P[0, 3] / P[0, 0]))
-
-
-def in_map_frame(T_world_imu: Array, covariance: Array) -> Array:
-    """Return the covariance (6, 6) of ``xi`` as ROS wants it."""
-    R = np.kron(np.eye(2), T_world_imu[:3, :3])
-    return np.asarray(R @ covariance @ R.T)
 
 
 class Slam:
@@ -105,8 +93,7 @@ class Slam:
     def on_velocities(self, message: Any) -> None:
         """Take a velocity."""
         if self.stereo is not None:
-            v, w = message.twist.linear, message.twist.angular
-            self._take(self.stereo.velocities, [v.x, v.y, v.z, w.x, w.y, w.z], seconds(message.header.stamp))
+            self._take(self.stereo.velocities, twist_of(message), seconds(message.header.stamp))
 
     def _take(self, call: Any, *arguments: Any) -> None:
         """Give a message to the filter; start again after a jump of the clock, and log other errors."""
@@ -123,13 +110,7 @@ class Slam:
         """Publish the newest pose."""
         assert self.stereo is not None
         _, T, covariance, _ = self.stereo.pose()
-        out = self._message()
-        out.header.stamp, out.header.frame_id = message.header.stamp, "map"
-        place, turn = out.pose.pose.position, out.pose.pose.orientation
-        place.x, place.y, place.z = T[:3, 3].tolist()
-        turn.x, turn.y, turn.z, turn.w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
-        out.pose.covariance = in_map_frame(T, covariance).ravel().tolist()
-        self._publisher.publish(out)
+        self._publisher.publish(filled(self._message(), message.header.stamp, T, covariance))
 
 
 def main() -> None:
