@@ -1,8 +1,8 @@
 """Play a recording of stereo images into `ekfslam.LiveStereo` at its own pace, and measure how long poses take.
 
 The latency of a pair is the time from its arrival until the filter has processed it. The first frames configure the
-filter: latencies are counted once it has caught up, and the time until then is printed. Velocities or inertial samples of the recording arrive with their images. ``--rate`` plays
-faster or slower than the stamps say.
+filter: latencies are counted once it has caught up, and the time until then is printed. Velocities or inertial samples
+of the recording arrive with their images. ``--rate`` plays faster or slower than the stamps say.
 
     python experiments/live.py BAG_OR_FOLDER --rate 20
 """
@@ -37,7 +37,8 @@ def main() -> None:
         arrived, done, stereo = played(recording, options.rate, learn=options.learn, delay_s=options.delay)
     width, height = recording.calibration.size
     print(f"pairs: {len(recording.time_s)} of {width} x {height}, dropped {stereo.skipped}")
-    caught_up = int(np.argmax(done[:-1] < arrived[1:])) + 1
+    usual_s = np.nanmedian((done - arrived)[-len(done) // 4 :])
+    caught_up = int(np.argmax(done - arrived < 1.5 * usual_s))
     print(f"first pose after pair {options.learn}: {done[options.learn - 1] - arrived[options.learn - 1]:.2f} s")
     print(f"caught up at pair {caught_up}")
     latency_s = (done - arrived)[caught_up:]
