@@ -29,7 +29,7 @@ from ekfslam.filters.loop import one_thread
 from ekfslam.filters.result import Result
 from ekfslam.names import without_common_ends
 from ekfslam.others import Others
-from ekfslam.runner import run
+from ekfslam.runner import require_arguments, run
 from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import archive_image, open_result, read_archive, require_same_origin
@@ -140,7 +140,7 @@ class Comparison(Shown):
 @one_thread()
 def compare(
     sequence: Sequence,
-    modes: Iterable[Mode] = MODES,
+    modes: Mode | Iterable[Mode] = MODES,
     config: Config | None = None,
     timings: Timings | None = None,
     others: Others | Mapping[str, Trajectory | str | Path] | None = None,
@@ -155,12 +155,14 @@ def compare(
         FilterError: No mode has a result; if some have, `Comparison.skipped` tells why others have none.
         TruthError: Fewer than three poses of a trajectory belong to frames. Others as of `ekfslam.others`.
     """
+    require_arguments(sequence, config)
     others = Others.of(others)
     others.results(sequence)  # a mistake there should not cost the runs
     if config is not None:
         sequence = with_truth_noise(sequence, config.truth)
     timings = timings or Timings()
-    results, skipped = _run_all(sequence, list(modes), config, timings)
+    wanted: list[Any] = [modes] if isinstance(modes, str) else list(modes)
+    results, skipped = _run_all(sequence, wanted, config, timings)
     if skipped and not results:
         raise FilterError("; ".join(f"no {mode}: {reason}" for mode, reason in skipped.items()))
     with timings.part("evaluation"):

@@ -39,6 +39,15 @@ from ekfslam.stored import empty
 from ekfslam.timings import Timings
 
 
+def require_arguments(sequence: object, config: object) -> None:
+    """Raise `ConfigError` for a name in place of a recording, or a dictionary in place of a configuration."""
+    if not isinstance(sequence, Sequence):
+        message = f"expected a Sequence, as open_sequence returns it, found {type(sequence).__name__}"
+        raise ConfigError(message)
+    if not isinstance(config, Config | None):
+        raise ConfigError(f"expected a Config, as Config().with_overrides(...) makes it, found {type(config).__name__}")
+
+
 @one_thread()
 @solvable()
 def run(
@@ -63,6 +72,7 @@ def run(
             number is none (`NonFiniteResultError`), or a matrix is singular.
         IllPosedError: The posterior of a smoothed run leaves something undetermined.
     """
+    require_arguments(sequence, config)
     if mode not in MODES:
         raise ConfigError(f"unknown mode {mode!r}; known: {', '.join(MODES)}")
     if mode == "dead-reckoning" and not sequence.has_velocities:

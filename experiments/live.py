@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from ekfslam import LiveStereo, open_images
 from ekfslam.arrays import Array
-from ekfslam.data.images import ImageRecording
+from ekfslam.data.images import ImageRecording, PairCalibration
 
 
 def main() -> None:
@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("--delay", type=float, default=0.0, help="delay_s of LiveStereo")
     options = parser.parse_args()
     recording = open_images(options.data)
-    if recording is None:
+    if recording is None or not isinstance(recording.calibration, PairCalibration):
         parser.error(f"{options.data} has no stereo images")
     with threadpool_limits(1):
         arrived, done, stereo = played(recording, options.rate, learn=options.learn, delay_s=options.delay)
@@ -50,6 +50,7 @@ def main() -> None:
 def played(recording: ImageRecording, rate_hz: float | None = None, **settings: Any) -> tuple[Array, Array, LiveStereo]:
     """Return when each pair arrived and was processed (T,), s, NaN if it never was, and the filter."""
     noise = None if recording.inertial is None else recording.inertial.noise
+    assert isinstance(recording.calibration, PairCalibration)
     stereo = LiveStereo(recording.calibration, recording.T_cam_imu, imu_noise=noise, **settings)
     stamps = recording.time_s
     arrived, done = np.full(len(stamps), np.nan), np.full(len(stamps), np.nan)
@@ -72,7 +73,8 @@ def played(recording: ImageRecording, rate_hz: float | None = None, **settings: 
             for call, *values in messages:
                 getattr(stereo, call)(*values)
             arrived[k] = time.monotonic()
-            stereo.images(*pairs[k], stamps[k])
+            left, right = pairs[k]
+            stereo.images(left, right, stamps[k])
         stereo.flush()
         time.sleep(0.01)
         over.set()

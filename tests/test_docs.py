@@ -168,3 +168,12 @@ def test_the_tables_of_the_pages_stand_in_the_results():
         found = re.findall(rf"^\| 2011_{month}_{day}_drive_{drive}_sync_KLT \|.*", real, re.MULTILINE)
         assert re.search(rf"\| {dead_m} \(.*\) \| {full_m} \(", found[0])
         assert all(f" {value} " in found[1] for value in others.split(" | "))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "said"), [("frames", ""), ("course", "mapping-only 14.49 m, NEES 465922")])
+def test_the_examples_of_a_page_run(page, said, capsys):
+    names: dict = {}
+    for code in re.findall(r"^```python\n([\s\S]*?)^```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.MULTILINE):
+        exec(compile(code, f"{page}.md", "exec"), names)
+    assert said in capsys.readouterr().out

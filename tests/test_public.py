@@ -58,3 +58,12 @@ def test_a_run_without_figures_draws_with_no_package(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "0 []"
+
+
+def test_a_name_in_place_of_a_recording_is_refused():
+    with pytest.raises(ekfslam.EkfslamError, match="expected a Sequence, as open_sequence returns it, found str"):
+        ekfslam.run("builtin:city")
+    sequence = ekfslam.open_sequence("builtin:city?frames=3")
+    with pytest.raises(ekfslam.EkfslamError, match="expected a Config, .* found dict"):
+        ekfslam.compare(sequence, "full", {"filter": {}})
+    assert list(ekfslam.compare(sequence, "dead-reckoning").results) == ["dead-reckoning"]
