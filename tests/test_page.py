@@ -115,7 +115,7 @@ def test_every_run_has_a_verdict_from_what_there_is(archive):
     bare = dataclasses.replace(honest, innovation=empty(Innovation, T=len(honest.time_s)))
     said = carded(known, first=honest, small=small, doubled=doubled, bare=bare)
     of_truth = "consistent as far as the truth of one drive can tell"
-    assert said["bare"] == ("good", [f"{of_truth} (pose NEES 6; 6 expected on average, 1.2 to 14.4 in one drive)"])
+    assert said["bare"] == ("good", [f"{of_truth} (pose NEES 6; 1.2 to 14.4 in 95 % of drives)"])
     assert said["small"][0] == "bad"
     assert "standard deviations about 5.0x too small by the truth" in said["small"][1][0]
     kind, (head, reason) = said["doubled"]

@@ -74,7 +74,7 @@ class Honesty:
             return self._by_innovations(by)
         nees = ""
         if self.truth is not None:
-            usual = f"{POSE_DOF} expected on average, {self.truth.low:.1f} to {self.truth.high:.1f} in one drive"
+            usual = f"{self.truth.low:.1f} to {self.truth.high:.1f} in 95 % of drives"
             nees = f"pose NEES {self.truth.nees:.3g}; {usual}"
         if not self.causes:
             if true == 1.0:
