@@ -174,6 +174,8 @@ def test_the_tables_of_the_pages_stand_in_the_results():
 @pytest.mark.parametrize(("page", "said"), [("frames", ""), ("course", "mapping-only 14.49 m, NEES 465922")])
 def test_the_examples_of_a_page_run(page, said, capsys):
     names: dict = {}
-    for code in re.findall(r"^```python\n([\s\S]*?)^```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.MULTILINE):
+    for code in re.findall(
+        r"^```python\n([\s\S]*?)^```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.MULTILINE
+    ):
         exec(compile(code, f"{page}.md", "exec"), names)
     assert said in capsys.readouterr().out

@@ -64,6 +64,6 @@ def test_a_name_in_place_of_a_recording_is_refused():
     with pytest.raises(ekfslam.EkfslamError, match="expected a Sequence, as open_sequence returns it, found str"):
         ekfslam.run("builtin:city")
     sequence = ekfslam.open_sequence("builtin:city?frames=3")
-    with pytest.raises(ekfslam.EkfslamError, match="expected a Config, .* found dict"):
+    with pytest.raises(ekfslam.EkfslamError, match=r"expected a Config, .* found dict"):
         ekfslam.compare(sequence, "full", {"filter": {}})
     assert list(ekfslam.compare(sequence, "dead-reckoning").results) == ["dead-reckoning"]
