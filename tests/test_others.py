@@ -88,6 +88,13 @@ def test_a_world_of_its_own_is_moved_to_the_first_pose_unless_it_shall_stay(worl
     assert "moved by" in " ".join(Others({"moved": moved}).results(world, full)["moved"].remarks)
 
 
+def test_the_first_pose_is_moved_to_the_true_one_from_any_world_to_any_other(world, full):
+    truth = dataclasses.replace(world.truth, T_world_imu=WORLD @ world.truth.T_world_imu)
+    theirs = ekfslam.Trajectory(full.time_s, se3.exp(np.arange(6.0) / 3.0) @ full.T_world_imu)
+    moved = Others({"mine": theirs}).results(dataclasses.replace(world, truth=truth))["mine"]
+    np.testing.assert_allclose(moved.T_world_imu, WORLD @ full.T_world_imu, atol=1e-9)
+
+
 def test_a_first_pose_that_agrees_within_its_covariance_stays_where_it_is():
     """The first tilt of an inertial unit is uncertain: moved to the true heading, its NEES would be another one."""
     room = ekfslam.open_sequence("builtin:room?frames=40")
