@@ -25,7 +25,7 @@ from ekfslam.data.noise import Noise
 from ekfslam.data.observations import Truth
 from ekfslam.data.readers.poses import FIRST_IMAGE, Poses, nearest, truth_of_frames
 from ekfslam.data.readers.registry import Source, expected, read_as
-from ekfslam.data.readers.tum import COVARIANCE_ENDING, covariance_path, covariances_beside
+from ekfslam.data.readers.tum import covariance_file, covariances_beside
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.trajectory import Moving, Trajectory, left_error_covariance
 from ekfslam.errors import ConfigError, TruthError, UnknownFormatError
@@ -125,7 +125,7 @@ def files_of(given: Trajectory | str | Path) -> list[Path]:
     if isinstance(given, Trajectory):
         return []
     path = Path(given)
-    return [p for p in (path, covariance_path(path), path.with_suffix(COVARIANCE_ENDING)) if p.exists()]
+    return [p for p in (path, covariance_file(path)) if p is not None and p.exists()]
 
 
 def placed_poses(recording: Sequence | Archive, poses: Poses, name: str) -> Truth:
@@ -206,8 +206,7 @@ def _read(
             poses.time_s, poses.T_world_imu, covariances_beside(Path(given), poses.time_s), frame or "body"
         )
         return _read(recording, trajectory, None)
-    beside = Path(given).with_suffix(COVARIANCE_ENDING)
-    if beside.is_file():
+    if (beside := covariance_file(Path(given))) is not None:
         raise ConfigError(f"{beside}: covariances need the stamps of their poses, which KITTI has not; write TUM")
     if frame == "body" and poses.frame is None:  # the reader took them for those of the left camera
         poses = dataclasses.replace(poses, T_world_imu=T_cam_imu @ poses.T_world_imu @ se3.inverse(T_cam_imu))

@@ -182,6 +182,16 @@ def test_a_covariance_that_is_none_is_named_by_file_and_line(world, full, tmp_pa
         Others({"mine": tmp_path / "mine.tum"}).results(world)
 
 
+def test_the_csv_of_euroc_is_read_and_covariances_of_another_file_are_not_taken_for_its_own(tmp_path):
+    room = ekfslam.open_sequence("builtin:room?frames=20")
+    ours = ekfslam.run(room)
+    for name, format in (("room.txt", "tum"), ("room.csv", "euroc")):
+        export(ours, tmp_path / name, format)
+    found = figures(room, ours, {"csv": tmp_path / "room.csv"}, world="given")
+    assert found["csv"]["ate_m"] == pytest.approx(found["ours"]["ate_m"], rel=1e-4)
+    assert found["csv"]["pose_nees_mean"] is None
+
+
 def test_one_trajectory_is_not_compared_with_two_recordings(capsys, files):
     assert main(["compare", "builtin:city?frames=9", "builtin:loop?frames=9", "--with", str(files / "mine.txt")]) == 2
     assert "write {name} for them" in capsys.readouterr().err

@@ -145,6 +145,8 @@ def test_compare_writes_the_table_of_several_recordings(tmp_path, capsys):
             main(["compare", *drives, *arguments, "--table", str(tmp_path / name)])
         assert words in capsys.readouterr().err
     assert is_table(path)
+    assert main(["compare", *drives, *arguments, "--columns", "ate"]) == 2
+    assert "there is no column 'ate'; known: ate_m, " in capsys.readouterr().err
 
 
 def test_a_study_has_means_over_runs_and_paired_tests():

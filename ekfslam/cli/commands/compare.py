@@ -25,6 +25,7 @@ from ekfslam.cli.options import (
 )
 from ekfslam.config import MODES
 from ekfslam.errors import ConfigError
+from ekfslam.evaluation.metrics import METRICS
 from ekfslam.names import components
 from ekfslam.reports import PAPER, compare_all, compared_table
 from ekfslam.storage.archive import require_same_origin
@@ -61,6 +62,9 @@ def command(options: argparse.Namespace) -> None:
     for flag in ("truth", "timings"):
         if getattr(options, flag) and len(options.data) > 1:
             raise ConfigError(f"--{flag} belongs to one recording, but several are given; compare them one by one")
+    for key in options.columns:
+        if key not in METRICS:
+            raise ConfigError(f"there is no column {key!r}; known: {', '.join(METRICS)}")
     if options.width:
         from ekfslam.figures.paper import width_of  # imports Matplotlib
 

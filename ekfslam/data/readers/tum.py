@@ -47,10 +47,16 @@ def read_trajectory(path: str | Path, *, frame: Moving = "body") -> Trajectory:
     return Trajectory(poses.time_s, poses.T_world_imu, covariances_beside(path, poses.time_s), frame)
 
 
+def covariance_file(path: Path) -> Path | None:
+    """Return the file of the covariances of poses that exists; ``mine.cov.txt`` is that of ``mine.txt`` if both do."""
+    other = path.with_suffix(COVARIANCE_ENDING)
+    places = [covariance_path(path), *([] if path.with_suffix(".txt").exists() else [other])]
+    return next((place for place in places if place.is_file()), None)
+
+
 def covariances_beside(path: Path, time_s: Array) -> Array | None:
     """Return the covariances (n, 6, 6) of ``mine.cov.txt`` or ``mine.tum.cov.txt`` beside ``mine.tum``, if any."""
-    places = (covariance_path(path), path.with_suffix(COVARIANCE_ENDING))
-    beside = next((place for place in places if place.is_file() and place != path), None)
+    beside = covariance_file(path)
     if beside is None:
         return None
     words = f"expected a stamp and {len(COVARIANCE)} numbers a line"
