@@ -163,7 +163,7 @@ class Stream:
     def disturb(self, calls: list[tuple[str, tuple[Any, ...]]]) -> None:
         rng, i, kind = self.rng, int(self.rng.integers(len(calls))), self.rng.integers(10)
         name, arguments = calls[i]
-        t = arguments[-1] if arguments else 0.0
+        t = 0.02 * i
         if kind == 0:
             calls.insert(int(rng.integers(len(calls))), calls[i])
         elif kind == 1:
@@ -230,8 +230,7 @@ class Stream:
 
     def replayed(self, live: LiveEKF, accepted: list[tuple[str, tuple[Any, ...]]]) -> str:
         """Return whether the messages that were accepted, sent alone, lead to another state."""
-        names = {name for name, _ in accepted}
-        if self.is_threaded or live.counts.failed or "reset" in names or self.window.get("late") == "count":
+        if self.is_threaded or live.counts.failed or live.counts.resets or self.window.get("late") == "count":
             return ""
         other = self.new()
         for name, arguments in accepted:
