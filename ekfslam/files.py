@@ -147,7 +147,7 @@ def claimed(*writes: str | Path | None, reads: Iterable[str | Path] = ()) -> Ite
     """
     wanted: dict[Path, tuple[str | Path, bool]] = {_target(path): (path, False) for path in writes if path is not None}
     for path in reads:
-        with suppress(OSError, ValueError):
+        with suppress(OSError, ValueError, RuntimeError):  # loops of links: the reader names them
             if (target := Path(path).resolve()).is_file():
                 wanted.setdefault(target, (path, True))
     with ExitStack() as stack:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from xml.etree import ElementTree
@@ -75,6 +76,24 @@ def test_what_shows_an_archive_that_is_gone_may_be_replaced(two):
     assert main(["plot", str(a)]) == 0
     a.rename(a.with_name("c.h5"))
     assert main(["plot", str(b)]) == 0
+
+
+def test_marks_that_somebody_crafted_are_no_archives(two, tmp_path):
+    a, _ = two
+    (tmp_path / "loop.h5").symlink_to(tmp_path / "loop.h5")
+    for name in (b"a%00b.h5", b"loop.h5", b"%FF%FE.h5", b"", b"/dev/zero", b"../" * 2000):
+        (tmp_path / "map.png").write_bytes(b"ekfslam_shows:" + name + b";")
+        assert main(["plot", str(a)]) == 0
+    assert main(["plot", str(tmp_path / "loop.h5")]) == 2
+
+
+def test_an_archive_whose_name_is_no_text_is_named(two, tmp_path):
+    name = os.fsdecode(b"a\xff.h5")
+    two[0].rename(tmp_path / name)
+    for _ in range(2):
+        assert main(["plot", str(tmp_path / name)]) == 0
+    assert archives_in(tmp_path / "map.png") == {tmp_path / name}
+    assert main(["plot", str(two[1])]) == 2
 
 
 def test_a_page_of_more_archives_replaces_the_one_of_some(two):

@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from urllib.parse import quote, unquote
+from urllib.parse import quote, unquote_to_bytes
 
 from ekfslam.errors import WriteError
 
@@ -23,6 +23,7 @@ WAY = "--out chooses another place"
 WAYS = f"{WAY}, --force replaces it"
 _PICTURES = (".png", ".svg", ".pdf")
 _KEPT = ("report.html", "drive.gif", "drive.mp4")  # files under other names are records of the user
+_END = 1 << 18  # bytes at the end of a file that hold its mark
 _MARK = re.compile(rb"ekfslam_shows:([A-Za-z0-9_.~%/:,]*);")
 
 
@@ -33,14 +34,19 @@ def marked(contents: Mapping[Path, str | bytes], archives: Iterable[Path]) -> di
         return found
     for path, content in contents.items():
         data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
-        names = ",".join(quote(_seen_from(path, archive)).replace("-", "%2D") for archive in archives)
+        names = ",".join(quote(os.fsencode(_seen_from(path, archive))).replace("-", "%2D") for archive in archives)
         found[path] = _with_mark(data, path.suffix, f"ekfslam_shows:{names};".encode())
     return found
 
 
+def _real(path: Path) -> Path:
+    """Return a path without links; `Path.resolve` raises errors for loops of links."""
+    return Path(os.path.realpath(path))
+
+
 def _seen_from(path: Path, archive: Path) -> str:
     """Return the path of an archive relative to the folder of a file."""
-    target, folder = archive.resolve(), path.parent.resolve()
+    target, folder = _real(archive), _real(path.parent)
     try:
         return os.path.relpath(target, folder)
     except ValueError:  # on another drive of Windows
@@ -65,27 +71,32 @@ def _with_mark(data: bytes, suffix: str, mark: bytes) -> bytes:
 def archives_in(path: Path) -> set[Path]:
     """Return the archives that a picture or page names, none if it is missing or has no mark."""
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _END))
+            data = file.read()
     except OSError:
         return set()
     marks = _MARK.findall(data)
-    return {path.parent / unquote(name.decode()) for name in marks[-1].split(b",")} if marks else set()
+    names = [os.fsdecode(unquote_to_bytes(name)) for name in marks[-1].split(b",")] if marks else []
+    return {path.parent / name for name in names if "\0" not in name}
 
 
 def require_own(paths: Iterable[Path], archives: Iterable[Path], ways: str = WAYS) -> None:
     """Raise a `WriteError` if a picture or page shows an archive that is still there and not among some."""
-    own = {archive.resolve() for archive in archives}
+    own = {_real(archive) for archive in archives}
     for path in paths:
-        others = [archive for archive in archives_in(path) if archive.is_file() and archive.resolve() not in own]
+        # Not `Path.is_file`, which raises errors for names that are too long.
+        there = [archive for archive in archives_in(path) if os.path.isfile(archive)]  # noqa: PTH113
+        others = [archive for archive in there if _real(archive) not in own]
         if others:
             raise WriteError(f"{path}: shows {min(others)}, another archive; {ways}")
 
 
 def pictures_of(archives: Iterable[Path], folder: Path) -> list[Path]:
     """Return the pictures in a folder that show these archives and no other."""
-    own = {archive.resolve() for archive in archives}
+    own = {_real(archive) for archive in archives}
     places = [path for suffix in _PICTURES for path in folder.glob(f"*{suffix}")]
-    return [path for path in sorted(places) if own and {other.resolve() for other in archives_in(path)} == own]
+    return [path for path in sorted(places) if own and {_real(other) for other in archives_in(path)} == own]
 
 
 def older_figures(archive: Path) -> list[Path]:
@@ -93,10 +104,10 @@ def older_figures(archive: Path) -> list[Path]:
 
     Figures of older releases have no marks. They are among them if the folder has no other archive.
     """
-    folder, own = archive.parent, {archive.resolve()}
+    folder, own = archive.parent, {_real(archive)}
     found = pictures_of(own, folder)
     kept = [folder / name for name in _KEPT]
-    found += [path for path in kept if {other.resolve() for other in archives_in(path)} == own]
+    found += [path for path in kept if {_real(other) for other in archives_in(path)} == own]
     if archive.exists() and all(path == archive for path in folder.glob("*.h5")):
         found += [path for path in folder.glob("*.png") if not archives_in(path) and _is_figure(path)]
     return found
