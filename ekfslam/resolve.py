@@ -87,6 +87,7 @@ _FACTORS, _SAMPLING_STRETCHES, _SAMPLING_TRACKS = (0.0, 1.0, 2.0, 4.0), (10, 5),
 _SURE, _LEAST_GAIN = 3.0, 20.0  # standard errors
 
 
+_ADVICE = "begin at rest (half a second) or where it accelerates, or give both cameras"
 _DENSITIES = tuple(field.name for field in dataclasses.fields(InertialNoise))
 
 
@@ -479,6 +480,11 @@ def with_densities(sequence: Sequence, config: Config, searched: Config | None) 
         found = Densities(samples.noise, "as stated")
     elif searched is not None:
         found = _likeliest_densities(sequence, searched)
+    if found is None and searched is not None and sequence.camera.is_monocular and _rest(sequence) is None:
+        raise ScaleError(
+            f"{sequence.name}: the rig of one camera moves from the first frame on, and no start explains its tracks "
+            f"from frame to frame, so that its scale and the noise of its unit are unknown: {_ADVICE}"
+        )
     if found is None:
         found = Densities(from_differences(samples), "from differences of samples: no stretch shows them otherwise")
     return config.with_overrides({"inertial": {name: getattr(found.noise, name) for name in missing}}), found.text
@@ -498,19 +504,24 @@ def _likeliest_densities(sequence: Sequence, config: Config) -> Densities | None
     return likeliest_densities(sequence, config.filter, begun)
 
 
+def _rest(sequence: Sequence) -> tuple[float, float] | None:
+    """Return begin and end of a rest at the first frame; noisier tracks of one camera may rest, too."""
+    return rest_of(sequence) or (rest_of(sequence, is_loose=True) if sequence.camera.is_monocular else None)
+
+
 def first_state(sequence: Sequence, config: Config, model: Model) -> InertialStart:
     """Return the first state of an inertial process and how it was found: at rest, in motion, or not at all."""
     samples = sequence.inertial
     assert samples is not None
     prior = FirstPrior.of(sequence.initial_T_world_imu, model, config.inertial.gravity_m_s2)
     is_monocular = sequence.camera.is_monocular
-    if (rest := rest_of(sequence) or (rest_of(sequence, is_loose=True) if is_monocular else None)) is not None:
+    if (rest := _rest(sequence)) is not None:
         return at_rest(samples, *rest, prior, densities_of(config))
     start, refused = in_motion(sequence, model, prior, config.filter)
     if is_monocular and start is None:
         raise ScaleError(
             f"{sequence.name}: the rig of one camera moves from the first frame on, and its scale and velocity are not "
-            f"found ({refused}): begin at rest (half a second) or where it accelerates, or give both cameras"
+            f"found ({refused}): {_ADVICE}"
         )
     return start or unknown(samples, float(sequence.time_s[0]), prior, refused or "in motion")
 
