@@ -283,7 +283,7 @@ def test_figures_of_papers_have_their_width_and_letters_of_eight_points(sequence
     for figure in drawn.values():
         assert figure.get_figwidth() == WIDTHS[width]
         assert {text.get_fontsize() for text in figure.findobj(Text) if text.get_text()} == {8.0}
-        assert not [text for text in (figure._suptitle, *(ax.title for ax in figure.axes)) if text and text.get_text()]
+        assert not [text for text in (figure.get_suptitle(), *(ax.get_title() for ax in figure.axes)) if text]
 
 
 def test_figures_of_papers_tell_estimators_apart_in_grey(sequence, results):

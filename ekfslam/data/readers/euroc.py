@@ -46,7 +46,7 @@ _PLACES = ("data.csv", *(f"{above}{folder}/data.csv" for above in ("", "mav0/") 
 def open_euroc(folder: Path, calibration: str | None = None) -> ImageRecording:
     """Open images, calibration, samples and truth of a recording; frames without samples are left out."""
     mav = _mav(folder) or folder
-    cameras = [name for name in CAMERAS if (mav / name / "data.csv").is_file()]
+    cameras = [name for name in CAMERAS if (mav / name).is_dir()]
     rig, imu = _calibration(mav, calibration, len(cameras) == 1), _inertial(mav)
     time_ns, files, found_notes = _frames(mav, cameras)
     load, deep = pair_files(*files, rig.left.size)
