@@ -45,15 +45,12 @@ def completed(tasks: Iterable[Task], submit: Callable[[Task], Future[Outcome]]) 
                 return
             # Do not wait while there is more to submit: an executor in this process has finished by now.
             finished, _ = wait(pending, timeout=None if task is None else 0, return_when=FIRST_COMPLETED)
-            for future in sorted(finished, key=_has_failed):  # an error ends the work, so it comes last
+            # An error ends the work, so it comes last.
+            for future in sorted(finished, key=lambda future: future.cancelled() or future.exception() is not None):
                 yield pending.pop(future), future.result()
     finally:
         for future in pending:
             future.cancel()
-
-
-def _has_failed(future: Future[Any]) -> bool:
-    return future.cancelled() or future.exception() is not None
 
 
 class SerialExecutor(Executor):
@@ -93,17 +90,12 @@ def open_executor(spec: str = "processes", workers: int | None = None) -> Iterat
         with _opened(kind, spec, workers) as executor:
             yield executor
     except Exception as error:
-        if not _is_of_executor(error):
+        is_of_dask = any(kind.__module__.startswith("distributed.") for kind in type(error).__mro__)
+        if not (is_of_dask or isinstance(error, BrokenExecutor | CancelledError)):  # an error of a task
             raise
         raise WorkerError(
             f"executor {spec}: {_LOST[kind]}. What is finished is kept: give the same command again"
         ) from None
-
-
-def _is_of_executor(error: Exception) -> bool:
-    """Return whether an error is one of an executor that has lost a worker, and not one of a task."""
-    of_dask = any(kind.__module__.startswith("distributed.") for kind in type(error).__mro__)
-    return of_dask or isinstance(error, BrokenExecutor | CancelledError)
 
 
 @contextmanager
@@ -118,10 +110,8 @@ def _opened(kind: str, spec: str, workers: int | None) -> Iterator[Executor]:
         with ProcessPoolExecutor(workers or os.cpu_count(), context, _end_with_parent) as processes:
             yield processes
     elif kind == "mpi":
-        try:
+        with _imported(spec):
             from mpi4py.futures import MPIPoolExecutor
-        except (ImportError, RuntimeError) as error:  # RuntimeError: there is no MPI library to load
-            raise _missing(spec, error) from None
         with MPIPoolExecutor(max_workers=workers) as ranks:
             yield ranks
     else:
@@ -142,11 +132,9 @@ def _quiet(logger: str) -> Iterator[None]:
 
 def _dask_client(spec: str) -> Any:
     """Return a client of a Dask scheduler, with certificates or without."""
-    try:
+    with _imported(spec):
         from distributed import Client
         from distributed.security import Security
-    except ImportError as error:
-        raise _missing(spec, error) from None
     security = None
     if spec.startswith("tls://"):
         security = Security(require_encryption=True)  # with the files of Dask's configuration
@@ -161,8 +149,13 @@ def _dask_client(spec: str) -> Any:
         raise ConfigError(f"executor {spec}: no scheduler there ({error})") from None
 
 
-def _missing(spec: str, error: Exception) -> ConfigError:
-    return ConfigError(f"executor {spec} is not installed ({error}); it comes with: pip install 'ekfslam[cluster]'")
+@contextmanager
+def _imported(spec: str) -> Iterator[None]:
+    try:
+        yield
+    except (ImportError, RuntimeError) as error:  # RuntimeError: there is no MPI library to load
+        said = f"executor {spec} is not installed ({error}); it comes with: pip install 'ekfslam[cluster]'"
+        raise ConfigError(said) from None
 
 
 def _end_with_parent() -> None:

@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
-from contextlib import AbstractContextManager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -33,33 +33,34 @@ Key = tuple[str, int]  # of a run: level and number in a study; digest and 0 in 
 
 def run_missing(
     journal: Journal,
-    tasks: Mapping[Key, Any],
-    submit: Callable[[Any], Future[Any]],
+    earlier: Callable[[], Iterable[tuple[Key, Record]]],
+    missing: Callable[[], Mapping[Key, Any]],
+    submit: Callable[..., Future[Any]],
     keep: Callable[[Key, Record], None],
     save: Callable[[], None],
     label: str,
 ) -> None:
-    """Run the tasks that the journal does not hold, and save the archive at the end or when an exception interrupts.
+    """Run what archive and journal do not hold, and save the archive at the end or when an exception interrupts.
 
-    After a kill, the next call finds the finished runs in the journal. It is removed once they are saved. ``submit``
-    hands a task to an executor, ``keep`` adds the record of a run to the archive, ``save`` writes it. Without a
-    ``label`` there is no progress bar. Raise an `ArchiveError` if the journal is of another study or damaged; nothing
-    is changed then.
+    ``keep`` takes in the records of the runs that the archive holds (``earlier``), of those in the journal, which a
+    kill has left, and of new ones. Then ``missing`` are arguments of ``submit`` by key. Without a ``label`` there is no
+    progress bar. Raise an `ArchiveError` if archive or journal are of another study or damaged; nothing is changed
+    then. Raise a `WriteError` if another study writes there.
     """
-    held = dict(journal.entries())
-    for key, record in held.items():
-        keep(key, record)
-    missing = [key for key in tasks if key not in held]
-    finished: Iterable[tuple[Key, Record]] = completed(missing, lambda key: submit(tasks[key]))
-    if label:
-        finished = progress(finished, label, "run", total=len(missing))
-    try:
-        for key, record in finished:
-            journal.append(key, record)
+    with files.held(journal.path):
+        for key, record in chain(earlier() if journal.archive.exists() else (), journal.entries()):
             keep(key, record)
-    finally:
-        save()
-        journal.remove()
+        tasks = missing()
+        finished: Iterable[tuple[Key, Record]] = completed(tasks, lambda key: submit(*tasks[key]))
+        if label:
+            finished = progress(finished, label, "run", total=len(tasks))
+        try:
+            for key, record in finished:
+                journal.append(key, record)
+                keep(key, record)
+        finally:
+            save()
+            journal.remove()
 
 
 class Journal:
@@ -69,12 +70,8 @@ class Journal:
     """
 
     def __init__(self, archive: Path, study: Any, blank: Callable[[str], Record]) -> None:
-        self.path, self.blank = archive.with_name(f".{archive.name}.journal"), blank
+        self.archive, self.path, self.blank = archive, archive.with_name(f".{archive.name}.journal"), blank
         self._heading = json.dumps(study, sort_keys=True).encode()
-
-    def claimed(self) -> AbstractContextManager[None]:
-        """Claim journal and archive, from reading to the end of writing; `WriteError` if another study writes there."""
-        return files.held(self.path)
 
     def entries(self) -> Iterator[tuple[Key, Record]]:
         """Yield key and record of each complete run; raise `ArchiveError` if one is of another study."""
@@ -108,17 +105,12 @@ class Journal:
 
     def append(self, key: Key, record: Record) -> None:
         """Append a run and wait until it is on the disk; `WriteError` if that is full."""
-        parts = [
-            np.asarray(record[variant][name], dtype=value.dtype).tobytes()
-            for variant, fields in self.blank(key[0]).items()
-            for name, value in fields.items()
-        ]
-        content = framed(json.dumps(key).encode() + b"\n" + b"".join(parts))
+        blank = self.blank(key[0])
+        parts = [np.asarray(record[v][f], x.dtype).tobytes() for v, fields in blank.items() for f, x in fields.items()]
         before = self.path.stat().st_size if self.path.is_file() else 0
-        if before == 0:
-            content = framed(self._heading) + content
+        content = b"" if before else framed(self._heading)
+        content += framed(json.dumps(key).encode() + b"\n" + b"".join(parts))
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("ab") as file:
                 file.write(content)
                 file.flush()

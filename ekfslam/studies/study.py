@@ -13,10 +13,12 @@ a consistent filter equals its degrees of freedom. Results are bit-equal for any
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -33,17 +35,15 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import Loop, simulate
 from ekfslam.data.worlds import require_kind
 from ekfslam.errors import ArchiveError, ConfigError, FilterError
-from ekfslam.evaluation.consistency import nanmean, nees, pose_error
+from ekfslam.evaluation.consistency import nanmean, nees, pose_error, world_axes_errors, world_axes_std
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.filters.result import ERROR_CONVENTION
-from ekfslam.geometry import se3
-from ekfslam.geometry.motion import world_axes_covariance
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.provenance import provenance, versions
 from ekfslam.shown import Card, Shown, count
 from ekfslam.smoother.fixed_lag import FixedLag
-from ekfslam.stored import COUNTS, FLAGS, NOT_NEGATIVE_OR_NONE, NUMBERS_OR_NONE, Check, Item, Shape, fixed_length
+from ekfslam.stored import COUNTS, FLAGS, NOT_NEGATIVE_OR_NONE, NUMBERS_OR_NONE, Check, Item, Layout, Shape, zeros
 from ekfslam.studies.executors import ONE_RUN_AT_A_TIME
 from ekfslam.studies.journal import Journal, Key, Record, flat, run_missing
 
@@ -109,6 +109,7 @@ VARIANT_LAYOUT = (
     _field("three_sigma", ("T", "error"), "m (0-2), rad (3-5)", "bounds of position and rotation error, world axes"),
     _field("diverged", (), "1", "stopped with an error, not finite, or left the ring altogether", FLAGS),
 )
+_RUN_LAYOUT = tuple(item._replace(shape=item.shape[1:]) for item in VARIANT_LAYOUT)
 
 
 @dataclass(frozen=True, repr=False)
@@ -120,21 +121,16 @@ class Study(Shown):
             archive = run_study(study, "study.h5", executor)
         print(study_table(summarise_study(archive)))  # of ekfslam.studies.summary
 
-    Args:
-        levels: Name to world; the seed of a world is not used.
-        variants: Names in `STUDY_VARIANTS`: the variants of the filter, ``-iterated`` with three iterations per
-            update, and ``textbook``, the standard variant with landmarks in ``xyz``.
-        runs: Number of realisations of each level.
-        seed: Seed of all realisations.
-
-    Raises:
-        ConfigError: There is nothing to do, or a variant is unknown.
+    Raise a `ConfigError` if there is nothing to do, or a variant is unknown.
     """
 
+    # Name to world; the seed of a world is not used.
     levels: Mapping[str, Loop] = dataclasses.field(default_factory=lambda: dict(LEVELS))
+    # Names in `STUDY_VARIANTS`: the variants of the filter, ``-iterated`` with three iterations per update, and
+    # ``textbook``, the standard variant with landmarks in ``xyz``.
     variants: tuple[str, ...] = VARIANTS
-    runs: int = 50
-    seed: int = 0
+    runs: int = 50  # number of realisations of each level
+    seed: int = 0  # seed of all realisations
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "levels", dict(self.levels))  # a mapping proxy could not be sent to a worker
@@ -196,15 +192,15 @@ def run_one(study: Study, level: str, run: int) -> dict[str, dict[str, NDArray]]
         return {variant: evaluate(sequence, world, filter_config(world, variant)) for variant in study.variants}
 
 
-def _blank(frames: int, runs: tuple[int, ...] = ()) -> dict[str, NDArray]:
-    """Return every field of one variant without values: NaN, 0 or False."""
-    sizes, empty = {"T": frames, "J": JOINT_INSTANTS}, {"f": np.nan, "i": 0, "b": False}
-    return {
-        item.name: np.full(
-            (*runs, *(sizes.get(n) or fixed_length(n) or 0 for n in item.shape[1:])), empty[item.check.kinds]
-        )
-        for item in VARIANT_LAYOUT
-    }
+def _blank(study: Study, level: str, layout: Layout = _RUN_LAYOUT) -> dict[str, dict[str, NDArray]]:
+    """Return every field of every variant without values: NaN, 0 or False."""
+    sizes = {"runs": study.runs, "T": study.levels[level].frames, "J": JOINT_INSTANTS}
+    return {variant: _no_values(layout, sizes) for variant in study.variants}
+
+
+def _no_values(layout: Layout, sizes: Mapping[str, int]) -> dict[str, NDArray]:
+    found = zeros(layout, **sizes)
+    return {name: np.full_like(x, np.nan) if x.dtype.kind == "f" else x for name, x in found.items()}
 
 
 def _joint_frames(frames: int) -> list[int]:
@@ -220,13 +216,12 @@ def evaluate(sequence: Sequence, world: Loop, config: FilterConfig) -> dict[str,
     T_true = np.full((frames, 4, 4), np.nan)
     T_true[truth.frame] = truth.T_world_imu
     T_est, P_pose = np.full((frames, 4, 4), np.nan), np.full((frames, 6, 6), np.nan)
-    record = _blank(frames)
+    record = _no_values(_RUN_LAYOUT, {"T": frames, "J": JOINT_INSTANTS})
     joint_frames = _joint_frames(frames)
 
     rig, start = Rig(sequence.camera, sequence.T_cam_imu, noise), sequence.initial_T_world_imu
     ekf = JointEKF(rig, config, start, window=FixedLag)
-    known = np.zeros(frames, dtype=bool)
-    stopped = False
+    known, stopped = np.zeros(frames, dtype=bool), False
     try:
         for k, report, _ in run_filter(ekf, sequence):
             if not (np.isfinite(ekf.T_imu_world).all() and ekf.gaussian.is_finite):
@@ -259,10 +254,9 @@ def _put_errors(record: dict[str, NDArray], known: BoolArray, T_est: Array, T_tr
     record["pose_nees"][known] = nees(xi, P)
     record["position_nees"][known] = nees(xi[:, :3], P[:, :3, :3])
     record["orientation_nees"][known] = nees(xi[:, 3:], P[:, 3:, 3:])
-    record["position_error"][known] = T_est[:, :3, 3] - T_true[:, :3, 3]
-    record["rotation_error"][known] = se3.so3_log(T_est[:, :3, :3] @ np.swapaxes(T_true[:, :3, :3], 1, 2))
-    variance = np.hstack([np.diagonal(c, axis1=1, axis2=2) for c in world_axes_covariance(T_est, P)])
-    record["three_sigma"][known] = 3.0 * np.sqrt(np.maximum(variance, 0.0))
+    errors = world_axes_errors(T_est, T_true)
+    record["position_error"][known], record["rotation_error"][known] = errors[:, :3], errors[:, 3:]
+    record["three_sigma"][known] = 3.0 * world_axes_std(T_est, P)
 
 
 @dataclass(frozen=True, repr=False)
@@ -278,11 +272,8 @@ class StudyArchive(Shown):
     @staticmethod
     def empty(study: Study) -> StudyArchive:
         """Return an archive with room for all runs."""
-        data = {
-            level: {variant: _blank(world.frames, (study.runs,)) for variant in study.variants}
-            for level, world in study.levels.items()
-        }
-        return StudyArchive(study, {level: np.zeros(study.runs, dtype=bool) for level in study.levels}, data)
+        done = {level: np.zeros(study.runs, dtype=bool) for level in study.levels}
+        return StudyArchive(study, done, {level: _blank(study, level, VARIANT_LAYOUT) for level in study.levels})
 
     def card(self) -> Card:
         runs = self.study.runs
@@ -329,32 +320,25 @@ def run_study(study: Study, path: str | Path, executor: Executor, progress: bool
     path = Path(path)
     archive = StudyArchive.empty(study)
     decides = {**study.parameters, "runs": None, **versions()}
-    journal = Journal(
-        path, decides, lambda level: {variant: _blank(study.levels[level].frames) for variant in study.variants}
-    )
+    journal = Journal(path, decides, partial(_blank, study))
+
+    def missing() -> dict[Key, tuple[Study, str, int]]:
+        keys = itertools.product(range(study.runs), study.levels)
+        return {(level, run): (study, level, run) for run, level in keys if not archive.done[level][run]}
 
     def keep(key: Key, record: Record) -> None:
+        level, run = key
         for variant, fields in record.items():
-            _require_run(f"{path}: {variant} of run {key[1]} at {key[0]}", fields)
-        if key[1] < study.runs:  # the journal may be one of a longer study
+            _require_run(f"{path}: {variant} of run {run} at {level}", fields)
+        if run < study.runs:  # the journal may be one of a longer study
             archive.put(key, record)
 
     def save() -> None:
-        if archive.runs > before:
+        if journal.path.stat().st_size:  # some runs have finished
             write_study(path, archive)
 
-    with journal.claimed():
-        if path.exists():
-            _take_over(archive, path)
-        before = archive.runs
-        tasks = {
-            (level, run): (study, level, run)
-            for run in range(study.runs)
-            for level in study.levels
-            if not archive.done[level][run]
-        }
-        label = "consistency" if progress else ""
-        run_missing(journal, tasks, lambda task: executor.submit(run_one, *task), keep, save, label)
+    earlier, label = partial(_earlier, path, study), "consistency" if progress else ""
+    run_missing(journal, earlier, missing, lambda *task: executor.submit(run_one, *task), keep, save, label)
     return archive
 
 
@@ -367,16 +351,14 @@ def _require_run(place: str, record: Mapping[str, NDArray]) -> None:
         raise ArchiveError(f"{place}: it did not diverge, but has no last position")
 
 
-def _take_over(archive: StudyArchive, path: Path) -> None:
-    """Copy the finished runs of an earlier archive; raise an `ArchiveError` if it is of another study."""
+def _earlier(path: Path, study: Study) -> Iterator[tuple[Key, Record]]:
+    """Yield the finished runs of an archive; raise an `ArchiveError` if it is of another study."""
     old = read_study(path)
-    study = archive.study
-    wanted, found = study.parameters, old.study.parameters
+    wanted, found = dict(flat(study.parameters)), dict(flat(old.study.parameters))
     found["runs"] = max(found["runs"], wanted["runs"])
     # Numbers of another version of the software may differ in the last bits, which matters only if they would mix.
     if not (old.complete and old.study.runs == study.runs):
         wanted, found = {**wanted, **versions()}, {**found, **old.software}
-    wanted, found = dict(flat(wanted)), dict(flat(found))
     differing = [name for name in {**found, **wanted} if found.get(name) != wanted.get(name)]
     if differing:
         said = [f"{name} is {found.get(name)}, asked for {wanted.get(name)}" for name in differing[:3]]
@@ -386,10 +368,7 @@ def _take_over(archive: StudyArchive, path: Path) -> None:
         )
     for level, done in old.done.items():
         for run in np.flatnonzero(done).tolist():
-            record = {v: {f: x[run] for f, x in of.items()} for v, of in old.data[level].items()}
-            for variant, fields in record.items():
-                _require_run(f"{path}: {variant} of run {run} at {level}", fields)
-            archive.put((level, run), record)
+            yield (level, run), {v: {f: x[run] for f, x in of.items()} for v, of in old.data[level].items()}
 
 
 def write_study(path: str | Path, archive: StudyArchive) -> None:

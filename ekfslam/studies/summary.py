@@ -47,8 +47,7 @@ def study_runs(archive: StudyArchive) -> SweepTable:
     rows = []
     for level in archive.data:
         for variant, values in archive.finished(level).items():
-            found = {name: nanmean(values[name], axis=1) for name in (*_NEES, "joint_nees_per_dof")}
-            found["nis_per_dof"] = _nis_per_dof(values)
+            found = _averages(values)
             for name, unit, scale in (("position", "m", 1.0), ("rotation", "deg", np.degrees(1.0))):
                 squares = np.sum(values[f"{name}_error"] ** 2, axis=-1)
                 found[f"{name}_rmse_{unit}"] = scale * np.sqrt(nanmean(squares, axis=1))
@@ -59,22 +58,21 @@ def study_runs(archive: StudyArchive) -> SweepTable:
     return SweepTable.of_rows(rows, ("recording", "variant", "seed"), len(rows), headings)
 
 
-def _nis_per_dof(values: Mapping[str, NDArray]) -> Array:
-    """Return the sum of NIS over the sum of degrees of freedom of each run (runs,)."""
+def _averages(values: Mapping[str, NDArray]) -> dict[str, Array]:
+    """Return the average over time (runs,) of each field; of NIS the sum over the sum of its degrees of freedom."""
+    found = {name: nanmean(values[name], axis=1) for name in (*_NEES, "joint_nees_per_dof")}
     dof = values["nis_dof"].sum(axis=1)
-    return np.where(dof > 0, np.nansum(values["nis"], axis=1) / np.maximum(dof, 1), np.nan)
+    return found | {"nis_per_dof": np.where(dof > 0, np.nansum(values["nis"], axis=1) / np.maximum(dof, 1), np.nan)}
 
 
 def _summarise(values: Mapping[str, NDArray]) -> dict[str, Any]:
     """Return the figures of merit of one variant from its fields (runs, ...)."""
     out: dict[str, Any] = {}
-    for field, (dof, _) in _NEES.items():
-        average = average_over_runs(nanmean(values[field], axis=1))
-        bounds = [float(b) for b in chi2_bounds(dof, BOUND_PROBABILITY, max(average["runs"], 1))]
-        out[field] = {**average, "expected": dof, "bounds": bounds}
-    ratios = (nanmean(values["joint_nees_per_dof"], axis=1), _nis_per_dof(values))
-    for name, per_run in zip(_RATIOS, ratios, strict=True):
-        out[name] = {**average_over_runs(per_run), "expected": 1}
+    for name, per_run in _averages(values).items():
+        average, dof = average_over_runs(per_run), _NEES[name][0] if name in _NEES else 1
+        out[name] = {**average, "expected": dof}
+        if name in _NEES:
+            out[name]["bounds"] = list(map(float, chi2_bounds(dof, BOUND_PROBABILITY, max(average["runs"], 1))))
     out["position_rmse_m"] = _rms(values["position_error"])
     rotation = _rms(values["rotation_error"])
     out["rotation_rmse_deg"] = None if rotation is None else float(np.degrees(rotation))
@@ -92,26 +90,14 @@ def _rms(errors: Array) -> float | None:
 
 def study_table(summary: Mapping[str, Any]) -> str:
     """Return `summarise_study` as a Markdown table, one row a level and variant."""
-    (_, first), *others = _NEES.values()
-    headings = ["level", "variant", first, "median", *(heading for _, heading in others), *_RATIOS.values()]
-    headings += ["RMSE [m]", "RMSE [deg]", "diverged"]
-    means = [*list(_NEES)[1:], *_RATIOS]
-    rows = []
+    figures = [*(heading for _, heading in _NEES.values()), *_RATIOS.values(), *_RMSE.values()]
+    headings, rows = ["level", "variant", figures[0], "median", *figures[1:], "diverged"], []
     for level, variants in summary["levels"].items():
         for variant, found in variants.items():
-            pose = found["pose_nees"]
-            rows.append(
-                [
-                    level,
-                    LABELS[variant],
-                    plus_minus(significant(pose["mean"]), significant(pose["half_width"])),
-                    significant(pose["median"]),
-                    *(significant(found[name]["mean"]) for name in means),
-                    significant(found["position_rmse_m"]),
-                    significant(found["rotation_rmse_deg"]),
-                    f"{found['diverged']} of {found['runs']}",
-                ]
-            )
+            pose, *means = (significant(found[name]["mean"]) for name in (*_NEES, *_RATIOS))
+            pose = plus_minus(pose, significant(found["pose_nees"]["half_width"]))
+            numbers = [pose, significant(found["pose_nees"]["median"]), *means, *(significant(found[x]) for x in _RMSE)]
+            rows.append([level, LABELS[variant], *numbers, f"{found['diverged']} of {found['runs']}"])
     study = summary["study"]
     low, high = chi2_bounds(6, BOUND_PROBABILITY, study["runs"])
     note = (

@@ -17,7 +17,7 @@ import itertools
 import json
 import math
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
@@ -58,9 +58,8 @@ _ERROR_BYTES = 400
 _KEYS = {"recordings": list, "modes": list, "variants": list, "seeds": list, "settings": dict, "cases": dict}
 _KEYS |= {"with": dict, "with_frame": str, "with_world": str}
 _KINDS = {list: "list", dict: "table", str: "text"}
-_FILES = ("data", "truth", "velocities", "calibration", "imu", "imu_noise")  # of a recording
-# Arguments of `open_sequence`.
-_READ_AS = ("truth", "extrinsics", "lateral", "velocities", "velocity_frame", "topics", *_FILES[3:])
+_FILES = ("truth", "velocities", "calibration", "imu", "imu_noise")  # of a recording, beside its data
+_READ_AS = ("extrinsics", "lateral", "velocity_frame", "topics", *_FILES)  # arguments of `open_sequence`
 _RECORDING_KEYS = ("data", "name", "frames", *_READ_AS)
 _TAKEN = ("key", "recording", "seed", "case", "mode", "error", "run", *KEYS)  # names of columns
 
@@ -69,20 +68,12 @@ Column = Callable[[Sequence, Result], float | None]
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording of a sweep.
+    """A recording of a sweep."""
 
-    Args:
-        data: Path, or ``builtin:NAME``.
-        name: Name in the table.
-        truth, extrinsics, lateral, velocities, velocity_frame, topics, calibration, imu, imu_noise: Arguments of
-            `ekfslam.open_sequence`; ``topics`` in a file is one text with blanks between names.
-        frames: Stretch ``A:B`` of the recording, empty for all of it; applied before ``prepare``.
-        prepare: Function from the sequence and the seed (None without seeds) to the sequence that is run. It must be a
-            function of a module, or a `functools.partial` of one, and draw random numbers from the seed alone.
-    """
-
-    data: str
-    name: str
+    data: str  # path, or ``builtin:NAME``
+    name: str  # name in the table
+    # truth, extrinsics, lateral, velocities, velocity_frame, topics, calibration, imu, imu_noise: arguments of
+    # `ekfslam.open_sequence`; ``topics`` in a file is one text with blanks between names.
     truth: str | None = None
     extrinsics: str = "corrected"
     lateral: str = "corrected"
@@ -92,7 +83,9 @@ class Recording:
     calibration: str | None = None
     imu: str | None = None
     imu_noise: str | None = None
-    frames: str = ""
+    frames: str = ""  # stretch ``A:B`` of the recording, empty for all of it; applied before ``prepare``
+    # Function from the sequence and the seed (None without seeds) to the sequence that is run. It must be a function of
+    # a module, or a `functools.partial` of one, and draw random numbers from the seed alone.
     prepare: Callable[[Sequence, int | None], Sequence] | None = None
 
     @property
@@ -113,14 +106,10 @@ class Recording:
     @cached_property
     def content(self) -> str:
         """Everything that decides its numbers: digests of its files or the name of the world, and its preparation."""
-        files = {name: getattr(self, name) for name in ("velocities", "calibration", "imu", "imu_noise")}
-        further = {name: path and _digest(Path(path)) for name, path in files.items()}
-        further |= {"frames": self.frames, "velocity_frame": self.velocity_frame, "topics": " ".join(self.topics)}
-        facts = [self.data] if self.is_simulated else [self.extrinsics, self.lateral]
-        if not self.is_simulated:
-            facts += [_digest(Path(path)) for path in (self.data, self.truth) if path]
-        facts += [] if self.prepare is None else [_source(self.prepare)]
-        return " ".join([*facts, *(f"{name} {value}" for name, value in further.items() if value)])
+        facts = {name: getattr(self, name) for name in ("data", "frames", *_READ_AS)}
+        for name in _FILES if self.is_simulated else ("data", *_FILES):
+            facts[name] = facts[name] and _digest(Path(facts[name]))
+        return json.dumps([facts, _source(self.prepare)])
 
 
 @dataclass(frozen=True)
@@ -161,11 +150,10 @@ class Task:
         return self._key(settings)
 
     def _key(self, settings: Mapping[str, Any]) -> str:
-        facts: list[Any] = [self.recording.content, self.mode, settings, versions(), _program()]
+        columns = {name: _source(column) for name, column in self.columns.items()}
+        facts: list[Any] = [self.recording.content, self.mode, settings, versions(), _program(), columns]
         if self.recording.prepare is not None:
             facts.append(self.seed)
-        if self.columns:
-            facts.append({name: _source(column) for name, column in self.columns.items()})
         for path in self.others.files.values():
             facts += [*map(_digest, files_of(path)), self.others.frame, self.others.world]
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
@@ -198,9 +186,8 @@ class Sweep:
         for name in self.columns:
             if name in _TAKEN or not name or set(name) & set("./"):
                 raise ConfigError(f"a column of a sweep cannot have the name {name!r}")
-        seeded = sum(len(self._seeds_of(recording)) for recording in self.recordings)
-        seeds = max((len(self._seeds_of(recording)) for recording in self.recordings), default=1)
-        self.others.require_distinct(len(self.recordings), seeds)
+        seeded = len(self._seeded)
+        self.others.require_distinct(len(self.recordings), len({seed for _, seed in self._seeded} - {None}))
         ways = sum(1 if case.mode else len(self.modes) for case in self._cases.values())
         count = seeded * ways * len(self.variants) * math.prod(len(values) for _, values in flat(self.settings))
         if not 1 <= count <= MOST_RUNS:
@@ -215,32 +202,30 @@ class Sweep:
     def _cases(self) -> Mapping[str, Case]:
         return self.cases or {"": Case()}
 
-    def _seeds_of(self, recording: Recording) -> tuple[int | None, ...]:
-        return self.seeds if self.seeds and recording.is_seeded else (None,)
+    @property
+    def _seeded(self) -> list[tuple[Recording, int | None]]:
+        """Each recording with each of its seeds."""
+        return [(own, seed) for own in self.recordings for seed in (own.is_seeded and self.seeds) or (None,)]
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
         """All runs; the mode changes fastest."""
-        choices = dict(flat(self.settings))
-        found = []
-        seeded = [(recording, seed) for recording in self.recordings for seed in self._seeds_of(recording)]
-        for (recording, seed), (name, case), variant, values in itertools.product(
-            seeded, self._cases.items(), self.variants, list(itertools.product(*choices.values()))
-        ):
-            overrides: dict[str, dict[str, Any]] = {"filter": {"variant": variant}}
-            for setting, value in zip(choices, values, strict=True):
-                _put(overrides, setting, value)
-            for table, own in case.overrides.items():
-                overrides.setdefault(table, {}).update(own)
-            modes = (case.mode,) if case.mode else self.modes
-            found += [Task(recording.with_seed(seed), seed, name, mode, overrides, self.columns) for mode in modes]
-        for recording, seed in seeded:
+        choices, found = dict(flat(self.settings)), []
+        for recording, seed in self._seeded:
             own, named = recording.with_seed(seed), self.others.named(recording.name, seed)
+            grid = itertools.product(self._cases.items(), self.variants, itertools.product(*choices.values()))
+            for (name, case), variant, values in grid:
+                overrides: dict[str, dict[str, Any]] = {"filter": {"variant": variant}}
+                for setting, value in zip(choices, values, strict=True):
+                    _put(overrides, setting, value)
+                for table, settings in case.overrides.items():
+                    overrides.setdefault(table, {}).update(settings)
+                modes = (case.mode,) if case.mode else self.modes
+                found += [Task(own, seed, name, mode, overrides, self.columns) for mode in modes]
             for name, path in named.files.items():
                 only = dataclasses.replace(named, files={name: path})
                 found.append(Task(own, seed, "", name, {}, self.columns, only))
-        order = {(recording.with_seed(seed), seed): place for place, (recording, seed) in enumerate(seeded)}
-        return tuple(sorted(found, key=lambda task: order[task.recording, task.seed]))
+        return tuple(found)
 
     @staticmethod
     def from_toml(path: str | Path) -> Sweep:
@@ -259,10 +244,18 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
     """
     path = Path(path)
     tasks = {(task.key, 0): task for task in sweep.tasks}
-    done: dict[Key, Mapping[str, NDArray]] = {}
-    twins: dict[str, list[Key]] = {}
-    for key, task in tasks.items():
-        twins.setdefault(task.run_key, []).append(key)
+    journal = Journal(path, "sweep", lambda _: _record(sweep.columns, {}))
+    done: dict[str, Mapping[str, NDArray]] = {}  # by `Task.run_key`
+
+    def earlier() -> Iterator[tuple[Key, Record]]:
+        for row in read_table(path).rows():
+            yield (row["key"], 0), _record(sweep.columns, row, row["error"])
+
+    def missing() -> dict[Key, tuple[Task, float]]:
+        limit, runs = limit_gb(), dict[str, Task]()
+        for task in sweep.tasks:
+            runs.setdefault(task.run_key, task)
+        return {(task.key, 0): (task, limit) for run, task in runs.items() if run not in done}
 
     def keep(key: Key, record: Record) -> None:
         if key not in tasks:
@@ -271,22 +264,14 @@ def run_sweep(sweep: Sweep, path: str | Path, executor: Executor, progress: bool
                 "choose another folder"
             )
         _require_row(f"{path}: run {key[0]}", record["run"], is_own=not tasks[key].others.files)
-        for twin in twins[tasks[key].run_key]:
-            done[twin] = record["run"]
+        done[tasks[key].run_key] = record["run"]
 
     def save() -> None:
         if done:
             write_table(path, _table(sweep, done))
 
-    journal = Journal(path, "sweep", lambda _: _record(sweep.columns, {}))
-    with journal.claimed():
-        if path.exists():
-            for row in read_table(path).rows():
-                keep((row["key"], 0), _record(sweep.columns, row, row["error"]))
-        missing = {key: tasks[key] for key, *_ in twins.values() if key not in done}
-        limit = limit_gb()
-        label = "sweep" if progress else ""
-        run_missing(journal, missing, lambda task: executor.submit(run_task, task, limit), keep, save, label)
+    label = "sweep" if progress else ""
+    run_missing(journal, earlier, missing, lambda *task: executor.submit(run_task, *task), keep, save, label)
     return _table(sweep, done)
 
 
@@ -337,11 +322,11 @@ def _opened(recording: Recording, seed: int | None, front_end: FrontEndConfig) -
     return sequence if recording.prepare is None else recording.prepare(sequence, seed)
 
 
-def _table(sweep: Sweep, done: Mapping[Key, Mapping[str, NDArray]]) -> SweepTable:
+def _table(sweep: Sweep, done: Mapping[str, Mapping[str, NDArray]]) -> SweepTable:
     """Return the finished runs in the order of the sweep."""
     rows = []
     for task in sweep.tasks:
-        record = done.get((task.key, 0))
+        record = done.get(task.run_key)
         if record is None:
             continue
         settings = dataclasses.asdict(task.config)
@@ -386,11 +371,8 @@ def _parsed(found: Mapping[str, Any], folder: Path) -> Sweep:
     for name, path in found.get("with", {}).items():
         if not isinstance(path, str):
             raise ConfigError(f"with.{name} must be a path, found {path!r}")
-    others = Others(
-        {name: str(folder / path) for name, path in found.get("with", {}).items()},
-        found.get("with_frame"),
-        found.get("with_world", "first"),
-    )
+    theirs = {name: str(folder / path) for name, path in found.get("with", {}).items()}
+    others = Others(theirs, found.get("with_frame"), found.get("with_world", "first"))
     return Sweep(recordings, settings=settings, cases=cases, others=others, **given)
 
 
@@ -419,13 +401,11 @@ def _recording(entry: Any, folder: Path) -> Recording:
         stretch(given.get("frames", ":"))
     except ValueError as error:
         raise ConfigError(f"frames of {data}: {error}") from None
-    places = {key: str((folder / given[key]).resolve()) for key in _FILES if key in given}
-    name = Path(data).stem
-    if data.startswith(BUILTIN):
-        places["data"], name = data, data.removeprefix(BUILTIN)
-    if "topics" in given:
-        given = {**given, "topics": tuple(given["topics"].split())}
-    return Recording(**{**given, **places, "name": printable(given.get("name", name))})
+    is_file = not data.startswith(BUILTIN)
+    name = given.get("name", Path(data).stem if is_file else data.removeprefix(BUILTIN))
+    files = [key for key in ("data", *_FILES) if key in given and (is_file or key != "data")]
+    places = {key: str((folder / given[key]).resolve()) for key in files}
+    return Recording(**{**given, **places, "name": printable(name), "topics": tuple(given.get("topics", "").split())})
 
 
 # --- Digests ---------------------------------------------------------------------------------------------------------

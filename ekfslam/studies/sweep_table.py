@@ -141,7 +141,7 @@ class SweepTable:
         names, kept = [name for name in self.told if name not in over], self._without_repeats()
         parts = kept.groups(*names) if names else {(): kept}
         texts = [Column(self.words(name), [spoken(key[i]) for key in parts]) for i, name in enumerate(names)]
-        numbers = [Column("runs", [len(part) for part in parts.values()])]
+        numbers, gaps = [Column("runs", [len(part) for part in parts.values()])], list[str]()
         shown = [name for name in self._shown(figures) if self.column(name).dtype.kind == "f"]
         for place, name in enumerate(shown):
             values = [x[np.isfinite(x)] for x in (part.column(name) for part in parts.values())]
@@ -152,15 +152,10 @@ class SweepTable:
             numbers.append(one := self._column(name, mean, errors))
             further = {} if place else {"median": median, "worst": worst}
             numbers += [Column(heading, x, decimals=one.places) for heading, x in further.items()]
+            lacking = sum(len(part) - len(x) for part, x in zip(parts.values(), values, strict=True) if len(x))
+            gaps += [f"{self.words(name)} is missing in {count(lacking, 'run')}"] if lacking else []
         groups = [key[names.index("recording")] if "recording" in names else "" for key in parts]
         words = f"± is the standard error over {' and '.join(f'{name}s' for name in over if name in self.told)}"
-        known = {name: [int(np.isfinite(part.column(name)).sum()) for part in parts.values()] for name in shown}
-        lacking = {name: [len(p) - n for n, p in zip(known[name], parts.values(), strict=True) if n] for name in shown}
-        gaps = [
-            f"{self.words(name)} is missing in {count(sum(found), 'run')}"
-            for name, found in lacking.items()
-            if any(found)
-        ]
         return Grid([*texts, *numbers], groups, ["; ".join([words, *gaps, self._head(self.told)])])
 
     def tests(self, figures: Sequence[str] = SHOWN) -> tuple[Grid | None, tuple[str, ...]]:
@@ -209,11 +204,8 @@ class SweepTable:
         facts = [
             x for name, x in columns.items() if name != "key" and name not in _TIMES and is_known_to_prediction(name)
         ]
-        repeated, seen = set(rows.tolist()), set[str]()
-        for row in rows.tolist():
-            if (text := str([x[row] for x in facts])) not in seen:
-                seen.add(text)
-                repeated.remove(row)
+        first = {str([x[row] for x in facts]): row for row in reversed(rows.tolist())}
+        repeated = {*rows.tolist()} - {*first.values()}
         return replace(self, columns=columns)._only([row for row in range(len(self)) if row not in repeated])
 
     def _head(self, told: Sequence[str]) -> str:
@@ -227,11 +219,9 @@ class SweepTable:
     def markdown(self, figures: Sequence[str] = SHOWN) -> str:
         """Return some figures of merit of all runs as Markdown, with their means over seeds and paired tests."""
         tests, said = self.tests(figures)
-        means = [markdown_text(self.means(figures))] if self._is_repeated("seed") else []
-        further = [*means, *([] if tests is None else [markdown_text(tests)])]
-        if means and tests is None:
-            further += said
-        return document(markdown_text(self.grid(figures)), *further)
+        means = [self.means(figures)] if self._is_repeated("seed") else []
+        grids = [self.grid(figures), *means, *([] if tests is None else [tests])]
+        return document(*map(markdown_text, grids), *(said if means and tests is None else ()))
 
 
 def words_of(column: str) -> str:

@@ -62,6 +62,7 @@ _NEVER = 1e9  # deviations beyond which a track moves
 
 _NO_PART = "the likelihood does not depend on it where tracks err; not refined"
 _UNSEEN = "the differences see none; not refined"
+_AT_BOUND = "at the bound of the search range"
 _BELOW_FLOOR = "below the errors of the motion that are assumed anyway; not refined"
 
 
@@ -79,44 +80,31 @@ class Estimate:
 
 @dataclass(frozen=True)
 class TunedNoise:
-    """Result of `tune`.
+    """Result of `tune`."""
 
-    Args:
-        sequence: Name of the recording.
-        model: Model of the noise as in `NoiseConfig`: ``tuned`` or ``white``.
-        estimates: All parameters, searched by likelihood or not.
-        found: Noise of the velocities by their differences.
-        log_likelihood: Maximum of the likelihood alone.
-        frames, runs: Number of frames in a run, and number of runs.
-        converged: Whether the maximum was found within the limit of runs.
-    """
-
-    sequence: str
-    model: str
-    estimates: tuple[Estimate, ...]
-    found: VelocityNoise
-    log_likelihood: float
-    frames: int
-    runs: int
-    converged: bool
+    sequence: str  # name of the recording
+    model: str  # model of the noise as in `NoiseConfig`: tuned or white
+    estimates: tuple[Estimate, ...]  # all parameters, searched by likelihood or not
+    found: VelocityNoise  # noise of the velocities by their differences
+    log_likelihood: float  # maximum of the likelihood alone
+    frames: int  # number of frames in a run
+    runs: int  # number of runs
+    converged: bool  # whether the maximum was found within the limit of runs
 
     @property
     def config(self) -> Config:
         """Settings with the tuned noise and the record of its origin."""
         values = {estimate.name: estimate.value for estimate in self.estimates}
         errors = {f"{estimate.name}_error": estimate.error for estimate in self.estimates}
-        facts = {name: getattr(self, name) for name in ("sequence", "frames", "runs", "log_likelihood")}
-        remarks = {"remarks": "; ".join(self.remarks) or None}
-        record = {**facts, **values, **errors, **found_attributes(self.found), **remarks}
+        record = {name: getattr(self, name) for name in ("sequence", "frames", "runs", "log_likelihood")}
+        record |= {**values, **errors, **found_attributes(self.found), "remarks": "; ".join(self.remarks) or None}
         return Config().with_overrides({"noise": {"model": self.model, **values}, "tuning": record})
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Remarks on the maximum, one sentence each."""
-        remarks = [f"{estimate.name}: {estimate.remark}" for estimate in self.estimates if estimate.remark]
-        if not self.converged:
-            remarks.append(f"stopped after {self.runs} runs before the maximum was found")
-        return tuple(remarks)
+        late = () if self.converged else (f"stopped after {self.runs} runs before the maximum was found",)
+        return (*(f"{estimate.name}: {estimate.remark}" for estimate in self.estimates if estimate.remark), *late)
 
     @property
     def toml(self) -> str:
@@ -231,10 +219,9 @@ class Likelihood:
     parts: list[Sequence]  # stretches of the recording
     base: Noise  # noise whose parameters are replaced
     free: list[str]  # names of the parameters
-    gated: Config  # gated, ungated: settings of the filter that reject wrong matches, and that reject nothing
-    ungated: Config
-    # (6,) velocities whose noise the parameters are.
-    measured: BoolArray = field(default_factory=lambda: np.ones(6, dtype=bool))
+    gated: Config  # settings of the filter that reject wrong matches
+    ungated: Config  # settings that reject nothing
+    measured: BoolArray = field(default_factory=lambda: np.ones(6, dtype=bool))  # (6,) velocities with these parameters
 
     def noise(self, x: Array) -> Noise:
         """Return the noise at logarithms (n,) of the parameters."""
@@ -328,14 +315,12 @@ def estimates_of(start: dict[str, float], free: list[str], peak: Peak, found: Ve
             remark = f"likelihood and differences are {apart:.1f} standard errors apart" if sigma and apart > 3 else ""
             estimates.append(Estimate(name, value, total_error, likely, error, remark))
         elif name in free:
-            at_bound = free.index(name) not in peak.inside
-            remark = "at the bound of the search range" if at_bound else "the likelihood has no maximum here"
+            remark = "the likelihood has no maximum here" if free.index(name) in peak.inside else _AT_BOUND
             likely = float(f"{at_peak[name]:.6g}")
             estimates.append(Estimate(name, sigma or likely, sigma_error or None, likely, remark=remark))
         else:
             remark = _NO_PART if name == "sigma_px" else _BELOW_FLOOR if sigma else _UNSEEN
-            value = sigma if name in differences else value
-            estimates.append(Estimate(name, value, sigma_error or None, remark=remark))
+            estimates.append(Estimate(name, differences.get(name, (value,))[0], sigma_error or None, remark=remark))
     return tuple(estimates)
 
 
