@@ -93,10 +93,8 @@ def swept(name: str, sweep: Sweep, workers: int) -> SweepTable:
 
     The table is kept in ``results/local``, and computed again when the program has changed.
     """
-    decides = hashlib.sha256("".join(task.key for task in sweep.tasks).encode())
-    for source in sorted((ROOT / "ekfslam").rglob("*.py")):
-        decides.update(source.read_bytes())
-    path = ROOT / "results" / "local" / "sweeps" / f"{name}-{decides.hexdigest()[:12]}.h5"
+    decides = hashlib.sha256("".join(task.key for task in sweep.tasks).encode()).hexdigest()[:12]
+    path = ROOT / "results" / "local" / "sweeps" / f"{name}-{decides}.h5"
     with open_executor("processes", workers) as executor:
         table = run_sweep(sweep, path, executor)
     for why, failed in table.groups("error").items():
