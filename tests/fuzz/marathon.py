@@ -45,6 +45,7 @@ def drive(points_m: np.ndarray, frames: int, seen: int, rng: np.random.Generator
 def judged(P: np.ndarray) -> float:
     """Return the smallest eigenvalue of the correlations; raise unless P is symmetric and positive semi-definite."""
     std = np.sqrt(np.diag(P))
+    std[std == 0.0] = 1.0  # a pose that is known
     least = float(np.linalg.eigvalsh(P / np.outer(std, std))[0])
     assert np.isfinite(P).all() and np.abs(P - P.T).max() <= 1e-12 * np.abs(P).max() and least > -1e-9, least
     return least
