@@ -40,8 +40,11 @@ def marked(contents: Mapping[Path, str | bytes], archives: Iterable[Path]) -> di
 
 
 def _real(path: Path) -> Path:
-    """Return a path without links; `Path.resolve` raises errors for loops of links."""
-    return Path(os.path.realpath(path))
+    """Return a path without links; `Path.resolve` raises errors for loops of links. What no path can be stays."""
+    try:
+        return Path(os.path.realpath(path))
+    except ValueError:
+        return path
 
 
 def _seen_from(path: Path, archive: Path) -> str:
