@@ -31,9 +31,7 @@ struct Tried {
 
 // Whether tracks are tested for motion: if they have errors, from the second frame on.
 // For one camera a wrong depth looks like a motion along the way.
-bool judges_motion(const Estimate& e) {
-    return e.track_error && e.motion.tau_s > 0 && e.sensor.type == Sensor::rig;
-}
+bool judges_motion(const Estimate& e) { return e.track_error && e.motion.tau_s > 0 && e.sensor.type == Sensor::rig; }
 
 // The last step of the rig in world.
 Vector3 last_step(const Estimate& e) {

@@ -153,9 +153,9 @@ Flags Filter::start_new(Index frame, const Ids& ids, const Matrix& rows, Report&
         }
         e.updated = any && all_new ? Updated::view : Updated::none;
     }
-    report.begun = {picked(ids, which),           std::move(found.position_m), std::move(found.rows),
-                    std::move(found.variance),    found.step_before,           std::move(found.rows_before),
-                    std::move(found.variance_before)};
+    report.begun = {
+        picked(ids, which), std::move(found.position_m),  std::move(found.rows),           std::move(found.variance),
+        found.step_before,  std::move(found.rows_before), std::move(found.variance_before)};
     return found.which;
 }
 

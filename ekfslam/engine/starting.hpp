@@ -7,10 +7,10 @@ namespace ekfslam {
 
 // New tracks by whether they have a landmark now, and the observations that started those: for the log.
 struct Started {
-    std::vector<bool> which;  // (n)
-    Matrix position_m;        // (3, j)
-    Matrix rows, variance;    // (d, j) in this frame
-    Index step_before = -1;   // of the anchor, where two views start a landmark
+    std::vector<bool> which;              // (n)
+    Matrix position_m;                    // (3, j)
+    Matrix rows, variance;                // (d, j) in this frame
+    Index step_before = -1;               // of the anchor, where two views start a landmark
     Matrix rows_before, variance_before;  // (d, j) at the anchor
 };
 
