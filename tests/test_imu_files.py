@@ -25,6 +25,7 @@ from ekfslam.errors import (
     UnknownFormatError,
 )
 from ekfslam.geometry import se3
+from ekfslam.geometry.camera import T_CAM_BODY
 
 COUNT = 500
 TIME_NS = FIRST_NS + STEP_NS * np.arange(COUNT)
@@ -272,6 +273,13 @@ def test_images_without_extrinsics_need_a_chain_of_kalibr_beside_the_samples(tmp
     np.testing.assert_allclose(found.inertial.time_s, TIME_NS / 1e9 + 0.01, rtol=0, atol=3e-7)
     assert found.attributes["imu_late_s"] == -0.01
     assert not any("The body is the left camera" in note for note in found.notes)
+
+
+def test_only_an_inertial_unit_that_nothing_places_is_said_to_be_the_left_camera(tmp_path):
+    path, placed = written(tmp_path), dataclasses.replace(recording(), T_cam_imu=se3.exp(np.full(6, 0.3)))
+    for sequence, is_told in ((dataclasses.replace(placed, T_cam_imu=T_CAM_BODY), True), (placed, False)):
+        notes = attach_inertial(sequence, path).notes
+        assert any("the inertial unit is taken to be the left camera" in note for note in notes) is is_told
 
 
 def test_samples_given_as_arrays_are_looked_at_too():
