@@ -138,6 +138,16 @@ def test_one_camera_in_motion_with_few_tracks_is_refused():
         ekfslam.run(replace(sequence, observations=few))
 
 
+@pytest.mark.slow
+def test_a_start_in_motion_whose_tracks_the_filter_does_not_accept_is_refused():
+    """Two axes of the accelerometer point backwards: the few observations that are left fit a wrong start well."""
+    sequence = room(100, 1, max_range_m=10.0)[60:84]
+    wrong = replace(sequence.inertial, accel_m_s2=sequence.inertial.accel_m_s2 * [-1.0, -1.0, 1.0])
+    config = ekfslam.Config().with_overrides({"inertial": vars(wrong.noise)})
+    with pytest.raises(ScaleError, match="of the last observations fit"):
+        ekfslam.run(replace(sequence, inputs=(wrong,)), config=config)
+
+
 # --- errors of tracks that walk ---------------------------------------------------------------------------------------
 
 

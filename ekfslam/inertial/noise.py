@@ -104,6 +104,8 @@ def likeliest_densities(sequence: Sequence, config: FilterConfig, begun: Begun) 
     if stated is not None and not search.gains((0.0, 0.0, 0.0), at):
         return Densities(stated, "as stated: no others are clearly likelier")
     noise = search.noise(at)
+    if is_monocular and (noise.gyro > _REFUTED * upper.gyro or noise.accel > _REFUTED * upper.accel):
+        return None  # noisier than the samples can be: the first state is wrong
     of = f"{2.0 ** at[0]:.2g} and {2.0 ** at[1]:.2g} times the stated densities, " if stated else ""
     text = f"found from {len(search.stretches)} stretches: {of}gyroscope {noise.gyro:.2g} rad/s/sqrt(Hz), "
     walk = f"walks of biases {noise.gyro_walk:.2g} and {noise.accel_walk:.2g} per root of a second"
