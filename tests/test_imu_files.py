@@ -14,6 +14,7 @@ from support.imu import FIRST_NS, HEADER, STEP_NS, motion, rows, write_imu0, wri
 import ekfslam
 from ekfslam import attach_inertial
 from ekfslam.data.imu import attach_inertial_noise
+from ekfslam.data.inertial import NOT_STATED
 from ekfslam.errors import (
     CalibrationError,
     DataError,
@@ -145,7 +146,10 @@ def test_missing_densities_are_a_note(tmp_path):
     write_lines(tmp_path / "imu.yaml", yaml_lines()[:3])
     sequence = attached(written(tmp_path))
     assert sequence.inertial.noise is None
-    assert "imu.yaml does not state accelerometer_random_walk: its densities are not used." in sequence.notes
+    unused = "imu.yaml does not state accelerometer_random_walk: its densities are not used."
+    assert unused in sequence.notes and NOT_STATED in sequence.notes
+    given = attach_inertial_noise(sequence, write_lines(tmp_path / "a.yaml", yaml_lines()))
+    assert set(sequence.notes) - set(given.notes) == {unused, NOT_STATED}
 
 
 def test_a_named_file_must_state_all_densities(tmp_path):

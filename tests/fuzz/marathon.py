@@ -27,6 +27,7 @@ from ekfslam.geometry import se3
 from ekfslam.geometry.camera import project
 
 RADIUS_M, SPEED_M_S, STEP_S, SEEN = 10.0, 2.0, 0.1, 8
+LEAST, MOST_EIGENVALUES = 1e-9, 4000
 TURN = np.array([SPEED_M_S, 0.0, 0.0, 0.0, 0.0, SPEED_M_S / RADIUS_M])
 
 
@@ -43,11 +44,20 @@ def drive(points_m: np.ndarray, frames: int, seen: int, rng: np.random.Generator
 
 
 def judged(P: np.ndarray) -> float:
-    """Return the smallest eigenvalue of the correlations; raise unless P is symmetric and positive semi-definite."""
+    """Return the smallest eigenvalue of the correlations; raise unless P is symmetric and positive semi-definite.
+
+    Of thousands of landmarks, whose eigenvalues take too long, a bound of it is returned.
+    """
     std = np.sqrt(np.diag(P))
     std[std == 0.0] = 1.0  # a pose that is known
-    least = float(np.linalg.eigvalsh(P / np.outer(std, std))[0])
-    assert np.isfinite(P).all() and np.abs(P - P.T).max() <= 1e-12 * np.abs(P).max() and least > -1e-9, least
+    correlations = P / np.outer(std, std)
+    if len(P) > MOST_EIGENVALUES:
+        correlations[np.diag_indices_from(correlations)] += LEAST
+        np.linalg.cholesky(correlations)  # raises if there is one below
+        least = -LEAST
+    else:
+        least = float(np.linalg.eigvalsh(correlations)[0])
+    assert np.isfinite(P).all() and np.abs(P - P.T).max() <= 1e-12 * np.abs(P).max() and least >= -LEAST, least
     return least
 
 

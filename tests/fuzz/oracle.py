@@ -76,7 +76,7 @@ def verdict(case: Case, folder: Path) -> str:
         return f"exit code {code}: {error}"
     if code == 2 and error.count("\n") != 1 and not error.startswith("usage:"):
         return f"no single line: {error!r}"
-    if code == 2 and "damaged" in error and re.search(r"module|object has no|positional|unsupported", error):
+    if code == 2 and "damaged" in error and re.search(r"module|object has no|positional|unsupported operand", error):
         return f"an error of the program itself is blamed on the file: {error}"
     if case.arguments[0] == "sweep":  # a recording's name is the user's word
         printed = re.sub(r"\S*=\S*", "", printed)
