@@ -163,6 +163,12 @@ def test_a_lag_excludes_first_estimates_and_landmarks_that_wait():
         JointEKF(camera, FilterConfig(lag=3), world.initial_T_world_imu, window=FixedLag)
 
 
+def test_a_lag_without_a_window_is_an_error():
+    world = small_world(frames=3)
+    with pytest.raises(ConfigError, match="lag needs a window"):
+        JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), FilterConfig(lag=3), world.initial_T_world_imu)
+
+
 def test_a_landmark_that_comes_back_begins_a_new_window():
     """Its mean and covariance come from the whole log, and the window goes on from there."""
     world = recordings(12, scale=4e-3)["velocities"]

@@ -53,11 +53,11 @@ class JointEKF(Estimate):
             first `update`.
         blocks: Further state blocks.
         revival: Source of returning landmarks; None: they are initialised again.
-        window: Maker of the relinearised window for ``config.lag``, `ekfslam.smoother.fixed_lag.FixedLag`; None: no
-            frame is linearised again.
+        window: Maker of the relinearised window for ``config.lag``, `ekfslam.smoother.fixed_lag.FixedLag`.
 
     Raises:
-        ConfigError: A calibration to estimate, but no `Rig`; or neither a model nor a first pose.
+        ConfigError: A calibration to estimate, but no `Rig`; neither a model nor a first pose; or a ``config.lag``
+            without ``window``.
 
     Attributes:
         retired: Landmarks that have left the state.
@@ -84,8 +84,10 @@ class JointEKF(Estimate):
             coordinates = config.landmark_coordinates
             model = model_of(sensor, sensor.noise, se3.inverse(T_world_imu), P_pose, calibration, blocks, coordinates)
         super().__init__(model, config)
+        if config.lag and window is None:
+            raise ConfigError("filter.lag needs a window: JointEKF(..., window=ekfslam.smoother.fixed_lag.FixedLag)")
         self._in_use = OneAtATime()
-        self.window = window(model, config) if config.lag and window is not None else None
+        self.window = window(model, config) if config.lag and window else None
         self._look_again()
         self.revival, self.retired, self._revived = revival, Retired(), False
         self._log = LogBook(self)
