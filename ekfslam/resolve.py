@@ -33,6 +33,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import LEAST_PX, BlockSetting, Config, Mode
+from ekfslam.data.checks import require_scale
 from ekfslam.data.hygiene import HygieneReport, clean_tracks
 from ekfslam.data.inputs import InertialNoise, InertialSamples, Velocities
 from ekfslam.data.interpolation import INTERPOLATED
@@ -254,7 +255,7 @@ def _without_velocities(sequence: Sequence) -> Sequence:
 def with_odometry(sequence: Sequence) -> Sequence:
     """Return the recording with stereo odometry in place of velocities that were not measured or never filled in."""
     if sequence.camera.is_monocular:
-        _require_scale(sequence)
+        require_scale(sequence.name, sequence.inertial is not None or bool(sequence.measured_axes[:3].any()))
         return sequence
     measured = sequence.measured_axes.reshape(2, 3).any(axis=1)
     if measured.all() or sequence.attributes.get("velocities") in MEASURED_KINDS:
@@ -268,15 +269,6 @@ def with_odometry(sequence: Sequence) -> Sequence:
     kind = MEASURED_KINDS[int(np.argmax(measured))]
     twist = np.where(np.repeat(measured, 3), sequence.twist, found)
     return dataclasses.replace(sequence, attributes={**sequence.attributes, "velocities": kind}).with_velocities(twist)
-
-
-def _require_scale(sequence: Sequence) -> None:
-    """Raise `ScaleError` if nothing tells the scale of a recording of one camera."""
-    if sequence.inertial is None and not sequence.measured_axes[:3].any():
-        raise ScaleError(
-            f"{sequence.name}: one camera alone cannot tell the scale: give inertial samples (imu, --imu) or "
-            "measured velocities (twist, --velocities), or the tracks of both cameras"
-        )
 
 
 def noise_of_velocities(sequence: Sequence, config: Config | None = None) -> VelocityNoise:

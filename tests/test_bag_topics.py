@@ -18,6 +18,7 @@ from support.bags import (
     Written,
     camera_info,
     image,
+    imu,
     odometry,
     picture,
     stereo,
@@ -27,6 +28,7 @@ from support.bags import (
 import ekfslam
 from ekfslam import open_images
 from ekfslam.cli import main
+from ekfslam.data.images import LensCalibration
 from ekfslam.errors import CalibrationError, ConfigError, LostDataError, StampError
 
 IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
@@ -117,8 +119,6 @@ def test_topics_that_are_not_there_are_named_with_all_that_are(tmp_path, capsys)
         LostDataError, match=r"there is no topic /left; the bag has .*/zed/depth/depth_registered \(sensor"
     ):
         open_images(path, topics=["/left", "/right"])
-    with pytest.raises(CalibrationError, match="expected two topics of images, found /zed/rgb/image_rect_color"):
-        open_images(path, topics=["/zed/rgb/image_rect_color"])
     assert main(["info", str(path), "--topics", "/left", "/right"]) == 2
     assert "there is no topic /left" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="topics must be a list of names"):
@@ -197,6 +197,66 @@ def test_a_calibration_for_other_sizes_is_refused(tmp_path):
     chain.write_text(CHAIN.format(left=0, right=1, topics=("", "")).replace("[10, 6]", "[752, 480]"))
     with pytest.raises(CalibrationError, match=r"chain\.yaml: size: .*\(752, 480\).*\(10, 6\)"):
         open_images(write(tmp_path, bare()), calibration=chain)
+
+
+# One camera
+
+
+def alone(topic: str, **info: Any) -> Written:
+    """A colour camera beside its depth, as RealSense has them by default."""
+    bag = Written()
+    add(bag, topic, 0, 0.0, **info)
+    add(bag, "/camera/camera/aligned_depth_to_color/image_raw", 0, 0.0)
+    for k in range(-2, 30):
+        stamp = FIRST_NS + k * STEP_NS // 4
+        bag.add("/camera/camera/imu", "sensor_msgs/msg/Imu", stamp, imu(stamp, [0.1, 0, 0.2], [0, 0, 9.8], "optical_0"))
+    return bag
+
+
+COLOUR = "/camera/camera/color/image_raw"
+
+
+@pytest.mark.parametrize("topics", [(), (COLOUR,), (COLOUR, "/camera/camera/imu")])
+def test_one_camera_with_a_unit_is_read(tmp_path, topics):
+    found = open_images(write(tmp_path, alone(COLOUR)), topics=topics)
+    assert isinstance(found.calibration, LensCalibration) and found.attributes["topics"] == COLOUR
+    assert f"There is one camera: {COLOUR}." in found.notes and found.inertial is not None
+    (image_4,) = found.load(4)
+    np.testing.assert_array_equal(image_4, picture(4, 0))
+
+
+def test_the_right_camera_of_a_pair_can_be_named_alone(tmp_path):
+    bag = stereo()
+    path = write(tmp_path, bag)
+    found = open_images(path, topics=["/stereo/right/image_raw", "/velocity"])
+    assert found.baseline_m == 0.0 and found.twist is not None
+    np.testing.assert_array_equal(found.load(1)[0], picture(1, 1))
+    bag.topics.pop("/stereo/left/image_raw")
+    notes = open_images(write(tmp_path / "b", bag)).notes
+    assert "/stereo/left/camera_info is without images." in notes
+
+
+def test_a_chain_gives_the_camera_of_each_named_topic(tmp_path):
+    topics = ("/cam0/image_raw", "/cam1/image_raw")
+    path, chain = write(tmp_path, bare(topics)), tmp_path / "four.yaml"
+    further = (
+        CHAIN.format(left=2, right=3, topics=("/x", "/y")).replace("T_cam_imu", "T_cn_cnm1").replace("400.", "300.")
+    )
+    chain.write_text(CHAIN.format(left=0, right=1, topics=("/p", "/q")) + further.replace("/x", "/cam0/image_raw"))
+    one = open_images(path, topics=topics[:1], calibration=chain)
+    assert one.calibration.K[0, 0] == 300.0
+    step = np.array([[0, -1, 0, 0.1], [0, 0, -1, 0.2], [1, 0, 0, 0.3], [0, 0, 0, 1.0]])
+    right = np.eye(4)
+    right[0, 3] = -0.11
+    np.testing.assert_allclose(one.T_cam_imu, step @ right @ step, atol=1e-12)
+    chain.write_text(CHAIN.format(left=0, right=1, topics=topics))
+    np.testing.assert_allclose(open_images(path, topics=topics[1:], calibration=chain).T_cam_imu, right @ step)
+
+
+def test_a_camera_without_calibration_is_named(tmp_path):
+    path = write(tmp_path, alone(COLOUR, k=np.zeros(9)))
+    with pytest.raises(CalibrationError, match=r"CameraInfo of .*color/image_raw: K is 0: .*--calibration FILE"):
+        open_images(path)
 
 
 # Stamps

@@ -6,7 +6,17 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.images import LEFT_IN_BODY, STAMPS_NS, TOML, picture, write_euroc, write_plain
+from support.images import (
+    LEFT_IN_BODY,
+    STAMPS_NS,
+    TOML,
+    picture,
+    write_euroc,
+    write_picture,
+    write_plain,
+    write_raw_images,
+)
+from support.kitti_raw import write_drive
 from support.rendered import drive, recording
 
 import ekfslam
@@ -62,6 +72,15 @@ def test_images_of_one_camera_alone_do_not_tell_the_scale():
         ekfslam.run(tracked()[0])
 
 
+def test_the_scale_is_missed_before_the_images_are_tracked(tmp_path):
+    folder = write_plain(tmp_path)
+    (folder / "calibration.toml").write_text(ONE)
+    for image in (folder / "left").glob("*.png"):
+        image.write_bytes(image.read_bytes()[:50])  # its header alone: tracking would fail
+    with pytest.raises(ScaleError, match="--imu"):
+        ekfslam.open_sequence(folder)
+
+
 def test_empty_images_of_one_camera_are_named():
     def grey(_: int) -> tuple[Image]:
         return (np.full((200, 400), 90, dtype=np.uint8),)
@@ -115,3 +134,28 @@ def test_the_left_camera_of_a_pair_is_tracked_alone(tmp_path, write):
 def test_an_impossible_lens_is_refused(K):
     with pytest.raises(CalibrationError, match="K"):
         LensCalibration(K, (640, 480))
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 3])
+def test_a_folder_of_kitti_odometry_of_one_camera_is_read(tmp_path, number):
+    for frame in range(3, 6):
+        write_picture(tmp_path / f"image_{number}/{frame:06d}.png", frame, 0)
+    P = [f"P{i}: {700 + i} 0 6 {-380.0 * i} 0 {700 + i} 4 0 0 0 1 0" for i in range(4)]
+    (tmp_path / "calib.txt").write_text("\n".join(P))
+    np.savetxt(tmp_path / "times.txt", 0.1 * np.arange(9))
+    found = open_images(tmp_path)
+    assert found.calibration.K[0, 0] == 700 + number and found.attributes["images"] == f"image_{number}"
+    assert f"There is one camera: image_{number}." in found.notes and len(found) == 3
+    np.testing.assert_array_equal(found.load(1)[0], picture(4, 0))
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_drive_of_kitti_raw_of_one_camera_is_read(tmp_path, side):
+    drive = write_raw_images(write_drive(tmp_path))
+    both = open_images(drive)
+    shutil.rmtree(drive / f"image_0{1 - side}")
+    found = open_images(drive)
+    assert isinstance(found.calibration, LensCalibration) and found.twist is not None
+    T = np.linalg.matrix_power(both.calibration.T_right_left, side) @ both.T_cam_imu
+    np.testing.assert_allclose(found.T_cam_imu, T, atol=1e-12)
+    np.testing.assert_array_equal(found.load(2)[0], picture(2, side))

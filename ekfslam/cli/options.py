@@ -107,7 +107,7 @@ _SHARED: dict[str, dict[str, Any]] = {
         "nargs": "+",
         "default": [],
         "metavar": "TOPIC",
-        "help": "topics of a bag: LEFT RIGHT [ODOMETRY] [IMU] (default: chosen by CameraInfo and names)",
+        "help": "topics of a bag: LEFT RIGHT (or one camera) [ODOMETRY] [IMU] (default: by CameraInfo and names)",
     },
     "--calibration": _file(
         "calibration of the pair: chain of Kalibr or OpenVINS, left.yaml of ROS, OpenCV, ORB-SLAM, calibration.toml "

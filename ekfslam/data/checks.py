@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ekfslam.arrays import Array
-from ekfslam.errors import DataError, ExtrinsicsError, NonFiniteError, ShapeError, StampError
+from ekfslam.errors import DataError, ExtrinsicsError, NonFiniteError, ScaleError, ShapeError, StampError
 from ekfslam.geometry import se3
 from ekfslam.stored import rigid_defect
 
@@ -55,6 +55,15 @@ def require_rigid(T: Array, name: str, error: type[DataError]) -> None:
         index = tuple(int(i) for i in bad[0])
         found = f"orthogonality defect {defect[index]:.2g}, determinant {np.linalg.det(T[index][:3, :3]):.6g}"
         raise error(f"not a rigid transform: {found}", field=name, index=_position(index))
+
+
+def require_scale(name: str, is_told: bool) -> None:
+    """Raise `ScaleError` unless velocities or inertial samples tell the scale of a recording of one camera."""
+    if not is_told:
+        raise ScaleError(
+            f"{name}: one camera alone cannot tell the scale: give inertial samples (imu, --imu) or "
+            "measured velocities (twist, --velocities), or the tracks of both cameras"
+        )
 
 
 def _position(index: tuple[int, ...]) -> int | tuple[int, ...] | None:

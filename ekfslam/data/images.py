@@ -182,6 +182,12 @@ class ImageRecording:
         return 0.0 if of_one else float(np.linalg.norm(self.calibration.T_right_left[:3, 3]))  # type: ignore[union-attr]
 
     @property
+    def has_scale(self) -> bool:
+        """Whether a second camera, inertial samples or linear velocities tell the scale."""
+        has_way = self.twist is not None and bool(self.twist[:, :3].any())
+        return isinstance(self.calibration, PairCalibration) or self.inertial is not None or has_way
+
+    @property
     def of_left_camera(self) -> ImageRecording:
         """The images of the left camera alone."""
         pair = self.calibration

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from ekfslam.config import FrontEndConfig
+from ekfslam.data.checks import require_scale
+from ekfslam.data.images import ImageRecording
 from ekfslam.data.imu import with_inertial_files
 from ekfslam.data.opening import attach_truth, open_recording
 from ekfslam.data.readers.registry import Extrinsics, Lateral
@@ -41,7 +43,7 @@ def open_sequence(
         truth: File or folder of true poses to use in place of the recording's own, see `attach_truth`.
         velocities, velocity_frame: File or recording with other velocities, their frame, see `attach_velocities`.
         imu, imu_noise: Files of inertial samples and of their noise densities, see `attach_inertial`.
-        topics: Topics of a bag: left and right images, velocities, inertial samples. Others are chosen automatically.
+        topics: Topics of a bag: images of a pair or one camera, velocities, samples. Others are chosen automatically.
         calibration: Calibration of the pair in place of the recording's own, see `read_pair`.
         camera: ``left`` takes the left camera of a stereo recording alone.
         front_end: Settings of tracking; None for the defaults.
@@ -50,6 +52,7 @@ def open_sequence(
         UnknownFormatError: The file is missing, empty, damaged or of unknown content, or there is no such world.
         ConfigError, ArchiveError: An argument means nothing here, or lacks another; a newer release wrote the file.
         MissingPackageError: There are images, but OpenCV is not installed.
+        ScaleError: Images are of one camera, without velocities and inertial samples.
         DataError: A field is missing or malformed; the subclass says how.
     """
     _require(camera, "velocity_frame", velocity_frame, "velocities", velocities)
@@ -63,10 +66,15 @@ def open_sequence(
     if isinstance(recording, Sequence):
         recording = of_left_camera(recording) if camera == "left" else recording
         return with_inputs(recording if truth is None else attach_truth(recording, truth))
+    tracked = _tracked(with_inputs(recording.of_left_camera if camera == "left" else recording), front_end)
+    return tracked if truth is None else attach_truth(tracked, truth)
+
+
+def _tracked(images: ImageRecording, front_end: FrontEndConfig | None) -> Sequence:
     from ekfslam.frontend.track import track
 
-    tracked = track(with_inputs(recording.of_left_camera if camera == "left" else recording), front_end)[0]
-    return tracked if truth is None else attach_truth(tracked, truth)
+    require_scale(images.name, images.has_scale)  # before minutes of tracking
+    return track(images, front_end)[0]
 
 
 def _require(camera: str, name: str, value: object, needed: str, other: object) -> None:

@@ -1,4 +1,4 @@
-"""Cameras of a bag: choice of the stereo pair among its topics, its calibration, and the stamps of its images."""
+"""Cameras of a bag: choice of the pair, or of one camera, among its topics, calibration, and stamps of images."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.checks import spelled_as_in
-from ekfslam.data.images import Distortion, PairCalibration, side_by_side
+from ekfslam.data.images import Distortion, LensCalibration, PairCalibration, side_by_side
 from ekfslam.data.readers import messages
 from ekfslam.data.readers.calibrations import PairFile, lens_of, read_pair, rectified_apart, shift_of
 from ekfslam.data.readers.imu_yaml import find_chain
@@ -63,12 +63,11 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class BagPair:
-    """The stereo pair of a bag."""
+class BagCameras:
+    """The stereo pair of a bag, or its one camera."""
 
-    left: Camera
-    right: Camera
-    calibration: PairCalibration
+    cameras: tuple[Camera, ...]  # left and right, or one
+    calibration: PairCalibration | LensCalibration
     R_cam_optical: Array  # (3, 3) rotation from the optical frame of the left camera to its images
     file: PairFile | None  # calibration in a file, if it was taken in place of CameraInfo
     notes: tuple[str, ...]  # facts about the choice
@@ -88,37 +87,36 @@ def first_of(bag: Bag, connection: Any) -> Any:
     return first
 
 
-def pair_of(bag: Bag, calibration: str | None = None) -> BagPair:
+def cameras_of(bag: Bag, calibration: str | None = None) -> BagCameras:
     """Choose the stereo pair of a bag: named topics, otherwise by CameraInfo, a calibration file, or the topics' names.
 
-    Of several pairs a rectified one is preferred, then images that are not compressed. A ``calibration`` file for
-    `read_pair` takes precedence over CameraInfo. Without either, the chain of Kalibr beside the bag is taken. Raise
-    `CalibrationError`, which lists all topics, if there is no such pair.
+    One named topic of images is one camera, and so is the only one of a bag. Of several pairs a rectified one is
+    preferred, then images that are not compressed. A ``calibration`` file for `read_pair` takes precedence over
+    CameraInfo. Without either, the chain of Kalibr beside the bag is taken. Raise `CalibrationError`, which lists all
+    topics, if there is no such pair.
     """
     cameras = _cameras(bag)
-    if calibration is None and sum(camera.info is not None for camera in cameras) < 2:
+    wanted = min(len(cameras), 2)
+    if calibration is None and sum(camera.info is not None for camera in cameras) < wanted:
         beside = find_chain(bag.path if bag.path.is_dir() else bag.path.parent, bag.path.resolve().parent)
         calibration = None if beside is None else str(beside)
-    file = None if calibration is None else read_pair(calibration)
-    if file is not None:
-        left, right, notes = _by_names(bag, cameras, file)
-        size = messages.size_of(left.first, f"{bag.path}: {printable(left.topic)}")
-        said = (f"The calibration is that of {file.files[0].name}.", *file.notes)
-        pair = file.pair(size)
-        assert isinstance(pair, PairCalibration)
-        return BagPair(left, right, pair, np.eye(3), file, (*notes, *said))
-    left, right, notes = _by_info(bag, cameras)
-    found, R_cam_optical = _calibration(left, right)
-    return BagPair(left, right, found, R_cam_optical, None, notes)
+    if calibration is None:
+        chosen, notes = _by_info(bag, cameras)
+        found, R_cam_optical = _calibration(*chosen)
+        return BagCameras(chosen, found, R_cam_optical, None, notes)
+    images = tuple(camera.topic for camera in cameras) if bag.named or wanted == 1 else ("left", "right")
+    file = read_pair(calibration, images)
+    chosen, notes = _by_names(bag, cameras, file)
+    size = messages.size_of(chosen[0].first, f"{bag.path}: {printable(chosen[0].topic)}")
+    said = (f"The calibration is that of {file.files[0].name}.", *file.notes)
+    return BagCameras(chosen, file.pair(size), np.eye(3), file, (*notes, *said))
 
 
 def _cameras(bag: Bag) -> list[Camera]:
-    """Return the cameras that may be of a pair: those named, in that order, or else all that take pictures."""
+    """Return the cameras that may be meant: those named, in that order, or else all that take pictures."""
     infos = {parts_of(connection.topic)[0]: connection for connection in bag.connections(CAMERA_INFO)}
     streams = bag.connections(IMAGE, COMPRESSED)
     named = [stream for stream in streams if stream.topic in bag.named]
-    if len(named) == 1:
-        raise CalibrationError(f"expected two topics of images, found {printable(named[0].topic)}", field="topics")
     best: dict[str, Any] = {}
     for stream in named or [stream for stream in streams if not _NO_PICTURES.search(stream.topic)]:
         space = stream.topic if named else parts_of(stream.topic)[0]
@@ -134,12 +132,14 @@ def _rank(camera: Camera) -> tuple[bool, bool]:
     return not camera.is_rectified, camera.stream.msgtype == COMPRESSED
 
 
-def _by_info(bag: Bag, cameras: list[Camera]) -> tuple[Camera, Camera, tuple[str, ...]]:
-    """Return left and right camera by the baseline in P, and a note on other pairs."""
+def _by_info(bag: Bag, cameras: list[Camera]) -> tuple[tuple[Camera, ...], tuple[str, ...]]:
+    """Return left and right camera by the baseline in P, or the only camera, and notes on the choice."""
     known = [camera for camera in cameras if camera.info is not None]
     if bag.named and len(known) < len(cameras):
         lacking = ", ".join(printable(camera.topic) for camera in cameras if camera.info is None)
         raise CalibrationError(f"no CameraInfo in the namespace of {lacking}; {_WAYS}", field="topics")
+    if len(cameras) == len(known) == 1:
+        return (known[0],), _is_one(known[0])
     if len(known) == 2:
         pairs = [_ordered(*known)]
     else:
@@ -156,10 +156,17 @@ def _by_info(bag: Bag, cameras: list[Camera]) -> tuple[Camera, Camera, tuple[str
         found = f"found {len(known)}: {printable(', '.join(camera.topic for camera in known)) or 'none'}"
         message = f"expected two cameras with images and CameraInfo, {found}; {_WAYS}; {listed(bag)}"
         raise CalibrationError(message, field="topics")
-    return (*pairs[0], _others(pairs))
+    return pairs[0], _others(pairs)
 
 
-_WAYS = "--topics LEFT RIGHT names the pair, --calibration FILE gives a calibration"
+_WAYS = "--topics LEFT RIGHT names the pair, --topics CAMERA one camera, --calibration FILE gives a calibration"
+
+
+def _is_one(camera: Camera) -> tuple[str, ...]:
+    bag, space = camera.bag, parts_of(camera.topic)[0]
+    alone = [each.topic for each in bag.connections(CAMERA_INFO) if parts_of(each.topic)[0] != space]
+    alone = [] if bag.named else [printable(topic) for topic in alone if not _NO_PICTURES.search(topic)]
+    return (f"There is one camera: {printable(camera.topic)}.", *(f"{topic} is without images." for topic in alone))
 
 
 def listed(bag: Bag) -> str:
@@ -193,13 +200,15 @@ def _others(pairs: list[tuple[Camera, Camera]]) -> tuple[str, ...]:
     return tuple(f"Not used: the pair {printable(name)}; --topics chooses it." for name in names)
 
 
-def _by_names(bag: Bag, cameras: list[Camera], file: PairFile) -> tuple[Camera, Camera, tuple[str, ...]]:
+def _by_names(bag: Bag, cameras: list[Camera], file: PairFile) -> tuple[tuple[Camera, ...], tuple[str, ...]]:
     """Return the cameras of a calibration file: those named, its own topics, or those whose names are of two sides."""
+    if len(cameras) == 1:
+        return (cameras[0],), _is_one(cameras[0])
     if bag.named and len(cameras) == 2:
-        return cameras[0], cameras[1], ()
+        return tuple(cameras), ()
     by_topic = {camera.topic: camera for camera in cameras}
-    if file.topics is not None and all(topic in by_topic for topic in file.topics):
-        return by_topic[file.topics[0]], by_topic[file.topics[1]], ()
+    if file.topics and all(topic in by_topic for topic in file.topics):
+        return tuple(by_topic[topic] for topic in file.topics), ()
     pairs = [(left, right) for left in cameras for right in cameras if _are_sides(left, right)]
     if not pairs and len(cameras) == 2:
         pairs = [(cameras[0], cameras[1])]
@@ -208,7 +217,7 @@ def _by_names(bag: Bag, cameras: list[Camera], file: PairFile) -> tuple[Camera, 
     if not pairs:
         message = f"no two topics are of a left and a right camera by name; {_WAYS}; {listed(bag)}"
         raise CalibrationError(message, field="topics")
-    return (*pairs[0], _others(pairs))
+    return pairs[0], _others(pairs)
 
 
 def places_of(camera: Camera) -> tuple[IntArray, int, tuple[str, ...]]:
@@ -243,8 +252,16 @@ def in_order_of_stamps(rows: Any, column: int, what: str) -> tuple[Any, tuple[st
     return rows[kept], tuple(f"{count} {words}." for words, count in counts.items() if count)
 
 
-def _calibration(left: Camera, right: Camera) -> tuple[PairCalibration, Array]:
+def _calibration(left: Camera, right: Camera | None = None) -> tuple[PairCalibration | LensCalibration, Array]:
     """Return the calibration by CameraInfo, and the rotation (3, 3) from the left optical frame to its images."""
+    if right is None:
+        if left.is_rectified:
+            return LensCalibration(left.projection[:, :3], left.size), _rotation(left)
+        K = messages.matrix_of(left.info, "k", 3)
+        if not K.any():
+            field = f"CameraInfo of {printable(left.topic)}"
+            raise CalibrationError("K is 0: the camera is not calibrated; --calibration FILE gives one", field=field)
+        return LensCalibration(K, left.size, _lens(left)), np.eye(3)
     if left.size != right.size:
         raise CalibrationError("the cameras have different sizes", field="CameraInfo")
     if left.is_rectified != right.is_rectified:

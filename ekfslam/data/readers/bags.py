@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, and MCAP: a stereo pair with CameraInfo, and velocities by Odometry or a stamped twist.
+"""Bags of ROS 1 and ROS 2, and MCAP: a pair or one camera with CameraInfo, and velocities or inertial samples.
 
 The package rosbags reads them; it is an extra: ``pip install 'ekfslam[ros]'``.
 """
@@ -19,7 +19,7 @@ from ekfslam.data.imu import with_rows
 from ekfslam.data.inertial import InertialRows
 from ekfslam.data.inputs import VelocitySamples
 from ekfslam.data.readers import messages
-from ekfslam.data.readers.bag_cameras import Camera, in_order_of_stamps, pair_of, places_of
+from ekfslam.data.readers.bag_cameras import Camera, cameras_of, in_order_of_stamps, places_of
 from ekfslam.data.readers.bag_imu import imu_of_bag, inertial_of, velocities_of_unit
 from ekfslam.data.readers.calibrations import PairFile
 from ekfslam.data.readers.fields import BODY_IS_CAMERA, checksum
@@ -38,13 +38,16 @@ from ekfslam.names import printable
 
 
 class BagPairs:
-    """Load pairs of images from a bag, opened at the first call; ``places`` (T, 2): time of writing and stamp, ns."""
+    """Load images of a pair or of one camera from a bag, opened at the first call.
+
+    ``places`` of each camera are (T, 2): time of writing and stamp, ns.
+    """
 
     def __init__(
         self,
         path: Path,
-        topics: tuple[str, str],
-        places: tuple[IntArray, IntArray],
+        topics: tuple[str, ...],
+        places: tuple[IntArray, ...],
         size: tuple[int, int],
         bits: int = 16,
     ):
@@ -54,8 +57,8 @@ class BagPairs:
     def _bag(self) -> Bag:
         return Bag(self.path)
 
-    def __call__(self, frame: int) -> tuple[Image, Image]:
-        return self._image(0, frame), self._image(1, frame)
+    def __call__(self, frame: int) -> tuple[Image, ...]:
+        return tuple(self._image(side, frame) for side in range(len(self.topics)))
 
     def _image(self, side: int, frame: int) -> Image:
         written_ns, stamp_ns = self.places[side][frame].tolist()
@@ -71,7 +74,7 @@ class BagPairs:
 
 
 def open_bag(path: Path, topics: tuple[str, ...] = (), calibration: str | None = None) -> ImageRecording:
-    """Open the images of the stereo pair of a bag, its calibration, inertial samples and velocities if it has any.
+    """Open the images of the pair, or the one camera, of a bag, its calibration, inertial samples and velocities.
 
     The CameraInfo of the right camera has a baseline in P. Topics with ``rect`` in their last part are rectified images
     with the camera P; others are as the lens sees them, with K, D and R. The body is the inertial unit if
@@ -80,13 +83,14 @@ def open_bag(path: Path, topics: tuple[str, ...] = (), calibration: str | None =
     precedence.
     """
     with contextlib.closing(Bag(path, topics)) as bag, spelled_as_in(str(path)):
-        pair = pair_of(bag, calibration)
-        left, right = pair.left, pair.right
-        (left_at, left_bits, said_left), (right_at, right_bits, said_right) = (places_of(left), places_of(right))
-        in_left, in_right, alone = pair_stamps(left_at[:, 1], right_at[:, 1], str(path))
-        time_s = left_at[in_left, 1] / 1e9
-        velocities, T_optical_body, rows, found = _inputs(bag, left, pair.file)
-        notes = (*pair.notes, *said_left, *said_right, *alone, *found)
+        rig = cameras_of(bag, calibration)
+        places, bits, said = zip(*map(places_of, rig.cameras), strict=True)
+        if len(places) == 2:
+            *paired, alone = pair_stamps(places[0][:, 1], places[1][:, 1], str(path))
+            places, said = tuple(at[kept] for at, kept in zip(places, paired, strict=True)), (*said, alone)
+        time_s = places[0][:, 1] / 1e9
+        velocities, T_optical_body, rows, found = _inputs(bag, rig.cameras[0], rig.file)
+        notes = (*rig.notes, *(note for some in said for note in some), *found)
         twist, used, stated = None, np.ones(len(time_s), dtype=bool), {}
         if velocities is not None:
             used = is_covered(velocities.time_s, time_s)
@@ -95,16 +99,16 @@ def open_bag(path: Path, topics: tuple[str, ...] = (), calibration: str | None =
             twist, how = resample(velocities, time_s[used])
             notes = (*notes, f"Velocities: {how}.")
             stated = stated_at(velocities, time_s[used])
-        chosen = (left_at[in_left[used]], right_at[in_right[used]])
-        names, bits = (left.topic, right.topic), max(left_bits, right_bits)
-        given = {} if pair.file is None else {CALIBRATION: checksum(*pair.file.files)}
+        names = tuple(camera.topic for camera in rig.cameras)
+        load = BagPairs(path, names, tuple(at[used] for at in places), rig.calibration.size, max(bits))
+        given = {} if rig.file is None else {CALIBRATION: checksum(*rig.file.files)}
         recording = ImageRecording(
             name=path.resolve().stem,
             source=str(path),
             time_s=time_s[used],
-            calibration=pair.calibration,
-            load=BagPairs(path, names, chosen, pair.calibration.size, bits),
-            T_cam_imu=se3.transform(pair.R_cam_optical, np.zeros(3)) @ T_optical_body,
+            calibration=rig.calibration,
+            load=load,
+            T_cam_imu=se3.transform(rig.R_cam_optical, np.zeros(3)) @ T_optical_body,
             twist=twist,
             notes=notes,
             attributes={"reader": READER.name, "topics": printable(" ".join(names)), **given, **stated},
@@ -142,7 +146,7 @@ def _unit(bag: Bag, left: Camera, frame: str, file: PairFile | None) -> tuple[Ar
     T = np.eye(4) if frame and frame == left.frame else _transform(bag, left.frame, frame) if frame else None
     late, chain = 0.0, find_chain(bag.path if bag.path.is_dir() else bag.path.parent, bag.path.resolve().parent)
     if chain is not None:
-        late, T_chain, notes = read_chain(chain)
+        late, T_chain, notes = read_chain(chain, left.topic)
         if T is None and T_chain is not None:
             return T_chain, late, notes
     if T is not None:

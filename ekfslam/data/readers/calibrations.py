@@ -20,7 +20,7 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.data.checks import require_finite, require_rigid, require_shape, spelled_as_in
 from ekfslam.data.images import Distortion, DistortionModel, LensCalibration, PairCalibration, side_by_side
-from ekfslam.data.readers.imu_yaml import chain_of, find_chain, late_s, pose_of
+from ekfslam.data.readers.imu_yaml import between_cameras, chain_of, find_chain, late_s, pose_of, topics_of
 from ekfslam.data.readers.pictures import other_side, side_of
 from ekfslam.data.readers.text import read_lines
 from ekfslam.data.readers.yaml import Calibration, read_yaml
@@ -67,8 +67,16 @@ class PairFile:
     files: tuple[Path, ...]  # files that were read
     T_cam_imu: Array | None = None  # (4, 4) IMU to left optical frame; None if it is not stated
     notes: tuple[str, ...] = ()  # facts about the reading
-    topics: tuple[str, str] | None = None  # topics of left and right images that the files name
+    topics: tuple[str, ...] = ()  # topics of left and right images that the files name
     late_s: float = 0.0  # stamp of an inertial sample less that of an image of the same instant
+
+    @property
+    def of_right(self) -> PairFile:
+        """The right camera alone; the only one of a file of one camera."""
+        if self.right is None:
+            return self
+        T = None if self.T_cam_imu is None else self.T_right_left @ self.T_cam_imu
+        return replace(self, left=self.right, right=None, T_cam_imu=T, topics=self.topics[1:])
 
     def pair(self, size: Size | None = None) -> PairCalibration | LensCalibration:
         """Return the calibration for images of a size, by default the stated one; raise `CalibrationError` if none."""
@@ -103,9 +111,13 @@ def lens_of(name: str, coefficients: Array, key: str) -> Distortion:
     return Distortion(_MODELS[name], tuple(values)) if _MODELS[name] != "none" else Distortion()
 
 
-def read_pair(path: str | Path) -> PairFile:
-    """Read the calibration of a pair from a file, or from the files of a folder; a `DataError` names a wrong key."""
-    path = Path(path)
+def read_pair(path: str | Path, images: tuple[str, ...] = ("left", "right")) -> PairFile:
+    """Read the calibration of a pair from a file, or from the files of a folder; a `DataError` names a wrong key.
+
+    ``images`` are the names of its topics or folders of images, for which chains of Kalibr are searched. A single name
+    stands for one camera, the right one if the name says so.
+    """
+    path, is_one = Path(path), len(images) == 1
     if path.is_dir():
         path = _in_folder(path)
     with spelled_as_in(str(path)):
@@ -114,8 +126,17 @@ def read_pair(path: str | Path) -> PairFile:
         read = read_yaml(path)
         for key, reader in _FORMATS.items():
             if any(name == key or name.startswith(f"{key}.") for name in read.values):
-                return reader(read)
-    raise UnknownFormatError(f"{path}: no calibration of a pair that is known; {EXPECTED}")
+                found: PairFile = reader(read, images) if reader is _chain else reader(read)
+                break
+        else:
+            raise UnknownFormatError(f"{path}: no calibration of a pair that is known; {EXPECTED}")
+    if is_one:
+        is_right = found.topics != images and side_of(images[0]) == 1
+        return found.of_right if is_right else replace(found, right=None, topics=found.topics[:1])
+    if found.right is None:
+        sides = "left.yaml and right.yaml, or cam0 and cam1"
+        raise UnknownFormatError(f"{path}: it has one camera, and no file beside it is that of the other side: {sides}")
+    return found
 
 
 def read_toml(file: Path) -> dict[str, Any]:
@@ -192,19 +213,29 @@ def _in_folder(folder: Path) -> Path:
     return chain or lefts[0]
 
 
-def _chain(read: Calibration) -> PairFile:
-    """Read ``cam0`` and ``cam1`` of a chain of Kalibr."""
-    cameras = [_kalibr_camera(read, f"{name}.", "distortion_coeffs") for name in ("cam0", "cam1")]
-    (T_left, notes), (T_right, further) = (chain_of(read, name) for name in ("cam0", "cam1"))
+def _chain(read: Calibration, images: tuple[str, ...]) -> PairFile:
+    """Read the cameras of a chain of Kalibr that have the topics ``images``, otherwise ``cam0`` and ``cam1``."""
+    known = topics_of(read)
+    named = [name for image in images for name, topic in known.items() if topic == image]
+    chosen = named if len(named) == len(images) else list(known)[:2]
+    cameras = [_kalibr_camera(read, f"{name}.", "distortion_coeffs") for name in chosen]
+    (T_left, notes), (T_right, further) = (chain_of(read, name) for name in (chosen[0], chosen[-1]))
+    T_between = between_cameras(read, chosen[0], chosen[-1])
     if T_left is not None and T_right is not None:
-        T_right_left = T_right @ se3.inverse(T_left)
-    elif "cam1.T_cn_cnm1" in read:
-        T_right_left = pose_of(read, "cam1.T_cn_cnm1")
-    else:
-        raise CalibrationError("neither T_cn_cnm1 nor T_cam_imu of both cameras is stated", field="cam1")
-    left, right = (read.values.get(f"{name}.rostopic", "").strip().strip("\"'") for name in ("cam0", "cam1"))
-    topics, late = (left, right) if left and right else None, late_s(read, "cam0")
-    return PairFile(cameras[0], cameras[1], T_right_left, (read.path,), T_left, (*notes, *further), topics, late)
+        T_between = T_right @ se3.inverse(T_left)
+    if T_between is None:
+        raise CalibrationError("neither T_cn_cnm1 nor T_cam_imu of both cameras is stated", field=chosen[-1])
+    topics = tuple(filter(None, (known[name] for name in chosen)))
+    return PairFile(
+        cameras[0],
+        cameras[1] if len(chosen) == 2 else None,
+        T_between,
+        (read.path,),
+        T_left,
+        tuple(dict.fromkeys((*notes, *further))),
+        topics if len(topics) == len(chosen) else (),
+        late_s(read, chosen[0]),
+    )
 
 
 def _kalibr_camera(read: Calibration, prefix: str, coefficients: str) -> CameraFile:
@@ -235,7 +266,7 @@ def _euroc(read: Calibration) -> PairFile:
     folder = other_side(path.parent.resolve())
     other = other_side(path) or (folder / path.name if folder is not None else None)
     if other is None or not other.is_file():
-        raise UnknownFormatError(f"{path}: it has one camera, and there is none of the other side, as cam0 and cam1")
+        return read_euroc_pair(path)
     is_right = side_of(path.stem) == 1 or side_of(path.resolve().parent.name) == 1
     return read_euroc_pair(other, path) if is_right else read_euroc_pair(path, other)
 
@@ -262,27 +293,27 @@ def _openvins(read: Calibration) -> PairFile:
 
 def _ros(read: Calibration) -> PairFile:
     """Read the file of one side and that of the other, whose names differ in the side alone."""
-    side = side_of(read.path.stem)
-    other = other_side(read.path)
+    side, other = side_of(read.path.stem), other_side(read.path)
     if side is None or other is None:
-        message = "it has one camera, and no file beside it is that of the other side, as left.yaml and right.yaml"
-        raise UnknownFormatError(f"{read.path}: {message}")
+        return PairFile(_ros_camera(read), None, np.eye(4), (read.path,))
     reads = (read, read_yaml(other)) if side == 0 else (read_yaml(other), read)
-    cameras, turned, shifts = [], [], []
+    cameras, turned, shifts = [_ros_camera(each) for each in reads], [], []
     for each in reads:
         with spelled_as_in(str(each.path)):
-            P = each.matrix("projection_matrix", 3, 4)
-            model = each.word("distortion_model") if "distortion_model" in each else "plumb_bob"
-            lens = lens_of(model, each.numbers("distortion_coefficients"), "distortion_model")
-            size = _size(each, "image_width", "image_height")
-            cameras.append(CameraFile(each.matrix("camera_matrix", 3, 3), lens, size))
             turned.append(_rotation(each, "rectification_matrix"))
-            shifts.append(shift_of(P, "projection_matrix"))
+            shifts.append(shift_of(each.matrix("projection_matrix", 3, 4), "projection_matrix"))
     if not (shifts[0] == 0 < shifts[1]):
         found = f"expected a baseline on the right and none on the left, found {shifts[1]:g} and {shifts[0]:g} m"
         raise CalibrationError(found, source=str(reads[1].path), field="projection_matrix")
     T = rectified_apart(turned[0], turned[1], shifts[1])
     return PairFile(cameras[0], cameras[1], T, (reads[0].path, reads[1].path))
+
+
+def _ros_camera(read: Calibration) -> CameraFile:
+    with spelled_as_in(str(read.path)):
+        model = read.word("distortion_model") if "distortion_model" in read else "plumb_bob"
+        lens = lens_of(model, read.numbers("distortion_coefficients"), "distortion_model")
+        return CameraFile(read.matrix("camera_matrix", 3, 3), lens, _size(read, "image_width", "image_height"))
 
 
 def shift_of(P: Array, key: str) -> float:
@@ -349,6 +380,8 @@ def _orb_camera(read: Calibration, prefix: str) -> CameraFile:
 def _orb_two(read: Calibration) -> PairFile:
     """Read the settings of ORB-SLAM3: two cameras and ``Stereo.T_c1_c2``, or ``Rectified`` and a baseline."""
     left = _orb_camera(read, "Camera1")
+    if not any(key.startswith(("Stereo.", "Camera.bf")) for key in read.values):
+        return PairFile(left, None, np.eye(4), (read.path,), _orb_body(read))
     if not any(key.startswith("Stereo.T_c1_c2") for key in read.values):
         baseline = float(read.numbers("Stereo.b", 1)[0]) if "Stereo.b" in read else _orb_bf(read, left)
         return PairFile(left, left, side_by_side(baseline), (read.path,), _orb_body(read))
@@ -369,7 +402,9 @@ def _orb_one(read: Calibration) -> PairFile:
         require_rigid(T_left_right, "Tlr", ExtrinsicsError)
         T = se3.inverse(se3.nearest_rigid(T_left_right))
         return PairFile(left, _orb_camera(read, "Camera2"), T, (read.path,), _orb_body(read))
-    return PairFile(left, left, side_by_side(_orb_bf(read, left)), (read.path,), _orb_body(read))
+    right = left if "Camera.bf" in read else None
+    T = np.eye(4) if right is None else side_by_side(_orb_bf(read, left))
+    return PairFile(left, right, T, (read.path,), _orb_body(read))
 
 
 def _orb_body(read: Calibration) -> Array | None:

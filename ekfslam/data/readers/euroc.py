@@ -166,8 +166,7 @@ def _calibration(mav: Path, given: str | None, is_one: bool) -> PairFile:
     chain = given or (None if own.is_file() else find_chain(*places))
     if chain is None:
         return read_euroc_pair(own, *([] if is_one else [mav / CAMERAS[1] / "sensor.yaml"]))
-    found = read_pair(chain)
-    found = replace(found, right=None) if is_one else found
+    found = read_pair(chain, CAMERAS[: 2 - is_one])
     notes = (f"The calibration is that of {found.files[0].name}.", *found.notes) if given else found.notes
     if found.T_cam_imu is None:
         notes += (f"{found.files[0].name} states no T_cam_imu. {BODY_IS_CAMERA}",)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -98,20 +99,45 @@ def find_chain(*folders: Path) -> Path | None:
     return _first_of(_CHAINS, folders)
 
 
-def read_chain(path: Path) -> tuple[float, Array | None, tuple[str, ...]]:
-    """Return `late_s` and ``T_cam_imu`` of ``cam0`` in a chain, None if it is not stated, and notes."""
+def read_chain(path: Path, topic: str = "") -> tuple[float, Array | None, tuple[str, ...]]:
+    """Return `late_s` and ``T_cam_imu`` of a topic's camera in a chain, or of ``cam0``, None if unknown; and notes."""
     read = read_yaml(path)
-    T_cam_imu, notes = chain_of(read, "cam0")
-    notes = () if T_cam_imu is None else (f"T_cam_imu is that of cam0 in {path.name}.", *notes)
-    return late_s(read, "cam0"), T_cam_imu, notes
+    camera = next((name for name, of in topics_of(read).items() if topic and of == topic), "cam0")
+    T_cam_imu, notes = chain_of(read, camera)
+    notes = () if T_cam_imu is None else (f"T_cam_imu is that of {camera} in {path.name}.", *notes)
+    return late_s(read, camera), T_cam_imu, notes
+
+
+def topics_of(read: Calibration) -> dict[str, str]:
+    """Return the cameras of a chain in their order, with their topics; an empty one is not stated."""
+    known = dict.fromkeys(key.split(".")[0] for key in read.values if re.match(r"cam\d+\.", key))
+    topics = {name: read.values.get(f"{name}.rostopic", "").strip().strip("\"'") for name in known}
+    return topics or {"cam0": ""}
+
+
+def between_cameras(read: Calibration, first: str, last: str) -> Array | None:
+    """Return ``T_last_first`` (4, 4) by the ``T_cn_cnm1`` of a chain; None if one of them is not stated."""
+    begin, end = sorted(int(name[3:]) for name in (first, last))
+    T = np.eye(4)
+    for key in (f"cam{number}.T_cn_cnm1" for number in range(begin + 1, end + 1)):
+        if read.place(key) not in read:
+            return None
+        T = pose_of(read, key) @ T
+    return T if first == f"cam{begin}" else se3.inverse(T)
 
 
 def chain_of(read: Calibration, camera: str) -> tuple[Array | None, tuple[str, ...]]:
-    """Return ``T_cam_imu`` (4, 4) of a camera in a chain of Kalibr or OpenVINS, None if it is not stated, and notes."""
-    if (key := f"{camera}.T_cam_imu") in read:
-        return pose_of(read, key), ()
-    if (key := f"{camera}.T_imu_cam") in read:
-        return se3.inverse(pose_of(read, key)), (f"{read.path.name} states {key}: it is inverted.",)
+    """Return ``T_cam_imu`` (4, 4) of a camera in a chain of Kalibr or OpenVINS, None if it is unknown, and notes.
+
+    If it is not stated, it is that of another camera and the transforms between both.
+    """
+    for other in dict.fromkeys((camera, *topics_of(read))):
+        T_camera_other = between_cameras(read, other, camera)
+        for key in (f"{other}.T_cam_imu", f"{other}.T_imu_cam"):
+            if T_camera_other is not None and read.place(key) in read:
+                is_inverse, T = key.endswith("T_imu_cam"), pose_of(read, key)
+                notes = (f"{read.path.name} states {key}: it is inverted.",) if is_inverse else ()
+                return T_camera_other @ (se3.inverse(T) if is_inverse else T), notes
     return None, ()
 
 

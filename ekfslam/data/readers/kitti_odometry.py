@@ -1,4 +1,4 @@
-"""The KITTI odometry benchmark: folders of rectified pairs with ``calib.txt times.txt``, and poses (12 numbers)."""
+"""The KITTI odometry benchmark: rectified pairs, or one camera, with ``calib.txt times.txt``; poses (12 numbers)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.data.checks import require_rigid
-from ekfslam.data.images import ImageRecording, PairCalibration, side_by_side
+from ekfslam.data.images import ImageRecording, LensCalibration, PairCalibration, side_by_side
 from ekfslam.data.readers.fields import BODY_IS_CAMERA
-from ekfslam.data.readers.pictures import PAIRS, find_pair, in_order, numbered_images, pair_files
+from ekfslam.data.readers.pictures import PAIRS, find_one, find_pair, in_order, numbered_images, pair_files
 from ekfslam.data.readers.poses import FIRST_IMAGE, Poses
 from ekfslam.data.readers.registry import Reader
 from ekfslam.data.readers.text import Table, first_row, parse_table, read_keys, read_lines, rows_of
@@ -25,32 +25,35 @@ _LABELS = ("P0", "P1")
 
 
 def open_kitti_odometry(folder: Path) -> ImageRecording:
-    """Open a sequence of the benchmark, or a run of its images; the body is the left camera."""
-    names = find_pair(folder)
+    """Open a sequence of the benchmark, or a run of its images; the body is the left camera, or the only one."""
+    names = _names(folder)
     lacking = _lacking(folder, names)
-    if lacking or names is None:
+    if lacking or not names:
         raise UnknownFormatError(f"{folder}: looks like a folder of KITTI odometry, but lacks {', and '.join(lacking)}")
     path = folder / "times.txt"
     times = parse_table(read_lines(path, "expected a stamp a line"), path, columns=1).values[:, 0]
-    sides = (0, 1) if names[0] == names[1] else (None, None)
+    sides = (0, 1) if names[0] == names[-1] and len(names) == 2 else (None, None)[: len(names)]
     found = [numbered_images(folder / name, side) for name, side in zip(names, sides, strict=True)]
     first, last = min(map(min, found)), max(map(max, found))
     frames, stamps = last - first + 1, len(times)
-    left, right = (in_order(images, range(first, last + 1)) for images in found)
+    left, *right = (in_order(images, range(first, last + 1)) for images in found)
     begin = _first_line(times, first, frames)
     if begin + frames > stamps:
         message = f"{frames} images, but {stamps} stamps in times.txt"
         message = message if first == 0 else f"images {first} to {last}, but {stamps} stamps in times.txt"
         raise LostDataError(message, source=str(folder), field="times.txt")
-    load, notes = pair_files(left, right)
-    notes += ("There are no velocities.", BODY_IS_CAMERA)
+    load, notes = pair_files(left, right[0] if right else None)
+    notes += ("There are no velocities.", BODY_IS_CAMERA, *(() if right else (f"There is one camera: {names[0]}.",)))
     if first:
         notes += (f"The folder has images {first} to {last}; times.txt has {stamps} stamps.",)
     elif frames < stamps:
         notes += (f"The folder has the first {frames} of {stamps} images.",)
     if names[0] == "image_2":
         notes += ("True poses of the benchmark are of the left gray camera, 6 cm from the left colour camera.",)
-    keys = tuple(f"P{name[-1]}" for name in names) if names in (PAIRS[0], PAIRS[1]) else _LABELS
+    elif names[0] in ("image_1", "image_3"):
+        notes += ("True poses of the benchmark are of the left gray camera, half a metre from this one.",)
+    is_numbered = set(names) <= {*PAIRS[0], *PAIRS[1]}
+    keys = tuple(f"P{name[-1]}" for name in names) if is_numbered else _LABELS[: len(names)]
     return ImageRecording(
         name=folder.resolve().name,
         source=str(folder),
@@ -72,11 +75,17 @@ def _first_line(times_s: Array, first: int, frames: int) -> int:
     return 0 if len(times_s) == frames else first
 
 
-def _lacking(folder: Path, names: tuple[str, str] | None) -> list[str]:
+def _names(folder: Path) -> tuple[str, ...]:
+    """Return the folders of left and right images, or of one camera."""
+    one = find_one(folder)
+    return find_pair(folder) or (() if one is None else (one,))
+
+
+def _lacking(folder: Path, names: tuple[str, ...]) -> list[str]:
     """Return the parts of a sequence that a folder lacks, in words."""
     lacking = []
-    if names is None:
-        lacking.append("a pair of folders of images (image_0 and image_1, image_2 and image_3, or image_l and image_r)")
+    if not names:
+        lacking.append("folders of images (image_0 and image_1, image_2 and image_3, image_l and image_r, or one)")
     if not (folder / "times.txt").is_file():
         lacking.append("times.txt (a stamp in seconds a line)")
     lines = [line for _, line in rows_of(read_lines(folder / "calib.txt", "expected P0: and 12 numbers"))]
@@ -86,10 +95,12 @@ def _lacking(folder: Path, names: tuple[str, str] | None) -> list[str]:
     return lacking
 
 
-def _calibration(path: Path, keys: tuple[str, ...], size: tuple[int, int]) -> PairCalibration:
-    """Return the calibration of two cameras of ``calib.txt``, whose images are rectified."""
+def _calibration(path: Path, keys: tuple[str, ...], size: tuple[int, int]) -> PairCalibration | LensCalibration:
+    """Return the calibration of one or two cameras of ``calib.txt``, whose images are rectified."""
     values = read_keys(path, dict.fromkeys(keys, _COLUMNS), "expected P0: and 12 numbers")
-    left, right = (values[key].reshape(3, 4) for key in keys)
+    left, right = (values[key].reshape(3, 4) for key in (keys[0], keys[-1]))
+    if len(keys) == 1:
+        return LensCalibration(left[:, :3], size)
     if not np.allclose(left[:, :3], right[:, :3], rtol=1e-6, atol=1e-9):
         message = "the two cameras have different intrinsics, so the pair is not rectified"
         raise ShapeError(message, source=str(path), field="P")
@@ -127,7 +138,7 @@ def _recognises(folder: Path) -> bool:
     if not (folder / "calib.txt").is_file():
         return False
     words = first_row(folder / "calib.txt").split()
-    return find_pair(folder) is not None or len([word for word in words if not word.endswith(":")]) == _COLUMNS
+    return bool(_names(folder)) or len([word for word in words if not word.endswith(":")]) == _COLUMNS
 
 
 def read_kitti_360(path: Path, sequence: Sequence) -> Poses:

@@ -1,4 +1,4 @@
-"""Drive folders of KITTI raw: velocities, calibration, 6-DoF truth, and rectified stereo images if there are any.
+"""Drive folders of KITTI raw: velocities, calibration, 6-DoF truth, and rectified images of a pair or one camera.
 
 Geiger, Lenz, Stiller, Urtasun, *Vision meets Robotics: The KITTI Dataset* (IJRR 2013), and the readme of its
 development kit. A drive has ``oxts`` (see `oxts`), and ``image_00 image_01`` (gray) or ``image_02 image_03`` (colour)
@@ -17,7 +17,7 @@ import numpy as np
 
 from ekfslam.arrays import Array
 from ekfslam.data.checks import require_rigid, spelled_as_in
-from ekfslam.data.images import ImageRecording, PairCalibration, side_by_side
+from ekfslam.data.images import ImageRecording, LensCalibration, PairCalibration, side_by_side
 from ekfslam.data.readers.fields import checksum
 from ekfslam.data.readers.oxts import EXPECTED, Oxts, image_stamp_notes, read_oxts
 from ekfslam.data.readers.pictures import in_order, numbered_images, pair_files
@@ -99,22 +99,27 @@ def open_kitti_raw(folder: str | Path, pair: Pair = "gray", lateral: Lateral = "
 
 def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> ImageRecording | None:
     """Open the rectified images of a sync drive, with velocities and truth; None without images."""
-    pair = next((pair for pair in CAMERAS if (folder / f"image_{CAMERAS[pair][0]}" / "data").is_dir()), None)
-    if pair is None:
+    there = {pair: [c for c in cameras if (folder / f"image_{c}/data").is_dir()] for pair, cameras in CAMERAS.items()}
+    pair = max(there, key=lambda pair: len(there[pair]))
+    if not there[pair]:
         return None
     if folder.resolve().name.endswith("_extract"):
         raise UnknownFormatError(f"{folder}: images of an extract drive are not rectified; take the sync drive")
-    found = [numbered_images(folder / f"image_{camera}" / "data") for camera in CAMERAS[pair]]
+    found = [numbered_images(folder / f"image_{camera}/data") for camera in there[pair]]
     drive = open_kitti_raw(folder, pair, lateral).sequence()
-    first, last = min(found[0]), max(found[0])
+    first, last = min(map(min, found)), max(map(max, found))
     if last >= len(drive):
         message = f"image {last:010d} has no packet, there are {len(drive)}"
         raise LostDataError(message, source=str(folder), field="oxts")
-    left, right = (in_order(images, range(first, last + 1)) for images in found)
+    left, *right = (in_order(images, range(first, last + 1)) for images in found)
     part = drive[first : last + 1]
-    load, deep = pair_files(left, right)
+    load, deep = pair_files(left, right[0] if right else None)
     K = np.vstack([part.camera.matrix[:2, :3], [0.0, 0.0, 1.0]])
     notes = tuple(note for note in part.notes if note != _NO_TRACKS)
+    T_cam_imu, T_right_left = part.T_cam_imu, side_by_side(part.camera.baseline_m)
+    if not right:
+        notes = (*notes, f"There is one camera: image_{there[pair][0]}.")
+        T_cam_imu = T_right_left @ T_cam_imu if there[pair][0] == CAMERAS[pair][1] else T_cam_imu
     if len(part) < len(drive):
         notes = (*notes, f"The folder has images {first} to {last} of {len(drive)} packets.")
     attributes = {name: value for name, value in part.attributes.items() if name not in WITHOUT_TRACKS}
@@ -122,9 +127,9 @@ def open_kitti_raw_images(folder: Path, lateral: Lateral = "corrected") -> Image
         name=part.name,
         source=part.source,
         time_s=part.time_s,
-        calibration=PairCalibration(K, K, load.size, side_by_side(part.camera.baseline_m)),
+        calibration=PairCalibration(K, K, load.size, T_right_left) if right else LensCalibration(K, load.size),
         load=load,
-        T_cam_imu=part.T_cam_imu,
+        T_cam_imu=T_cam_imu,
         twist=part.twist,
         velocity_frame=part.velocity_frame,
         truth=part.truth,

@@ -184,6 +184,12 @@ def find_pair(folder: Path) -> tuple[str, str] | None:
     return (".", ".") if all(any(side.search(name) for name in names) for side in _SIDES) else None
 
 
+def find_one(folder: Path) -> str | None:
+    """Return the only folder of images with the name of a side in a folder; None if there is none, or several."""
+    found = [name for pair in PAIRS for name in pair if (folder / name).is_dir()]
+    return found[0] if len(found) == 1 else None
+
+
 def images_of_sides(left: Path, right: Path) -> tuple[dict[str, Path], dict[str, Path]]:
     """Return the images of two folders, or of one, by the part of their names that both sides share."""
     found = [images_in(folder) for folder in (left, right)]
