@@ -40,6 +40,8 @@ from ekfslam.timings import Timings
 if TYPE_CHECKING:
     from ekfslam.studies.study import Study, StudyArchive
 
+Width = str | float | None  # of figures of a paper: column, page, or inches; None for those of the screen
+
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Shown):
@@ -92,7 +94,7 @@ class Comparison(Shown):
         force: bool = False,
         figures: bool = True,
         timings: Timings | None = None,
-        width: str = "",
+        width: Width = None,
     ) -> list[Path]:
         """Write ``archive.h5``, ``summary.json``, ``summary.md`` and the figures into a folder; return their paths.
 
@@ -106,7 +108,9 @@ class Comparison(Shown):
         with _claimed(Path(directory)):
             return self._write(Path(directory), force, figures, timings or Timings(), width)
 
-    def _write(self, directory: Path, force: bool, figures: bool, timings: Timings, width: str) -> list[Path]:
+    def _write(
+        self, directory: Path, force: bool, figures: bool, timings: Timings, width: str | float | None
+    ) -> list[Path]:
         archive, summary, table = (directory / name for name in ("archive.h5", "summary.json", "summary.md"))
         if not force:
             require_same_origin(archive, self.sequence)
@@ -124,7 +128,7 @@ class Comparison(Shown):
             with timings.part("figures"):
                 of = (self.results, self.sequence.truth, self.sequence.interpolated)
                 if width:
-                    drawn = paper_contents(directory, draw_paper(*of, width_of(width)), "pdf")
+                    drawn = paper_contents(directory, draw_paper(*of, width_of(width)))
                 else:
                     drawn = pngs(directory, draw_figures(*of))
                 contents |= marked(drawn, [archive])
@@ -214,7 +218,7 @@ def compare_into(
     verbose: bool = False,
     timings: Timings | None = None,
     others: Others | None = None,
-    width: str = "",
+    width: Width = None,
 ) -> str:
     """Save `compare` into a folder, and return the text for a terminal: notes of the reader, `brief`, folder written.
 

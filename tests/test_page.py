@@ -242,6 +242,12 @@ def test_command(archive, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_figures_of_a_paper_are_written_beside_the_page(archive, tmp_path):
+    assert main(["report", str(archive), "--out", str(tmp_path / "p/report.html"), "--width", "3.25"]) == 0
+    assert {"report.html", "map.pdf", "captions.md"} <= {path.name for path in (tmp_path / "p").iterdir()}
+
+
+@pytest.mark.slow
 def test_the_script_draws_without_an_error(archive, tmp_path):
     """In a real browser: maps and plots are there, and nothing complains."""
     browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -302,7 +302,8 @@ def test_plot_writes_figures_of_papers_with_captions_as_pdf(sequence, results, t
     assert re.search(rb"/MediaBox \[ 0 0 234 ", (tmp_path / "map.pdf").read_bytes())
     captions = (tmp_path / "captions.md").read_text()
     assert "**nees**: Pose NEES on" in captions and "6 expected" in captions
-    assert main([*arguments, "wide"]) == 2
+    with pytest.raises(SystemExit):
+        main([*arguments, "wide"])
     assert "a width of figures is column, page, or 2.5 to 20 inches" in capsys.readouterr().err
 
 

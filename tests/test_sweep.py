@@ -22,7 +22,7 @@ from ekfslam.cli import main
 from ekfslam.config import Config
 from ekfslam.errors import ArchiveError, ConfigError, WriteError
 from ekfslam.evaluation.summary import KEYS, summarise
-from ekfslam.figures.sweep import plot_sweep
+from ekfslam.figures.sweep import paper_sweep, plot_sweep
 from ekfslam.runner import run
 from ekfslam.storage.exports import export
 from ekfslam.studies import sweep as sweeps
@@ -399,6 +399,12 @@ def test_any_figure_against_any_setting_in_a_panel_for_each_recording(undisturbe
         plot_sweep(undisturbed, "mode", "noise.sigma_px")
 
 
+def test_a_figure_of_a_paper_has_its_width_and_a_caption(undisturbed):
+    drawn = paper_sweep(undisturbed, "ate_m", "noise.sigma_px", 3.5)
+    assert drawn.figure.get_figwidth() == 3.5 and not drawn.figure.get_suptitle()
+    assert len(drawn.figure.axes) == 2 and "mean over seeds" in drawn.caption
+
+
 def test_a_figure_has_no_more_lines_than_one_can_tell_apart():
     rows = [{"recording": "drive", "a": f"a{a}", "b": float(b), "y": 1.0} for a in range(25) for b in range(2)]
     table = SweepTable.of_rows(rows, ("recording", "a", "b"), len(rows))
@@ -432,6 +438,9 @@ def test_the_command_shows_a_table_without_running_anything(finished, capsys):
 
 
 def test_the_command_shows_chosen_runs_only(finished, capsys):
+    call = ["sweep", "--table", "--out", str(finished), "--plot", "ate_m", "seed", "--width", "column"]
+    assert main(call) == 0 and (finished / "ate_m-seed.pdf").read_bytes().startswith(b"%PDF")
+    assert "ate_m-seed" in (finished / "captions.md").read_text()
     assert main(["sweep", "--table", "--out", str(finished), "--only", "seed=2", "mode=dead-reckoning"]) == 0
     shown = capsys.readouterr().out
     assert "1 of 1 runs" in shown

@@ -11,7 +11,7 @@ from ekfslam import files
 from ekfslam.config import ENGINES, VARIANTS, Config
 from ekfslam.data.sequence import Sequence, stretch
 from ekfslam.data.trajectory import Moving
-from ekfslam.errors import WriteError
+from ekfslam.errors import ConfigError, WriteError
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.evaluation.tables import WRITERS, is_table
@@ -54,6 +54,16 @@ def table_file(text: str) -> Path:
     return Path(text)
 
 
+def width(text: str) -> float:
+    """Return the width of the figures of a paper in inches."""
+    from ekfslam.figures.paper import width_of  # imports Matplotlib
+
+    try:
+        return width_of(text)
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
 def _file(words: str, metavar: str = "FILE") -> dict[str, Any]:
     return {"type": Path, "metavar": metavar, "help": words}
 
@@ -70,9 +80,9 @@ def _choice(names: tuple[str, ...], default: str, words: str) -> dict[str, Any]:
 _SHARED: dict[str, dict[str, Any]] = {
     "data": {"nargs": "?", "default": DEFAULT_DATA, "metavar": "DATA", "help": f"default: {DEFAULT_DATA}"},
     "--width": {
-        "default": "",
+        "type": width,
         "metavar": "WIDTH",
-        "help": "draw the figures of a paper: column (3.5 inches), page (7.16), or inches; captions in captions.md",
+        "help": "draw figures of a paper, column (3.5 inches), page (7.16), or inches wide; captions in captions.md",
     },
     "archive": _file("as written by run or compare", "ARCHIVE"),
     "--out": _file("default: the folder of the archive", "DIR"),

@@ -63,10 +63,10 @@ class Drawn(NamedTuple):
     caption: str
 
 
-def width_of(text: str) -> float:
+def width_of(text: str | float) -> float:
     """Return the width in inches of ``column``, ``page`` or a number of inches; raise a `ConfigError` otherwise."""
     try:
-        width = WIDTHS.get(text) or float(text)
+        width = WIDTHS.get(str(text)) or float(text)
     except ValueError:
         width = 0.0
     if not NARROWEST <= width <= WIDEST:
@@ -96,17 +96,19 @@ def draw_paper(
     return found
 
 
-def paper_contents(directory: str | Path, drawn: Mapping[str, Drawn], format: Format) -> dict[Path, str | bytes]:
+def paper_contents(
+    directory: str | Path, figures: Mapping[str, Drawn], format: Format = "pdf"
+) -> dict[Path, str | bytes]:
     """Return figures and ``captions.md`` as files of a folder, for `ekfslam.files.write_all`."""
-    figures = {name: one.figure for name, one in drawn.items()}
-    captions = document(*(f"**{name}**: {one.caption}" for name, one in drawn.items()))
-    return {**pngs(directory, figures, format=format, dpi=DPI), Path(directory) / CAPTIONS: captions}
+    drawings = {name: one.figure for name, one in figures.items()}
+    captions = document(*(f"**{name}**: {one.caption}" for name, one in figures.items()))
+    return {**pngs(directory, drawings, format=format, dpi=DPI), Path(directory) / CAPTIONS: captions}
 
 
-def _drawn(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
+def drawn(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
     """Decorate a function to draw in our style, in the size of papers."""
 
-    def drawn(*arguments: Any) -> Drawn:
+    def wrapper(*arguments: Any) -> Drawn:
         captions = []
 
         def figure(*given: Any) -> Figure:
@@ -118,7 +120,7 @@ def _drawn(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
 
         return Drawn(styled(figure)(*arguments), captions[0])
 
-    return drawn
+    return wrapper
 
 
 def _stack(width: float, rows: int, height: float, columns: int = 1) -> tuple[Figure, Any]:
@@ -126,7 +128,7 @@ def _stack(width: float, rows: int, height: float, columns: int = 1) -> tuple[Fi
     return figure, figure.subplots(rows, columns, squeeze=False, sharex=True)
 
 
-def _legend(figure: Figure, axes: list[Axes], width: float) -> None:
+def legend_below(figure: Figure, axes: list[Axes], width: float) -> None:
     """Add a legend below with as many columns as fit, and its height to the figure."""
     labels = list(dict.fromkeys(label for ax in axes for label in ax.get_legend_handles_labels()[1]))
     for columns in range(len(labels), 0, -1):
@@ -144,7 +146,7 @@ def _marked(name: str, of: str, count: int, place: int) -> Style:
     return {**style_of(of), "markevery": (place * step // 4 % step, step), "label": name}
 
 
-@_drawn
+@drawn
 def _map(results: Mapping[str, Result], truth: Truth | None, width: float) -> Drawn:
     mapper = maps.map_of(results)
     points = mapper.landmarks.position_m[:, :2]
@@ -167,11 +169,11 @@ def _map(results: Mapping[str, Result], truth: Truth | None, width: float) -> Dr
         xy = result.T_world_imu[:, :2, 3]
         ax.plot(*xy.T, **_marked(name, result.mode, len(xy), i), zorder=3)
         maps.add_pose_ellipses(ax, result, _MARKS)
-    _legend(figure, [ax], width)
+    legend_below(figure, [ax], width)
     return Drawn(figure, caption)
 
 
-@_drawn
+@drawn
 def _side(results: Mapping[str, Result], truth: Truth | None, width: float) -> Drawn:
     figure, axes = _stack(width, 1, 1.5)
     ax = axes[0, 0]
@@ -182,12 +184,12 @@ def _side(results: Mapping[str, Result], truth: Truth | None, width: float) -> D
         line = {key: value for key, value in _marked(name, result.mode, len(one.x), i).items() if key != "label"}
         draw_series(ax, one, style_of(result.mode)["color"], line, label=name)
     ax.set_ylabel("z [m]")
-    _legend(figure, [ax], width)
+    legend_below(figure, [ax], width)
     name = next(iter(results.values())).sequence_name
     return Drawn(figure, f"Height of {name} over the distance driven; bands: {BAND_SIGMAS:g} sigma.")
 
 
-@_drawn
+@drawn
 def _errors(results: Mapping[str, Result], truth: Truth, width: float) -> Drawn:
     figure, axes = _stack(width, 2, 1.2)
     upper, lower = axes[:, 0]
@@ -201,12 +203,12 @@ def _errors(results: Mapping[str, Result], truth: Truth, width: float) -> Drawn:
         ax.set_yscale("log")
         ax.margins(x=0.01)
     lower.set_xlabel("time [s]")
-    _legend(figure, [upper], width)
+    legend_below(figure, [upper], width)
     name = next(iter(results.values())).sequence_name
     return Drawn(figure, f"Lengths of the position and rotation errors on {name}, from a common first pose.")
 
 
-@_drawn
+@drawn
 def _axes(result: Result, truth: Truth, width: float) -> Drawn:
     found, color = series.errors(result, truth), style_of(result.mode)["color"]
     figure, axes = _stack(width, 3, 0.85, 2)
@@ -218,7 +220,7 @@ def _axes(result: Result, truth: Truth, width: float) -> Drawn:
     return Drawn(figure, said)
 
 
-@_drawn
+@drawn
 def _nees(judged: Mapping[str, tuple[Result, Series]], width: float) -> Drawn:
     figure, axes = _stack(width, 1, 1.6)
     ax, (first, band) = axes[0, 0], next(iter(judged.values()))
@@ -229,12 +231,12 @@ def _nees(judged: Mapping[str, tuple[Result, Series]], width: float) -> Drawn:
     log_axis(ax, (1.0, 3.0))
     ax.margins(x=0.01)
     ax.set(xlabel="time [s]", ylabel="pose NEES [-]")
-    _legend(figure, [ax], width)
+    legend_below(figure, [ax], width)
     means = ", ".join(f"{name} {one.mean:.3g}" for name, (_, one) in judged.items())
     return Drawn(figure, f"Pose NEES on {first.sequence_name}, 6 expected; means: {means}.")
 
 
-@_drawn
+@drawn
 def _nis(results: Mapping[str, Result], width: float) -> Drawn:
     figure, axes = _stack(width, len(results), 1.2)
     said = []
@@ -244,6 +246,6 @@ def _nis(results: Mapping[str, Result], width: float) -> Drawn:
         draw_series(ax, nis, style["color"], {**dots, "linestyle": ""}, label=mode)
         ax.set_ylabel("NIS / dof [-]")
         said.append(f"{mode} {100 * nis.share_inside:.1f} %")
-    _legend(figure, list(axes[:, 0]), width)
+    legend_below(figure, list(axes[:, 0]), width)
     name = next(iter(results.values())).sequence_name
     return Drawn(figure, f"NIS per degree of freedom on {name}; within the bounds of their frames: {', '.join(said)}.")

@@ -1,4 +1,4 @@
-"""Figures of a sweep: any figure of merit against any setting."""
+"""Figures of a sweep, for the screen or a paper: any figure of merit against any setting."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array
+from ekfslam.figures.paper import Drawn, drawn, legend_below
 from ekfslam.figures.series import LOG_RATIO
 from ekfslam.figures.style import BAND_ALPHA, SERIES, legend_of, log_axis, styled
 from ekfslam.studies.sweep_table import SweepTable, spoken, words_of
@@ -17,11 +18,23 @@ from ekfslam.studies.sweep_table import SweepTable, spoken, words_of
 _MARKERS = "os^Dv<>P"
 _MOST_LINES, _MOST_PANELS = 24, 24
 _PANELS_A_ROW = 3
+_PANEL_IN = 2.2  # least width of a panel in a paper
 
 
 @styled
 def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
     """Draw figures of merit against a setting: a line (mean over seeds, with range) for each choice of the others."""
+    return _plotted(table, figure, setting, None)
+
+
+@drawn
+def paper_sweep(table: SweepTable, figure: str, setting: str, width: float) -> Drawn:
+    """Draw `plot_sweep` as wide as ``width`` inches, with its caption."""
+    said = f"{words_of(figure)} against {words_of(setting)}; lines: mean over seeds, bands: their range."
+    return Drawn(_plotted(table, figure, setting, width), said)
+
+
+def _plotted(table: SweepTable, figure: str, setting: str, paper: float | None) -> Figure:
     y, x = table.column(figure), table.column(setting)
     if y.dtype.kind != "f":
         raise ValueError(f"{figure} is no number")
@@ -32,11 +45,12 @@ def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
     if len(choices) > _MOST_LINES or len(panels) > _MOST_PANELS:
         found = f"{len(panels)} panels with {len(choices)} lines of {', '.join(others)}"
         raise ValueError(f"{found} are more than a figure can show: {_MOST_PANELS} with {_MOST_LINES}")
-    columns = min(len(panels), _PANELS_A_ROW)
+    columns = min(len(panels), _PANELS_A_ROW if paper is None else max(1, int(paper / _PANEL_IN)))
     rows = -(-len(panels) // columns)
-    width = 8.0 if columns == 1 else 1.0 + 4.0 * columns
-    drawn = Figure(figsize=(width, 0.6 + (4.2 if rows == 1 else 3.2 * rows) + 0.09 * len(choices)))
-    axes = drawn.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+    width, height = 8.0 if columns == 1 else 1.0 + 4.0 * columns, 4.2 if rows == 1 else 3.2 * rows
+    size = (width, 0.6 + height + 0.09 * len(choices)) if paper is None else (paper, 1.6 * rows + 0.3)
+    page = Figure(figsize=size)
+    axes = page.subplots(rows, columns, squeeze=False, sharex=True).ravel()
     # Values of a setting that is text, in the order of their places on the axis.
     names = [] if x.dtype.kind == "f" else list(dict.fromkeys(x.tolist()))
     for ax, (name, panel) in zip(axes, panels.items(), strict=False):
@@ -44,11 +58,15 @@ def plot_sweep(table: SweepTable, figure: str, setting: str) -> Figure:
         ax.set(title=", ".join(name), xlabel=words_of(setting), ylabel=words_of(figure))
     for ax in axes[len(panels) :]:
         ax.remove()
+    if paper is not None:
+        if others:
+            legend_below(page, list(axes[:1]), paper)
+        return page
     missing = int((~np.isfinite(y)).sum())
-    drawn.suptitle(f"{words_of(figure)}, {len(y) - missing} runs" + (f", {missing} without it" if missing else ""))
+    page.suptitle(f"{words_of(figure)}, {len(y) - missing} runs" + (f", {missing} without it" if missing else ""))
     if others:
-        legend_of(drawn, axes[:1], min(columns + 1, 3), ", ".join(others))
-    return drawn
+        legend_of(page, axes[:1], min(columns + 1, 3), ", ".join(others))
+    return page
 
 
 def _draw_panel(

@@ -47,11 +47,13 @@ def write_report(
     path: str | Path,
     title: str = "",
     others: Others | Mapping[str, Trajectory | str | Path] | None = None,
+    width: str | float | None = None,
 ) -> Path:
     """Write one HTML page of archives, and return its path; archives of one recording share a section.
 
     The title is by default the names of the recordings. ``others`` are trajectories of other programs, as in
-    `ekfslam.compare`; ``{name}`` in a path is the name of the recording.
+    `ekfslam.compare`; ``{name}`` in a path is the name of the recording. With a ``width`` (``column``, ``page`` or
+    inches) the figures of a paper are written beside, in a folder for each of several archives.
 
     Raises:
         ArchiveError: There is none, there are too many, or one cannot be read or holds no run.
@@ -59,9 +61,27 @@ def write_report(
         ConfigError, TruthError: A trajectory cannot be compared, see `ekfslam.others`.
     """
     files.require_writable(path)
-    page = report_page(_joined(read_archives(archives), Others.of(others)), title)
-    files.write_all(marked({Path(path): page}, map(Path, archives)))
+    files.write_all(report_contents(archives, Path(path), title, others, width))
     return Path(path)
+
+
+def report_contents(
+    archives: Sequence[str | Path],
+    path: Path,
+    title: str = "",
+    others: Others | Mapping[str, Trajectory | str | Path] | None = None,
+    width: str | float | None = None,
+) -> dict[Path, str | bytes]:
+    """Return the files of `write_report` with their contents."""
+    joined = _joined(read_archives(archives), Others.of(others))
+    contents: dict[Path, str | bytes] = {path: report_page(joined, title)}
+    if width:
+        from ekfslam.figures.paper import draw_paper, paper_contents, width_of  # imports Matplotlib
+
+        for label, archive in joined.items():
+            drawn = draw_paper(archive.results, archive.truth, archive.interpolated, width_of(width))
+            contents |= paper_contents(path.parent / label if len(joined) > 1 else path.parent, drawn)
+    return marked(contents, map(Path, archives))
 
 
 def _joined(archives: Mapping[str, Archive], others: Others) -> dict[str, Archive]:

@@ -65,10 +65,6 @@ def command(options: argparse.Namespace) -> None:
     for key in options.columns:
         if key not in METRICS:
             raise ConfigError(f"there is no column {key!r}; known: {', '.join(METRICS)}")
-    if options.width:
-        from ekfslam.figures.paper import width_of  # imports Matplotlib
-
-        width_of(options.width)
     timings, others = Timings(), others_of(options, len(options.data))
     # Read everything first: a mistyped last name should not cost the first hour.
     with timings.part("reading"):

@@ -11,7 +11,7 @@ from ekfslam import files
 from ekfslam.cli.options import declare, require_ours
 from ekfslam.errors import ArchiveError
 from ekfslam.figures.older import FIGURES, marked, require_own
-from ekfslam.figures.paper import draw_paper, paper_contents, width_of
+from ekfslam.figures.paper import draw_paper, paper_contents
 from ekfslam.figures.run import save_figures
 from ekfslam.figures.style import Format
 from ekfslam.figures.viewer import is_viewer_file, show_archive, write_viewer_file
@@ -66,7 +66,7 @@ def command(options: argparse.Namespace) -> None:
     files.require_writable(directory / f"map.{options.format}")
     drawn = (archive.results, archive.truth, archive.interpolated)
     if options.width:
-        contents = paper_contents(directory, draw_paper(*drawn, width_of(options.width)), options.format)
+        contents = paper_contents(directory, draw_paper(*drawn, options.width), options.format)
         if not options.force:
             require_own(contents, [options.archive])
         files.write_all(marked(contents, [options.archive]))

@@ -10,8 +10,9 @@ from pathlib import Path
 from ekfslam import files
 from ekfslam.cli.options import EXECUTOR, OTHERS, TABLE_WORDS, declare, table_file
 from ekfslam.errors import ConfigError
+from ekfslam.figures.paper import paper_contents
 from ekfslam.figures.style import pngs
-from ekfslam.figures.sweep import plot_sweep
+from ekfslam.figures.sweep import paper_sweep, plot_sweep
 from ekfslam.others import Others
 from ekfslam.studies.executors import open_executor
 from ekfslam.studies.sweep import Sweep, run_sweep
@@ -22,7 +23,7 @@ EXAMPLES = (
     "sweep study.toml --executor tls://scheduler:8786 --out results/local/all",
     "sweep study.toml --table paper.tex",
     "sweep --table --out results/local/all --figures ate_m nis_per_dof",
-    "sweep --table --out results/local/all --only mode=full --plot ate_m noise.sigma_px",
+    "sweep --table --out results/local/all --only mode=full --plot ate_m noise.sigma_px --width column",
 )
 
 
@@ -54,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("FIGURE", "SETTING"),
         help="draw a column against another, a panel for each recording; may be given several times",
     )
-    declare(parser, *OTHERS, *EXECUTOR)
+    declare(parser, "--width", *OTHERS, *EXECUTOR)
     resumes = "default: %(default)s; an interrupted sweep there resumes"
     declare(parser, "--out", default=Path("results/local/sweep"), help=resumes)
 
@@ -91,6 +92,13 @@ def _with_others(sweep: Sweep, options: argparse.Namespace) -> Sweep:
     return replace(sweep, others=Others.parse(options.others, options.with_frame, options.with_world))
 
 
+def _drawn(options: argparse.Namespace, table: SweepTable) -> dict[Path, str | bytes]:
+    plots = {f"{figure}-{setting}": (table, figure, setting) for figure, setting in options.plot}
+    if plots and options.width:
+        return paper_contents(options.out, {name: paper_sweep(*of, options.width) for name, of in plots.items()})
+    return pngs(options.out, {name: plot_sweep(*of) for name, of in plots.items()})
+
+
 def _show(options: argparse.Namespace, table: SweepTable) -> None:
     whole, chosen = table, dict[str, list[str]]()
     for name, value in (pair for pairs in options.only for pair in pairs):
@@ -101,11 +109,11 @@ def _show(options: argparse.Namespace, table: SweepTable) -> None:
     if chosen:
         shown += f"\nchosen from {len(whole)} of {whole.asked} runs\n"
     try:
-        figures = {f"{figure}-{setting}": plot_sweep(table, figure, setting) for figure, setting in options.plot}
+        drawn = _drawn(options, table)
     except ValueError as error:
         print(shown)
         raise ConfigError(f"{error}; --only chooses runs") from None
-    contents = {options.out / "sweep.md": shown, **pngs(options.out, figures)}
+    contents = {options.out / "sweep.md": shown, **drawn}
     if options.table:
         contents[options.table] = table.paper(options.table.suffix, options.figures)
     files.write_all(contents)
