@@ -15,8 +15,10 @@ from support.recordings import ece276a_fields, utias_fields, write_mat, write_np
 from ekfslam import open_sequence, reports
 from ekfslam.cli import main
 from ekfslam.cli.commands import doctor
+from ekfslam.data.trajectory import Trajectory
 from ekfslam.errors import FilterError
 from ekfslam.storage.archive import read_archive
+from ekfslam.storage.exports import Poses, contents
 
 CITY = "builtin:city?frames=20"
 
@@ -166,7 +168,8 @@ def test_mistakes_in_the_call(tmp_path, capsys):
     assert "no.toml" in failure(capsys, "run", CITY, "--config", tmp_path / "no.toml", "--out", tmp_path / "o.h5")
     assert "sigma_px" in failure(capsys, "run", CITY, "--sigma-px", "0", "--out", tmp_path / "o.h5")
     assert "unknown mode 'best'" in failure(capsys, "run", CITY, "--mode", "best", "--out", tmp_path / "o.h5")
-    assert "one by one" in failure(capsys, "compare", CITY, CITY, "--truth", tmp_path / "t.txt", "--out", tmp_path)
+    assert "write {name}" in failure(capsys, "compare", CITY, CITY, "--truth", tmp_path / "t.txt", "--out", tmp_path)
+    assert "one by one" in failure(capsys, "compare", CITY, CITY, "--timings", "--out", tmp_path)
     (tmp_path / "file").touch()
     assert "file" in failure(capsys, "run", CITY, "--out", tmp_path / "file" / "o.h5")
     main(["run", CITY, "--mode", "dead-reckoning", "--out", str(tmp_path / "o.h5")])
@@ -273,6 +276,19 @@ def test_many_recordings_are_compared_in_processes_as_one_by_one(tmp_path, capsy
         np.testing.assert_array_equal(runs[0].T_world_imu, runs[1].T_world_imu)
         assert not list(together.parent.glob("*.png"))
         shutil.rmtree(tmp_path / "one")
+
+
+def test_each_of_many_recordings_has_the_truth_of_its_name(tmp_path):
+    names, mode = ("loop", "city"), ("--modes", "dead-reckoning", "--no-figures")
+    for name in names:
+        sequence = open_sequence(f"builtin:{name}?frames=8")
+        poses = Poses(Trajectory(sequence.time_s, sequence.truth.T_world_imu), sequence.T_cam_imu)
+        (tmp_path / f"{sequence.name}.tum").write_text(contents(poses, tmp_path / "x.txt", "tum")[tmp_path / "x.txt"])
+    data = [f"builtin:{name}?frames=8" for name in names]
+    call = ["compare", *data, *mode, "--truth", str(tmp_path / "{name}.tum"), "--out", str(tmp_path), "--workers", "1"]
+    assert main(call) == 0
+    for path in tmp_path.glob("*/archive.h5"):
+        assert any(".tum" in note for note in read_archive(path).notes)
 
 
 def test_one_recording_that_fails_does_not_keep_the_others(tmp_path, capsys, monkeypatch):

@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 from ekfslam import files
 from ekfslam.config import ENGINES, VARIANTS, Config
+from ekfslam.data.opening import attach_truth
 from ekfslam.data.sequence import Sequence, stretch
 from ekfslam.data.trajectory import Moving
 from ekfslam.errors import ConfigError, WriteError
@@ -17,7 +18,7 @@ from ekfslam.evaluation.summary import compare_table, summarise_all
 from ekfslam.evaluation.tables import WRITERS, is_table
 from ekfslam.filters.result import Result
 from ekfslam.frontend.opening import open_sequence
-from ekfslam.others import Others, World
+from ekfslam.others import NAME, Others, World
 from ekfslam.storage.archive import Archive
 
 DEFAULT_DATA = "builtin:city"
@@ -98,7 +99,7 @@ _SHARED: dict[str, dict[str, Any]] = {
         "configuration distributed.comm.tls), dask://HOST:PORT (without certificates: anyone who reaches that port "
         "runs programs as you; for private networks only), or mpi",
     },
-    "--truth": _file("true poses: KITTI odometry or TUM text"),
+    "--truth": _file(f"true poses: KITTI odometry, TUM, EuRoC, ...; {NAME} in it is the recording's name"),
     "--velocities": _file(
         "velocities from elsewhere: text of time vx vy vz wx wy wz (s, m/s, rad/s), or another recording"
     ),
@@ -224,7 +225,9 @@ def config_file(options: argparse.Namespace) -> Config:
 def open_data(options: argparse.Namespace, data: str) -> Sequence:
     """Open a recording as the options of `DATA` say."""
     given = {name: getattr(options, name) for name in (flag[2:].replace("-", "_") for flag in _READ_AS)}
+    named = str(given.pop("truth")) if NAME in str(given["truth"]) else ""
     sequence = open_sequence(data, front_end=config_file(options).front_end, **given)
+    sequence = attach_truth(sequence, named.replace(NAME, sequence.name)) if named else sequence
     return sequence if options.frames is None else sequence[options.frames]
 
 

@@ -27,6 +27,7 @@ from ekfslam.config import MODES
 from ekfslam.errors import ConfigError
 from ekfslam.evaluation.metrics import METRICS
 from ekfslam.names import components
+from ekfslam.others import NAME
 from ekfslam.reports import PAPER, compare_all, compared_table
 from ekfslam.storage.archive import require_same_origin
 from ekfslam.studies.executors import open_executor
@@ -59,9 +60,12 @@ def claims(options: argparse.Namespace) -> AbstractContextManager[None]:
 
 def command(options: argparse.Namespace) -> None:
     config = configured(options)
-    for flag in ("truth", "timings"):
-        if getattr(options, flag) and len(options.data) > 1:
-            raise ConfigError(f"--{flag} belongs to one recording, but several are given; compare them one by one")
+    if len(options.data) > 1:
+        if options.timings:
+            raise ConfigError("--timings belongs to one recording, but several are given; compare them one by one")
+        if options.truth and NAME not in str(options.truth):
+            message = f"one file for {len(options.data)} recordings; write {NAME} for their names in {options.truth}"
+            raise ConfigError(f"--truth: {message}")
     for key in options.columns:
         if key not in METRICS:
             raise ConfigError(f"there is no column {key!r}; known: {', '.join(METRICS)}")
