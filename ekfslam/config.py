@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from ekfslam.errors import ConfigError, RetiredSettingWarning, UnknownFormatError
-from ekfslam.limits import require_file
+from ekfslam.limits import require_file, toml_values
 
 Mode = Literal["dead-reckoning", "mapping-only", "full", "smoothed"]
 Variant = Literal["invariant", "fej", "standard"]
@@ -433,7 +432,7 @@ def of_toml(path: str | Path, made: Callable[[dict[str, Any]], Made]) -> Made:
     """Return what is made of the content of a TOML file; every `ConfigError` names the file."""
     try:
         require_file(path, is_text=True)
-        return made(tomllib.loads(Path(path).read_text(encoding="utf-8")))
+        return made(toml_values(Path(path).read_text(encoding="utf-8")))
     except UnknownFormatError as error:  # names the file
         raise ConfigError(str(error)) from None
     except (OSError, ValueError, RecursionError, ConfigError) as error:  # ValueError: no UTF-8, no TOML

@@ -88,6 +88,8 @@ def _named(format: str) -> str:
 
 def _reading(path: str | Path) -> h5py.File:
     """Open a file for reading, even if this process has it open by other means, such as xarray."""
+    if not Path(path).is_file():  # a pipe would never end
+        raise FileNotFoundError(f"no regular file {path}")
     try:
         # Files are replaced as a whole and never changed, so that they need no locks.
         return h5py.File(str(path), "r", locking=False)
@@ -102,7 +104,7 @@ def format_of(path: str | Path) -> str:
     """Return the attribute ``format`` of an HDF5 file; empty for other files and damaged ones."""
     try:
         with _reading(path) as h5file:
-            return str(plain(h5file.attrs.get("format", "")))
+            return str(plain(h5file.attrs["format"])) if h5file.attrs.get_id("format").shape == () else ""
     except _DAMAGE:
         return ""
 
@@ -147,13 +149,24 @@ def _inspect_attributes(item: h5py.Group | h5py.Dataset, budget: Budget) -> None
         space, dtype = attribute.get_space(), attribute.dtype
         if space.get_simple_extent_type() == h5py.h5s.NULL or not (_is_known(dtype) or _is_of_scales(name, dtype)):
             raise budget.error(f"{item.file.filename}: {_spoken(item, name)} is empty or of an unknown type")
-        budget.take(space.get_simple_extent_npoints() * dtype.itemsize, _spoken(item, name))
+        count = space.get_simple_extent_npoints()
+        budget.take(count * dtype.itemsize, _spoken(item, name))
+        if h5py.check_string_dtype(dtype) is not None and dtype.kind == "O":
+            if count > 1:  # each may be the same text in the file
+                whole = Path(item.file.filename).stat().st_size
+                Budget(budget.source, budget.error).take(count * whole, _spoken(item, name))
+            budget.take(sum(map(len, np.ravel(item.attrs[name]))), _spoken(item, name))
 
 
 def _inspect_size(dataset: h5py.Dataset, place: str, budget: Budget) -> None:
     """Raise an error if a data set claims more than may be read, or more than the file has of it."""
     size = math.prod(dataset.shape) * dataset.dtype.itemsize
     budget.take(size, dataset.name.strip("/"))
+    if dataset.dtype.kind == "O":  # texts of any length, which may all be the same in the file
+        if dataset.size > _MOST_OBJECTS:
+            raise budget.error(f"{place} has too many texts")
+        for index in np.ndindex(dataset.shape):
+            budget.take(len(dataset[index]), dataset.name.strip("/"))
     if dataset.chunks is None:
         if dataset.id.get_storage_size() < size:
             raise budget.error(f"{place} claims {size} bytes, of which the file has {dataset.id.get_storage_size()}")

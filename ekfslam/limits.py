@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import stat
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
+from typing import Any
 
 from ekfslam.errors import ConfigError, EkfslamError, UnknownFormatError
 
 DEFAULT_GB = 0.5  # more than twice the largest recording known; reading takes about three times as much
 _TEXT_SHARE = 16  # memory of parsed numbers over that of their text
+_MOST_DOTS = 100_000_000  # sum over lines of squares, as which the time of `tomllib` grows with dotted keys
 _limit: ContextVar[int] = ContextVar("limit", default=int(DEFAULT_GB * 1e9))
+_noted: ContextVar[set[Path] | None] = ContextVar("noted", default=None)
 
 
 @contextmanager
@@ -48,6 +52,24 @@ class Budget:
             )
 
 
+@contextmanager
+def noting_files() -> Iterator[set[Path]]:
+    """Yield a set to which `require_file` adds every file of the context, without symbolic links."""
+    found: set[Path] = set()
+    token = _noted.set(found)
+    try:
+        yield found
+    finally:
+        _noted.reset(token)
+
+
+def toml_values(text: str) -> dict[str, Any]:
+    """Return the values of a TOML file; `TOMLDecodeError` also for keys of thousands of parts."""
+    if sum(line.count(".") ** 2 for line in text.splitlines()) > _MOST_DOTS:
+        raise tomllib.TOMLDecodeError("a line has too many dots")
+    return tomllib.loads(text)
+
+
 def require_file(path: str | Path, is_text: bool = False) -> None:
     """Raise an `UnknownFormatError` unless this is a small enough regular file; a pipe would never end."""
     try:
@@ -59,3 +81,5 @@ def require_file(path: str | Path, is_text: bool = False) -> None:
             f"{path}: cannot be read (it is {'a directory' if stat.S_ISDIR(status.st_mode) else 'no regular file'})"
         )
     Budget(str(path)).take(status.st_size * (_TEXT_SHARE if is_text else 1), "the text" if is_text else "the file")
+    if (noted := _noted.get()) is not None:
+        noted.add(Path(path).resolve())

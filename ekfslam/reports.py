@@ -19,7 +19,7 @@ from ekfslam import files
 from ekfslam.config import MODES, Config, Mode
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.trajectory import Trajectory
-from ekfslam.errors import ArchiveError, EkfslamError, FilterError, IllPosedError, PosteriorError
+from ekfslam.errors import ArchiveError, EkfslamError, FilterError, IllPosedError, PosteriorError, UnknownFormatError
 from ekfslam.evaluation.brief import ATE, brief, brief_rows
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations, verdict_on
 from ekfslam.evaluation.summary import compare_table, summarise_all
@@ -27,6 +27,7 @@ from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.figures.older import FIGURES, WAY, marked, older_figures, remove_figures, require_own
 from ekfslam.filters.loop import one_thread
 from ekfslam.filters.result import Result
+from ekfslam.limits import require_file
 from ekfslam.names import without_common_ends
 from ekfslam.others import Others
 from ekfslam.runner import require_arguments, run
@@ -261,9 +262,10 @@ def compared_table(folders: Iterable[Path]) -> SweepTable:
     names = without_common_ends([folder.name for folder in folders])
     for folder, name in zip(folders, names, strict=True):
         try:
+            require_file(folder / "summary.json", is_text=True)
             modes = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["modes"]
             rows += [{"recording": name, "mode": mode, **figures} for mode, figures in modes.items()]
-        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, UnknownFormatError) as error:
             raise ArchiveError(f"{folder / 'summary.json'}: no summary of compare ({error})") from None
     return SweepTable.of_rows(rows, ("recording", "mode"), len(rows), {"mode": "estimator"})
 

@@ -4,23 +4,32 @@ from __future__ import annotations
 
 import bz2
 import contextlib
+import os
 import pickle
 import re
 import sqlite3
 import struct
 import time
+import zlib
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from support.bags import stereo, write
 from support.images import write_plain
 from support.npy import npy_fields, write_npy
 
-from ekfslam import open_images, open_sequence
+from ekfslam import hdf5, open_images, open_sequence
+from ekfslam.cli import main
+from ekfslam.config import Config
+from ekfslam.data.readers.calibrations import read_pair
 from ekfslam.data.simulate import builtin
-from ekfslam.errors import EkfslamError, UnknownFormatError
+from ekfslam.errors import ArchiveError, EkfslamError, UnknownFormatError
+from ekfslam.figures.older import archives_in, older_figures
 from ekfslam.limits import reading_up_to
+from ekfslam.reports import compared_table
+from ekfslam.studies.sweep import Sweep
 
 
 def npy_of(path: Path, pickled: bytes) -> Path:
@@ -180,3 +189,97 @@ def test_images_that_claim_huge_sizes_are_refused_by_their_header(tmp_path, suff
     Pillow.fromarray(np.zeros((4000, 4000), np.uint8)).save(path)
     with reading_up_to(0.02), pytest.raises(UnknownFormatError, match=r"the image claims .* --read-limit"):
         read_gray(path)
+
+
+def test_a_matrix_of_millions_of_empty_elements_is_refused_at_once(tmp_path):
+    element = struct.pack("<II", 14, 1 << 24) + bytes(1 << 24)  # eight bytes of zeros are an empty element
+    data = zlib.compress(element, 9)
+    path = tmp_path / "a.mat"
+    head = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM"
+    path.write_bytes(head + struct.pack("<II", 15, len(data)) + data)
+    begin = time.process_time()
+    with pytest.raises(UnknownFormatError, match=r"damaged \.mat file"):
+        open_sequence(path)
+    assert time.process_time() - begin < 1.0
+
+
+ENDLESS = "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r)"
+ROWS = {
+    "view": f"DROP TABLE schema; CREATE VIEW schema AS {ENDLESS} SELECT max(n) AS schema_version FROM r",
+    "column": "ALTER TABLE messages ADD COLUMN more BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL",
+    "default": f"ALTER TABLE messages ADD COLUMN more TEXT DEFAULT '{'x' * 20_000}'",
+    "virtual": "CREATE VIRTUAL TABLE more USING rtree(id, a, b)",
+}
+
+
+@pytest.mark.parametrize("kind", ROWS)
+def test_a_bag_whose_rows_are_computed_is_refused(tmp_path, kind):
+    path = write(tmp_path, stereo(), "ros2")
+    with contextlib.closing(sqlite3.connect(next(path.rglob("*.db3")))) as database:
+        database.executescript(ROWS[kind])
+    with pytest.raises(UnknownFormatError, match="is a view, trigger or computed column, which no bag has"):
+        open_sequence(path)
+
+
+def test_keys_and_numbers_of_a_calibration_take_time_in_proportion_to_their_length(tmp_path):
+    path, begin = tmp_path / "a.yaml", time.process_time()
+    path.write_text("K" * 1_000_000 + ":\n" + "".join(f" a{i}: 1\n" for i in range(100_000)))
+    with pytest.raises(UnknownFormatError, match="a key with those above it claims"):
+        read_pair(path)
+    path.write_text("cam0:\n  intrinsics: [" + "1" * 100_000 + "a]\n  camera_model: pinhole\n")
+    with pytest.raises(EkfslamError, match="expected numbers"):
+        read_pair(path)
+    (tmp_path / "c.toml").write_text("a" + ".a" * 100_000 + " = 1")
+    for read in (Config.from_toml, read_pair, Sweep.from_toml):
+        with pytest.raises(EkfslamError, match="too many dots"):
+            read(tmp_path / "c.toml")
+    assert time.process_time() - begin < 2.0
+
+
+@pytest.mark.parametrize("header", ["time,a_x," + "(" * 50_000, "time,v" + " " * 50_000 + "x"], ids=["(", "blanks"])
+def test_a_header_takes_time_in_proportion_to_its_length(tmp_path, header):
+    path, begin = tmp_path / "a.csv", time.process_time()
+    path.write_text(header + "\n0,0,0\n")
+    for kind in ("velocities", "imu"):
+        with pytest.raises(EkfslamError):
+            open_sequence("builtin:loop?frames=5", **{kind: path})
+    assert time.process_time() - begin < 2.0
+
+
+def test_a_directory_of_a_zip_file_with_too_many_entries_is_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(b"PK\x03\x04" + (b"PK\x01\x02" + bytes(42)) * 20_000)
+    with pytest.raises(UnknownFormatError, match="a zip file of 20000 entries"):
+        open_sequence(path)
+
+
+@pytest.mark.parametrize("where", ["attribute", "data set"])
+def test_texts_that_are_one_and_the_same_in_the_file_are_counted(tmp_path, where):
+    path, texts = tmp_path / "a.h5", ["x" * 10_000] + ["y"] * 3000
+    with h5py.File(path, "w") as h5file:
+        if where == "attribute":
+            h5file.attrs.create("more", texts, dtype=h5py.string_dtype())
+        else:
+            h5file.create_dataset("more", data=texts, dtype=h5py.string_dtype())
+    content = path.read_bytes()
+    place = re.search(struct.pack("<I", 10_000) + b".{12}" + struct.pack("<I", 1), content, re.S).start()
+    path.write_bytes(content[:place] + content[place : place + 16] * 3001 + content[place + 16 * 3001 :])
+    assert path.stat().st_size < 150_000
+    with reading_up_to(0.02), pytest.raises(ArchiveError, match=r"more.* claims .* --read-limit"):
+        hdf5.opened(path, "any", 1).__enter__()
+
+
+def test_pipes_beside_and_in_place_of_a_file_are_not_read(tmp_path, capsys, monkeypatch):
+    for name in ("a.h5", "figure.png", "summary.json"):
+        os.mkfifo(tmp_path / name)
+    assert main(["info", str(tmp_path / "a.h5")]) == 2
+    assert "it is no regular file" in capsys.readouterr().err
+    with pytest.raises(ArchiveError, match="no summary of compare"):
+        compared_table([tmp_path])
+    assert older_figures(tmp_path / "a.h5") == []
+
+
+def test_the_marks_of_a_picture_take_time_in_proportion_to_their_length(tmp_path):
+    path, begin = tmp_path / "a.png", time.process_time()
+    path.write_bytes(b"ekfslam_shows:" * 100_000)
+    assert archives_in(path) == set() and time.process_time() - begin < 0.5

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,11 +16,15 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.images import write_course, write_plain
+from support.kitti_raw import write_drive
 from support.running import processes
 
 from ekfslam import open_sequence
 from ekfslam.cli import main
 from ekfslam.config import Config
+from ekfslam.data.readers.hdf5 import write_sequence
+from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError, ConfigError, WriteError
 from ekfslam.evaluation.summary import KEYS, summarise
 from ekfslam.figures.sweep import paper_sweep, plot_sweep
@@ -498,16 +503,42 @@ def test_a_second_sweep_into_the_same_table_is_told_and_loses_nothing(tmp_path):
     assert read_table(path).rows() == table.rows()
 
 
-def test_contents_of_folders_and_of_files_that_a_description_names_decide_a_run(tmp_path):
-    (tmp_path / "left").mkdir()
-    image, calib = tmp_path / "left" / "0.png", tmp_path / "calibration.toml"
-    calib.write_text('left = "left"\n')
-    found = set()
-    for data in (tmp_path, calib):
-        for content in (b"a", b"b"):  # equal in size
-            image.write_bytes(content)
-            found.add(Recording(str(data), "images").content)
-    assert len(found) == 4
+@pytest.mark.parametrize("kind", ["folder", "description", "links", "above", "beside", "imu"])
+def test_every_file_that_opening_reads_decides_a_run(tmp_path, kind):
+    folder, more = write_plain(tmp_path), {}
+    data, changed = folder, folder / "left" / "0001.png"
+    if kind == "description":
+        data = folder / "calibration.toml"
+    elif kind == "links":
+        shutil.move(folder / "left", tmp_path / "elsewhere")
+        (folder / "left").symlink_to(tmp_path / "elsewhere")
+    elif kind == "above":
+        data = write_drive(tmp_path)
+        changed = data.parent / "calib_velo_to_cam.txt"
+    elif kind == "beside":
+        data = write_course(tmp_path)
+        changed = tmp_path / "dataset02_imgs.npy"
+    elif kind == "imu":
+        samples = "\n".join(f"{k * 5_000_000},0,0,0,0,0,9.81" for k in range(400))
+        (tmp_path / "imu.csv").write_text(samples)
+        changed, more = tmp_path / "imu.yaml", {"imu": str(tmp_path / "imu.csv")}
+        changed.write_text("gyroscope_noise_density: 1e-3\n")
+    contents = [Recording(str(data), "a", **more).content for _ in range(2)]
+    changed.write_bytes(changed.read_bytes() + b" ")
+    contents.append(Recording(str(data), "a", **more).content)
+    assert contents[0] == contents[1] != contents[2]
+
+
+def test_a_file_that_changes_between_two_sweeps_of_a_process_is_read_again(tmp_path):
+    path, poses = tmp_path / "a.h5", []
+    for seed in (1, 2):
+        write_sequence(builtin(f"loop?frames=5&seed={seed}"), path)
+        with open_executor("serial") as executor:
+            table = run_sweep(
+                Sweep((Recording(str(path), "a"),), ("dead-reckoning",)), tmp_path / f"{seed}.h5", executor
+            )
+        poses.append(table.rows()[0]["ate_m"])
+    assert poses[0] != poses[1]
 
 
 def without_noise(sequence, seed):

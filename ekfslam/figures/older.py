@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import struct
 import zlib
 from collections.abc import Iterable, Mapping
@@ -24,7 +25,7 @@ WAYS = f"{WAY}, --force replaces it"
 _PICTURES = (".png", ".svg", ".pdf")
 _KEPT = ("report.html", "drive.gif", "drive.mp4")  # files under other names are records of the user
 _END = 1 << 18  # bytes at the end of a file that hold its mark
-_MARK = re.compile(rb"ekfslam_shows:([A-Za-z0-9_.~%/:,]*);")
+_MARK, _NAMES = b"ekfslam_shows:", re.compile(rb"([A-Za-z0-9_.~%/:,]*);")
 
 
 def marked(contents: Mapping[Path, str | bytes], archives: Iterable[Path]) -> dict[Path, str | bytes]:
@@ -74,13 +75,16 @@ def _with_mark(data: bytes, suffix: str, mark: bytes) -> bytes:
 def archives_in(path: Path) -> set[Path]:
     """Return the archives that a picture or page names, none if it is missing or has no mark."""
     try:
+        if not stat.S_ISREG(path.stat().st_mode):  # a pipe would never end
+            return set()
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _END))
             data = file.read()
     except OSError:
         return set()
-    marks = _MARK.findall(data)
-    names = [os.fsdecode(unquote_to_bytes(name)) for name in marks[-1].split(b",")] if marks else []
+    _, is_marked, rest = data.rpartition(_MARK)
+    mark = _NAMES.match(rest) if is_marked else None
+    names = [os.fsdecode(unquote_to_bytes(name)) for name in mark[1].split(b",")] if mark else []
     return {path.parent / name for name in names if "\0" not in name}
 
 
@@ -112,7 +116,8 @@ def older_figures(archive: Path) -> list[Path]:
     kept = [folder / name for name in _KEPT]
     found += [path for path in kept if {_real(other) for other in archives_in(path)} == own]
     if archive.exists() and all(path == archive for path in folder.glob("*.h5")):
-        found += [path for path in folder.glob("*.png") if not archives_in(path) and _is_figure(path)]
+        files = (path for path in folder.glob("*.png") if path.is_file())
+        found += [path for path in files if not archives_in(path) and _is_figure(path)]
     return found
 
 

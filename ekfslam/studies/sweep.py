@@ -16,9 +16,9 @@ import inspect
 import itertools
 import json
 import math
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
@@ -29,15 +29,18 @@ from numpy.typing import NDArray
 
 import ekfslam
 from ekfslam.config import MODES, VARIANTS, Config, FrontEndConfig, of_toml
+from ekfslam.data.imu import with_inertial_files
+from ekfslam.data.opening import open_recording
 from ekfslam.data.readers.simulated import BUILTIN
 from ekfslam.data.sequence import Sequence, stretch
+from ekfslam.data.velocities import attach_velocities
 from ekfslam.errors import ArchiveError, ConfigError, EkfslamError
 from ekfslam.evaluation.summary import KEYS, summarise
 from ekfslam.evaluation.truth import with_truth_noise
 from ekfslam.filters.loop import one_thread
 from ekfslam.filters.result import Result
 from ekfslam.frontend.opening import open_sequence
-from ekfslam.limits import DEFAULT_GB, limit_gb, reading_up_to, require_file
+from ekfslam.limits import DEFAULT_GB, limit_gb, noting_files, reading_up_to, require_file
 from ekfslam.names import printable
 from ekfslam.others import NO_OTHERS, Others, files_of
 from ekfslam.provenance import versions
@@ -59,6 +62,7 @@ _KEYS = {"recordings": list, "modes": list, "variants": list, "seeds": list, "se
 _KEYS |= {"with": dict, "with_frame": str, "with_world": str}
 _KINDS = {list: "list", dict: "table", str: "text"}
 _FILES = ("truth", "velocities", "calibration", "imu", "imu_noise")  # of a recording, beside its data
+_OPENED_AS = ("extrinsics", "lateral", "topics", "calibration")  # arguments of `open_recording`
 _READ_AS = ("extrinsics", "lateral", "velocity_frame", "topics", *_FILES)  # arguments of `open_sequence`
 _RECORDING_KEYS = ("data", "name", "frames", *_READ_AS)
 _TAKEN = ("key", "recording", "seed", "case", "mode", "error", "run", *KEYS)  # names of columns
@@ -107,9 +111,25 @@ class Recording:
     def content(self) -> str:
         """Everything that decides its numbers: digests of its files or the name of the world, and its preparation."""
         facts = {name: getattr(self, name) for name in ("data", "frames", *_READ_AS)}
-        for name in _FILES if self.is_simulated else ("data", *_FILES):
-            facts[name] = facts[name] and _digest(Path(facts[name]))
+        given = [name for name in _FILES if facts[name]] + ([] if self.is_simulated else ["data"])
+        places = [Path(facts[name]) for name in given]
+        for name, place in zip(given, places, strict=True):
+            facts[name] = _digest(place)
+        inside = {place.resolve() for place in places}
+        beside = [path for path in self._read if not inside & {path, *path.parents}]
+        facts["beside"] = sorted(f"{path.name} {_digest_of_file(path)}" for path in beside)
         return json.dumps([facts, _source(self.prepare)])
+
+    @property
+    def _read(self) -> set[Path]:
+        """Files that opening reads, such as calibrations beside the recording; for a damaged one, those until then."""
+        with noting_files() as found, suppress(EkfslamError, OSError):
+            options: dict[str, Any] = {name: getattr(self, name) for name in _OPENED_AS}
+            recording: Any = open_recording(self.data, **options)
+            if self.velocities:
+                attach_velocities(recording, self.velocities)
+            with_inertial_files(recording, self.imu, self.imu_noise)
+        return found
 
 
 @dataclass(frozen=True)
@@ -280,7 +300,7 @@ def run_task(task: Task, read_gb: float = DEFAULT_GB) -> Record:
     """Run one task, with a limit on the size of files, and return its figures of merit or its error."""
     try:
         with ONE_RUN_AT_A_TIME, reading_up_to(read_gb):
-            sequence = _opened(task.recording, task.seed, task.config.front_end)
+            sequence = _opened(task.recording, task.recording.content, task.seed, task.config.front_end)
             sequence = with_truth_noise(sequence, task.config.truth)
             theirs = task.others.results(sequence)
             result = theirs.get(task.mode) or run(sequence, task.mode, task.config)  # type: ignore[arg-type]
@@ -313,8 +333,8 @@ def _record(columns: Mapping[str, Column], figures: Mapping[str, Any], error: st
 
 
 @lru_cache(maxsize=2)
-def _opened(recording: Recording, seed: int | None, front_end: FrontEndConfig) -> Sequence:
-    """Open a recording and keep it for the next run in the same process."""
+def _opened(recording: Recording, content: str, seed: int | None, front_end: FrontEndConfig) -> Sequence:
+    """Open a recording and keep it for the next run in the same process, unless its files change."""
     options: dict[str, Any] = {name: getattr(recording, name) for name in _READ_AS}
     sequence = open_sequence(recording.data, front_end=front_end, **options)
     if recording.frames:
@@ -426,22 +446,12 @@ def _source(value: Any) -> str:
 
 
 def _digest(path: Path) -> str:
-    """Return the digest of a file, or of all files in a folder; of a TOML file also that of the paths it names."""
+    """Return the digest of a file, or of all files in a folder."""
     if path.is_dir():
         inside = [f"{p.relative_to(path)} {_digest_of_file(p)}" for p in sorted(path.rglob("*")) if p.is_file()]
         return hashlib.sha256("\n".join(inside).encode()).hexdigest()
     require_file(path)
-    named = [path.parent / text for text in _texts_in(path)] if path.suffix == ".toml" else []
-    return " ".join([_digest_of_file(path), *(_digest(other) for other in named if other.exists() and other != path)])
-
-
-def _texts_in(path: Path) -> list[str]:
-    """Return the texts in the first level of a TOML file; of a damaged one, which the run will name, none."""
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8")).values()
-    except (OSError, ValueError, RecursionError):
-        return []
-    return [value for value in values if isinstance(value, str) and value and "\0" not in value]
+    return _digest_of_file(path)
 
 
 def _digest_of_file(path: Path) -> str:

@@ -26,6 +26,7 @@ from ekfslam.data.readers.text import read_lines
 from ekfslam.data.readers.yaml import Calibration, read_yaml
 from ekfslam.errors import CalibrationError, DataError, ExtrinsicsError, UnknownFormatError
 from ekfslam.geometry import se3
+from ekfslam.limits import toml_values
 
 Size = tuple[int, int]
 _MODELS: dict[str, DistortionModel] = {
@@ -143,7 +144,7 @@ def read_toml(file: Path) -> dict[str, Any]:
     """Return the values of a ``calibration.toml``; unknown keys are refused."""
     text = "\n".join(read_lines(file, "expected calibration.toml"))
     try:
-        values = tomllib.loads(text)
+        values = toml_values(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise UnknownFormatError(f"{file}: not a TOML file ({error})") from None
     tables = [("", values, _KEYS | _TABLES)]

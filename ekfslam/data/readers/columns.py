@@ -28,7 +28,7 @@ NAMES: dict[str, str] = {
 NAMES |= dict.fromkeys(("time", "timestamp", "t", "stamp", "times", "timestamps", "sec", "seconds"), "time")
 _UNITS = {"ns": 1e-9, "nsec": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0}
 _PREFIXES = ("field", "headerstamp", "header", "pose", "twist", "msg", "data")
-_HEADER_WITHIN = 20  # lines
+_HEADER_WITHIN, _LONGEST_HEADER = 20, 5000  # lines, characters
 POSE = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
 TWIST = ("time", "vx", "vy", "vz", "wx", "wy", "wz")
 
@@ -47,8 +47,8 @@ class Header:
 def header_of(lines: list[str]) -> Header | None:
     """Return the header of a file: a line before its numbers that names the stamp and two more known columns."""
     for number, line in enumerate(lines[:_HEADER_WITHIN]):
-        text = line.strip().lstrip("#%").strip()
-        if text and text == line.strip() and not text[0].isalpha():
+        text = line[:_LONGEST_HEADER].strip().lstrip("#%").strip()
+        if text and text[:1] == line.strip()[:1] and not text[0].isalpha():
             return None
         # A unit may stand apart from its name: p_RS_R_x [m]
         text = re.sub(r"\s+([\[(])", r"\1", text)

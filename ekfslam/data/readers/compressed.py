@@ -13,13 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from ekfslam.data.readers.text import read_lines
+from ekfslam.errors import UnknownFormatError
 from ekfslam.limits import Budget
+from ekfslam.names import printable
 
 _PIECE = 1 << 20
 _MOST_LZ4 = 255  # times its size that lz4 may become
 _GENEROUS = 20  # times its own size that a compressed file may become, beyond the limit of reading
 _MCAP, _ROS1 = b"\x89MCAP0\r\n", b"#ROSBAG V2.0"
 _CHUNK = 6  # MCAP
+_ODD_ENTRY = "type NOT IN ('table', 'index') OR sql LIKE 'create virtual%' OR length(sql) > 10000"  # long defaults
 
 
 def require_room(path: Path) -> None:
@@ -29,6 +32,8 @@ def require_room(path: Path) -> None:
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
         if not file.is_file():
             continue
+        if file.suffix == ".db3":
+            _require_plain_tables(file)
         if by_message and file.suffix == ".db3":
             for data in _messages(file):
                 _require_small("zstd", data, str(file))
@@ -42,10 +47,25 @@ def require_room(path: Path) -> None:
             _require_small_chunks(file)
 
 
+def _require_plain_tables(file: Path) -> None:
+    """Refuse a database whose rows are computed rather than stored: they may have no end. Damaged ones pass."""
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(_database(file)) as database:
+        odd = list(database.execute(f"SELECT name FROM sqlite_master WHERE {_ODD_ENTRY}"))
+        tables = [] if odd else list(database.execute("SELECT name FROM sqlite_master WHERE type = 'table'"))
+        for table in tables:
+            odd += database.execute("SELECT name FROM pragma_table_xinfo(?) WHERE hidden", table)
+        if odd:
+            name = printable(str(odd[0][0]))
+            raise UnknownFormatError(f"{file}: {name} is a view, trigger or computed column, which no bag has")
+
+
+def _database(file: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"{file.resolve().as_uri()}?immutable=1", uri=True)
+
+
 def _messages(file: Path) -> Iterator[bytes]:
     """Yield the messages of a bag in SQLite; none if it is damaged, which its reader names."""
-    place = f"{file.resolve().as_uri()}?mode=ro"
-    with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(place, uri=True)) as database:
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(_database(file)) as database:
         for (data,) in database.execute("SELECT data FROM messages"):
             if isinstance(data, bytes):
                 yield data

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
@@ -22,6 +22,7 @@ from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.limits import Budget, require_file
 
+_ENTRY, _MOST_ENTRIES = b"PK\x01\x02", 10_000  # mark of an entry in the directory of a zip file
 _COMMON = ("features", "time_stamps", "linear_velocity", "K", "b")
 FIELDS = (*_COMMON, "rotational_velocity", "cam_T_imu")
 LATER_FIELDS = (*_COMMON, "angular_velocity", "imu_T_cam")
@@ -89,7 +90,7 @@ def stamps_of(fields: Mapping[str, NDArray], name: str) -> Array:
 def _load(path: Path) -> dict[str, np.ndarray]:
     expected = f"expected an .npz file with the fields {', '.join(FIELDS)}"
     try:
-        _inspect(path)
+        inspect_npz(path, _KNOWN)
         with np.load(path, allow_pickle=False) as file:
             names = file.files
             fields = {name: file[name] for name in _KNOWN if name in names} if "features" in names else {}
@@ -102,13 +103,17 @@ def _load(path: Path) -> dict[str, np.ndarray]:
     return fields
 
 
-def _inspect(path: Path) -> None:
-    """Refuse arrays that claim too much memory, or more than they have, before they are decompressed."""
+def inspect_npz(path: Path, known: Container[str]) -> None:
+    """Refuse known arrays that claim too much memory, or more than they have, before they are decompressed."""
     require_file(path)
     budget = Budget(str(path))
+    with path.open("rb") as file:
+        count = sum(piece.count(_ENTRY) for piece in iter(lambda: file.read(1 << 24), b""))
+    if count > _MOST_ENTRIES:
+        raise UnknownFormatError(f"{path}: a zip file of {count} entries, which no .npz is")
     with ZipFile(path) as archive:
         for entry in archive.infolist():
-            if entry.filename.removesuffix(".npy") not in _KNOWN:
+            if entry.filename.removesuffix(".npy") not in known:
                 continue
             budget.take(entry.file_size, entry.filename)
             if entry.compress_type not in (ZIP_STORED, ZIP_DEFLATED):

@@ -11,18 +11,18 @@ from dataclasses import replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
-from zipfile import BadZipFile, ZipFile
+from zipfile import BadZipFile
 
 import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.data.inertial import InertialRows
+from ekfslam.data.readers.ece276a import inspect_npz
 from ekfslam.data.readers.fields import checksum, require_numbers
 from ekfslam.data.readers.imu_yaml import beside, calibrated, read_imu_yaml
 from ekfslam.data.readers.registry import Reader, Source
 from ekfslam.data.readers.text import first_row, line_of, parse_numbers, read_lines
 from ekfslam.errors import LineError, StampError, UnknownFormatError
-from ekfslam.limits import Budget
 
 _PLACES = ("mav0/imu0/data.csv", "imu0/data.csv", "data.csv")
 _NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
@@ -31,7 +31,7 @@ _UNITS = {
     "gyro": {"rad/s": 1.0, "deg/s": np.pi / 180, "dps": np.pi / 180, "mrad/s": 1e-3},
     "accel": {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "cm/s2": 1e-2, "mm/s2": 1e-3},
 }
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?")
 _SAME = {"nsec": "ns", "sec": "s", "seconds": "s"}
 _RATES_HZ = 20.0, 8000.0  # of inertial units: at one of them a step tells the unit of stamps
 _KIND = (
@@ -120,7 +120,7 @@ def _columns(header: str, count: int, path: Path) -> _Columns:
 
 def _kind_of(name: str) -> tuple[str, str]:
     """Return a name of `_WANTED`, empty for any other column, and the unit of a column; empty if not stated."""
-    stem, unit = name.strip().strip("\"'").lower(), ""
+    stem, unit = name.strip().strip("\"'").lower()[:200], ""
     if match := re.search(r"[\[(]([^\])]*)[\])]", stem):
         stem, unit = stem[: match.start()], match.group(1)
     elif match := re.search(r"_(ns|us|ms|s|nsec|sec|rad_s|rads|deg_s|dps|m_s2|m_s_2|ms2|mg)$", stem):
@@ -180,11 +180,7 @@ def _read_arrays(source: Source) -> InertialRows | None:
     path = source.path
     names = ("imu_time_s", "gyro_rad_s", "accel_m_s2")
     try:
-        with ZipFile(path) as archive:
-            budget = Budget(str(path))
-            for info in archive.infolist():
-                if info.filename.removesuffix(".npy") in names:
-                    budget.take(info.file_size, info.filename)
+        inspect_npz(path, names)
         with np.load(path, allow_pickle=False) as file:
             fields = {name: file[name] for name in names if name in file.files}
     except (OSError, ValueError, KeyError, BadZipFile) as error:

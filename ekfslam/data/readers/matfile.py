@@ -10,6 +10,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
 
 
 def _matrix(data: memoryview, order: str) -> tuple[str, NDArray]:
-    elements = list(_elements(data, order))
+    elements = list(islice(_elements(data, order), 4))
     if len(elements) < 3:
         raise ValueError("a matrix without name")
     flags, dimensions, name = (element for _, element in elements[:3])

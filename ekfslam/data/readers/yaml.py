@@ -15,11 +15,12 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.data.readers.text import read_lines
 from ekfslam.errors import CalibrationError
+from ekfslam.limits import Budget
 from ekfslam.names import printable
 
 _KEY = re.compile(r"(\s*)(?:- )?([A-Za-z_][\w.]*)\s*:(?:\s+(.*)|(\[.*)|)$")
 _WORD = re.compile(r"[A-Za-z~.]+")
-_NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
+_NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ def read_yaml(path: Path) -> Calibration:
     """Read the keys of a file."""
     parts: dict[str, list[str]] = {}
     above: list[tuple[int, str]] = []
+    budget = Budget(str(path))
     for raw in read_lines(path, "expected a calibration in YAML"):
         line = (re.sub(r"(^|\s)#.*$", "", raw) if "#" in raw else raw).rstrip()
         if not line or line.startswith(("%", "---")):
@@ -71,7 +73,8 @@ def read_yaml(path: Path) -> Calibration:
         if match:
             depth = len(match.group(1))
             above = [entry for entry in above if entry[0] < depth] + [(depth, match.group(2))]
-            parts[".".join(key for _, key in above)] = [match.group(3) or match.group(4) or ""]
+            budget.take(sum(len(key) + 1 for _, key in above), "a key with those above it")
+            last = parts[".".join(key for _, key in above)] = [match.group(3) or match.group(4) or ""]
         elif above:
-            parts[".".join(key for _, key in above)].append(line)
+            last.append(line)
     return Calibration(path, {key: " ".join(lines) for key, lines in parts.items()})
