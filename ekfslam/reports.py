@@ -7,7 +7,7 @@ known. `check` judges one run by its innovations, which need no truth.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -371,11 +371,17 @@ class Check:
     paths: list[Path]
 
 
-def check(archive: str | Path, mode: str = "full", directory: str | Path | None = None) -> Check:
+def check(
+    archive: str | Path,
+    mode: str = "full",
+    directory: str | Path | None = None,
+    say: Callable[[Honesty], None] = lambda _: None,
+) -> Check:
     """Judge the covariance of a run, and write ``check.json``, ``check.md`` and ``check.png``.
 
     Innovations need no truth; if the archive has one, it is compared, too. The files go into ``directory``, by default
-    the folder of the archive. Raise `HonestyError` if the run has no innovations.
+    the folder of the archive. ``say`` gets the verdict before they are written. Raise `HonestyError` if the run has no
+    innovations.
     """
     from ekfslam.figures.check import plot_check
     from ekfslam.figures.style import png
@@ -383,7 +389,6 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
     folder = Path(archive).parent if directory is None else Path(directory)
     values, table, figure = _targets(folder, "check.json", "check.md", "check.png")
     with files.claimed(values, reads=[archive]):
-        require_own([figure], [Path(archive)], WAY)
         result = open_result(archive, mode)
         require_innovations(result)
         recorded = read_archive(archive)
@@ -393,6 +398,8 @@ def check(archive: str | Path, mode: str = "full", directory: str | Path | None 
         except PosteriorError as error:
             skipped = str(error)
         found = judge(result, smoothed, skipped, recorded.truth, recorded.interpolated)
+        say(found)
+        require_own([figure], [Path(archive)], WAY)
         written: dict[Path, str | bytes] = {
             values: _json(found.values),
             table: found.table,

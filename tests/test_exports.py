@@ -247,6 +247,20 @@ def test_covariances_with_other_stamps_are_a_named_error(full, tmp_path):
         ekfslam.read_trajectory(tmp_path / "poses.txt")
 
 
+@pytest.mark.parametrize(("shift", "is_same"), [(5e-4, True), (0.02, False)])
+def test_rounded_stamps_of_covariances_are_those_of_the_poses(full, tmp_path, shift, is_same):
+    full.export(tmp_path / "poses.txt", "tum")
+    beside = tmp_path / "poses.cov.txt"
+    rows = np.loadtxt(beside)
+    rows[3, 0] += shift
+    np.savetxt(beside, rows, fmt="%.9g")
+    if is_same:
+        assert ekfslam.read_trajectory(tmp_path / "poses.txt").covariance is not None
+    else:
+        with pytest.raises(ShapeError, match=r"in line 4, where the pose has"):
+            ekfslam.read_trajectory(tmp_path / "poses.txt")
+
+
 def test_the_truth_leaves_no_covariances_of_an_earlier_export_beside_it(archive, tmp_path):
     call = ["export", str(archive), "--format", "tum", "--out", str(tmp_path / "poses.txt")]
     assert main(call) == 0 and ekfslam.read_trajectory(tmp_path / "poses.txt").covariance is not None

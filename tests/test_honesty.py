@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.running import WHOLE, seeds
 
-from ekfslam.data.sequence import Noise
+from ekfslam.data.sequence import Noise, Sequence
 from ekfslam.data.simulate import CAMERA, T_CAM_IMU, City, Loop, simulate
 from ekfslam.errors import HonestyError
 from ekfslam.evaluation import evidence
@@ -212,6 +212,25 @@ def test_a_rig_at_rest_is_not_pessimistic():
 
 
 # --- the verdict ------------------------------------------------------------------------------------------------------
+
+
+def test_velocities_whose_noise_was_found_are_not_better_than_stated():
+    """On a circle the velocities are constant, which the steps of a walk overestimate."""
+    rng, T = np.random.default_rng(0), 60
+    step = se3.exp(0.1 * np.array([3.0, 0, 0, 0, 0, 0.3]))
+    poses = np.array([np.linalg.matrix_power(step, k) for k in range(T)])
+    angle, away = rng.uniform(0, 2 * np.pi, 150), rng.uniform(12, 25, 150)
+    points = np.column_stack([away * np.cos(angle), 10 + away * np.sin(angle), rng.uniform(-2, 4, 150)])
+    q = se3.apply((T_CAM_IMU @ se3.inverse(poses))[:, None], points)
+    pixels = project(CAMERA, np.where(q[..., 2:] > 1, q, np.nan))
+    pixels[(pixels[..., 0] < 0) | (pixels[..., 0] > 1240)] = np.nan
+    twist = np.tile([3.0, 0, 0, 0, 0, 0.3], (T, 1)) + rng.normal(size=(T, 6)) * np.repeat([0.2, 0.02], 3)
+    pixels += rng.normal(size=pixels.shape)
+    sequence = Sequence.from_tracks(0.1 * np.arange(T), pixels, CAMERA, twist=twist, T_cam_imu=T_CAM_IMU)
+    result = run(sequence, "full")
+    assert result.noise.twist_walk_std is not None
+    said = " ".join(judge(result).reasons)
+    assert "smoother than the noise found" in said and "stated" not in said and "give" not in said
 
 
 @pytest.mark.slow

@@ -80,10 +80,26 @@ def test_paired_tests_are_those_of_scipy_on_complete_pairs():
 
 
 def test_too_few_pairs_are_said_and_not_tested():
-    choices = {"full": {k: 1.0 * k for k in range(5)}, "mine": {k: 2.0 * k for k in range(4)}}
+    choices = {("full",): {k: 1.0 * k for k in range(5)}, ("mine",): {k: 2.0 * k for k in range(4)}}
     grid, said = paired_grid({"ATE [m]": choices})
     assert grid is None
     assert said == ("4 pairs are not enough for a test, 6 are needed: full and mine",)
+
+
+def test_of_many_choices_those_that_differ_in_one_part_are_compared():
+    choices = [("drift", "-", "-"), *((("full", a, b)) for a in ("x", "y") for b in ("1", "2"))]
+    values = {choice: {k: float(v) for k, v in enumerate(RNG.normal(size=6))} for choice in choices}
+    grid, said = paired_grid({"ATE [m]": values})
+    pairs = set(zip(grid.columns[1].values, grid.columns[2].values, strict=True))
+    of_full = {("full, x, 1", "full, x, 2"), ("full, x, 1", "full, y, 1"), ("full, x, 2", "full, y, 2")}
+    of_full.add(("full, y, 1", "full, y, 2"))
+    assert pairs == of_full | {("drift", f"full, {a}, {b}") for a in ("x", "y") for b in ("1", "2")}
+    assert said == () and grid.notes[0].endswith("Only choices that differ in one part are compared.")
+
+
+def test_an_estimator_without_a_figure_is_not_said_to_have_too_few_pairs():
+    choices = {("drift",): dict.fromkeys(range(6), np.nan), ("full",): dict.fromkeys(range(6), 1.0)}
+    assert paired_grid({"NIS": choices}) == (None, ())
 
 
 def test_equal_values_have_no_p_value():

@@ -10,12 +10,13 @@ import numpy as np
 from ekfslam.arrays import Array
 from ekfslam.data.checks import frozen, require_shape
 from ekfslam.geometry import se3
+from ekfslam.shown import Card, Shown, count, figure
 
 Moving = Literal["body", "camera"]
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(Shown):
     """Stamped poses of a moving frame, the body (IMU) or the left camera, in world.
 
     Args:
@@ -38,6 +39,19 @@ class Trajectory:
                 value = np.asarray(getattr(self, name), dtype=float)
                 require_shape(value, shape, name)
                 object.__setattr__(self, name, frozen(value))
+
+    def card(self) -> Card:
+        """Return the card that ``repr`` and a notebook show."""
+        poses = count(len(self.time_s), "pose")
+        if not len(self.time_s):
+            return Card(poses, {})
+        way_m = np.linalg.norm(np.diff(self.T_world[:, :3, 3], axis=0), axis=1).sum()
+        facts = {
+            "stamps": f"{self.time_s[0]:.10g} to {self.time_s[-1]:.10g} s",
+            "way": f"{figure(float(way_m))} m of the {self.moving}",
+            "covariance": "none" if self.covariance is None else "of every pose",
+        }
+        return Card(poses, facts, (".time_s", ".T_world", ".covariance"))
 
     def of_camera(self, T_cam_imu: Array) -> Trajectory:
         """Return the trajectory of the left camera on a body; the extrinsics count as known."""

@@ -128,8 +128,21 @@ def _shared_causes(result: Result, shared: SharedInnovations, t: float) -> Itera
             yield Cause("shared noise", where, size, text, _velocity_remedy(result, large, size))
     size, low = _mean(shared.factor), shared.factor_low / shared.factor
     if (shared.factor < _NOTABLE * low).all() and size < 1.0 / _NOTABLE and measures_velocities(result):
-        text = f"shared innovations are {1 / size:.1f}x smaller than expected: velocities are better than stated"
-        yield Cause("shared noise", AXES, size, text, _velocity_remedy(result, order, size))
+        text = f"shared innovations are {1 / size:.1f}x smaller than expected"
+        if _is_found(result):  # the steps of the motion and the noise of the velocities explain it alike
+            yield Cause(
+                "shared noise", AXES, size, text + "the motion is smoother than the noise found from the data", ""
+            )
+        else:
+            text += "velocities are better than stated"
+            yield Cause("shared noise", AXES, size, text, _velocity_remedy(result, order, size))
+
+
+def _is_found(result: Result) -> bool:
+    """Return whether the velocities walk and their noise was found from the data."""
+    noise = result.config.get("noise", {})
+    is_stated = noise.get("sigma_v_m_s") is not None or noise.get("sigma_w_rad_s") is not None
+    return result.noise.twist_walk_std is not None and not is_stated
 
 
 def _velocity_remedy(result: Result, axes: IntArray, size: float) -> str:

@@ -82,7 +82,8 @@ class Honesty:
                 return f"consistent as far as {known} can tell ({nees})"
             reason = "" if self.nis is None else f", for a reason that {by} do not show"
             return f"standard deviations {_size(true)} by the truth ({nees}){reason}"
-        said = f"by the truth they are {_size(true)}" if true != 1.0 else "the truth of one drive does not show it"
+        they = "standard deviations" if self.shared is None else "they"
+        said = f"by the truth {they} are {_size(true)}" if true != 1.0 else "the truth of one drive does not show it"
         return f"{self._by_innovations(by)}; {said} ({nees})"
 
     @property
@@ -134,8 +135,17 @@ class Honesty:
         return rows
 
     @property
+    def brief(self) -> str:
+        """Verdict, evidence and what innovations cannot show, as Markdown that is also legible on a terminal."""
+        return document(*self._blocks, BLIND)
+
+    @property
     def table(self) -> str:
-        """Verdict and evidence as Markdown that is also legible on a terminal."""
+        """`brief` with the errors by axis and by row."""
+        return document(*self._blocks, *self._details, BLIND)
+
+    @property
+    def _blocks(self) -> list[str]:
         blocks = [
             f"# {self.name}: honesty of the covariance, {self.frames} frames",
             f"**Verdict: {self.verdict}.**",
@@ -143,21 +153,25 @@ class Honesty:
         ]
         if self.smoother is None:
             blocks.append(f"No comparison with the smoother: {self.smoother_skipped}.")
-        if self.shared is not None and self.tracks is not None:
-            shared, tracks, unknown = self.shared, self.tracks, np.full(6, np.nan)
-            of_axes = {"size": shared.std, **_lags(shared, 1, 5), "persists": shared.persistence}
-            of_axes |= {"grows by": shared.factor, "at least": shared.factor_low}
-            of_axes["vision"] = unknown if self.vision is None else self.vision
-            of_axes["pose"] = unknown if self.factors is None else self.factors
-            of_rows = {**_lags(tracks, 1, 5, LAGS), "persists": tracks.persistence, "grows by": tracks.factor}
-            blocks += [
-                "Errors that the landmarks of a frame share, in standard deviations that the filter expects of them; "
-                "share of the pose that vision decides; factor of the pose's standard deviations:",
-                _table("axis", AXES, of_axes),
-                "Errors of single observations, without those, along tracks:",
-                _table("row", ROWS, of_rows),
-            ]
-        return document(*blocks, BLIND)
+        return blocks
+
+    @property
+    def _details(self) -> list[str]:
+        if self.shared is None or self.tracks is None:
+            return []
+        shared, tracks, unknown = self.shared, self.tracks, np.full(6, np.nan)
+        of_axes = {"size": shared.std, **_lags(shared, 1, 5), "persists": shared.persistence}
+        of_axes |= {"grows by": shared.factor, "at least": shared.factor_low}
+        of_axes["vision"] = unknown if self.vision is None else self.vision
+        of_axes["pose"] = unknown if self.factors is None else self.factors
+        of_rows = {**_lags(tracks, 1, 5, LAGS), "persists": tracks.persistence, "grows by": tracks.factor}
+        return [
+            "Errors that the landmarks of a frame share, in standard deviations that the filter expects of them; "
+            "share of the pose that vision decides; factor of the pose's standard deviations:",
+            _table("axis", AXES, of_axes),
+            "Errors of single observations, without those, along tracks:",
+            _table("row", ROWS, of_rows),
+        ]
 
     def _by_innovations(self, by: str) -> str:
         if not self.causes:

@@ -125,7 +125,8 @@ def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]
     rejected -= result.counts.get(f"rejected: {REASONS[WAITING]}", 0)  # such an observation is used later
     if rejected > _REJECTED * max(accepted + rejected, 1):
         parts = "tracks, velocities, stamps and T_cam_imu" if sequence.has_velocities else "the tracks"
-        cause = warnings[0] if warnings else f"{parts} do not fit each other"
+        stated = "the stated noise is too small, or " if result.config["noise"]["sigma_px"] is not None else ""
+        cause = warnings[0] if warnings else f"{stated}{parts} do not fit each other"
         return (f"{rejected / (accepted + rejected):.0%} of the observations were rejected: {cause}",)
     doubted = result.counts.get("rejected: velocities", 0) / len(sequence)
     if doubted > _REJECTED:

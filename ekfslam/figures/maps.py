@@ -85,8 +85,8 @@ def plot_landmark_arrows(result: Result, truth: Truth | None = None) -> Figure:
 def plot_side(results: Mapping[str, Result], truth: Truth | None = None) -> Figure:
     """Draw the drive from the side: height z of world over the distance driven, metres, with 3-sigma bands.
 
-    Landmarks are those of the map, at the distance at which they were last seen. The view holds the trajectories and
-    the bulk of the landmarks.
+    Landmarks are those of the map, at the distance at which they were last seen. The view holds the trajectories, the
+    band of the mode with the map, and the bulk of the landmarks.
     """
     mapper, figure = map_of(results), Figure(figsize=(9.0, 4.2))
     ax, landmarks = figure.subplots(), mapper.landmarks
@@ -103,6 +103,8 @@ def plot_side(results: Mapping[str, Result], truth: Truth | None = None) -> Figu
         line = line_of(mode)
         one = height(result.T_world_imu, result.covariance if result.has_covariance else None)
         draw_series(ax, one, line["color"], {**line, "zorder": 3}, label=mode)
+        if result is mapper and one.low is not None and one.high is not None:
+            heights += [one.low, one.high]
     low, high = min(z.min() for z in heights), max(z.max() for z in heights)
     margin = 0.06 * (high - low) + 0.05
     ax.set_ylim(low - margin, high + margin)

@@ -22,14 +22,10 @@ _CELLS = 500  # across a picture of a sparsity pattern
 def plot_map_before_and_after(full: Result, smoothed: Result, truth: Truth | None = None) -> Figure:
     """Draw the maps of filter and posterior from above at one scale, poses and landmarks with 2-sigma ellipses.
 
-    The view is the middle half of the smoothed drive. If the drive closes a loop, earlier poses gain most: the last map
-    of the filter knows of the loop, its earlier poses do not.
+    If the drive closes a loop, earlier poses gain most: the last map of the filter knows of the loop, its earlier poses
+    do not.
     """
-    path = smoothed.T_world_imu[:, :2, 3]
-    middle = path[len(path) // 4 : 3 * (len(path) // 4) + 1]
-    low, high = middle.min(axis=0), middle.max(axis=0)
-    margin = 0.1 * (high - low).max() + 5.0
-    low, high = low - margin, high + margin
+    low, high, _ = maps.view_of({"full": full, "smoothed": smoothed}, truth, smoothed.landmarks.position_m[:, :2])
     aspect = float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 2.0))
     figure = Figure(figsize=(10.0, 4.6 * aspect + 1.5))
     axes = figure.subplots(1, 2, sharex=True, sharey=True)

@@ -160,15 +160,14 @@ class SweepTable:
 
     def tests(self, figures: Sequence[str] = SHOWN) -> tuple[Grid | None, tuple[str, ...]]:
         """Return paired tests of estimators and settings over recordings and seeds, see `paired_grid`."""
-        found: dict[str, dict[str, dict[Any, float]]] = {}
+        found: dict[str, dict[tuple[str, ...], dict[Any, float]]] = {}
         names = [name for name in self._shown(figures) if self.column(name).dtype.kind == "f" and name not in _TIMES]
         for choice, part in self._without_repeats().groups(*self.choices).items() if self.choices else ():
             keys = list(zip(*(part.column(name).tolist() for name in _DRAWS if name in self.columns), strict=True))
             keys = [tuple(map(spoken, key)) for key in keys]
-            label = ", ".join(map(spoken, choice))
             for name in names:
                 values = dict(zip(keys, part.column(name).tolist(), strict=True))
-                found.setdefault(self.words(name), {})[label] = values
+                found.setdefault(self.words(name), {})[tuple(map(spoken, choice))] = values
         return paired_grid(found)
 
     def paper(self, ending: str, figures: Sequence[str] = SHOWN) -> str:

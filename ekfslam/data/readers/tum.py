@@ -23,6 +23,7 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")  # position, then rotation, along the a
 UPPER = np.triu_indices(len(AXES))
 COVARIANCE = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER, strict=True))
 COVARIANCE_ENDING = ".cov.txt"
+_ROUNDED = 0.01  # of the least time step: stamps of the two files that differ by less are the same
 
 
 def covariance_path(path: Path) -> Path:
@@ -63,8 +64,15 @@ def covariances_beside(path: Path, time_s: Array) -> Array | None:
     table = parse_table(read_lines(beside, words), beside, columns=1 + len(COVARIANCE))
     if not len(table.values):
         return None
-    if not np.array_equal(table.values[:, 0], time_s):
-        raise ShapeError(f"the stamps are not those of {path.name}", source=str(beside), field="time")
+    found, words = table.values[:, 0], f"the stamps are not those of {path.name}"
+    if len(found) != len(time_s):
+        raise ShapeError(f"{words}: {len(found)} lines, {len(time_s)} poses", source=str(beside), field="time")
+    # Programs round the stamps of their files differently.
+    apart = np.abs(found - time_s) > (_ROUNDED * np.min(np.diff(time_s)) if len(time_s) > 1 else 0.0)
+    if apart.any():
+        k = int(np.argmax(apart))
+        words += f": {found[k]:.6f} in line {table.line[k]}, where the pose has {time_s[k]:.6f}"
+        raise ShapeError(words, source=str(beside), field="time")
     covariance = np.zeros((len(table.values), 6, 6))
     covariance[(slice(None), *UPPER)] = covariance[(slice(None), *UPPER[::-1])] = table.values[:, 1:]
     is_wrong = ~COVARIANCES.holds(covariance, {})
