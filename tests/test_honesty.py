@@ -13,7 +13,7 @@ from ekfslam.data.sequence import Noise, Sequence
 from ekfslam.data.simulate import CAMERA, T_CAM_IMU, City, Loop, simulate
 from ekfslam.errors import HonestyError
 from ekfslam.evaluation import evidence
-from ekfslam.evaluation.causes import Cause
+from ekfslam.evaluation.causes import Cause, truth_causes
 from ekfslam.evaluation.consistency import pose_error, pose_nees_by_axis
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations
 from ekfslam.figures.check import plot_check
@@ -231,6 +231,13 @@ def test_velocities_whose_noise_was_found_are_not_better_than_stated():
     assert result.noise.twist_walk_std is not None
     said = " ".join(judge(result).reasons)
     assert "smoother than the noise found" in said and "stated" not in said and "give" not in said
+
+
+def test_a_truth_far_from_what_innovations_say_is_doubted():
+    far, near = evidence.TruthAgreement(6.0 * 20.0**2, 1.2, 14.4), evidence.TruthAgreement(6.0 * 5.0**2, 1.2, 14.4)
+    (cause,) = truth_causes(far, np.full(6, 1.0))
+    assert "20x larger than innovations say" in cause.text and "base_link" in cause.remedy
+    assert not [*truth_causes(near, np.ones(6)), *truth_causes(far, np.full(6, 4.0)), *truth_causes(far, None)]
 
 
 @pytest.mark.slow

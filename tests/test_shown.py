@@ -15,8 +15,10 @@ from support.same import assert_same
 
 import ekfslam
 from ekfslam.config import VARIANTS, Config
+from ekfslam.data.images import ImageRecording, PairCalibration, side_by_side
 from ekfslam.data.sequence import Truth
 from ekfslam.data.simulate import builtin
+from ekfslam.data.trajectory import from_left_error
 from ekfslam.errors import ShapeError, TruthError
 from ekfslam.evaluation.consistency import pose_error
 from ekfslam.geometry import se3
@@ -25,6 +27,8 @@ from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior
 from ekfslam.storage.archive import read_archive, write_archive
 from ekfslam.studies.study import Study, StudyArchive
+
+PAIR = PairCalibration(np.diag([500.0, 500.0, 1.0]), np.diag([500.0, 500.0, 1.0]), (640, 480), side_by_side(0.54))
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +56,15 @@ def test_everything_shows_itself_in_a_few_lines(world, compared, full, tmp_path)
         "Comparison": (compared, ["dead-reckoning", "full", "ATE (aligned)", "print(comparison.table)"]),
         "Posterior": (posterior(full), ["maximum a posteriori", "60 poses", ".joint_covariance("]),
         "Archive": (read_archive(tmp_path / "a.h5"), ["city", "60 frames", "archive.results["]),
+        "Velocities": (world.inputs[0], ["60 velocities (imu frame)", ".twist"]),
+        "Trajectory": (
+            from_left_error(full.time_s, full.T_world_imu, full.covariance),
+            ["60 poses", "0 to 5.9", "of the body", "of every pose"],
+        ),
+        "ImageRecording": (
+            ImageRecording("pair", "here", world.time_s, PAIR, lambda k: (), np.eye(4), world.twist),
+            ["60, 5.9 s", "two, 0.54 m apart, 640 x 480 px", "in .twist", "ekfslam.track(recording)"],
+        ),
         "Study": (study, ["3 runs", "large-heading", "invariant", "ekfslam.check_consistency(study"]),
         "StudyArchive": (
             StudyArchive(study, {"mid": np.array([True, False, True])}, {}),

@@ -17,6 +17,7 @@ from ekfslam.data.observations import Truth, validate_truth
 from ekfslam.errors import CalibrationError
 from ekfslam.geometry import se3
 from ekfslam.names import printable
+from ekfslam.shown import Card, Shown, count, figure
 
 Image = NDArray[np.uint8]
 DistortionModel = Literal["none", "radtan", "equidistant"]
@@ -129,8 +130,8 @@ def side_by_side(baseline_m: float) -> Array:
     return se3.transform(np.eye(3), np.array([-baseline_m, 0.0, 0.0]))
 
 
-@dataclass(frozen=True)
-class ImageRecording:
+@dataclass(frozen=True, repr=False)
+class ImageRecording(Shown):
     """One recording of images of a pair or of one camera, with or without body velocities and inertial samples.
 
     Args:
@@ -174,6 +175,21 @@ class ImageRecording:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def card(self) -> Card:
+        """Return the card that ``repr`` and a notebook show."""
+        size = " x ".join(map(str, self.calibration.size))
+        cameras = f"two, {figure(self.baseline_m)} m apart" if self.baseline_m else "one"
+        facts = {
+            "source": self.source,
+            "frames": f"{len(self)}, {figure(float(self.time_s[-1] - self.time_s[0]))} s",
+            "cameras": f"{cameras}, {size} px",
+            "velocities": "none" if self.twist is None else f"in .twist, {self.velocity_frame} frame",
+            "inertial": "none" if self.inertial is None else self.inertial.text,
+            "truth": "none" if self.truth is None else self.truth.text,
+        }
+        facts |= {"notes": count(len(self.notes), "sentence") + " in .notes"} if self.notes else {}
+        return Card(self.name, facts, ("ekfslam.track(recording)", "recording[100:300]", "recording.load(0)"))
 
     @property
     def baseline_m(self) -> float:

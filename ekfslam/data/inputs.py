@@ -14,6 +14,7 @@ from ekfslam.data.checks import LARGEST_VELOCITY, frozen, require_finite, requir
 from ekfslam.data.interpolation import interpolated_intervals
 from ekfslam.data.interval import Interval
 from ekfslam.errors import DataError, LostDataError, ShapeError
+from ekfslam.shown import Card, Shown
 from ekfslam.stored import FLAGS, attribute, stored
 
 VelocityFrame = Literal["imu", "level"]
@@ -21,8 +22,8 @@ GAP_STEPS = 3.0
 _ZERO = 1e-9  # m/s and rad/s, below which a velocity is a rounded 0
 
 
-@dataclass(frozen=True)
-class Velocities:
+@dataclass(frozen=True, repr=False)
+class Velocities(Shown):
     """Measured body velocities; sample k drives the interval from stamp k-1 to stamp k.
 
     Args:
@@ -61,6 +62,12 @@ class Velocities:
     def text(self) -> str:
         """The samples in words."""
         return f"{len(self.time_s)} velocities ({self.frame} frame), {_rate(self.time_s)}"
+
+    def card(self) -> Card:
+        """Return the card that ``repr`` and a notebook show."""
+        return Card(
+            self.text, {"stamps": f"{self.time_s[0]:.10g} to {self.time_s[-1]:.10g} s"}, (".time_s", ".twist", ".frame")
+        )
 
     def between(self, begin_s: float, end_s: float) -> Velocities:
         """Return the samples that drive the time from ``begin_s`` to ``end_s``."""
@@ -144,8 +151,8 @@ class InertialNoise:
                 raise DataError(f"must be finite and not negative, found {value}", field=f"inertial noise {name}")
 
 
-@dataclass(frozen=True)
-class InertialSamples:
+@dataclass(frozen=True, repr=False)
+class InertialSamples(Shown):
     """Instantaneous samples of a gyroscope and an accelerometer, both in the IMU frame.
 
     Args:
@@ -176,6 +183,14 @@ class InertialSamples:
         gaps, longest_s = self.gaps
         pauses = f"; {gaps} gaps, the longest {longest_s:.3g} s" if gaps else ""
         return f"{len(self.time_s)} inertial samples, {_rate(self.time_s)}{pauses}; {stated}"
+
+    def card(self) -> Card:
+        """Return the card that ``repr`` and a notebook show."""
+        return Card(
+            self.text,
+            {"stamps": f"{self.time_s[0]:.10g} to {self.time_s[-1]:.10g} s"},
+            (".time_s", ".gyro_rad_s", ".accel_m_s2", ".noise"),
+        )
 
     def between(self, begin_s: float, end_s: float) -> InertialSamples:
         """Return the samples from ``begin_s`` to ``end_s``, with one more on each side to interpolate to both ends."""

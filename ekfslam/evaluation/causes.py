@@ -16,12 +16,14 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.evaluation.evidence import (
     AXES,
+    POSE_DOF,
     ROWS,
     SURE,
     Ratio,
     SharedInnovations,
     SmootherAgreement,
     TrackInnovations,
+    TruthAgreement,
     measures_velocities,
 )
 from ekfslam.evaluation.systematic import Systematic, grown_by
@@ -38,6 +40,7 @@ _MANY = 0.05  # share of the velocities that cannot all be wild samples
 _UNSURE = frozenset({"bias", "scale", "delay", "shared drift", "motion"})
 _LEAST_OUTLIERS, _LEAST_MOVING = 0.013, 0.2  # shares of the observations
 _SMOOTHER = 5.0  # filter minus smoother: healthy runs have up to 3, failed linearisation has 10 and more
+_FAR = 10.0  # errors by the truth per error by innovations, from which the truth is doubted
 _SYSTEMATIC = {
     "bias": "velocities and camera disagree by {size} in {axis}: a bias of the velocities",
     "scale": "the way by velocities is {size} than by the camera: scale of the velocities, baseline, focal length, or "
@@ -226,6 +229,17 @@ def rejection_causes(result: Result, rejected: Mapping[str, float], causes: Sequ
     if moving > _LEAST_MOVING:
         text = f"{percent(moving)} of the observations are rejected as moving: traffic, or another noise than stated"
         yield Cause("moving", (), np.nan, text, "compare with the noise that `ekfslam info` finds")
+
+
+def truth_causes(truth: TruthAgreement | None, factors: Array | None) -> Iterator[Cause]:
+    """Yield that errors by the truth are far from those that innovations show: the truth may be the cause."""
+    if truth is not None and factors is not None:
+        size = float(np.sqrt(truth.nees / POSE_DOF) / max(np.sqrt((factors**2).mean()), 1.0))
+        if size > _FAR:
+            text = (
+                f"errors by the truth are {size:.0f}x larger than innovations say: it may be of another body or clock"
+            )
+            yield Cause("truth", (), np.nan, text, "a truth of `base_link` has to be turned into the body of this run")
 
 
 def smoother_causes(smoother: SmootherAgreement | None) -> Iterator[Cause]:

@@ -12,7 +12,16 @@ from ekfslam.arrays import Array, BoolArray
 from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.errors import HonestyError
 from ekfslam.evaluation import evidence
-from ekfslam.evaluation.causes import Cause, Causes, causes_of, nis_causes, percent, rejection_causes, smoother_causes
+from ekfslam.evaluation.causes import (
+    Cause,
+    Causes,
+    causes_of,
+    nis_causes,
+    percent,
+    rejection_causes,
+    smoother_causes,
+    truth_causes,
+)
 from ekfslam.evaluation.evidence import AXES, BLIND, LAGS, POSE_DOF, ROWS, Ratio, SharedInnovations
 from ekfslam.evaluation.systematic import Systematic, systematic_errors
 from ekfslam.evaluation.tables import document, markdown_table, number
@@ -209,6 +218,7 @@ def judge(
         found = causes_of(result, shared, tracks, rejected, systematic, vision)
         alarm = tuple(smoother_causes(smoother))
         found = Causes(None, (*alarm, *found.causes), found.findings) if alarm else found
+    agreed = evidence.truth_agreement(result, truth, interpolated)
     return Honesty(
         name=result.sequence_name,
         frames=len(result.time_s),
@@ -219,12 +229,16 @@ def judge(
         systematic=systematic,
         vision=vision,
         smoother=smoother,
-        truth=evidence.truth_agreement(result, truth, interpolated),
+        truth=agreed,
         smoother_skipped="" if smoother is not None else skipped,
         innovations_skipped=missing,
         factors=found.factors,
         causes=found.causes,
-        findings=(*found.findings, *rejection_causes(result, rejected, found.causes)),
+        findings=(
+            *truth_causes(agreed, found.factors),
+            *found.findings,
+            *rejection_causes(result, rejected, found.causes),
+        ),
     )
 
 

@@ -107,7 +107,8 @@ def likeliest_densities(sequence: Sequence, config: FilterConfig, begun: Begun) 
     if is_monocular and (noise.gyro > _REFUTED * upper.gyro or noise.accel > _REFUTED * upper.accel):
         return None  # noisier than the samples can be: the first state is wrong
     of = f"{2.0 ** at[0]:.2g} and {2.0 ** at[1]:.2g} times the stated densities, " if stated else ""
-    text = f"found from {len(search.stretches)} stretches: {of}gyroscope {noise.gyro:.2g} rad/s/sqrt(Hz), "
+    n = len(search.stretches)
+    text = f"found from {n} stretch{'es' if n > 1 else ''}: {of}gyroscope {noise.gyro:.2g} rad/s/sqrt(Hz), "
     walk = f"walks of biases {noise.gyro_walk:.2g} and {noise.accel_walk:.2g} per root of a second"
     return Densities(noise, f"{text}accelerometer {noise.accel:.2g} m/s^2/sqrt(Hz), {walk}")
 

@@ -84,7 +84,8 @@ def _print_recording(sequence: Sequence) -> None:
     for begin, end in drawn:
         print(f"truth gap     the true poses of frames {begin} to {end} lie on a line: interpolated, in no NEES")
     for key, value in sequence.attributes.items():
-        print(f"{key:13s} {value}")
+        if not key.startswith("right_camera_"):  # a note says it with units
+            print(f"{key:13s} {value:.4g}" if isinstance(value, float) else f"{key:13s} {value}")
 
 
 def _noise_line(sequence: Sequence) -> str:
