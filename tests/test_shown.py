@@ -59,7 +59,7 @@ def test_everything_shows_itself_in_a_few_lines(world, compared, full, tmp_path)
         "Velocities": (world.inputs[0], ["60 velocities (imu frame)", ".twist"]),
         "Trajectory": (
             from_left_error(full.time_s, full.T_world_imu, full.covariance),
-            ["60 poses", "0 to 5.9", "of the body", "of every pose"],
+            ["60 poses", "0 to 5.8", "of the body", "of every pose"],
         ),
         "ImageRecording": (
             ImageRecording("pair", "here", world.time_s, PAIR, lambda k: (), np.eye(4), world.twist),

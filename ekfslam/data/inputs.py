@@ -263,6 +263,10 @@ def _median_step(time_s: Array) -> float:
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
 
 
+def _extent(time_s: Array) -> dict[str, str]:
+    return {"stamps": f"{time_s[0]:.10g} to {time_s[-1]:.10g} s"}
+
+
 def _rate(time_s: Array) -> str:
     step_s = _median_step(time_s)
     return f"{1.0 / step_s:.4g} Hz" if step_s > 0 else "one instant"
