@@ -1,8 +1,9 @@
 """Mutants of some files, each against the tests that run its line: `python tests/mutants.py FILES --tests TESTS`.
 
 A mutant has one changed sign, term, comparison, condition, number or statement. It is killed if a test fails or takes
-too long. Tests are those that ran the line in a first run, the fastest first. A mutant never touches a file: a process
-forked for it imports the changed module.
+too long. Tests are those that ran the line in a first run: half of them the fastest, half those that run the fewest
+lines. A mutant never touches a file: tests are collected once, and a process forked for each mutant changes the code of
+the function. What an import runs is changed in a process that imports it.
 """
 
 from __future__ import annotations
@@ -11,18 +12,23 @@ import argparse
 import ast
 import collections
 import copy
+import dataclasses
+import gc
 import importlib.abc
 import importlib.util
+import itertools
 import json
+import math
 import os
 import random
+import resource
 import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import CodeType, FrameType, FunctionType, ModuleType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -152,17 +158,21 @@ class Covering:
 
 
 def forked(function: Any, seconds: float) -> Any:
-    """Return what a function returns in a process of its own; "killed" if that dies or takes too long."""
+    """Return what a function returns in a process of its own; "killed" if that dies or takes too long.
+
+    That is so many seconds of the processor, or ten times as many of the clock: other work on the machine kills none.
+    """
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder) / "answer"
         if not (child := os.fork()):
             os.setpgid(0, 0)
+            resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 1))
             with Path(folder, "out").open("w") as out:
                 os.dup2(out.fileno(), 1)
                 os.dup2(out.fileno(), 2)
                 answer.write_text(json.dumps(function()))
                 os._exit(0)
-        end = time.monotonic() + seconds
+        end = time.monotonic() + 10.0 * seconds
         while not os.waitpid(child, os.WNOHANG)[0]:
             time.sleep(0.02)
             if time.monotonic() > end:
@@ -188,20 +198,88 @@ def covered(files: list[Path], arguments: list[str]) -> dict[str, Any]:
     return {"lines": lines, "seconds": plugin.seconds, "failed": sorted(plugin.failed)}
 
 
-def judged(file: Path, tree: ast.Module, tests: list[str]) -> str:
-    name = ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-    sys.meta_path.insert(0, Changed(name, file, tree))
-    return "survives" if tested(["-x", *tests], []) == 0 else "killed"
+def name_of(file: Path) -> str:
+    return ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-def tests_of(file: Path, node: Any, in_function: bool, found: dict[str, Any]) -> list[str]:
-    """Return the tests that run a node, the fastest first; those that run the file, if an import runs the node."""
+def judged(mutant: Mutant) -> str:
+    """Return the verdict on a mutant of what an import runs."""
+    sys.meta_path.insert(0, Changed(name_of(mutant.file), mutant.file, mutant.tree))
+    return "survives" if tested(["-x", *mutant.tests], []) == 0 else "killed"
+
+
+def codes(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for each in code.co_consts:
+        if isinstance(each, CodeType):
+            yield from codes(each)
+
+
+def change_functions(file: Path, tree: ast.Module) -> None:
+    """Give the functions of a module the code of a changed tree."""
+    importlib.import_module(name_of(file))
+    new = {(code.co_qualname, code.co_firstlineno): code for code in codes(compile(tree, str(file), "exec"))}
+    for each in gc.get_objects():
+        if type(each) is FunctionType and each.__code__.co_filename == str(file):
+            each.__code__ = new.get((each.__code__.co_qualname, each.__code__.co_firstlineno), each.__code__)
+
+
+class Judging:
+    """Plugin of pytest: judges mutants of functions once all tests are collected."""
+
+    def __init__(self, mutants: list[Mutant], seconds: float, tell: Callable[[Mutant, str], None]) -> None:
+        self.mutants, self.seconds, self.tell = mutants, seconds, tell
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        items = {item.nodeid: item for item in session.items}
+        for mutant in self.mutants:
+            tests = [items[test] for test in mutant.tests]
+            self.tell(mutant, forked(lambda m=mutant, some=tests: self.verdict(m, some), self.seconds))
+        return True
+
+    def verdict(self, mutant: Mutant, tests: list[Any]) -> str:
+        change_functions(mutant.file, mutant.tree)
+        for test, following in itertools.zip_longest(tests, tests[1:]):
+            test.config.hook.pytest_runtest_protocol(item=test, nextitem=following)
+            if test.session.testsfailed:
+                return "killed"
+        return "survives"
+
+
+def tests_of(file: Path, line: int | None, found: dict[str, Any]) -> list[str]:
+    """Return tests that run a line, or the file if an import runs the line: fast ones and narrow ones, at most 40."""
     tests = [
         test
         for test, seen in found["lines"].items()
-        if any(name == str(file) and (line == node.lineno or not in_function) for name, line in seen)
+        if any(name == str(file) and line in (None, at) for name, at in seen)
     ]
-    return sorted(tests, key=found["seconds"].get)[:40]
+    fast, narrow = sorted(tests, key=found["seconds"].get), sorted(tests, key=lambda test: len(found["lines"][test]))
+    return sorted({*fast[:20], *narrow[:20]}, key=fast.index)
+
+
+@dataclasses.dataclass(frozen=True)
+class Mutant:
+    """A changed file, the change, and the tests that run it."""
+
+    file: Path
+    line: int
+    words: str
+    tree: ast.Module
+    in_function: bool
+    tests: list[str]
+
+
+def drawn(files: list[Path], count: int, seed: int, found: dict[str, Any]) -> Iterator[Mutant]:
+    """Yield mutants drawn over all files."""
+    trees = {file: ast.parse(file.read_text()) for file in files}
+    every = [(file, *site) for file, tree in trees.items() for site in sites(tree)]
+    random.Random(seed).shuffle(every)
+    for file, path, which in every[:count]:
+        above = [at(trees[file], path[:n]) for n in range(len(path), 0, -1)]
+        line = next(node.lineno for node in above if hasattr(node, "lineno"))
+        in_function = any(isinstance(node, ast.FunctionDef | ast.Lambda) for node in above)
+        tree, words = mutated(trees[file], path, which)
+        yield Mutant(file, line, words, tree, in_function, tests_of(file, line if in_function else None, found))
 
 
 def main() -> None:
@@ -210,7 +288,7 @@ def main() -> None:
     parser.add_argument("--tests", nargs="+", required=True, help="files or arguments of pytest")
     parser.add_argument("--count", type=int, default=60, help="mutants drawn over all files")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=60.0, help="most a mutant may take")
+    parser.add_argument("--seconds", type=float, default=60.0, help="most of the processor that a mutant may take")
     parser.add_argument("--marks", default="not slow and not data", help="which tests, as pytest's -m")
     options = parser.parse_args()
     import h5py, matplotlib.figure, numpy, pytest, scipy.linalg, scipy.spatial, scipy.stats  # noqa: E401, F401, I001
@@ -218,19 +296,23 @@ def main() -> None:
     files = [file.resolve() for file in options.files]
     found = forked(lambda: covered(files, [*options.tests, "-m", options.marks]), 3600.0)
     print(f"{len(found['lines'])} tests, without those that fail: {found['failed']}", flush=True)
-    trees = {file: ast.parse(file.read_text()) for file in files}
-    drawn = [(file, *site) for file, tree in trees.items() for site in sites(tree)]
-    random.Random(options.seed).shuffle(drawn)
     counts = collections.Counter[str]()
-    for file, path, which in drawn[: options.count]:
-        above = [at(trees[file], path[:n]) for n in range(len(path), 0, -1)]
-        nearest = next(node for node in above if hasattr(node, "lineno"))
-        in_function = any(isinstance(node, ast.FunctionDef | ast.Lambda) for node in above)
-        tests, (tree, words) = tests_of(file, nearest, in_function, found), mutated(trees[file], path, which)
-        verdict = forked(lambda f=file, t=tree, some=tests: judged(f, t, some), options.seconds) if tests else "not run"
+
+    def tell(mutant: Mutant, verdict: str) -> None:
         counts[verdict] += 1
         if verdict != "killed":
-            print(f"{file.relative_to(ROOT)}:{nearest.lineno}: {verdict} ({len(tests)} tests): {words}", flush=True)
+            place = f"{mutant.file.relative_to(ROOT)}:{mutant.line}"
+            print(f"{place}: {verdict} ({len(mutant.tests)} tests): {mutant.words}", file=sys.__stderr__, flush=True)
+
+    later = []
+    for mutant in drawn(files, options.count, options.seed, found):
+        if mutant.in_function and mutant.tests:
+            later.append(mutant)
+        else:
+            tell(mutant, forked(lambda m=mutant: judged(m), options.seconds) if mutant.tests else "not run")
+    with tempfile.TemporaryDirectory() as folder:
+        arguments = ["-s", "-x", "--basetemp", f"{folder}/tests", "-m", options.marks, *options.tests]
+        tested(arguments, [Judging(later, options.seconds, tell)])
     print(dict(counts))
 
 

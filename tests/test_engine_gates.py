@@ -81,6 +81,13 @@ def test_whitened_innovations_have_the_covariance_one_and_none_where_it_is_singu
     np.testing.assert_allclose(found[kept], expected, rtol=1e-9)
 
 
+def test_innovations_are_whitened_if_their_correlation_is_nearly_singular_but_not_if_it_is_more_so(rng):
+    """Smallest eigenvalues of 3e-6 and 3e-7 are on both sides of the bound; the next one is small, too."""
+    S = np.where(np.eye(3, dtype=bool), 1.0, 0.9) + np.zeros((2, 1, 1))
+    S[:, 0, 1] = S[:, 1, 0] = 1.0 - np.array([3e-6, 3e-7])
+    assert np.isnan(engine.whitened(S, rng.normal(size=(2, 3)))).all(axis=1).tolist() == [False, True]
+
+
 @pytest.mark.parametrize("k", [1, 2, 3, 4, 9, 10, 40])
 def test_samples_are_those_of_the_reference(k):
     """All of them if they are few, and else those of NumPy's generator, seeded by the frame."""

@@ -242,10 +242,10 @@ def drive(e, made, xi):
     arrive(made, e, flat(e), Phi, Q)
 
 
-@pytest.mark.parametrize("variant", ["invariant", "standard"])
-def test_tracks_wait_for_a_second_view_as_in_the_reference(variant):
+@pytest.mark.parametrize(("variant", "tracks"), [("invariant", False), ("standard", False), ("invariant", True)])
+def test_tracks_wait_for_a_second_view_as_in_the_reference(variant, tracks):
     rng = np.random.default_rng(8)
-    e, P = dataclasses.replace(CASES["one camera"], variant=variant).estimate(PLACES["random 0"], rng)
+    e, P = dataclasses.replace(CASES["one camera"], variant=variant, tracks=tracks).estimate(PLACES["random 0"], rng)
     sensor = dataclasses.replace(e.sensor, parallax_rad=0.1, patience=2)
     e.model = dataclasses.replace(e.model, sensor=sensor)
     made = compiled(engine, e, P * 0.05, waiting_gate=37.3)  # of probability 1 - 1e-9

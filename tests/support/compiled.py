@@ -101,7 +101,7 @@ def flat(e, values=None):
 
 def arguments(e, values=None, waiting_gate=1e9):
     """Return the arguments of a `Filter` of the module for a reference estimate."""
-    error = e.model.track_error
+    error = e.model.noise.track_error
     return [
         _blocks(e.model),
         _sensor(e.sensor),
