@@ -179,6 +179,7 @@ def test_the_page_on_the_format_is_that_of_the_code():
     spec = importlib.util.spec_from_file_location("make_archive", script)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    assert module.page() == module.PAGE.read_text(encoding="utf-8")
+    page = module.page()
+    assert page == module.PAGE.read_text(encoding="utf-8")
     names = [item.name for _, _, layout in layouts_of(Result) for item in layout]
-    assert len(names) > 50 and all(f"`{name}`" in module.page() for name in names)
+    assert len(names) > 50 and all(f"`{name}`" in page for name in names)

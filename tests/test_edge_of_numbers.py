@@ -105,8 +105,7 @@ def test_covariances_keep_their_digits_where_pixels_are_almost_exact(world, px):
     assert run(builtin(f"{world}?frames=20&sigma_px={LINEAR_FROM_PX}"), "full").remarks == ()
 
 
-@pytest.mark.parametrize("disparity_px", [0.0, 1e-12, 1e-3, -5.0])
-@pytest.mark.parametrize("states_noise", [True, False])
+@pytest.mark.parametrize(("disparity_px", "states_noise"), [(0.0, True), (1e-12, False), (1e-3, True), (-5.0, False)])
 def test_disparities_down_to_zero_without_hygiene(disparity_px, states_noise):
     sequence = builtin("city?frames=12")
     pixels = sequence.observations.pixels_px.copy()

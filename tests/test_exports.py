@@ -162,8 +162,7 @@ def test_gtsam_reads_the_graph(full, tmp_path):
         np.testing.assert_allclose(values.atPose3(k).matrix(), full.T_world_imu[k], atol=1e-9)
 
 
-@pytest.mark.parametrize("linearisation", ["map", "filtered"])
-@pytest.mark.parametrize("prior", ["known", "some"])
+@pytest.mark.parametrize(("prior", "linearisation"), [("known", "filtered"), ("some", "map")])
 def test_the_inverse_of_the_information_matrix_is_the_joint_covariance(prior, linearisation):
     settings = {"posterior": {"linearisation": linearisation}}
     settings["calibration"] = {"lever_arm_m": 0.01}
