@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.compiled import Case, arguments, compiled
+from support.compiled import Case, arguments, driven
 from support.odd import MATRICES, ODD, attempt
 from support.predicting import inertial_filters, walking_filters
 
@@ -24,17 +24,19 @@ NUMBERS = [
     None,
 ]
 WHOLE = [-1, 0, 2**40, 2**70, 1.5, None]
+FAR = (2**62, -(2**62), 2**63 - 1, -(2**63))
 
 
 @pytest.fixture(scope="module")
 def made():
-    e, P = Case().estimate(np.eye(4), np.random.default_rng(2))
-    return e, compiled(engine, e, P)
+    """Return a filter in the middle of a drive, and the compiled one inside."""
+    ekf = driven(Case())
+    return ekf, ekf.engine.filter
 
 
 @pytest.mark.parametrize("numbers", NUMBERS, ids=repr)
 def test_ids_of_any_kind(made, numbers):
-    for name in ("covariance_of", "landmark_blocks_of"):
+    for name in ("covariance", "landmark_blocks"):
         attempt(getattr(made[1].copy(), name), numbers)
     attempt(made[1].copy().rest, 9, numbers)
     for matrix in MATRICES:
@@ -132,13 +134,59 @@ def test_landmarks_that_were_revived_and_not_adopted_are_named(made):
             call()
 
 
+def test_numbers_whose_differences_exceed_64_bits_are_refused(made):
+    e, filter_ = made
+    ids, table = e.table.id[:1], filter_.table()
+    pixels = np.column_stack([e.table.seen_rows[:1, :2], e.table.seen_rows[:1, :2]])
+    for far in (2**60 + 1, -(2**63)):
+        with pytest.raises(ValueError, match="frame must be at most 2"):
+            filter_.copy().rest(far, ids)
+        with pytest.raises(ValueError, match="frame must be at most 2"):
+            filter_.copy().update(far, ids, pixels, False, None)
+        with pytest.raises(ValueError, match="last_step must be at most 2"):
+            filter_.copy().revive({**table, "last_step": np.full_like(table["last_step"], far)})
+    filter_.copy().rest(2**60, ids)
+
+
+@pytest.mark.parametrize("far", FAR)
+def test_numbers_of_frames_and_landmarks_may_be_far(made, far):
+    e, filter_ = made
+    ids, rows = e.table.id[[5, 1, 2]], e.table.seen_rows[[5, 1, 2]]
+    measured = np.column_stack([rows[:, :2], rows[:, 0] - 20.0, rows[:, 1]])
+    for frame in (far, 0):
+        other = filter_.copy()
+        for call in (lambda o, f: o.rest(f, ids), lambda o, f: o.update(f, ids, measured, False, None)):
+            attempt(call, other, frame)
+            attempt(call, other, far)
+            attempt(call, other, 9)
+    table = filter_.table()
+    for column, values in table.items():
+        if values.dtype == np.int64:
+            spoilt = {**table, column: np.full_like(values, far)}
+            other = filter_.copy()
+            attempt(other.revive, spoilt)
+            n, body = other.landmarks(), e.model.layout.body
+            attempt(other.adopt, other.values(), e.coordinates, other.table()["position_m"], np.eye(body + 3 * n))
+            attempt(other.update, 9, ids, measured, False, None)
+            attempt(other.rest, 9, ids)
+
+
+def test_each_argument_of_an_alignment_may_be_anything():
+    points = np.array([[300.0, 200.0, 280.0], [350.0, 250.0, 320.0], [200.0, 210.0, 150.0]])
+    fits = [np.array([400.0, 400.0, 320.0, 240.0, 0.5]), points, points, np.eye(4), 0.5, 3.0]
+    engine.align(*fits)
+    for place in range(len(fits)):
+        for odd in (*ODD, *MATRICES, np.empty((0, 3)), np.full((3, 3), np.nan), np.zeros((3, 3)), 0.0, 1e300):
+            attempt(engine.align, *fits[:place], odd, *fits[place + 1 :])
+
+
 # --- the constructor --------------------------------------------------------------------------------------------------
 
 
 def settings_of_filter():
     """Return the arguments of a `Filter`."""
-    e, _ = Case().estimate(np.eye(4), np.random.default_rng(2))
-    return arguments(e)
+    (ekf,) = Case().filters(np.eye(4), ("engine",))
+    return arguments(ekf.model, ekf.config)
 
 
 @pytest.mark.parametrize("place", range(8))
@@ -221,102 +269,3 @@ def test_each_argument_of_a_prediction_may_be_anything(predicting, kind):
     for place in range(5):
         for odd in (*ODD, *MATRICES, -1.0, 1e300):
             attempt(filter_.copy().predict, *fits[:place], odd, *fits[place + 1 :])
-
-
-# --- the covariance ---------------------------------------------------------------------------------------------------
-
-BODY, VIEW, PREVIOUS = 24, 6, 12
-
-
-def covariance_of_two():
-    """Return a covariance with two landmarks, and arguments that fit its verbs."""
-    rng = np.random.default_rng(0)
-    P = engine.Gaussian(np.eye(BODY), VIEW, PREVIOUS)
-    Y = np.zeros((6, BODY))
-    Y[:, :6] = np.eye(6)
-    P.propagate(np.eye(BODY), 0.01 * np.eye(BODY))
-    P.open_view(Y)
-    width = P.lead[-1]
-    P.augment(rng.normal(size=(2, 3, width)), np.stack([np.eye(3)] * 2))
-    rows = [[1, 0], rng.normal(size=(2, 3, width)), rng.normal(size=(2, 3, 3)), np.ones((2, 3)), np.ones((2, 3))]
-    return P, Y, width, rows
-
-
-def verbs(P, Y, width, rows):
-    """Return the arguments that fit each verb, by name."""
-    at = P.project(*rows)
-    solution = P.solve(at)
-    square, blocks = np.eye(BODY), np.stack([np.eye(3)] * 2)
-    return {
-        "project": rows,
-        "solve": [at],
-        "without": [solution, [True, False]],
-        "solve_body": [np.ones((2, BODY)), np.ones(2), np.ones(2)],
-        "correction": [solution],
-        "given_others": [solution, [1]],
-        "information": [solution, np.ones((6, 2))],
-        "apply": [solution],
-        "propagate": [square, square],
-        "open_view": [Y, Y],
-        "add_noise": [square],
-        "augment": [np.ones((2, 3, width)), blocks],
-        "transform_body": [VIEW, np.eye(6)],
-        "transform_landmarks": [[1, 0], blocks, np.ones((2, 3, 6)), VIEW],
-        "rest": [[True, False]],
-        "marginalise": [[True, False]],
-        "replace": [np.eye(BODY + 6)],
-        "consider": [2],
-        "clone": [0, 0, BODY],
-        "covariance_of": [[0, 1]],
-        "landmark_blocks": [[1]],
-    }
-
-
-CUBES = [np.ones((2, 3, 40)), np.ones((2, 2, 3)), np.ones((1, 3, 3)), np.empty((0, 3, 6)), np.full((2, 3, 6), np.nan)]
-CUBES += [np.ones((4, 6, 12))[::2, ::2, ::2], np.ones((2, 3, 6), dtype=np.float32)]
-FLAGS = [[True], [True] * 3, [], [0, 5], [-1], [1, 1], [2**40]]
-
-
-@pytest.mark.parametrize("name", tuple(verbs(*covariance_of_two())))
-def test_each_argument_of_the_covariance_may_be_anything(name):
-    fits = verbs(*covariance_of_two())[name]
-    for place in range(len(fits)):
-        for odd in (*ODD, *MATRICES, *CUBES, *FLAGS):
-            P, *others = covariance_of_two()
-            given = verbs(P, *others)[name]
-            attempt(getattr(P, name), *given[:place], odd, *given[place + 1 :])
-            P.covariance_of([*range(P.landmarks)])
-    P, *others = covariance_of_two()
-    getattr(P, name)(*verbs(P, *others)[name])
-
-
-def test_rows_wider_than_the_leading_columns_are_refused():
-    P, _, width, rows = covariance_of_two()
-    for wrong in (width + 1, width - 1, 2 * width, 0):
-        with pytest.raises(ValueError, match="width"):
-            P.project(rows[0], np.ones((2, 3, wrong)), *rows[2:])
-        with pytest.raises(ValueError, match="width"):
-            P.augment(np.ones((2, 3, wrong)), np.stack([np.eye(3)] * 2))
-
-
-def test_a_solution_of_an_earlier_covariance_is_refused():
-    P, *others = covariance_of_two()
-    given = verbs(P, *others)
-    at, solution = given["solve"][0], given["apply"][0]
-    P.apply(solution)
-    for call in (lambda: P.apply(solution), lambda: P.solve(at), lambda: P.correction(solution)):
-        with pytest.raises(ValueError, match="changed since"):
-            call()
-
-
-def test_rows_of_a_dormant_landmark_are_refused():
-    P, _, _, rows = covariance_of_two()
-    P.rest([True, False])
-    with pytest.raises(ValueError, match="dormant"):
-        P.project(*rows)
-
-
-@pytest.mark.parametrize("columns", [(0, 3, -1), (6, 6, -1), (20, 6, -1), (-1, 6, -1), (6, -1, 7)])
-def test_views_that_overlap_or_do_not_fit_are_refused(columns):
-    with pytest.raises(ValueError, match=r"column|view"):
-        engine.Gaussian(np.eye(BODY), *columns)

@@ -1,10 +1,9 @@
 #include <algorithm>
 #include <limits>
-#include <numeric>
 #include <optional>
 
+#include "blas.hpp"
 #include "consensus.hpp"
-#include "lapack.hpp"
 
 namespace ekfslam {
 namespace {
@@ -38,29 +37,26 @@ double square(const Block3& C, const OfOne& e) {
 // Rows of landmarks, d each.
 Slots rows_of(const Slots& landmarks, Index d) {
     Slots rows;
-    rows.reserve(landmarks.size() * static_cast<std::size_t>(d));
-    for (Index i : landmarks) {
-        for (Index j = 0; j < d; ++j) rows.push_back(i * d + j);
-    }
+    rows.reserve(landmarks.size() * d);
+    for (Index i : landmarks) append_range(rows, i * d, i * d + d);
     return rows;
 }
 
 // The inverse of a covariance, by Cholesky.
 Matrix inverse(Matrix S) {
-    int n = static_cast<int>(S.rows()), info = 0;
-    if (!n) return S;
+    int n = blas::size(S.rows()), failed = 0;
     char lower = 'L';
-    lapack::dpotrf(&lower, &n, S.data(), &n, &info);
-    if (!info) lapack::dpotri(&lower, &n, S.data(), &n, &info);
-    if (info) throw Error("the innovation covariance is not positive definite");
+    if (!n) return S;
+    const bool is_regular = blas::factorise(S);
+    if (is_regular) lapack::dpotri(&lower, &n, S.data(), &n, &failed);
+    if (!is_regular || failed) throw Error("the innovation covariance is not positive definite");
     S.triangularView<Eigen::StrictlyUpper>() = S.transpose();
     return S;
 }
 
 std::vector<Slots> combinations(Index k, Index size) {
     std::vector<Slots> all;
-    Slots one(size);
-    std::iota(one.begin(), one.end(), Index{0});
+    Slots one = range(0, size);
     while (true) {
         all.push_back(one);
         Index last = size - 1;
@@ -82,7 +78,7 @@ std::optional<Tally> tally(const Matrix& S, const Matrix& residual, const Vector
                            const Slots& sample, double most) {
     const Index d = residual.rows(), k = residual.cols();
     const Slots rows = rows_of(sample, d);
-    const Index size = static_cast<Index>(rows.size());
+    const Index size = size_of(rows);
     const Eigen::LLT<Sample> factor(S(rows, rows));
     if (factor.info() != Eigen::Success) return std::nullopt;
     const Sample U = factor.matrixU();
@@ -117,8 +113,8 @@ struct Agreeing {
 
     // The largest y_i^T K_ii^-1 y_i, y = K r_A, and its place.
     std::pair<double, Index> worst(const Matrix& residual) const {
-        const Vector y = K * columns(residual, some).reshaped();
-        Vector squares(static_cast<Index>(some.size()));
+        const Vector y = K * columns_of(residual, some).reshaped();
+        Vector squares(size_of(some));
         for (Index i = 0; i < squares.size(); ++i) {
             squares[i] = square(K.block(i * d, i * d, d, d), y.segment(i * d, d));
         }
@@ -132,9 +128,8 @@ struct Agreeing {
         const Block3 own = K.block(i * d, i * d, d, d);
         K -= (K.middleCols(i * d, d) * own.partialPivLu().solve(Matrix(K.middleRows(i * d, d)))).eval();
         some.erase(some.begin() + i);
-        Slots left(some.size());
-        std::iota(left.begin(), left.end(), Index{0});
-        for (std::size_t j = static_cast<std::size_t>(i); j < left.size(); ++j) ++left[j];
+        Slots left = range(0, i);
+        append_range(left, i + 1, size_of(some) + 1);
         const Slots rows = rows_of(left, d);
         K = Matrix(K(rows, rows));
     }
@@ -148,9 +143,8 @@ std::vector<Slots> samples_of(Index k, Index frame, const Uniform& uniform) {
     if (combined <= SAMPLES) return combinations(k, size);
     const Matrix numbers = uniform(frame, SAMPLES, k);
     std::vector<Slots> samples;
-    Slots order(k);
     for (Index i = 0; i < SAMPLES; ++i) {
-        std::iota(order.begin(), order.end(), Index{0});
+        Slots order = range(0, k);
         std::partial_sort(order.begin(), order.begin() + size, order.end(),
                           [&](Index a, Index b) { return numbers(i, a) < numbers(i, b); });
         samples.emplace_back(order.begin(), order.begin() + size);
@@ -167,7 +161,7 @@ Flags agreeing(const Matrix& S, const Matrix& residual, const Vector& focal, dou
         std::optional<Tally> next = tally(S, residual, focal, gate, sample, margin * best.cost);
         if (next && next->cost < best.cost) best = std::move(*next);
     }
-    Flags agree(static_cast<std::size_t>(residual.cols()));
+    Flags agree(residual.cols());
     for (Index i = 0; i < residual.cols(); ++i) agree[i] = best.squares[i] <= gate;
     return agree;
 }
@@ -184,7 +178,7 @@ Flags refined(const Matrix& S, const Matrix& residual, const Flags& inside, doub
     Flags agree(inside.size(), false);
     for (Index i : with.some) agree[i] = true;
     rows = rows_of(with.some, d);
-    const Vector r_a = columns(residual, with.some).reshaped();
+    const Vector r_a = columns_of(residual, with.some).reshaped();
     for (Index i : where(agree, false)) {
         const Matrix S_ia = S.middleRows(i * d, d)(Eigen::all, rows), gain = S_ia * with.K;
         const Block3 C = S.block(i * d, i * d, d, d) - gain * S_ia.transpose();

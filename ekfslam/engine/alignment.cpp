@@ -2,7 +2,6 @@
 // and symbols these are.
 #include "alignment.hpp"
 
-#include <cmath>
 #include <limits>
 
 #include "se3.hpp"
@@ -13,33 +12,26 @@ namespace {
 constexpr double least_depth_m = 0.1, track_std_px = 0.3, fits = 9.0, converged = 1e-4;
 constexpr int iterations = 12;
 
-// A row of a stereo camera at a point q, with its derivative.
-void project(const Alignment::Camera& camera, const Vector3& q, Vector3& row, Matrix3& by_q) {
-    const double x = camera.fu_px / q.z(), y = camera.fv_px / q.z();
-    row << x * q.x() + camera.cu_px, y * q.y() + camera.cv_px, x * (q.x() - camera.baseline_m) + camera.cu_px;
-    by_q << x, 0.0, -x * q.x() / q.z(), 0.0, y, -y * q.y() / q.z(), x, 0.0, -x * (q.x() - camera.baseline_m) / q.z();
-}
-
 }  // namespace
 
-void Alignment::linearise(const Camera& camera, const Points& before, const Points& now, double std_px, double scale) {
+void Alignment::linearise(const Sensor& camera, const Points& before, const Points& now, double std_px, double scale) {
     information.setZero();
     gradient.setZero();
     const Matrix3 R = se3::rotation(T), I = Matrix3::Identity();
     const double variance = std_px * std_px, track = track_std_px * track_std_px;
     for (Index i = 0; i < before.rows(); ++i) {
         const Vector3 z = true_px.row(i), z_before = before.row(i), z_now = now.row(i);
-        const double disparity = z[0] - z[2], depth = camera.fu_px * camera.baseline_m / disparity;
-        const Vector3 q_before((z[0] - camera.cu_px) / camera.fu_px * depth,
-                               (z[1] - camera.cv_px) / camera.fv_px * depth, depth);
-        Vector3 q = se3::apply(T, q_before), row;
+        const double disparity = z[0] - z[2];
+        const Vector3 q_before = camera.invert(z);
+        Vector3 q = se3::apply(T, q_before);
         const bool is_ahead = q.z() > least_depth_m;
         // A disparity moves a point along its ray.
         const Vector3 along = is_ahead ? Vector3((q - se3::translation(T)) / disparity) : Vector3(Vector3::Zero());
         if (!is_ahead) q << 0.0, 0.0, 1.0;
-        Matrix3 by_q, of_rows;
-        project(camera, q, row, by_q);
-        of_rows << R.col(0) * (depth / camera.fu_px) - along, R.col(1) * (depth / camera.fv_px), along;
+        const Vector3 row = camera.predict(q);
+        const Matrix3 by_q = camera.jacobian(q);
+        Matrix3 of_rows;
+        of_rows << R.col(0) * (q_before.z() / camera.fu_px) - along, R.col(1) * (q_before.z() / camera.fv_px), along;
         const Matrix36 by_xi = by_q * se3::by_frame(q);
         const Matrix3 by_rows = by_q * of_rows;
         const Vector3 r = z_now - row - by_rows * (z_before - z), k = I.col(2) - by_rows.col(2);
@@ -63,7 +55,7 @@ void Alignment::linearise(const Camera& camera, const Points& before, const Poin
     }
 }
 
-Alignment align(const Alignment::Camera& camera, const Alignment::Points& before, const Alignment::Points& now,
+Alignment align(const Sensor& camera, const Alignment::Points& before, const Alignment::Points& now,
                 const Matrix4& first, double std_px, double scale) {
     const Index n = before.rows();
     Alignment found{

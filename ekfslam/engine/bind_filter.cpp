@@ -20,20 +20,16 @@ Kind kind_of(const std::string& name) {
     throw nb::value_error(("unknown kind of a block: " + name).c_str());
 }
 
+using Numbers = std::vector<std::pair<const char*, double*>>;
+
 std::vector<Block> blocks_of(const nb::list& given) {
     std::vector<Block> blocks;
     for (const nb::handle item : given) {
         const nb::dict from = nb::cast<nb::dict>(item);
-        Block block;
-        block.name = get<std::string>(from, "name");
-        block.kind = kind_of(get<std::string>(from, "kind"));
-        block.at = get<Index>(from, "at");
-        block.size = get<Index>(from, "size");
-        block.value_at = get<Index>(from, "value_at");
-        block.value_size = get<Index>(from, "value_size");
-        block.moves_camera = get<bool>(from, "moves_camera");
-        block.free = get<std::vector<Index>>(from, "free");
-        blocks.push_back(block);
+        blocks.push_back({get<std::string>(from, "name"), kind_of(get<std::string>(from, "kind")),
+                          get<Index>(from, "at"), get<Index>(from, "size"), get<Index>(from, "value_at"),
+                          get<Index>(from, "value_size"), get<bool>(from, "moves_camera"), 0.0, 0.0,
+                          get<Slots>(from, "free")});
     }
     return blocks;
 }
@@ -42,14 +38,7 @@ constexpr Index MOST_COLUMNS = 10000;
 
 // The value of a kind of block has so many numbers.
 Index value_size(const Block& block) {
-    switch (block.kind) {
-        case Kind::pose:
-            return 16;
-        case Kind::calibration:
-            return 9;
-        default:
-            return block.size;
-    }
+    return block.kind == Kind::pose ? 16 : block.kind == Kind::calibration ? 9 : block.size;
 }
 
 // Blocks that follow each other in columns and values, the pose first, each of the size of its kind.
@@ -70,7 +59,7 @@ void require_places(const std::vector<Block>& blocks) {
         require(!block.moves_camera || block.kind == Kind::vector, named + " must be a vector to move the camera");
         require(block.kind != Kind::direction || block.size == 3, named + " must have three columns");
         const bool is_calibration = block.kind == Kind::calibration;
-        require(static_cast<Index>(block.free.size()) == (is_calibration ? block.size : 0),
+        require(size_of(block.free) == (is_calibration ? block.size : 0),
                 named + " must have one free parameter for each column");
         Index last = -1;
         for (const Index parameter : block.free) {
@@ -87,29 +76,23 @@ void require_places(const std::vector<Block>& blocks) {
 Sensor sensor_of(const nb::dict& from) {
     Sensor sensor;
     sensor.type = get<bool>(from, "is_monocular") ? Sensor::monocular : Sensor::rig;
-    sensor.fu_px = get<double>(from, "fu_px");
-    sensor.fv_px = get<double>(from, "fv_px");
-    sensor.cu_px = get<double>(from, "cu_px");
-    sensor.cv_px = get<double>(from, "cv_px");
-    sensor.baseline_m = get<double>(from, "baseline_m");
-    sensor.disparity_offset_px = get<double>(from, "disparity_offset_px");
-    sensor.least_disparity_px = get<double>(from, "least_disparity_px");
+    const Numbers numbers = {{"fu_px", &sensor.fu_px},
+                             {"fv_px", &sensor.fv_px},
+                             {"cu_px", &sensor.cu_px},
+                             {"cv_px", &sensor.cv_px},
+                             {"baseline_m", &sensor.baseline_m},
+                             {"disparity_offset_px", &sensor.disparity_offset_px},
+                             {"least_disparity_px", &sensor.least_disparity_px},
+                             {"weight_left", &sensor.weight_left},
+                             {"parallax_rad", &sensor.parallax_rad}};
+    for (const auto& [name, number] : numbers) {
+        *number = get<double>(from, name);
+        require(std::isfinite(*number), "numbers of the sensor must be finite");
+    }
     sensor.sees_disparity = get<bool>(from, "sees_disparity");
-    sensor.weight_left = get<double>(from, "weight_left");
     sensor.T_cam_imu = get<Matrix4>(from, "T_cam_imu");
     sensor.variance_px2 = get<Vector3>(from, "variance_px2");
-    sensor.parallax_rad = get<double>(from, "parallax_rad");
     sensor.patience = whole_number("patience", get<Index>(from, "patience"));
-    const double* numbers[] = {&sensor.fu_px,
-                               &sensor.fv_px,
-                               &sensor.cu_px,
-                               &sensor.cv_px,
-                               &sensor.baseline_m,
-                               &sensor.disparity_offset_px,
-                               &sensor.least_disparity_px,
-                               &sensor.weight_left,
-                               &sensor.parallax_rad};
-    for (const double* number : numbers) require(std::isfinite(*number), "numbers of the sensor must be finite");
     require_finite("T_cam_imu", sensor.T_cam_imu);
     require_finite("variance_px2", sensor.variance_px2);
     return sensor;
@@ -118,11 +101,8 @@ Sensor sensor_of(const nb::dict& from) {
 std::optional<TrackError> track_error_of(const nb::object& given) {
     if (given.is_none()) return std::nullopt;
     const nb::dict from = nb::cast<nb::dict>(given);
-    TrackError error;
-    error.first_std = get<Vector3>(from, "first_std");
-    error.walk_std = get<Vector3>(from, "walk_std");
-    error.flow_px = get<double>(from, "flow_px");
-    error.parallax = get<double>(from, "parallax");
+    const TrackError error{get<Vector3>(from, "first_std"), get<Vector3>(from, "walk_std"),
+                           get<double>(from, "flow_px"), get<double>(from, "parallax")};
     require_finite("first_std", error.first_std);
     require_finite("walk_std", error.walk_std);
     return error;
@@ -132,21 +112,22 @@ Config config_of(const nb::dict& from) {
     Config config;
     config.variant = get<bool>(from, "is_invariant") ? Variant::invariant : Variant::standard;
     config.image_coordinates = get<bool>(from, "image_coordinates");
-    config.gate = get<double>(from, "gate");
-    config.gate_probability = get<double>(from, "gate_probability");
-    config.waiting_gate = get<double>(from, "waiting_gate");
-    config.min_depth_m = get<double>(from, "min_depth_m");
-    config.moving_sigma = get<double>(from, "moving_sigma");
-    config.moving_share = get<double>(from, "moving_share");
+    const Numbers numbers = {{"gate", &config.gate},
+                             {"gate_probability", &config.gate_probability},
+                             {"waiting_gate", &config.waiting_gate},
+                             {"min_depth_m", &config.min_depth_m},
+                             {"moving_sigma", &config.moving_sigma},
+                             {"moving_share", &config.moving_share},
+                             {"input_gate", &config.input_gate},
+                             {"doubt", &config.doubt}};
+    for (const auto& [name, number] : numbers) {
+        *number = get<double>(from, name);
+        require(!std::isnan(*number), "numbers of the settings must not be NaN");
+    }
     config.estimates_velocity = get<bool>(from, "estimates_velocity");
     config.retire_after = whole_number("retire_after", get<Index>(from, "retire_after"));
     config.misses_to_split = whole_number("misses_to_split", get<Index>(from, "misses_to_split"));
     config.dormant = whole_number("dormant", get<Index>(from, "dormant"));
-    config.input_gate = get<double>(from, "input_gate");
-    config.doubt = get<double>(from, "doubt");
-    for (const double number : {config.gate, config.gate_probability, config.waiting_gate, config.min_depth_m,
-                                config.moving_sigma, config.moving_share, config.input_gate, config.doubt})
-        require(!std::isnan(number), "numbers of the settings must not be NaN");
     return config;
 }
 
@@ -179,13 +160,10 @@ Filter make(const nb::list& blocks, const nb::dict& sensor, const nb::object& tr
         body += block.size;
         size += block.value_size;
     }
-    require_shape("values", values, size, 1);
-    require_shape("coordinates", coordinates, body, 1);
-    require_shape("P", P, body, body);
-    require_finite("values", values);
-    require_finite("coordinates", coordinates);
+    require_vector("values", values, size);
+    require_vector("coordinates", coordinates, body);
     require_finite("shares", shares);
-    require_covariance(P);
+    require_covariance(P, body);
     Filter filter(
         Estimate(config_of(config), sensor_of(sensor), track_error_of(track_error), parts, values, coordinates, P));
     filter.uniform = &uniform;
@@ -195,10 +173,8 @@ Filter make(const nb::list& blocks, const nb::dict& sensor, const nb::object& tr
 }
 
 void set_mean(Filter& filter, const Vector& values, const Vector& coordinates) {
-    require_shape("values", values, filter.e.values.flat.size(), 1);
-    require_shape("coordinates", coordinates, filter.e.coordinates.size(), 1);
-    require_finite("values", values);
-    require_finite("coordinates", coordinates);
+    require_vector("values", values, filter.e.values.flat.size());
+    require_vector("coordinates", coordinates, filter.e.coordinates.size());
     filter.e.values.flat = values;
     filter.e.coordinates = coordinates;
 }
@@ -279,8 +255,7 @@ nb::object update(Filter& filter, Index frame, const Integers& ids, const Matrix
     const Matrix columns = measured.transpose();
     if (std::unordered_set<std::int64_t>(seen.begin(), seen.end()).size() != seen.size())
         throw nb::value_error("ids must be distinct");
-    if (columns.cols() != static_cast<Index>(seen.size()) ||
-        columns.rows() < (filter.e.sensor.type == Sensor::rig ? 4 : 2))
+    if (columns.cols() != size_of(seen) || columns.rows() < (filter.e.sensor.type == Sensor::rig ? 4 : 2))
         throw nb::value_error("measured must have one row of pixels for each id");
     require_finite("measured", columns);
     filter.e.twist_after = [&](const Values& after) {
@@ -304,22 +279,22 @@ nb::object update(Filter& filter, Index frame, const Integers& ids, const Matrix
 nb::tuple adopt(Filter& filter, const Vector& values, const Vector& coordinates, const Matrix& position_m,
                 const Matrix& P) {
     const Index body = filter.e.columns.body, count = filter.e.table.size();
-    require_shape("values", values, filter.e.values.flat.size(), 1);
-    require_shape("coordinates", coordinates, body, 1);
+    require_vector("values", values, filter.e.values.flat.size());
+    require_vector("coordinates", coordinates, body);
     require_shape("position_m", position_m, count, 3);
-    require_shape("P", P, body + 3 * count, body + 3 * count);
-    require_finite("values", values);
-    require_finite("coordinates", coordinates);
     require_finite("position_m", position_m);
-    require_covariance(P);
+    require_covariance(P, body + 3 * count);
     filter.adopt(values, coordinates, position_m.transpose(), P);
     return mean_of(filter);
 }
 
-Slots all(const Filter& filter) {
-    Slots slots(static_cast<std::size_t>(filter.e.table.size()));
-    for (std::size_t i = 0; i < slots.size(); ++i) slots[i] = static_cast<Index>(i);
-    return slots;
+// Landmarks at some slots, checked, or all of them.
+Slots slots_of(const Filter& filter, const std::optional<Integers>& given) {
+    const Index count = whole(filter).e.table.size();
+    if (!given) return range(0, count);
+    for (const std::int64_t slot : *given)
+        if (slot < 0 || slot >= count) throw nb::index_error("a slot is not in the table");
+    return {given->data(), given->data() + given->size()};
 }
 
 void bind_reading(nb::class_<Shared>& bound) {
@@ -329,19 +304,14 @@ void bind_reading(nb::class_<Shared>& bound) {
         .def("considered", reading(+[](const Filter& filter) { return filter.e.gaussian.considered(); }))
         .def("body_covariance",
              reading(+[](const Filter& filter) { return rows(filter.e.gaussian.body_covariance()); }))
-        .def("covariance",
-             reading(+[](const Filter& filter) { return rows(whole(filter).e.gaussian.covariance_of(all(filter))); }))
-        .def("covariance_of", reading(+[](const Filter& filter, const Integers& slots) {
-                 return rows(whole(filter).e.gaussian.covariance_of(slots_of(slots, filter.e.table.size())));
+        .def("covariance", reading(+[](const Filter& filter, const std::optional<Integers>& slots) {
+                 return rows(filter.e.gaussian.covariance_of(slots_of(filter, slots)));
              }),
-             arg("slots"))
-        .def("landmark_blocks", reading(+[](const Filter& filter) {
-                 return blocks(whole(filter).e.gaussian.landmark_blocks(all(filter)));
-             }))
-        .def("landmark_blocks_of", reading(+[](const Filter& filter, const Integers& slots) {
-                 return blocks(whole(filter).e.gaussian.landmark_blocks(slots_of(slots, filter.e.table.size())));
+             arg("slots") = nb::none())
+        .def("landmark_blocks", reading(+[](const Filter& filter, const std::optional<Integers>& slots) {
+                 return blocks(filter.e.gaussian.landmark_blocks(slots_of(filter, slots)));
              }),
-             arg("slots"))
+             arg("slots") = nb::none())
         .def("consider", changing(+[](Filter& filter, Index columns) {
                  require_range("considered columns", 0, columns, MOST_CONSIDERED);
                  return filter.e.gaussian.consider(columns);
@@ -372,7 +342,7 @@ void refuse() {
 void raise_innovation_error(const Filter& filter, Index frame, const Error& error) {
     Ids ids;
     for (const Index slot : error.slots)
-        if (slot < filter.e.table.size()) ids.push_back(filter.e.table.id[static_cast<std::size_t>(slot)]);
+        if (slot < filter.e.table.size()) ids.push_back(filter.e.table.id[slot]);
     const nb::object type = nb::module_::import_("ekfslam.errors").attr("InnovationError");
     const nb::object raised = type(frame, array(ids).attr("tolist")());
     PyErr_SetObject(type.ptr(), raised.ptr());
@@ -415,8 +385,7 @@ void bind_filter(nb::module_& module) {
         .def("look_again", changing(&look_again), arg("imu_twist"))
         .def("replace", changing(+[](Filter& filter, const Matrix& P) {
                  const Index size = filter.e.columns.body + filter.e.gaussian.considered() + 3 * filter.e.table.size();
-                 require_shape("P", P, size, size);
-                 require_covariance(P);
+                 require_covariance(P, size);
                  filter.e.gaussian.replace(P);
              }),
              arg("P"));

@@ -13,41 +13,7 @@ nb::object owned(T values, std::initializer_list<std::size_t> shape) {
     return nb::cast(nb::ndarray<nb::numpy, Scalar>(kept->data(), shape, owner));
 }
 
-struct Column {
-    const char* name;
-    Ids Table::* values;
-};
-struct Block {
-    const char* name;
-    Matrix Table::* values;
-};
-constexpr Column COLUMNS[] = {
-    {"id", &Table::id},
-    {"first_frame", &Table::first_frame},
-    {"last_frame", &Table::last_frame},
-    {"observations", &Table::observations},
-    {"misses", &Table::misses},
-    {"log_row", &Table::log_row},
-    {"stay_until", &Table::stay_until},
-    {"first_step", &Table::first_step},
-    {"last_step", &Table::last_step},
-    {"last_observation", &Table::last_observation},
-    {"asleep", &Table::asleep},
-};
-constexpr Block BLOCKS[] = {
-    {"position_m", &Table::position_m},
-    {"initial_m", &Table::initial_m},
-    {"evidence", &Table::evidence},
-    {"seen_rows", &Table::seen_rows},
-};
-
 }  // namespace
-
-Slots slots_of(const Integers& values, Index count) {
-    for (const std::int64_t slot : values)
-        if (slot < 0 || slot >= count) throw nb::index_error("a slot is not in the table");
-    return {values.data(), values.data() + values.size()};
-}
 
 void require(bool holds, const std::string& what) {
     if (!holds) throw nb::value_error(what.c_str());
@@ -75,13 +41,19 @@ void require_finite(const char* name, const Eigen::Ref<const Matrix>& found) {
     require(found.allFinite(), std::string(name) + " must be finite");
 }
 
-void require_covariance(const Eigen::Ref<const Matrix>& P) {
+void require_vector(const char* name, const Vector& found, Index size) {
+    require_shape(name, found, size, 1);
+    require_finite(name, found);
+}
+
+void require_covariance(const Matrix& P, Index size) {
+    require_shape("P", P, size, size);
     require_finite("P", P);
     require(!(P.diagonal().array() < 0.0).any(), "P must have no negative variance");
 }
 
 nb::object array(Vector values) {
-    const auto size = static_cast<std::size_t>(values.size());
+    const std::size_t size = values.size();
     return owned(std::move(values), {size});
 }
 
@@ -91,42 +63,37 @@ nb::object array(Ids values) {
 }
 
 nb::object rows(Matrix values) {
-    const auto columns = static_cast<std::size_t>(values.cols()), rows = static_cast<std::size_t>(values.rows());
+    const std::size_t columns = values.cols(), rows = values.rows();
     return owned(std::move(values), {columns, rows});
 }
 
-template <class Block>
-nb::object stacked(const std::vector<Block>& values, Index size) {
+nb::object blocks(const std::vector<Matrix3>& values) {
     std::vector<double> flat;
-    flat.reserve(values.size() * static_cast<std::size_t>(size * size));
-    for (const Block& block : values) flat.insert(flat.end(), block.data(), block.data() + size * size);
-    const std::size_t count = values.size(), d = static_cast<std::size_t>(size);
-    return owned(std::move(flat), {count, d, d});
+    flat.reserve(9 * values.size());
+    for (const Matrix3& block : values) flat.insert(flat.end(), block.data(), block.data() + 9);
+    return owned(std::move(flat), {values.size(), 3, 3});
 }
-nb::object blocks(const std::vector<Matrix3>& values) { return stacked(values, 3); }
-nb::object blocks(const std::vector<Matrix>& values, Index size) { return stacked(values, size); }
 
 nb::dict table_of(const Table& table) {
     nb::dict out;
-    for (const Column& column : COLUMNS) out[column.name] = array(table.*column.values);
-    for (const Block& block : BLOCKS) out[block.name] = rows(table.*block.values);
+    for (const auto& column : WHOLE) out[column.name] = array(table.*column.values);
+    for (const auto& column : REAL) out[column.name] = rows(table.*column.values);
     return out;
 }
 
 Table table_from(const nb::dict& from, Index dimension) {
     Table table;
-    for (const Column& column : COLUMNS) table.*column.values = ids_of(get<Integers>(from, column.name));
-    for (const Column& column : COLUMNS)
+    for (const auto& column : WHOLE) {
+        table.*column.values = ids_of(get<Integers>(from, column.name));
+        require(size_of(table.*column.values) == table.size(),
+                std::string(column.name) + " must have one number a landmark");
         for (const std::int64_t value : table.*column.values)
             if (column.values != &Table::id) whole_number(column.name, value);
-    const Index count = table.size(), heights[] = {3, 3, 2, dimension};
-    for (const Column& column : COLUMNS)
-        require(static_cast<Index>((table.*column.values).size()) == count,
-                std::string(column.name) + " must have one number a landmark");
-    for (std::size_t i = 0; i < 4; ++i) {
-        const Matrix given = get<Matrix>(from, BLOCKS[i].name);
-        require_shape(BLOCKS[i].name, given, count, heights[i]);
-        table.*BLOCKS[i].values = given.transpose();
+    }
+    for (const auto& column : REAL) {
+        const Matrix given = get<Matrix>(from, column.name);
+        require_shape(column.name, given, table.size(), column.height ? column.height : dimension);
+        table.*column.values = given.transpose();
     }
     return table;
 }
@@ -180,9 +147,9 @@ nb::object retired_of(const Retired& retired) {
 
 nb::object report_of(const Report& report, const Filter& filter) {
     const Taken& taken = report.taken;
-    const Begun& begun = report.begun;
+    const Started& begun = report.begun;
     const FrameInnovations& innovations = report.innovations;
-    const auto count = static_cast<std::int64_t>(begun.ids.size());
+    const auto count = size_of(begun.ids);
     Packed packed;
     for (const Ids* ids : {&report.split, &report.moving, &begun.ids, &innovations.landmark}) packed.add_whole(*ids);
     packed.add_whole(report.reason);

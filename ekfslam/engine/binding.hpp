@@ -23,16 +23,11 @@ namespace nb = nanobind;
 
 using nb::arg;
 using Integers = Eigen::Matrix<std::int64_t, Eigen::Dynamic, 1>;
-using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
-using Stack = nb::ndarray<const double, nb::ndim<3>, nb::c_contig>;  // the landmark first
 
-// `Filter`, its predictions, and what tests compare: the covariance, gates and consensus, observations.
+// `Filter`, and its predictions.
 struct Shared;
 void bind_filter(nb::module_& module);
 void bind_process(nb::class_<Shared>& bound);
-void bind_gaussian(nb::module_& module);
-void bind_gates(nb::module_& module);
-void bind_model(nb::module_& module);
 
 // The entry of a dictionary.
 template <class T>
@@ -41,12 +36,7 @@ T get(const nb::dict& from, const char* key) {
     return nb::cast<T>(from[key]);
 }
 
-template <class T>
-std::vector<T> listed(const Eigen::Matrix<T, Eigen::Dynamic, 1>& values) {
-    return {values.data(), values.data() + values.size()};
-}
-inline Ids ids_of(const Integers& values) { return listed<std::int64_t>(values); }
-Slots slots_of(const Integers& values, Index count);  // checked: from 0 to count - 1
+inline Ids ids_of(const Integers& values) { return {values.data(), values.data() + values.size()}; }
 
 constexpr Index MOST_CONSIDERED = 10000;
 
@@ -57,7 +47,8 @@ Index whole_number(const std::string& name, Index value);
 void require_range(const std::string& name, Index first, Index size, Index count);
 void require_shape(const char* name, const Eigen::Ref<const Matrix>& found, Index rows, Index columns);
 void require_finite(const char* name, const Eigen::Ref<const Matrix>& found);
-void require_covariance(const Eigen::Ref<const Matrix>& P);
+void require_vector(const char* name, const Vector& found, Index size);
+void require_covariance(const Matrix& P, Index size);
 
 // The filter of Python: one call at a time, and a call that fails leaves it as it was. A copy of the filter before each
 // call would cost a twentieth of a frame, and far more with many dormant landmarks: one in a while has to do, and
@@ -81,7 +72,7 @@ std::size_t numbers_of(const Argument& argument) {
     if constexpr (std::is_base_of_v<nb::handle, Argument>)
         return argument.is_none() ? 0 : MOST_KEPT;
     else if constexpr (std::is_base_of_v<Eigen::EigenBase<Argument>, Argument>)
-        return static_cast<std::size_t>(argument.size());
+        return argument.size();
     return 0;
 }
 
@@ -166,18 +157,6 @@ nb::object array(Vector values);
 nb::object array(Ids values);
 nb::object rows(Matrix values);
 nb::object blocks(const std::vector<Matrix3>& values);  // (k, 3, 3), symmetric
-nb::object blocks(const std::vector<Matrix>& values, Index size);
-
-// Blocks of a stack (k, r, c).
-template <class Block>
-std::vector<Block> blocks_of(const Stack& stack, Index rows, Index columns) {
-    const auto r = static_cast<Index>(stack.shape(1)), c = static_cast<Index>(stack.shape(2));
-    require(r == rows && c == columns, "a stack of blocks of another shape");
-    std::vector<Block> blocks;
-    for (std::size_t i = 0; i < stack.shape(0); ++i)
-        blocks.push_back(Eigen::Map<const RowMajor>(stack.data() + static_cast<Index>(i) * r * c, r, c));
-    return blocks;
-}
 
 nb::dict table_of(const Table& table);
 Table table_from(const nb::dict& from, Index dimension);

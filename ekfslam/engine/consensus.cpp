@@ -29,7 +29,7 @@ struct Settled {
     double cost = 0;
 
     Index agree() const { return std::count(inside.begin(), inside.end(), true); }
-    bool is_majority() const { return 2 * agree() > static_cast<Index>(inside.size()); }
+    bool is_majority() const { return 2 * agree() > size_of(inside); }
 };
 
 // The observations of a frame.
@@ -39,10 +39,6 @@ struct Frame {
     const Matrix& measured;
     const Uniform& uniform;
 };
-
-bool is_one_of(int verdict, std::initializer_list<int> some) {
-    return std::find(some.begin(), some.end(), verdict) != some.end();
-}
 
 // Whether the trigger holds: many landmarks are rejected, or those that pass agree on an error of the inputs.
 bool is_suspect(const Estimate& e, const Correction& found) {
@@ -78,29 +74,21 @@ Vector6 jump(const Estimate& e) {
     return in_noise(e, se3::log(as_before * se3::inverse(motion.T_predicted)));
 }
 
-Block3 own_block(const Matrix& S, Index i, Index d) { return S.block(i * d, i * d, d, d); }
-
-Flags picked_flags(const Flags& flags, const Slots& which) {
-    Flags some(which.size());
-    for (std::size_t i = 0; i < some.size(); ++i) some[i] = flags[which[i]];
-    return some;
-}
-
 // Solves eq. (6) under a prior for the candidates that agree.
 class Settling {
    public:
     Settling(Estimate prior, const Frame& at, Slots candidates, const Flags* begin)
         : e_(std::move(prior)), at_(at), begin_(begin) {
         slots_ = picked(at.slots, candidates);
-        measured_ = columns(at.measured, candidates);
+        measured_ = columns_of(at.measured, candidates);
         found_.candidates = std::move(candidates);
     }
 
     // At most so many linearisations; nothing if no candidates agree.
     std::optional<Settled> run(int rounds) {
         Rows rows = observe(e_, e_.mean(), slots_, measured_).rows;
-        Slots some = where(Flags(slots_.size(), true));
-        found_.inside = begin_ ? picked_flags(*begin_, found_.candidates) : Flags(slots_.size(), false);
+        Slots some = range(0, size_of(slots_));
+        found_.inside = begin_ ? picked(*begin_, found_.candidates) : Flags(slots_.size(), false);
         Mean linear = e_.mean();
         Vector coordinates = e_.coordinates;
         for (int round = 0; round < rounds; ++round) {
@@ -156,7 +144,7 @@ class Settling {
             const Vector focal = focal_lengths(by_pose(e_, rows), rows.dimension());
             found_.inside = agreeing(S, rows.residual, focal, gate, samples_of(rows.count(), at_.frame, at_.uniform));
         }
-        const Slots agree = where(refined(S, rows.residual, picked_flags(found_.inside, some), gate));
+        const Slots agree = where(refined(S, rows.residual, picked(found_.inside, some), gate));
         if (agree.empty()) return false;
         found_.inside.assign(slots_.size(), false);
         for (Index i : agree) found_.inside[some[i]] = true;
@@ -165,7 +153,8 @@ class Settling {
         found_.rows = rows.only(agree);
         found_.left = found_.solution.residual();
         found_.S.clear();
-        for (Index i : agree) found_.S.push_back(own_block(S, i, rows.dimension()));
+        const Index d = rows.dimension();
+        for (Index i : agree) found_.S.push_back(S.block(i * d, i * d, d, d));
         found_.cost = found_.solution.nis + gate * static_cast<double>(slots_.size() - agree.size());
         return true;
     }
@@ -182,30 +171,25 @@ class Settling {
 std::optional<Settled> settled(Estimate prior, const Frame& at, const Verdicts& verdict, int rounds, const Flags* begin,
                                std::initializer_list<int> verdicts) {
     Slots candidates;
-    for (std::size_t i = 0; i < verdict.size(); ++i) {
-        if (is_one_of(verdict[i], verdicts)) candidates.push_back(static_cast<Index>(i));
-    }
+    for (Index i = 0; i < size_of(verdict); ++i)
+        if (std::find(verdicts.begin(), verdicts.end(), verdict[i]) != verdicts.end()) candidates.push_back(i);
     return Settling(std::move(prior), at, std::move(candidates), begin).run(rounds);
 }
 
 // A correction by the landmarks that agree among the candidates.
 void take(Correction& found, const Frame& at, Settled settled) {
-    for (std::size_t i = 0; i < settled.inside.size(); ++i) {
+    for (Index i = 0; i < size_of(settled.inside); ++i) {
         found.verdict[settled.candidates[i]] = settled.inside[i] ? ACCEPTED : GATE;
-    }
-    Slots accepted;
-    for (std::size_t i = 0; i < found.verdict.size(); ++i) {
-        if (found.verdict[i] == ACCEPTED) accepted.push_back(static_cast<Index>(i));
     }
     const Estimate& prior = *settled.prior;
     found.innovations = innovations_of(prior, prior.gaussian, settled.solution, settled.rows, settled.S, settled.left);
-    found.outside = static_cast<Index>(settled.inside.size()) - settled.agree();
+    found.outside = size_of(settled.inside) - settled.agree();
     found.nis = settled.solution.nis;
     found.log_det = settled.solution.log_det;
     found.dof = settled.rows.residual.size();
     found.slot = settled.rows.slot;
     found.variance = settled.rows.variance;
-    found.measured = columns(at.measured, accepted);
+    found.measured = columns_of(at.measured, where(found.verdict, ACCEPTED));
     found.solution = std::move(settled.solution);
     found.change = std::move(settled.change);
     found.linear = std::move(settled.linear);
@@ -239,7 +223,7 @@ Correction correct(Estimate& e, Index frame, const Slots& slots, const Matrix& m
     Estimate prior = e;
     if (e.has_time_offset()) look_at(prior, predicted);
     Flags accepted(slots.size());
-    for (std::size_t i = 0; i < accepted.size(); ++i) accepted[i] = found.verdict[i] == ACCEPTED;
+    for (Index i = 0; i < size_of(accepted); ++i) accepted[i] = found.verdict[i] == ACCEPTED;
     const Flags* begin = suspect ? nullptr : &accepted;
     auto trusted = settled(prior, at, found.verdict, rounds, begin, {ACCEPTED, GATE});
     auto cost = cost_of(trusted);

@@ -41,7 +41,7 @@ Vector3 last_step(const Estimate& e) {
 // Derivative (d, j) of the rows by a motion of their landmarks along a step.
 Matrix along(const Vector3& step, const Observed& seen, const Slots& some) {
     const Index d = seen.rows.dimension();
-    Matrix h(d, static_cast<Index>(some.size()));
+    Matrix h(d, size_of(some));
     for (Index i = 0; i < h.cols(); ++i) h.col(i) = seen.H_m.middleCols(some[i] * d, d).transpose() * step;
     return h;
 }
@@ -50,8 +50,8 @@ Matrix along(const Vector3& step, const Observed& seen, const Slots& some) {
 void reject_blurred(Tried& tried, Verdicts& verdict) {
     const Matrix& variance = tried.projection.rows.variance;
     Flags sharp(tried.some.size());
-    for (std::size_t i = 0; i < sharp.size(); ++i) {
-        const Vector own = tried.S[i].diagonal(), most = MOST_BLURRED * variance.col(static_cast<Index>(i));
+    for (Index i = 0; i < size_of(sharp); ++i) {
+        const Vector own = tried.S[i].diagonal(), most = MOST_BLURRED * variance.col(i);
         sharp[i] = !(own.array() > most.array()).any();
         if (!sharp[i]) verdict[tried.some[i]] = BEHIND_CAMERA;
     }
@@ -60,10 +60,7 @@ void reject_blurred(Tried& tried, Verdicts& verdict) {
 
 // The landmarks that pass the gate by themselves; verdicts are written on others.
 Tried gate_alone(Estimate& e, const Observed& seen, Verdicts& verdict) {
-    Slots some;
-    for (std::size_t i = 0; i < verdict.size(); ++i) {
-        if (verdict[i] == ACCEPTED) some.push_back(static_cast<Index>(i));
-    }
+    const Slots some = where(verdict, ACCEPTED);
     Tried tried{some, e.gaussian.project(some.size() == verdict.size() ? seen.rows : seen.rows.only(some)), {}};
     tried.S = own_covariances(tried.projection);
     reject_blurred(tried, verdict);
@@ -96,17 +93,15 @@ Verdicts gate_by_others(Estimate& e, const Solution& solution, const Tried& trie
     if (!std::isfinite(gate) && !judges) return verdict;
     const Rows& rows = solution.at.rows;
     const Matrix left_by_all = solution.residual();
-    Slots doubtful;
-    if (judges) {
-        doubtful = where(Flags(verdict.size(), true));
-    } else {
+    Slots doubtful = judges ? range(0, size_of(verdict)) : Slots();
+    if (!judges) {
         const Vector most = most_given_others(left_by_all, rows.variance, tried.S);
         for (Index i = 0; i < most.size(); ++i) {
             if (!(most[i] <= gate)) doubtful.push_back(i);
         }
     }
     if (doubtful.empty()) return verdict;
-    const Matrix left = columns(left_by_all, doubtful), variance = columns(rows.variance, doubtful);
+    const Matrix left = columns_of(left_by_all, doubtful), variance = columns_of(rows.variance, doubtful);
     const std::vector<Matrix> C = e.gaussian.given_others(solution, doubtful);
     const Judged found = agrees_with_others(left, variance, C);
     Flags moves(doubtful.size(), false);
@@ -115,8 +110,8 @@ Verdicts gate_by_others(Estimate& e, const Solution& solution, const Tried& trie
         const Evidence evidence = evidence_given_others(left, variance, C, along(step, seen, tried.some));
         moves = moves_along(e.table, rows.slot, evidence, found.squares, gate, e.config);
     }
-    for (std::size_t i = 0; i < doubtful.size(); ++i) {
-        if (found.squares[static_cast<Index>(i)] > gate) verdict[doubtful[i]] = GATE;
+    for (Index i = 0; i < size_of(doubtful); ++i) {
+        if (found.squares[i] > gate) verdict[doubtful[i]] = GATE;
         if (moves[i] && found.judged[i]) verdict[doubtful[i]] = MOVING;
     }
     return verdict;
@@ -127,7 +122,7 @@ void gate_jointly(Estimate& e, Tried& tried, const Observed& seen, const Vector3
     Solution solution = e.gaussian.solve(std::move(tried.projection));
     const Verdicts verdict = gate_by_others(e, solution, tried, seen, step);
     Flags out(verdict.size());
-    for (std::size_t i = 0; i < verdict.size(); ++i) {
+    for (Index i = 0; i < size_of(verdict); ++i) {
         out[i] = verdict[i] != ACCEPTED;
         found.verdict[tried.some[i]] = verdict[i];
         found.outside += verdict[i] == GATE;
@@ -136,7 +131,7 @@ void gate_jointly(Estimate& e, Tried& tried, const Observed& seen, const Vector3
     const Rows& rows = solution.at.rows;
     if (inside.size() < out.size()) {
         solution = e.gaussian.without(std::move(solution), out);
-        const Matrix left = columns(solution.residual(), inside);
+        const Matrix left = columns_of(solution.residual(), inside);
         found.innovations = innovations_of(e, e.gaussian, solution, rows.only(inside), picked(tried.S, inside), left);
     } else {
         found.innovations = innovations_of(e, e.gaussian, solution, rows, tried.S, solution.residual());
@@ -209,13 +204,10 @@ Correction correct_plainly(Estimate& e, const Slots& slots, const Matrix& measur
     } else {
         found.change = Vector::Zero(e.gaussian.considered() + e.columns.body + 3 * e.gaussian.landmarks());
     }
-    Slots taken;
-    for (std::size_t i = 0; i < slots.size(); ++i) {
-        if (found.verdict[i] == ACCEPTED) taken.push_back(static_cast<Index>(i));
-    }
+    const Slots taken = where(found.verdict, ACCEPTED);
     found.slot = picked(slots, taken);
-    found.measured = columns(measured, taken);
-    found.variance = columns(seen.rows.variance, taken);
+    found.measured = columns_of(measured, taken);
+    found.variance = columns_of(seen.rows.variance, taken);
     found.dof = found.variance.size();
     found.linear = e.mean();
     found.coordinates = e.coordinates;

@@ -12,14 +12,13 @@ namespace {
 constexpr Index WAITING = 192;
 }  // namespace
 
-std::vector<Index> triples(const std::vector<Index>& which) {
-    std::vector<Index> columns;
-    for (Index i : which)
-        for (Index axis = 0; axis < 3; ++axis) columns.push_back(3 * i + axis);
+Slots triples(const Slots& which) {
+    Slots columns;
+    for (Index i : which) append_range(columns, 3 * i, 3 * i + 3);
     return columns;
 }
 
-void Dormant::append(const std::vector<Index>& at, const Matrix& K_new, const std::vector<Matrix3>& S_new) {
+void Dormant::append(const Slots& at, const Matrix& K_new, const std::vector<Matrix3>& S_new) {
     const Index before = K.cols(), after = before + K_new.cols(), room = S_.rows();
     slot.insert(slot.end(), at.begin(), at.end());
     K.conservativeResize(K_new.rows(), after);
@@ -34,31 +33,30 @@ void Dormant::append(const std::vector<Index>& at, const Matrix& K_new, const st
         sign_.conservativeResize(WAITING);
     }
     S_.block(before, 0, after - before, after).setZero();
-    for (std::size_t i = 0; i < S_new.size(); ++i) {
-        const Index own = before + static_cast<Index>(3 * i);
+    for (Index i = 0; i < size_of(S_new); ++i) {
+        const Index own = before + 3 * i;
         S_.block<3, 3>(own, own) = S_new[i];
     }
     squares_.block(before, 0, after - before, waiting_).setZero();
 }
 
-void Dormant::keep(const std::vector<Index>& which) {
-    const std::vector<Index> own = triples(which);
-    std::vector<Index> kept;
-    for (Index i : which) kept.push_back(slot[static_cast<std::size_t>(i)]);
+void Dormant::keep(const Slots& which) {
+    const Slots own = triples(which);
+    Slots kept;
+    for (Index i : which) kept.push_back(slot[i]);
     slot = kept;
     K = Matrix(K(Eigen::all, own));
     cross = Matrix(cross(Eigen::all, own));
-    const auto n = static_cast<Index>(own.size());
-    std::vector<Index> end(own.size());  // of neighbours that stay neighbours
+    const auto n = size_of(own);
+    Slots end(own.size());  // of neighbours that stay neighbours
     for (std::size_t i = own.size(); i-- > 0;) {
         const bool is_last = i + 1 == own.size() || own[i + 1] != own[i] + 1;
-        end[i] = is_last ? static_cast<Index>(i) + 1 : end[i + 1];
+        end[i] = is_last ? i + 1 : end[i + 1];
     }
     const auto move = [&](const double* from, double* to, Index begin) {  // in place: they ascend
-        for (Index i = begin; i < n; i = end[static_cast<std::size_t>(i)])
-            std::copy_n(from + own[static_cast<std::size_t>(i)], end[static_cast<std::size_t>(i)] - i, to + i);
+        for (Index i = begin; i < n; i = end[i]) std::copy_n(from + own[i], end[i] - i, to + i);
     };
-    for (Index j = 0; j < n; ++j) move(S_.col(own[static_cast<std::size_t>(j)]).data(), S_.col(j).data(), j);
+    for (Index j = 0; j < n; ++j) move(S_.col(own[j]).data(), S_.col(j).data(), j);
     for (Index j = 0; j < waiting_; ++j) move(squares_.col(j).data(), squares_.col(j).data(), 0);
 }
 
@@ -83,10 +81,10 @@ void Dormant::turn(Index which, const Matrix3& M) {
     cross.middleCols(own, 3) = (cross.middleCols(own, 3) * M.transpose()).eval();
 }
 
-Matrix Dormant::rows(const std::vector<Index>& own) const {
-    Matrix S(static_cast<Index>(own.size()), K.cols());
+Matrix Dormant::rows(const Slots& own) const {
+    Matrix S(size_of(own), K.cols());
     for (Index i = 0; i < S.rows(); ++i) {
-        const Index row = own[static_cast<std::size_t>(i)];
+        const Index row = own[i];
         S.row(i).head(row) = S_.row(row).head(row);
         S.row(i).tail(K.cols() - row) = S_.col(row).segment(row, K.cols() - row).transpose();
     }
@@ -103,7 +101,7 @@ Matrix3 Dormant::block(Index which) const {
 
 void Dormant::fold() {
     for (double sign : {1.0, -1.0}) {
-        std::vector<Index> which;
+        Slots which;
         for (Index j = 0; j < waiting_; ++j)
             if (sign_(j) == sign) which.push_back(j);
         square(squares()(Eigen::all, which), sign);

@@ -18,20 +18,20 @@ namespace ekfslam {
 
 class Dormant {
    public:
-    std::vector<Index> slot;  // (n)
-    Matrix K;                 // K_B^T (n_A, 3n)
-    Matrix cross;             // (e, 3n)
+    Slots slot;    // (n)
+    Matrix K;      // K_B^T (n_A, 3n)
+    Matrix cross;  // (e, 3n)
 
-    Index size() const { return static_cast<Index>(slot.size()); }
+    Index size() const { return size_of(slot); }
     // Adds landmarks, independent of the others given A.
-    void append(const std::vector<Index>& at, const Matrix& K_new, const std::vector<Matrix3>& S_new);
+    void append(const Slots& at, const Matrix& K_new, const std::vector<Matrix3>& S_new);
     // Keeps some of the landmarks, ascending.
-    void keep(const std::vector<Index>& which);
+    void keep(const Slots& which);
     // Adds sign A A^T to S, A (3n, c).
     void add(const Matrix& A, double sign);
     // d_i <- M_i d_i + ... in S and cross.
     void turn(Index which, const Matrix3& M);
-    Matrix rows(const std::vector<Index>& own) const;  // (r, 3n) rows of S
+    Matrix rows(const Slots& own) const;  // (r, 3n) rows of S
     Matrix3 block(Index which) const;
 
    private:
@@ -45,6 +45,6 @@ class Dormant {
 };
 
 // Columns (3n) of landmarks.
-std::vector<Index> triples(const std::vector<Index>& which);
+Slots triples(const Slots& which);
 
 }  // namespace ekfslam

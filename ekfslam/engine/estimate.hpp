@@ -19,7 +19,7 @@ struct Block {
     Index value_at = 0, value_size = 0;  // place in Values::flat; poses are 16 numbers, row-major
     bool moves_camera = false;
     double share = 0.0, share_of_difference = 0.0;  // of the present frame, set by each prediction
-    std::vector<Index> free;                        // of a calibration: indices among its nine parameters
+    Slots free;                                     // of a calibration: indices among its nine parameters
 };
 
 struct Config {
@@ -38,7 +38,7 @@ struct Table {  // one entry a landmark, columns as in filters/landmarks.py
     Ids id, first_frame, last_frame, observations, misses, log_row, stay_until, first_step, last_step, last_observation,
         asleep;
     Matrix position_m, initial_m, evidence, seen_rows;  // (3, n), (3, n), (2, n), (d, n)
-    Index size() const { return static_cast<Index>(id.size()); }
+    Index size() const { return size_of(id); }
 };
 
 // The last prediction, set by Python: filters/estimate.py Motion.

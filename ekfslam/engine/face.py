@@ -211,13 +211,11 @@ class Engine:
 
     def landmark_blocks(self, slot: IntArray | None = None) -> Array:
         """Return the landmarks' own covariances (k, 3, 3), of all or at slots (k,)."""
-        if slot is None:
-            return np.asarray(self.filter.landmark_blocks())
-        return np.asarray(self.filter.landmark_blocks_of(slot))
+        return np.asarray(self.filter.landmark_blocks(slot))
 
     def covariance_of(self, slot: IntArray) -> Array:
         """Return the covariance (body+3k, body+3k) of the body and of the landmarks at the slots (k,)."""
-        return np.asarray(self.filter.covariance_of(slot))
+        return np.asarray(self.filter.covariance(slot))
 
     def consider(self, columns: int) -> int:
         """Add considered columns, and return the first of them."""

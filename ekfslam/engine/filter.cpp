@@ -1,7 +1,6 @@
 #include "filter.hpp"
 
 #include <algorithm>
-#include <numeric>
 
 #include "retraction.hpp"
 
@@ -18,11 +17,11 @@ Taken taken_by(const Estimate& e, const Correction& found) {
                 picked(e.table.last_observation, found.slot),
                 found.measured,
                 found.variance,
-                columns(linear.position_m, found.slot),
+                columns_of(linear.position_m, found.slot),
                 linear.values.flat,
                 found.coordinates,
                 linear.imu_twist};
-    for (std::size_t i = 0; i < found.slot.size(); ++i) {
+    for (Index i = 0; i < size_of(found.slot); ++i) {
         const bool follows = e.track_error && e.table.last_step[found.slot[i]] == e.step - 1;
         if (!follows) taken.previous[i] = -1;
     }
@@ -50,7 +49,7 @@ Report Filter::update(Index frame, const Ids& ids, const Matrix& measured) {
 Retired Filter::rest(Index frame, const Ids& ids) {
     const Flags out = out_of_view(e.table, ids, frame, e.config.retire_after);
     Flags asleep = at_rest(out, e.table, e.config.dormant), gone(out.size());
-    for (std::size_t i = 0; i < gone.size(); ++i) gone[i] = out[i] && !asleep[i];
+    for (Index i = 0; i < size_of(gone); ++i) gone[i] = out[i] && !asleep[i];
     Retired retired = retire(e, gone, true);
     Flags still;
     for (Index i : where(gone, false)) still.push_back(asleep[i]);
@@ -66,32 +65,32 @@ Report Filter::take(Index frame, const Ids& ids, const Matrix& measured) {
     report.reason = e.sensor.screen(measured);
     const Lookup at = lookup(e.table, ids);
     Slots known;
-    for (std::size_t i = 0; i < ids.size(); ++i) {
+    for (Index i = 0; i < size_of(ids); ++i) {
         if (moving.count(ids[i])) report.reason[i] = MOVING;
-        if (at.known[i] && report.reason[i] == ACCEPTED) known.push_back(static_cast<Index>(i));
+        if (at.known[i] && report.reason[i] == ACCEPTED) known.push_back(i);
     }
     // 2. Correct with known landmarks: solve eq. (6) for rows (3), (4), (10), then apply (6), (7) and (7').
     const Slots slots = picked(at.slot, known);
-    Correction found = correct(e, frame, slots, columns(rows, known), uniform);
+    Correction found = correct(e, frame, slots, columns_of(rows, known), uniform);
     take_in(found, frame, report);
     // 3. Retire tracks that move for good, and start tracks that jumped again.
     Slots moves;
-    for (std::size_t i = 0; i < known.size(); ++i) {
+    for (Index i = 0; i < size_of(known); ++i) {
         report.reason[known[i]] = found.verdict[i];
         if (missed(found.verdict[i])) ++e.table.misses[slots[i]];
         if (found.verdict[i] == MOVING) moves.push_back(slots[i]);
     }
     split(moves, report);
     Slots fresh;
-    for (std::size_t i = 0; i < ids.size(); ++i) {
+    for (Index i = 0; i < size_of(ids); ++i) {
         const bool jumped = std::count(report.split.begin(), report.split.end(), ids[i]);
-        if (jumped || (!at.known[i] && report.reason[i] == ACCEPTED)) fresh.push_back(static_cast<Index>(i));
+        if (jumped || (!at.known[i] && report.reason[i] == ACCEPTED)) fresh.push_back(i);
     }
     report.updated_values = e.values.flat;
     report.updated_coordinates = e.coordinates;
     // 4. Start new landmarks, eq. (5), or let them wait.
-    const Flags started = start_new(frame, picked(ids, fresh), columns(rows, fresh), report);
-    for (std::size_t i = 0; i < fresh.size(); ++i) {
+    const Flags started = start_new(frame, picked(ids, fresh), columns_of(rows, fresh), report);
+    for (Index i = 0; i < size_of(fresh); ++i) {
         const int waits = e.sensor.type == Sensor::rig ? DISPARITY : WAITING;
         report.reason[fresh[i]] = started[i] ? ACCEPTED : waits;
     }
@@ -137,7 +136,7 @@ Flags Filter::start_new(Index frame, const Ids& ids, const Matrix& rows, Report&
     const bool is_rig = e.sensor.type == Sensor::rig;
     Started found = is_rig ? start(e, frame, ids, rows) : waiting.start(e, frame, ids, rows);
     const Slots which = where(found.which);
-    const auto count = static_cast<Index>(which.size()), first = e.table.size() - count;
+    const auto count = size_of(which), first = e.table.size() - count;
     if (found.step_before >= 0) next_observation += count;
     for (Index i = 0; i < count; ++i) {
         e.table.log_row[first + i] = next_landmark++;
@@ -153,10 +152,9 @@ Flags Filter::start_new(Index frame, const Ids& ids, const Matrix& rows, Report&
         }
         e.updated = any && all_new ? Updated::view : Updated::none;
     }
-    report.begun = {
-        picked(ids, which), std::move(found.position_m),  std::move(found.rows),           std::move(found.variance),
-        found.step_before,  std::move(found.rows_before), std::move(found.variance_before)};
-    return found.which;
+    found.ids = picked(ids, which);
+    report.begun = std::move(found);
+    return report.begun.which;
 }
 
 void Filter::revive(const Table& more) { append(e.table, more); }

@@ -19,14 +19,6 @@ struct Taken {
     Vector6 imu_twist;
 };
 
-// New landmarks (j), for the log: `LogBook.started`. Their rows of the log follow each other.
-struct Begun {
-    Ids ids;
-    Matrix position_m, rows, variance;  // (3, j), (d, j), (d, j)
-    Index step_before = -1;             // of a first view that waited for this one, with rows (d, j); -1: there is none
-    Matrix rows_before, variance_before;
-};
-
 // What a frame did: everything that the log, the books on retired landmarks, and `FrameReport` take in.
 struct Report {
     std::vector<Retired> retired;  // in the order in which they left
@@ -38,7 +30,7 @@ struct Report {
     FrameInnovations innovations;
     Taken taken;
     Vector updated_values, updated_coordinates;  // after the correction, before new landmarks start
-    Begun begun;
+    Started begun;                               // new landmarks; their rows of the log follow each other
 };
 
 class Filter {

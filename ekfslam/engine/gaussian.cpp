@@ -2,7 +2,6 @@
 #include "gaussian.hpp"
 
 #include <algorithm>
-#include <numeric>
 #include <utility>
 
 #include "blas.hpp"
@@ -10,15 +9,7 @@
 namespace ekfslam {
 
 namespace {
-std::vector<Index> range(Index begin, Index size) {
-    std::vector<Index> places(static_cast<std::size_t>(size));
-    std::iota(places.begin(), places.end(), begin);
-    return places;
-}
-
-bool contains(const std::vector<Index>& some, Index value) {
-    return std::find(some.begin(), some.end(), value) != some.end();
-}
+bool contains(const Slots& some, Index value) { return std::find(some.begin(), some.end(), value) != some.end(); }
 
 bool is_within(Index j, Index begin) { return begin >= 0 && j >= begin && j < begin + 6; }
 }  // namespace
@@ -51,15 +42,15 @@ const Gaussian::View* Gaussian::view_at(Index at) const {
 
 Gaussian::View* Gaussian::view_at(Index at) { return const_cast<View*>(std::as_const(*this).view_at(at)); }
 
-std::vector<Index> Gaussian::body_places() const {
+Slots Gaussian::body_places() const {
     const Index e = P_AA_.rows();
-    std::vector<Index> places(static_cast<std::size_t>(columns_.body + considered_));
-    const auto set = [&places](Index column, Index place) { places[static_cast<std::size_t>(column)] = place; };
-    for (Index i = 0; i < static_cast<Index>(rest_.size()); ++i) set(rest_[static_cast<std::size_t>(i)], e + i);
-    for (Index i = 0; i < front_size(); ++i) set(columns_.front[static_cast<std::size_t>(i)], front_at() + i);
+    Slots places(columns_.body + considered_);
+    const auto set = [&places](Index column, Index place) { places[column] = place; };
+    for (Index i = 0; i < size_of(rest_); ++i) set(rest_[i], e + i);
+    for (Index i = 0; i < front_size(); ++i) set(columns_.front[i], front_at() + i);
     for (Index at : {columns_.view, columns_.previous, columns_.anchor})
         for (Index i = 0; at >= 0 && i < 6; ++i) set(at + i, view_at(at)->column + i);
-    for (Index i = 0; i < considered_; ++i) set(columns_.body + i, e + static_cast<Index>(rest_.size()) + i);
+    for (Index i = 0; i < considered_; ++i) set(columns_.body + i, e + size_of(rest_) + i);
     return places;
 }
 
@@ -69,11 +60,10 @@ double Gaussian::entry(Index i, Index j) const {
     return j < n ? P_eA_(i - n, j) : P_ee_(i - n, j - n);
 }
 
-Matrix Gaussian::gathered(const std::vector<Index>& rows, const std::vector<Index>& columns) const {
-    Matrix P(static_cast<Index>(rows.size()), static_cast<Index>(columns.size()));
+Matrix Gaussian::gathered(const Slots& rows, const Slots& columns) const {
+    Matrix P(size_of(rows), size_of(columns));
     for (Index j = 0; j < P.cols(); ++j)
-        for (Index i = 0; i < P.rows(); ++i)
-            P(i, j) = entry(rows[static_cast<std::size_t>(i)], columns[static_cast<std::size_t>(j)]);
+        for (Index i = 0; i < P.rows(); ++i) P(i, j) = entry(rows[i], columns[j]);
     return P;
 }
 
@@ -87,30 +77,29 @@ void Gaussian::turn_views(Matrix& P) const {
 }
 
 Matrix Gaussian::body_covariance() const {
-    const std::vector<Index> places = body_places();
+    const Slots places = body_places();
     Matrix P = gathered(places, places);
     turn_views(P);
     return P;
 }
 
-std::vector<Index> Gaussian::dormant_of(const Slots& slots) const {
-    std::vector<Index> which(row_.size(), -1), found;
-    for (Index i = 0; i < dormant_.size(); ++i)
-        which[static_cast<std::size_t>(dormant_.slot[static_cast<std::size_t>(i)])] = i;
-    for (Index slot : slots) found.push_back(which[static_cast<std::size_t>(slot)]);
+Slots Gaussian::dormant_of(const Slots& slots) const {
+    Slots which(row_.size(), -1), found;
+    for (Index i = 0; i < dormant_.size(); ++i) which[dormant_.slot[i]] = i;
+    for (Index slot : slots) found.push_back(which[slot]);
     return found;
 }
 
 Matrix Gaussian::dependence(const Slots& slots) const {
-    const std::vector<Index> dormant = dormant_of(slots);
-    Matrix K = Matrix::Zero(P_AA_.rows(), static_cast<Index>(3 * slots.size()));
-    for (std::size_t i = 0; i < slots.size(); ++i) {
-        auto own = K.middleCols(static_cast<Index>(3 * i), 3);
+    const Slots dormant = dormant_of(slots);
+    Matrix K = Matrix::Zero(P_AA_.rows(), 3 * size_of(slots));
+    for (Index i = 0; i < size_of(slots); ++i) {
+        auto own = K.middleCols(3 * i, 3);
         if (dormant[i] >= 0) {
             own = dormant_.K.middleCols(3 * dormant[i], 3);
             continue;
         }
-        const Awake& landmark = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slots[i])])];
+        const Awake& landmark = awake_[row_[slots[i]]];
         if (landmark.own >= 0)
             own.middleRows(landmark.own, 3).setIdentity();
         else
@@ -120,16 +109,16 @@ Matrix Gaussian::dependence(const Slots& slots) const {
 }
 
 Matrix Gaussian::own_covariance(const Slots& slots) const {
-    const std::vector<Index> dormant = dormant_of(slots);
-    Matrix S = Matrix::Zero(static_cast<Index>(3 * slots.size()), static_cast<Index>(3 * slots.size()));
-    std::vector<Index> asleep, at;
-    for (std::size_t i = 0; i < slots.size(); ++i) {
+    const Slots dormant = dormant_of(slots);
+    Matrix S = Matrix::Zero(3 * size_of(slots), 3 * size_of(slots));
+    Slots asleep, at;
+    for (Index i = 0; i < size_of(slots); ++i) {
         if (dormant[i] >= 0) {
             asleep.push_back(dormant[i]);
-            at.push_back(static_cast<Index>(i));
+            at.push_back(i);
         } else {
-            const Index own = static_cast<Index>(3 * i);
-            S.block<3, 3>(own, own) = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slots[i])])].S;
+            const Index own = 3 * i;
+            S.block<3, 3>(own, own) = awake_[row_[slots[i]]].S;
         }
     }
     if (!at.empty()) S(triples(at), triples(at)) = dormant_.rows(triples(asleep))(Eigen::all, triples(asleep));
@@ -137,19 +126,18 @@ Matrix Gaussian::own_covariance(const Slots& slots) const {
 }
 
 Matrix Gaussian::covariance_of(const Slots& slots) const {
-    const Index b = columns_.body + considered_, m = static_cast<Index>(3 * slots.size()), n = P_AA_.rows();
-    const std::vector<Index> places = body_places(), dormant = dormant_of(slots);
+    const Index b = columns_.body + considered_, m = 3 * size_of(slots), n = P_AA_.rows();
+    const Slots places = body_places(), dormant = dormant_of(slots);
     const Matrix K = dependence(slots);
     Matrix P_ed(P_eA_.rows(), m), P_Ad(n, m);
     blas::multiply('N', 'N', 1.0, P_AA_, K, 0.0, P_Ad);
     blas::multiply('N', 'N', 1.0, P_eA_, K, 0.0, P_ed);
-    for (std::size_t i = 0; i < slots.size(); ++i)
-        if (dormant[i] >= 0)
-            P_ed.middleCols(static_cast<Index>(3 * i), 3) += dormant_.cross.middleCols(3 * dormant[i], 3);
+    for (Index i = 0; i < size_of(slots); ++i)
+        if (dormant[i] >= 0) P_ed.middleCols(3 * i, 3) += dormant_.cross.middleCols(3 * dormant[i], 3);
     Matrix P(b + m, b + m);
     P.topLeftCorner(b, b) = gathered(places, places);
     for (Index j = 0; j < b; ++j) {
-        const Index place = places[static_cast<std::size_t>(j)];
+        const Index place = places[j];
         P.row(j).tail(m) = place < n ? P_Ad.row(place) : P_ed.row(place - n);
     }
     P.bottomLeftCorner(m, b) = P.topRightCorner(b, m).transpose();
@@ -163,11 +151,11 @@ Matrix Gaussian::covariance_of(const Slots& slots) const {
 std::vector<Matrix3> Gaussian::landmark_blocks(const Slots& slots) const {
     std::vector<Matrix3> blocks(slots.size());
     Slots others;
-    std::vector<std::size_t> at;
+    Slots at;
     Index begin = P_AA_.rows();
-    for (std::size_t i = 0; i < slots.size(); ++i) {
-        const Index row = row_[static_cast<std::size_t>(slots[i])];
-        const Awake* landmark = row < 0 ? nullptr : &awake_[static_cast<std::size_t>(row)];
+    for (Index i = 0; i < size_of(slots); ++i) {
+        const Index row = row_[slots[i]];
+        const Awake* landmark = row < 0 ? nullptr : &awake_[row];
         if (landmark && landmark->own >= 0) {
             blocks[i] = P_AA_.block<3, 3>(landmark->own, landmark->own);
             continue;
@@ -176,42 +164,56 @@ std::vector<Matrix3> Gaussian::landmark_blocks(const Slots& slots) const {
         others.push_back(slots[i]);
         at.push_back(i);
     }
-    const std::vector<Index> dormant = dormant_of(others);
+    const Slots dormant = dormant_of(others);
     const Matrix K = dependence(others).bottomRows(P_AA_.rows() - begin);
     Matrix PK(K.rows(), K.cols());
     blas::multiply('N', 'N', 1.0, P_AA_.bottomRightCorner(K.rows(), K.rows()), K, 0.0, PK);
-    for (std::size_t i = 0; i < others.size(); ++i) {
-        const Index own = static_cast<Index>(3 * i), row = row_[static_cast<std::size_t>(others[i])];
+    for (Index i = 0; i < size_of(others); ++i) {
+        const Index own = 3 * i, row = row_[others[i]];
         const Matrix3 P = K.middleCols(own, 3).transpose() * PK.middleCols(own, 3);
         blocks[at[i]] = 0.5 * (P + P.transpose());
-        blocks[at[i]] += row < 0 ? dormant_.block(dormant[i]) : awake_[static_cast<std::size_t>(row)].S;
+        blocks[at[i]] += row < 0 ? dormant_.block(dormant[i]) : awake_[row].S;
     }
     return blocks;
 }
 
+Gaussian::Parts Gaussian::parts() const {
+    const Lead at = lead();
+    Parts parts{{0, front_at(), front_size(), nullptr}};
+    if (columns_.anchor >= 0) parts.push_back({front_size(), anchor_.column, 6, &anchor_});
+    if (at.drifted >= 0) parts.push_back({at.drifted, view_column() + 6, 6, nullptr});
+    parts.push_back({at.view, view_.column, 6, &view_});
+    if (at.previous >= 0) parts.push_back({at.previous, previous_.column, 6, &previous_});
+    return parts;
+}
+
+Index Gaussian::first_column(const Parts& parts, const Eigen::Ref<const Matrix>& H, Index begin) {
+    for (const Part& part : parts)
+        if (part.column < begin && !H.middleRows(part.row, part.size).isZero(0.0)) begin = part.column;
+    return begin;
+}
+
 Gaussian::Over Gaussian::over(const Matrix& H) const {
     Over rows{Matrix::Zero(H.rows(), P_AA_.rows()), Matrix::Zero(H.rows(), P_eA_.rows())};
-    for (Index i = 0; i < static_cast<Index>(rest_.size()); ++i)
-        rows.e.col(i) = H.col(rest_[static_cast<std::size_t>(i)]);
-    for (Index i = 0; i < front_size(); ++i)
-        rows.A.col(front_at() + i) = H.col(columns_.front[static_cast<std::size_t>(i)]);
+    for (Index i = 0; i < size_of(rest_); ++i) rows.e.col(i) = H.col(rest_[i]);
+    for (Index i = 0; i < front_size(); ++i) rows.A.col(front_at() + i) = H.col(columns_.front[i]);
     for (Index at : {columns_.view, columns_.previous, columns_.anchor})
         if (at >= 0) rows.A.middleCols(view_at(at)->column, 6) += H.middleCols(at, 6) * view_at(at)->E;
     return rows;
 }
 
 void Gaussian::propagate(const Matrix& Phi, const Matrix& Q) {
-    std::vector<Index> body = rest_, changed;
+    Slots body = rest_, changed;
     body.insert(body.end(), columns_.front.begin(), columns_.front.end());
     for (Index i = 0; i < front_size(); ++i) {
-        const Index j = columns_.front[static_cast<std::size_t>(i)];
+        const Index j = columns_.front[i];
         const bool stays = Phi(j, j) == 1.0 && (Phi.row(j).array() != 0.0).count() == 1;
         if (!stays || !Q.row(j).isZero(0.0)) changed.push_back(i);
     }
     if (!changed.empty()) push_front(changed);
-    const Index r = static_cast<Index>(rest_.size()), n = P_AA_.rows(), b = static_cast<Index>(body.size());
-    std::vector<Index> at = range(n, r);
-    for (Index i = 0; i < front_size(); ++i) at.push_back(front_at() + i);
+    const Index r = size_of(rest_), n = P_AA_.rows(), b = size_of(body);
+    Slots at = range(n, n + r);
+    append_range(at, front_at(), front_at() + front_size());
     const Matrix Phi_b = Phi(body, body), Q_b = Q(body, body);
     Matrix before(b, n + P_eA_.rows());  // rows of P over [A, e]
     before.topLeftCorner(r, n) = P_eA_.topRows(r);
@@ -233,7 +235,7 @@ void Gaussian::propagate(const Matrix& Phi, const Matrix& Q) {
     if (!dormant_.size()) return;
     const Matrix cross = Phi_b.leftCols(r) * dormant_.cross.topRows(r);
     dormant_.cross.topRows(r) = cross.topRows(r);
-    std::vector<Index> entered, of;
+    Slots entered, of;
     for (Index i : changed) entered.push_back(front_at() + i), of.push_back(r + i);
     if (!entered.empty()) absorb(entered, cross(of, Eigen::all));
 }
@@ -243,10 +245,10 @@ void Gaussian::transform_body(Index at, const Matrix& A) {
         view->E = A * view->E;
         return;
     }
-    const std::vector<Index> places = body_places();
-    std::vector<Index> some[2], of[2];  // places in A and in e, and the rows of the matrix
+    const Slots places = body_places();
+    Slots some[2], of[2];  // places in A and in e, and the rows of the matrix
     for (Index i = 0; i < A.rows(); ++i) {
-        const Index place = places[static_cast<std::size_t>(at + i)], is_e = place >= P_AA_.rows();
+        const Index place = places[at + i], is_e = place >= P_AA_.rows();
         some[is_e].push_back(place);
         of[is_e].push_back(i);
     }
@@ -256,9 +258,9 @@ void Gaussian::transform_body(Index at, const Matrix& A) {
         if (!of[part].empty()) transform_columns(some[part], A(of[part], of[part]));
 }
 
-void Gaussian::transform_columns(const std::vector<Index>& at, const Matrix& A) {
+void Gaussian::transform_columns(const Slots& at, const Matrix& A) {
     const Index n = P_AA_.rows();
-    std::vector<Index> in_e;
+    Slots in_e;
     for (Index place : at) in_e.push_back(place - n);
     if (at.front() >= n) {
         P_eA_(in_e, Eigen::all) = (A * P_eA_(in_e, Eigen::all)).eval();
@@ -275,7 +277,7 @@ void Gaussian::transform_columns(const std::vector<Index>& at, const Matrix& A) 
     dormant_.K(at, Eigen::all) = (back * dormant_.K(at, Eigen::all)).eval();
     for (Awake& landmark : awake_) {
         if (landmark.own >= 0) continue;
-        std::vector<Index> rows;
+        Slots rows;
         for (Index place : at) rows.push_back(place - landmark.begin);
         tail(landmark)(rows, Eigen::all) = (back * tail(landmark)(rows, Eigen::all)).eval();
     }
@@ -296,7 +298,7 @@ void Gaussian::clone(Index source, Index size, Index to) {
     Matrix H = Matrix::Zero(size, columns_.body);
     H.middleCols(source, size).setIdentity();
     const Over rows = over(H);
-    const Index at = static_cast<Index>(rest_.size()) + to - columns_.body;
+    const Index at = size_of(rest_) + to - columns_.body;
     const Matrix P_A = rows.A * P_AA_ + rows.e * P_eA_;
     Matrix P_e = rows.A * P_eA_.transpose() + rows.e * P_ee_;
     const Matrix own = P_A * rows.A.transpose() + P_e * rows.e.transpose();

@@ -29,21 +29,21 @@ namespace ekfslam {
 // Columns of the body in the layout of the model. All body matrices and vectors of the interface have this layout.
 // A model without a block `view` has a view inside of the covariance all the same; its `at` is -1.
 struct Columns {
-    Index body = 0;            // all blocks, views included
-    Index view = -1;           // first column of the block `view`
-    Index previous = -1;       // of `previous_view`
-    Index anchor = -1;         // of `anchor`
-    std::vector<Index> front;  // columns of the body (no view) on which rows depend directly
+    Index body = 0;       // all blocks, views included
+    Index view = -1;      // first column of the block `view`
+    Index previous = -1;  // of `previous_view`
+    Index anchor = -1;    // of `anchor`
+    Slots front;          // columns of the body (no view) on which rows depend directly
 };
 
 // Whitened rows of k landmarks over A, one column a row, with what both gates need. The columns of T^T are sorted by
 // the first of their rows that is not zero: T^T is a staircase.
 struct Projection {
     Rows rows;
-    std::vector<double> L;     // (k) lower (d, d), column-major
-    Matrix T, G;               // T^T (f, k d), G (3, k d)
-    std::vector<Index> begin;  // (k) first row of a landmark's columns of T^T that is not zero
-    std::vector<Index> place;  // (k) of each landmark in T^T
+    std::vector<double> L;  // (k) lower (d, d), column-major
+    Matrix T, G;            // T^T (f, k d), G (3, k d)
+    Slots begin;            // (k) first row of a landmark's columns of T^T that is not zero
+    Slots place;            // (k) of each landmark in T^T
 
     Projection only(const Slots& which) const;
     void keep(const Slots& which);                 // ascending, in place
@@ -56,11 +56,11 @@ struct Projection {
 // Eq. (6) solved for projected rows, all or some of them; or for rows of the body alone.
 struct Solution {
     Projection at;
-    std::vector<bool> left;  // which landmarks are in it
-    Matrix M, C;             // (f, f) in their lower triangles
-    Matrix w, v;             // (d, k) L^-1 r, and w - T y of the rows that are left
-    Vector y;                // (f)
-    Matrix V_A, V_e, H_e;    // of rows of the body, whitened by their S: P_A: H^T, P_e: H^T (e, k), and H_e (k, e)
+    Flags left;            // which landmarks are in it
+    Matrix M, C;           // (f, f) in their lower triangles
+    Matrix w, v;           // (d, k) L^-1 r, and w - T y of the rows that are left
+    Vector y;              // (f)
+    Matrix V_A, V_e, H_e;  // of rows of the body, whitened by their S: P_A: H^T, P_e: H^T (e, k), and H_e (k, e)
     double nis = 0.0, log_det = 0.0;
 
     // (d, k) residuals that the correction leaves in the rows that are left, V S^-1 r; 0 in others.
@@ -72,11 +72,9 @@ class Gaussian {
     Gaussian(const Matrix& P_body, Columns columns);
 
     const Columns& columns() const { return columns_; }
-    Lead lead() const;                                                   // of rows in the present frame
-    Index landmarks() const { return static_cast<Index>(row_.size()); }  // in the table's order, dormant ones included
-    bool is_dormant(Index slot) const { return row_[static_cast<std::size_t>(slot)] < 0; }
+    Lead lead() const;                                 // of rows in the present frame
+    Index landmarks() const { return size_of(row_); }  // in the table's order, dormant ones included
     Index considered() const { return considered_; }
-    Index width() const { return P_AA_.rows() + static_cast<Index>(rest_.size()); }  // n_X
 
     Matrix body_covariance() const;                  // (body + considered)
     Matrix covariance_of(const Slots& slots) const;  // (body + considered + 3k)
@@ -96,7 +94,7 @@ class Gaussian {
 
     Projection project(Rows rows) const;
     Solution solve(Projection at) const;
-    Solution without(Solution solution, const std::vector<bool>& out) const;
+    Solution without(Solution solution, const Flags& out) const;
     Solution solve_body(const Matrix& H, const Vector& residual, const Vector& variance) const;  // H (k, body)
     // Correction (body + considered + 3n) of the mean; asked for before `apply`.
     Vector correction(const Solution& solution) const;
@@ -111,8 +109,8 @@ class Gaussian {
     // d_i <- M_i d_i + B_i z for the view in layout columns `at`; M empty: identity.
     void transform_landmarks(const Slots& slots, const std::vector<Matrix3>& M, const std::vector<Matrix36>& B,
                              Index at);
-    void rest(const std::vector<bool>& asleep);
-    void marginalise(const std::vector<bool>& stay);
+    void rest(const Flags& asleep);
+    void marginalise(const Flags& stay);
     void replace(const Matrix& P);  // (body + considered + 3n): all landmarks promoted, none asleep
 
     Index consider(Index columns);                   // considered columns for clones; the first one, from `body` on
@@ -134,45 +132,52 @@ class Gaussian {
         Matrix3 A = Matrix3::Identity();  // K_i is A K in so many first columns, which have not been multiplied yet
         Index waiting = 0;
     };
+    struct Part {  // leading columns of rows from `row` on, and where they are in A
+        Index row, column, size;
+        const View* view;
+    };
+    using Parts = std::vector<Part>;
     struct Over {  // the same rows over A and over e
         Matrix A, e;
     };
     using Tail = Eigen::Map<Eigen::Matrix<double, Eigen::Dynamic, 3>>;
 
     // gaussian.cpp
-    Over over(const Matrix& H) const;        // rows H (k, body) over the columns of A and e
-    std::vector<Index> body_places() const;  // places of body and considered columns in [A, e]
-    double entry(Index i, Index j) const;    // of P over [A, e]
-    Matrix gathered(const std::vector<Index>& rows, const std::vector<Index>& columns) const;
+    Parts parts() const;
+    // The first column of A, from `begin` at the latest, that columns H (lead, w) depend on.
+    static Index first_column(const Parts& parts, const Eigen::Ref<const Matrix>& H, Index begin);
+    Over over(const Matrix& H) const;      // rows H (k, body) over the columns of A and e
+    Slots body_places() const;             // places of body and considered columns in [A, e]
+    double entry(Index i, Index j) const;  // of P over [A, e]
+    Matrix gathered(const Slots& rows, const Slots& columns) const;
     const View* view_at(Index at) const;
     View* view_at(Index at);
     void turn_views(Matrix& P) const;                 // E of each view to rows and columns of a body covariance
     Matrix dependence(const Slots& slots) const;      // K^T (n_A, 3k)
     Matrix own_covariance(const Slots& slots) const;  // (3k, 3k) of d given A
-    std::vector<Index> dormant_of(const Slots& slots) const;
-    void transform_columns(const std::vector<Index>& at, const Matrix& A);
+    Slots dormant_of(const Slots& slots) const;
+    void transform_columns(const Slots& at, const Matrix& A);
 
     // window.cpp
-    Matrix lead_over(const Matrix& H_x) const;  // rows (lead, m) over A, (n_A, m)
-    Tail tail(const Awake& landmark) const;     // K_i^T
-    Tail recent(const Awake& landmark) const;   // its rows from the view of the frame before on, K_i^T or shorter
+    Tail tail(const Awake& landmark) const;    // K_i^T
+    Tail recent(const Awake& landmark) const;  // its rows from the view of the frame before on, K_i^T or shorter
     void turn(Awake& landmark, const Matrix3& A) const;  // K_i <- A K_i
     void extend(Awake& landmark, Index begin) const;
-    void move(Awake& landmark, const std::vector<Index>& first) const;
+    void move(Awake& landmark, const Slots& first) const;
     bool is_used(Index column, Index size) const;
-    void rearrange(const std::vector<Index>& from);
-    Matrix release(const std::vector<Index>& leaving);  // covariance (o, 3n) of the columns with what K_B leaves
-    void drop(const std::vector<Index>& leaving);
-    std::vector<Index> cut();
+    void rearrange(const Slots& from);
+    Matrix release(const Slots& leaving);  // covariance (o, 3n) of the columns with what K_B leaves
+    void drop(const Slots& leaving);
+    Slots cut();
     void open_again();
     void restore_views();
-    void promote(const std::vector<Index>& rows);
+    void promote(const Slots& rows);
     Index join(const Matrix& K, const Matrix& S, const Matrix& cross);
     void enter(Index column, const Matrix& Y);
-    void absorb(const std::vector<Index>& entered, const Matrix& cross);
-    void push_front(const std::vector<Index>& changed);
+    void absorb(const Slots& entered, const Matrix& cross);
+    void push_front(const Slots& changed);
     Index front_at() const { return P_AA_.rows() - (has_anchor_ ? 6 : 0) - front_size(); }
-    Index front_size() const { return static_cast<Index>(columns_.front.size()); }
+    Index front_size() const { return size_of(columns_.front); }
     Index view_column() const { return front_at() - (has_drifted_ ? 12 : 6); }
     // Columns of this frame and the frame before begin here.
     Index recent_column() const {
@@ -180,8 +185,8 @@ class Gaussian {
     }
 
     // landmarks.cpp
-    void wake(const std::vector<bool>& wakes);
-    void forget(const std::vector<bool>& gone);
+    void wake(const Flags& wakes);
+    void forget(const Flags& gone);
     struct Change {  // x_own <- M x_own + B z for a promoted landmark
         Index own;
         Matrix3 M;
@@ -194,22 +199,22 @@ class Gaussian {
     // project.cpp, solve.cpp
     const Root& root() const;
     Matrix by_columns(Matrix H_x) const;  // rows (lead, m) by the columns of A
-    bool whiten(Projection& at, Index i, const Matrix& H_x) const;
+    bool whiten(Projection& at, Index i, const Matrix& H_x, const Parts& parts) const;
     void solve_left(Solution& solution) const;
-    void apply_rows(const Solution& solution, Index i, const Matrix& H_x);
+    void apply_rows(const Solution& solution, Index i, const Matrix& H_x, const Parts& parts);
     void apply_body(const Solution& solution);
 
     Columns columns_;
-    std::vector<Index> rest_;  // layout columns of e, considered ones not included
+    Slots rest_;  // layout columns of e, considered ones not included
     Index considered_ = 0;
     Matrix P_AA_, P_eA_, P_ee_;
     View view_, previous_, anchor_;
-    std::vector<Index> groups_;                      // widths of views in the window, from the oldest
+    Slots groups_;                                   // widths of views in the window, from the oldest
     Index promoted_ = 0;                             // columns of promoted landmarks
     bool has_drifted_ = false, has_anchor_ = false;  // whether A has columns of zd, and of an anchor of its own
     Matrix Y_, Yd_;
     std::vector<Awake> awake_;
-    std::vector<Index> row_;  // of each slot, in `awake_`; -1: dormant
+    Slots row_;  // of each slot, in `awake_`; -1: dormant
     Dormant dormant_;
     mutable std::optional<Root> root_;
     mutable Matrix F_e_;

@@ -1,6 +1,5 @@
 // Landmarks of the Gaussian: they start, move, sleep, wake and leave.
 #include <algorithm>
-#include <numeric>
 
 #include "blas.hpp"
 #include "gaussian.hpp"
@@ -10,25 +9,20 @@ namespace ekfslam {
 // Renews the places of awake landmarks by slot.
 void Gaussian::number() {
     std::fill(row_.begin(), row_.end(), -1);
-    for (std::size_t i = 0; i < awake_.size(); ++i)
-        row_[static_cast<std::size_t>(awake_[i].slot)] = static_cast<Index>(i);
+    for (Index i = 0; i < size_of(awake_); ++i) row_[awake_[i].slot] = i;
 }
 
 void Gaussian::augment(const Matrix& G, const std::vector<Matrix3>& covariance) {
-    const Matrix K = lead_over(G);
-    const Lead lead = this->lead();
-    for (std::size_t i = 0; i < covariance.size(); ++i) {
-        const Index at = static_cast<Index>(3 * i);
-        Index begin = view_column();
-        const auto depends = [&](Index row, const View& view) {
-            if (row >= 0 && !G.block(row, at, 6, 3).isZero(0.0)) begin = std::min(begin, view.column);
-        };
-        depends(lead.previous, previous_);
-        depends(columns_.anchor >= 0 ? front_size() : -1, anchor_);
-        Awake landmark{landmarks(), -1, begin, std::vector<double>(static_cast<std::size_t>(3 * (K.rows() - begin))),
-                       covariance[i]};
+    const Matrix G_A = by_columns(G);
+    const Parts parts = this->parts();
+    Matrix K = Matrix::Zero(P_AA_.rows(), G.cols());
+    for (const Part& part : parts) K.middleRows(part.column, part.size) += G_A.middleRows(part.row, part.size);
+    for (Index i = 0; i < size_of(covariance); ++i) {
+        const Index at = 3 * i;
+        const Index begin = first_column(parts, G.middleCols(at, 3), view_column());
+        Awake landmark{landmarks(), -1, begin, std::vector<double>(3 * (K.rows() - begin)), covariance[i]};
         tail(landmark) = K.middleCols(at, 3).bottomRows(K.rows() - begin);
-        row_.push_back(static_cast<Index>(awake_.size()));
+        row_.push_back(size_of(awake_));
         awake_.push_back(std::move(landmark));
     }
 }
@@ -37,16 +31,16 @@ void Gaussian::transform_landmarks(const Slots& slots, const std::vector<Matrix3
                                    Index at) {
     const View* view = view_at(at);
     if (!view) throw Error("landmarks depend on views alone");
-    const std::vector<Index> dormant = dormant_.size() ? dormant_of(slots) : std::vector<Index>(slots.size(), -1);
+    const Slots dormant = dormant_.size() ? dormant_of(slots) : Slots(slots.size(), -1);
     std::vector<Change> promoted;
-    for (std::size_t i = 0; i < slots.size(); ++i) {
+    for (Index i = 0; i < size_of(slots); ++i) {
         const Matrix3 M_i = M.empty() ? Matrix3::Identity() : M[i];
         const Matrix36 B_i = B[i] * view->E;
         if (dormant[i] >= 0) {
             transform_dormant(dormant[i], M_i, B_i, view->column);
             continue;
         }
-        Awake& landmark = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slots[i])])];
+        Awake& landmark = awake_[row_[slots[i]]];
         if (landmark.own >= 0) {
             promoted.push_back({landmark.own, M_i, B_i});
             continue;
@@ -103,15 +97,15 @@ void Gaussian::transform_dormant(Index which, const Matrix3& M, const Matrix36& 
     dormant_.K.block(view, 3 * which, 6, 3) += B.transpose();
 }
 
-void Gaussian::rest(const std::vector<bool>& asleep) {
-    std::vector<bool> wakes(asleep.size()), tires(awake_.size());
+void Gaussian::rest(const Flags& asleep) {
+    Flags wakes(asleep.size()), tires(awake_.size());
     bool some_wake = false, some_tire = false;
-    for (std::size_t slot = 0; slot < asleep.size(); ++slot) {
+    for (Index slot = 0; slot < size_of(asleep); ++slot) {
         const Index row = row_[slot];
         wakes[slot] = row < 0 && !asleep[slot];
         some_wake = some_wake || wakes[slot];
         if (row < 0 || !asleep[slot]) continue;
-        tires[static_cast<std::size_t>(row)] = true;
+        tires[row] = true;
         some_tire = true;
     }
     if (some_wake) wake(wakes);
@@ -119,7 +113,7 @@ void Gaussian::rest(const std::vector<bool>& asleep) {
     tires.resize(awake_.size(), false);
     Slots slots;
     std::vector<Matrix3> S;
-    for (std::size_t i = 0; i < tires.size(); ++i) {
+    for (Index i = 0; i < size_of(tires); ++i) {
         if (!tires[i]) continue;
         slots.push_back(awake_[i].slot);
         S.push_back(awake_[i].S);
@@ -128,17 +122,17 @@ void Gaussian::rest(const std::vector<bool>& asleep) {
     forget(tires);
 }
 
-void Gaussian::wake(const std::vector<bool>& wakes) {
-    std::vector<Index> which, others;
+void Gaussian::wake(const Flags& wakes) {
+    Slots which, others;
     for (Index i = 0; i < dormant_.size(); ++i) {
-        const bool is_one = wakes[static_cast<std::size_t>(dormant_.slot[static_cast<std::size_t>(i)])];
+        const bool is_one = wakes[dormant_.slot[i]];
         (is_one ? which : others).push_back(i);
     }
-    const std::vector<Index> own = triples(which), rest = triples(others);
+    const Slots own = triples(which), rest = triples(others);
     const Matrix rows = dormant_.rows(own), S = rows(Eigen::all, own), S_br = rows(Eigen::all, rest).transpose();
     const Matrix K = dormant_.K(Eigen::all, own), cross = dormant_.cross(Eigen::all, own);
     Slots slots;
-    for (Index i : which) slots.push_back(dormant_.slot[static_cast<std::size_t>(i)]);
+    for (Index i : which) slots.push_back(dormant_.slot[i]);
     dormant_.keep(others);
     Index at = join(K, S, cross);
     const Root root(S);
@@ -159,52 +153,51 @@ void Gaussian::wake(const std::vector<bool>& wakes) {
 }
 
 // Removes awake landmarks, and their columns if they are promoted.
-void Gaussian::forget(const std::vector<bool>& gone) {
-    std::vector<Index> leaving;
-    std::size_t kept = 0;
-    for (std::size_t i = 0; i < awake_.size(); ++i) {
+void Gaussian::forget(const Flags& gone) {
+    Slots leaving;
+    Index kept = 0;
+    for (Index i = 0; i < size_of(awake_); ++i) {
         if (!gone[i]) {
             if (kept != i) awake_[kept] = std::move(awake_[i]);
             ++kept;
         } else if (awake_[i].own >= 0) {
-            for (Index axis = 0; axis < 3; ++axis) leaving.push_back(awake_[i].own + axis);
+            append_range(leaving, awake_[i].own, awake_[i].own + 3);
         }
     }
     awake_.resize(kept);
     number();
-    promoted_ -= static_cast<Index>(leaving.size());
+    promoted_ -= size_of(leaving);
     drop(leaving);
 }
 
-void Gaussian::marginalise(const std::vector<bool>& stay) {
-    std::vector<Index> dormant, renamed(stay.size());
+void Gaussian::marginalise(const Flags& stay) {
+    Slots dormant, renamed(stay.size());
     for (Index i = 0; i < dormant_.size(); ++i)
-        if (stay[static_cast<std::size_t>(dormant_.slot[static_cast<std::size_t>(i)])]) dormant.push_back(i);
-    if (static_cast<Index>(dormant.size()) < dormant_.size()) dormant_.keep(dormant);
-    std::vector<bool> gone;
-    for (const Awake& landmark : awake_) gone.push_back(!stay[static_cast<std::size_t>(landmark.slot)]);
+        if (stay[dormant_.slot[i]]) dormant.push_back(i);
+    if (size_of(dormant) < dormant_.size()) dormant_.keep(dormant);
+    Flags gone;
+    for (const Awake& landmark : awake_) gone.push_back(!stay[landmark.slot]);
     forget(gone);
     Index after = 0;
-    for (std::size_t slot = 0; slot < stay.size(); ++slot) renamed[slot] = stay[slot] ? after++ : -1;
-    for (Awake& landmark : awake_) landmark.slot = renamed[static_cast<std::size_t>(landmark.slot)];
-    for (Index& slot : dormant_.slot) slot = renamed[static_cast<std::size_t>(slot)];
-    row_.resize(static_cast<std::size_t>(after));
+    for (Index slot = 0; slot < size_of(stay); ++slot) renamed[slot] = stay[slot] ? after++ : -1;
+    for (Awake& landmark : awake_) landmark.slot = renamed[landmark.slot];
+    for (Index& slot : dormant_.slot) slot = renamed[slot];
+    row_.resize(after);
     number();
 }
 
 void Gaussian::replace(const Matrix& P) {
     const Index b = columns_.body + considered_, n = (P.rows() - b) / 3;
-    std::vector<Index> A(static_cast<std::size_t>(3 * n)), e = rest_;
-    std::iota(A.begin(), A.end(), b);
+    Slots A = range(b, b + 3 * n), e = rest_;
     const auto add = [&A](Index at) {
-        for (Index i = 0; i < 6; ++i) A.push_back(at + i);
-        return View{static_cast<Index>(A.size()) - 6};
+        append_range(A, at, at + 6);
+        return View{size_of(A) - 6};
     };
     if (columns_.previous >= 0) previous_ = add(columns_.previous);
     if (columns_.view >= 0) view_ = add(columns_.view);
     A.insert(A.end(), columns_.front.begin(), columns_.front.end());
     if (columns_.anchor >= 0) anchor_ = add(columns_.anchor);
-    for (Index i = 0; i < considered_; ++i) e.push_back(columns_.body + i);
+    append_range(e, columns_.body, b);
     P_AA_ = P(A, A);
     P_eA_ = P(e, A);
     P_ee_ = P(e, e);
@@ -212,7 +205,7 @@ void Gaussian::replace(const Matrix& P) {
     promoted_ = 3 * n;
     has_anchor_ = columns_.anchor >= 0;
     awake_.clear();
-    row_.assign(static_cast<std::size_t>(n), -1);
+    row_.assign(n, -1);
     for (Index i = 0; i < n; ++i) awake_.push_back(Awake{i, 3 * i, 3 * i, {}, Matrix3::Zero()});
     number();
     dormant_ = Dormant();

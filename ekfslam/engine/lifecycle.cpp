@@ -15,7 +15,7 @@ Flags out_of_view(const Table& table, const Ids& ids, Index frame, Index after) 
 
 Flags at_rest(const Flags& out, const Table& table, Index limit) {
     Slots slots = where(out);
-    const Index excess = static_cast<Index>(slots.size()) - limit;
+    const Index excess = size_of(slots) - limit;
     if (limit < 0 || excess <= 0) return out;
     std::stable_sort(slots.begin(), slots.end(),
                      [&](Index a, Index b) { return table.last_frame[a] < table.last_frame[b]; });

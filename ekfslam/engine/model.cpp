@@ -101,9 +101,8 @@ Columns columns_of(const std::vector<Block>& blocks) {
         if (block.name == "view") out.view = block.at;
         if (block.name == "previous_view") out.previous = block.at;
         if (block.name == "anchor") out.anchor = block.at;
-        for (std::size_t j = 0; j < block.free.size(); ++j)
-            if (block.free[j] == LOG_BASELINE || block.free[j] == DISPARITY_OFFSET)
-                out.front.push_back(block.at + static_cast<Index>(j));
+        for (Index j = 0; j < size_of(block.free); ++j)
+            if (block.free[j] == LOG_BASELINE || block.free[j] == DISPARITY_OFFSET) out.front.push_back(block.at + j);
     }
     return out;
 }

@@ -42,10 +42,10 @@ Rows blank(const Slots& slots, const Matrix& measured, Index lead) {
 }  // namespace
 
 Intrinsics::Intrinsics(const Estimate& e, const Values& values) : sensor(e.sensor.calibrated(values.calibration())) {
-    const std::vector<Index>& front = e.columns.front;
+    const Slots& front = e.columns.front;
     for (const Block& block : e.blocks) {
-        for (std::size_t j = 0; j < block.free.size(); ++j) {
-            const auto found = std::find(front.begin(), front.end(), block.at + static_cast<Index>(j));
+        for (Index j = 0; j < size_of(block.free); ++j) {
+            const auto found = std::find(front.begin(), front.end(), block.at + j);
             if (block.free[j] == LOG_BASELINE) log_baseline = found - front.begin();
             if (block.free[j] == DISPARITY_OFFSET) disparity = found - front.begin();
         }

@@ -19,7 +19,7 @@ Walked none(const Estimate& e) { return {Vector::Ones(e.columns.body), Vector::Z
 // Let the blocks walk: x+ = x + w, or x+ = exp(-l / L) x + w with w ~ N(0, sigma^2 (1 - exp(-2 l / L))).
 Walked wander(Estimate& e, const Process& process, double tau_s, double way_m) {
     Walked out = none(e);
-    for (std::size_t i = 0; i < e.blocks.size(); ++i) {
+    for (Index i = 0; i < size_of(e.blocks); ++i) {
         const Block& block = e.blocks[i];
         const Law& law = process.laws[i];
         if (law.transition == Law::stays) continue;
@@ -38,7 +38,7 @@ Walked wander(Estimate& e, const Process& process, double tau_s, double way_m) {
 }
 
 void set_shares(Estimate& e, const Process& process, double way_m) {
-    for (std::size_t i = 0; i < e.blocks.size(); ++i) {
+    for (Index i = 0; i < size_of(e.blocks); ++i) {
         const Law& law = process.laws[i];
         if (law.share == Law::none) continue;
         e.blocks[i].share = law.share == Law::one ? 1.0 : 0.0;

@@ -1,7 +1,5 @@
 // Rows projected on A: whitened, multiplied with the root of P_AA, and the covariances of innovations that follow.
 #include <algorithm>
-#include <cmath>
-#include <numeric>
 
 #include "blas.hpp"
 #include "gaussian.hpp"
@@ -32,21 +30,18 @@ Rows Rows::only(const Slots& which) const {
               columns_of(H_m, which, d),
               columns_of(residual, which, 1),
               columns_of(variance, which, 1)};
-    for (Index i : which) some.slot.push_back(slot[static_cast<std::size_t>(i)]);
+    for (Index i : which) some.slot.push_back(slot[i]);
     return some;
 }
 
 namespace {
 // Places of some landmarks in T^T among each other, and those that they have now in the new order.
 std::pair<Slots, Slots> order_of(const Projection& at, const Slots& which) {
-    Slots sorted(which.size()), place(which.size()), now;
-    std::iota(sorted.begin(), sorted.end(), 0);
-    const auto place_of = [&](Index i) {
-        return at.place[static_cast<std::size_t>(which[static_cast<std::size_t>(i)])];
-    };
+    Slots sorted = range(0, size_of(which)), place(which.size()), now;
+    const auto place_of = [&](Index i) { return at.place[which[i]]; };
     std::sort(sorted.begin(), sorted.end(), [&](Index i, Index j) { return place_of(i) < place_of(j); });
     for (const Index i : sorted) {
-        place[static_cast<std::size_t>(i)] = static_cast<Index>(now.size());
+        place[i] = size_of(now);
         now.push_back(place_of(i));
     }
     return {std::move(place), std::move(now)};
@@ -59,23 +54,23 @@ Projection Projection::only(const Slots& which) const {
     Projection some{rows.only(which), {}, columns_of(T, columns, d), columns_of(G, which, d), {}, std::move(own)};
     for (Index i : which) {
         some.L.insert(some.L.end(), root(i).data(), root(i).data() + d * d);
-        some.begin.push_back(begin[static_cast<std::size_t>(i)]);
+        some.begin.push_back(begin[i]);
     }
     return some;
 }
 
 void Projection::keep(const Slots& which) {
-    const Index d = rows.dimension(), k = static_cast<Index>(which.size());
+    const Index d = rows.dimension(), k = size_of(which);
     auto [own, columns] = order_of(*this, which);
     rows = rows.only(which);
     for (Index p = 0; p < k; ++p) {
-        const Index i = which[static_cast<std::size_t>(p)], column = columns[static_cast<std::size_t>(p)];
+        const Index i = which[p], column = columns[p];
         std::copy_n(L.begin() + i * d * d, d * d, L.begin() + p * d * d);
-        begin[static_cast<std::size_t>(p)] = begin[static_cast<std::size_t>(i)];
+        begin[p] = begin[i];
         if (i != p) G.middleCols(p * d, d) = G.middleCols(i * d, d);
         if (column != p) T.middleCols(p * d, d) = T.middleCols(column * d, d);
     }
-    L.resize(static_cast<std::size_t>(k * d * d));
+    L.resize(k * d * d);
     begin.resize(which.size());
     place = std::move(own);
     G.conservativeResize(Eigen::NoChange, k * d);
@@ -88,8 +83,8 @@ Eigen::Map<const Matrix> Projection::root(Index i) const {
 }
 
 Eigen::Block<const Matrix> Projection::of(Index i) const {
-    const Index d = rows.dimension(), first = begin[static_cast<std::size_t>(i)];
-    return T.block(first, place[static_cast<std::size_t>(i)] * d, T.rows() - first, d);
+    const Index d = rows.dimension(), first = begin[i];
+    return T.block(first, place[i] * d, T.rows() - first, d);
 }
 
 Matrix Projection::own_variance(Index i) const {
@@ -109,7 +104,7 @@ Matrix Projection::S() const {
     const Index d = rows.dimension(), k = rows.count();
     Matrix LT(T.rows(), k * d), S = Matrix::Zero(k * d, k * d);
     for (Index i = 0; i < k; ++i) {
-        LT.middleCols(i * d, d).topRows(begin[static_cast<std::size_t>(i)]).setZero();
+        LT.middleCols(i * d, d).topRows(begin[i]).setZero();
         LT.middleCols(i * d, d).bottomRows(of(i).rows()) = of(i).lazyProduct(root(i).transpose());
         S.block(i * d, i * d, d, d) = root(i) * root(i).transpose();
     }
@@ -127,22 +122,18 @@ const Root& Gaussian::root() const {
 }
 
 Matrix Gaussian::by_columns(Matrix H_x) const {
-    const Lead at = lead();
-    const auto turned = [&H_x](const View& view, Index row) {
-        if (row >= 0 && !view.E.isIdentity(0.0))
-            H_x.middleRows(row, 6) = (view.E.transpose() * H_x.middleRows(row, 6)).eval();
-    };
-    turned(anchor_, columns_.anchor >= 0 ? front_size() : -1);
-    turned(view_, at.view);
-    turned(previous_, at.previous);
+    for (const Part& part : parts()) {
+        if (!part.view || part.view->E.isIdentity(0.0)) continue;
+        auto rows = H_x.middleRows(part.row, 6);
+        rows = (part.view->E.transpose() * rows).eval();
+    }
     return H_x;
 }
 
 // Fills the whitened rows B^T of landmark i in T; false: their variance is not positive definite.
-bool Gaussian::whiten(Projection& at, Index i, const Matrix& H_x) const {
+bool Gaussian::whiten(Projection& at, Index i, const Matrix& H_x, const Parts& parts) const {
     const Index d = at.rows.dimension(), n = P_AA_.rows();
-    const auto u = static_cast<std::size_t>(i);
-    const Awake& landmark = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(at.rows.slot[u])])];
+    const Awake& landmark = awake_[row_[at.rows.slot[i]]];
     Narrow H_m = at.rows.H_m.middleCols(i * d, d), SH = landmark.S.lazyProduct(H_m);
     Small R = H_m.transpose().lazyProduct(SH);
     R.diagonal() += at.rows.variance.col(i);
@@ -153,7 +144,7 @@ bool Gaussian::whiten(Projection& at, Index i, const Matrix& H_x) const {
     divide(SH, L);
     divide(H_m, L);
     at.G.middleCols(i * d, d) = SH;
-    auto B = at.T.middleCols(at.place[u] * d, d);
+    auto B = at.T.middleCols(at.place[i] * d, d);
     B.topRows(landmark.own >= 0 ? n : landmark.begin).setZero();
     if (landmark.own >= 0)
         B.middleRows(landmark.own, 3) = H_m;
@@ -164,41 +155,26 @@ bool Gaussian::whiten(Projection& at, Index i, const Matrix& H_x) const {
     }
     Leading H = H_x.middleCols(i * d, d);
     divide(H, L);
-    const Lead lead = this->lead();
-    B.middleRows(front_at(), front_size()) += H.topRows(front_size());
-    if (columns_.anchor >= 0) B.middleRows(anchor_.column, 6) += H.middleRows(front_size(), 6);
-    if (lead.drifted >= 0) B.middleRows(view_column() + 6, 6) += H.middleRows(lead.drifted, 6);
-    B.middleRows(view_.column, 6) += H.middleRows(lead.view, 6);
-    if (lead.previous >= 0) B.middleRows(previous_.column, 6) += H.middleRows(lead.previous, 6);
+    for (const Part& part : parts) B.middleRows(part.column, part.size) += H.middleRows(part.row, part.size);
     return true;
 }
 
 Projection Gaussian::project(Rows rows) const {
     const Index d = rows.dimension(), k = rows.count(), n = P_AA_.rows();
     const Matrix H_x = by_columns(rows.H_x);
-    const Lead lead = this->lead();
-    Projection at{std::move(rows),
-                  std::vector<double>(static_cast<std::size_t>(k * d * d)),
-                  Matrix(n, k * d),
-                  Matrix(3, k * d),
-                  {},
-                  Slots(static_cast<std::size_t>(k))};
+    const Parts parts = this->parts();
+    Projection at{std::move(rows), std::vector<double>(k * d * d), Matrix(n, k * d), Matrix(3, k * d), {}, Slots(k)};
     for (Index i = 0; i < k; ++i) {
-        const Index slot = at.rows.slot[static_cast<std::size_t>(i)], row = row_[static_cast<std::size_t>(slot)];
+        const Index slot = at.rows.slot[i], row = row_[slot];
         if (row < 0) throw Error("a dormant landmark must wake before it is observed", {slot});
-        Index begin = std::min(view_column(), awake_[static_cast<std::size_t>(row)].begin);
-        const auto depends = [&](Index at_row, const View& view) {
-            if (at_row >= 0 && view.column < begin && !H_x.block(at_row, i * d, 6, d).isZero(0.0)) begin = view.column;
-        };
-        depends(lead.previous, previous_);
-        depends(columns_.anchor >= 0 ? front_size() : -1, anchor_);
-        at.begin.push_back(begin);
+        const Index begin = std::min(view_column(), awake_[row].begin);
+        at.begin.push_back(first_column(parts, H_x.middleCols(i * d, d), begin));
     }
     const Slots order = ascending(at.begin);
-    for (std::size_t p = 0; p < order.size(); ++p) at.place[static_cast<std::size_t>(order[p])] = static_cast<Index>(p);
+    for (Index p = 0; p < size_of(order); ++p) at.place[order[p]] = p;
     Slots failed;
     for (Index i = 0; i < k; ++i)
-        if (!whiten(at, i, H_x)) failed.push_back(at.rows.slot[static_cast<std::size_t>(i)]);
+        if (!whiten(at, i, H_x, parts)) failed.push_back(at.rows.slot[i]);
     if (!failed.empty()) throw Error("the innovation covariance is not positive definite", failed);
     if (root().regular) {
         for (const Stair& s : stairs(at))

@@ -93,7 +93,7 @@ void retract_in_world(const Estimate& e, const Slots& slots, const Turn& turn, c
 
 // Eq. (7').
 void retract_in_view(const Estimate& e, const Turn& turn, const Matrix& d, Moved& moved) {
-    const auto n = static_cast<Index>(moved.awake.size());
+    const auto n = size_of(moved.awake);
     const Matrix3 R = se3::rotation(turn.before);
     const Matrix4 back = se3::inverse(turn.after);
     moved.q.resize(3, n);
@@ -172,7 +172,7 @@ Parts parts(const Estimate& e, const Vector& correction) {
     const Lead lead = e.gaussian.lead();
     const auto body = correction.head(e.columns.body);
     Parts out{Vector::Zero(lead.width), Matrix(3, e.table.size())};
-    for (std::size_t j = 0; j < e.columns.front.size(); ++j) out.x[static_cast<Index>(j)] = body[e.columns.front[j]];
+    for (Index j = 0; j < size_of(e.columns.front); ++j) out.x[j] = body[e.columns.front[j]];
     if (e.columns.anchor >= 0) out.x.segment<6>(lead.front - 6) = body.segment<6>(e.columns.anchor);
     if (e.drifted && lead.drifted >= 0) out.x.segment<6>(lead.drifted) = e.drifted->Y * body;
     if (lead.view >= 0) {

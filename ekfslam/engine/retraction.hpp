@@ -9,9 +9,9 @@ namespace ekfslam {
 // The mean after a correction, and the landmarks by the coordinates in which it moved them.
 struct Moved {
     Mean mean;
-    Slots awake, others;         // corrected in the last updated view, eq. (7'), and in world, eq. (7)
-    std::vector<bool> in_image;  // (awake) which of the former count by their images
-    Matrix q, q_after;           // (3, awake) in that view before and after
+    Slots awake, others;  // corrected in the last updated view, eq. (7'), and in world, eq. (7)
+    Flags in_image;       // (awake) which of the former count by their images
+    Matrix q, q_after;    // (3, awake) in that view before and after
 };
 
 // Landmark errors after a correction, d_i+ = M_i d_i + B_i z, with z the error of the view in layout columns `at`.

@@ -53,13 +53,13 @@ void Root::pivot(const Matrix& P, const Vector& of) {
     char lower = 'L';
     int size = blas::size(n), rank = 0, failed = 0;
     double tolerance = LEAST_PIVOT;
-    std::vector<int> order(static_cast<std::size_t>(n));
-    std::vector<double> work(static_cast<std::size_t>(2 * n));
+    std::vector<int> order(n);
+    std::vector<double> work(2 * n);
     if (n) lapack::dpstrf(&lower, &size, L.data(), &size, order.data(), &rank, &tolerance, work.data(), &failed);
     F.setZero(n, rank);
     L_.setZero(rank, rank);
     for (Index i = 0; i < n; ++i) {
-        const Index row = order[static_cast<std::size_t>(i)] - 1, length = std::min<Index>(i + 1, rank);
+        const Index row = order[i] - 1, length = std::min<Index>(i + 1, rank);
         F.row(row).head(length) = std(row) * L.row(i).head(length);
         if (i >= rank) continue;
         pivots_.push_back(row);

@@ -22,8 +22,8 @@ class Root {
 
    private:
     void pivot(const Matrix& P, const Vector& of);
-    std::vector<Index> pivots_;  // if singular: rows of F that are lower triangular
-    Matrix L_;                   // those rows
+    Slots pivots_;  // if singular: rows of F that are lower triangular
+    Matrix L_;      // those rows
 };
 
 // For upper triangular F and W, which stay so: W <- F C^-T with lower triangular C, and the lower triangle of W W^T.

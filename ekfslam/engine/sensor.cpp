@@ -29,7 +29,7 @@ Sensor Sensor::calibrated(const Parameters& parameters) const {
 }
 
 std::vector<int> Sensor::screen(const Matrix& measured) const {
-    std::vector<int> reason(static_cast<std::size_t>(measured.cols()), ACCEPTED);
+    std::vector<int> reason(measured.cols(), ACCEPTED);
     if (type == monocular) return reason;
     for (Index i = 0; i < measured.cols(); ++i)
         if (measured(0, i) <= measured(2, i)) reason[i] = DISPARITY;

@@ -15,7 +15,7 @@ using Small = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMa
 Matrix Solution::residual() const {
     const Index d = at.rows.dimension();
     Matrix e = Matrix::Zero(d, at.rows.count());
-    for (Index i : places_of(left)) {
+    for (Index i : where(left)) {
         const auto L = at.root(i);
         for (Index j = d - 1; j >= 0; --j) {
             e(j, i) = v(j, i);
@@ -30,7 +30,7 @@ Matrix Solution::residual() const {
 Solution Gaussian::solve(Projection at) const {
     Solution solution;
     const Index k = at.rows.count();
-    solution.left.assign(static_cast<std::size_t>(k), true);
+    solution.left.assign(k, true);
     solution.w = at.rows.residual;
     for (Index i = 0; i < k; ++i) divide_rows(at.root(i), solution.w.col(i));
     solution.at = std::move(at);
@@ -38,17 +38,17 @@ Solution Gaussian::solve(Projection at) const {
     return solution;
 }
 
-Solution Gaussian::without(Solution s, const std::vector<bool>& out) const {
+Solution Gaussian::without(Solution s, const Flags& out) const {
     // Removal from M is exact to rounding of what is removed.
     constexpr double most = 1e4;
     const Index d = s.at.rows.dimension();
     double removed = 0.0;
     Slots some;
-    for (Index i : places_of(out)) {
-        if (!s.left[static_cast<std::size_t>(i)]) continue;
-        s.left[static_cast<std::size_t>(i)] = false;
+    for (Index i : where(out)) {
+        if (!s.left[i]) continue;
+        s.left[i] = false;
         removed += s.at.of(i).squaredNorm();
-        some.push_back(s.at.place[static_cast<std::size_t>(i)]);
+        some.push_back(s.at.place[i]);
     }
     if (some.empty()) return s;
     if (removed < most)
@@ -56,7 +56,7 @@ Solution Gaussian::without(Solution s, const std::vector<bool>& out) const {
     else
         s.M.resize(0, 0);
     for (Index place : some) s.at.T.middleCols(place * d, d).setZero();
-    for (Index i : places_of(out)) s.w.col(i).setZero();
+    for (Index i : where(out)) s.w.col(i).setZero();
     solve_left(s);
     return s;
 }
@@ -74,7 +74,7 @@ void Gaussian::solve_left(Solution& s) const {
     for (Index j = 0; j < f; ++j) s.C.col(j).tail(f - j) = s.M.col(j).tail(f - j);
     if (!blas::factorise(s.C)) throw Error("the innovation covariance is not positive definite", s.at.rows.slot);
     Vector white(k * d);
-    for (Index i = 0; i < k; ++i) white.segment(s.at.place[static_cast<std::size_t>(i)] * d, d) = s.w.col(i);
+    for (Index i = 0; i < k; ++i) white.segment(s.at.place[i] * d, d) = s.w.col(i);
     Vector u = blas::multiply('N', s.at.T, white);
     s.C.triangularView<Eigen::Lower>().solveInPlace(u);
     s.y = s.C.transpose().triangularView<Eigen::Upper>().solve(u);
@@ -82,8 +82,8 @@ void Gaussian::solve_left(Solution& s) const {
     s.v.setZero(d, k);
     s.nis = s.w.squaredNorm() - u.squaredNorm();
     s.log_det = 2.0 * s.C.diagonal().array().log().sum();
-    for (Index i : places_of(s.left)) {
-        s.v.col(i) = white.segment(s.at.place[static_cast<std::size_t>(i)] * d, d);
+    for (Index i : where(s.left)) {
+        s.v.col(i) = white.segment(s.at.place[i] * d, d);
         for (Index j = 0; j < d; ++j) s.log_det += 2.0 * std::log(s.at.root(i)(j, j));
     }
 }
@@ -114,8 +114,8 @@ Vector Gaussian::correction(const Solution& s) const {
     const Vector x_e = of_body ? Vector(s.V_e * s.w) : blas::multiply('N', F_e_, s.y);
     const Index b = columns_.body, n = x_A.size();
     Vector x = Vector::Zero(b + considered_ + 3 * landmarks());
-    for (Index i = 0; i < static_cast<Index>(rest_.size()); ++i) x(rest_[static_cast<std::size_t>(i)]) = x_e(i);
-    for (Index i = 0; i < front_size(); ++i) x(columns_.front[static_cast<std::size_t>(i)]) = x_A(front_at() + i);
+    for (Index i = 0; i < size_of(rest_); ++i) x(rest_[i]) = x_e(i);
+    for (Index i = 0; i < front_size(); ++i) x(columns_.front[i]) = x_A(front_at() + i);
     for (Index at : {columns_.view, columns_.previous, columns_.anchor})
         if (at >= 0) x.segment<6>(at) = view_at(at)->E * x_A.segment<6>(view_at(at)->column);
     const auto own = [&](Index slot) { return x.segment<3>(b + considered_ + 3 * slot); };
@@ -126,13 +126,12 @@ Vector Gaussian::correction(const Solution& s) const {
             own(landmark.slot) = tail(landmark).transpose() * x_A.tail(n - landmark.begin);
     }
     for (Index i = 0; i < dormant_.size(); ++i) {
-        const Index slot = dormant_.slot[static_cast<std::size_t>(i)];
+        const Index slot = dormant_.slot[i];
         own(slot) = dormant_.K.middleCols(3 * i, 3).transpose() * x_A;
         if (of_body) own(slot) += (s.H_e * dormant_.cross.middleCols(3 * i, 3)).transpose() * s.w;
     }
     const Index d = s.at.rows.dimension();
-    for (Index i : places_of(s.left))
-        own(s.at.rows.slot[static_cast<std::size_t>(i)]) += s.at.G.middleCols(i * d, d).lazyProduct(s.v.col(i));
+    for (Index i : where(s.left)) own(s.at.rows.slot[i]) += s.at.G.middleCols(i * d, d).lazyProduct(s.v.col(i));
     return x;
 }
 
@@ -141,14 +140,14 @@ std::vector<Matrix> Gaussian::given_others(const Solution& s, const Slots& which
     Slots columns;
     Index begin = f;
     for (Index i : which) {
-        columns.push_back(s.at.place[static_cast<std::size_t>(i)]);
-        begin = std::min(begin, s.at.begin[static_cast<std::size_t>(i)]);
+        columns.push_back(s.at.place[i]);
+        begin = std::min(begin, s.at.begin[i]);
     }
     Matrix Z = columns_of(s.at.T, columns, d).bottomRows(f - begin);
     blas::solve('L', 'L', 'N', s.C.bottomRightCorner(f - begin, f - begin), Z);
     std::vector<Matrix> blocks;
-    for (std::size_t i = 0; i < which.size(); ++i) {
-        const auto Z_i = Z.middleCols(static_cast<Index>(i) * d, d);
+    for (Index i = 0; i < size_of(which); ++i) {
+        const auto Z_i = Z.middleCols(i * d, d);
         Small white = s.at.rows.variance.col(which[i]).cwiseSqrt().asDiagonal(), left = Small::Identity(d, d);
         left -= Z_i.transpose().lazyProduct(Z_i);
         divide_rows(s.at.root(which[i]), white);
@@ -158,12 +157,12 @@ std::vector<Matrix> Gaussian::given_others(const Solution& s, const Slots& which
 }
 
 Matrix Gaussian::information(const Solution& s, const Matrix& J) const {
-    const Slots some = places_of(s.left);
+    const Slots some = where(s.left);
     const Index d = s.at.rows.dimension();
     Matrix A = Matrix::Zero(s.at.T.cols(), J.cols()), along(s.at.T.rows(), J.cols());
-    for (std::size_t i = 0; i < some.size(); ++i) {
-        auto rows = A.middleRows(s.at.place[static_cast<std::size_t>(some[i])] * d, d);
-        rows = J.middleRows(static_cast<Index>(i) * d, d);
+    for (Index i = 0; i < size_of(some); ++i) {
+        auto rows = A.middleRows(s.at.place[some[i]] * d, d);
+        rows = J.middleRows(i * d, d);
         divide_rows(s.at.root(some[i]), rows);
     }
     blas::multiply('N', 'N', 1.0, s.at.T, A, 0.0, along);
@@ -194,14 +193,15 @@ void Gaussian::apply(const Solution& s) {
     P_ee_.bottomRightCorner(considered_, considered_) = P_cc;
     root_.reset();
     const Matrix H_x = by_columns(s.at.rows.H_x);
-    for (Index i : places_of(s.left)) apply_rows(s, i, H_x);
+    const Parts parts = this->parts();
+    for (Index i : where(s.left)) apply_rows(s, i, H_x, parts);
 }
 
 // K_i <- (I - G L^-1 H_m) K_i - G L^-1 H_x, S_i <- S_i - G G^T.
-void Gaussian::apply_rows(const Solution& s, Index i, const Matrix& H_x) {
+void Gaussian::apply_rows(const Solution& s, Index i, const Matrix& H_x, const Parts& parts) {
     const Index d = s.at.rows.dimension();
-    const Index slot = s.at.rows.slot[static_cast<std::size_t>(i)];
-    Awake& landmark = awake_[static_cast<std::size_t>(row_[static_cast<std::size_t>(slot)])];
+    const Index slot = s.at.rows.slot[i];
+    Awake& landmark = awake_[row_[slot]];
     if (landmark.own >= 0) return;
     const auto G = s.at.G.middleCols(i * d, d);
     Gain gain = G;  // G L^-1
@@ -211,22 +211,15 @@ void Gaussian::apply_rows(const Solution& s, Index i, const Matrix& H_x) {
         gain.col(j) /= L(j, j);
     }
     turn(landmark, Matrix3::Identity() - gain.lazyProduct(s.at.rows.H_m.middleCols(i * d, d).transpose()));
-    const auto subtract = [&](Index column, Index row, Index size) {
-        if (row < 0) return;
-        const auto H = H_x.block(row, i * d, size, d);
-        if (column < landmark.begin) {
-            if (H.isZero(0.0)) return;
-            extend(landmark, column);
+    for (const Part& part : parts) {
+        const auto H = H_x.block(part.row, i * d, part.size, d);
+        if (part.column < landmark.begin) {
+            if (H.isZero(0.0)) continue;
+            extend(landmark, part.column);
         }
-        Tail K = column >= recent_column() ? recent(landmark) : tail(landmark);
-        K.middleRows(column - landmark.begin, size) -= H.lazyProduct(gain.transpose());
-    };
-    const Lead lead = this->lead();
-    subtract(front_at(), 0, front_size());
-    subtract(anchor_.column, columns_.anchor >= 0 ? front_size() : -1, 6);
-    subtract(view_column() + 6, lead.drifted, 6);
-    subtract(view_.column, lead.view, 6);
-    subtract(previous_.column, lead.previous, 6);
+        Tail K = part.column >= recent_column() ? recent(landmark) : tail(landmark);
+        K.middleRows(part.column - landmark.begin, part.size) -= H.lazyProduct(gain.transpose());
+    }
     landmark.S -= G.lazyProduct(G.transpose());
     landmark.S = (0.5 * (landmark.S + landmark.S.transpose())).eval();
 }

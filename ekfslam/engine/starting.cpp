@@ -20,7 +20,7 @@ Matrix4 view_of(const Estimate& e) {
 
 // Write new landmarks into the table, after `views` observations each.
 void enter(Estimate& e, Index frame, const Ids& ids, const Matrix& position_m, const Matrix& rows, Index views) {
-    Table fresh = blank(static_cast<Index>(ids.size()), rows.rows());
+    Table fresh = blank(size_of(ids), rows.rows());
     fresh.id = ids;
     for (Ids* column : {&fresh.first_frame, &fresh.last_frame}) column->assign(ids.size(), frame);
     for (Ids* column : {&fresh.first_step, &fresh.last_step}) column->assign(ids.size(), e.step);
@@ -43,8 +43,8 @@ Started start(Estimate& e, Index frame, const Ids& ids, const Matrix& rows) {
         out.which.push_back(!is_calibrated || sensor.has_depth(sensor.invert(rows.col(i))));
         if (out.which.back()) some.push_back(i);
     }
-    const auto n = static_cast<Index>(some.size());
-    out.rows = columns(rows, some);
+    const auto n = size_of(some);
+    out.rows = columns_of(rows, some);
     out.variance = e.sensor.variance(n);
     out.position_m.resize(3, n);
     if (n == 0) return out;
@@ -138,7 +138,7 @@ void split(const Estimate& e, const Matrix4& anchor, const Matrix4& view, Index 
 
 // The rows (k, body) that two views leave.
 Matrix rest(const Estimate& e, const std::vector<Pair>& pairs) {
-    Matrix H = Matrix::Zero(static_cast<Index>(pairs.size()), e.columns.body);
+    Matrix H = Matrix::Zero(size_of(pairs), e.columns.body);
     for (Index j = 0; j < H.rows(); ++j) {
         const auto row = pairs[j].by_views.row(3);
         H.block<1, 6>(j, e.columns.anchor) = row.head<6>();
@@ -150,7 +150,7 @@ Matrix rest(const Estimate& e, const std::vector<Pair>& pairs) {
 // Landmarks of pairs into covariance and table.
 void initialise(Estimate& e, Index frame, const Ids& ids, const std::vector<Pair>& pairs, Started& out) {
     const Lead lead = e.gaussian.lead();
-    const auto k = static_cast<Index>(pairs.size());
+    const auto k = size_of(pairs);
     Matrix G = Matrix::Zero(lead.width, 3 * k);
     std::vector<Matrix3> covariance;
     Ids started;
@@ -210,17 +210,17 @@ Started Waiting::start(Estimate& e, Index frame, const Ids& ids, const Matrix& r
         retract(e, correction);
     }
     const Slots left = where(out.which, false);
-    move_on(e, picked(ids, left), columns(rows, left));
+    move_on(e, picked(ids, left), columns_of(rows, left));
     return out;
 }
 
 // Keep the tracks without a landmark that wait already; if none is left or patience ends, all start to wait again here.
 void Waiting::move_on(Estimate& e, const Ids& ids, const Matrix& rows) {
     Slots still;
-    for (std::size_t j = 0; j < ids_.size(); ++j)
-        if (std::find(ids.begin(), ids.end(), ids_[j]) != ids.end()) still.push_back(static_cast<Index>(j));
+    for (Index j = 0; j < size_of(ids_); ++j)
+        if (std::find(ids.begin(), ids.end(), ids_[j]) != ids.end()) still.push_back(j);
     ids_ = picked(ids_, still);
-    rows_ = columns(rows_, still);
+    rows_ = columns_of(rows_, still);
     if (!ids_.empty() && e.step - step_ < e.sensor.patience) return;
     e.gaussian.hold_anchor();
     e.values.set(e.values.places.anchor, e.values.view());

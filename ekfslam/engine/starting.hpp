@@ -5,12 +5,13 @@
 
 namespace ekfslam {
 
-// New tracks by whether they have a landmark now, and the observations that started those: for the log.
+// New tracks by whether they have a landmark now, and the observations that started those (j): for the log.
 struct Started {
-    std::vector<bool> which;              // (n)
+    Flags which;                          // (n)
+    Ids ids;                              // (j)
     Matrix position_m;                    // (3, j)
     Matrix rows, variance;                // (d, j) in this frame
-    Index step_before = -1;               // of the anchor, where two views start a landmark
+    Index step_before = -1;               // of the anchor, where two views start a landmark; -1: there is none
     Matrix rows_before, variance_before;  // (d, j) at the anchor
 };
 

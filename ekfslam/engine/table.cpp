@@ -1,22 +1,15 @@
 #include "table.hpp"
 
 #include <algorithm>
-#include <array>
-#include <numeric>
 
 namespace ekfslam {
 namespace {
-
-constexpr std::array whole = {&Table::id,        &Table::first_frame,      &Table::last_frame, &Table::observations,
-                              &Table::misses,    &Table::log_row,          &Table::stay_until, &Table::first_step,
-                              &Table::last_step, &Table::last_observation, &Table::asleep};
-constexpr std::array real = {&Table::position_m, &Table::initial_m, &Table::evidence, &Table::seen_rows};
 
 // Ids in ascending order, each with its place.
 std::vector<std::pair<std::int64_t, Index>> ascending(const Ids& ids) {
     std::vector<std::pair<std::int64_t, Index>> order;
     order.reserve(ids.size());
-    for (Index i = 0; i < static_cast<Index>(ids.size()); ++i) order.emplace_back(ids[i], i);
+    for (Index i = 0; i < size_of(ids); ++i) order.emplace_back(ids[i], i);
     std::sort(order.begin(), order.end());
     return order;
 }
@@ -39,9 +32,8 @@ void each_match(const Table& table, const Ids& ids, F f) {
 
 Table blank(Index n, Index d) {
     Table table;
-    for (auto column : whole) (table.*column).assign(n, 0);
-    const Index heights[] = {3, 3, 2, d};
-    for (std::size_t i = 0; i < real.size(); ++i) (table.*real[i]).setZero(heights[i], n);
+    for (const auto& column : WHOLE) (table.*column.values).assign(n, 0);
+    for (const auto& column : REAL) (table.*column.values).setZero(column.height ? column.height : d, n);
     return table;
 }
 
@@ -61,12 +53,13 @@ Flags is_among(const Table& table, const Ids& ids) {
 }
 
 void append(Table& table, const Table& more) {
-    for (auto column : whole) {
-        (table.*column).insert((table.*column).end(), (more.*column).begin(), (more.*column).end());
+    for (const auto& column : WHOLE) {
+        Ids& to = table.*column.values;
+        to.insert(to.end(), (more.*column.values).begin(), (more.*column.values).end());
     }
-    for (auto column : real) {
-        Matrix& to = table.*column;
-        const Matrix& from = more.*column;
+    for (const auto& column : REAL) {
+        Matrix& to = table.*column.values;
+        const Matrix& from = more.*column.values;
         const Index n = to.cols();
         to.conservativeResize(from.rows(), n + from.cols());
         to.rightCols(from.cols()) = from;
@@ -75,8 +68,8 @@ void append(Table& table, const Table& more) {
 
 Table only(const Table& table, const Slots& slots) {
     Table some;
-    for (auto column : whole) some.*column = picked(table.*column, slots);
-    for (auto column : real) some.*column = columns(table.*column, slots);
+    for (const auto& column : WHOLE) some.*column.values = picked(table.*column.values, slots);
+    for (const auto& column : REAL) some.*column.values = columns_of(table.*column.values, slots);
     return some;
 }
 
@@ -86,7 +79,7 @@ void keep(Table& table, const Flags& stay) {
 }
 
 void observed(Table& table, const Slots& slots, Index step, const Matrix& rows, std::int64_t place) {
-    for (Index i = 0; i < static_cast<Index>(slots.size()); ++i) {
+    for (Index i = 0; i < size_of(slots); ++i) {
         table.last_step[slots[i]] = step;
         table.seen_rows.col(slots[i]) = rows.col(i);
         table.last_observation[slots[i]] = place + i;
@@ -99,20 +92,6 @@ void accepted(Table& table, const Slots& slots, Index frame) {
         ++table.observations[slot];
         table.misses[slot] = 0;
     }
-}
-
-Slots where(const Flags& flags, bool value) {
-    Slots which;
-    for (std::size_t i = 0; i < flags.size(); ++i) {
-        if (flags[i] == value) which.push_back(static_cast<Index>(i));
-    }
-    return which;
-}
-
-Matrix columns(const Matrix& values, const Slots& which) {
-    Matrix some(values.rows(), static_cast<Index>(which.size()));
-    for (Index i = 0; i < some.cols(); ++i) some.col(i) = values.col(which[i]);
-    return some;
 }
 
 }  // namespace ekfslam

@@ -5,7 +5,32 @@
 
 namespace ekfslam {
 
-using Flags = std::vector<bool>;
+// Columns of the table by name. A height of 0 is that of an observation.
+template <class Values>
+struct Column {
+    const char* name;
+    Values Table::* values;
+    Index height = 1;
+};
+constexpr Column<Ids> WHOLE[] = {
+    {"id", &Table::id},
+    {"first_frame", &Table::first_frame},
+    {"last_frame", &Table::last_frame},
+    {"observations", &Table::observations},
+    {"misses", &Table::misses},
+    {"log_row", &Table::log_row},
+    {"stay_until", &Table::stay_until},
+    {"first_step", &Table::first_step},
+    {"last_step", &Table::last_step},
+    {"last_observation", &Table::last_observation},
+    {"asleep", &Table::asleep},
+};
+constexpr Column<Matrix> REAL[] = {
+    {"position_m", &Table::position_m, 3},
+    {"initial_m", &Table::initial_m, 3},
+    {"evidence", &Table::evidence, 2},
+    {"seen_rows", &Table::seen_rows, 0},
+};
 
 struct Lookup {
     Slots slot;   // of each id; 0 if it is unknown
@@ -25,17 +50,5 @@ void keep(Table& table, const Flags& stay);
 void observed(Table& table, const Slots& slots, Index step, const Matrix& rows, std::int64_t place);
 // Counts an accepted observation of the landmarks.
 void accepted(Table& table, const Slots& slots, Index frame);
-
-// Indices at which a flag is set, or is not.
-Slots where(const Flags& flags, bool value = true);
-template <class T>
-std::vector<T> picked(const std::vector<T>& values, const Slots& which) {
-    std::vector<T> some;
-    some.reserve(which.size());
-    for (Index i : which) some.push_back(values[i]);
-    return some;
-}
-// Columns of a matrix.
-Matrix columns(const Matrix& values, const Slots& which);
 
 }  // namespace ekfslam

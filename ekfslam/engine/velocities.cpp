@@ -37,7 +37,7 @@ void turn(const Estimate& e, const Block& up_block, Vector6& twist, Matrix& by) 
 // Inputs less the blocks that are added to them, and their derivative (6, body).
 std::pair<Vector6, Matrix> unbiased(const Estimate& e, const Process& process, Vector6 twist) {
     Matrix by = Matrix::Zero(6, e.columns.body);
-    for (std::size_t i = 0; i < e.blocks.size(); ++i) {
+    for (Index i = 0; i < size_of(e.blocks); ++i) {
         const Matrix& J = process.laws[i].offset;
         if (J.cols() == 0) continue;
         twist -= J * e.values.flat.segment(e.blocks[i].value_at, J.cols());
@@ -54,7 +54,7 @@ std::pair<Vector6, Matrix> imu_velocities(const Estimate& e, const Process& proc
         by.setZero();
         by.middleCols<6>(walk->at).setIdentity();
     }
-    for (std::size_t i = 0; i < e.blocks.size(); ++i)
+    for (Index i = 0; i < size_of(e.blocks); ++i)
         if (process.laws[i].turns) turn(e, e.blocks[i], twist, by);
     return {twist, by};
 }

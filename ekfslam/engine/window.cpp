@@ -1,6 +1,5 @@
 // The columns of A: views enter it and leave it, landmarks are promoted to it.
 #include <algorithm>
-#include <numeric>
 #include <utility>
 
 #include "blas.hpp"
@@ -9,16 +8,12 @@
 namespace ekfslam {
 
 namespace {
-void append_range(std::vector<Index>& places, Index begin, Index end) {
-    for (Index i = begin; i < end; ++i) places.push_back(i);
-}
-
-std::vector<Index> complement(const std::vector<Index>& some, Index size) {
-    std::vector<bool> is_in(static_cast<std::size_t>(size), false);
-    for (Index i : some) is_in[static_cast<std::size_t>(i)] = true;
-    std::vector<Index> others;
+Slots complement(const Slots& some, Index size) {
+    Flags is_in(size, false);
+    for (Index i : some) is_in[i] = true;
+    Slots others;
     for (Index i = 0; i < size; ++i)
-        if (!is_in[static_cast<std::size_t>(i)]) others.push_back(i);
+        if (!is_in[i]) others.push_back(i);
     return others;
 }
 
@@ -27,10 +22,10 @@ struct Run {
     Index to, from, size;
 };
 
-std::vector<Run> runs(const std::vector<Index>& from) {
+std::vector<Run> runs(const Slots& from) {
     std::vector<Run> found;
-    for (Index j = 0; j < static_cast<Index>(from.size()); ++j) {
-        const Index old = from[static_cast<std::size_t>(j)];
+    for (Index j = 0; j < size_of(from); ++j) {
+        const Index old = from[j];
         if (old < 0) continue;
         if (!found.empty() && found.back().to + found.back().size == j && found.back().from + found.back().size == old)
             ++found.back().size;
@@ -56,16 +51,10 @@ Matrix picked(const Matrix& P, const std::vector<Run>& rows, Index height, const
 }
 
 // Columns of C at some places among more, which are zero.
-Matrix widened(const Matrix& C, const std::vector<Index>& columns, Index width) {
+Matrix widened(const Matrix& C, const Slots& columns, Index width) {
     Matrix wide = Matrix::Zero(C.rows(), width);
     wide(Eigen::all, columns) = C;
     return wide;
-}
-
-std::vector<Index> all(Index size) {
-    std::vector<Index> places;
-    append_range(places, 0, size);
-    return places;
 }
 }  // namespace
 
@@ -105,7 +94,7 @@ void Gaussian::turn(Awake& landmark, const Matrix3& A) const {
 void Gaussian::extend(Awake& landmark, Index begin) const {
     if (landmark.own >= 0 || begin >= landmark.begin) return;
     const Index rows = P_AA_.rows() - begin, before = P_AA_.rows() - landmark.begin;
-    std::vector<double> K(static_cast<std::size_t>(3 * rows), 0.0);
+    std::vector<double> K(3 * rows, 0.0);
     Tail(K.data(), rows, 3).bottomRows(before) = tail(landmark);
     landmark.K.swap(K);
     landmark.begin = begin;
@@ -125,50 +114,48 @@ bool Gaussian::is_used(Index column, Index size) const {
 
 // Puts the columns of A in a new order: new column j is `from[j]`, or zero if that is -1. If a column is there twice,
 // landmarks depend on the first one.
-void Gaussian::rearrange(const std::vector<Index>& from) {
-    const Index before = P_AA_.rows(), n = static_cast<Index>(from.size());
-    std::vector<Index> to(static_cast<std::size_t>(before + 1), -1), first = from;
+void Gaussian::rearrange(const Slots& from) {
+    const Index before = P_AA_.rows(), n = size_of(from);
+    Slots to(before + 1, -1), first = from;
     for (Index j = 0; j < n; ++j) {
-        const Index old = from[static_cast<std::size_t>(j)];
+        const Index old = from[j];
         if (old < 0) continue;
-        if (to[static_cast<std::size_t>(old)] >= 0)
-            first[static_cast<std::size_t>(j)] = -1;
+        if (to[old] >= 0)
+            first[j] = -1;
         else
-            to[static_cast<std::size_t>(old)] = j;
+            to[old] = j;
     }
     for (Awake& landmark : awake_) {
         if (landmark.own >= 0)
-            landmark.own = landmark.begin = to[static_cast<std::size_t>(landmark.own)];
+            landmark.own = landmark.begin = to[landmark.own];
         else
             move(landmark, first);
     }
     for (View* view : {&view_, &previous_, &anchor_})
-        if (view->column >= 0) view->column = to[static_cast<std::size_t>(view->column)];
-    const std::vector<Run> order = runs(from), e = runs(all(P_eA_.rows()));
+        if (view->column >= 0) view->column = to[view->column];
+    const std::vector<Run> order = runs(from), e = runs(range(0, P_eA_.rows()));
     P_AA_ = picked(P_AA_, order, n, order, n);
     P_eA_ = picked(P_eA_, e, P_eA_.rows(), order, n);
-    dormant_.K = picked(dormant_.K, runs(first), n, runs(all(dormant_.K.cols())), dormant_.K.cols());
+    dormant_.K = picked(dormant_.K, runs(first), n, runs(range(0, dormant_.K.cols())), dormant_.K.cols());
     root_.reset();
 }
 
 // Gives K of a landmark the new order of A, see `rearrange`.
-void Gaussian::move(Awake& landmark, const std::vector<Index>& first) const {
-    const Index before = P_AA_.rows(), n = static_cast<Index>(first.size()), begin = landmark.begin;
+void Gaussian::move(Awake& landmark, const Slots& first) const {
+    const Index before = P_AA_.rows(), n = size_of(first), begin = landmark.begin;
     Index after = n;
-    while (after > 0 && first[static_cast<std::size_t>(after - 1)] == before - (n - after) - 1 &&
-           before - (n - after) > begin)
-        --after;
+    while (after > 0 && first[after - 1] == before - (n - after) - 1 && before - (n - after) > begin) --after;
     if (before - (n - after) == begin) {  // all of its columns stay together
         landmark.begin = after;
         return;
     }
     after = 0;
-    while (after < n && first[static_cast<std::size_t>(after)] < begin) ++after;
+    while (after < n && first[after] < begin) ++after;
     const Tail old = tail(landmark);
-    std::vector<double> K(static_cast<std::size_t>(3 * (n - after)), 0.0);
+    std::vector<double> K(3 * (n - after), 0.0);
     Tail moved(K.data(), n - after, 3);
     for (Index j = after; j < n; ++j) {
-        const Index row = first[static_cast<std::size_t>(j)] - begin;
+        const Index row = first[j] - begin;
         if (row < 0) continue;
         for (Index axis = 0; axis < 3; ++axis) moved(j - after, axis) = old(row, axis);
     }
@@ -177,12 +164,12 @@ void Gaussian::move(Awake& landmark, const std::vector<Index>& first) const {
 }
 
 // Makes dormant landmarks independent of columns that leave A, see dormant.hpp.
-Matrix Gaussian::release(const std::vector<Index>& leaving) {
-    Matrix covariance = Matrix::Zero(static_cast<Index>(leaving.size()), 3 * dormant_.size());
+Matrix Gaussian::release(const Slots& leaving) {
+    Matrix covariance = Matrix::Zero(size_of(leaving), 3 * dormant_.size());
     if (!dormant_.size() || leaving.empty()) return covariance;
     const Matrix K_o = dormant_.K(leaving, Eigen::all);
     if (K_o.isZero(0.0)) return covariance;
-    const std::vector<Index> kept = complement(leaving, P_AA_.rows());
+    const Slots kept = complement(leaving, P_AA_.rows());
     const Root root(P_AA_(kept, kept));
     const Matrix F_o = root.coefficients(P_AA_(leaving, kept)), C = root.regression(F_o);
     const Matrix D = P_AA_(leaving, leaving) - F_o * F_o.transpose();
@@ -194,16 +181,16 @@ Matrix Gaussian::release(const std::vector<Index>& leaving) {
     return D * K_o;
 }
 
-void Gaussian::drop(const std::vector<Index>& leaving) {
+void Gaussian::drop(const Slots& leaving) {
     if (leaving.empty()) return;
     release(leaving);
     rearrange(complement(leaving, P_AA_.rows()));
 }
 
 // Makes dormant landmarks depend on columns that entered A and have a covariance with eps_B, see dormant.hpp.
-void Gaussian::absorb(const std::vector<Index>& entered, const Matrix& cross) {
+void Gaussian::absorb(const Slots& entered, const Matrix& cross) {
     if (!dormant_.size() || cross.isZero(0.0)) return;
-    const std::vector<Index> others = complement(entered, P_AA_.rows());
+    const Slots others = complement(entered, P_AA_.rows());
     const Root root(P_AA_(others, others));
     const Matrix F_n = root.coefficients(P_AA_(entered, others)), C = root.regression(F_n);
     const Matrix F_e = root.coefficients(P_eA_(Eigen::all, others));
@@ -224,9 +211,8 @@ Index Gaussian::join(const Matrix& K, const Matrix& S, const Matrix& cross) {
     blas::multiply('N', 'N', 1.0, P_AA_, K, 0.0, P_Am);
     blas::multiply('N', 'N', 1.0, P_eA_, K, 1.0, P_em);
     blas::multiply('T', 'N', 1.0, K, P_Am, 1.0, P_mm);
-    std::vector<Index> from;
-    append_range(from, 0, at);
-    from.insert(from.end(), static_cast<std::size_t>(m), -1);
+    Slots from = range(0, at);
+    from.insert(from.end(), m, -1);
     append_range(from, at, n);
     rearrange(from);
     P_AA_.block(0, at, at, m) = P_Am.topRows(at);
@@ -238,29 +224,29 @@ Index Gaussian::join(const Matrix& K, const Matrix& S, const Matrix& cross) {
     return at;
 }
 
-void Gaussian::promote(const std::vector<Index>& rows) {
+void Gaussian::promote(const Slots& rows) {
     if (rows.empty()) return;
     Slots slots;
-    for (Index row : rows) slots.push_back(awake_[static_cast<std::size_t>(row)].slot);
-    const Index m = static_cast<Index>(3 * rows.size());
+    for (Index row : rows) slots.push_back(awake_[row].slot);
+    const Index m = 3 * size_of(rows);
     const Matrix K = dependence(slots), S = own_covariance(slots);
     Index own = join(K, S, Matrix::Zero(P_eA_.rows(), m));
     for (Index row : rows) {
-        Awake& landmark = awake_[static_cast<std::size_t>(row)];
+        Awake& landmark = awake_[row];
         landmark = Awake{landmark.slot, own, own, {}, Matrix3::Zero()};
         own += 3;
     }
 }
 
 // Promotes landmarks so that A becomes smallest without the views that only they depend on; returns these columns.
-std::vector<Index> Gaussian::cut() {
-    std::vector<Index> begins;
+Slots Gaussian::cut() {
+    Slots begins;
     for (const Awake& landmark : awake_)
         if (landmark.own < 0) begins.push_back(landmark.begin);
     std::sort(begins.begin(), begins.end());
     Index end = promoted_, best = promoted_, least = 0;
-    std::size_t groups = 0;
-    for (std::size_t c = 0; c < groups_.size(); ++c) {
+    Index groups = 0;
+    for (Index c = 0; c < size_of(groups_); ++c) {
         end += groups_[c];
         if (previous_.column >= promoted_ && previous_.column < end) break;
         const auto joined = std::lower_bound(begins.begin(), begins.end(), end) - begins.begin();
@@ -272,11 +258,11 @@ std::vector<Index> Gaussian::cut() {
     }
     if (!groups) return {};
     const Index dropped = best - promoted_;
-    std::vector<Index> joined, leaving;
-    for (std::size_t i = 0; i < awake_.size(); ++i)
-        if (awake_[i].own < 0 && awake_[i].begin < best) joined.push_back(static_cast<Index>(i));
+    Slots joined, leaving;
+    for (Index i = 0; i < size_of(awake_); ++i)
+        if (awake_[i].own < 0 && awake_[i].begin < best) joined.push_back(i);
     promote(joined);
-    groups_.erase(groups_.begin(), groups_.begin() + static_cast<std::ptrdiff_t>(groups));
+    groups_.erase(groups_.begin(), groups_.begin() + groups);
     append_range(leaving, promoted_, promoted_ + dropped);
     return leaving;
 }
@@ -286,9 +272,9 @@ void Gaussian::close_view() {
 }
 
 void Gaussian::open_view(const Matrix& Y, const std::optional<Matrix>& Yd) {
-    std::vector<Index> leaving = cut(), from, group;
+    Slots leaving = cut(), from, group;
     const Index z = view_column(), front = front_at(), n = P_AA_.rows();
-    const Index groups = promoted_ + static_cast<Index>(leaving.size());
+    const Index groups = promoted_ + size_of(leaving);
     const bool is_anchor = columns_.anchor >= 0 && anchor_.column == z;
     if (is_anchor) {
     } else if (is_used(z, 6) || (columns_.previous >= 0 && previous_.column == z))
@@ -304,7 +290,7 @@ void Gaussian::open_view(const Matrix& Y, const std::optional<Matrix>& Yd) {
     append_range(from, front, n);
     if (is_anchor) append_range(from, z, z + 6);
     rearrange(from);
-    if (!group.empty()) groups_.push_back(static_cast<Index>(group.size()));
+    if (!group.empty()) groups_.push_back(size_of(group));
     has_anchor_ = has_anchor_ || is_anchor;
     has_drifted_ = Yd.has_value();
     Y_ = Y;
@@ -316,11 +302,10 @@ void Gaussian::open_view(const Matrix& Y, const std::optional<Matrix>& Yd) {
 void Gaussian::open_again() {
     view_ = View{view_column()};
     enter(view_column(), Y_);
-    std::vector<Index> entered;
-    append_range(entered, view_column(), front_at());
+    const Slots entered = range(view_column(), front_at());
     if (has_drifted_) enter(view_column() + 6, Yd_);
     if (!dormant_.size()) return;
-    Matrix cross(static_cast<Index>(entered.size()), dormant_.cross.cols());
+    Matrix cross(size_of(entered), dormant_.cross.cols());
     cross.topRows(6) = over(Y_).e * dormant_.cross;
     if (has_drifted_) cross.bottomRows(6) = over(Yd_).e * dormant_.cross;
     absorb(entered, cross);
@@ -330,7 +315,7 @@ void Gaussian::open_again() {
 void Gaussian::restore_views() {
     root_.reset();
     const bool lacks_view = columns_.view < 0, has_drifted = std::exchange(has_drifted_, false);
-    std::vector<Index> from = all(P_AA_.rows());
+    Slots from = range(0, P_AA_.rows());
     const Index at = front_at() - (lacks_view ? 0 : 6);
     from.insert(from.begin() + front_at(), (lacks_view ? 6 : 0) + (has_drifted ? 6 : 0), -1);
     rearrange(from);
@@ -361,10 +346,9 @@ void Gaussian::hold_anchor() {
     if (has_anchor_) {
         const Index a = P_AA_.rows() - 6, z = view_column();
         const bool stays = is_used(a, 6) || (columns_.previous >= 0 && previous_.column == a);
-        std::vector<Index> from, own;
-        append_range(own, a, a + 6);
+        Slots from = range(0, z);
+        const Slots own = range(a, a + 6);
         if (!stays) release(own);
-        append_range(from, 0, z);
         if (stays) from.insert(from.end(), own.begin(), own.end());
         append_range(from, z, a);
         anchor_.column = -1;
@@ -376,52 +360,37 @@ void Gaussian::hold_anchor() {
 }
 
 // Lets columns of the front that are about to change stay in the window, if landmarks depend on them.
-void Gaussian::push_front(const std::vector<Index>& changed) {
+void Gaussian::push_front(const Slots& changed) {
     bool stays = dormant_.size() > 0;
     for (Index i : changed) stays = stays || is_used(front_at() + i, 1);
     if (!stays) return;
-    std::vector<Index> from;
-    append_range(from, 0, view_column());
+    Slots from = range(0, view_column());
     for (Index i : changed) from.push_back(front_at() + i);
     append_range(from, view_column(), P_AA_.rows());
     rearrange(from);
-    groups_.push_back(static_cast<Index>(changed.size()));
+    groups_.push_back(size_of(changed));
 }
 
 void Gaussian::add_noise(const Matrix& Q) {
-    std::vector<Index> noisy, leaving, of;
+    Slots noisy, leaving, of;
     for (Index i = 0; i < front_size(); ++i) {
-        if (Q.row(columns_.front[static_cast<std::size_t>(i)]).isZero(0.0)) continue;
+        if (Q.row(columns_.front[i]).isZero(0.0)) continue;
         noisy.push_back(front_at() + i);
     }
     append_range(leaving, view_column(), front_at());
-    const std::size_t views = leaving.size();
+    const Index views = size_of(leaving);
     leaving.insert(leaving.end(), noisy.begin(), noisy.end());
     const Matrix cross = release(leaving);
-    for (std::size_t i = views; i < leaving.size(); ++i) of.push_back(static_cast<Index>(i));
-    std::vector<Index> from = all(P_AA_.rows());
+    append_range(of, views, size_of(leaving));
+    Slots from = range(0, P_AA_.rows());
     std::fill(from.begin() + view_column(), from.begin() + front_at(), -1);
     rearrange(from);
-    const Index r = static_cast<Index>(rest_.size());
+    const Index r = size_of(rest_);
     P_ee_.topLeftCorner(r, r) += Q(rest_, rest_);
     P_eA_.block(0, front_at(), r, front_size()) += Q(rest_, columns_.front);
     P_AA_.block(front_at(), front_at(), front_size(), front_size()) += Q(columns_.front, columns_.front);
     absorb(noisy, cross(of, Eigen::all));
     open_again();
-}
-
-Matrix Gaussian::lead_over(const Matrix& H_x) const {
-    Matrix H = Matrix::Zero(P_AA_.rows(), H_x.cols());
-    const Lead at = lead();
-    H.middleRows(front_at(), front_size()) = H_x.topRows(front_size());
-    const auto add = [&](const View& view, Index row) {
-        H.middleRows(view.column, 6) += view.E.transpose() * H_x.middleRows(row, 6);
-    };
-    if (columns_.anchor >= 0) add(anchor_, front_size());
-    if (at.drifted >= 0) H.middleRows(view_column() + 6, 6) += H_x.middleRows(at.drifted, 6);
-    add(view_, at.view);
-    if (at.previous >= 0) add(previous_, at.previous);
-    return H;
 }
 
 }  // namespace ekfslam
