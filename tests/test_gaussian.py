@@ -5,8 +5,8 @@ import pytest
 
 from ekfslam.config import FilterConfig
 from ekfslam.errors import InnovationError
-from ekfslam.filters.gates import agrees_with_others, most_given_others, moves_along
-from ekfslam.filters.gaussian import Gaussian, Rows, add_square
+from ekfslam.filters.gates import agrees_with_others, moves_along
+from ekfslam.filters.gaussian import Gaussian, Rows
 from ekfslam.filters.landmarks import LandmarkTable
 
 BODY, SEEN, POSE, CLONE, WALK = 14, 12, slice(0, 6), slice(6, 12), slice(12, 14)
@@ -130,17 +130,20 @@ def condition(rng, gaussian, naive, slots, out):
     solution = gaussian.solve(projection, 0, ids)
     inverse, std = np.linalg.inv(S), np.sqrt(rows.variance)
     left = rows.corrected(solution.done.correction[: gaussian.seen], _by_landmark(gaussian, solution))
-    bound = most_given_others(left, projection.variances + np.eye(d) * rows.variance[:, :, None])
-    for which in (np.arange(len(slots)), np.arange(len(slots))[::-2][:1]):
-        blocks = solution.given_others(which)
-        for i, C in zip(which, blocks, strict=True):
-            own = slice(i * d, i * d + d)
-            np.testing.assert_allclose(C, inverse[own, own] * np.outer(std[i], std[i]), atol=1e-9)
-        squares, _ = agrees_with_others(left.only(which), blocks)
-        assert (squares <= bound[which] * (1 + 1e-9)).all()
+    blocks = solution.given_others()
+    for i, C in enumerate(blocks):
+        own = slice(i * d, i * d + d)
+        np.testing.assert_allclose(C, inverse[own, own] * np.outer(std[i], std[i]), atol=1e-9)
+    squares, _ = agrees_with_others(left, blocks)
+    for i in range(len(slots)):
+        others = np.delete(np.arange(len(S)), np.s_[i * d : i * d + d])
+        gain = np.linalg.solve(S[np.ix_(others, others)], S[others, i * d : i * d + d]).T
+        rest = rows.residual[i] - gain @ r[others]
+        block = S[i * d : i * d + d, i * d : i * d + d] - gain @ S[others, i * d : i * d + d]
+        np.testing.assert_allclose(squares[i], rest @ np.linalg.solve(block, rest), rtol=1e-6, atol=1e-9)
     out = np.isin(np.arange(len(slots)), out)
     if out.any():
-        solution = solution.without(out)
+        solution = gaussian.solve(projection.only(np.flatnonzero(~out)), 0, ids[~out])
     kept = np.flatnonzero(np.repeat(~out, d))
     J = rng.normal(size=(int((~out).sum()), d, 6))
     flat = J.reshape(-1, 6)
@@ -166,8 +169,7 @@ def step(rng):
 
 @pytest.mark.parametrize("certain", [False, True], ids=["uncertain", "certain"])
 @pytest.mark.parametrize("considered", [0, 12])
-@pytest.mark.parametrize("naps", [False, True], ids=["awake", "naps"])
-def test_all_verbs_over_many_frames(considered, certain, naps):
+def test_all_verbs_over_many_frames(considered, certain):
     """Landmarks come, are seen in part and shuffled, and leave; coordinates change; all is compared in every frame."""
     rng = np.random.default_rng(considered + certain)
     body = np.diag(rng.uniform(0.01, 0.1, BODY)) * (not certain)
@@ -188,12 +190,6 @@ def test_all_verbs_over_many_frames(considered, certain, naps):
         np.testing.assert_allclose([solution.done.nis, solution.done.log_det], [nis, log_det], atol=1e-9)
         if naive.n:
             slots = rng.permutation(naive.n)[: max(3, naive.n - 2)]
-            if naps:
-                slots = rng.permutation(naive.n)[: max(1, naive.n - 3)]
-                asleep = rng.random(naive.n) < 0.7
-                asleep[slots] = False
-                gaussian.rest(asleep)
-                same(gaussian, naive)
             condition(rng, gaussian, naive, slots, out=[[], [1], [0, 2]][frame % 3] if len(slots) > 2 else [])
             same(gaussian, naive)
             which = np.flatnonzero(rng.random(naive.n) < 0.6) if frame % 2 else np.arange(naive.n)
@@ -213,8 +209,6 @@ def test_all_verbs_over_many_frames(considered, certain, naps):
             stay[:3] = True
             stay[0] = frame < 15  # one landmark outlives all others
             gaussian.marginalise(stay), naive.marginalise(stay)
-        if naps and naive.n:
-            gaussian.rest(rng.random(naive.n) < 0.3)
         if considered and frame % 5 == 0:
             gaussian.clone(POSE, slice(BODY, BODY + 6)), naive.clone(POSE, slice(BODY, BODY + 6))
         same(gaussian, naive)
@@ -258,7 +252,7 @@ def test_all_rows_taken_out_leave_what_was():
     gaussian = Gaussian(np.eye(BODY), SEEN)
     gaussian.replace(root @ root.T)
     projection = gaussian.project(rows_of(rng, [1, 2]), 0, np.arange(2))
-    solution = gaussian.solve(projection, 0, np.arange(2)).without(np.ones(2, dtype=bool))
+    solution = gaussian.solve(projection.only(np.empty(0, dtype=np.int64)), 0, np.empty(0, dtype=np.int64))
     done = solution.done
     assert done.nis == 0 and done.log_det == 0 and not done.correction.any()
     gaussian.apply(solution)
@@ -305,12 +299,3 @@ def test_the_table_keeps_its_columns_aligned():
     assert table.last_frame.tolist() == [0, 8] and table.first_frame.tolist() == [0, 4]
     found = table.snapshot(np.array([1]), 3 * np.eye(3)[None])
     assert found.id.tolist() == [9] and found.covariance[0, 0, 0] == 3 and found.observations.tolist() == [1]
-
-
-@pytest.mark.parametrize("size", [1, 5, 127, 128, 129, 300])
-def test_a_square_is_added_symmetrically(size):
-    rng = np.random.default_rng(size)
-    P, A = np.eye(size), rng.normal(size=(size, 4))
-    add_square(P, A, 1.0)
-    np.testing.assert_allclose(P, np.eye(size) + A @ A.T, atol=1e-13)
-    np.testing.assert_array_equal(P, P.T)

@@ -43,19 +43,16 @@ def dense(gaussian, rows):
     return H, H @ gaussian.P @ H.T + np.diag(rows.variance.ravel()), rows.residual.ravel()
 
 
-@pytest.mark.parametrize("taken_out", [0, 2])
-def test_equals_the_joint_innovation_covariance_written_out(prior, taken_out):
+def test_equals_the_joint_innovation_covariance_written_out(prior):
     gaussian, rows = prior
-    kept = np.arange(len(rows.slot)) >= taken_out
+    kept = np.arange(len(rows.slot)) >= 2
     accepted = rows.only(kept)
     H, S, r = dense(gaussian, accepted)
     J, inverse = H[:, :6], np.linalg.inv(S)
 
     projection = gaussian.project(rows, 0, rows.slot)
     S_own = projection.variances[kept] + diagonal(accepted.variance)
-    solution = gaussian.solve(projection, 0, rows.slot)
-    if taken_out:
-        solution = solution.without(~kept)
+    solution = gaussian.solve(projection.only(np.flatnonzero(kept)), 0, rows.slot[kept])
     done = solution.done
     left = accepted.corrected(done.correction[:SEEN], done.correction[BODY:].reshape(-1, 3))
     found = innovations_of(solution, accepted.slot, accepted, S_own, left.residual)

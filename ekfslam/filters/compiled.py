@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from ekfslam.filters.innovations import FrameInnovations
 from ekfslam.filters.landmarks import landmarks_of
 from ekfslam.filters.lifecycle import Retired
 from ekfslam.filters.logbook import Accepted, LogBook
-from ekfslam.models.blocks import Values
+from ekfslam.filters.observing import corrected_twist
 
 
 def rest(e: Estimate, engine: Engine, retired: Retired, frame: int, ids: IntArray) -> None:
@@ -37,12 +38,9 @@ def update(
 ) -> Outcome:
     """Let landmarks out of view leave, unless `rest` was called; correct with known ones (6), start new ones (5)."""
 
-    def twist_after(after: Values) -> Array:
-        return e.model.process.imu_twist({"pose": e.motion.T_departed}, after, e.motion.interval)
-
     needs_twist = e.model.observer.has_time_offset and e.motion.tau_s
     e.forget_table()
-    found = engine.update(frame, ids, measured, is_rested, twist_after if needs_twist else None)
+    found = engine.update(frame, ids, measured, is_rested, partial(corrected_twist, e) if needs_twist else None)
     for gone in found.retired:
         _keep(retired, gone)
     retired.moving.update(found.moving.tolist())

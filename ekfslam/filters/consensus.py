@@ -36,7 +36,7 @@ from ekfslam.filters.correction import Correction, focal_lengths, relinearised
 from ekfslam.filters.estimate import Estimate, Mean
 from ekfslam.filters.gaussian import Gaussian, Rows, Solution
 from ekfslam.filters.innovations import innovations_of
-from ekfslam.filters.observing import observe
+from ekfslam.filters.observing import corrected_twist, observe
 from ekfslam.filters.retraction import parts
 from ekfslam.geometry import se3
 from ekfslam.models.sensors.base import ACCEPTED, GATE, MOVING
@@ -220,9 +220,7 @@ def _at(e: Estimate, solution: Solution) -> Mean:
     """Return the mean with the velocity at the image that a solution corrects, if a time offset needs it, eq. (9)."""
     if not e.model.observer.has_time_offset:
         return e.mean
-    after = e.model.retract(e.values, solution.done.correction)
-    twist = e.model.process.imu_twist({"pose": e.motion.T_departed}, after, e.motion.interval)
-    return replace(e.mean, imu_twist=twist)
+    return replace(e.mean, imu_twist=corrected_twist(e, e.model.retract(e.values, solution.done.correction)))
 
 
 def agreeing(S: Array, rows: Rows, gate: float, generator: np.random.Generator) -> BoolArray:

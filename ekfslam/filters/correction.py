@@ -11,7 +11,7 @@ from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate, Mean
 from ekfslam.filters.gaussian import Conditioned, Gaussian, Projection, Rows, Solution
 from ekfslam.filters.innovations import FrameInnovations, innovations_of
-from ekfslam.filters.observing import observe
+from ekfslam.filters.observing import corrected_twist, observe
 from ekfslam.filters.retraction import carried_back, parts, retracted
 from ekfslam.models.observer import Projected
 from ekfslam.models.sensors.base import ACCEPTED, BEHIND_CAMERA, GATE, MOVING, DelayedSensor
@@ -62,7 +62,8 @@ def correct(e: Estimate, frame: int, slot: IntArray, measured: Array) -> Correct
     some, tried, outside = _gate_alone(e, frame, rows, seen, verdict, gate)
     if len(some):
         if e.model.observer.has_time_offset and e.motion.tau_s:
-            at = replace(at, imu_twist=_corrected_twist(e, frame, tried))
+            correction = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot]).done.correction
+            at = replace(at, imu_twist=corrected_twist(e, e.model.retract(e.values, correction)))
             _, rows = observe(e, at, slot, measured)
             tried = e.gaussian.project(rows.only(some), frame, e.ids[slot[some]])
         solution, innovations = _gate_jointly(e, frame, tried, seen, some, verdict, gate)
@@ -121,11 +122,11 @@ def _gate_jointly(
     S = tried.variances + gates.diagonal(tried.rows.variance)
     solution = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot])
     accepted, left = tried.rows, tried.rows.corrected(*parts(e, solution.done.correction))
-    verdict[some] = _gate_by_others(e, solution, left, S, seen, some, gate)
+    verdict[some] = _gate_by_others(e, solution, left, seen, some, gate)
     inside = verdict[some] == ACCEPTED
     if not inside.all():
-        solution = solution.without(~inside)
-        accepted, S = accepted.only(inside), S[inside]
+        tried, S = tried.only(np.flatnonzero(inside)), S[inside]
+        solution, accepted = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot]), tried.rows
         left = accepted.corrected(*parts(e, solution.done.correction))
     return solution, innovations_of(solution, e.table.log_row[accepted.slot], accepted, S, left.residual)
 
@@ -159,24 +160,19 @@ def _gate_alone(
 
 
 def _gate_by_others(
-    e: Estimate, solution: Solution, left: Rows, S: Array, seen: Projected, some: IntArray, gate: float
+    e: Estimate, solution: Solution, left: Rows, seen: Projected, some: IntArray, gate: float
 ) -> IntArray:
-    """Return verdicts (j,) on ``some`` landmarks by all others, given the residuals ``left`` and prior S (j, d, d)."""
+    """Return verdicts (j,) on ``some`` landmarks by all others, given the residuals ``left`` by all."""
     verdict, judges_motion = np.full(len(some), ACCEPTED), _judges_motion(e) and e.model.process.estimates_velocity
     if not (np.isfinite(gate) or judges_motion):
         return verdict
-    doubtful = np.arange(len(some))
-    if not judges_motion:
-        doubtful = np.flatnonzero(~(gates.most_given_others(left, S) <= gate))
-        left = left.only(doubtful)
-    if len(doubtful):
-        C = solution.given_others(doubtful)
-        squares, judged = gates.agrees_with_others(left, C)
-        verdict[doubtful[squares > gate]] = GATE
-        if judges_motion:
-            # Noisy velocities would accuse all tracks of a frame alike: only what others leave counts.
-            evidence = gates.evidence_given_others(left, C, _motion(e, seen, some))
-            verdict[gates.moves_along(e.table, left.slot, evidence, squares, gate, e.config) & judged] = MOVING
+    C = solution.given_others()
+    squares, judged = gates.agrees_with_others(left, C)
+    verdict[squares > gate] = GATE
+    if judges_motion:
+        # Noisy velocities would accuse all tracks of a frame alike: only what others leave counts.
+        evidence = gates.evidence_given_others(left, C, _motion(e, seen, some))
+        verdict[gates.moves_along(e.table, left.slot, evidence, squares, gate, e.config) & judged] = MOVING
     return verdict
 
 
@@ -191,13 +187,6 @@ def _judges_motion(e: Estimate) -> bool:
 def _motion(e: Estimate, seen: Projected, some: IntArray) -> Array:
     """Return the derivative (j, d) of the rows by a motion of their landmarks along the last step of the rig."""
     return seen.H_m[some] @ (e.T_imu_world[:3, :3].T @ (e.imu_twist[:3] * e.motion.tau_s))
-
-
-def _corrected_twist(e: Estimate, frame: int, tried: Projection) -> Array:
-    """Return the velocity (6,) as corrected, eq. (9): the noise of the measured one is in the innovations."""
-    correction = e.gaussian.solve(tried, frame, e.ids[tried.rows.slot]).done.correction
-    after = e.model.retract(e.values, correction)
-    return e.model.process.imu_twist({"pose": e.motion.T_departed}, after, e.motion.interval)
 
 
 def _iterated(

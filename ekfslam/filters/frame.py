@@ -41,7 +41,6 @@ def rest(e: Estimate, retired: Retired, frame: int, ids: IntArray) -> None:
     stay = ~out | asleep
     _retire(e, retired, ~stay, may_return=True)
     e.table.asleep[:] = asleep[stay]
-    e.gaussian.rest(asleep[stay])
 
 
 def update(

@@ -46,16 +46,6 @@ def normalised_squares(S: Array, residual: Array, frame: int, ids: IntArray) -> 
         raise InnovationError(frame, ids[smallest <= 0]) from None
 
 
-def most_given_others(left: Rows, S: Array) -> Array:
-    """Return the upper bound ``e_i^T V^-1 S_i V^-1 e_i`` (k,) of the squares of `agrees_with_others`.
-
-    The others can only make an innovation more certain: ``((S^-1)_ii)^-1 <= S_i``. Landmarks that pass the gate by this
-    bound need no `Solution.given_others`. ``left`` has the residuals that the correction leaves, S is (k, d, d).
-    """
-    y = left.residual / left.variance
-    return np.einsum("ni,nij,nj->n", y, S, y)
-
-
 def agrees_with_others(left: Rows, C: Array) -> tuple[Array, BoolArray]:
     """Return ``e_i^T C_i^-1 e_i`` (k,), the normalised square of each landmark's innovation given all others.
 

@@ -10,14 +10,9 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import blas, lapack
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.errors import InnovationError
-
-# Rows that are mirrored at once.
-_BLOCK = 128
-_ABOVE = ~np.tri(_BLOCK, dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -78,61 +73,29 @@ class Projection:
 
 @dataclass(frozen=True)
 class Solution:
-    """Eq. (6) with ``S = L L^T``.
-
-    Rows E are removed by projection of the whitened rows to those orthogonal to ``A = L^-1 E``, because
-    ``S_kk^-1 = L^-T (I - A (A^T A)^-1 A^T) L^-1``.
-    """
+    """Eq. (6) with ``S = L L^T``."""
 
     Y: Array  # (body+3n, m) (L^-1 H P)^T, with P - Y Y^T the covariance afterwards
-    L: Array  # (m, m) in the lower triangle; the upper one is not used
+    L: Array  # (m, m), lower triangular
     white: Array  # (m,) L^-1 r
-    log_det: float  # log det S
-    shape: tuple[int, int]  # (k, d) of the rows; d is 1 for rows of the body alone
-    variance: Array  # (m,)
+    std: Array  # (k, d) of the rows; d is 1 for rows of the body alone
     considered: slice  # columns of the mean that stay
-    left: BoolArray | None = None  # (k,) which landmarks are left; None: all
-    Q: Array | None = None  # (m, r) orthonormal basis of the removed rows
 
     @cached_property
     def done(self) -> Conditioned:
         """The effect on the mean, NIS and ``log det S``."""
         correction = self.Y @ self.white
         correction[self.considered] = 0.0
-        return Conditioned(correction, float(self.white @ self.white), self.log_det)
+        return Conditioned(correction, float(self.white @ self.white), 2.0 * float(np.log(self.L.diagonal()).sum()))
 
-    def given_others(self, which: IntArray) -> Array:
-        """Return ``V^1/2 (S^-1)_ii V^1/2`` (j, d, d): ``((S^-1)_ii)^-1`` is the covariance given *others*."""
-        k, d = self.shape
-        columns = self._whitened(which).T.reshape(len(which), d, k * d)
-        std = np.sqrt(self.variance.reshape(k, d)[which])
-        return (columns @ columns.swapaxes(1, 2)) * (std[:, :, None] * std[:, None, :])
-
-    def _whitened(self, which: IntArray) -> Array:
-        """Return ``L^-1 E`` (m, j d) for unit vectors E of the rows of landmarks (j,)."""
-        rows = _columns(which, self.shape[1])
-        E = np.zeros((len(self.L), len(rows)))
-        E[rows, np.arange(len(rows))] = 1.0
-        return blas.dtrsm(1.0, self.L, E, lower=1)
-
-    def without(self, out: BoolArray) -> Solution:
-        """Return the solution without the rows of the landmarks ``out`` (k,)."""
-        assert self.Q is None
-        Q, R = np.linalg.qr(self._whitened(np.flatnonzero(out)))
-        white = self.white - Q @ (Q.T @ self.white)
-        log_det = self.log_det + 2.0 * float(np.log(np.abs(R.diagonal())).sum())
-        if out.all():  # so that rounding is not left over
-            white, log_det = np.zeros_like(white), 0.0
-        return replace(self, Y=self.Y - (self.Y @ Q) @ Q.T, white=white, log_det=log_det, left=~out, Q=Q)
+    def given_others(self) -> Array:
+        """Return ``V^1/2 (S^-1)_ii V^1/2`` (k, d, d): ``((S^-1)_ii)^-1`` is the covariance given *others*."""
+        columns = np.linalg.inv(self.L).T.reshape(*self.std.shape, len(self.L))
+        return (columns @ columns.swapaxes(1, 2)) * (self.std[:, :, None] * self.std[:, None, :])
 
     def information(self, J: Array) -> Array:
-        """Return ``J^T S^-1 J`` (c, c) for J (j, d, c) of the j landmarks that are left."""
-        k, d = self.shape
-        wide = np.zeros((k, d, J.shape[-1]))
-        wide[slice(None) if self.left is None else self.left] = J
-        A = blas.dtrsm(1.0, self.L, wide.reshape(k * d, -1), lower=1)
-        if self.Q is not None:
-            A -= self.Q @ (self.Q.T @ A)
+        """Return ``J^T S^-1 J`` (c, c) for J (k, d, c)."""
+        A = np.linalg.solve(self.L, J.reshape(len(self.L), J.shape[-1]))
         return A.T @ A
 
 
@@ -174,12 +137,9 @@ class Gaussian:
         return slice(self.body - self.considered, self.body)
 
     def landmark_blocks(self, slot: IntArray | None = None) -> Array:
-        """Return the landmarks' own covariances (k, 3, 3), of all or at slots (k,). Read only."""
-        b, (row, column) = self.body, self._P.strides
-        blocks = np.lib.stride_tricks.as_strided(
-            self._P[b:, b:], (self.landmarks, 3, 3), (3 * (row + column), row, column), writeable=False
-        )
-        return blocks if slot is None else blocks[slot]
+        """Return the landmarks' own covariances (k, 3, 3), of all or at slots (k,)."""
+        at = self._columns(np.arange(self.landmarks) if slot is None else slot).reshape(-1, 3)
+        return self._P[at[:, :, None], at[:, None, :]]
 
     def covariance_of(self, slot: IntArray) -> Array:
         """Return the covariance (body+3k, body+3k) of the body and of the landmarks at the slots (k,)."""
@@ -239,23 +199,20 @@ class Gaussian:
         return self._solve(HP, HPH, residual[:, None], variance[:, None], frame, nobody)
 
     def _solve(self, HP: Array, HPH: Array, residual: Array, variance: Array, frame: int, ids: IntArray) -> Solution:
-        S = HPH.copy()
-        S.ravel()[:: len(S) + 1] += variance.ravel()
-        # LAPACK sees row-major arrays as their transposes: S is symmetric, and (H P)^T is what dtrsm wants.
-        L, failed = lapack.dpotrf(S.T, lower=1, clean=0, overwrite_a=1)
-        if failed or not np.isfinite(L.diagonal()).all():
+        try:
+            L = np.asarray(np.linalg.cholesky(HPH + np.diag(variance.ravel())), dtype=float)
+        except np.linalg.LinAlgError:
+            raise InnovationError(frame, ids) from None
+        if not np.isfinite(L.diagonal()).all():
             raise InnovationError(frame, ids)
-        Y = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1)
-        white = blas.dtrsm(1.0, L, residual.reshape(-1, 1), lower=1)[:, 0]
-        log_det = 2.0 * float(np.log(L.diagonal()).sum())
-        k, d = residual.shape
-        return Solution(Y, L, white, log_det, (k, d), variance.ravel(), self._considered)
+        white = np.linalg.solve(L, residual.ravel())
+        return Solution(np.linalg.solve(L, HP).T, L, white, np.sqrt(variance), self._considered)
 
     def apply(self, solution: Solution) -> None:
         """Condition on the rows of a solution of the present covariance."""
         at = self._considered
-        own = self._P[at, at].copy()
-        add_square(self._P, solution.Y, -1.0)
+        own = self._P[at, at]
+        self._P = self._P - solution.Y @ solution.Y.T
         self._P[at, at] = own
 
     def augment(self, G: Array, covariance: Array) -> None:
@@ -278,16 +235,25 @@ class Gaussian:
 
         M is (n, 3, 3), None is the identity; B is (n, 3, c) for the body columns (c,) of x.
         """
-        own = slice(self.body, None) if len(slot) == self.landmarks else self._columns(slot)
-        transform_part(self._P, own, M, B, columns)
+        n, own, P = len(slot), self._columns(slot), self._P
+        B = B.reshape(3 * n, len(columns))
+
+        def turned(A: Array) -> Array:
+            return A if M is None else (M @ A.reshape(n, 3, A.shape[1])).reshape(A.shape)
+
+        rows = turned(P[own]) + B @ P[columns]
+        block = turned(rows[:, own].T) + B @ rows[:, columns].T
+        P[own] = rows
+        P[:, own] = rows.T
+        P[np.ix_(own, own)] = 0.5 * (block + block.T)
 
     def transform_body(self, at: slice, A: Array) -> None:
         """Re-express some body columns, ``x_at <- A x_at`` with invertible A."""
-        transform(self._P, at, A)
-
-    def rest(self, asleep: BoolArray) -> None:
-        """Set which landmarks (n,) are dormant, that is not observed before they wake; P stays unchanged."""
-        # here it would save nothing
+        P = self._P
+        P[at] = A @ P[at]
+        P[:, at] = P[at].T
+        block = A @ P[at, at]
+        P[at, at] = 0.5 * (block + block.T)
 
     def marginalise(self, stay: BoolArray) -> None:
         """Drop the rows and columns of landmarks that do not stay (n,): exact marginalisation."""
@@ -309,58 +275,3 @@ class Gaussian:
 def _columns(which: IntArray, size: int) -> IntArray:
     """Return the columns (n size,) of blocks (n,) of one size."""
     return (size * which[:, None] + np.arange(size)).ravel()
-
-
-def transform(P: Array, at: slice, A: Array) -> None:
-    """Re-express columns of symmetric P in place: ``x_at <- A x_at``."""
-    P[at] = A @ P[at]
-    P[:, at] = P[at].T
-    P_xx = A @ P[at, at]
-    P[at, at] = 0.5 * (P_xx + P_xx.T)
-
-
-def transform_part(P: Array, own: IntArray | slice, M: Array | None, B: Array, columns: IntArray) -> None:
-    """Re-express the columns ``own`` (3n,) of symmetric P in place: ``d_i <- M_i d_i + B_i x``."""
-    n, B = len(B), B.reshape(-1, len(columns))
-    if M is None and isinstance(own, slice):
-        # d+ = d + B a, hence P+ = P + B Z^T + Z B^T with Z = P_a + B P_aa / 2.
-        wide = np.zeros((len(P), len(columns)))
-        wide[own] = B
-        add_product(P, wide, P[:, columns] + 0.5 * wide @ P[np.ix_(columns, columns)])
-        return
-    rows = B @ P[columns]
-    rows += P[own] if M is None else (M @ P[own].reshape(n, 3, len(P))).reshape(3 * n, len(P))
-    right = rows[:, own] if M is None else (M @ rows[:, own].T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
-    right = right + (B @ rows[:, columns].T if M is not None else rows[:, columns] @ B.T)
-    P[own] = rows
-    P[:, own] = rows.T
-    block = np.ix_(own, own) if not isinstance(own, slice) else (own, own)
-    P[block] = 0.5 * (right + right.T)
-
-
-def add_square(P: Array, A: Array, sign: float) -> None:
-    """Add ``sign A A^T`` to symmetric C-ordered P in place, which stays symmetric to the last bit; A is (n, k)."""
-    _require_order(P)
-    # NumPy's row-major P is LAPACK's column-major P^T: the upper triangle there is the lower one here.
-    blas.dsyrk(sign, A, beta=1.0, c=P.T, lower=0, overwrite_c=1)
-    _mirror(P)
-
-
-def add_product(P: Array, A: Array, B: Array) -> None:
-    """Add ``A B^T + B A^T`` to P, see `add_square`; A and B are (n, k)."""
-    _require_order(P)
-    blas.dsyr2k(1.0, A, B, beta=1.0, c=P.T, lower=0, overwrite_c=1)
-    _mirror(P)
-
-
-def _require_order(P: Array) -> None:
-    if not P.flags.c_contiguous:
-        raise ValueError("P must be C-contiguous, or BLAS would update a copy of it")
-
-
-def _mirror(P: Array) -> None:
-    for begin in range(0, len(P), _BLOCK):
-        end = begin + _BLOCK
-        P[begin:end, end:] = P[end:, begin:end].T
-        own = P[begin:end, begin:end]
-        np.copyto(own, own.T, where=_ABOVE[: len(own), : len(own)])

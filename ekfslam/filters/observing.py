@@ -9,7 +9,7 @@ import numpy as np
 from ekfslam.arrays import Array, IntArray
 from ekfslam.filters.estimate import Estimate, Mean
 from ekfslam.filters.gaussian import Rows
-from ekfslam.models.blocks import PreviousView, View
+from ekfslam.models.blocks import PreviousView, Values, View
 from ekfslam.models.observer import Moment, Projected
 
 
@@ -34,6 +34,14 @@ def camera_of(e: Estimate, at: Mean) -> Array:
     """Return the camera ``T_cam_world`` (4, 4) of the present frame at a mean."""
     now = moment(e, at)
     return np.asarray(e.model.observer.camera(now).T_cam_imu @ now.T_imu_world, dtype=float)
+
+
+def corrected_twist(e: Estimate, after: Values) -> Array:
+    """Return the velocity (6,) of the IMU at this frame by corrected values, for eq. (9).
+
+    The noise of the measured one is in the innovations, so that with it a time offset would come out too small.
+    """
+    return e.model.process.imu_twist({"pose": e.motion.T_departed}, after, e.motion.interval)
 
 
 def look(e: Estimate) -> Array | None:

@@ -142,7 +142,11 @@ def _doubt(e: Estimate, measured: Measured) -> float:
     """
     if e.config.gate_probability == 1.0:
         return 1.0
+    return max(1.0, float(np.sqrt(squared(e, measured) / gates.of_inputs(len(measured.value)))))
+
+
+def squared(e: Estimate, measured: Measured) -> float:
+    """Return the normalised innovation squared of measurements of blocks."""
     H = e.model.process.jacobian(measured)
     P, residual = e.gaussian.body_covariance[: H.shape[1], : H.shape[1]], measured.value - H @ e.coordinates
-    nis = residual @ np.linalg.solve(H @ P @ H.T + np.diag(measured.std**2), residual)
-    return max(1.0, float(np.sqrt(nis / gates.of_inputs(len(residual)))))
+    return float(residual @ np.linalg.solve(H @ P @ H.T + np.diag(measured.std**2), residual))

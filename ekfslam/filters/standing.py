@@ -19,6 +19,7 @@ from ekfslam.arrays import Array, IntArray
 from ekfslam.filters import gates
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.observing import present
+from ekfslam.filters.prediction import squared
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import StereoCamera
 from ekfslam.models.blocks import GyroBias, Velocity
@@ -81,7 +82,7 @@ class Stillness:
         # What one rest hides, all its rows hide: together they say no more than one.
         std = np.hypot(STD_M_S, np.sqrt(len(self._views) - 1) * hidden)
         none = Measured(np.arange(3), np.zeros(3), np.full(3, std), np.zeros(3, dtype=bool))
-        return Standing(None if _contradicts(e, none) else none)
+        return Standing(None if squared(e, none) > gates.of_inputs(3) else none)
 
 
 def moved_px(before: Array, now: Array) -> float:
@@ -140,11 +141,3 @@ def _depth_m(e: Estimate, ids: IntArray) -> float:
         return _DEPTH_M
     q = se3.apply(present(e).T_cam_world, e.table.position_m[slot[is_known]])
     return max(float(np.median(q[:, 2])), 0.0)
-
-
-def _contradicts(e: Estimate, measured: Measured) -> bool:
-    """Return whether the state surely moves."""
-    H = e.model.process.jacobian(measured)
-    P, residual = e.gaussian.body_covariance[: H.shape[1], : H.shape[1]], measured.value - H @ e.coordinates
-    nis = residual @ np.linalg.solve(H @ P @ H.T + np.diag(measured.std**2), residual)
-    return bool(nis > gates.of_inputs(len(residual)))

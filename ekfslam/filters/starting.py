@@ -137,7 +137,8 @@ class Waiting:
         Phi[at], Phi[at, : e.gaussian.seen] = 0.0, now.by
         e.gaussian.propagate(Phi, np.zeros_like(Phi))
         e.values = {**e.values, Anchor.name: now.T_cam_world}
-        self._ids, self._rows, self._step, self._W_linear = ids, rows, e.step, now.T_linear
+        order = np.argsort(ids)
+        self._ids, self._rows, self._step, self._W_linear = ids[order], rows[order], e.step, now.T_linear
 
 
 def _append(

@@ -6,11 +6,12 @@ A difference of observations, eq. (10), may see the present frame through anothe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.models.blocks import StateBlock
@@ -103,17 +104,16 @@ class Sight:
 
     def norms(self) -> Array:
         """Return the norms (K,) of the whitened residuals of all observations."""
-        s = np.empty(sum(len(o.which) for o in self.batches))
-        for kind, o in enumerate(self.batches):
-            s[o.which] = self.norms_of(kind)
-        return s
+        return self._all(self.norms_of)
 
     def in_view(self, min_depth_m: float) -> BoolArray:
         """Return whether the camera of each observation (K,) can see its landmark."""
-        found = np.empty(sum(len(o.which) for o in self.batches), dtype=bool)
-        for kind, o in enumerate(self.batches):
-            found[o.which] = self.can_see(kind, min_depth_m)
-        return found
+        return self._all(lambda kind: self.can_see(kind, min_depth_m))
+
+    def _all(self, of_kind: Callable[[int], NDArray]) -> NDArray:
+        """Return values of all observations (K,), given a function that returns those of a kind."""
+        parts = [of_kind(kind) for kind in range(len(self.batches))]
+        return np.concatenate(parts)[np.argsort(np.concatenate([o.which for o in self.batches]))]
 
     @cached_property
     def _by_points(self) -> list[list[Array]]:
