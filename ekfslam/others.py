@@ -30,6 +30,7 @@ from ekfslam.data.sequence import Sequence
 from ekfslam.data.trajectory import Moving, Trajectory, left_error_covariance
 from ekfslam.errors import ConfigError, TruthError, UnknownFormatError
 from ekfslam.evaluation.consistency import chi2_bounds, nees, pose_error
+from ekfslam.evaluation.other_body import other_body
 from ekfslam.evaluation.sanity import sanity_attributes
 from ekfslam.evaluation.trajectory import align_yaw
 from ekfslam.filters.result import OTHER, OTHER_LEVEL, OTHER_MISSING, Innovation, Landmarks, Rejections, Result
@@ -43,6 +44,7 @@ NAME, SEED = "{name}", "{seed}"  # in a path, replaced by the recording's name a
 LEAST_POSES = 3
 _SHOWN = 3  # stretches in messages
 _SAME_WORLD = 0.998  # two-sided probability, so that 99.9 % of the first poses in the same world agree
+_LEFT = 0.6  # of the differences of motions, which the pose of another body leaves at most
 _ROUNDING = 1e-3  # m and rad, of first poses without an uncertainty
 
 
@@ -162,7 +164,8 @@ def _result(
     if covariance is not None:
         P = covariance[row][np.clip(np.searchsorted(placed.frame, np.arange(frames), side="right") - 1, 0, None)]
     noise = recording.noise or (Noise.isotropic(1.0, 1.0, 1.0) if like is None else like.noise)
-    lines = tuple(line for line in (_matching(recording, poses, placed.frame, row, has), moved) if line)
+    said = _matching(recording, poses, placed.frame, row, has), moved, _other_body(recording, placed, like)
+    lines = tuple(line for line in said if line)
     source = name if isinstance(given, Trajectory) else Path(given).name
     facts: dict[str, str | int | float] = {OTHER: printable(source), OTHER_LEVEL: int(is_level)}
     return Result(
@@ -253,6 +256,18 @@ def _moved(T: Array, start: Array | None, is_level: bool) -> tuple[Array, str]:
         return T, ""
     kept = ", its tilt kept" if is_level else ""
     return by @ T, f"moved by {shift_m:.3g} m and turned by {turn_deg:.3g} deg to the recording's first pose{kept}"
+
+
+def _other_body(recording: Sequence | Archive, placed: Truth, like: Result | None) -> str:
+    """Return words on the place of the body of a trajectory, if it differs from that of the truth, or of our run."""
+    known = recording.truth or (None if like is None else Truth(np.arange(len(like.time_s)), like.T_world_imu))
+    if known is None:
+        return ""
+    frame, ours, theirs = np.intersect1d(known.frame, placed.frame, return_indices=True)
+    found = other_body(recording.time_s[frame], known.T_world_imu[ours], placed.T_world_imu[theirs])
+    if found is None or found.left > _LEFT:
+        return ""
+    return f"it looks like poses of another body, {found.size}: its pose in ours is {found.flag} (x y z qx qy qz qw)"
 
 
 def _filled(time_s: Array, frame: IntArray, T: Array) -> Array:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 from ekfslam import files
 from ekfslam.config import ENGINES, VARIANTS, Config
-from ekfslam.data.opening import attach_truth
+from ekfslam.data.opening import attach_truth, with_truth_frame
 from ekfslam.data.sequence import Sequence, stretch
 from ekfslam.data.trajectory import Moving
 from ekfslam.errors import ConfigError, WriteError
@@ -130,6 +130,12 @@ _SHARED: dict[str, dict[str, Any]] = {
     ),
     "--frames": {"type": _stretch, "metavar": "A:B", "help": "frames A to B - 1 only, like a slice in Python"},
     "--extrinsics": _choice(_READINGS, "corrected", "how to read cam_T_imu of .npz recordings"),
+    "--truth-frame": {
+        "nargs": "+",
+        "default": ["body"],
+        "metavar": "FRAME",
+        "help": "moving frame of the truth: body, camera, or its pose in the body, x y z [qx qy qz qw] (default: body)",
+    },
     "--truth-noise": {
         "nargs": "+",
         "type": _setting,
@@ -167,7 +173,7 @@ EXECUTOR = ("--workers", "--executor")
 _INPUTS = ("--velocities", "--velocity-frame", "--imu", "--imu-noise")
 PLACES = ("--truth", *_INPUTS, "--topics", "--calibration", "--lateral")  # parts of a recording in other files
 _READ_AS = (*PLACES, "--camera", "--extrinsics")  # arguments of `open_sequence`
-DATA = (*PLACES, "--camera", "--frames", "--extrinsics", "--truth-noise")
+DATA = (*PLACES, "--truth-frame", "--camera", "--frames", "--extrinsics", "--truth-noise")
 
 # Flags that override a setting, the table and key of it, and how argparse declares the flag.
 _SETTINGS: tuple[tuple[str, str, dict[str, Any], str], ...] = (
@@ -228,7 +234,18 @@ def open_data(options: argparse.Namespace, data: str) -> Sequence:
     named = str(given.pop("truth")) if NAME in str(given["truth"]) else ""
     sequence = open_sequence(data, front_end=config_file(options).front_end, **given)
     sequence = attach_truth(sequence, named.replace(NAME, sequence.name)) if named else sequence
+    sequence = with_truth_frame(sequence, _frame(options.truth_frame))
     return sequence if options.frames is None else sequence[options.frames]
+
+
+def _frame(words: list[str]) -> Moving | list[float]:
+    for name in get_args(Moving):
+        if words == [name]:
+            return cast(Moving, name)
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return []
 
 
 def others_of(options: argparse.Namespace, recordings: int = 1) -> Others:

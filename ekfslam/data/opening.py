@@ -7,6 +7,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
 from ekfslam.arrays import Array
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.readers.fields import checksum
@@ -14,7 +18,9 @@ from ekfslam.data.readers.poses import FIRST_IMAGE, Poses, truth_of_frames
 from ekfslam.data.readers.registry import CALIBRATION, Extrinsics, Lateral, Source, expected, read_as, readers
 from ekfslam.data.readers.text import read_lines, rows_of
 from ekfslam.data.sequence import Sequence
+from ekfslam.data.trajectory import Moving
 from ekfslam.errors import ConfigError, TruthError, UnknownFormatError
+from ekfslam.geometry import se3
 
 MIN_COVERAGE = 0.9  # a file that knows fewer of the frames belongs to another recording
 MOST_LISTED = 8  # names of a folder in a message
@@ -131,6 +137,35 @@ def attach_truth(sequence: Sequence, path: str | Path) -> Sequence:
         notes=(*sequence.notes, note, *poses.notes),
         attributes={**sequence.attributes, "truth_checksum_sha256": checksum(*poses.files)},
     )
+
+
+def with_truth_frame(sequence: Sequence, frame: Moving | ArrayLike) -> Sequence:
+    """Return a recording whose truth was that of another frame, with the true poses of its body.
+
+    Args:
+        frame: ``camera`` for poses of the left camera, or the pose of the moving frame in that of the body: translation
+            (m), or translation and quaternion x y z w. ``body`` changes nothing.
+
+    Raises:
+        ConfigError: It is none of these, or there is no truth.
+    """
+    if isinstance(frame, str) and frame == "body":
+        return sequence
+    truth = sequence.truth
+    if truth is None:
+        raise ConfigError(f"{sequence.name}: there is no truth whose frame could be another one (--truth-frame)")
+    T_body_frame = se3.inverse(sequence.T_cam_imu) if isinstance(frame, str) and frame == "camera" else _pose(frame)
+    T_world_imu, note = truth.T_world_imu @ se3.inverse(T_body_frame), "Truth is moved to the body of the recording."
+    moved = dataclasses.replace(truth, T_world_imu=T_world_imu, motion=None)
+    return dataclasses.replace(sequence, truth=moved, notes=(*sequence.notes, note))
+
+
+def _pose(numbers: ArrayLike) -> Array:
+    values = np.empty(0) if isinstance(numbers, str) else np.asarray(numbers, dtype=float)
+    if values.shape not in ((3,), (7,)) or not np.isfinite(values).all() or (len(values) == 7 and not values[3:].any()):
+        raise ConfigError("a frame of truth is body, camera, 3 numbers x y z, or 7 numbers x y z qx qy qz qw")
+    quaternion = values[3:] if len(values) == 7 else [0.0, 0.0, 0.0, 1.0]
+    return se3.transform(Rotation.from_quat(quaternion).as_matrix(), values[:3])
 
 
 def _span(time_s: Array) -> str:

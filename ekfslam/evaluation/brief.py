@@ -51,7 +51,7 @@ def verdict_lines(data: Sequence | Archive, result: Result, archive: Any = "ARCH
 
 def next_step(found: Honesty, archive: Any) -> str:
     """Return the remedy of the first cause that has one, with the cause; without any, the command that shows more."""
-    defects = (*found.causes, *found.findings)
+    defects = sorted((*found.causes, *found.findings), key=lambda defect: defect.kind != "body")
     named = next((defect for defect in defects if defect.remedy), defects[0] if defects else None)
     if named is None:
         return f"ekfslam report {archive} draws map, errors and consistency"

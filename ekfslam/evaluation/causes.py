@@ -66,7 +66,7 @@ class Cause:
     """A defect of the model."""
 
     # Bias, scale, direction, delay, shared drift, shared noise, pixel noise, tracks, motion, smoother, nis, outliers,
-    # moving or velocities.
+    # moving, velocities or body (of the truth).
     kind: str
     where: tuple[str, ...]  # axes, or rows of the image
     factor: float  # ratio of these errors to the stated ones, in standard deviations; NaN if it does not apply
@@ -239,7 +239,7 @@ def truth_causes(truth: TruthAgreement | None, factors: Array | None) -> Iterato
             text = (
                 f"errors by the truth are {size:.0f}x larger than innovations say: it may be of another body or clock"
             )
-            yield Cause("truth", (), np.nan, text, "a truth of `base_link` has to be turned into the body of this run")
+            yield Cause("truth", (), np.nan, text, "state the body of the truth with --truth-frame")
 
 
 def smoother_causes(smoother: SmootherAgreement | None) -> Iterator[Cause]:

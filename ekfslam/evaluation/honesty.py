@@ -23,6 +23,7 @@ from ekfslam.evaluation.causes import (
     truth_causes,
 )
 from ekfslam.evaluation.evidence import AXES, BLIND, LAGS, POSE_DOF, ROWS, Ratio, SharedInnovations
+from ekfslam.evaluation.other_body import body_causes
 from ekfslam.evaluation.systematic import Systematic, systematic_errors
 from ekfslam.evaluation.tables import document, markdown_table, number
 from ekfslam.filters.result import Result
@@ -90,6 +91,8 @@ class Honesty:
                 known = "the truth of one drive" if self.nis is None else f"{by} and the truth of one drive"
                 return f"consistent as far as {known} can tell ({nees})"
             reason = "" if self.nis is None else f", for a reason that {by} do not show"
+            if any(finding.kind == "body" for finding in self.findings):
+                reason = ", which is of another body"
             return f"standard deviations {_size(true)} by the truth ({nees}){reason}"
         they = "standard deviations" if self.shared is None else "they"
         said = f"by the truth {they} are {_size(true)}" if true != 1.0 else "the truth of one drive does not show it"
@@ -219,6 +222,7 @@ def judge(
         alarm = tuple(smoother_causes(smoother))
         found = Causes(None, (*alarm, *found.causes), found.findings) if alarm else found
     agreed = evidence.truth_agreement(result, truth, interpolated)
+    bodies = tuple(body_causes(result, truth, interpolated, agreed))
     return Honesty(
         name=result.sequence_name,
         frames=len(result.time_s),
@@ -235,7 +239,7 @@ def judge(
         factors=found.factors,
         causes=found.causes,
         findings=(
-            *truth_causes(agreed, found.factors),
+            *(bodies or truth_causes(agreed, found.factors)),
             *found.findings,
             *rejection_causes(result, rejected, found.causes),
         ),
