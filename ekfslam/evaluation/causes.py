@@ -239,7 +239,7 @@ def truth_causes(truth: TruthAgreement | None, factors: Array | None) -> Iterato
             text = (
                 f"errors by the truth are {size:.0f}x larger than innovations say: it may be of another body or clock"
             )
-            yield Cause("truth", (), np.nan, text, "state the body of the truth with --truth-frame")
+            yield Cause("truth", (), np.nan, text, "for a truth of `base_link` state its place with --truth-frame")
 
 
 def smoother_causes(smoother: SmootherAgreement | None) -> Iterator[Cause]:
