@@ -9,7 +9,6 @@ from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array
 from ekfslam.data.images import ImageRecording
@@ -161,6 +160,8 @@ def with_truth_frame(sequence: Sequence, frame: Moving | ArrayLike) -> Sequence:
 
 
 def _pose(numbers: ArrayLike) -> Array:
+    from scipy.spatial.transform import Rotation  # imported late: it takes long
+
     values = np.empty(0) if isinstance(numbers, str) else np.asarray(numbers, dtype=float)
     if values.shape not in ((3,), (7,)) or not np.isfinite(values).all() or (len(values) == 7 and not values[3:].any()):
         raise ConfigError("a frame of truth is body, camera, 3 numbers x y z, or 7 numbers x y z qx qy qz qw")

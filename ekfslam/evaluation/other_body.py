@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
@@ -53,6 +52,8 @@ class OtherBody(NamedTuple):
     @property
     def flag(self) -> str:
         """Argument of ``--truth-frame``: translation, m, and quaternion x y z w."""
+        from scipy.spatial.transform import Rotation  # imported late: it takes long
+
         quaternion = Rotation.from_matrix(self.T[:3, :3]).as_quat(canonical=True)
         return " ".join(f"{value:.4g}" for value in (*self.T[:3, 3], *quaternion))
 
