@@ -6,12 +6,15 @@ import csv
 import dataclasses
 import io
 import re
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from ekfslam.cli import main
+from ekfslam.evaluation.metrics import METRICS
 from ekfslam.evaluation.paired import paired_grid, paired_test
 from ekfslam.evaluation.tables import Column, Grid, is_table, latex
 from ekfslam.names import without_common_ends
@@ -191,3 +194,22 @@ def test_names_lose_the_words_at_both_ends_that_all_have():
     assert without_common_ends(names) == ["26", "30"] == without_common_ends(["a_26_b", "a_30_b"])
     assert without_common_ends(["city", "loop"]) == ["city", "loop"] and without_common_ends(["a_b"]) == ["a_b"]
     assert without_common_ends(["a_b", "a_b_c"]) == ["b", "b_c"]
+
+
+ODD = ("V1_01_easy", "50% & more #2", "a~b^c_{x}$y$", "[1] first", "*star", "Straße 3 µ ° ±", "back\\slash", "<a|b>")
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex")
+def test_pdflatex_compiles_tables_whatever_the_names(tmp_path):
+    names = [*ODD, "--dash---", "long_name_" * 12]
+    columns = [
+        Column(metric.heading, [-0.25, None, *[1e4] * 8], [0.1] * 10, is_compared=True) for metric in METRICS.values()
+    ]
+    parts = [Grid([Column("recording", names), column], names, ["% of #1 & \\x"]) for column in columns]
+    text = "\n\n".join(part.text(".tex") for part in parts)
+    assert r"$-$0" in text
+    page = r"\documentclass{article}\usepackage{booktabs}\begin{document}\tiny " + text + r"\end{document}"
+    (tmp_path / "t.tex").write_text(page, encoding="utf-8")
+    call = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "-draftmode", "t.tex"]
+    found = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120, errors="replace")
+    assert found.returncode == 0 and "Missing character" not in (tmp_path / "t.log").read_text(errors="replace")

@@ -142,13 +142,16 @@ class Grid:
         return found
 
 
-def _texts(grid: Grid, bold: Callable[[str], str], sign: str, escape: Callable[[str], str]) -> list[list[str]]:
+def _texts(
+    grid: Grid, bold: Callable[[str], str], sign: str, escape: Callable[[str], str], minus: str = "-"
+) -> list[list[str]]:
     """Return the cells of each row, with errors and the best in bold."""
     columns, best = [], grid.best
     for c, column in enumerate(grid.columns):
         cells = []
         for r, (text, error) in enumerate(column.cells):
-            shown = bold(text) if (c, r) in best else escape(text)
+            shown = escape(text) if column.is_text else minus + text[1:] if text.startswith("-") and text[1:] else text
+            shown = bold(shown) if (c, r) in best else shown
             cells.append(shown if error == MISSING else f"{shown}{sign}{error}")
         columns.append(cells)
     return [list(row) for row in zip(*columns, strict=True)]
@@ -167,7 +170,7 @@ def markdown_text(grid: Grid) -> str:
 
 def latex_text(grid: Grid) -> str:
     """Return a grid as a tabular of booktabs; notes are comments. Equal texts of successive rows are written once."""
-    rows = _texts(grid, lambda text: rf"\textbf{{{text}}}", r" $\pm$ ", latex)
+    rows = _texts(grid, lambda text: rf"\textbf{{{text}}}", r" $\pm$ ", latex, "$-$")
     heads = [latex(column.heading) for column in grid.columns]
     lines = [rf"\begin{{tabular}}{{{''.join('l' if c.is_text else 'r' for c in grid.columns)}}}", r"\toprule"]
     lines += [f"{' & '.join(heads)} \\\\", r"\midrule"]
@@ -223,5 +226,5 @@ _LATEX |= {"±": r"$\pm$", "\N{DEGREE SIGN}": r"$^\circ$", "\n": " "}
 
 def latex(text: str) -> str:
     """Return a text with the characters escaped that mean something to LaTeX."""
-    found = "".join(_LATEX.get(c, c) for c in text)
+    found = "".join(_LATEX.get(c, c) for c in text).replace("--", "-{}-").replace("--", "-{}-")  # no dash
     return f"{{}}{found}" if found[:1] in ("[", "*") else found  # after a line break they would be its argument
