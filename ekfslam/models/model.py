@@ -149,10 +149,6 @@ class Model:
     def widened(self, values: Values, step: Step) -> Transition:
         """Return a step of some blocks as a transition of all blocks."""
         Phi, Q = np.eye(self.layout.body), np.zeros((self.layout.body, self.layout.body))
-        if len(step.values) == 1:  # a slice, and no index
-            at = self.layout[next(iter(step.values))]
-            Phi[at], Q[at, at] = step.Phi, step.Q
-        else:
-            columns = self.layout.columns(step.values)
-            Phi[columns], Q[np.ix_(columns, columns)] = step.Phi, step.Q
+        columns = self.layout.columns(step.values)
+        Phi[columns], Q[np.ix_(columns, columns)] = step.Phi, step.Q
         return Transition({**values, **step.values}, Phi, Q, step.imu_twist)

@@ -172,11 +172,9 @@ class Observer:
         default the same, or (FEJ) the first ones.
         """
         sensor, q = self.sensor_at(parameters), se3.apply(T_cam_world, positions_m)
-        A, q_linear = sensor.jacobian(q), q
         if T_linear is None or linear_positions_m is None:
-            T_linear = T_cam_world
-        elif T_linear is not T_cam_world or linear_positions_m is not positions_m:
-            q_linear = se3.apply(T_linear, linear_positions_m)
+            T_linear, linear_positions_m = T_cam_world, positions_m
+        A, q_linear = sensor.jacobian(q), se3.apply(T_linear, linear_positions_m)
         H_z = np.concatenate([A, -A @ se3.skew(q_linear)], axis=-1)
         H_i = np.empty((*A.shape[:-1], 0))
         if self.calibration is not None:

@@ -37,19 +37,14 @@ class VelocityInputs(Process):
 
     def step(self, values: Values, interval: Interval | Intervals, T_linear: Array, first_estimates: bool) -> Step:
         """Return eq. (1) and (2)."""
-        twist, by, tau_s, T = mean_velocity(interval), None, interval.tau_s, values["pose"]
-        if self._depends_on_blocks:
-            twist, by = self.imu_velocities(values, twist, T_linear[..., :3, :3])
+        tau_s, T = interval.tau_s, values["pose"]
+        twist, by = self.imu_velocities(values, mean_velocity(interval), T_linear[..., :3, :3])
         E, G = motion.increment(twist, tau_s), motion.twist_jacobian(twist, tau_s)
         T_next = E @ T
-        Phi = np.zeros((*G.shape[:-1], self.layout.body))
-        Phi[..., self.layout["pose"]] = motion.error_jacobian(T_next @ se3.inverse(T_linear) if first_estimates else E)
-        if by is not None:
-            Phi -= G @ by
-        std = self.noise.pose_std
-        if np.any(interval.is_gap) or np.any(interval.doubt != 1.0):
-            std = self.noise.pose_std_during(interval.is_gap, interval.doubt)
-        Q = motion.process_noise_by(G, std)
+        Phi = -G @ by
+        by_pose = motion.error_jacobian(T_next @ se3.inverse(T_linear) if first_estimates else E)
+        Phi[..., self.layout["pose"]] += by_pose
+        Q = motion.process_noise_by(G, self.noise.pose_std_during(interval.is_gap, interval.doubt))
         return Step({"pose": T_next}, twist, Phi, Q)
 
     def residual(self, before: Values, after: Values, intervals: Intervals) -> Residual:
@@ -88,15 +83,6 @@ class VelocityInputs(Process):
         pairs = ((block, block.velocity_offset()) for block in self.layout.coupled("velocity"))
         return tuple((block, J) for block, J in pairs if J is not None)
 
-    @cached_property
-    def _turning(self) -> tuple[StateBlock, ...]:
-        """Blocks that turn velocities into the IMU frame."""
-        return self.layout.coupled("level")
-
-    @cached_property
-    def _depends_on_blocks(self) -> bool:
-        return bool(self._offsets or self._turning)
-
     def unbiased(self, inputs: Array, values: Values) -> Array:
         """Return inputs (..., 6) less the biases in the state."""
         for block, J in self._offsets:
@@ -116,7 +102,7 @@ class VelocityInputs(Process):
         Values of the pose are those before the interval; its error is linearised at a rotation (..., 3, 3).
         """
         twist, by = self._driving(values, inputs)
-        for block in self._turning:
+        for block in self.layout.coupled("level"):
             twist, by = block.turn_velocities(twist, by, values, R_linear, self.layout)
         return twist, by
 
@@ -128,10 +114,6 @@ class VelocityWalk(VelocityInputs):
     started = (Twist.name,)
     velocity = Twist.name
     estimates_velocity = True
-
-    @property
-    def _depends_on_blocks(self) -> bool:
-        return True
 
     @cached_property
     def _is_measured(self) -> bool:
