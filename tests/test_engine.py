@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.compiled import assert_same_covariance, assert_same_report
 from support.everything import BLOCKS, CALIBRATION, PRIOR, with_everything
 from support.running import DATA, WHOLE
 
@@ -46,16 +47,9 @@ def drive(problem, engine, frames):
 
 def assert_same_reports(found, known):
     for one, other in zip(found, known, strict=True):
-        np.testing.assert_array_equal(one.reason, other.reason)
-        np.testing.assert_array_equal(one.split, other.split)
-        assert (one.dof, one.doubt) == (other.dof, pytest.approx(other.doubt))
-        figures = [[r.nis, r.log_likelihood] for r in (one, other)]
-        np.testing.assert_allclose(*figures, rtol=1e-6, atol=1e-9)
-        size = np.abs(other.innovations.information).max(initial=0.0)
-        np.testing.assert_allclose(one.innovations.information, other.innovations.information, atol=1e-8 * size)
+        assert_same_report(one, other, rtol=1e-6)
         if other.dof > 24 and other.doubt == 1.0:  # else some are known to rounding alone
             np.testing.assert_allclose(one.innovations.apart, other.innovations.apart, atol=1e-6)
-        np.testing.assert_array_equal(one.innovations.landmark, other.innovations.landmark)
 
 
 def assert_same_logs(found, known, layout, tolerance):
@@ -72,8 +66,7 @@ def assert_same_estimates(found, known, tolerance):
     np.testing.assert_array_equal(found.ids, known.ids)
     for name, value in known.values.items():
         np.testing.assert_allclose(found.values[name], value, atol=tolerance, err_msg=name)
-    std = np.sqrt(np.diag(known.P))
-    assert (np.abs(found.P - known.P) <= tolerance * np.outer(std, std) + 1e-300).all()
+    assert_same_covariance(found.P, known.P, tolerance)
     one, other = found.landmarks(), known.landmarks()
     np.testing.assert_array_equal(one.id, other.id)
     np.testing.assert_array_equal(one.observations, other.observations)

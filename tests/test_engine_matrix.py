@@ -7,6 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
+from support.compiled import assert_same_state
 
 from ekfslam.config import Config, FilterConfig
 from ekfslam.data.simulate import builtin
@@ -34,11 +35,6 @@ RIGS = list(itertools.product(VARIANTS, COORDINATES, (False, True), CALIBRATIONS
 EVERY_RIG = [pytest.param(*rig, marks=[] if at % 20 == 7 else [pytest.mark.slow]) for at, rig in enumerate(RIGS)]
 
 
-def assert_same_covariance(found, known):
-    std = np.sqrt(np.maximum(np.diag(known), 0.0))  # a view before any motion is known to rounding
-    assert (np.abs(found - known) <= 1e-9 * np.outer(std, std) + 1e-16).all()
-
-
 def assert_refused_or_same(model, config, sequence):
     """Compare filters of a model frame by frame; a model that the engine refuses has a reason in words."""
     if reason := choice.obstacle(model, config):
@@ -47,11 +43,7 @@ def assert_refused_or_same(model, config, sequence):
     one, other = (JointEKF(model, dataclasses.replace(config, engine=name)) for name in ("engine", "reference"))
     for found, known in zip(run_filter(one, sequence), run_filter(other, sequence), strict=True):
         np.testing.assert_array_equal(found.report.reason, known.report.reason)
-        np.testing.assert_array_equal(one.ids, other.ids)
-        for name, value in other.values.items():
-            np.testing.assert_allclose(one.values[name], value, rtol=1e-9, atol=1e-9, err_msg=name)
-        np.testing.assert_allclose(one.positions_m, other.positions_m, rtol=1e-9, atol=1e-9)
-        assert_same_covariance(one.P, other.P)
+        assert_same_state(one, other, floor=1e-16)
     assert len(one.ids) > 3
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from unittest.mock import patch
 
 import numpy as np
+import pytest
 
 from ekfslam.config import CalibrationConfig, FilterConfig
 from ekfslam.data.interval import Interval
@@ -121,3 +122,30 @@ def arguments(model, config):
     with patch("ekfslam.engine._engine.Filter") as made:
         Engine(model, config)
     return list(made.call_args.args)
+
+
+def assert_same_covariance(found, known, tolerance=1e-9, floor=1e-300):
+    """Errors count in standard deviations."""
+    std = np.sqrt(np.maximum(np.diag(known), 0.0))
+    assert (np.abs(found - known) <= tolerance * np.outer(std, std) + floor).all()
+
+
+def assert_same_state(found, known, tolerance=1e-9, floor=1e-300):
+    """Compare mean and covariance of two filters; a view before any motion is known to rounding, hence ``floor``."""
+    np.testing.assert_array_equal(found.ids, known.ids)
+    for name, value in known.values.items():
+        np.testing.assert_allclose(found.values[name], value, rtol=tolerance, atol=tolerance, err_msg=name)
+    np.testing.assert_allclose(found.positions_m, known.positions_m, rtol=tolerance, atol=tolerance)
+    assert_same_covariance(found.P, known.P, tolerance, floor)
+
+
+def assert_same_report(found, known, rtol=1e-9):
+    np.testing.assert_array_equal(found.reason, known.reason)
+    np.testing.assert_array_equal(found.split, known.split)
+    assert (found.dof, found.doubt) == (known.dof, pytest.approx(known.doubt))
+    figures = [[report.nis, report.log_likelihood] for report in (found, known)]
+    np.testing.assert_allclose(*figures, rtol=rtol, atol=1e-9)
+    one, other = found.innovations, known.innovations
+    np.testing.assert_array_equal(one.landmark, other.landmark)
+    size = np.abs(other.information).max(initial=1.0)
+    np.testing.assert_allclose(one.information, other.information, atol=1e-8 * size)

@@ -91,9 +91,3 @@ def assert_same(one, other, tolerance=1e-13):
     logs = one.log(), other.log()
     for field in dataclasses.fields(logs[0]):
         assert_close(*(np.asarray(getattr(log, field.name), dtype=float) for log in logs), field.name, tolerance)
-
-
-def assert_same_covariance(one, other, tolerance=1e-12):
-    """Errors count in standard deviations."""
-    std = np.sqrt(np.diag(other.P))
-    assert (np.abs(one.P - other.P) <= tolerance * np.outer(std, std) + 1e-300).all()
