@@ -17,7 +17,9 @@ from ekfslam.data.simulate import builtin
 from ekfslam.engine import choice
 from ekfslam.errors import DataError, EkfslamError, FilterError, InnovationError
 from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.logbook import LogBook
 from ekfslam.filters.loop import run_filter
+from ekfslam.models.process import Measured
 from ekfslam.models.process.velocities import VelocityInputs
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.resolve import resolve
@@ -206,6 +208,22 @@ def test_an_error_of_the_users_own_process_changes_nothing(engine, call):
             each.update(FRAMES, *problem.sequence.observations.at(FRAMES))
         go_on(each, problem, range(FRAMES + (call == "update"), FRAMES + 3))
     assert_equal(numbers(ekf), numbers(clean))
+
+
+def fail(*_):
+    raise MemoryError
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_error_after_a_further_sensor_has_corrected_the_velocity_changes_nothing(engine, monkeypatch):
+    problem = problem_of("walk")
+    ekf = filter_of(problem, engine)
+    drive(ekf, problem, range(FRAMES))
+    before, interval = numbers(ekf), problem.sequence.interval(FRAMES, ekf.model.process.takes)
+    monkeypatch.setattr(LogBook, "predicted", fail)
+    with pytest.raises(MemoryError):
+        ekf.predict(interval, also=Measured(np.zeros(1, int), np.full(1, 7.0), np.full(1, 0.1), np.zeros(1, bool)))
+    assert_equal(numbers(ekf), before)
 
 
 class Watching(VelocityInputs):

@@ -13,6 +13,9 @@ from support.imu import motion, write_lines, yaml_lines
 
 from ekfslam import attach_inertial, open_images
 from ekfslam.data.images import ImageRecording
+from ekfslam.data.inputs import VelocitySamples
+from ekfslam.data.readers.bag_imu import velocities_of_unit
+from ekfslam.data.sequence import TWIST_STD
 from ekfslam.geometry import se3
 
 COUNT, IMU_NS = 120, 5_000_000
@@ -129,6 +132,17 @@ def test_velocities_of_wheels_are_turned_into_the_frame_of_the_unit(tmp_path):
     R, t = T_BASE_IMU[:3, :3], T_BASE_IMU[:3, 3]
     v, w = np.array([4.0, 0.0, 0.1]), np.array([0.0, 0.0, 0.6])
     np.testing.assert_allclose(found.twist[2], np.concatenate([R.T @ (v + np.cross(w, t)), R.T @ w]), atol=1e-6)
+
+
+def test_stated_errors_of_velocities_are_turned_with_them():
+    """By 30 degrees about z and onto axes of which the last has no stated error."""
+    std = np.array([0.3, 0.1, 0.0, 0.01, 0.02, 0.05])
+    samples = VelocitySamples("a", np.arange(3.0), np.ones((3, 6)), attributes={TWIST_STD: " ".join(map(str, std))})
+    T = se3.transform(se3.so3_exp(np.array([0.0, 0.0, np.pi / 6])), np.zeros(3))
+    found, _ = velocities_of_unit(samples, T, "imu")
+    R = T[:3, :3]
+    expected = np.sqrt(np.concatenate([np.diag(R @ np.diag(part**2) @ R.T) for part in (std[:3], std[3:])]))
+    np.testing.assert_allclose(np.array(found.attributes[TWIST_STD].split(), dtype=float), expected, atol=1e-12)
 
 
 def test_another_recording_takes_the_samples_of_a_bag(tmp_path):

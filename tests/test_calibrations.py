@@ -11,7 +11,7 @@ import pytest
 from support.images import FRAMES, TOML, picture, write_euroc, write_picture
 
 from ekfslam import open_images
-from ekfslam.data.readers.calibrations import read_pair
+from ekfslam.data.readers.calibrations import read_pair, shift_of
 from ekfslam.data.readers.yaml import read_yaml
 from ekfslam.errors import CalibrationError, DataError, ExtrinsicsError, NonFiniteError, UnknownFormatError
 from ekfslam.geometry import se3
@@ -172,6 +172,11 @@ def test_one_camera_of_ros_alone_is_a_named_error(tmp_path):
     (tmp_path / "right.yaml").write_text(ros(0, "plumb_bob", D))
     with pytest.raises(CalibrationError, match=r"right\.yaml: projection_matrix: expected a baseline on the right"):
         read_pair(tmp_path / "left.yaml")
+
+
+def test_a_projection_without_a_focal_length_states_no_baseline():
+    with pytest.raises(CalibrationError, match="P2: P has no positive focal length"):
+        shift_of(np.array([[0.0, 0.0, 1.0, -5.0]]), "P2")
 
 
 # OpenCV and ORB-SLAM

@@ -252,6 +252,7 @@ def test_info_of_a_recording_lists_what_the_reader_noticed(tmp_path, capsys):
     printed = capsys.readouterr().out
     for note in open_sequence(npz).notes:
         assert note in printed
+    assert "noise         not stated; white noise of the velocities, from the data: " in printed
 
 
 def test_the_sign_of_the_lateral_velocity_is_a_flag(tmp_path, capsys):

@@ -21,12 +21,22 @@ from ekfslam.data.readers import read_sequence, write_sequence
 from ekfslam.data.readers.messages import message_types
 from ekfslam.data.simulate import builtin
 from ekfslam.errors import ArchiveError, MissingPackageError, PosteriorError, ShapeError
+from ekfslam.files import write_all
 from ekfslam.geometry import se3
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage import tables
 from ekfslam.storage.archive import open_result, read_archive, write_archive
-from ekfslam.storage.exports import EXPORTS, csv_text, g2o_text, information_bytes, ply_bytes
+from ekfslam.storage.exports import (
+    EXPORTS,
+    contents,
+    csv_text,
+    g2o_text,
+    information_bytes,
+    is_export,
+    ply_bytes,
+    trajectory_of,
+)
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +54,19 @@ def archive(world, full, tmp_path_factory):
     path = tmp_path_factory.mktemp("exports") / "city.h5"
     write_archive(path, world, {"full": full})
     return path
+
+
+@pytest.mark.parametrize("name", sorted(set(EXPORTS) - {"bag", "euroc"}))
+def test_a_written_export_is_known_again_and_another_file_is_not(full, tmp_path, name):
+    path = tmp_path / "out"
+    if EXPORTS[name].poses is None:
+        found = contents(full, path, name)
+    else:
+        found = contents(trajectory_of(full), path, name, "body")
+    write_all(found)
+    assert is_export(path, name)
+    path.write_text("mine\n")
+    assert not is_export(path, name)
 
 
 @pytest.mark.parametrize("table", [name for name in tables.TABLES if name != "inertial"])
@@ -277,6 +300,9 @@ def test_a_bag_of_a_result_holds_poses_and_covariances_as_ros_means_them(full, t
         read = [types.deserialize_cdr(raw, connection.msgtype) for _, _, raw in reader.messages()]
     assert (connection.topic, connection.msgtype) == ("/ekfslam/odometry", "nav_msgs/msg/Odometry")
     assert len(read) == len(full.time_s) and read[7].child_frame_id == "base_link"
+    stamps = [message.header.stamp for message in read]
+    np.testing.assert_array_equal([10**9 * at.sec + at.nanosec for at in stamps], np.round(1e9 * full.time_s))
+    assert max(at.nanosec for at in stamps) < 10**9
     position = read[7].pose.pose.position
     np.testing.assert_array_equal([position.x, position.y, position.z], full.T_world_imu[7, :3, 3])
     P = read[7].pose.covariance.reshape(6, 6)

@@ -17,7 +17,7 @@ from ekfslam.evaluation.consistency import chi2_bounds, nees, pose_error
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.geometry import camera, motion, se3
-from ekfslam.models.blocks import TwistBias
+from ekfslam.models.blocks import TwistBias, VisionDrift
 from ekfslam.models.build import model_of
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
@@ -207,6 +207,15 @@ def test_tracks_that_wait_are_listed_and_start_with_both_views():
     assert (reasons == -1).sum() == log.observations - log.landmarks  # the view from the anchor was reported as waiting
     with pytest.raises(PosteriorError, match="waited"):
         posterior_of_log(log, ekf.model, ekf.landmarks().position_m, PosteriorConfig(linearisation="filtered"))
+
+
+def test_one_camera_with_tracks_that_wait_may_have_a_bias_of_its_velocities_but_no_drift_of_its_views():
+    world = builtin("city?frames=2")
+    sensor = Monocular(world.camera, world.T_cam_imu, world.noise, parallax_rad=0.2)
+    first = se3.inverse(world.initial_T_world_imu), np.eye(6)
+    assert "twist_bias" in model_of(sensor, world.noise, *first, blocks=[TwistBias()]).layout
+    with pytest.raises(ConfigError, match="vision_drift: not with landmarks that wait"):
+        model_of(sensor, world.noise, *first, blocks=[VisionDrift()])
 
 
 def test_a_bias_keeps_its_size():

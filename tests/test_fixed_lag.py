@@ -90,6 +90,15 @@ def test_a_short_window_ends_there_too_if_no_row_is_curved(name, lag):
     assert_equal_at_the_end(recordings(12, scale=4e-3)[name], lag, share=2e-2, scale=4e-3)
 
 
+def test_poses_that_have_left_the_window_have_no_covariance_with_the_last_one():
+    problem = resolve(recordings()["velocities"], with_lag(3))
+    ekf = JointEKF(problem.model, problem.config.filter, window=FixedLag)
+    assert ekf.window.cross(0) is None
+    last = max(frame.number for frame in run_filter(ekf, problem.sequence))
+    assert [ekf.window.cross(last - j) is None for j in range(6)] == [False, False, False, False, True, True]
+    np.testing.assert_allclose(ekf.window.cross(last), ekf.gaussian.body_covariance[:6, :6], rtol=1e-6)
+
+
 def test_without_a_lag_nothing_is_linearised_again():
     world = small_world(frames=12, landmarks=30)
     ekf, _, _ = run_joint(world, Rig(world.camera, world.T_cam_imu, world.noise), FilterConfig(), window=FixedLag)

@@ -17,7 +17,7 @@ from ekfslam.evaluation.causes import Cause, truth_causes
 from ekfslam.evaluation.consistency import pose_error, pose_nees_by_axis
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations
 from ekfslam.figures.check import plot_check
-from ekfslam.filters.result import Result, WhitenedInnovations
+from ekfslam.filters.result import REASONS, Result, WhitenedInnovations
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import project
 from ekfslam.runner import run
@@ -371,6 +371,11 @@ def test_values_table_and_figure_say_the_same(one_run):
     dots = next(line for line in figure.axes[0].lines if line.get_label() == "frame")
     seen = one_run.innovation.dof > 0
     np.testing.assert_allclose(dots.get_ydata(), (one_run.innovation.nis / np.maximum(one_run.innovation.dof, 1))[seen])
+    drawn = next(ax for ax in figure.axes if ax.get_title().startswith("rejections"))
+    for line in drawn.lines:
+        count = (one_run.rejections.reason == REASONS.index(line.get_label())).sum()
+        assert 0 < (line.get_ydata() > 0).sum() <= count
+    assert len(drawn.lines) == len(np.unique(one_run.rejections.reason))
     for ax in figure.axes:
         assert "[" in ax.get_xlabel() and "[" in ax.get_ylabel() and ax.get_title()
     assert found.verdict[:20] in figure.get_suptitle()

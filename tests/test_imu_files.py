@@ -15,6 +15,7 @@ import ekfslam
 from ekfslam import attach_inertial
 from ekfslam.data.imu import attach_inertial_noise
 from ekfslam.data.inertial import NOT_STATED
+from ekfslam.data.readers.imu_text import read_imu
 from ekfslam.errors import (
     CalibrationError,
     DataError,
@@ -97,6 +98,16 @@ def test_the_unit_of_stamps_follows_from_their_steps(tmp_path, unit, scale):
     sequence = attached(written(tmp_path, header="", time_ns=TIME_NS // scale))
     np.testing.assert_allclose(sequence.inertial.time_s, TIME_NS // scale * (scale / 1e9), rtol=0, atol=3e-7)
     assert f"Stamps of imu.csv are taken as {unit}, by their steps." in sequence.notes
+
+
+@pytest.mark.parametrize(("factor", "count", "unit"), [(1_000, 400, "us"), (1, 1, "ns")])
+def test_the_unit_of_stamps_follows_from_their_steps_before_their_size(tmp_path, factor, count, unit):
+    """Stamps in us since a start are too small for a date; the step of a single one is unknown."""
+    stamps = (TIME_NS[:count] - (TIME_NS[0] if count > 1 else 0)) // factor
+    lines = rows(stamps, GYRO[:count], ACCEL[:count])
+    found = read_imu(write_lines(tmp_path / "imu.csv", lines))
+    np.testing.assert_array_equal(found.time_ns, stamps * factor)
+    assert any(f"taken as {unit}" in note for note in found.notes) == (unit != "ns")
 
 
 def test_a_unit_of_stamps_that_cannot_be_right_is_named(tmp_path):
@@ -276,6 +287,7 @@ def test_images_without_extrinsics_need_a_chain_of_kalibr_beside_the_samples(tmp
     np.testing.assert_allclose(found.T_cam_imu, T, atol=1e-9)
     np.testing.assert_allclose(found.inertial.time_s, TIME_NS / 1e9 + 0.01, rtol=0, atol=3e-7)
     assert found.attributes["imu_late_s"] == -0.01
+    assert "T_cam_imu is that of cam0 in camchain-imucam.yaml." in found.notes
     assert not any("The body is the left camera" in note for note in found.notes)
 
 

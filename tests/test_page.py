@@ -93,6 +93,10 @@ def test_the_page_holds_the_numbers_of_the_archive(archive, page):
         assert (heading in page) == (heading != "Track hygiene" or full.hygiene is not None), heading
 
 
+def test_the_page_states_the_noise_that_a_run_assumed(archive):
+    assert "<h4>Assumed noise</h4>" in report_page(read_archives([archive]))
+
+
 def carded(archive_of, **runs) -> dict[str, tuple[str, list[str]]]:
     """Kind and words of each run's card, by mode."""
     found = dataclasses.replace(archive_of, results=runs)

@@ -347,6 +347,12 @@ def test_archive_alone_rebuilds_the_posterior(tmp_path):
         np.testing.assert_array_equal(here.landmark_covariance, there.landmark_covariance)
 
 
+def test_a_smoothed_result_counts_observations_weighted_below_one_half():
+    result = run(builtin("city?frames=5&max_tracks=9"), "full")
+    found = dataclasses.replace(posterior(result), weight=np.array([0.2, 0.49, 0.7, 1.0]))
+    assert smooth(result, found=found).counts["observations weighted below one half"] == 2
+
+
 @pytest.mark.slow
 def test_smoothed_result_is_the_posterior():
     world = builtin("loop?frames=60")

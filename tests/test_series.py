@@ -11,6 +11,7 @@ from support.helpers import synthetic_result, synthetic_sequence
 
 from ekfslam.figures import series
 from ekfslam.filters.result import Parameters
+from ekfslam.geometry import se3
 from ekfslam.page.content import plotted, sections_of
 from ekfslam.storage.archive import read_archive, write_archive
 
@@ -29,6 +30,14 @@ def test_pose_nees_has_the_bounds_of_six_degrees_of_freedom(sequence, result):
     found = series.nees(result, sequence.truth)
     assert found.levels == (6.0,)
     np.testing.assert_allclose([found.low[0], found.high[0]], chi2.ppf([0.025, 0.975], 6))
+
+
+def test_lengths_of_errors_are_those_of_position_and_of_rotation(sequence, result):
+    position, rotation = series.error_lengths(result, sequence.truth)
+    T, true = result.T_world_imu[sequence.truth.frame], sequence.truth.T_world_imu
+    np.testing.assert_allclose(position.y, np.linalg.norm(T[:, :3, 3] - true[:, :3, 3], axis=1), atol=1e-9)
+    angle = np.linalg.norm(se3.so3_log(true[:, :3, :3].swapaxes(1, 2) @ T[:, :3, :3]), axis=1)
+    np.testing.assert_allclose(rotation.y, np.degrees(angle), atol=1e-6)
 
 
 def test_nis_has_the_bounds_of_the_degrees_of_freedom_of_each_frame(result):

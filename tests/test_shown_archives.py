@@ -163,3 +163,5 @@ def test_a_mark_names_any_archive(tmp_path, suffix, name):
         with Image.open(path) as picture:
             picture.load()
             assert picture.info["Software"] == "ekfslam"
+        with Image.open(path) as picture:
+            picture.verify()  # the checksums, to the last block

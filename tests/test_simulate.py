@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from support.jacobians import hat
 
 from ekfslam.data.sequence import Sequence
-from ekfslam.data.simulate import BUILTIN, GROUND_M, IMAGE_SIZE_PX, builtin, simulate
-from ekfslam.data.worlds import OUTLIER_SHIFT_PX
+from ekfslam.data.simulate import BUILTIN, CAMERA, GROUND_M, IMAGE_SIZE_PX, T_CAM_IMU, builtin, simulate
+from ekfslam.data.worlds import BORDER_PX, OUTLIER_SHIFT_PX, View, outlier_shifts
 from ekfslam.errors import ConfigError, UnknownFormatError
 from ekfslam.geometry import motion, se3
 from ekfslam.geometry.camera import project
@@ -162,6 +162,17 @@ def test_outliers_have_the_stated_share_and_stay_in_the_image(city):
     assert (z >= 0).all()
     assert (z <= np.tile(IMAGE_SIZE_PX, 2) - 1).all()
     assert (z[:, 0] > z[:, 2]).all()
+
+
+def test_a_jump_never_leads_out_of_the_border_of_the_image():
+    rng, (width, height) = np.random.default_rng(0), IMAGE_SIZE_PX
+    low, high = BORDER_PX, np.array([width, height]) - 1 - BORDER_PX
+    u, v = rng.uniform(low, high, (20_000, 2)).T
+    pixels = np.stack([u, v, np.maximum(u - rng.uniform(1.0, 30.0, len(u)), low), v], axis=1)
+    world = replace(CITY, outlier_fraction=1.0)
+    shifted = pixels + outlier_shifts(world, View(CAMERA, IMAGE_SIZE_PX, T_CAM_IMU), pixels, rng)
+    assert (shifted >= low).all()
+    assert (shifted <= np.tile(high, 2)).all()
 
 
 def test_loop_has_no_outliers(loop):

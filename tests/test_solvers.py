@@ -74,6 +74,18 @@ def test_superlu_keeps_zeros_that_belong_to_the_pattern():
     assert solvers.SuperLU(A).factorise(A).lower().nnz == 6  # both zeros, and (2, 1) that follows from them
 
 
+@pytest.mark.parametrize("bad", [0, 7, 29])
+@pytest.mark.parametrize("kind", {solvers.solver, solvers.SuperLU}, ids=lambda kind: kind.__name__)
+def test_the_first_pivot_that_is_not_positive_is_named(kind, bad):
+    A = np.array(drive(10, 0).todense())
+    A = A + np.tril(A, -1).T
+    A[bad, bad] -= 10.0 * A[bad, bad]
+    A = sp.csc_matrix(np.tril(A))
+    with pytest.raises(solvers.PivotError) as caught:
+        kind(A).factorise(A)
+    assert caught.value.column == bad
+
+
 def test_superlu_serves_a_long_chain_with_one_loop_closure():
     """The entries that the closure fills would underflow if each step along the chain made them smaller."""
     chain = drive(3000, 0)[::3, ::3].tocoo()

@@ -53,6 +53,13 @@ def test_what_is_written_is_there_and_nothing_else(tmp_path):
     assert contents(tmp_path) == {"a": b"other"}
 
 
+def test_a_file_and_then_its_new_name_reach_the_disk(tmp_path, monkeypatch):
+    reached, fsync = [], os.fsync
+    monkeypatch.setattr(os, "fsync", lambda number: (reached.append(os.fstat(number).st_ino), fsync(number)))
+    files.write(tmp_path / "a", "text")
+    assert reached == [(tmp_path / "a").stat().st_ino, tmp_path.stat().st_ino]
+
+
 def test_files_that_belong_together_appear_together(tmp_path):
     (tmp_path / "a").write_text("old")
     (tmp_path / "b").mkdir()

@@ -88,7 +88,6 @@ class Stillness:
 def moved_px(before: Array, now: Array) -> float:
     """Return the root mean square motion of most tracks (n, 2), as a robust similarity has it, less that of noise."""
     d, x = now - before, before - before.mean(axis=0)
-    x = x / max(float(np.sqrt((x**2).mean())), 1.0)
     A = np.zeros((len(x), 2, 4))
     A[:, 0, 0] = A[:, 1, 1] = 1.0
     A[:, 0, 2], A[:, 0, 3], A[:, 1, 2], A[:, 1, 3] = x[:, 0], -x[:, 1], x[:, 1], x[:, 0]
