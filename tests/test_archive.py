@@ -16,9 +16,10 @@ from support.helpers import synthetic_result, synthetic_sequence
 from support.same import assert_same
 
 from ekfslam import hdf5
+from ekfslam.config import Config
 from ekfslam.data.readers import read_sequence, write_sequence
 from ekfslam.data.simulate import builtin
-from ekfslam.errors import ArchiveError, PosteriorError
+from ekfslam.errors import ArchiveError, PosteriorError, WriteError
 from ekfslam.filters.result import ERROR_CONVENTION, Result
 from ekfslam.geometry import se3
 from ekfslam.runner import run
@@ -28,6 +29,7 @@ from ekfslam.storage.archive import (
     add_result,
     open_result,
     read_archive,
+    require_same_origin,
     write_archive,
 )
 from ekfslam.storage.exports import export
@@ -142,6 +144,24 @@ def test_adding_to_no_archive_is_a_named_error(tmp_path, results):
     with pytest.raises(ArchiveError, match=r"text\.h5"):
         add_result(tmp_path / "text.h5", results["full"])
     assert (tmp_path / "text.h5").read_text() == "no archive"
+
+
+def test_settings_come_back_as_they_were(tmp_path):
+    world = builtin("city?frames=3")
+    config = Config().with_overrides({"hygiene": {"min_observations": 3, "reused_id_sigma": 7.0}})
+    result = run(world, "full", config)
+    write_archive(tmp_path / "a.h5", world, {"full": result})
+    assert read_archive(tmp_path / "a.h5").results["full"].config == result.config
+
+
+def test_an_archive_of_the_same_recording_elsewhere_may_be_replaced_and_one_of_another_not(tmp_path, sequence, results):
+    here = dataclasses.replace(sequence, attributes={"checksum_sha256": "a", "note": 1})
+    write_archive(tmp_path / "a.h5", here, results)
+    moved = dataclasses.replace(here, source="/elsewhere", attributes={"checksum_sha256": "a", "note": 2})
+    require_same_origin(tmp_path / "a.h5", moved)
+    for attributes in ({"checksum_sha256": "b", "note": 1}, {"note": 1}):
+        with pytest.raises(WriteError, match="a result of another recording"):
+            require_same_origin(tmp_path / "a.h5", dataclasses.replace(here, attributes=attributes))
 
 
 def test_sequence_and_truth_come_back_bit_for_bit(written, sequence):

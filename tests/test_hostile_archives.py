@@ -150,6 +150,19 @@ def test_a_difference_from_an_earlier_frame_than_the_one_before_is_named(whole, 
         read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
 
 
+def test_a_difference_is_from_the_same_landmark_in_the_frame_before(whole, tmp_path):
+    with h5py.File(whole) as h5file:
+        frame, landmark, previous = (h5file[f"runs/full/log/{name}"][()] for name in ("frame", "landmark", "previous"))
+    later = np.flatnonzero(frame == 5)[0]
+    before = np.flatnonzero(frame == 4)
+    same, other = (before[(landmark[before] == landmark[later]) == is_same][0] for is_same in (True, False))
+    previous[later] = same
+    read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
+    previous[later] = other
+    with pytest.raises(ArchiveError, match=rf"previous\[{later}\] is no observation of the same landmark"):
+        read_archive(altered(whole, tmp_path, "runs/full/log/previous", previous))
+
+
 def test_a_stamp_that_comes_twice_is_named(whole, tmp_path):
     with h5py.File(whole) as h5file:
         time_s = h5file["runs/full/trajectory/time"][()]

@@ -131,6 +131,14 @@ def test_poses_without_a_frame_are_counted_and_named(world, full):
     assert said.startswith("10 of 12 poses belong to frames") and "no frame for those at 3.9" in said
 
 
+def test_without_truth_and_a_run_of_ours_a_trajectory_stays_in_its_own_world(world, full, tmp_path):
+    moved = ekfslam.Trajectory(full.time_s, WORLD @ full.T_world_imu)
+    ekfslam.write_archive(tmp_path / "a.h5", world, {"full": full})
+    recording = dataclasses.replace(ekfslam.read_archive(tmp_path / "a.h5"), truth=None)
+    found = Others({"mine": moved}).results(recording)["mine"]
+    np.testing.assert_allclose(found.T_world_imu, moved.T_world, atol=1e-9)
+
+
 def test_compare_saves_them_as_runs_that_figures_and_the_page_show(world, files, tmp_path):
     compared = ekfslam.compare(world, ["full"], others={"mine": files / "mine.txt", "gaps": files / "gaps.tum"})
     assert list(compared.results) == ["full", "mine", "gaps"] == list(compared.summary["modes"])
