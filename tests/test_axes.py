@@ -18,6 +18,7 @@ from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.evaluation.trajectory import absolute_trajectory_error
 from ekfslam.models.blocks import TwistBias
 from ekfslam.models.noise import velocity_noise
+from ekfslam.models.odometry import missing_velocities
 from ekfslam.models.vehicle import odometry_text, slow_slip, up_axis, vehicle_std
 from ekfslam.resolve import noise_of, resolve, settings_of, with_odometry
 
@@ -47,6 +48,12 @@ def test_axes_that_agree_share_their_noise_and_another_has_its_own():
     np.testing.assert_allclose(found.axes, std, rtol=0.15)
     assert found.axes[1] == found.axes[2] == found.sigma[0] and found.axes[3] == found.axes[4] == found.sigma[1]
     assert found.texts[0].startswith("v_x 1.")
+
+
+@pytest.mark.parametrize(("odometry", "missing"), [(0.15, ("linear",)), (0.05, ())])
+def test_linear_velocities_of_0_are_missing_if_odometry_exceeds_a_tenth_of_a_metre_a_second(odometry, missing):
+    still = only(world(5), (3, 4, 5))
+    assert missing_velocities(still, np.where(mask((0,)), odometry, 0.0) * np.ones((5, 1))) == missing
 
 
 def test_exact_zeros_do_not_dilute_the_noise_of_the_measured_axes():
