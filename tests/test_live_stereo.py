@@ -17,7 +17,7 @@ from ekfslam.config import Config, FrontEndConfig
 from ekfslam.errors import ClockError, ConfigError, DataError, EmptyTracksError, LateError
 from ekfslam.frontend.track import track
 from ekfslam.geometry import se3
-from ekfslam.live_stereo import Line
+from ekfslam.live_stereo import Learner, Line
 from ekfslam.runner import run
 
 FRAMES = 16
@@ -149,3 +149,23 @@ def test_pairs_beyond_the_queue_displace_the_oldest():
     may_go.set()
     line.stop()
     assert tracked == [0.0, 3.0, 4.0] and line.skipped == 2
+
+
+def test_nothing_waits_after_a_line_has_stopped():
+    line = Line(lambda *_: None, most_pairs=2)
+    line.start()
+    line.offer(None, None, 0.0)
+    line.stop()
+    waiting = threading.Thread(target=line.wait, daemon=True)
+    waiting.start()
+    waiting.join(10)
+    assert not waiting.is_alive()
+
+
+def test_velocities_before_the_first_frames_are_kept_for_them():
+    learner, time_s = Learner(Config(), {}), 0.1 * np.arange(5)
+    for k, t in enumerate(time_s):
+        learner.take("velocity", np.full(6, float(k)), t)
+    twist, samples = learner.recorded(time_s, None)
+    np.testing.assert_allclose(twist[1:], np.arange(1.0, 5.0)[:, None] * np.ones(6), atol=1e-9)
+    assert samples is None
