@@ -5,6 +5,7 @@ The command line turns an `EkfslamError` into one line and exit code 2; any othe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 
@@ -147,7 +148,8 @@ class LateError(EkfslamError):
     def __init__(self, what: str, stamp_s: float, least_s: float | None) -> None:
         self.what, self.stamp_s, self.least_s = what, stamp_s, least_s
         known = "no image has been processed yet" if least_s is None else f"the filter is at {least_s:.6f} s"
-        super().__init__(f"{what} at {stamp_s:.6f} s comes too late: {known}")
+        at = f"{what} at {stamp_s:.6f} s comes too late" if math.isfinite(stamp_s) else f"no {what}"
+        super().__init__(f"{at}: {known}")
 
 
 class ClockError(StampError):

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -258,16 +258,20 @@ def compared_table(folders: Iterable[Path]) -> SweepTable:
     Raises:
         ArchiveError: A summary is missing or damaged.
     """
-    folders, rows = list(folders), []
+    folders, rows, notes = list(folders), [], list[str]()
     names = without_common_ends([folder.name for folder in folders])
     for folder, name in zip(folders, names, strict=True):
         try:
             require_file(folder / "summary.json", is_text=True)
-            modes = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["modes"]
-            rows += [{"recording": name, "mode": mode, **figures} for mode, figures in modes.items()]
+            summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+            rows += [{"recording": name, "mode": mode, **figures} for mode, figures in summary["modes"].items()]
+            for mode, missing in summary.get("without_pose", {}).items():
+                of = f"{missing} of {summary['frames']} frames of {name}"
+                notes.append(f"{mode} has no pose in {of}, and its figures are of the others")
         except (OSError, ValueError, LookupError, TypeError, AttributeError, UnknownFormatError) as error:
             raise ArchiveError(f"{folder / 'summary.json'}: no summary of compare ({error})") from None
-    return SweepTable.of_rows(rows, ("recording", "mode"), len(rows), {"mode": "estimator"})
+    table = SweepTable.of_rows(rows, ("recording", "mode"), len(rows), {"mode": "estimator"})
+    return replace(table, notes=tuple(notes))
 
 
 def details(results: Mapping[str, Result]) -> str:

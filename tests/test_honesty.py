@@ -20,6 +20,7 @@ from ekfslam.figures.check import plot_check
 from ekfslam.filters.result import REASONS, Result, WhitenedInnovations
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import project
+from ekfslam.reports import compare
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior
 
@@ -238,6 +239,17 @@ def test_a_truth_far_from_what_innovations_say_is_doubted():
     (cause,) = truth_causes(far, np.full(6, 1.0))
     assert "20x larger than innovations say" in cause.text and "base_link" in cause.remedy
     assert not [*truth_causes(near, np.ones(6)), *truth_causes(far, np.full(6, 4.0)), *truth_causes(far, None)]
+
+
+def test_the_next_step_of_a_run_with_an_inverted_camera_is_the_camera():
+    true = world(0, frames=30)
+    inverted = dataclasses.replace(true, T_cam_imu=se3.inverse(true.T_cam_imu))
+    compared = compare(inverted, "full")
+    said = compared.brief.partition("next: ")[2]
+    assert "T_cam_imu looks inverted" in said.splitlines()[0] and said.count("T_cam_imu looks inverted") == 2
+    rejected = judge(compared.results["full"])
+    few = dataclasses.replace(rejected, rejected={"gate": 0.3, "moving": 0.2}, causes=(), truth=None)
+    assert few.headline == "too few observations fit the model to judge by them" and few.grade == "bad"
 
 
 @pytest.mark.slow

@@ -309,3 +309,10 @@ def test_samples_given_as_arrays_are_looked_at_too():
             imu=samples,
             T_cam_imu=sequence.T_cam_imu,
         )
+
+
+def test_the_samples_of_a_recording_can_be_left_out():
+    room = "builtin:room?frames=5"
+    sequence = ekfslam.open_sequence(room, imu="none")
+    assert ekfslam.open_sequence(room).inertial is not None
+    assert sequence.inertial is None and sequence.notes[-1] == "The inertial samples of the recording are left out."

@@ -17,6 +17,7 @@ from ekfslam.evaluation.truth import estimated
 from ekfslam.figures.run import draw_figures
 from ekfslam.geometry import se3
 from ekfslam.others import Others
+from ekfslam.reports import compared_table
 from ekfslam.storage.exports import export
 
 WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 0.2, -0.4, 2.0]))
@@ -144,6 +145,9 @@ def test_compare_saves_them_as_runs_that_figures_and_the_page_show(world, files,
     assert list(compared.results) == ["full", "mine", "gaps"] == list(compared.summary["modes"])
     assert "Note on gaps: 24 of 24 poses" in compared.table
     compared.save(tmp_path, figures=False)
+    (note,) = compared_table([tmp_path]).notes
+    assert note.startswith("gaps has no pose in 6 of 30 frames of ")
+    assert note in compared_table([tmp_path]).paper(".tex", ["ate_m"])
     read = ekfslam.read_archive(tmp_path / "archive.h5")
     assert not read.results["gaps"].has_covariance and read.results["mine"].has_covariance
     np.testing.assert_array_equal(estimated(read.results["gaps"], read.truth).frame[:3], [2, 3, 4])

@@ -109,7 +109,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     },
     "--imu": _file(
         "inertial samples from elsewhere: csv of timestamp w_x w_y w_z a_x a_y a_z (ns, rad/s, m/s^2), imu0 of EuRoC, "
-        "or a bag"
+        "or a bag; none leaves out those of the recording"
     ),
     "--imu-noise": _file(
         "sensor.yaml or imu.yaml with the noise densities of inertial samples (default: the one beside them)"

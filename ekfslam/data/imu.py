@@ -68,7 +68,12 @@ def attach_inertial_noise(recording: Recording, path: str | Path) -> Recording:
 
 
 def with_inertial_files(recording: Recording, samples: str | Path | None, noise: str | Path | None) -> Recording:
-    """Return a recording with the samples and the densities of files, if any are given."""
+    """Return a recording with the samples and the densities of files, if any are given; ``none`` leaves its own out."""
+    if str(samples) == "none" and not Path("none").exists():
+        notes = (*recording.notes, "The inertial samples of the recording are left out.")
+        if isinstance(recording, ImageRecording):
+            return replace(recording, inertial=None, notes=notes)
+        return replace(recording, inputs=tuple(x for x in recording.inputs if isinstance(x, Velocities)), notes=notes)
     if samples is not None:
         return attach_inertial(recording, samples, noise)
     return recording if noise is None else attach_inertial_noise(recording, noise)

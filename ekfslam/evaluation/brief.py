@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.honesty import Honesty, judge
+from ekfslam.evaluation.sanity import UNKNOWN, WERE_REJECTED
 from ekfslam.evaluation.tables import MISSING, document, markdown_table, significant
 from ekfslam.evaluation.trajectory import absolute_trajectory_error, align_se3, align_yaw
 from ekfslam.evaluation.truth import estimated
@@ -46,11 +47,18 @@ def verdict_lines(data: Sequence | Archive, result: Result, archive: Any = "ARCH
     if result.whitened is None:
         return []
     found = judge(result, truth=data.truth, interpolated=data.interpolated)
-    return [f"verdict: {found.headline}", f"next: {next_step(found, archive)}"]
+    return [f"verdict: {found.headline}", f"next: {next_step(found, archive, result.remarks)}"]
 
 
-def next_step(found: Honesty, archive: Any) -> str:
-    """Return the remedy of the first cause that has one, with the cause; without any, the command that shows more."""
+def next_step(found: Honesty, archive: Any, remarks: Iterable[str] = ()) -> str:
+    """Return the remedy of the first cause that has one, with the cause; without any, the command that shows more.
+
+    A likely cause among the remarks on a run that most observations contradict takes precedence.
+    """
+    for remark in remarks:
+        likely = remark.partition(WERE_REJECTED)[2]
+        if likely and not likely.endswith(UNKNOWN):
+            return likely
     defects = sorted((*found.causes, *found.findings), key=lambda defect: defect.kind != "body")
     named = next((defect for defect in defects if defect.remedy), defects[0] if defects else None)
     if named is None:
@@ -69,7 +77,8 @@ def brief(data: Sequence | Archive, results: Mapping[str, Result], skipped: Mapp
     remarks: dict[str, list[str]] = {}
     for mode, result in results.items():
         for remark in result.remarks:
-            remarks.setdefault(remark, []).append(mode)
+            if not any(other.endswith(WERE_REJECTED + remark) for other in result.remarks):
+                remarks.setdefault(remark, []).append(mode)
     of = (f" on {', '.join(modes)}" if len(results) > 1 else "" for modes in remarks.values())
     lines += [f"note{modes}: {remark}" for modes, remark in zip(of, remarks, strict=True)]
     return document(brief_table(data, results), "\n".join(lines))

@@ -29,6 +29,7 @@ from ekfslam.evaluation.evidence import (
 from ekfslam.evaluation.systematic import Systematic, grown_by
 from ekfslam.evaluation.tables import number
 from ekfslam.filters.result import Result
+from ekfslam.smoother.posterior import is_inertial
 
 _NOTABLE = 1.3  # factor from which a deviation is reported
 _LEAST_LOW = 1.15  # of the factor, minus three standard errors
@@ -54,6 +55,7 @@ _REMEDY = {
     "direction": "calibrate T_cam_imu, or let [calibration] rotation_deg estimate it",
     "delay": "correct the stamps, or let [calibration] time_s estimate it",
     "shared drift": "use [blocks.twist_bias] for velocities, [blocks.vision_drift] for tracks",
+    "inertial drift": "let [calibration] rotation_deg and time_s estimate T_cam_imu and a time offset",
     "tracks": "leave out [noise] sigma_px, so that the errors of tracks are found",
     "motion": "mask what moves",
     "white": ", or leave out [noise] sigma_px, so that tracks are tested for motion",
@@ -124,10 +126,12 @@ def _shared_causes(result: Result, shared: SharedInnovations, t: float) -> Itera
         where, size = tuple(AXES[a] for a in large), float(factor[large[0]])
         text = f"innovations agree across landmarks in {_axes(where)}"
         if slow.mean() > max(np.log(_LEAST_SLOW), fast.mean()):
-            text += " and persist: a slow error of all tracks or of the velocities"
-            yield Cause("shared drift", where, size, text, _REMEDY["shared drift"])
+            text += f" and persist: a slow error of all tracks or of the {_movers(result)[0]}"
+            remedy = _REMEDY["inertial drift" if is_inertial(result) else "shared drift"]
+            yield Cause("shared drift", where, size, text, remedy)
         else:
-            text += f" in each frame: velocities are up to {size:.1f}x noisier than stated, or all tracks jitter"
+            movers, known = _movers(result)
+            text += f" in each frame: {movers} are up to {size:.1f}x noisier than {known}, or all tracks jitter"
             yield Cause("shared noise", where, size, text, _velocity_remedy(result, large, size))
     size, low = _mean(shared.factor), shared.factor_low / shared.factor
     if (shared.factor < _NOTABLE * low).all() and size < 1.0 / _NOTABLE and measures_velocities(result):
@@ -139,6 +143,13 @@ def _shared_causes(result: Result, shared: SharedInnovations, t: float) -> Itera
         else:
             text += "velocities are better than stated"
             yield Cause("shared noise", AXES, size, text, _velocity_remedy(result, order, size))
+
+
+def _movers(result: Result) -> tuple[str, str]:
+    """Return what moves the poses of a run, and the origin of its noise, in words."""
+    if measures_velocities(result):
+        return "velocities", "found" if _is_found(result) else "stated"
+    return ("inertial samples" if is_inertial(result) else "steps of the motion"), "assumed"
 
 
 def _is_found(result: Result) -> bool:

@@ -26,11 +26,14 @@ from ekfslam.evaluation.evidence import AXES, BLIND, LAGS, POSE_DOF, ROWS, Ratio
 from ekfslam.evaluation.other_body import body_causes
 from ekfslam.evaluation.systematic import Systematic, systematic_errors
 from ekfslam.evaluation.tables import document, markdown_table, number
-from ekfslam.filters.result import Result
+from ekfslam.filters.result import REASONS, Result
+from ekfslam.models.sensors.base import WAITING
 from ekfslam.smoother.posterior import Posterior
 from ekfslam.storage.archive import Archive
 
 _NOTABLE, _BAD = 1.3, 2.0  # factors
+_MOSTLY = 0.4  # share of rejected observations from which the others are no evidence
+_FEW_FIT = "too few observations fit the model to judge by them"
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,11 @@ class Honesty:
         return self.nis is not None or self.truth is not None
 
     @property
+    def is_mostly_rejected(self) -> bool:
+        """Whether so many observations are rejected that the others are no evidence."""
+        return sum(share for name, share in self.rejected.items() if name != REASONS[WAITING]) > _MOSTLY
+
+    @property
     def headline(self) -> str:
         """The verdict in one clause, without its reasons."""
         if not self.is_judged:
@@ -87,6 +95,8 @@ class Honesty:
             usual = f"{self.truth.low:.1f} to {self.truth.high:.1f} in 95 % of drives"
             nees = f"pose NEES {self.truth.nees:.3g}; {usual}"
         if not self.causes:
+            if true == 1.0 and self.is_mostly_rejected:
+                return f"{_FEW_FIT} ({nees})"
             if true == 1.0:
                 known = "the truth of one drive" if self.nis is None else f"{by} and the truth of one drive"
                 return f"consistent as far as {known} can tell ({nees})"
@@ -115,7 +125,7 @@ class Honesty:
             return "none"
         by_nis = (cause.factor for cause in self.causes if cause.kind == "nis")
         known = [f for f in (self.factor, self.true_factor, *by_nis) if not np.isnan(f)]
-        if any(not 1 / _BAD < f < _BAD for f in known) or (self.causes and not known):
+        if any(not 1 / _BAD < f < _BAD for f in known) or (self.causes and not known) or self.is_mostly_rejected:
             return "bad"
         return "fair" if self.causes or self.findings or any(f != 1.0 for f in known) else "good"
 
@@ -187,7 +197,7 @@ class Honesty:
 
     def _by_innovations(self, by: str) -> str:
         if not self.causes:
-            return f"consistent as far as {by} can tell"
+            return _FEW_FIT if self.is_mostly_rejected else f"consistent as far as {by} can tell"
         if self.shared is None:
             return "innovations do not fit their covariance"
         if self.factors is None:

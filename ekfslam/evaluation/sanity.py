@@ -40,6 +40,8 @@ _SURE = 4.0
 _OTHER_WAY = 0.3  # relative difference of motions from which the truth is another one
 _SAME_LENGTH = 0.1
 _REJECTED = 0.4
+WERE_REJECTED = " were rejected: "  # in the warning about a run, before the likely cause
+UNKNOWN = "do not fit each other"  # its end without a likely cause
 _MOVING = 0.2  # share of the observations; hardly ever traffic
 _OFF_TRUTH = 0.1  # ATE as a share of the path from which the truth is another one
 
@@ -126,12 +128,12 @@ def inspect_result(sequence: Sequence, result: Result, warnings: tuple[str, ...]
     if rejected > _REJECTED * max(accepted + rejected, 1):
         parts = "tracks, velocities, stamps and T_cam_imu" if sequence.has_velocities else "the tracks"
         stated = "the stated noise is too small, or " if result.config["noise"]["sigma_px"] is not None else ""
-        cause = warnings[0] if warnings else f"{stated}{parts} do not fit each other"
-        return (f"{rejected / (accepted + rejected):.0%} of the observations were rejected: {cause}",)
+        cause = warnings[0] if warnings else f"{stated}{parts} {UNKNOWN}"
+        return (f"{rejected / (accepted + rejected):.0%} of the observations{WERE_REJECTED}{cause}",)
     doubted = result.counts.get("rejected: velocities", 0) / len(sequence)
     if doubted > _REJECTED:
-        cause = warnings[0] if warnings else "tracks, velocities, stamps and T_cam_imu do not fit each other"
-        return (f"{doubted:.0%} of the velocities were rejected: {cause}",)
+        cause = warnings[0] if warnings else f"tracks, velocities, stamps and T_cam_imu {UNKNOWN}"
+        return (f"{doubted:.0%} of the velocities{WERE_REJECTED}{cause}",)
     moving = result.counts.get("rejected: moving", 0) / max(accepted + rejected, 1)
     if moving > _MOVING:
         cause = "traffic, or errors of tracks or velocities that are larger or of another kind than assumed"

@@ -11,7 +11,7 @@ from ekfslam.data.sequence import Sequence, Truth
 from ekfslam.evaluation.metrics import METRICS, Value, computed, offered
 from ekfslam.evaluation.tables import document, markdown_table, number, significant
 from ekfslam.evaluation.trajectory import Part, absolute_trajectory_error, error_parts
-from ekfslam.evaluation.truth import estimated
+from ekfslam.evaluation.truth import estimated, without_pose
 from ekfslam.filters.result import Result
 from ekfslam.storage.archive import Archive
 
@@ -33,9 +33,12 @@ def summarise(sequence: Sequence | Archive, result: Result) -> dict[str, Value]:
 def summarise_all(sequence: Sequence | Archive, landmarks: int | None, results: Mapping[str, Result]) -> dict[str, Any]:
     """Return the summaries of all modes of a recording, and words on their trajectory errors, ready for JSON."""
     said = {mode: error_in_words(result, sequence.truth) for mode, result in results.items()}
+    frames = len(sequence.time_s)
+    missing = {mode: int(without_pose(result).sum()) for mode, result in results.items()}
     return {
         "sequence": sequence.name,
-        "frames": len(sequence.time_s),
+        "frames": frames,
+        "without_pose": {mode: count for mode, count in missing.items() if count},
         "landmarks": landmarks,
         "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
         "errors": {mode: words for mode, words in said.items() if words},

@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
+
+from ekfslam.arrays import BoolArray
 from ekfslam.config import TruthConfig
 from ekfslam.data.interpolation import stretches_of
 from ekfslam.data.observations import TrueMotion, Truth
@@ -33,10 +36,16 @@ def with_truth_noise(sequence: Sequence, settings: TruthConfig) -> Sequence:
     return dataclasses.replace(sequence, truth=dataclasses.replace(sequence.truth, noise=noise))
 
 
-def estimated(result: Result, truth: Truth) -> Truth:
-    """Return the true poses of frames that have an estimate: all, but for the gaps of another program."""
+def without_pose(result: Result) -> BoolArray:
+    """Return the frames (T,) without an estimate: none, but for the gaps of another program."""
     missing = stretches_of(str(result.attributes.get(OTHER_MISSING, "")), len(result.time_s))
-    if missing is None or not missing[truth.frame].any():
+    return np.zeros(len(result.time_s), dtype=bool) if missing is None else missing
+
+
+def estimated(result: Result, truth: Truth) -> Truth:
+    """Return the true poses of frames that have an estimate."""
+    missing = without_pose(result)
+    if not missing[truth.frame].any():
         return truth
     kept = ~missing[truth.frame]
     motion = truth.motion and TrueMotion(*(value[kept] for value in vars(truth.motion).values()))

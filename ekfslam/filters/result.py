@@ -186,7 +186,7 @@ class Parameters:
         """One line a parameter: the last estimate, its standard deviation, and whether it is observed."""
         rows = zip(self.name, self.unit, self.prior_std, self.value[-1], self.std[-1], self.is_observed, strict=True)
         return tuple(
-            f"{name}: {value:.3g} +- {std:.2g} {unit} (before: 0 +- {prior:.2g})"
+            f"{name}: {value:.3g} +- {std:.2g}{f' {unit}' * (unit != '1')} (before: 0 +- {prior:.2g})"
             + ("" if is_observed else ", not observable here")
             for name, unit, prior, value, std, is_observed in rows
         )

@@ -42,7 +42,8 @@ def open_sequence(
         lateral: Sign of the lateral velocity of KITTI (.npz, .mat, folder), see `with_lateral`; else ``corrected``.
         truth: File or folder of true poses to use in place of the recording's own, see `attach_truth`.
         velocities, velocity_frame: File or recording with other velocities, their frame, see `attach_velocities`.
-        imu, imu_noise: Files of inertial samples and of their noise densities, see `attach_inertial`.
+        imu, imu_noise: Files of inertial samples and of their noise densities, see `attach_inertial`. ``imu="none"``
+            leaves out the samples of the recording.
         topics: Topics of a bag: images of a pair or one camera, velocities, samples. Others are chosen automatically.
         calibration: Calibration of the pair in place of the recording's own, see `read_pair`.
         camera: ``left`` takes the left camera of a stereo recording alone.

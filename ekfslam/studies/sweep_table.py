@@ -61,6 +61,7 @@ class SweepTable:
     swept: tuple[str, ...]  # names of the columns that distinguish the runs
     asked: int  # number of runs of the complete sweep
     headings: Mapping[str, str] = field(default_factory=dict)  # of columns that are neither metrics nor settings
+    notes: tuple[str, ...] = ()  # below the table of a paper
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
@@ -180,7 +181,7 @@ class SweepTable:
             grid = grid.above(self.means(figures, _DRAWS), "mean")
         tests, said = self.tests(figures)
         further = said if tests is None else [markdown_text(tests)]
-        return replace(grid, notes=[in_words(provenance()), *grid.notes, *further]).text(ending)
+        return replace(grid, notes=[in_words(provenance()), *grid.notes, *self.notes, *further]).text(ending)
 
     def _is_repeated(self, name: str) -> bool:
         return name in self.told and len(set(self.column(name).tolist())) > 1
