@@ -15,6 +15,7 @@ from ekfslam.errors import ConfigError, ShapeError, TruthError, UnknownFormatErr
 from ekfslam.evaluation.summary import summarise
 from ekfslam.evaluation.truth import estimated
 from ekfslam.figures.run import draw_figures
+from ekfslam.figures.series import height, height_of
 from ekfslam.geometry import se3
 from ekfslam.others import Others
 from ekfslam.reports import compared_table
@@ -154,6 +155,13 @@ def test_compare_saves_them_as_runs_that_figures_and_the_page_show(world, files,
     assert {"map", "errors", "side"} <= draw_figures(read.results, read.truth, read.interpolated).keys()
     read.results["gaps"].export(tmp_path / "again.txt", "tum")
     assert not (tmp_path / "again.cov.txt").exists()
+
+
+def test_the_height_of_a_trajectory_that_begins_late_begins_at_the_true_distance(world, full, files):
+    gaps = Others({"gaps": files / "gaps.tum"}, world="given").results(world, full)["gaps"]
+    late, true = height_of(gaps, world.truth, has_band=True), height(world.truth.T_world_imu)
+    assert len(late.x) == FRAMES - 2 and late.x[0] == pytest.approx(true.x[2])
+    assert len(height_of(full, world.truth, has_band=True).x) == FRAMES
 
 
 def test_the_report_page_takes_a_trajectory_by_name(world, full, files, tmp_path):

@@ -15,7 +15,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.trajectory import distance_along
 from ekfslam.figures import registry
-from ekfslam.figures.series import BAND_SIGMAS, draw_series, height
+from ekfslam.figures.series import BAND_SIGMAS, draw_series, height, height_of
 from ekfslam.figures.style import FIRST_LANDMARK_COLOR, LANDMARK_COLOR, TRUTH, arrange, legend_of, line_of, style_of
 from ekfslam.filters.result import Result
 from ekfslam.geometry.motion import world_axes_covariance
@@ -101,7 +101,7 @@ def plot_side(results: Mapping[str, Result], truth: Truth | None = None) -> Figu
         heights.append(truth.T_world_imu[:, 2, 3])
     for mode, result in results.items():
         line = line_of(mode)
-        one = height(result.T_world_imu, result.covariance if result.has_covariance else None)
+        one = height_of(result, truth, has_band=True)
         draw_series(ax, one, line["color"], {**line, "zorder": 3}, label=mode)
         if result is mapper and one.low is not None and one.high is not None:
             heights += [one.low, one.high]

@@ -180,7 +180,7 @@ def _side(results: Mapping[str, Result], truth: Truth | None, width: float) -> D
     if truth is not None and len(truth.frame):
         draw_series(ax, series.height(truth.T_world_imu), "", {**TRUTH, "linewidth": 1.8}, label="truth")
     for i, (name, result) in enumerate(different(results).items()):
-        one = series.height(result.T_world_imu, result.covariance if result.has_covariance else None)
+        one = series.height_of(result, truth, has_band=True)
         line = {key: value for key, value in _marked(name, result.mode, len(one.x), i).items() if key != "label"}
         draw_series(ax, one, style_of(result.mode)["color"], line, label=name)
     ax.set_ylabel("z [m]")

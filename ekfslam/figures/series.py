@@ -13,7 +13,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.consistency import chi2_bounds, measured_truth, pose_nees, world_axes_errors, world_axes_std
 from ekfslam.evaluation.trajectory import align_se3, distance_along
-from ekfslam.evaluation.truth import estimated
+from ekfslam.evaluation.truth import estimated, without_pose
 from ekfslam.figures.style import BAND_ALPHA, BOUNDS, EXPECTED, Style, log_axis
 from ekfslam.filters.inertial_states import FIELDS, UNITS
 from ekfslam.filters.result import Result
@@ -204,6 +204,18 @@ def height(T_world_imu: Array, covariance: Array | None = None) -> Series:
         return Series("z", "m", x, z, x_unit="m")
     bound = BAND_SIGMAS * world_axes_std(T_world_imu, covariance)[:, 2]
     return Series("z", "m", x, z, z - bound, z + bound, x_unit="m")
+
+
+def height_of(result: Result, truth: Truth | None, has_band: bool) -> Series:
+    """Return `height` of a result. The first pose of one that begins late is at the true distance there."""
+    one = height(result.T_world_imu, result.covariance if has_band and result.has_covariance else None)
+    first = int(np.argmin(without_pose(result)))
+    if not first:
+        return one
+    one = one.only(np.arange(first, len(one.x)))
+    is_known = truth is not None and len(truth.frame) > 0
+    at_m = np.interp(first, truth.frame, distance_along(truth.T_world_imu)) if is_known else 0.0  # type: ignore[union-attr]
+    return dataclasses.replace(one, x=one.x - one.x[0] + at_m)
 
 
 def trajectory(result: Result, truth: Truth | None = None) -> list[tuple[Series, Series | None]]:

@@ -151,7 +151,7 @@ def _compared(section: Section) -> list[dict[str, Any]]:
     best = next((j for j, run in shown if run.result.mode == "full"), shown[0][0])
     heights: list[Curve] = [] if truth is None else [(series.height(truth.T_world_imu), "truth", "truth", None, None)]
     for j, run in shown:
-        one = series.height(run.result.T_world_imu, run.result.covariance if j == best else None)
+        one = series.height_of(run.result, truth, has_band=j == best)
         heights.append((one, run.label, "", j, j))
     words = f"z in m over metres driven; band: {series.BAND_SIGMAS:g} sigma of {section.runs[best].label}"
     plots = [_plot("Height profile", words, heights)]
