@@ -9,6 +9,7 @@ from support.running import WHOLE
 from ekfslam import Config, open_sequence, run
 from ekfslam.evaluation.summary import summarise
 from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.resolve import settings_of
 
@@ -49,12 +50,8 @@ def test_state_stays_as_small_as_the_view():
     sequence = open_sequence("builtin:city?frames=300")
     config = settings_of(sequence, Config()).filter
     ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, sequence.noise), config, sequence.initial_T_world_imu)
-    for k in range(len(sequence)):
-        if k:
-            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
-        ids, pixels = sequence.observations.at(k)
-        ekf.update(k, ids, pixels)
-        assert set(ekf.ids.tolist()) <= set(ids.tolist())
+    for k, *_ in run_filter(ekf, sequence):
+        assert set(ekf.ids.tolist()) <= set(sequence.observations.at(k)[0].tolist())
     assert len(ekf.landmarks()) > 4 * len(ekf.ids)
 
 

@@ -16,6 +16,7 @@ from ekfslam.data.simulate import builtin
 from ekfslam.errors import ConfigError
 from ekfslam.filters.coordinates import CameraCoordinates, change_in_view, image, image_jacobian, points_in
 from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
 from ekfslam.filters.observing import look, observe
 from ekfslam.filters.retraction import carried_back, retracted
 from ekfslam.filters.variants import VARIANTS
@@ -167,10 +168,8 @@ def test_rows_are_carried_back_by_the_chain_rule(variant, coordinates):
     rig, is_all = Rig(world.camera, world.T_cam_imu, noise), variant == "invariant"
     blocks, calibration = ((CameraJitter(), VisionDrift()), CAMERAS["rotation free"]) if is_all else ((), None)
     ekf = JointEKF(rig, config, world.initial_T_world_imu, P0, calibration, blocks=blocks)
-    for k in range(4):
-        if k:
-            ekf.predict(world.twist[k], 0.1)
-        ekf.update(k, *world.observations.at(k))
+    for _ in run_filter(ekf, world, range(4)):
+        pass
     ekf.predict(world.twist[4], 0.1)
     ids, pixels = world.observations.at(4)
     slot, is_known = ekf.table.lookup(ids)
@@ -274,11 +273,7 @@ def test_what_is_seen_does_not_depend_on_the_prior_of_the_gauge(variant, iterati
     config = dataclasses.replace(OPEN, variant=variant, iterations=iterations)
     found = []
     for scale in (1e-4, 1.0):
-        ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu, scale * P0)
-        for k in range(len(world)):
-            if k:
-                ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
-            ekf.update(k, *world.observations.at(k))
+        ekf = drive(world, config, scale * P0)
         found.append(se3.apply(ekf.T_imu_world, ekf.positions_m))
     assert len(found[0]) >= 10
     difference = np.abs(found[0] - found[1]).max() / np.abs(found[0]).max()

@@ -5,17 +5,18 @@ import dataclasses
 import numpy as np
 import pytest
 from support.jacobians import measurement_jacobian
-from support.reference import report_mapping, run_naive, small_world
+from support.literal import Literal, filter_of, side_by_side
+from support.reference import report_mapping, small_world
 
 from ekfslam.config import Config, FilterConfig, HygieneConfig, NoiseConfig
 from ekfslam.data.sequence import Observations
 from ekfslam.errors import ConfigError, InnovationError
 from ekfslam.filters.dead_reckoning import dead_reckon
 from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import se3
 from ekfslam.models.sensors.stereo import Rig
-from ekfslam.resolve import noise_of
 from ekfslam.runner import run
 
 OPEN = FilterConfig(landmark_coordinates="xyz", gate_probability=1.0, split_after=0)
@@ -27,19 +28,6 @@ def settings(**changes):
     return Config(filter=dataclasses.replace(OPEN, **changes))
 
 
-def drive(sequence, config, P0=None):
-    """`JointEKF` over a sequence with any initial covariance; poses after each frame and the filter."""
-    rig = Rig(sequence.camera, sequence.T_cam_imu, noise_of(sequence, config))
-    ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu, P0)
-    poses = []
-    for k in range(len(sequence)):
-        if k > 0:
-            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
-        ekf.update(k, *sequence.observations.at(k))
-        poses.append(ekf.T_imu_world)
-    return np.array(poses), ekf
-
-
 @pytest.fixture(scope="module")
 def world():
     return small_world()
@@ -47,25 +35,18 @@ def world():
 
 @pytest.mark.parametrize("variant", ["standard", "invariant"])
 @pytest.mark.parametrize("prior", [np.zeros((6, 6)), P0], ids=["certain start", "uncertain start"])
-def test_joint_filter_equals_the_naive_dense_one(world, variant, prior):
-    """60 frames; for ``invariant`` the naive one is the textbook form with process noise in every landmark."""
-    expected_poses, naive = run_naive(world, variant, prior)
-    found_poses, ekf = drive(world, settings(variant=variant, retire="never"), prior)
-    np.testing.assert_allclose(found_poses, expected_poses, atol=1e-9)
-    at = [naive.ids.index(i) for i in ekf.ids.tolist()]
-    np.testing.assert_allclose(ekf.positions_m, np.array(naive.m)[at], atol=1e-9)
-    columns = np.concatenate([np.arange(6), *(6 + 3 * i + np.arange(3) for i in at)])
-    np.testing.assert_allclose(ekf.P, naive.stored_covariance()[np.ix_(columns, columns)], atol=1e-9)
-    np.testing.assert_array_equal(ekf.P, ekf.P.T)
+def test_joint_filter_equals_the_literal_one(world, variant, prior):
+    ekf = filter_of(world, settings(variant=variant, retire="never").filter, P=prior)
+    side_by_side(ekf, Literal(world, variant, P=prior), world, 1e-9, frames=30)
     # The comparison means something only if vision moved the pose and landmarks share information.
-    assert np.abs(found_poses - dead_reckon(world, world.noise, prior)[0]).max() > 0.1
+    assert np.abs(ekf.T_imu_world - dead_reckon(world, world.noise, prior)[0][29]).max() > 0.1
     assert np.abs(ekf.P[6:9, 9:]).max() > 1e-6
 
 
 def test_the_variants_differ(world):
-    standard, _ = drive(world, settings(variant="standard"), P0)
-    invariant, _ = drive(world, settings(variant="invariant"), P0)
-    assert np.abs(standard - invariant).max() > 1e-4
+    one, two = (filter_of(world, settings(variant=variant).filter, P=P0) for variant in ("standard", "invariant"))
+    poses = [[ekf.T_imu_world for _ in run_filter(ekf, world)] for ekf in (one, two)]
+    assert np.abs(np.subtract(*poses)).max() > 1e-4
 
 
 def test_mapping_only_equals_the_report_s_loop_over_landmarks(world):
@@ -157,10 +138,8 @@ def test_conditional_gate_equals_leaving_each_landmark_out(variant):
     ekf, free = (JointEKF(rig, f, world.initial_T_world_imu) for f in (config.filter, settings(variant=variant).filter))
     for filter_ in (ekf, free):
         filter_.P = P0.copy()
-        for k in range(6):
-            if k > 0:
-                filter_.predict(world.twist[k], tau[k])
-            filter_.update(k, *world.observations.at(k))
+        for _ in run_filter(filter_, world, range(6)):
+            pass
     np.testing.assert_array_equal(ekf.P, free.P)  # nothing was rejected so far
     for filter_ in (ekf, free):
         filter_.predict(world.twist[6], tau[6])

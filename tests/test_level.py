@@ -22,7 +22,6 @@ from support.literal import (
     Z,
     difference,
     filter_of,
-    gauge_information,
     gravity,
     in_imu,
     in_level_frame,
@@ -30,6 +29,7 @@ from support.literal import (
     moved,
     recorded,
     rotated,
+    side_by_side,
     stencil,
     with_noise,
 )
@@ -177,71 +177,14 @@ def test_filter_of_everything_equals_the_literal_one(case):
     std = np.array([0.1] * 3 + [np.deg2rad(0.5)] * 3 + [0.02, 0.5, 0.02])
     free = np.arange(9) if calibration is EVERYTHING else np.array([3, 4, 5, 7, 8])
     literal = Literal(world, variant, free, std[free], TILTED @ Z, bias, coordinates == "image")
-    rng = np.random.default_rng(3)
-    follow = again = 0
     # Differences of images near the rim of what counts by its image are good for fewer digits.
     accuracy = 1e-9 if coordinates == "xyz" else 2e-8
-    for k in range(len(world)):
-        if k:
-            tau = world.time_s[k] - world.time_s[k - 1]
-            ekf.predict(world.twist[k], tau)
-            literal.predict(world.twist[k], tau)
-        else:
-            ekf.begin(world.twist[0])
-            literal.begin(world.twist[0])
-        ids, pixels = world.observations.at(k)
-        # Of what is there some are left out, the first among them, and the others come in any order.
-        some = rng.permutation(len(ids))[: max(3, len(ids) - 2)]
-        if k > 1:
-            some = some[ids[some] != literal.ids[0]]
-        last = [literal.last[i] for i in ids[some].tolist() if i in literal.ids]
-        follow, again = follow + last.count(k - 1), again + sum(seen < k - 1 for seen in last)
-        ekf.update(k, ids[some], pixels[some])
-        literal.update(ids[some], pixels[some])
-        assert literal.ids == ekf.ids.tolist()
-        for ours, theirs in (
-            (ekf.T_imu_world, literal.T),
-            (ekf.values["calibration"], literal.c),
-            (ekf.values["up"], literal.W @ Z),
-            (ekf.positions_m, literal.m),
-            (ekf.P, literal.P),
-        ):
-            np.testing.assert_allclose(ours, theirs, rtol=accuracy, atol=accuracy)
-        np.testing.assert_array_equal(ekf.P, ekf.P.T)
-        if bias is not None:
-            np.testing.assert_allclose(ekf.values["twist_bias"], literal.b, atol=accuracy)
-        if walks and k:
-            np.testing.assert_allclose(ekf.values["twist"], literal.twist, atol=accuracy)
-        if literal.has_views and k:
-            for name, value in (("view", literal.view), ("previous_view", literal.before)):
-                np.testing.assert_allclose(ekf.values[name], value, rtol=accuracy, atol=accuracy)
+    follow, again = side_by_side(ekf, literal, world, accuracy, shuffle=True)
     assert len(ekf.ids) > 6
     assert follow > 20 and again > 5
     assert (literal.by_position > 0) == (coordinates == "image")
     assert (np.abs(ekf.values["calibration"][free]) > 1e-6).all()
     assert not np.delete(ekf.values["calibration"], free).any()
-
-
-@pytest.mark.parametrize("tracks", [TRACKS, {}], ids=["tracks", "white"])
-@pytest.mark.parametrize("coordinates", ["xyz", "image"])
-@pytest.mark.parametrize("variant", ["invariant", "fej", "standard"])
-def test_information_about_the_gauge_with_up_and_calibration(variant, coordinates, tracks):
-    """Velocities taken as exact: not the least is gained or lost, but by the standard variant."""
-    world = in_level_frame(
-        small_world(seed=4, frames=60 if WHOLE else 30), TILTED, twist_std=np.zeros(6), tilt_rad=0.05, **tracks
-    )
-    config = dataclasses.replace(OPEN, variant=variant, landmark_coordinates=coordinates)
-    ekf = filter_of(world, config, EVERYTHING, up=TILTED @ Z)
-    prior = gauge_information(ekf)
-    for k in range(len(world)):
-        if k:
-            ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
-        ekf.update(k, *world.observations.at(k))
-    ratio = np.linalg.eigvals(np.linalg.solve(prior, gauge_information(ekf))).real
-    if variant == "standard":
-        assert ratio.max() > 10
-    else:
-        np.testing.assert_allclose(ratio, 1.0, atol=1e-6)
 
 
 DRIVE = "city?frames=120&outlier_fraction=0&max_tracks=6&sigma_v_m_s=0.02&sigma_w_rad_s=0.001&seed={}"

@@ -7,7 +7,8 @@ import pytest
 from support.gauge import gauge_directions
 from support.helpers import grown, run_joint, tracked
 from support.jacobians import central, measurement_jacobian, transition_jacobian
-from support.reference import D, circle_dot, homogeneous, jacobian_of_pi, small_world, stereo_matrix
+from support.literal import Literal, filter_of, side_by_side
+from support.reference import small_world
 from support.running import WHOLE, seeds
 
 from ekfslam import open_sequence
@@ -210,104 +211,6 @@ def test_twist_jacobian_against_central_differences():
     np.testing.assert_allclose(-motion.twist_jacobian(twist, tau), numeric, atol=1e-8)
 
 
-class NaiveTwistFilter:
-    """The standard variant with pose, pose before, velocities and landmarks, errors of whose tracks walk.
-
-    Written out with four pixels, full matrices and explicit inverses.
-    """
-
-    def __init__(self, sequence):
-        self.sequence, self.noise, self.u = sequence, sequence.noise, None
-        self.T, self.T_before = np.linalg.inv(sequence.initial_T_world_imu), np.eye(4)
-        self.P = np.zeros((18, 18))
-        self.P[:6, :6] = P0
-        self.m, self.ids, self.first, self.last, self.pixels, self.k = np.empty((0, 3)), [], {}, {}, {}, 0
-
-    def predict(self, measured, tau):
-        n, self.way = 3 * len(self.m), np.linalg.norm(measured[:3]) * tau
-        if self.u is None:
-            self.u = measured.copy()
-            assert not self.P[12:18].any()
-            self.P[12:18, 12:18] = np.diag(self.noise.twist_std**2)
-        else:
-            H = np.zeros((6, 18 + n))
-            H[:, 12:18] = np.eye(6)
-            self.P[12:18, 12:18] += np.diag(self.noise.twist_walk_std**2)
-            self.condition(H, measured - self.u, np.diag(self.noise.twist_std**2))
-        E = motion.increment(self.u, tau)
-        F = np.eye(18 + n)
-        F[:6, :6], F[:6, 12:18] = se3.adjoint(E), -motion.twist_jacobian(self.u, tau)
-        F[6:12, 6:12], F[6:12, :6] = 0.0, np.eye(6)
-        self.P = F @ self.P @ F.T
-        self.P[:6, :6] += motion.process_noise(self.u, tau, self.noise.motion_std)
-        self.T, self.T_before, self.k = E @ self.T, self.T, self.k + 1
-
-    def condition(self, H, residual, V):
-        K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + V)
-        x = K @ residual
-        self.P = self.P - K @ H @ self.P
-        self.T, self.T_before = se3.exp(x[:6]) @ self.T, se3.exp(x[6:12]) @ self.T_before
-        if self.u is not None:
-            self.u = self.u + x[12:18]
-        self.m = self.m + x[18:].reshape(-1, 3)
-
-    def seen(self, T, m):
-        """Rows (u, v, disparity) of a landmark, by pose and by landmark."""
-        # Of four pixels with equal noise: the left column, the mean row, the difference of the columns.
-        B = np.array([[1, 0, 0, 0], [0, 0.5, 0, 0.5], [1, 0, -1, 0]])
-        M, oTi = B @ stereo_matrix(self.sequence.camera), self.sequence.T_cam_imu
-        q = oTi @ T @ homogeneous(m)
-        by_point = M @ jacobian_of_pi(q) @ oTi
-        return M @ (q / q[2]), by_point @ circle_dot(T @ homogeneous(m)), by_point @ T @ D
-
-    def update(self, ids, pixels):
-        tracks, H, residual, variance = self.noise, [], [], []
-        rows = np.column_stack([pixels[:, 0], pixels[:, [1, 3]].mean(axis=1), pixels[:, 0] - pixels[:, 2]])
-        for i, z in zip(ids.tolist(), rows, strict=True):
-            if i not in self.ids:
-                continue
-            at = 18 + 3 * self.ids.index(i)
-            row, m = np.zeros((3, len(self.P))), self.m[self.ids.index(i)]
-            h, row[:, :6], row[:, at : at + 3] = self.seen(self.T, m)
-            residual.append(z - h)
-            if self.last[i] == self.k - 1:
-                before, by_pose, by_landmark = self.seen(self.T_before, m)
-                residual[-1] = residual[-1] - (self.pixels[i] - before)
-                row[:, 6:12] -= by_pose
-                row[:, at : at + 3] -= by_landmark
-                depth = (self.sequence.T_cam_imu @ self.T @ homogeneous(m))[2]
-                growth = (
-                    grown(z - self.pixels[i], tracks.track_flow_px) + (self.way / depth / tracks.track_parallax) ** 2
-                )
-                variance.append(tracks.track_walk_px**2 * growth)
-            else:
-                variance.append(tracks.track_first_px**2)
-                for _ in range(self.k - self.first[i]):
-                    variance[-1] = variance[-1] + tracks.track_walk_px**2
-            H.append(row)
-        if H:
-            self.condition(np.vstack(H), np.concatenate(residual), np.diag(np.concatenate(variance)))
-        for i, z in zip(ids.tolist(), rows, strict=True):
-            if i not in self.ids:
-                self.start(i, z)
-            self.last[i], self.pixels[i] = self.k, z
-
-    def start(self, i, z):
-        camera, n = self.sequence.camera, len(self.P)
-        depth = camera.fu_px * camera.baseline_m / z[2]
-        x, y = (z[0] - camera.cu_px) / camera.fu_px, (z[1] - camera.cv_px) / camera.fv_px
-        m = (np.linalg.inv(self.sequence.T_cam_imu @ self.T) @ np.array([x * depth, y * depth, depth, 1.0]))[:3]
-        h, by_pose, by_landmark = self.seen(self.T, m)
-        np.testing.assert_allclose(h, z, rtol=1e-12)
-        back = np.linalg.inv(by_landmark)
-        wide = np.vstack([np.eye(n), np.hstack([-back @ by_pose, np.zeros((3, n - 6))])])
-        self.P = wide @ self.P @ wide.T
-        self.P[n:, n:] += back @ np.diag(self.noise.track_first_px**2) @ back.T
-        self.m = np.vstack([self.m, m])
-        self.ids.append(i)
-        self.first[i] = self.k
-
-
 def with_gaps(world, share=0.1):
     """The world with a share of its observations missing, so that tracks come back after some frames."""
     observations = world.observations
@@ -316,44 +219,14 @@ def with_gaps(world, share=0.1):
     return dataclasses.replace(world, observations=Observations(*(part[kept] for part in parts)))
 
 
-def test_filter_with_velocities_and_errors_of_tracks_equals_the_naive_one():
-    world = with_noise(
-        with_gaps(small_world()),
-        twist_walk_std=WALK,
-        motion_std=np.full(6, 0.01),
-        **TRACKS,
-    )
-    config = dataclasses.replace(STILL, variant="standard", retire="never")
-    ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu, P0)
-    naive = NaiveTwistFilter(world)
-    for k in range(15):
-        if k:
-            tau = world.time_s[k] - world.time_s[k - 1]
-            ekf.predict(world.twist[k], tau)
-            naive.predict(world.twist[k], tau)
-            assert_same_state(ekf, naive)
-        ids, pixels = world.observations.at(k)
-        ekf.update(k, ids, pixels)
-        naive.update(ids, pixels)
-        assert_same_state(ekf, naive)
-    log = ekf.log()
-    assert 10 < len(naive.m) < (log.previous < 0).sum() - 5
-    assert (log.previous >= 0).sum() > 50
-
-
-def assert_same_state(ekf, naive):
-    E = np.insert(np.eye(len(naive.P)), [6] * 6, 0.0, axis=0)  # the view is the pose in the camera frame
-    E[6:12, :6] = E[12:18, 6:12] = se3.adjoint(ekf.sensor.T_cam_imu)
-    np.testing.assert_allclose(ekf.P, E @ naive.P @ E.T, atol=1e-10)
-    np.testing.assert_array_equal(ekf.P, ekf.P.T)
-    assert ekf.ids.tolist() == naive.ids
-    np.testing.assert_allclose(ekf.positions_m, naive.m, atol=1e-10)
-    np.testing.assert_allclose(ekf.T_imu_world, naive.T, atol=1e-11)
-    if naive.k:
-        C = ekf.sensor.T_cam_imu
-        np.testing.assert_allclose(ekf.values["previous_view"], C @ naive.T_before, atol=1e-11)
-    if naive.u is not None:
-        np.testing.assert_allclose(ekf.values["twist"], naive.u, atol=1e-11)
+@pytest.mark.parametrize("variant", ["standard", "invariant"])
+def test_filter_with_velocities_and_errors_of_tracks_equals_the_literal_one(variant):
+    world = with_noise(with_gaps(small_world()), twist_walk_std=WALK, motion_std=np.full(6, 0.01), **TRACKS)
+    ekf = filter_of(world, dataclasses.replace(STILL, variant=variant, retire="never"), P=P0)
+    literal = Literal(world, variant, P=P0)
+    follow, again = side_by_side(ekf, literal, world, 1e-9, frames=15)
+    assert len(ekf.ids) > 10
+    assert follow > 50 and again > 5
 
 
 @pytest.mark.parametrize("tracks", [{}, TRACKS], ids=["white", "tracks"])
@@ -363,10 +236,8 @@ def test_transition_and_measurement_jacobians_know_of_the_velocities(tracks):
         dataclasses.replace(STILL, engine="reference"),
     )
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu, P0)
-    for k in range(3):
-        if k:
-            ekf.predict(world.twist[k], 0.1)
-        ekf.update(k, *world.observations.at(k))
+    for _ in run_filter(ekf, world, range(3)):
+        pass
     at = ekf.model.layout["twist"]
     F = transition_jacobian(ekf, Interval.of_one(ekf.values["twist"], 0.1)).toarray()
     np.testing.assert_allclose(F[:6, at], -motion.twist_jacobian(ekf.values["twist"], 0.1))
@@ -436,10 +307,7 @@ def test_no_information_about_the_gauge_comes_with_velocities_and_errors_of_trac
     config = dataclasses.replace(STILL, variant=variant)
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu, P0)
     prior = se3.adjoint(ekf.T_imu_world).T @ np.linalg.solve(P0, se3.adjoint(ekf.T_imu_world))
-    for k in range(len(world)):
-        if k:
-            ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
-        ekf.update(k, *world.observations.at(k))
+    for k, *_ in run_filter(ekf, world):
         if k == 0:
             continue  # nothing is known of the velocities, and P is singular
         view = ekf.model.layout["view"]  # a function of the pose, so that P is singular
@@ -478,10 +346,7 @@ def test_moving_is_for_good_and_never_where_pixels_are_white():
     assert run(white, "full").counts["moving"] == 0
     ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), FilterConfig(), world.initial_T_world_imu)
     banned = set()
-    for k in range(len(world)):
-        if k:
-            ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
-        report = ekf.update(k, *world.observations.at(k))
+    for _, report, _ in run_filter(ekf, world):
         assert not banned & set(ekf.ids.tolist())
         banned |= set(report.ids[report.reason == MOVING].tolist())
     assert banned

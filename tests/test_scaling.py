@@ -16,6 +16,7 @@ from ekfslam.config import Config, FilterConfig
 from ekfslam.data.sequence import Sequence
 from ekfslam.data.simulate import City, simulate
 from ekfslam.filters import JointEKF
+from ekfslam.filters.loop import run_filter
 from ekfslam.models.sensors.stereo import Rig
 from ekfslam.resolve import noise_of, settings_of
 from ekfslam.smoother.posterior import posterior
@@ -28,13 +29,7 @@ def state_sizes(sequence: Sequence) -> list[int]:
     config = settings_of(sequence, Config(filter=FilterConfig(retire="unseen")))
     rig = Rig(sequence.camera, sequence.T_cam_imu, noise_of(sequence, config))
     ekf = JointEKF(rig, config.filter, sequence.initial_T_world_imu)
-    sizes = []
-    for k in range(len(sequence)):
-        if k > 0:
-            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
-        ekf.update(k, *sequence.observations.at(k))
-        sizes.append(len(ekf.P))
-    return sizes
+    return [len(ekf.P) for _ in run_filter(ekf, sequence)]
 
 
 def test_the_state_is_as_large_as_what_is_in_view_however_long_the_drive() -> None:

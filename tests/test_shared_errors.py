@@ -19,6 +19,7 @@ from support.literal import (
     filter_of,
     gauge_information,
     in_level_frame,
+    side_by_side,
 )
 from support.reference import CAMERA, T_CAM_IMU, small_world
 from support.running import WHOLE, seeds
@@ -301,21 +302,19 @@ def test_views_of_a_prediction():
     np.testing.assert_allclose(ekf.P[view], Y @ ekf.P, atol=1e-9 * np.abs(ekf.P).max())
 
 
+@pytest.mark.parametrize("blocks", [[], SHARED], ids=["up and calibration", "shared errors, too"])
 @pytest.mark.parametrize("tracks", [TRACKS, {}], ids=["tracks", "white"])
 @pytest.mark.parametrize("coordinates", ["xyz", "image"])
 @pytest.mark.parametrize("variant", ["invariant", "fej", "standard"])
-def test_information_about_the_gauge_with_shared_errors(variant, coordinates, tracks):
+def test_information_about_the_gauge_with_everything(variant, coordinates, tracks, blocks):
     """Velocities taken as exact: not the least is gained or lost, but by the standard variant."""
-    world = in_level_frame(
-        small_world(seed=4, frames=60 if WHOLE else 30), TILTED, twist_std=np.zeros(6), tilt_rad=0.05, **tracks
-    )
+    world = small_world(seed=4, frames=60 if WHOLE else 30)
+    world = in_level_frame(world, TILTED, twist_std=np.zeros(6), tilt_rad=0.05, **tracks)
     config = dataclasses.replace(OPEN, variant=variant, landmark_coordinates=coordinates)
-    ekf = filter_of(world, config, EVERYTHING, up=TILTED[:, 2], blocks=SHARED)
+    ekf = filter_of(world, config, EVERYTHING, up=TILTED[:, 2], blocks=blocks)
     prior = gauge_information(ekf)
-    for k in range(len(world)):
-        if k:
-            ekf.predict(world.twist[k], world.time_s[k] - world.time_s[k - 1])
-        ekf.update(k, *world.observations.at(k))
+    for _ in run_filter(ekf, world):
+        pass
     ratio = np.linalg.eigvals(np.linalg.solve(prior, gauge_information(ekf))).real
     if variant == "standard":
         assert ratio.max() > 3
@@ -341,10 +340,6 @@ class LiteralShared(Literal):
     def moved_by(self, e):
         own = {name: getattr(self, name) + e[..., self.at[name]] for name in self.OWN}
         return {**super().moved_by(e), **own}
-
-    def predict(self, measured, tau):
-        self.way_m = tau * np.linalg.norm(measured[:3])
-        super().predict(measured, tau)
 
     def wander(self, tau):
         super().wander(tau)
@@ -393,40 +388,8 @@ def test_filter_with_shared_errors_equals_the_literal_one(variant, coordinates, 
     # Landmarks that are not seen for some frames stay awake.
     config = dataclasses.replace(OPEN, variant=variant, landmark_coordinates=coordinates, retire_after=100)
     ekf = filter_of(world, config, EVERYTHING, up=TILTED[:, 2], blocks=BLOCKS)
-    literal, layout, rng = (
-        LiteralShared(world, variant, coordinates == "image"),
-        ekf.model.layout,
-        np.random.default_rng(3),
-    )
-    names = ["pose", "view", "previous_view", "calibration", "twist", "up", "twist_bias"]
-    names += [block.name for block in SHARED]
-    body = layout.columns(name for name in names if name in layout)
-    accuracy = 1e-9 if coordinates == "xyz" else 2e-8
-    for k in range(len(world)):
-        if k:
-            tau = world.time_s[k] - world.time_s[k - 1]
-            ekf.predict(world.twist[k], tau)
-            literal.predict(world.twist[k], tau)
-        else:
-            ekf.begin(world.twist[0])
-            literal.begin(world.twist[0])
-        ids, pixels = world.observations.at(k)
-        some = rng.permutation(len(ids))[: max(3, len(ids) - 2)]
-        if k > 1:
-            some = some[ids[some] != literal.ids[0]]
-        ekf.update(k, ids[some], pixels[some])
-        literal.update(ids[some], pixels[some])
-        assert literal.ids == ekf.ids.tolist()
-        columns = np.concatenate([body, np.arange(layout.body, len(ekf.P))])
-        own = zip(names[7:], literal.OWN, strict=True)
-        pairs = [(ekf.values[name], getattr(literal, value)) for name, value in own if name in layout]
-        for ours, theirs in (
-            *pairs,
-            (ekf.T_imu_world, literal.T),
-            (ekf.positions_m, literal.m),
-            (ekf.P[np.ix_(columns, columns)], literal.P),
-        ):
-            np.testing.assert_allclose(ours, theirs, rtol=accuracy, atol=accuracy)
+    literal = LiteralShared(world, variant, coordinates == "image")
+    side_by_side(ekf, literal, world, 1e-9 if coordinates == "xyz" else 2e-8, shuffle=True)
     assert (np.abs(ekf.values["camera_jitter"]) > 1e-6).all()
 
 

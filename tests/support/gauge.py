@@ -8,6 +8,7 @@ import numpy as np
 
 from ekfslam.data.sequence import Noise
 from ekfslam.filters.joint import JointEKF
+from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import se3
 from ekfslam.models.sensors.stereo import Rig
 
@@ -21,10 +22,8 @@ def exact_motion(sequence):
 
 def drive(sequence, config, P0=P0, frames=None):
     ekf = JointEKF(Rig(sequence.camera, sequence.T_cam_imu, sequence.noise), config, sequence.initial_T_world_imu, P0)
-    for k in range(frames or len(sequence)):
-        if k > 0:
-            ekf.predict(sequence.twist[k], sequence.time_s[k] - sequence.time_s[k - 1])
-        ekf.update(k, *sequence.observations.at(k))
+    for _ in run_filter(ekf, sequence, range(frames or len(sequence))):
+        pass
     return ekf
 
 

@@ -56,9 +56,9 @@ def in_imu(level_twist, up):
 def moved(T, W, twist, tau, errors=None):
     """Pose and IMU velocities after one step at level velocities; up is the z axis of W, in world.
 
-    ``errors`` (6,) are those of the velocities.
+    ``errors`` (6,) are those of the velocities. Without W these are those of the IMU.
     """
-    u = in_imu(twist, (T[..., :3, :3] @ W)[..., 2])
+    u = twist if W is None else in_imu(twist, (T[..., :3, :3] @ W)[..., 2])
     if errors is not None:
         u = u + errors
     return se3.exp(-tau * u) @ T, u
@@ -107,17 +107,18 @@ class Literal:
     """Textbook EKF: full-width numeric F, H and G, S^-1, Joseph's form. Nothing is gated or retired.
 
     The state is pose, view, view before, free calibration parameters, velocities, up, bias, landmarks, as in
-    `JointEKF`; where the noise knows no tracks, velocities or bias, these have no columns. With ``images`` landmarks
-    are corrected in pixels (u, v, disparity) of the last updated view, eq. (7').
+    `JointEKF`; where the noise knows no tracks, velocities, up or bias, these have no columns. With ``images``
+    landmarks are corrected in pixels (u, v, disparity) of the last updated view, eq. (7').
     """
 
-    def __init__(self, sequence, variant, free, std, up=Z, bias=None, images=False, P=P0):
-        self.sequence, self.noise, self.variant, self.free = sequence, sequence.noise, variant, free
+    def __init__(self, sequence, variant, free=(), std=(), up=None, bias=None, images=False, P=P0):
+        self.sequence, self.noise, self.variant = sequence, sequence.noise, variant
+        self.free = np.array(free, dtype=int)
         self.images, self.updated, self.by_position = images, "view", 0
         self.T = self.departed = np.linalg.inv(sequence.initial_T_world_imu)
         self.view, self.before, self.c, self.twist, self.b = np.eye(4), np.eye(4), np.zeros(9), None, np.zeros(6)
         self.u = np.zeros(6)
-        self.W = self.T[:3, :3].T @ level_axes(up)
+        self.W = None if up is None else self.T[:3, :3].T @ level_axes(up)
         self.m, self.ids, self.first, self.last, self.rows = np.empty((0, 3)), [], {}, {}, {}
         self.walks, self.bias, self.tracks = self.noise.twist_walk_std is not None, bias, self.noise.track_error
         self.has_views = images or self.tracks is not None
@@ -127,9 +128,9 @@ class Literal:
             "pose": P,
             "view": np.zeros((6 * self.has_views,) * 2),
             "before": np.zeros((6 * self.has_views,) * 2),
-            "c": np.diag(std**2),
+            "c": np.diag(np.square(std)),
             "twist": np.zeros((6 * self.walks,) * 2),
-            "up": self.noise.tilt_rad**2 * np.eye(3),
+            "up": self.noise.tilt_rad**2 * np.eye(0 if up is None else 3),
             "bias": np.diag(of_bias**2),
         }
         for name, block in prior.items():
@@ -147,9 +148,11 @@ class Literal:
             "before": self.before,
             "c": self.c + e[..., self.at["c"]] @ np.eye(9)[self.free],
             "twist": self.twist,
-            "W": se3.so3_exp(e[..., self.at["up"]]) @ self.W,
+            "W": self.W,
             "b": self.b,
         }
+        if self.W is not None:
+            found["W"] = se3.so3_exp(e[..., self.at["up"]]) @ self.W
         if self.has_views:
             for name in ("view", "before"):
                 found[name] = se3.exp(e[..., self.at[name]]) @ getattr(self, name)
@@ -176,6 +179,7 @@ class Literal:
         self.P, self.view = E @ self.P @ E.T, here
 
     def predict(self, measured, tau):
+        self.way_m = tau * np.linalg.norm(measured[:3])
         if self.has_views:
             F = np.eye(len(self.P))
             F[self.at["before"]] = F[self.at["view"]]
@@ -266,13 +270,15 @@ class Literal:
 
     def correct(self, seen):
         variance = []
-        for i, z, _ in seen:
+        for i, z, place in seen:
             if self.tracks is None:
                 variance.append(self.noise.pixel_std_px[0] ** 2 * np.array([1, 0.5, 1]))
             elif self.last[i] == self.k - 1:
                 u, v, d = (z - self.rows[i]) ** 2
                 flow = np.array([u + 0.35 * (v + d), v + 0.35 * (u + d), d + 0.35 * (u + v)])
-                variance.append(self.noise.track_walk_px**2 * (1 + flow / self.noise.track_flow_px**2))
+                parallax = self.way_m / se3.apply(self.view, self.m[place])[2] / self.noise.track_parallax
+                growth = 1 + flow / self.noise.track_flow_px**2 + parallax**2
+                variance.append(self.noise.track_walk_px**2 * growth)
             else:
                 spread = self.noise.track_first_px**2
                 for _ in range(self.first[i], self.k):
@@ -400,6 +406,60 @@ class Literal:
         self.turn_landmarks(after, rotation)
         transport = after @ np.linalg.inv(stored)
         self.P = transport @ self.P @ transport.T
+
+
+# Blocks of `Literal`, and their names in a layout.
+BLOCKS = {
+    "pose": "pose",
+    "view": "view",
+    "before": "previous_view",
+    "c": "calibration",
+    "twist": "twist",
+    "up": "up",
+    "bias": "twist_bias",
+    "jitter": "camera_jitter",
+    "drift": "vision_drift",
+}
+
+
+def assert_same(ekf, literal, accuracy):
+    """Compare all that a filter and the literal one hold."""
+    layout = ekf.model.layout
+    values = {name: getattr(literal, {"pose": "T", "bias": "b"}.get(name, name), None) for name in literal.at}
+    values["up"] = None if literal.W is None else literal.W @ Z
+    if not literal.k:
+        values["before"] = None
+    columns = [np.r_[layout[BLOCKS[name]]] for name in literal.at if BLOCKS[name] in layout]
+    columns = np.concatenate([*columns, np.arange(layout.body, len(ekf.P))])
+    pairs = [(ekf.values[BLOCKS[name]], x) for name, x in values.items() if BLOCKS[name] in layout and x is not None]
+    assert literal.ids == ekf.ids.tolist()
+    for ours, theirs in (*pairs, (ekf.positions_m, literal.m), (ekf.P[np.ix_(columns, columns)], literal.P)):
+        np.testing.assert_allclose(ours, theirs, rtol=accuracy, atol=accuracy)
+    np.testing.assert_array_equal(ekf.P, ekf.P.T)
+
+
+def side_by_side(ekf, literal, world, accuracy, frames=None, shuffle=False):
+    """Compare both after every prediction and update; return how often a difference of tracks, or a revisit, counted.
+
+    With ``shuffle`` some of what is there is left out, the first landmark among it, and the rest comes in any order.
+    """
+    rng, follow, again = np.random.default_rng(3), 0, 0
+    for k in range(frames or len(world)):
+        if k:
+            tau = world.time_s[k] - world.time_s[k - 1]
+            ekf.predict(world.twist[k], tau), literal.predict(world.twist[k], tau)
+            assert_same(ekf, literal, accuracy)
+        else:
+            ekf.begin(world.twist[0]), literal.begin(world.twist[0])
+        ids, pixels = world.observations.at(k)
+        some = rng.permutation(len(ids))[: max(3, len(ids) - 2)] if shuffle else np.arange(len(ids))
+        if shuffle and k > 1:
+            some = some[ids[some] != literal.ids[0]]
+        last = [literal.last[i] for i in ids[some].tolist() if i in literal.ids]
+        follow, again = follow + last.count(k - 1), again + sum(seen < k - 1 for seen in last)
+        ekf.update(k, ids[some], pixels[some]), literal.update(ids[some], pixels[some])
+        assert_same(ekf, literal, accuracy)
+    return follow, again
 
 
 def gravity(sequence, W):
